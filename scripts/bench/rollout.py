@@ -54,7 +54,7 @@ from residnet.heads.base import ZeroHead
 from residnet.heads.lstm import LstmConfig
 from residnet.heads.mlp import MlpConfig
 from residnet.physics.signals import SignalsConfig
-from residnet.training.refit import RefitConfig, level_of, problem_of, refit
+from residnet.training.refit import RefitConfig, problem_of, refit, simulate
 
 NAMES = ("u", "v", "r", "tau_x", "tau_n")
 _BATCH, _STEPS, _SLOPE = 1_024, 200, 40
@@ -277,7 +277,7 @@ def refits(repeats: int) -> None:
     plan = RefitConfig(horizon=20.0, every=10.0)
     start = baseline.free()
     problem = problem_of(model, known, store, plan, _SCALES)
-    windows, steps = problem.w.shape[:2]
+    windows, steps = problem.inputs.shape[:2]
     found = []
     for _ in range(1 + repeats):
         baseline.place(start)
@@ -285,24 +285,24 @@ def refits(repeats: int) -> None:
         notes = refit(model, known, store, plan, _SCALES).notes
         found.append(spent() - begun)
     print(
-        f"refit of {len(problem.active)} parameters, {windows} windows of {steps} steps: first"
+        f"refit of {len(problem.free)} parameters, {windows} windows of {steps} steps: first"
         f" {found[0]:.2f} s, then {min(found[1:]):.2f} s, {notes['iterations']} iterations, cost"
         f" {notes['cost_before']:.6f} -> {notes['cost_after']:.9f}"
     )
     root = np.linalg.cholesky(problem.precision.numpy()).T
-    each = np.sqrt(problem.nu.numel())
+    each = np.sqrt(problem.measured.numel())
 
     def errors(values: np.ndarray) -> np.ndarray:
         baseline.place(torch.from_numpy(values))
-        flown = Rollout(model)(problem.x0, problem.w, problem.x0[:, :0])[0]
-        error = (velocities_on(flown[:, 1:]) - problem.nu) * problem.weight / each
-        return np.append(error.numpy().ravel(), root @ (values - problem.start.numpy()))
+        flown = Rollout(model)(problem.x0, problem.inputs, problem.x0[:, :0])[0]
+        error = (velocities_on(flown[:, 1:]) - problem.measured) * problem.weight / each
+        return np.append(error.numpy().ravel(), root @ (values - problem.prior_mean.numpy()))
 
     begun = spent()
-    best = least_squares(errors, problem.start.numpy(), method="lm", x_scale="jac", xtol=1e-4)
+    best = least_squares(errors, problem.prior_mean.numpy(), method="lm", x_scale="jac", xtol=1e-4)
     taken = spent() - begun
     baseline.place(torch.from_numpy(best.x))
-    level = level_of(model, problem)[0]
+    level = simulate(model, problem)[0]
     print(f"scipy: {taken:.2f} s, {best.nfev} free runs, cost {level:.9f}")
 
 

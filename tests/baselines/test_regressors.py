@@ -14,7 +14,7 @@ from sklearn.linear_model import Ridge
 from sklearn.preprocessing import PolynomialFeatures
 
 from residnet.baselines.given import StillConfig
-from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig, _undamped
+from residnet.baselines.regressors import RegressorsConfig, _undamped
 from residnet.baselines.sets import merged
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, FitError
@@ -87,22 +87,6 @@ def test_still_knows_nothing() -> None:
     baseline = StillConfig().build(NAMES)
     assert StillConfig().fit(baseline, made()) == []
     assert torch.equal(baseline(torch.randn(4, 7, 5)), torch.zeros(4, 7, 3))
-
-
-@pytest.mark.parametrize("bounded", [False, True])
-def test_derivatives_of_a_model_along_directions(bounded: bool) -> None:
-    """By differences, inside the range in which the model is as fitted and far outside it."""
-    baseline = RegressorBaseline([[*row] for row in TRUTH.values()], NAMES, bounded=bounded)
-    torch.manual_seed(1)
-    baseline.theta.data.normal_()
-    z = torch.randn(40, 5, dtype=torch.float64) * torch.tensor([3.0, 0.9, 0.9, 900.0, 600.0])
-    if bounded:
-        assert baseline.bound is not None
-        baseline.bound.calibrate(made())
-        assert not torch.equal(baseline.bound.held(z), z)
-    ahead = torch.randn(3, 40, 5, dtype=torch.float64)
-    about = (baseline(z + 1e-6 * ahead) - baseline(z - 1e-6 * ahead)) / 2e-6
-    torch.testing.assert_close(baseline.along(z, ahead), about, rtol=1e-6, atol=1e-6)
 
 
 SHIP = ("u", "v", "r", "n", "delta")

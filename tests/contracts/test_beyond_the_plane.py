@@ -37,6 +37,7 @@ from residnet.data.simulated import (
 from residnet.dynamics.actuated import ActuatedDynamics, PlantActuators
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.jacobian import StepJacobian
 from residnet.dynamics.rollout import Rollout, scripted
 from residnet.dynamics.store import save_model
 from residnet.heads.linear import RidgeConfig
@@ -54,7 +55,6 @@ from residnet.simulators.ardupilot import ArduPilotBackEnd, servos
 from residnet.simulators.vehicle import vehicle
 from residnet.testing import example_samples
 from residnet.testing.checks import ROLLING, STEP, SUBMERGED, example_model, example_spec
-from residnet.training import refit
 
 PHI, P, DEPTH = ROLL.names.index("phi"), ROLL.names.index("p"), SIX.names.index("z")
 HULL = RegressorsConfig(sets=("fossen",), ridge=1e-4)
@@ -173,11 +173,12 @@ def test_sensitivities_are_the_derivatives_of_the_step(scheme: Integrator) -> No
     spread = torch.tensor([0, 0, 1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.3, 1, 0.6, 0.6]).double()
     x = torch.randn(3, 12, generator=random, dtype=torch.float64) * spread
     x[:, 3] += 1.5
-    p = model.signals.prepare(torch.tensor([[0.2, -0.1, 10.0]]).double().expand(3, 3))
+    w = torch.tensor([[0.2, -0.1, 10.0]]).double().expand(3, 3)
     baseline: Any = model.baseline
     active = baseline.free_indices()
     s = 0.1 * torch.randn(3, 10, len(active), generator=random, dtype=torch.float64)
-    found = refit.step_sensitivities(model, x, p, s)
+    by_state, by_theta = StepJacobian.of(model)(x, w)
+    found = by_state @ s + by_theta
     start, size = baseline.theta.detach().flatten()[active].clone(), 1e-6
     for j in range(0, len(active), 17):
         ends = []
@@ -187,7 +188,7 @@ def test_sensitivities_are_the_derivatives_of_the_step(scheme: Integrator) -> No
             moved[:, 2:] += sign * size * s[:, :, j]
             baseline.place(values)
             with torch.no_grad():
-                ends.append(refit._ahead(model, moved, p)[:, 2:])
+                ends.append(model.step(moved, w, moved[:, :0])[0][:, 2:])
         wanted = (ends[0] - ends[1]) / (2.0 * size)
         torch.testing.assert_close(found[:, :, j].detach(), wanted, rtol=1e-6, atol=1e-6)
 

@@ -10,7 +10,6 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch
-from made_samples import sampled
 from scipy.linalg import expm
 from torch import Tensor
 
@@ -22,7 +21,6 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.heads.base import ResidualHead, ZeroHead
 from residnet.heads.lstm import LstmConfig
-from residnet.heads.mlp import MlpConfig
 from residnet.heads.recurrent import RecurrentConfig
 from residnet.physics.signals import SignalsConfig
 
@@ -164,44 +162,3 @@ def test_heading_and_velocities_do_not_hang_on_positions(
     torch.testing.assert_close(alone, whole, rtol=0, atol=1e-13)
     torch.testing.assert_close(*slopes, rtol=0, atol=1e-13)
     assert torch.equal(states[1][..., POSITION], x0[:, None, POSITION].expand(5, 21, 2))
-
-
-@pytest.mark.parametrize(
-    "head",
-    [
-        MlpConfig(hidden=(5, 4)),
-        LstmConfig(hidden_size=4, features=("b", "r", "u"), readout=3, memory=("b",)),
-        LstmConfig(hidden_size=4, readout=3, memory=("u", "a"), per_axis=True),
-        RecurrentConfig(members=2, hidden_size=4, step=STEP),
-    ],
-    ids=["mlp", "lstm of inputs", "lstm by axis", "recurrent"],
-)
-@pytest.mark.parametrize("terms", TERMS)
-def test_gradients_are_those_of_single_steps(head: Any, terms: str) -> None:
-    torch.manual_seed(5)
-    signals = SignalsConfig(inputs=("a", "b")).build()
-    baseline = RegressorBaseline([TERMS[terms]] * 3, signals.names, bounded=terms != "linear")
-    z = torch.randn(60, len(signals.names), dtype=torch.float64)
-    known = sampled(z, z[:, :3].flip(1), signals.names)
-    if baseline.bound is not None:
-        baseline.bound.calibrate(known)
-    baseline.theta.data.copy_(0.2 * torch.randn(3, 5) - 0.6 * torch.eye(3, 5))
-    model = HybridDynamics(signals, baseline, head.build(signals.names), STEP)
-    model.head.calibrate(known)
-    model = model.double()
-    rows = 3 * model.head.copies
-    x0 = torch.randn(rows, 6, dtype=torch.float64)
-    w, s = torch.randn(rows, 20, 2, dtype=torch.float64), torch.rand(rows, model.n_state).double()
-    free = Rollout(model)
-    # several stretches, the last one shorter
-    free.together = 7 * rows
-    found = []
-    for model.positions in (True, False):
-        model.zero_grad()
-        states, _, memory = free(x0, w, s)
-        (states[..., HEADING : MOTION.stop].square().sum() + memory.square().sum()).backward()
-        slopes = [p.grad for p in model.head.parameters() if p.grad is not None]
-        found.append([states[..., HEADING : MOTION.stop].detach(), memory.detach(), *slopes])
-    assert len(found[0]) == len(found[1]) > 4
-    for alone, ahead in zip(*found, strict=True):
-        torch.testing.assert_close(ahead, alone, rtol=1e-8, atol=1e-10)

@@ -87,24 +87,6 @@ def test_batched_shapes_equal_sample_by_sample(
     torch.testing.assert_close(found, torch.cat(rows or [found]), rtol=1e-13, atol=1e-13)
 
 
-@pytest.mark.parametrize("exogenous", [(), WIND])
-@pytest.mark.parametrize("forces", [None, "wam_v_cal"])
-def test_slopes_are_the_derivatives_by_heading_and_velocities(
-    exogenous: tuple[str, ...], forces: str | None
-) -> None:
-    signals = build(exogenous=exogenous, forces=forces).double()
-    torch.manual_seed(4)
-    x = torch.randn(5, 6, dtype=torch.float64)
-    p = signals.prepare(torch.randn(5, 2 + len(exogenous), dtype=torch.float64))
-    found = signals.slopes(x, p)
-    assert found.shape == (4, 5, signals.count)
-    for row, column in enumerate((2, 3, 4, 5)):
-        step = torch.zeros(6, dtype=torch.float64)
-        step[column] = 1e-6
-        about = (signals(x + step, p) - signals(x - step, p)) / 2e-6
-        torch.testing.assert_close(found[row], about, rtol=1e-6, atol=1e-7)
-
-
 def test_a_resolved_config_needs_no_vessel_file() -> None:
     config = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal")
     resolved = config.resolved()

@@ -37,7 +37,7 @@ from residnet.heads.base import ZeroHead
 from residnet.physics.signals import SignalsConfig
 from residnet.training import refit as module
 from residnet.training.left_out import without_logs
-from residnet.training.refit import Problem, RefitConfig, refit, sensitivities, step_sensitivities
+from residnet.training.refit import Problem, RefitConfig, refit, sensitivities
 
 
 def fitted(
@@ -102,19 +102,19 @@ def windy(
     half = torch.from_numpy(random.normal(size=(count, count)))
     problem = Problem(
         x0=torch.from_numpy(random.normal(size=(batch, 3 + n)) * [5, 5, 1, 0.5, *[0.2] * (n - 1)]),
-        w=torch.cat((inputs(batch, steps, 6), wind), dim=-1),
-        nu=torch.from_numpy(random.normal(size=(batch, steps, n)) * 0.3),
+        inputs=torch.cat((inputs(batch, steps, 6), wind), dim=-1),
+        measured=torch.from_numpy(random.normal(size=(batch, steps, n)) * 0.3),
         weight=torch.cat((usable, usable, *[torch.ones_like(usable)] * (n - 2)), dim=-1)
         / torch.cat((SCALES, SCALES.new_full((n - 3,), 0.2))),
         precision=0.01 * half @ half.T,
-        own=torch.zeros(count, count, dtype=torch.float64),
-        start=torch.from_numpy(random.normal(size=count) * 0.1),
-        pull=torch.diag(torch.from_numpy(random.uniform(0, 0.1, size=count))),
-        still=torch.zeros(count, dtype=torch.bool),
-        active=active,
-        believed=torch.from_numpy(random.normal(size=count) * 0.1),
-        belief=torch.from_numpy(random.uniform(0, 50, size=count)),
-        count=7.0,
+        regularisation=torch.zeros(count, count, dtype=torch.float64),
+        prior_mean=torch.from_numpy(random.normal(size=count) * 0.1),
+        symmetry=torch.diag(torch.from_numpy(random.uniform(0, 0.1, size=count))),
+        fixed=torch.zeros(count, dtype=torch.bool),
+        free=active,
+        belief_mean=torch.from_numpy(random.normal(size=count) * 0.1),
+        belief_precision=torch.from_numpy(random.uniform(0, 50, size=count)),
+        independent_errors=7.0,
         robust=0.05,
         log=torch.tensor([0, 0, 1, 3, 3]),
     )
@@ -129,10 +129,10 @@ def with_step(model: HybridDynamics, problem: Problem, place: int, step: float) 
     other = copy.deepcopy(model)
     assert isinstance(other.baseline, RegressorBaseline)
     with torch.no_grad():
-        other.baseline.theta.view(-1)[problem.active[place]] += step
-        values = other.baseline.theta.flatten()[problem.active]
-        known = problem.prior_cost(values, problem.share(LEVEL))
-    return float(module.level_of(other, problem)[0] + known)
+        other.baseline.theta.view(-1)[problem.free[place]] += step
+        values = other.baseline.theta.flatten()[problem.free]
+        known = problem.prior_cost(values, problem.cost_per_nat(LEVEL))
+    return float(module.simulate(other, problem)[0] + known)
 
 
 @pytest.mark.parametrize("integrator", get_args(Integrator))
@@ -140,33 +140,29 @@ def test_sensitivities_are_those_of_the_rollout(integrator: Integrator) -> None:
     """Central differences of the one time loop, heading included: the wind makes it matter."""
     model, problem = windy(integrator, ROLLS)
     assert isinstance(model.baseline, RegressorBaseline)
-    theta, count = model.baseline.theta.data.view(-1), len(problem.active)
-    steps = problem.w.shape[1]
+    theta, count = model.baseline.theta.data.view(-1), len(problem.free)
     memory = model.initial_state(len(problem.x0)).double()
 
     def rolled(place: int, change: float) -> Tensor:
-        theta[problem.active[place]] += change
-        states, _, _ = Rollout(model)(problem.x0, problem.w, memory)
-        theta[problem.active[place]] -= change
+        theta[problem.free[place]] += change
+        states, _, _ = Rollout(model)(problem.x0, problem.inputs, memory)
+        theta[problem.free[place]] -= change
         return states
 
     def moved(place: int, change: float) -> Tensor:
         x0 = problem.x0.clone()
         x0[:, HEADING + place] += change
-        return Rollout(model)(x0, problem.w, memory)[0]
+        return Rollout(model)(x0, problem.inputs, memory)[0]
 
     with torch.no_grad():
-        x, found = problem.x0, torch.zeros(len(problem.x0), 1 + model.dof, count).double()
-        for k in range(steps):
-            p = model.signals.prepare(problem.w[:, k])
-            found = step_sensitivities(model, x, p, found)
-            x, _ = model.step(x, problem.w[:, k], memory)
-        torch.testing.assert_close(x, rolled(0, 0.0)[:, -1], rtol=1e-12, atol=1e-12)
+        states = rolled(0, 0.0)
+        *_, (_, last) = sensitivities(model, states[:, :-1], problem.inputs)
+        found = last[-1]
         for place in range(count):
             central = (rolled(place, 1e-5) - rolled(place, -1e-5))[:, -1, HEADING:] / 2e-5
             torch.testing.assert_close(found[:, :, place], central, rtol=1e-6, atol=1e-8)
         run = moved(0, 0.0)[:, :-1]
-    whole = sensitivities(model, run, problem.w, to_start=True)
+    whole = sensitivities(model, run, problem.inputs, to_start=True)
     to_start = torch.cat([part for _, part in whole]).transpose(0, 1).detach()
     with torch.no_grad():
         for place in range(1 + model.dof):
@@ -187,7 +183,7 @@ def test_noisy_starts_teach_no_damping_where_they_are_estimated() -> None:
 
 def normal_equations(model: HybridDynamics, problem: Problem) -> tuple[Tensor, Tensor]:
     assert isinstance(model.baseline, RegressorBaseline)
-    squares = module.level_of(model, problem)[1]
+    squares = module.simulate(model, problem)[1]
     return module.normal_equations(model, problem, LEVEL, squares)
 
 
@@ -217,10 +213,10 @@ def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
     # free runs that are compiled round otherwise than single steps
     fields = {
         **vars(problem),
-        "nu": module.level_of(model, problem)[1][:, 1:, 3:],
+        "measured": module.simulate(model, problem)[1][:, 1:, 3:],
         "precision": 0 * problem.precision,
-        "pull": 0 * problem.pull,
-        "belief": 0 * problem.belief,
+        "symmetry": 0 * problem.symmetry,
+        "belief_precision": 0 * problem.belief_precision,
     }
     perfect = Problem(**fields)
     hessian, gradient = normal_equations(model, perfect)

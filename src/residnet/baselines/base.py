@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError, FitError
-from residnet.core.samples import Samples, derivatives_along
+from residnet.core.samples import Samples
 from residnet.physics.symmetry import live_of
 from residnet.regression.estimator import Coefficient, Solution
 
@@ -20,34 +20,11 @@ class Baseline(nn.Module, ABC):
     """A baseline: accelerations [..., n] from channels z [..., nz], without memory.
 
     They are in m/s^2, m/s^2 and rad/s^2.
-
-    Attributes:
-        linear: whether they are linear in the velocities.
     """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.linear = False
 
     @abstractmethod
     def forward(self, z: Tensor) -> Tensor:
         """Return nu_dot [..., n] at channels z [..., nz] (see `residnet.physics.signals`)."""
-
-    def ahead(self, p: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return what velocities do not decide, for `at`: rows [..., q], and what all rows share.
-
-        Args:
-            p: channels behind the velocities [..., nz - n].
-        """
-        return p, []
-
-    def at(self, nu: Tensor, row: Tensor, held: list[Tensor]) -> Tensor:
-        """Return nu_dot [B, n] at velocities nu [B, n], by what `ahead` found.
-
-        Where the baseline is `linear` that is row + nu held[0].
-        """
-        found: Tensor = self.forward(torch.cat((nu, row), dim=-1))
-        return found
 
     @abstractmethod
     def parameter_count(self) -> list[float]:
@@ -102,15 +79,6 @@ class ParametricBaseline(Baseline, ABC):
 
         They are taken at channels z [B, nz].
         """
-
-    def along(self, z: Tensor, ahead: Tensor) -> Tensor:
-        """Return the derivatives of nu_dot [D, B, n] along directions.
-
-        Args:
-            z: channels [B, nz].
-            ahead: the directions [D, B, nz].
-        """
-        return derivatives_along(self, z, ahead)
 
     @abstractmethod
     def information(self, samples: Samples) -> Tensor:

@@ -19,7 +19,7 @@ from residnet.core.samples import Samples
 from residnet.physics.hull import HullConfig, OdinConfig
 from residnet.physics.signals import FORCE_CHANNELS
 from residnet.physics.symmetry import live_of
-from residnet.physics.terms import SplitTerms, TermLibrary, parse_term, read_rows
+from residnet.physics.terms import TermLibrary, parse_term, read_rows
 from residnet.physics.vessel import load_vessel
 from residnet.regression.estimator import Solution
 
@@ -39,10 +39,7 @@ class GivenBaseline(Baseline):
         super().__init__()
         terms = list(dict.fromkeys(term for row in rows for term in row))
         self.library = TermLibrary(terms, names)
-        moving = live_of(names).moving
-        self.dof = len(moving)
-        self.split = SplitTerms(terms, names[self.dof :], moving)
-        self.linear = self.split.linear
+        self.dof = live_of(names).size
         self.fitted = fitted
         beside = [dict[str, float]()] * (self.dof - len(rows))
         theta = [[row.get(term, 0.0) for term in terms] for row in (*rows, *beside)]
@@ -57,14 +54,6 @@ class GivenBaseline(Baseline):
             return zero_acceleration(z, self.dof)
         phi: Tensor = self.library(z)
         return phi @ self.theta.to(z.dtype).T
-
-    def ahead(self, p: Tensor) -> tuple[Tensor, list[Tensor]]:
-        row, own = self.split.ahead(p, self.theta.to(p.dtype).T)
-        return row, [own]
-
-    def at(self, nu: Tensor, row: Tensor, held: list[Tensor]) -> Tensor:
-        found: Tensor = self.split(nu, row, held[0])
-        return found
 
     def parameter_count(self) -> list[float]:
         """Return the number of terms of each axis where they were fitted, else zeros."""

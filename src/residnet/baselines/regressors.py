@@ -19,7 +19,7 @@ from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseli
 from residnet.baselines.sets import Roles, SetName, expand, merged
 from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY
-from residnet.core.samples import Samples
+from residnet.core.samples import Samples, derivatives_along
 from residnet.physics.signals import VelocityBound
 from residnet.physics.symmetry import (
     ChannelNames,
@@ -31,7 +31,7 @@ from residnet.physics.symmetry import (
     without_dead,
     wrong_parity,
 )
-from residnet.physics.terms import SplitTerms, TermLibrary
+from residnet.physics.terms import TermLibrary
 from residnet.regression.estimator import Coefficient, Solution, chosen, regressors
 from residnet.regression.least_squares import LeastSquares
 
@@ -76,8 +76,6 @@ class RegressorBaseline(ParametricBaseline):
         self.bound: VelocityBound | None = (
             VelocityBound(_BEYOND, len(names), live.size) if bounded else None
         )
-        self.split = SplitTerms(terms, names[live.size :], live.moving)
-        self.linear = self.split.linear and not bounded
 
     def forward(self, z: Tensor) -> Tensor:
         weights = (self.theta * self.allowed).to(z.dtype)
@@ -88,24 +86,6 @@ class RegressorBaseline(ParametricBaseline):
             return phi @ weights.T + back
         known: Tensor = self.library(z)
         return known @ weights.T
-
-    def ahead(self, p: Tensor) -> tuple[Tensor, list[Tensor]]:
-        weights = (self.theta * self.allowed).to(p.dtype).T
-        if self.bound is None:
-            row, own = self.split.ahead(p, weights)
-            return row, [own]
-        low, high = self.bound.low.to(p.dtype), self.bound.high.to(p.dtype)
-        n = self.dof
-        row, own = self.split.ahead(torch.clamp(p, low[n:], high[n:]), weights)
-        return row, [own, low[:n], high[:n], self.bound.rate.to(p.dtype)]
-
-    def at(self, nu: Tensor, row: Tensor, held: list[Tensor]) -> Tensor:
-        if self.bound is None:
-            free: Tensor = self.split(nu, row, held[0])
-            return free
-        near = torch.clamp(nu, held[1], held[2])
-        found: Tensor = self.split(near, row, held[0])
-        return torch.addcmul(found, held[3], near - nu)
 
     def parameter_count(self) -> list[float]:
         """Return the number of coefficients of each axis that are not zero."""
@@ -140,15 +120,6 @@ class RegressorBaseline(ParametricBaseline):
             out[:, axis, begin : begin + len(own)] = part
             begin += len(own)
         return out
-
-    def along(self, z: Tensor, ahead: Tensor) -> Tensor:
-        weights = self.theta * self.allowed
-        if self.bound is None:
-            return self.library.along(z, ahead) @ weights.T
-        held = self.bound.along(z, ahead)
-        return self.library.along(self.bound.held(z), held) @ weights.T + self.bound.back(
-            held, ahead
-        )
 
     def information(self, samples: Samples) -> Tensor:
         """Return the mean information of a sample [P, P].
@@ -270,7 +241,7 @@ def _own_slopes(library: TermLibrary, samples: Samples) -> Tensor:
     ahead = z.new_zeros(len(moving), *z.shape)
     for axis, name in enumerate(moving):
         ahead[axis, :, samples.names.index(name)] = 1.0
-    return library.along(z, ahead)
+    return derivatives_along(library, z, ahead)
 
 
 def _undamped(theta: Tensor, slopes: Tensor) -> int | None:

@@ -87,30 +87,6 @@ class Dynamics(nn.Module, ABC):
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state [B, nx] and the memory [B, n_state] one step later, inputs w [B, m]."""
 
-    def ahead(self, w: Tensor, s: Tensor) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
-        """Return what a stretch of steps needs that no state decides, for `go`.
-
-        Args:
-            w: inputs of the steps [B, T, m].
-            s: memory before them [B, n_state].
-
-        Returns:
-            what each step needs, T lists of rows [B, q]; and what all of them share.
-        """
-        rows: list[list[Tensor]] = []
-        for row in w.unbind(1):
-            rows.append([row])
-        return rows, []
-
-    def go(
-        self, x: Tensor, row: list[Tensor], shared: list[list[Tensor]], s: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the state and the memory one step later, as `step` does, by what `ahead` found.
-
-        Of a memory that inputs alone decide only that after the last step of the stretch is told.
-        """
-        return self.step(x, row[0], s)
-
     def initial_state(self, batch: int) -> Tensor:
         """Return the memory [batch, n_state] without a past: zeros."""
         return torch.zeros(batch, self.n_state)

@@ -157,33 +157,6 @@ class MeanOfTrajectories(HybridDynamics):
             memory.append(own)
         return self._joined(x, reached, memory)
 
-    def ahead(self, w: Tensor, s: Tensor) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
-        rows: list[list[Tensor]] = []
-        for _ in range(w.shape[1]):
-            rows.append([])
-        shared: list[list[Tensor]] = []
-        for i, member in enumerate(self.members):
-            given, part = w.repeat(self.copies[i], 1, 1), self._part(s, i)[..., self.dof :]
-            own, kept = member.ahead(given, part.reshape(given.shape[0], self.widths[i] - self.dof))
-            shared.extend(kept)
-            for k in range(len(own)):
-                rows[k].extend(own[k])
-        return rows, shared
-
-    def go(
-        self, x: Tensor, row: list[Tensor], shared: list[list[Tensor]], s: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        x = self.alive(x)
-        kept = self._kept(x, s)
-        reached: list[Tensor] = []
-        memory: list[Tensor] = []
-        for i, member in enumerate(self.members):
-            at, part = self._own(x, s, kept, i)
-            after, own = member.go(at, row[2 * i : 2 * i + 2], shared[3 * i : 3 * i + 3], part)
-            reached.append(after)
-            memory.append(own)
-        return self._joined(x, reached, memory)
-
     def _kept(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the share [B, 1] of their distances from the mean that members keep."""
         missed = (velocities(x, self.dof) - s[:, 1 : 1 + self.dof]) / self.small.to(x.dtype)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.baselines.base import Baseline
-from residnet.core.columns import pose, sinking, turning, velocities
+from residnet.core.columns import pose, sinking, velocities
 from residnet.core.layout import ATTITUDE, Live
 from residnet.dynamics.base import Dynamics, Integrator
 from residnet.heads.base import ResidualHead
@@ -195,79 +195,8 @@ class HybridDynamics(Dynamics):
             p: what `signals.prepare` returned for the step's inputs.
             rho: residual of the step [B, n].
         """
-        if self.positions or self.signals.wind or self.spatial:
-            nu_dot = self.found(self.baseline(z), rho, velocities(x, self.dof))
-            return self.integrate_from(torch.cat((self.kinematics(x), nu_dot), dim=-1), x, p, rho)
-        row, held = self.baseline.ahead(p)
-        return self.moved(x, row, held, rho)
-
-    def moved(self, x: Tensor, row: Tensor, held: list[Tensor], rho: Tensor) -> Tensor:
-        """Return the state [B, 3 + n] one step later where nothing but what moves enters.
-
-        The heading follows once, the position stays.
-
-        Args:
-            x: states [B, 3 + n].
-            row: what the baseline found ahead for the step [B, q].
-            held: what it found for all steps.
-            rho: residual of the step [B, n].
-        """
-        place, psi, nu = x.split([2, 1, self.dof], dim=-1)
-        nu_dot = self.found(self.baseline.at(nu, row, held), rho, nu)
-        total, mean = self.weights[0] * nu_dot, self.weights[0] * turning(nu, self.dof)
-        for i in range(1, len(self.nodes)):
-            stage = torch.add(nu, nu_dot, alpha=self.dt * self.nodes[i])
-            nu_dot = self.found(self.baseline.at(stage, row, held), rho, stage)
-            total = torch.add(total, nu_dot, alpha=self.weights[i])
-            mean = torch.add(mean, turning(stage, self.dof), alpha=self.weights[i])
-        after = torch.add(nu, total, alpha=self.dt)
-        if self.rolls and self.semi_implicit:
-            after = self.turned(nu, after)
-        turned = turning(after, self.dof) if self.semi_implicit else mean
-        psi = torch.add(psi, turned, alpha=self.dt)
-        return torch.cat((place, psi, after), dim=-1)
-
-    def ahead(self, w: Tensor, s: Tensor) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
-        p = self.signals.prepare(w)
-        rows: list[list[Tensor]] = []
-        if self.positions or self.signals.wind or self.spatial:
-            for row in p.unbind(1):
-                rows.append([row, row])
-            return rows, [[], [], []]
-        known, held = self.baseline.ahead(p)
-        own, kept = self.head.ahead(p, s[:, : self.width])
-        ones, others = known.unbind(1), own.unbind(1)
-        for k in range(len(ones)):
-            rows.append([ones[k], others[k]])
-        steps: list[Tensor] = []
-        if self.baseline.linear and self.level:
-            # a step is linear in states, row and residual: what it does to the unit of each
-            unit = torch.eye(12, dtype=w.dtype, device=w.device)
-            x, row, rho = unit.split([6, 3, 3], dim=-1)
-            steps.append(self.moved(x, row, held, rho))
-        return rows, [held, kept, steps]
-
-    def go(
-        self, x: Tensor, row: list[Tensor], shared: list[list[Tensor]], s: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        if self.positions or self.signals.wind or self.spatial:
-            return self.stepped(x, row[0], s)
-        x = self.alive(x)
-        nu = velocities(x, self.dof)
-        missed = nu
-        if self.missed is None:
-            rho, own = self.head.at(nu, row[1], s, shared[1])
-        else:
-            missed = self.missed(x, s[:, self.width :])
-            seen = torch.cat((nu, missed), dim=-1)
-            rho, own = self.head.at(seen, row[1], s[:, : self.width], shared[1])
-        if self.baseline.linear and self.level:
-            after = torch.cat((x, row[0], rho), dim=-1) @ shared[2][0]
-        else:
-            after = self.moved(x, row[0], shared[0], rho)
-        if self.missed is None:
-            return after, own
-        return after, torch.cat((own, self.missed.remembered(after, missed)), dim=-1)
+        nu_dot = self.found(self.baseline(z), rho, velocities(x, self.dof))
+        return self.integrate_from(torch.cat((self.kinematics(x), nu_dot), dim=-1), x, p, rho)
 
     def known(self, z: Tensor) -> Tensor:
         """Return what the baseline says at channels z [..., nz], accelerations [..., n]."""

@@ -17,9 +17,6 @@ from torch.jit._fuser import optimized_execution
 
 from residnet.dynamics.base import Dynamics
 
-_TOGETHER = 4_096
-"""Rows of inputs whose share of the steps is found at once: enough to be quick, and few to keep."""
-
 
 class Source(nn.Module, ABC):
     """Where the inputs of a rollout come from.
@@ -72,7 +69,6 @@ class Rollout(nn.Module):
         super().__init__()
         self.model = model
         self.source = Playback() if source is None else source
-        self.together = _TOGETHER
 
     def forward(self, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Run the model freely over T steps.
@@ -89,13 +85,9 @@ class Rollout(nn.Module):
         x = x0
         states = [x0]
         if self.source.given:
-            # what no state decides is found for many steps at once
-            stretch = max(self.together // max(x0.shape[0], 1), 1)
-            for begin in range(0, w.shape[1], stretch):
-                rows, shared = self.model.ahead(w[:, begin : begin + stretch], s)
-                for row in rows:
-                    x, s = self.model.go(x, row, shared, s)
-                    states.append(x)
+            for row in w.unbind(1):
+                x, s = self.model.step(x, row, s)
+                states.append(x)
             return torch.stack(states, dim=1), w, s
         memory = self.source.initial(x0)
         applied: list[Tensor] = []

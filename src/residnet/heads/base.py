@@ -64,30 +64,6 @@ class ResidualHead(nn.Module, ABC):
         Called once per step; the memory is [B, n_state].
         """
 
-    def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return what velocities do not decide, for `at`: rows [B, T, q], and what all share.
-
-        Args:
-            p: channels behind the velocities, of T steps [B, T, nz - n].
-            s: memory before them [B, n_state].
-        """
-        return p, []
-
-    def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, n] and the memory for the next step, by what `ahead` found.
-
-        Of a memory that inputs alone decide only that after the last step is told.
-
-        Args:
-            nu: velocities [B, n], behind them what was predicted wrong where there is `settle`.
-            row: of the step [B, q].
-            s: memory [B, n_state].
-            held: what all steps share.
-        """
-        z = torch.cat((nu[:, : self.dof], row, nu[:, self.dof :]), dim=-1)
-        found: tuple[Tensor, Tensor] = self.forward(z, s)
-        return found
-
     def sequence(self, z: Tensor) -> Tensor:
         """Return residuals [B, T, n] along measured channels [B, T, nz], from an empty memory.
 
@@ -276,8 +252,7 @@ class Features(nn.Module):
 
     def __init__(self, chosen: Sequence[str], names: Sequence[str], margin: float) -> None:
         super().__init__()
-        moving = live_of(names).moving
-        self.names, self.dof = tuple(chosen), len(moving)
+        self.names, self.dof = tuple(chosen), live_of(names).size
         self.count = len(self.names)
         self.margin = margin
         self.index = _places([list(names).index(name) for name in chosen])
@@ -285,50 +260,6 @@ class Features(nn.Module):
         self.std = nn.Buffer(torch.ones(self.count, dtype=torch.float64))
         self.low = nn.Buffer(torch.full((self.count,), -torch.inf, dtype=torch.float64))
         self.high = nn.Buffer(torch.full((self.count,), torch.inf, dtype=torch.float64))
-        # velocities decide some of them, the channels behind these the others
-        near = [place for place, name in enumerate(chosen) if name in moving]
-        far = [place for place, name in enumerate(chosen) if name not in moving]
-        self.near, self.far = _places(near), _places(far)
-        self.axis = _places([moving.index(chosen[place]) for place in near])
-        self.column = _places([list(names).index(chosen[place]) - self.dof for place in far])
-
-    def inputs(self, p: Tensor) -> Tensor:
-        """Return the features that velocities do not decide, held in their range [..., F'].
-
-        Args:
-            p: channels behind the velocities [..., nz - n].
-        """
-        low, high = self.low.index_select(0, self.far), self.high.index_select(0, self.far)
-        chosen = p.index_select(-1, self.column)
-        return torch.clamp(chosen, low.to(p.dtype), high.to(p.dtype))
-
-    def reach(self, like: Tensor) -> list[Tensor]:
-        """Return the least and the largest of what moves [n], zero for what is no feature."""
-        none = torch.zeros(self.dof, dtype=like.dtype, device=like.device)
-        low, high = self.low.to(like.dtype), self.high.to(like.dtype)
-        return [
-            none.index_copy(0, self.axis, low.index_select(0, self.near)),
-            none.index_copy(0, self.axis, high.index_select(0, self.near)),
-        ]
-
-    def layer(self, p: Tensor, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what a layer of the features makes of all but velocities, and what of these.
-
-        The layer is a matrix product of the features; with v the velocities within `reach` it is
-        the first of what is returned, rows [..., H], plus v times the second [..., n, H].
-
-        Args:
-            p: channels behind the velocities [..., nz - n].
-            weight: of the layer [..., H, F].
-            bias: of the layer [..., H].
-        """
-        std, mean = self.std.to(p.dtype), self.mean.to(p.dtype)
-        whole = weight / std
-        shift = bias - whole @ mean
-        row = self.inputs(p) @ whole.index_select(-1, self.far).transpose(-1, -2) + shift
-        near = whole.index_select(-1, self.near).transpose(-1, -2)
-        own = near.new_zeros((self.dof, near.shape[-1])).index_copy(0, self.axis, near)
-        return row, own
 
     def calibrate(self, samples: Samples) -> None:
         """Take mean, standard deviation and range of each feature from the samples.

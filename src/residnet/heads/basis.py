@@ -18,7 +18,7 @@ from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.symmetry import live_of
-from residnet.physics.terms import SplitTerms, TermLibrary, polynomial_terms
+from residnet.physics.terms import TermLibrary, polynomial_terms
 from residnet.regression.estimator import (
     Estimator,
     Solution,
@@ -80,9 +80,6 @@ class BasisHead(ClosedFormHead):
         self.library = TermLibrary(
             config.terms or polynomial_terms(chosen, config.degree, magnitudes=magnitudes), chosen
         )
-        self.split = SplitTerms(
-            self.library.terms, [name for name in chosen if name not in moving], moving
-        )
         self.config = config
         self.coefficients = nn.Buffer(
             torch.zeros(self.library.count, self.dof, dtype=torch.float64)
@@ -99,23 +96,6 @@ class BasisHead(ClosedFormHead):
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         return self.basis(z) @ self.coefficients.to(z.dtype) + self.intercept.to(z.dtype), s
-
-    def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
-        std, far = self.features.std.to(p.dtype), self.features.far
-        row, own = self.split.ahead(
-            self.features.inputs(p) / std.index_select(0, far), self.coefficients.to(p.dtype)
-        )
-        n = self.dof
-        row = torch.cat((row[..., :n] + self.intercept.to(p.dtype), row[..., n:]), dim=-1)
-        low, high = self.features.reach(p)
-        scale = torch.ones_like(low).index_copy(
-            0, self.features.axis, std.index_select(0, self.features.near)
-        )
-        return row, [low, high, scale, own]
-
-    def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        rho: Tensor = self.split(torch.clamp(nu, held[0], held[1]) / held[2], row, held[3])
-        return rho, s
 
     def require_samples(self, samples: Samples) -> None:
         fold_numbers(samples.group, self.config.folds or usual_folds(samples.group))

@@ -175,8 +175,6 @@ class LstmNetwork(nn.Module):
             torch.tensor([list(chosen).index(name) for name in seen], dtype=torch.long),
             persistent=False,
         )
-        # a memory of inputs alone
-        self.fed = self.partial and not any(name in live_of(names).moving for name in seen)
         softsign = config.activation == "softsign"
         self.core = LstmCore(len(seen), config.hidden_size, softsign)
         self.dropout = nn.Dropout(config.dropout)
@@ -209,50 +207,6 @@ class LstmNetwork(nn.Module):
         f = self.features(z)
         h, s = self.core(self.remembered(f), s)
         return self.read(h, f), s
-
-    def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return what velocities do not decide; see `ResidualHead.ahead`."""
-        hidden = self.core.hidden
-        held = self.features.reach(p)
-        own: Tensor = self.readout[0].weight  # type: ignore[assignment]
-        bias: Tensor = self.readout[0].bias  # type: ignore[assignment]
-        row = p[..., :0]
-        if self.skip:
-            # the first layer sees the output of the memory, then all features
-            row, near = self.features.layer(p, own[:, hidden:], bias)
-            own = own[:, :hidden]
-            held.append(near)
-        if self.fed:
-            # velocities, which the memory does not see, may be anything
-            z = nn.functional.pad(p, (self.features.dof, 0))
-            h, s = self.core.along(self.remembered(self.features(z)), s)
-            held.append(s)
-            return row + self.dropout(h) @ own.T, held
-        weight: Tensor = self.core.w_input
-        if self.partial:
-            none = weight.new_zeros((weight.shape[0], self.features.count))
-            weight = none.index_copy(1, self.seen, weight)
-        gates, near = self.features.layer(p, weight, self.core.bias)
-        held.append(near)
-        held.append(own.T)
-        return torch.cat((gates, row), dim=-1), held
-
-    def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return [B, outputs] and the memory at velocities nu [B, n], by what `ahead` found."""
-        v = torch.clamp(nu, held[0], held[1])
-        if self.fed:
-            out, s = torch.addmm(row, v, held[2]), held[3]
-        else:
-            gates, row = row.split([4 * self.core.hidden, row.shape[1] - 4 * self.core.hidden], -1)
-            h, s = self.core.gated(torch.addmm(gates, v, held[-2]), s)
-            h = self.dropout(h)
-            if not self.skip:
-                return self.readout(h), s
-            out = torch.addmm(torch.addmm(row, v, held[2]), h, held[-1])
-        for i, layer in enumerate(self.readout):
-            if i > 0:
-                out = layer(out)
-        return out, s
 
     def sequence(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return [B, T, outputs] for channels [B, T, nz], and the memory after them."""
@@ -299,30 +253,6 @@ class LstmHead(ResidualHead):
         if self.restoring is not None:
             rho = rho + self.restoring(nu)
         return rho, memory[0] if len(memory) == 1 else torch.cat(memory, dim=-1)
-
-    def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
-        rows: list[Tensor] = []
-        held: list[Tensor] = []
-        for i, network in enumerate(self.networks):
-            row, own = network.ahead(p, s[:, i * self.width : (i + 1) * self.width])
-            rows.append(row)
-            held.extend(own)
-        return rows[0] if len(rows) == 1 else torch.cat(rows, dim=-1), held
-
-    def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        out: list[Tensor] = []
-        memory: list[Tensor] = []
-        rows, many = row.shape[-1] // len(self.networks), len(held) // len(self.networks)
-        for i, network in enumerate(self.networks):
-            y, m = network.at(
-                nu,
-                row[:, i * rows : (i + 1) * rows],
-                s[:, i * self.width : (i + 1) * self.width],
-                held[i * many : (i + 1) * many],
-            )
-            out.append(y)
-            memory.append(m)
-        return self.joined(out, memory, nu)
 
     def sequence(self, z: Tensor) -> Tensor:
         out: list[Tensor] = []

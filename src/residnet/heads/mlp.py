@@ -73,17 +73,3 @@ class MlpHead(ResidualHead):
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         return self.scale(self.net(self.features(z))), s
-
-    def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
-        weight: Tensor = self.net[0].weight  # type: ignore[assignment]
-        bias: Tensor = self.net[0].bias  # type: ignore[assignment]
-        row, own = self.features.layer(p, weight, bias)
-        low, high = self.features.reach(p)
-        return row, [low, high, own]
-
-    def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        out = torch.addmm(row, torch.clamp(nu, held[0], held[1]), held[2])
-        for i, layer in enumerate(self.net):
-            if i > 0:
-                out = layer(out)
-        return self.scale(out), s

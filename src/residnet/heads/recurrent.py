@@ -107,39 +107,6 @@ class RecurrentHead(ResidualHead):
             rho = rho + self.restoring(z)
         return rho, h.reshape(-1, self.n_state)
 
-    def ahead(self, p: Tensor, s: Tensor) -> tuple[Tensor, list[Tensor]]:
-        hidden, count = self.n_state, self.features.count
-        # of gates and residual, one layer: [K, 3 H + n, F]
-        weight = torch.cat((self.w_input, self.w_skip), dim=-1)
-        weight, wrong = weight.split([count, self.dof], dim=1)
-        bias = torch.cat((self.bias, self.bias_out), dim=-1)[:, 0]
-        rows: list[Tensor] = []
-        near: list[Tensor] = []
-        for k, part in enumerate(p.chunk(self.copies)):
-            row, own = self.features.layer(part, weight[k].T, bias[k])
-            rows.append(row)
-            near.append(own)
-        own = torch.cat((torch.stack(near), wrong), dim=1)
-        held = self.features.reach(p)
-        held.extend(own.split([3 * hidden, self.dof], dim=-1))
-        return torch.cat(rows), held
-
-    def at(self, nu: Tensor, row: Tensor, s: Tensor, held: list[Tensor]) -> tuple[Tensor, Tensor]:
-        near, wrong = nu.split([self.dof, self.dof], dim=-1)
-        far = self.far * self.scale.spread.to(nu.dtype)
-        seen = torch.cat(
-            (torch.clamp(near, held[0], held[1]), self.far * torch.tanh(wrong / far)), dim=-1
-        ).view(self.copies, -1, 2 * self.dof)
-        gates, skip = row.view(self.copies, -1, row.shape[-1]).split(
-            [3 * self.n_state, self.dof], dim=-1
-        )
-        h = self.gated(torch.baddbmm(gates, seen, held[2]), s)
-        out = torch.baddbmm(torch.baddbmm(skip, seen, held[3]), h, self.w_out)
-        rho: Tensor = self.scale(out.reshape(-1, self.dof))
-        if self.restoring is not None:
-            rho = rho + self.restoring(near)
-        return rho, h.reshape(-1, self.n_state)
-
     def gated(self, share: Tensor, s: Tensor) -> Tensor:
         """Return the outputs [K, B, H] from the features' share [K, B, 3 H] and memories."""
         hidden = self.n_state

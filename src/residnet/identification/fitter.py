@@ -355,11 +355,11 @@ class Fitter:
         notes["prior"] = config.prior
         names = baseline.free_names()
         notes["open"] = [
-            name for name, lies in zip(names, refitted.open.tolist(), strict=True) if lies
+            name for name, lies in zip(names, refitted.unidentifiable.tolist(), strict=True) if lies
         ]
         notes["feeding"] = [names[i] for i in refitted.notes["at_rest"]]
         notes["refit"] = refitted.notes
-        return baseline.updated_table(table, refitted.errors), refitted.covariance
+        return baseline.updated_table(table, refitted.standard_errors), refitted.covariance
 
     def head(self, name: str, baseline: FittedModel) -> FittedModel:
         """Fit one head on top of a baseline, or take it from the store where it is finished there.

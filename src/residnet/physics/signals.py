@@ -13,7 +13,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from residnet.core.columns import heading, surge, sway, velocities
+from residnet.core.columns import velocities
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
@@ -232,28 +232,6 @@ class Signals(nn.Module):
             dim=-1,
         )
 
-    def slopes(self, x: Tensor, p: Tensor) -> Tensor:
-        """Return the derivatives of the channels by heading and what moves, [1 + n, B, nz].
-
-        Args:
-            x: states [B, nx].
-            p: what `prepare` returned for the step's inputs, [B, k].
-        """
-        out = x.new_zeros(1 + self.dof, x.shape[0], self.count)
-        for place in range(self.dof):
-            out[1 + place, :, place] = 1.0
-        if not self.wind:
-            return out
-        known = p.shape[-1] - 2
-        ahead, starboard = to_body(p[:, known], p[:, known + 1], heading(x))
-        along, across = ahead - surge(x), starboard - sway(x)
-        magnitude = torch.sqrt(along * along + across * across + 1e-8)
-        out[0, :, -3], out[0, :, -2] = starboard, -ahead
-        out[0, :, -1] = (along * starboard - across * ahead) / magnitude
-        out[1, :, -3], out[1, :, -1] = -1.0, -along / magnitude
-        out[2, :, -2], out[2, :, -1] = -1.0, -across / magnitude
-        return out
-
 
 _STRONG = 10.0
 """Accelerations, in standard deviations, that are balanced half a range beyond the edge."""
@@ -309,13 +287,6 @@ class VelocityBound(nn.Module):
     def back(self, held: Tensor, z: Tensor) -> Tensor:
         """Return the acceleration at channels z [..., nz] whose held ones are known."""
         return self.rate.to(z.dtype) * (held[..., : self.dof] - z[..., : self.dof])
-
-    def along(self, z: Tensor, ahead: Tensor) -> Tensor:
-        """Return directions [D, B, nz] from channels z [B, nz] as the held ones go along them."""
-        near = z[:, : self.channels]
-        inside = (near >= self.low.to(z.dtype)) & (near <= self.high.to(z.dtype))
-        held = ahead[..., : self.channels] * inside
-        return torch.cat((held, ahead[..., self.channels :]), dim=-1)
 
     def forward(self, z: Tensor) -> Tensor:
         """Return the acceleration at channels z [..., nz]."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations, combinations_with_replacement, product
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple
 
 import torch
 from pydantic import Field
@@ -19,7 +19,6 @@ from torch import Tensor, nn
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY, nearest
-from residnet.core.samples import derivatives_along
 
 FUNCTIONS = ("sin", "cos", "sqrt", "ssqrt", "inv")
 """Functions of one channel: sine, cosine, the protected square root sqrt|x|, the sign-preserving
@@ -160,7 +159,6 @@ class TermLibrary(nn.Module):
         for name, function in sorted(further):
             base[name, False, function] = len(base) + 1
             self.further.append((function, names.index(name)))
-        self.polynomial = not further
         columns = [
             [index for factor in factors for index in _columns(factor, base)] for factors in parsed
         ]
@@ -192,91 +190,6 @@ class TermLibrary(nn.Module):
         for d in range(1, self.depth):
             out = out * base.index_select(-1, self.index[d])
         return out
-
-    def along(self, z: Tensor, ahead: Tensor) -> Tensor:
-        """Return the derivatives of the terms [D, B, J] along directions.
-
-        Args:
-            z: channels [B, nz].
-            ahead: the directions [D, B, nz].
-        """
-        if not self.polynomial:
-            return derivatives_along(self, z, ahead)
-        if self.depth == 0:
-            return ahead.new_zeros(*ahead.shape[:2], self.count)
-        # the same products as in `forward`: written out, each is computed once for all directions
-        base = torch.cat((torch.ones_like(z[:, :1]), z, z.abs()), dim=-1)
-        moved = torch.cat((torch.zeros_like(ahead[..., :1]), ahead, z.sign() * ahead), dim=-1)
-        out, slope = (part.index_select(-1, self.index[0]) for part in (base, moved))
-        for d in range(1, self.depth):
-            factor = base.index_select(-1, self.index[d])
-            slope.mul_(factor).addcmul_(out, moved.index_select(-1, self.index[d]))
-            out = out * factor
-        return slope
-
-
-@final
-class SplitTerms(nn.Module):
-    """A weighted sum of terms by what moves: velocities, or all the other channels.
-
-    Args:
-        names: other channels than velocities that appear in them.
-        moves: the velocities, and what else moves with them.
-
-    Attributes:
-        linear: whether the sum is linear in the velocities.
-    """
-
-    def __init__(
-        self, terms: Sequence[str], names: Sequence[str], moves: Sequence[str] = VELOCITY
-    ) -> None:
-        super().__init__()
-        self.dof = len(moves)
-        moving: list[str] = []
-        beside: list[str] = []
-        alone: list[str] = []
-        places: list[int] = []
-        apart: list[int] = []
-        for place, term in enumerate(terms):
-            parts: list[list[str]] = [[], []]
-            for factor in parse_term(term, (*moves, *names)):
-                parts[factor.name in moves].append(factor.text)
-            other, own = (" ".join(part) or "1" for part in parts)
-            if parts[1]:
-                moving, beside, places = [*moving, own], [*beside, other], [*places, place]
-            else:
-                alone, apart = [*alone, other], [*apart, place]
-        self.alone, self.moving = TermLibrary(alone, names), TermLibrary(moving, moves)
-        # a term of velocities alone needs no factor
-        self.coupled = any(other != "1" for other in beside)
-        self.beside = TermLibrary(beside if self.coupled else (), names)
-        self.linear = not self.coupled and (self.moving.linear or not moving)
-        self.places = nn.Buffer(torch.tensor(places, dtype=torch.long), persistent=False)
-        self.apart = nn.Buffer(torch.tensor(apart, dtype=torch.long), persistent=False)
-
-    def ahead(self, p: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what velocities do not decide: rows [..., q], and the weights of what they do.
-
-        Args:
-            p: channels `names` [..., k].
-            weights: of the terms [J, n].
-        """
-        row = self.alone(p) @ weights.index_select(0, self.apart)
-        own = weights.index_select(0, self.places)
-        if self.linear:
-            slope = own.new_zeros(self.dof, own.shape[1])
-            return row, slope if len(own) == 0 else slope.index_add(0, self.moving.channel, own)
-        return (torch.cat((row, self.beside(p)), dim=-1) if self.coupled else row), own
-
-    def forward(self, nu: Tensor, row: Tensor, own: Tensor) -> Tensor:
-        """Return the sum [B, n] at velocities nu [B, d], by what `ahead` found."""
-        if self.linear:
-            return torch.addmm(row, nu, own)
-        found: Tensor = self.moving(nu)
-        if self.coupled:
-            row, beside = row.split([own.shape[1], own.shape[0]], dim=-1)
-            found = found * beside
-        return torch.addmm(row, found, own)
 
 
 def _function(name: str, x: Tensor) -> Tensor:

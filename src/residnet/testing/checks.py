@@ -391,11 +391,6 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
     compiled = _scripted(baseline, who)
     with torch.no_grad():
         require_equal(compiled(z), accelerations, 1e-9, f"{who}: scripted, it answers otherwise")
-        row, held = baseline.ahead(z[:, n:])
-        message = f"{who}: what it finds ahead of a free run changes its accelerations"
-        require_equal(baseline.at(z[:, :n], row, held), accelerations, 1e-9, message)
-        if baseline.linear:
-            require_equal(row + z[:, :n] @ held[0], accelerations, 1e-9, f"{who}: is not linear")
     counts = baseline.parameter_count()
     require(len(counts) == n, f"{who}: parameter_count gives {counts}, not one for each axis")
     empty = resolved.build(known.names)

@@ -21,11 +21,11 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.training.refit import (
     Problem,
     RefitConfig,
-    level_of,
+    estimate_initial_states,
     normal_equations,
     parametric,
     problem_of,
-    started,
+    simulate,
 )
 
 
@@ -59,11 +59,11 @@ def left_open(
         scales: of what moves, [n].
         still: numbers of the free parameters that the refit has left at zero.
     """
-    problem = problem_of(model, samples, store, config, scales).at_rest(still)
-    problem = started(model, problem)
-    level, states = level_of(model, problem)
+    problem = problem_of(model, samples, store, config, scales).fixing(still)
+    problem = estimate_initial_states(model, problem)
+    level, states = simulate(model, problem)
     hessian, _ = normal_equations(model, problem, level, states)
-    covariance = problem.share(level) * problem.inverse(hessian)
+    covariance = problem.cost_per_nat(level) * problem.inverse(hessian)
     return LeftOpen(covariance, float(level.square() - config.robust**2))
 
 
@@ -96,9 +96,9 @@ def without_logs(
         the step keeps the free runs of the other logs finite and no worse.
     """
     baseline = parametric(model)
-    problem = problem_of(model, samples, store, config, scales).at_rest(still)
-    problem = started(model, problem)
-    level, states = level_of(model, problem)
+    problem = problem_of(model, samples, store, config, scales).fixing(still)
+    problem = estimate_initial_states(model, problem)
+    level, states = simulate(model, problem)
     fitted, parameters = baseline.theta.detach().clone(), baseline.free()
     of_window = fold[problem.log]
     folds = int(fold.max()) + 1
@@ -119,14 +119,16 @@ def without_logs(
             out.append(fitted.clone())
             continue
         hessian = (
-            problem.precision + problem.pull + torch.diag(problem.share(level) * problem.belief)
+            problem.precision
+            + problem.symmetry
+            + torch.diag(problem.cost_per_nat(level) * problem.belief_precision)
         )
         for j, (own, _) in enumerate(parts):
             if j != k:
                 hessian = hessian + count[j] / left * own
         slope = count[k] / left * (parts[k][1] - together)
         step = torch.linalg.lstsq(hessian, slope.unsqueeze(1), driver="gelsd").solution.squeeze(1)
-        step[problem.still] = 0.0
+        step[problem.fixed] = 0.0
         others = _rows(problem, of_window != k)
         baseline.place(_best_share(model, others, parameters, step))
         out.append(baseline.theta.detach().clone())
@@ -136,11 +138,11 @@ def without_logs(
 
 def _best_share(model: HybridDynamics, others: Problem, parameters: Tensor, step: Tensor) -> Tensor:
     """Return the parameters after the largest share of the step that the other logs agree to."""
-    baseline, (before, _) = parametric(model), level_of(model, others)
+    baseline, (before, _) = parametric(model), simulate(model, others)
     for halving in range(_HALVINGS):
         trial = parameters + 0.5**halving * step
         baseline.place(trial)
-        after, _ = level_of(model, others)
+        after, _ = simulate(model, others)
         baseline.place(parameters)
         if torch.isfinite(after) and after <= before:
             return trial
@@ -152,11 +154,11 @@ def _rows(problem: Problem, chosen: Tensor) -> Problem:
     return replace(
         problem,
         x0=problem.x0[chosen],
-        w=problem.w[chosen],
-        nu=problem.nu[chosen],
+        inputs=problem.inputs[chosen],
+        measured=problem.measured[chosen],
         weight=problem.weight[chosen],
         log=problem.log[chosen],
-        begins=None,
+        initial=None,
     )
 
 
@@ -164,14 +166,14 @@ def _part(
     model: HybridDynamics, part: Problem, states: Tensor, level: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return Hessian [P, P] and half the gradient [P] of the mean cost of some windows alone."""
-    size = int(part.active.numel())
+    size = int(part.free.numel())
     if len(part.x0) == 0:
         return torch.zeros(size, size, dtype=states.dtype), torch.zeros(size, dtype=states.dtype)
     nothing = replace(
         part,
         precision=torch.zeros_like(part.precision),
-        pull=torch.zeros_like(part.pull),
-        belief=torch.zeros_like(part.belief),
-        start=parametric(model).free(),
+        symmetry=torch.zeros_like(part.symmetry),
+        belief_precision=torch.zeros_like(part.belief_precision),
+        prior_mean=parametric(model).free(),
     )
     return normal_equations(model, nothing, level, states)
