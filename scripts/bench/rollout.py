@@ -2,10 +2,8 @@
 
 - `rollout`: an LSTM on a linear baseline, 200 steps by RK4 at batch 1,024 in single precision,
   compiled and as it is, against the matrix products of its network alone.
-- `ahead`: free runs of 64 rows, and their gradient over 40 steps, by networks of 24 units on a
-  linear baseline: what no state decides found for many steps at once, against step by step.
 - `compiled`: free runs and gradients of 40 steps of 1, 64 and 1,024 rows by LSTMs on a linear
-  baseline: as compiled C against TorchScript with what it finds ahead.
+  baseline: as compiled C against TorchScript.
 - `device`: the same as compiled C on one core beside TorchScript on a GPU, by the number of rows.
   Left out where there is none.
 - `epoch`: 25 teacher-forced batches of 64 windows of 100 samples for an LSTM, with gradients and
@@ -19,7 +17,7 @@ Times are CPU seconds of this process, the least of `--repeats`, so that a busy 
 little; one thread, with the memory settings of a run (`keep_freed_memory`). Those of `device` are
 by the clock, since a GPU does not count in the former; those of `refit` count the compiler.
 
-    python scripts/bench/rollout.py [--parts rollout ahead compiled device epoch refit]
+    python scripts/bench/rollout.py [--parts rollout compiled device epoch refit]
         [--repeats 5]
 """
 
@@ -49,10 +47,9 @@ from residnet.data.prepare import PrepareConfig, prepare, samples
 from residnet.data.windows import WindowBatches, WindowStore
 from residnet.dynamics.compiled import CompiledRollout
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import MANY, FreeRun, Playback, Rollout, Source, scripted
+from residnet.dynamics.rollout import MANY, FreeRun, Rollout, scripted
 from residnet.heads.base import ZeroHead
 from residnet.heads.lstm import LstmConfig
-from residnet.heads.mlp import MlpConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.training.refit import RefitConfig, problem_of, refit, simulate
 
@@ -69,7 +66,7 @@ Way = Callable[[Rollout, tuple[Tensor, ...]], FreeRun]
 _SCALES = torch.tensor([0.5, 0.1, 0.3], dtype=torch.float64)
 
 
-def model_of(head: MlpConfig | LstmConfig) -> HybridDynamics:
+def model_of(head: LstmConfig) -> HybridDynamics:
     """Return a head on a linear baseline, without positions."""
     torch.manual_seed(0)
     signals = SignalsConfig(inputs=("tau_x", "tau_n")).build()
@@ -123,35 +120,6 @@ def rollouts(repeats: int) -> None:
                     f" {1e6 * whole / _STEPS:.0f} us a step,"
                     f" products alone {1e6 * bound / _STEPS:.0f} us: {100 * bound / whole:.0f} %"
                 )
-
-
-class StepByStep(Source):
-    """A source that gives inputs back as they are, and says so at every step only."""
-
-    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs w [B, m], unchanged."""
-        return w, memory
-
-
-def ahead(repeats: int) -> None:
-    """Print what it saves to find ahead what no state decides."""
-    inputs = ("tau_x", "tau_n")
-    for name, head in (
-        ("MLP", MlpConfig(hidden=(24, 24))),
-        ("LSTM", LstmConfig(hidden_size=24)),
-        ("LSTM of inputs", LstmConfig(hidden_size=24, memory=inputs, readout=32)),
-    ):
-        model = model_of(head)
-        given = (torch.zeros(64, 6), torch.randn(64, _STEPS, 2), model.initial_state(64))
-        (before, slope_before), (after, slope) = (
-            timed(scripted(Rollout(model, source), MANY), given, repeats)
-            for source in (StepByStep(), Playback())
-        )
-        print(
-            f"{name}, 64 rows: {before:.0f} us a step, found ahead {after:.0f} us"
-            f" ({before / after:.1f} times less); gradient of {_SLOPE} steps {slope_before:.1f} ms,"
-            f" found ahead {slope:.1f} ms ({slope_before / slope:.1f} times less)"
-        )
 
 
 WAYS: dict[str, Way] = {
@@ -308,7 +276,6 @@ def refits(repeats: int) -> None:
 
 PARTS = {
     "rollout": rollouts,
-    "ahead": ahead,
     "compiled": compiled_runs,
     "device": on_gpu,
     "epoch": epochs,
