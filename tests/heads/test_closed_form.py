@@ -435,7 +435,7 @@ def test_the_answers_of_a_pipeline_are_those_of_scikit_learn(pipeline: list[Any]
     x, spread = head.features(SAMPLES.z).numpy(), head.residual_std().numpy()
     rows = torch.linspace(0, len(x) - 1, 100).long()
     for axis in range(3):
-        own = make_pipeline(*map(scikit._made, pipeline))
+        own = make_pipeline(*map(scikit.make_estimator, pipeline))
         own.fit(x[rows], SAMPLES.target[rows, axis].numpy() / spread[axis])
         wanted = own.predict(x) * spread[axis]
         np.testing.assert_allclose(answer(head)[:, axis], wanted, atol=1e-9 * spread[axis])
@@ -451,8 +451,11 @@ def test_no_format_exports_it() -> None:
     ("pipeline", "said"),
     [
         (["os.system"], "names nothing below `sklearn`"),
-        (["sklearn.svm.SVX"], "scikit-learn has no"),
-        (["sklearn.datasets.load_iris"], "is no class"),
+        (["sklearn.svm.SVX"], r"'sklearn.svm.SVX' is not among.*did you mean 'sklearn.svm.SVR'"),
+        (["sklearn.datasets.load_iris"], "is not among the classes"),
+        ([{"sklearn.svm.SVR": {"C": "much"}}], "The 'C' parameter of SVR must be a float"),
+        (["sklearn.svm.SVR", "sklearn.svm.SVR"], "SVR is no transformer"),
+        ([{"sklearn.svm.SVR": {"kernel": {"os.system": {}}}}], "kernel: expected a number, a text"),
         ([{"sklearn.svm.SVR": {"D": 1}}], "unexpected keyword argument 'D'"),
         (["sklearn.preprocessing.StandardScaler"], "is no regressor"),
         ([], "at least 1"),

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.progress import say
-from residnet.dynamics.rollout import WORTH_COMPILING, FreeRun, Rollout, scripted
+from residnet.dynamics.rollout import WORTH_COMPILING, FreeRun, Rollout, runs_in_python, scripted
 
 if TYPE_CHECKING:
     from residnet.dynamics.compiled import CompiledRollout
@@ -61,7 +61,7 @@ def compiled(rollout: Rollout, steps: int) -> FreeRun:
 
 def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> FreeRun:
     apart = x0.device.type != "cpu" or rollout.source.counts or not w.numel()
-    if steps < WORTH_COMPILING or apart:
+    if steps < WORTH_COMPILING or apart or runs_in_python(rollout):
         return scripted(rollout, steps)
     out = io.BytesIO()
     try:

@@ -120,6 +120,14 @@ MANY = 1_000_000
 """Steps of a training: enough for compiling to pay."""
 
 
+def runs_in_python(rollout: Rollout) -> bool:
+    """Return whether a part of the model answers in Python alone, such as scikit-learn's.
+
+    TorchScript accepts such a part, and fails only when it runs.
+    """
+    return any(bool(getattr(part, "refusal", "")) for part in rollout.modules())
+
+
 def scripted(rollout: Rollout, steps: int) -> FreeRun:
     """Return the rollout compiled, or as it is where that does not pay or cannot be done.
 
@@ -131,7 +139,7 @@ def scripted(rollout: Rollout, steps: int) -> FreeRun:
         rollout: on its device, in its type, in training or in evaluation.
         steps: that will be run with it altogether.
     """
-    if steps < WORTH_COMPILING:
+    if steps < WORTH_COMPILING or runs_in_python(rollout):
         return rollout
     with warnings.catch_warnings():
         # TorchScript still works in torch 2.13 but announces its end

@@ -1,7 +1,9 @@
-"""Any regressor of scikit-learn as a head, judged in free run as every other one.
+"""Regressors of scikit-learn as heads, judged in free run as every other one.
 
-What is stored are the samples that it was fitted on. A load fits it again, so that no pickle is
-ever opened. Its predictions are made in Python: no format of export holds them.
+The fitted state of the estimators in `residnet.heads.scikit_state.FITTED` is stored as arrays and
+restored without a fit and without a pickle. Other classes of scikit-learn need `--trust`: their
+constructors and fits run when a config names them, and they are fitted again when they are loaded.
+Predictions are made in Python: no format of export holds them.
 """
 
 from __future__ import annotations
@@ -16,14 +18,21 @@ import torch
 from pydantic import Field, field_validator
 from torch import Tensor
 
-from residnet.core.errors import FitError
+from residnet.core.errors import FitError, UsageError
+from residnet.core.names import nearest
 from residnet.core.samples import Samples
+from residnet.core.trust import is_trusted
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features, ResidualScale
+from residnet.heads.scikit_state import FITTED, KERNELS, StateError, decode, encode
 from residnet.regression.estimator import Solution
 
 _REACH = 0.1
 """Standard deviations of a feature over which a slope is taken: trees are flat in between."""
-_SIZE = "_extra_state"
+_STATE = "_extra_state"
+_STORED_STATE, _STORED_SAMPLES = 1, 2
+"""First byte of the stored state: arrays of fitted estimators, or samples to fit them on again."""
+_STORES_PICKLES = ("memory",)
+"""Parameters that name a joblib store, which unpickles what it finds there."""
 
 
 class SklearnConfig(FeatureConfig):
@@ -33,13 +42,13 @@ class SklearnConfig(FeatureConfig):
 
     Attributes:
         pipeline: its steps by dotted name below `sklearn`, each a name or a mapping from the name
-            to its parameters; a parameter may be such a name or mapping itself.
-        samples: of the training logs that it is fitted on at most, evenly spread; they are stored
-            with the model, which is fitted again when it is loaded.
+            to its parameters; a parameter may be such a name or mapping itself. Classes outside of
+            `residnet.heads.scikit_state.FITTED` need `--trust`.
+        samples: of the training logs that it is fitted on at most, evenly spread.
     """
 
     kind: Literal["sklearn"] = "sklearn"
-    pipeline: tuple[str | dict[str, dict[str, Any]], ...] = Field(
+    pipeline: tuple[str | dict[str, dict[str, Any] | None], ...] = Field(
         default=("sklearn.ensemble.HistGradientBoostingRegressor",), min_length=1
     )
     samples: int = Field(default=5_000, ge=10, le=1_000_000)
@@ -47,10 +56,21 @@ class SklearnConfig(FeatureConfig):
     @field_validator("pipeline")
     @classmethod
     def _can_be_made(cls, steps: tuple[Any, ...]) -> tuple[Any, ...]:
-        last = [_made(step) for step in steps][-1]
+        estimators = [make_estimator(step) for step in steps]
+        last = estimators[-1]
         if not callable(getattr(last, "predict", None)):
             raise ValueError(f"the last step, {type(last).__name__}, is no regressor")
+        for estimator in estimators[:-1]:
+            if not callable(getattr(estimator, "transform", None)):
+                raise ValueError(
+                    f"{type(estimator).__name__} is no transformer; only the last step predicts"
+                )
         return steps
+
+    @property
+    def is_storable(self) -> bool:
+        """Whether all of it stands on the allow-list, so that its fitted state can be stored."""
+        return all(_is_listed(step, FITTED) for step in self.pipeline)
 
     def build(self, names: Sequence[str]) -> ClosedFormHead:
         """Return the module for channels `names`."""
@@ -68,16 +88,34 @@ def _named(step: Any) -> tuple[str, Mapping[str, Any]] | None:
     return None
 
 
-def _made(step: Any) -> Any:
-    """Return the object of a step, with a fixed seed where it takes one.
+def _is_listed(step: Any, names: Any) -> bool:
+    """Return whether a class and all classes among its parameters are on their allow-lists."""
+    named = _named(step)
+    if named is None or named[0] not in names:
+        return False
+    return all(_is_listed(value, KERNELS) for value in named[1].values() if _named(value))
+
+
+def make_estimator(step: Any, *, listed: Any = FITTED) -> Any:
+    """Return the object of a step, not yet fitted, with a fixed seed where it takes one.
+
+    Args:
+        step: its name, or a mapping from the name to the parameters.
+        listed: names that are allowed without `--trust`.
 
     Raises:
-        ValueError: where there is no such class or parameter.
+        ValueError: where there is no such class or parameter, or it is not allowed.
     """
     named = _named(step)
     if named is None:
         raise ValueError(f"{step!r} names nothing below `sklearn`, for example sklearn.svm.SVR")
     name, parameters = named
+    if name not in listed and not is_trusted():
+        raise ValueError(
+            f"'{name}' is not among the classes of scikit-learn whose fitted state is stored as"
+            f" data{nearest(name, listed)}; docs/howto/head.md lists them. Give --trust (in Python"
+            " trust=True) only for configs and runs whose source you trust"
+        )
     module, _, kind = name.rpartition(".")
     try:
         made = getattr(importlib.import_module(module), kind)
@@ -85,13 +123,43 @@ def _made(step: Any) -> Any:
         raise ValueError(f"scikit-learn has no '{name}'") from None
     if not inspect.isclass(made):
         raise ValueError(f"'{name}' is no class of scikit-learn")
-    given = {key: _made(v) if _named(v) else v for key, v in parameters.items()}
-    if "random_state" in inspect.signature(made).parameters:
-        given.setdefault("random_state", 0)
+    settings = {key: _parameter(name, key, value) for key, value in parameters.items()}
+    known = inspect.signature(made).parameters
+    if "random_state" in known:
+        settings.setdefault("random_state", 0)
+    if name == "sklearn.neighbors.KNeighborsRegressor":
+        # a tree of neighbours is an object of compiled code, which cannot be stored as data
+        if settings.setdefault("algorithm", "brute") != "brute":
+            raise ValueError(f"{name}: algorithm: expected 'brute', found {settings['algorithm']}")
     try:
-        return made(**given)
+        estimator = made(**settings)
+        # scikit-learn checks parameters when it fits; here it names the key in the config
+        if hasattr(estimator, "_validate_params"):
+            estimator._validate_params()
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: {error}") from None
+        first = next(iter(str(error).splitlines()), "")
+        raise ValueError(f"{name}: {first}") from None
+    return estimator
+
+
+def _parameter(owner: str, key: str, value: Any) -> Any:
+    """Return a parameter of an estimator: a plain value, a list of these, or an allowed kernel.
+
+    Raises:
+        ValueError: where it is none of these, or names a store of pickles.
+    """
+    if key in _STORES_PICKLES and value is not None:
+        raise ValueError(f"{owner}: {key}: is a store of pickles, which residnet does not open")
+    if _named(value):
+        return make_estimator(value, listed=KERNELS)
+    if isinstance(value, list | tuple):
+        return [_parameter(owner, key, part) for part in value]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise ValueError(
+        f"{owner}: {key}: expected a number, a text or a list of these, found"
+        f" {type(value).__name__}"
+    )
 
 
 @final
@@ -104,58 +172,120 @@ class SklearnHead(ClosedFormHead):
         self.config = config
         self.features = Features(config.chosen(names), names, config.margin)
         self.scale = ResidualScale(self.dof)
-        self.learned = np.zeros((0, self.features.count + self.dof))
-        self.axes: list[Any] = []
+        self.stored = np.zeros(0, dtype=np.uint8)
+        self.sample_count = 0
+        self.axes: list[list[Any]] = []
 
     def residual_std(self) -> Tensor:
         return self.scale.spread
 
     def solutions(self, samples: Samples) -> list[Solution]:
-        """Return the samples that the pipelines are fitted on; loaded, they are fitted.
+        """Fit the pipelines, and return their state.
 
         Raises:
-            FitError: where scikit-learn refuses them.
+            FitError: where scikit-learn refuses the samples.
         """
         rows = torch.linspace(0, len(samples) - 1, min(len(samples), self.config.samples)).long()
         with torch.no_grad():
-            x = self.features(samples.z[rows])
-            learned = torch.cat((x, samples.target[rows] / self.scale.spread), dim=1)
-        state = {_SIZE: learned}
-        self.set_extra_state(learned)
-        return [Solution({}, state, notes={"fitted_on": len(rows)})]
+            x = self.features(samples.z[rows]).double().numpy()
+            y = (samples.target[rows] / self.scale.spread).double().numpy()
+        axes = self._fit(x, y)
+        count = np.array([len(rows)], dtype="<u4").view(np.uint8)
+        if self.config.is_storable:
+            names = [_named(step)[0] for step in self.config.pipeline]  # type: ignore[index]
+            try:
+                content = encode([list(zip(names, axis, strict=True)) for axis in axes])
+            except StateError as error:
+                raise FitError(f"the fitted pipeline {error}") from None
+            parts = [[_STORED_STATE], count, np.frombuffer(content, dtype=np.uint8)]
+        else:
+            learned = np.ascontiguousarray(np.column_stack((x, y)))
+            parts = [[_STORED_SAMPLES], count, learned.reshape(-1).view(np.uint8)]
+        stored = torch.from_numpy(np.concatenate([np.asarray(p, dtype=np.uint8) for p in parts]))
+        self.set_extra_state(stored)
+        return [Solution({}, {_STATE: stored}, notes={"fitted_on": len(rows)})]
+
+    def _fit(self, x: np.ndarray, y: np.ndarray) -> list[list[Any]]:
+        """Return the fitted steps of each axis, from features [N, F] and targets [N, n]."""
+        axes = []
+        for i, name in enumerate(self.outputs):
+            steps = [make_estimator(step) for step in self.config.pipeline]
+            columns = x
+            try:
+                for step in steps[:-1]:
+                    columns = step.fit_transform(columns, y[:, i])
+                steps[-1].fit(columns, y[:, i])
+            except (TypeError, ValueError) as error:
+                first = next(iter(str(error).splitlines()), "")
+                raise FitError(f"scikit-learn cannot fit {name}: {first}") from None
+            axes.append(steps)
+        return axes
 
     def get_extra_state(self) -> Tensor:
-        """Return standardised features and targets [N, F + n], which a load fits again."""
-        return torch.from_numpy(self.learned)
+        """Return the fitted pipelines as bytes [N]; none before a fit."""
+        return torch.from_numpy(self.stored)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Fit the pipelines on standardised features and targets [N, F + n].
+        """Restore the pipelines from what `get_extra_state` returned.
 
         Raises:
-            FitError: where scikit-learn refuses them.
+            UsageError: where the state does not belong to this pipeline, or needs `--trust`.
         """
-        from sklearn.pipeline import make_pipeline
-
-        learned = state.double().numpy()
-        if np.array_equal(learned, self.learned):
+        stored = np.ascontiguousarray(state.detach().cpu().numpy())
+        if stored.dtype != np.uint8 or stored.ndim != 1:
+            raise UsageError(
+                "a head of kind sklearn: its state was stored by an earlier version of residnet,"
+                " which fitted it again at each load; run the fit again"
+            )
+        if np.array_equal(stored, self.stored):
             return
-        axes = []
-        for i, axis in enumerate(self.outputs):
-            whole = make_pipeline(*map(_made, self.config.pipeline))
+        if len(stored) < 5:
+            raise UsageError("a head of kind sklearn: its state is cut off; run the fit again")
+        self.sample_count = int(stored[1:5].copy().view("<u4")[0])
+        content = stored[5:]
+        if stored[0] == _STORED_STATE and self.config.is_storable:
+            self.axes = self._restore(content.tobytes())
+        elif stored[0] == _STORED_SAMPLES and is_trusted():
+            width = self.features.count + self.dof
             try:
-                whole.fit(learned[:, : -self.dof], learned[:, i - self.dof])
-            except (TypeError, ValueError) as error:
-                first = (str(error).splitlines() or [""])[0]
-                raise FitError(f"scikit-learn cannot fit {axis}: {first}") from None
-            axes.append(whole)
-        self.learned, self.axes = learned, axes
+                learned = content.copy().view(np.float64).reshape(self.sample_count, width)
+            except ValueError:
+                raise UsageError("a head of kind sklearn: its samples are cut off") from None
+            self.axes = self._fit(learned[:, : -self.dof], learned[:, -self.dof :])
+        else:
+            raise UsageError(
+                "a head of kind sklearn: would be fitted again when it is loaded; give --trust (in"
+                " Python trust=True) only if you trust the source of this model"
+            )
+        self.stored = stored
+
+    def _restore(self, content: bytes) -> list[list[Any]]:
+        """Return the steps of each axis with their stored state, after a trial prediction."""
+        axes = [[make_estimator(step) for step in self.config.pipeline] for _ in self.outputs]
+        names = [_named(step)[0] for step in self.config.pipeline]  # type: ignore[index]
+        again = "restore the model, or run the fit again with this version of scikit-learn"
+        try:
+            decode(content, [list(zip(names, a, strict=True)) for a in axes], self.features.count)
+        except StateError as error:
+            raise UsageError(f"a head of kind sklearn: its state {error}; {again}") from None
+        try:
+            answers = [_predict(steps, np.zeros((2, self.features.count))) for steps in axes]
+            complete = all(part.shape == (2,) for part in answers)
+        except Exception as error:
+            first = next(iter(str(error).splitlines()), "")
+            raise UsageError(
+                f"a head of kind sklearn: its state gives no prediction ({first}); {again}"
+            ) from None
+        if not complete:
+            raise UsageError(f"a head of kind sklearn: it predicts several values; {again}")
+        return axes
 
     def asked(self, x: Tensor) -> Tensor:
         """Return standardised residuals [N, n] at standardised features [N, F]."""
         if not self.axes or not len(x):
             return x.new_zeros(len(x), self.dof)
         rows = x.double().numpy()
-        answers = [np.asarray(axis.predict(rows)).reshape(-1) for axis in self.axes]
+        answers = [_predict(steps, rows) for steps in self.axes]
         return torch.from_numpy(np.stack(answers, axis=1)).to(x)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -164,7 +294,14 @@ class SklearnHead(ClosedFormHead):
 
     def parameter_count(self) -> list[float]:
         """Return the numbers that each axis was fitted on: nothing else bounds its freedom."""
-        return [float(len(self.learned))] * self.dof
+        return [float(self.sample_count)] * self.dof
+
+
+def _predict(steps: Sequence[Any], rows: np.ndarray) -> np.ndarray:
+    """Return the prediction [N] of a fitted pipeline at features [N, F]."""
+    for step in steps[:-1]:
+        rows = step.transform(rows)
+    return np.asarray(steps[-1].predict(rows)).reshape(-1)
 
 
 class _Asked(torch.autograd.Function):
