@@ -256,6 +256,26 @@ Logs = Annotated[
     list[Path] | None,
     typer.Option("--logs", metavar="PATH", help="The same, one at a time; may be repeated."),
 ]
+
+
+def _trust(context: typer.Context, trust: bool) -> bool:
+    """Allow parts outside of the allow-lists until the command ends, where the user asks for it."""
+    if trust:
+        from residnet.core.trust import trusting
+
+        context.with_resource(trusting())
+    return trust
+
+
+Trust = Annotated[
+    bool,
+    typer.Option(
+        "--trust",
+        callback=_trust,
+        help="Make and load parts that are not stored as data, such as other classes of"
+        " scikit-learn. They can run code: only for configs and runs whose source you trust.",
+    ),
+]
 _CONFIG = "YAML file of one run, or the name of a config that comes with residnet."
 
 
@@ -282,6 +302,7 @@ def run(
             help="Models of a fit that are fitted side by side; one a core where not given.",
         ),
     ] = None,
+    trust: Trust = False,
     quiet: Quiet = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print summary.json and the run's folder, for machines.")
@@ -365,6 +386,7 @@ def demo(
 def check(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help=_CONFIG)],
     overrides: Overrides = None,
+    trust: Trust = False,
     quiet: Quiet = False,
 ) -> None:
     """Validate a config and everything that it names, without running it."""
@@ -395,6 +417,7 @@ def inspect(
         Path | None,
         typer.Option("--json", metavar="FILE", help="Write the findings to a file as JSON, too."),
     ] = None,
+    trust: Trust = False,
     quiet: Quiet = False,
 ) -> None:
     """Check logs for faults that would mislead a fit.
@@ -441,6 +464,7 @@ def evaluate(
             "--out", metavar="DIR", help="Where results go; RUN/external-<time> where not given."
         ),
     ] = None,
+    trust: Trust = False,
     quiet: Quiet = False,
 ) -> None:
     """Evaluate the models of a finished run in free run on other logs."""
@@ -478,6 +502,7 @@ def monitor(
         Path | None,
         typer.Option("--json", metavar="FILE", help="Write what was found to a file as JSON, too."),
     ] = None,
+    trust: Trust = False,
     quiet: Quiet = False,
 ) -> None:
     """Watch new logs with a model of a finished fit, and name what has changed.
@@ -530,6 +555,7 @@ def plan_trial(
         Path | None,
         typer.Option("--out", metavar="DIR", help="Folder for next_trials.yaml and tracks."),
     ] = None,
+    trust: Trust = False,
     quiet: Quiet = False,
 ) -> None:
     """Say which manoeuvres to run next, and by how much they would narrow the predictions."""
@@ -574,6 +600,7 @@ def export(
             "--anyway", help="Write what is worse than doing without it, too; its card says so."
         ),
     ] = False,
+    trust: Trust = False,
     quiet: Quiet = False,
 ) -> None:
     """Export a model of a finished run for controllers, after a parity check."""
@@ -612,6 +639,7 @@ def autopilot(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace earlier files and an earlier run.")
     ] = False,
+    trust: Trust = False,
     quiet: Quiet = False,
 ) -> None:
     """Train a heading autopilot for your vessel under the conditions that its logs show."""
@@ -647,6 +675,7 @@ def ardupilot(
         ),
     ] = None,
     port: Annotated[int, typer.Option("--port", help="UDP port that ArduPilot sends to.")] = 9002,
+    trust: Trust = False,
 ) -> None:
     """Simulate a vessel or a learned model for ArduPilot (sim_vehicle.py --model JSON)."""
     from residnet.simulators.ardupilot import ArduPilotBackEnd, servos

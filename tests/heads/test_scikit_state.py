@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load, save
+
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.trust import trusting
@@ -17,7 +19,6 @@ from residnet.dynamics.store import load_model, restored, save_model
 from residnet.heads import scikit, scikit_state
 from residnet.heads.scikit import SklearnConfig, SklearnHead
 from residnet.testing.checks import example_model, example_spec
-from safetensors.numpy import load, save
 
 STEPS: dict[str, Any] = {
     "sklearn.linear_model.QuantileRegressor": {"alpha": 0.01},
@@ -54,7 +55,7 @@ def _config(pipeline: list[Any]) -> SklearnConfig:
 
 
 @pytest.fixture
-def no_fit(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+def no_fit(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """Make every later fit of an estimator an error."""
 
     def forbid() -> None:
@@ -63,7 +64,7 @@ def no_fit(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
 
         monkeypatch.setattr(SklearnHead, "_fit", fit)
 
-    yield forbid
+    return forbid
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -19,6 +19,7 @@ from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.core.processes import spread
 from residnet.core.progress import ProgressCallback
+from residnet.core.trust import trusting
 from residnet.identification.fit import fit as identify
 from residnet.identification.identified import Evaluation, Identified, candidates, evaluate
 from residnet.identification.prepared import require_window, through_currents, velocity_limit
@@ -296,6 +297,7 @@ def fit(
     baselines: Mapping[str, PartGiven] | None = None,
     threads: int = 1,
     workers: int = 1,
+    trust: bool = False,
     progress: ProgressCallback | None = None,
     **settings: Any,
 ) -> Models:
@@ -317,6 +319,8 @@ def fit(
         workers: models that may be fitted side by side, each in a process of its own, where they
             take long; the numbers stay the same. With more than one, a script has to keep its calls
             under `if __name__ == "__main__":`, since each process imports it again.
+        trust: allow classes of scikit-learn whose fitted state is not stored as data; they can run
+            code, so only for sources that you trust.
         progress: is told what is being fitted, and how far it is.
         settings: further keys of a fit, as YAML has them: recipe, effort, base_of, forces,
             ensembles, means, training, refit, current, bands, seed, and integrator, which is
@@ -330,34 +334,35 @@ def fit(
     Example:
         models = residnet.fit(logs); models.selected, models.metrics
     """
-    given = {
-        key: value
-        for key, value in settings.items()
-        if (value or key not in Parts.model_fields) and (key, value) != ("integrator", None)
-    }
-    given |= {"baselines": named_parts(baselines, "baseline")} if baselines else {}
-    if not (isinstance(heads, list | tuple | Mapping) and not heads):
-        given["heads"] = named_parts(heads, "head")
-    if baseline is not None:
-        given["baseline"] = part(baseline, "baseline")
-    if given.get("recipe") is None and not set(given) & set(Parts.model_fields):
-        given["recipe"] = "standard"
-    if given.get("recipe") is None:
-        given.setdefault("baseline", part("regressors", "baseline"))
-    if not isinstance(data, Data):
-        logs = (str, PathLike, Log, list, tuple, Mapping)
-        require(data, logs, "fit: expected logs, or data from residnet.prepare")
-        data = prepare(data)
-    if given.get("recipe") is not None:
-        given.setdefault("integrator", integrator(data.signals.live))
-    sections = {"prepare": data.prepare, "signals": data.signals, "evaluation": data.evaluation}
-    config: FitSettings = validate(plain({**sections, **given}), FitSettings, "fit")
-    with computing(threads), hearing(progress), spread(workers):
-        for split in ("validation", "test"):
-            for log in data.logs(split):
-                require_window(log, config)
-        splits, _ = through_currents(data.splits, config)
-        return Models(identify(splits, config), replace(data, splits=splits))
+    with trusting(trust):
+        given = {
+            key: value
+            for key, value in settings.items()
+            if (value or key not in Parts.model_fields) and (key, value) != ("integrator", None)
+        }
+        given |= {"baselines": named_parts(baselines, "baseline")} if baselines else {}
+        if not (isinstance(heads, list | tuple | Mapping) and not heads):
+            given["heads"] = named_parts(heads, "head")
+        if baseline is not None:
+            given["baseline"] = part(baseline, "baseline")
+        if given.get("recipe") is None and not set(given) & set(Parts.model_fields):
+            given["recipe"] = "standard"
+        if given.get("recipe") is None:
+            given.setdefault("baseline", part("regressors", "baseline"))
+        if not isinstance(data, Data):
+            logs = (str, PathLike, Log, list, tuple, Mapping)
+            require(data, logs, "fit: expected logs, or data from residnet.prepare")
+            data = prepare(data)
+        if given.get("recipe") is not None:
+            given.setdefault("integrator", integrator(data.signals.live))
+        sections = {"prepare": data.prepare, "signals": data.signals, "evaluation": data.evaluation}
+        config: FitSettings = validate(plain({**sections, **given}), FitSettings, "fit")
+        with computing(threads), hearing(progress), spread(workers):
+            for split in ("validation", "test"):
+                for log in data.logs(split):
+                    require_window(log, config)
+            splits, _ = through_currents(data.splits, config)
+            return Models(identify(splits, config), replace(data, splits=splits))
 
 
 def metrics(

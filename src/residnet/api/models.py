@@ -16,6 +16,7 @@ from residnet.api.values import PathGiven, described, path
 from residnet.core.config import validate
 from residnet.core.errors import UsageError
 from residnet.core.files import read_json
+from residnet.core.trust import trusting
 from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
@@ -218,13 +219,15 @@ def save(model: Model, folder: PathGiven, *, overwrite: bool = False) -> Path:
     return place
 
 
-def load(folder: PathGiven, name: str | None = None) -> Model:
+def load(folder: PathGiven, name: str | None = None, *, trust: bool = False) -> Model:
     """Read a model from its folder, or by its name from the folder of a run.
 
     Args:
         folder: of a model, or of a finished run.
         name: of the model in the run; `selected` is the single one that validation data chose;
             where not given, the one that is reported first.
+        trust: allow classes of scikit-learn whose fitted state is not stored as data; they can run
+            code, so only for sources that you trust.
 
     Raises:
         UsageError: where there is no such model.
@@ -232,21 +235,23 @@ def load(folder: PathGiven, name: str | None = None) -> Model:
     Example:
         model = residnet.load("runs/quickstart", "selected")
     """
-    place = path(folder, "load")
-    if name is not None or (not (place / "model.json").is_file() and (place / "models").is_dir()):
-        place = place / "models" / chosen_model(place, name or "predictor")
-    require_sealed(place)
-    spec, module = load_model(place)
-    # outside of a run there are neither notes nor bands
-    notes, bands = place / "fit.json", place.parent.parent / "bands.json"
-    return Model(
-        FittedModel(
-            spec,
-            module,
-            read_json(notes) if notes.is_file() else {},
-            bands=read_bands(read_json(bands)).get(place.name, {}) if bands.is_file() else {},
+    with trusting(trust):
+        place = path(folder, "load")
+        is_model = (place / "model.json").is_file()
+        if name is not None or (not is_model and (place / "models").is_dir()):
+            place = place / "models" / chosen_model(place, name or "predictor")
+        require_sealed(place)
+        spec, module = load_model(place)
+        # outside of a run there are neither notes nor bands
+        notes, bands = place / "fit.json", place.parent.parent / "bands.json"
+        return Model(
+            FittedModel(
+                spec,
+                module,
+                read_json(notes) if notes.is_file() else {},
+                bands=read_bands(read_json(bands)).get(place.name, {}) if bands.is_file() else {},
+            )
         )
-    )
 
 
 def export_model(

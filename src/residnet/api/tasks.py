@@ -20,6 +20,7 @@ from residnet.core.files import read_table
 from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.core.progress import ProgressCallback
+from residnet.core.trust import trusting
 from residnet.data.simulated import Flight
 from residnet.heads import HeadConfig
 from residnet.heads.base import FeatureConfig
@@ -60,11 +61,13 @@ def available(what: What) -> pd.DataFrame:
     return pd.DataFrame(catalogue(what), columns=["name", "about"])
 
 
-def head(kind: PartGiven, **settings: Any) -> FeatureConfig:
+def head(kind: PartGiven, *, trust: bool = False, **settings: Any) -> FeatureConfig:
     """Return the config of a residual head, for `fit`.
 
     Args:
         kind: one of `available("heads")`.
+        trust: allow classes of scikit-learn whose fitted state is not stored as data; they can run
+            code, so only for sources that you trust.
         settings: of the head, as YAML has them.
 
     Raises:
@@ -73,8 +76,9 @@ def head(kind: PartGiven, **settings: Any) -> FeatureConfig:
     Example:
         residnet.head("lstm", hidden_size=16)
     """
-    config: FeatureConfig = validate(part(kind, "head", **settings), HeadConfig, "head")
-    return config
+    with trusting(trust):
+        config: FeatureConfig = validate(part(kind, "head", **settings), HeadConfig, "head")
+        return config
 
 
 def baseline(kind: PartGiven, **settings: Any) -> IdentifiedConfig:
@@ -269,13 +273,17 @@ class Result:
                 f"{file}: not readable ({error}); restore it or run it again"
             ) from error
 
-    def model(self, name: str = "predictor") -> Model:
+    def model(self, name: str = "predictor", *, trust: bool = False) -> Model:
         """Return a model of a fit, the one that is reported first where none is named.
+
+        Args:
+            name: of the model.
+            trust: as of `load`.
 
         Raises:
             UsageError: where the run has no such model.
         """
-        return load(self.folder, name)
+        return load(self.folder, name, trust=trust)
 
     def __repr__(self) -> str:
         return f"Result({self.summary['task']}, {self.folder})"
@@ -289,6 +297,7 @@ def run(
     resume: bool = False,
     overwrite: bool = False,
     report: bool = True,
+    trust: bool = False,
     progress: ProgressCallback | None = None,
 ) -> Result:
     """Carry out any task, with the numbers of the command line.
@@ -303,6 +312,8 @@ def run(
         resume: continue an interrupted run in its folder.
         overwrite: replace an earlier run in its folder.
         report: draw the report and export; without them a run ends after its results.
+        trust: allow classes of scikit-learn whose fitted state is not stored as data; they can run
+            code, so only for sources that you trust.
         progress: is told what is being done, and how far it is.
 
     Raises:
@@ -312,30 +323,32 @@ def run(
     Example:
         result = residnet.run("quickstart.yaml", overrides={"seed": 3}); result.metrics
     """
-    changes, source, task = _overrides(overrides), None, config
-    if isinstance(config, Task | Mapping) and changes:
-        raise UsageError("run: overrides are for a file; change the mapping itself")
-    if isinstance(config, Mapping):
-        task = validate(plain(config), TaskConfig, "run", Path.cwd())
-    elif isinstance(config, str | Path):
-        source = path(config, "run")
-        task = load_config(source, changes, TaskConfig)
-    if not isinstance(task, Task):
-        raise UsageError(
-            f"run: expected the path of a YAML file, a mapping or a task, given {described(config)}"
-        )
-    kept = None if folder is not None else tempfile.TemporaryDirectory(prefix="residnet-")
-    place = path(folder, "run: folder") if kept is None else Path(kept.name) / task.name
-    with hearing(progress):
-        task.run(
-            source=source,
-            overrides=changes,
-            out=place,
-            resume=resume,
-            overwrite=overwrite,
-            report=report,
-        )
-    return Result(place, kept)
+    with trusting(trust):
+        changes, source, task = _overrides(overrides), None, config
+        if isinstance(config, Task | Mapping) and changes:
+            raise UsageError("run: overrides are for a file; change the mapping itself")
+        if isinstance(config, Mapping):
+            task = validate(plain(config), TaskConfig, "run", Path.cwd())
+        elif isinstance(config, str | Path):
+            source = path(config, "run")
+            task = load_config(source, changes, TaskConfig)
+        if not isinstance(task, Task):
+            raise UsageError(
+                "run: expected the path of a YAML file, a mapping or a task, given"
+                f" {described(config)}"
+            )
+        kept = None if folder is not None else tempfile.TemporaryDirectory(prefix="residnet-")
+        place = path(folder, "run: folder") if kept is None else Path(kept.name) / task.name
+        with hearing(progress):
+            task.run(
+                source=source,
+                overrides=changes,
+                out=place,
+                resume=resume,
+                overwrite=overwrite,
+                report=report,
+            )
+        return Result(place, kept)
 
 
 def _overrides(given: Any) -> list[str]:

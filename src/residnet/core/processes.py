@@ -16,6 +16,7 @@ from threading import Thread
 from typing import Any
 
 from residnet.core.errors import FitError
+from residnet.core.trust import is_trusted, set_trusted
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """Numbers of the settings in malloc.h of the GNU C library."""
@@ -100,7 +101,10 @@ def _pool(
     workers: int, begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()
 ) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(
-        workers, get_context("spawn"), initializer=begin_worker, initargs=(begin, given)
+        workers,
+        get_context("spawn"),
+        initializer=_begin_pooled,
+        initargs=(is_trusted(), begin, given),
     )
 
 
@@ -155,6 +159,14 @@ class ThisProcess(Executor):
         except Exception as error:
             future.set_exception(error)
         return future
+
+
+def _begin_pooled(
+    trust: bool, begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()
+) -> None:
+    """Take over what the parent may load, then begin as every worker."""
+    set_trusted(trust)
+    begin_worker(begin, given)
 
 
 def begin_worker(begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()) -> None:

@@ -129,8 +129,9 @@ def make_estimator(step: Any, *, listed: Any = FITTED) -> Any:
         settings.setdefault("random_state", 0)
     if name == "sklearn.neighbors.KNeighborsRegressor":
         # a tree of neighbours is an object of compiled code, which cannot be stored as data
-        if settings.setdefault("algorithm", "brute") != "brute":
-            raise ValueError(f"{name}: algorithm: expected 'brute', found {settings['algorithm']}")
+        algorithm = settings.setdefault("algorithm", "brute")
+        if algorithm != "brute":
+            raise ValueError(f"{name}: algorithm: expected 'brute', found {algorithm}")
     try:
         estimator = made(**settings)
         # scikit-learn checks parameters when it fits; here it names the key in the config

@@ -30,7 +30,12 @@ FITTED: Final[Mapping[str, tuple[str, ...]]] = {
     "sklearn.svm.LinearSVR": _COEFFICIENTS,
     "sklearn.svm.SVR": tuple(_SUPPORT.split()),
     "sklearn.svm.NuSVR": tuple(_SUPPORT.split()),
-    "sklearn.cross_decomposition.PLSRegression": (*_COEFFICIENTS, "_x_mean", "_x_std", "_predict_1d"),
+    "sklearn.cross_decomposition.PLSRegression": (
+        *_COEFFICIENTS,
+        "_x_mean",
+        "_x_std",
+        "_predict_1d",
+    ),
     "sklearn.kernel_ridge.KernelRidge": ("dual_coef_", "X_fit_"),
     "sklearn.neural_network.MLPRegressor": (
         "coefs_",
@@ -205,7 +210,7 @@ def _width_after(estimator: Any, columns: int) -> int:
         width = np.asarray(estimator.transform(np.zeros((1, columns)))).shape
     if len(width) != 2 or not 1 <= width[1] <= _MOST_FEATURES:
         raise StateError(f"gives columns of the shape {width}")
-    return width[1]
+    return int(width[1])
 
 
 def _fill(estimator: Any, name: str, state: dict[str, Any], columns: int) -> None:
