@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
+import json
 import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
+from forged_run import forge_sums
 from tiny import TINY, Command, read_json, write_yaml
 
 from residnet import load
@@ -88,17 +90,6 @@ def test_no_command_opens_a_store_of_pickles(
 
 def _plant(run: Path, head: dict[str, Any]) -> None:
     """Put a head into a model's description, and correct all sums, as an attacker does."""
-    import hashlib
-    import json
-
-    from residnet.runs.folder import seal
-
     card = run / "models" / "ridge" / "model.json"
-    content = read_json(card)
-    content["head"] = head
-    del content["description_sha256"]
-    text = json.dumps(content, sort_keys=True).encode()
-    content["description_sha256"] = hashlib.sha256(text).hexdigest()
-    card.write_text(json.dumps(content))
-    seal(card.parent)
-    seal(run)
+    card.write_text(json.dumps({**read_json(card), "head": head}))
+    forge_sums(run)
