@@ -9,12 +9,14 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, final
 
 import typer
 
+from residnet.core.errors import ResidnetError
+from residnet.core.ownership import Manifest, manifest_for, recorded_folder, require_replaceable
 from residnet.core.progress import Progress, ProgressCallback, listen
 from residnet.exits import enter
 
@@ -181,6 +183,8 @@ class RunLog:
     def open(self, folder: Path) -> None:
         """Write into a folder from now on, behind what an interrupted run left there."""
         self._file = folder / "log.txt"
+        if self._wanted:
+            self._claim(self._file)
         self._add("")
 
     @contextmanager
@@ -190,10 +194,23 @@ class RunLog:
             yield
         except BaseException as error:
             if self._file is None and self._wanted:
-                self._beside.parent.mkdir(parents=True, exist_ok=True)
-                self._file = self._beside
+                # the error under way counts more than a log that cannot be written
+                with suppress(ResidnetError):
+                    self._claim(self._beside)
+                    self._file = self._beside
             self._add("".join(traceback.format_exception(error)))
             raise
+
+    @staticmethod
+    def _claim(file: Path) -> None:
+        """Record a log before its first line.
+
+        Raises:
+            UsageError: if the file is the user's.
+        """
+        manifest = manifest_for(file)
+        manifest.require_replaceable(file)
+        manifest.record(file, None)
 
     def _add(self, text: str) -> None:
         self._held += text
@@ -413,11 +430,14 @@ def inspect(
             "--config", metavar="CONFIG", help="A run whose channel map reads these logs."
         ),
     ] = None,
-    file: Annotated[
+    out: Annotated[
         Path | None,
-        typer.Option("--json", metavar="FILE", help="Write the findings to a file as JSON, too."),
+        typer.Option("--out", metavar="FILE", help="Write the findings to a file as JSON, too."),
     ] = None,
     trust: Trust = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the findings as JSON, for machines.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Check logs for faults that would mislead a fit.
@@ -428,13 +448,14 @@ def inspect(
     from residnet.core.files import require_file_place
     from residnet.tasks.inspection import inspect_logs
 
-    if file is not None:
-        require_file_place(file)
-    with drawn_progress(quiet=quiet):
+    if out is not None:
+        require_file_place(out)
+        require_replaceable(out)
+    with drawn_progress(quiet=quiet or as_json):
         findings = inspect_logs(logs, config)
-    print(findings.text)
-    if file is not None:
-        findings.write(file)
+    print(json.dumps(findings.content, indent=1) if as_json else findings.text)
+    if out is not None:
+        findings.write(out)
     if findings.misled:
         raise typer.Exit(1)
 
@@ -465,6 +486,12 @@ def evaluate(
         ),
     ] = None,
     trust: Trust = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue an interrupted evaluation in its folder.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier evaluation in its folder.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Evaluate the models of a finished run in free run on other logs."""
@@ -474,7 +501,8 @@ def evaluate(
     with drawn_progress(quiet=quiet):
         run, task = finished_task(folder, "evaluate")
         require_room(out or folder)
-        finished = task.evaluate_on(run, _named(folder, given, logs), out)
+        named = _named(folder, given, logs)
+        finished = task.evaluate_on(run, named, out, resume=resume, overwrite=overwrite)
     show(finished)
 
 
@@ -488,7 +516,8 @@ def monitor(
     stretch: Annotated[str, typer.Option(help="Time that is looked back over.")] = "300 s",
     false_alarm: Annotated[str, typer.Option(help="Mean time between false alarms.")] = "10 h",
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Folder for a page.")
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder for a page and monitor.json."),
     ] = None,
     refit: Annotated[
         Path | None,
@@ -498,42 +527,42 @@ def monitor(
             help="Put the changes that are named into a copy of the model, in a new run folder.",
         ),
     ] = None,
-    file: Annotated[
-        Path | None,
-        typer.Option("--json", metavar="FILE", help="Write what was found to a file as JSON, too."),
-    ] = None,
     trust: Trust = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print what was found as JSON, for machines.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Watch new logs with a model of a finished fit, and name what has changed.
 
     The exit code is 1 where there is an alarm. A refit leaves the run as it is.
     """
-    from residnet.core.files import require_file_place, require_room, whole
+    from residnet.core.files import require_room, whole
     from residnet.tasks.registry import finished_task
 
-    if file is not None:
-        require_file_place(file)
     if out is not None:
         require_room(out)
+        Manifest(out).require_replaceable(out / "monitor.json")
+        Manifest(out).require_replaceable(out / "report.html")
     settings = {"window": window, "stretch": stretch, "false_alarm": false_alarm}
-    with drawn_progress(quiet=quiet):
+    with drawn_progress(quiet=quiet or as_json):
         run, task = finished_task(folder, "monitor")
         named = _named(folder, given, logs)
         found, refitted = task.monitor(run, named, model, settings, refit)
-    for log in found:
-        print("\n".join(log.text()))
     content: list[dict[str, Any]] = [log.content() for log in found]
+    lines = [line for log in found for line in log.text()]
     if refitted is not None:
-        print("\n".join(refitted.text()))
+        lines += refitted.text()
         content.append({"refit": refitted.content()})
-    if file is not None:
-        with whole(file) as part:
-            part.write_text(json.dumps(content, indent=1) + "\n")
+    document = json.dumps(content, indent=1)
     if out is not None:
         from residnet.tasks.fit_service import write_watched
 
-        print(f"page: {write_watched(out, found)}")
+        with recorded_folder(out):
+            lines.append(f"page: {write_watched(out, found)}")
+            with whole(out / "monitor.json") as part:
+                part.write_text(document + "\n")
+    print(document if as_json else "\n".join(lines))
     if any(log.since is not None for log in found):
         raise typer.Exit(1)
 

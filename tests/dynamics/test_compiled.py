@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -203,11 +204,37 @@ def test_the_same_source_is_compiled_once(tmp_path: Path, monkeypatch: pytest.Mo
     assert len(calls) == 1
     c_code.compiled_library(SOURCE.replace("2.0", "4.0"))
     assert len(calls) == 2
-    assert len(list((tmp_path / "kept").iterdir())) == 2
-    # where nothing can be written, it is compiled each time
-    monkeypatch.setenv("RESIDNET_CACHE", str(next((tmp_path / "kept").iterdir()) / "below"))
+    libraries = list((tmp_path / "kept" / "residnet-cache").glob("*.so"))
+    assert len(libraries) == 2
+    # a library that somebody edited is not loaded, and not replaced
+    # a new file: the old one is mapped into this process
+    libraries[0].unlink()
+    libraries[0].write_bytes(b"mine")
     assert called(c_code.compiled_library(SOURCE)) == 3.0
-    assert len(calls) == 3
+    assert called(c_code.compiled_library(SOURCE.replace("2.0", "4.0"))) == 6.0
+    assert libraries[0].read_bytes() == b"mine"
+    assert len(calls) == 4
+    # where nothing can be written, it is compiled each time
+    monkeypatch.setenv("RESIDNET_CACHE", str(libraries[0] / "below"))
+    assert called(c_code.compiled_library(SOURCE)) == 3.0
+    assert len(calls) == 5
+
+
+def test_the_cache_deletes_no_file_of_the_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RESIDNET_CACHE", str(tmp_path))
+    monkeypatch.setattr(c_code, "_KEPT", 1)
+    cache = tmp_path / "residnet-cache"
+    cache.mkdir()
+    mine = [folder / f"{n}.so" for folder in (tmp_path, cache) for n in range(5)]
+    for number, file in enumerate(mine):
+        file.write_text(str(number))
+        os.utime(file, (number, number))
+    for factor in ("2.0", "4.0", "8.0"):
+        c_code.compiled_library(SOURCE.replace("2.0", factor))
+    assert [file.read_text() for file in mine] == [str(number) for number in range(10)]
+    assert len(set(cache.glob("*.so")) - set(mine)) == 1
 
 
 def test_a_flight_whose_gradient_explodes_does_not_drown_the_others() -> None:

@@ -16,6 +16,7 @@ from PIL import Image
 from read_page import Page
 
 from residnet.core.errors import UsageError
+from residnet.core.ownership import recorded_folder
 from residnet.report.blocks import Section
 from residnet.report.browser import draw
 from residnet.report.figure import (
@@ -95,7 +96,8 @@ def every_kind() -> Figure:
 
 def test_a_figure_is_written_and_read_back(tmp_path: Path) -> None:
     given = every_kind()
-    (written,) = write_figures(tmp_path, [given])
+    with recorded_folder(tmp_path):
+        (written,) = write_figures(tmp_path, [given])
     (read,) = read_figures(tmp_path)
     assert [path.name for path in read.stills] == ["01_every_kind.png"]
     assert read.stills == written.stills
@@ -118,7 +120,7 @@ def test_a_figure_is_written_and_read_back(tmp_path: Path) -> None:
     assert len(read_figures(tmp_path)) == 1
     write_figures(tmp_path, [])
     left = {path.name for path in tmp_path.iterdir()}
-    assert left == {"damaged.json", "foreign.json", "mine.png"}
+    assert left == {"checksums.json", "damaged.json", "foreign.json", "mine.png"}
 
 
 def test_still_pictures_show_what_is_switched_on() -> None:

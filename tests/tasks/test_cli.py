@@ -122,7 +122,7 @@ def test_inspect_tells_what_misleads_and_drafts_a_channel_map(
     path, found = tmp_path / "logs" / "log_0.csv", tmp_path / "found.json"
     table = pd.read_csv(path)
     table.assign(psi=-table["psi"]).to_csv(path, index=False)
-    said = command("inspect", path, "--config", csv, "--json", found)
+    said = command("inspect", path, "--config", csv, "--out", found)
     assert said.code == 1
     assert "will mislead: x, y rates against R(psi) [u, v]" in said.out
     content = read_json(found)

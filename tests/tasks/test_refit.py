@@ -65,7 +65,7 @@ def test_a_refit_leaves_the_old_run_alone_and_can_be_exported(
     before = {file: file.read_bytes() for file in run.rglob("*") if file.is_file()}
     logs, out = new_logs(tmp_path / "logs", 0.2), tmp_path / "refit"
     given = ["monitor", run, *logs, "--model", "baseline", "--window", "5 s", "--refit", out]
-    said = command(*given, "--json", tmp_path / "found.json", "--out", tmp_path / "page")
+    said = command(*given, "--out", tmp_path / "page")
     assert said.code == 1
     alarms, causes = Page(plain(tmp_path / "page" / "report.html")).tables
     assert [line[1][:5] for line in alarms[1:]].count("after") >= 1
@@ -73,7 +73,7 @@ def test_a_refit_leaves_the_old_run_alone_and_can_be_exported(
     assert [line[1] for line in causes].count("gain n_stbd") == 4
     assert {file: file.read_bytes() for file in run.rglob("*") if file.is_file()} == before
     require_sealed(run)
-    found = read_json(tmp_path / "found.json")[-1]["refit"]
+    found = read_json(tmp_path / "page" / "monitor.json")[-1]["refit"]
     (change,) = found["changes"]
     assert change["cause"] == "gain n_stbd"
     assert found["worth_taking"]

@@ -15,7 +15,8 @@ from residnet.api.data import Data
 from residnet.api.values import PathGiven, described, path
 from residnet.core.config import validate
 from residnet.core.errors import UsageError
-from residnet.core.files import read_json
+from residnet.core.files import read_json, staged_files
+from residnet.core.ownership import Manifest, recorded_folder
 from residnet.core.trust import trusting
 from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
@@ -29,7 +30,7 @@ from residnet.identification.monitoring import MonitorConfig, Verdict, Watch, Wa
 from residnet.identification.recursive_refit import Refit, recursive_refit, refitted
 from residnet.judge.band import read_bands
 from residnet.judge.verdict import UNSEEN, Evidence, objections
-from residnet.runs.folder import require_sealed, seal
+from residnet.runs.folder import require_sealed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -214,8 +215,11 @@ def save(model: Model, folder: PathGiven, *, overwrite: bool = False) -> Path:
         raise UsageError(f"{place}: a model stands there already; give overwrite=True")
     if place.exists() and not place.is_dir():
         raise UsageError(f"{place}: is a file, expected a folder")
-    save_model(place, model.spec, model.module)
-    seal(place)
+    manifest = Manifest(place)
+    for name in ("model.json", "model.safetensors"):
+        manifest.require_replaceable(place / name)
+    with recorded_folder(place):
+        save_model(place, model.spec, model.module)
     return place
 
 
@@ -287,7 +291,9 @@ def export_model(
     own = [row for row in metrics if row.get("model", name) == name]
     exported = ExportedVessel(model.spec, model.module, own)
     released(exported, _objections(name, metrics), anyway=anyway)
-    return chosen_format.export(exported, path(file, "export_model"))
+    place = path(file, "export_model")
+    with staged_files(place, place.parent.glob("*.masses.yaml")) as staged:
+        return chosen_format.export(exported, staged)
 
 
 def _objections(name: str, metrics: Sequence[Mapping[str, Any]]) -> list[str]:

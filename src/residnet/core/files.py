@@ -10,13 +10,13 @@ import re
 import secrets
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import residnet
-from residnet.core.errors import UsageError
+from residnet.core.errors import ResidnetError, UsageError
 from residnet.core.ownership import (
     FILE_MANIFEST,
     Manifest,
@@ -90,11 +90,15 @@ def write_owned(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def staged_files(file: Path) -> Iterator[Path]:
+def staged_files(file: Path, inputs: Iterable[Path] = ()) -> Iterator[Path]:
     """Yield a path of the same name in an empty folder, for a writer of several files.
 
     At the end of the context all files that were written beside it move to the folder of `file`,
     none of them if one would replace a file that is not owned.
+
+    Args:
+        file: that is written.
+        inputs: files beside it that the writer reads; they are copied into the empty folder.
 
     Raises:
         UsageError: if a file is the user's or was edited, or cannot be written.
@@ -102,8 +106,15 @@ def staged_files(file: Path) -> Iterator[Path]:
     require_replaceable(file)
     with tempfile.TemporaryDirectory(prefix="residnet-") as name:
         staging = Path(name)
-        yield staging / file.name
-        sources = [path for path in sorted(staging.rglob("*")) if path.is_file()]
+        copies = {Path(shutil.copy(path, staging)) for path in inputs}
+        try:
+            yield staging / file.name
+        except ResidnetError as error:
+            # the user knows the place that he asked for
+            message = str(error).replace(str(staging), str(file.parent))
+            raise type(error)(message) from error
+        found = (path for path in sorted(staging.rglob("*")) if path.is_file())
+        sources = [path for path in found if path not in copies]
         targets = [file.parent / path.relative_to(staging) for path in sources]
         for target in targets:
             require_replaceable(target)

@@ -199,8 +199,8 @@ class Manifest:
                 self.record(path, sha256(path))
 
     def is_owned(self, path: Path) -> bool:
-        """Return whether residnet wrote a file, and its contents are still the same."""
-        return self._is_owned(path, self.read())
+        """Return whether residnet wrote a file of the folder, and its contents are the same."""
+        return path.is_relative_to(self.folder) and self._is_owned(path, self.read())
 
     def require_replaceable(self, path: Path) -> None:
         """Check that a file may be written: it does not exist, or is owned.
@@ -215,6 +215,31 @@ class Manifest:
         if self._is_owned(path, digests):
             return
         raise self._not_owned(path, digests)
+
+    def require_recorded_unchanged(self, *names: str) -> None:
+        """Check that what was recorded may be written again: it is unchanged or gone.
+
+        Args:
+            names: of files, and of folders whose recorded files are checked.
+
+        Raises:
+            UsageError: if a file was edited, or lies behind a symbolic link.
+        """
+        for name in names:
+            require_inside(self.folder, self.folder / name)
+        digests = self.read()
+        for name in digests:
+            path = self.folder / name
+            if any(PurePosixPath(name).is_relative_to(start) for start in names) and (
+                os.path.lexists(path) and not self._is_owned(path, digests)
+            ):
+                raise self._not_owned(path, digests)
+
+    def remove_if_owned(self, path: Path) -> None:
+        """Delete a file that residnet wrote and nobody edited; leave any other."""
+        if self.is_owned(path):
+            require_inside(self.folder, path)
+            path.unlink()
 
     def require_all_owned(self, below: Path | None = None) -> None:
         """Check that every file of the folder, or of one below it, is owned.

@@ -20,7 +20,9 @@ from typing import Any, Final
 import casadi as ca
 import numpy as np
 
-from residnet.core.errors import ExportError
+from residnet.core.errors import ExportError, UsageError
+from residnet.core.files import whole
+from residnet.core.ownership import Manifest
 
 FUNCTIONS: Final = {
     getattr(ca, f"OP_{name.upper()}"): name
@@ -441,6 +443,8 @@ _FLAGS = (
     *("-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros"),
     *("-fassociative-math", "-freciprocal-math"),
 )
+_LONGEST_JOURNAL = 1_000_000
+"""Bytes of the cache's journal above which it is merged into the manifest."""
 _KEPT = 64
 """Libraries that are kept, those used last."""
 
@@ -449,7 +453,8 @@ def compiled_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
     """Return a C source as a library compiled for this machine, from the cache where it is there.
 
     The cache is `residnet/compiled` in `XDG_CACHE_HOME`, or in `~/.cache`; `RESIDNET_CACHE` names
-    another folder. Without a folder to write to the library is compiled every time.
+    a folder in which the cache is the folder `residnet-cache`. Without a folder to write to, or if
+    a file there is not as residnet wrote it, the library is compiled every time.
 
     Args:
         source: in C.
@@ -462,16 +467,17 @@ def compiled_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
     flags = ("-O0", *_FLAGS[1:]) if quick else _FLAGS
     file = _kept(tool, source, flags)
     try:
-        if not file.is_file():
-            file.parent.mkdir(parents=True, exist_ok=True)
-            # two processes that compile the same source do not write to one file
-            partial = file.with_name(f"{file.stem}.{os.getpid()}")
-            _compile(tool, source, flags, partial)
-            partial.replace(file)
-            _forget(file.parent)
+        manifest = Manifest(file.parent)
+        if not manifest.is_owned(file):
+            with tempfile.TemporaryDirectory() as folder:
+                out = Path(folder) / "compiled.so"
+                _compile(tool, source, flags, out)
+                with whole(file, manifest) as partial:
+                    shutil.copyfile(out, partial)
+            _forget(manifest)
         file.touch()
         return ctypes.CDLL(str(file))
-    except OSError:
+    except (OSError, UsageError):
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "compiled.so"
             _compile(tool, source, flags, out)
@@ -487,7 +493,7 @@ def _kept(tool: str, source: str, flags: Sequence[str]) -> Path:
 def _folder() -> Path:
     """Return the folder of the cache."""
     if named := os.environ.get("RESIDNET_CACHE"):
-        return Path(named)
+        return Path(named) / "residnet-cache"
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "residnet" / "compiled"
 
@@ -515,8 +521,12 @@ def _compile(tool: str, source: str, flags: Sequence[str], out: Path) -> None:
         raise CompilerError(f"compiled code does not compile ({said[0]})")
 
 
-def _forget(folder: Path) -> None:
-    """Delete all but the libraries that were used last."""
-    files = sorted(folder.iterdir(), key=lambda file: file.stat().st_mtime, reverse=True)
+def _forget(manifest: Manifest) -> None:
+    """Delete all but the libraries that were used last; files that residnet did not write stay."""
+    files = [file for name in manifest.read() if (file := manifest.folder / name).is_file()]
+    files.sort(key=lambda file: file.stat().st_mtime, reverse=True)
     for file in files[_KEPT:]:
-        file.unlink(missing_ok=True)
+        manifest.remove_if_owned(file)
+    # another process may append meanwhile, and its entry would be lost: not after each library
+    if manifest.journal.stat().st_size > _LONGEST_JOURNAL:
+        manifest.compact()

@@ -22,6 +22,7 @@ from residnet.core.errors import ConfigError, UsageError
 from residnet.core.files import read_json, whole
 from residnet.core.layout import PLANAR, ROLL, SIX
 from residnet.core.names import nearest
+from residnet.core.ownership import run_manifest_above
 from residnet.core.version import __version__
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
@@ -210,7 +211,10 @@ def save_model(folder: Path, spec: Stored, module: nn.Module) -> None:
     content["sha256"] = hashlib.sha256(weights).hexdigest()
     content[_OWN_SUM] = _description_sum(content)
     # an earlier description would promise other numbers between the two writes
-    (folder / _DESCRIPTION).unlink(missing_ok=True)
+    description = folder / _DESCRIPTION
+    if (manifest := run_manifest_above(description)) is not None:
+        manifest.require_replaceable(description)
+    description.unlink(missing_ok=True)
     with whole(folder / _WEIGHTS) as file:
         file.write_bytes(weights)
     with whole(folder / _DESCRIPTION) as file:

@@ -658,7 +658,6 @@ def write_rollouts(
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    folder.mkdir(parents=True, exist_ok=True)
     for log, columns in rollout_columns(runs, logs, inputs, bands):
         table = pa.table({name: pa.array(values) for name, values in columns.items()})
         with whole(folder / f"{file_stem(log.log.name)}.parquet") as file:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from residnet.core.files import file_stem, whole
+from residnet.core.ownership import require_inside, run_manifest_above
 from residnet.core.progress import begin
 from residnet.report.blocks import Section
 from residnet.report.figure import Case, Curve, Figure, Look, Panel, joined, parts, thinned
@@ -54,7 +55,6 @@ def write_figure(folder: Path, figure: Figure, name: str = "") -> Figure:
     Args:
         name: of the files, that of the figure where empty.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     name = file_stem(name or figure.name)
     stills, several = [], len(figure.pictured) > 1
     for number, case in enumerate(figure.pictured, start=1):
@@ -94,12 +94,15 @@ def _stored(curves: Mapping[str, Curve]) -> dict[str, Any]:
 def write_figures(folder: Path, figures: Iterable[Figure]) -> list[Figure]:
     """Write figures in the order in which a page shows them; those of an earlier call are replaced.
 
-    Other pictures of the folder stay.
+    Other pictures of the folder stay, and so do figures that somebody edited.
     """
-    for path in folder.glob("*.json"):
-        before = _read(path)
-        for file in (path, *before.stills) if before else ():
-            file.unlink(missing_ok=True)
+    manifest = run_manifest_above(folder / "figure.json")
+    if manifest is not None:
+        require_inside(manifest.folder, folder)
+        for path in folder.glob("*.json"):
+            before = _read(path)
+            for file in (path, *before.stills) if before else ():
+                manifest.remove_if_owned(file)
     begin("drawing figures")
     # the number keeps the order for whoever lists the folder
     return [

@@ -8,7 +8,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -110,8 +110,9 @@ class RunFolder:
             # what is done again must not look finished meanwhile
             folder.summary.unlink(missing_ok=True)
             return folder
-        # the folder itself stays, since it is locked
-        folder.manifest.remove_owned()
+        if folder._has_results():
+            # the folder itself stays, since it is locked
+            folder.manifest.remove_owned()
         folder.manifest.begin()
         folder.write(folder.resolved, resolved)
         return folder
@@ -298,6 +299,21 @@ def require_recorded(run: Path) -> None:
         )
 
 
+def require_apart(folder: Path, inputs: Iterable[Path]) -> None:
+    """Check that a folder that is replaced holds none of the files that the work reads.
+
+    Raises:
+        UsageError: if it holds one.
+    """
+    place = folder.resolve()
+    for file in inputs:
+        if file.resolve().is_relative_to(place):
+            raise UsageError(
+                f"{file}: lies in {folder}, which --overwrite would empty; move it, or give another"
+                " --out"
+            )
+
+
 def seal(run: Path) -> None:
     """Bring checksums.json up to date: the SHA-256 of every file that residnet wrote there.
 
@@ -380,6 +396,11 @@ class Provenance:
                     f"{path}: is not the file that the run in {folder.path} began with; bring it"
                     " back, or begin anew with --overwrite"
                 )
+        for name in sorted(known.keys() - {str(path) for path in self.files}):
+            raise UsageError(
+                f"{name}: the run in {folder.path} began with this file, which is not among the"
+                " inputs now; name it, too, or begin anew with --overwrite"
+            )
 
     def write(self, folder: RunFolder) -> None:
         """Write provenance.json, with the seconds since the start."""

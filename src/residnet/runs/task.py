@@ -16,10 +16,11 @@ from pydantic import Field
 
 from residnet.core.config import Config, dump_config, load_mapping
 from residnet.core.errors import DataError, ExportError, ResidnetError, UsageError, WithheldError
+from residnet.core.files import staged_files
 from residnet.core.names import nearest
 from residnet.core.processes import keep_freed_memory
 from residnet.report.blocks import EXPORTS
-from residnet.runs.folder import Provenance, RunFolder, seal
+from residnet.runs.folder import Provenance, RunFolder, require_apart, seal
 
 if TYPE_CHECKING:
     from residnet.export.base import Exported
@@ -68,7 +69,9 @@ class ExportRequest(NamedTuple):
         chosen = exporter(self.file_format)
         out = self.out or self.run.exports / f"{stem or exported.name}{chosen.suffix}"
         file = out if out.suffix else out.with_name(out.name + chosen.suffix)
-        chosen.export(released(exported, objections, anyway=self.anyway), file)
+        exported = released(exported, objections, anyway=self.anyway)
+        with staged_files(file, file.parent.glob("*.masses.yaml")) as staged:
+            chosen.export(exported, staged)
         return file
 
     def named(self, names: Collection[str]) -> str:
@@ -233,6 +236,8 @@ class Task(Config):
         )
         if resume:
             made_from.require_same_inputs(RunFolder(place))
+        if overwrite:
+            require_apart(place, made_from.files if source is None else [source, *made_from.files])
         with RunFolder(place).held():
             folder = RunFolder.create(place, resolved, resume=resume, overwrite=overwrite)
             if opened is not None:
@@ -263,7 +268,7 @@ class Task(Config):
         """
         made_from.write(folder)
         # of an earlier run in this folder
-        (folder.path / EXPORTS).unlink(missing_ok=True)
+        folder.manifest.remove_if_owned(folder.path / EXPORTS)
         with self.resources():
             outcome = work(folder)
             about: Any = {

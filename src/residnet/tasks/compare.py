@@ -12,6 +12,7 @@ import pandas as pd
 
 from residnet.core.errors import UsageError
 from residnet.core.format import number, signed
+from residnet.core.ownership import recorded_folder
 from residnet.judge.metrics import blocks, difference
 from residnet.report.blocks import Block, Cell, Section, Table, paired_interval, table_of
 from residnet.report.figure import GLANCE, Case, Figure, Panel, family
@@ -77,8 +78,7 @@ def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
     )
     against = [_paired_table(runs, pairs)] if pairs else []
     verdict = _sentence(runs, pairs)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
+    with recorded_folder(out):
         sections = []
         if pairs:
             # of the first protocol, for the first screen: error, difference, interval
@@ -93,8 +93,6 @@ def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
         ]
         names = " against ".join(run.name for run in runs)
         page = write_page(out, "Runs compared", names, [verdict], sections)
-    except OSError as error:
-        raise UsageError(f"{out}: cannot be written ({error.strerror})") from error
     tables = [table.text() for table in (*of_runs, *against, differing)]
     return "\n\n".join([*tables, verdict]), page
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,9 @@ import numpy as np
 
 from residnet.core.config import validate
 from residnet.core.errors import UsageError
+from residnet.core.files import whole
 from residnet.core.log import Log
+from residnet.core.ownership import Manifest, recorded_folder
 from residnet.core.progress import report
 from residnet.data.simulated import SimulatedTrials, simulate
 
@@ -77,23 +79,28 @@ def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:
     Raises:
         UsageError: where they exist already, or cannot be written.
     """
+    manifest = Manifest(folder)
     for name in LAYOUTS:
-        if (folder / name).exists() and not overwrite:
-            raise UsageError(f"{folder / name}: exists; give --overwrite, or another folder")
-        shutil.rmtree(folder / name, ignore_errors=True)
+        layout = folder / name
+        if not os.path.lexists(layout):
+            continue
+        if not layout.is_dir() or not manifest.exists:
+            raise UsageError(f"{layout}: exists, and residnet did not make it; give another folder")
+        manifest.require_all_owned(layout)
+        if not overwrite:
+            raise UsageError(f"{layout}: exists; give --overwrite, or another folder")
     config = validate(TRIALS, SimulatedTrials, "demo")
     logs = [_with_gap(log, number) for number, log in enumerate(simulate(config.draw(), config))]
-    try:
+    with recorded_folder(folder):
+        for name in LAYOUTS:
+            manifest.remove_owned(folder / name)
         for number, (name, (_, tables)) in enumerate(LAYOUTS.items()):
             report("writing logs", number, len(LAYOUTS))
-            (folder / name).mkdir(parents=True)
             for log in logs:
                 for word, table in tables(_table(log)).items():
-                    file = folder / name / f"{word}{log.name}.csv"
-                    table.to_csv(file, index=False, float_format="%.4f")
+                    with whole(folder / name / f"{word}{log.name}.csv") as file:
+                        table.to_csv(file, index=False, float_format="%.4f")
         report("writing logs", len(LAYOUTS), len(LAYOUTS))
-    except OSError as error:
-        raise UsageError(f"{folder}: cannot be written ({error.strerror})") from error
     seconds = sum(float(log.t[-1] - log.t[0]) for log in logs)
     return [
         f"{len(logs)} logs of a simulated boat in wind, {seconds / 60.0:.0f} minutes, as",

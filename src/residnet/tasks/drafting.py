@@ -18,9 +18,11 @@ import numpy as np
 
 from residnet.core.config import validate
 from residnet.core.errors import DataError, ResidnetError, UsageError
+from residnet.core.files import write_owned
 from residnet.core.layout import ALIVE, ROLL, SIX, Live
 from residnet.core.log import Log
 from residnet.core.names import ACCELERATION, BOW_WIND, CHANNEL_UNITS, STATE, WIND_INPUTS
+from residnet.core.ownership import require_replaceable
 from residnet.core.progress import say
 from residnet.data.doctor import inspect
 from residnet.data.drafting.channels import CHANNELS
@@ -58,14 +60,11 @@ class Draft:
         """Write the config as YAML with its comments; returns the path of the file.
 
         Raises:
-            UsageError: where the file cannot be written.
+            UsageError: where the file cannot be written, or is not residnet's to replace.
         """
         path = Path(file)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(self.text, encoding="utf-8")
-        except OSError as error:
-            raise UsageError(f"{path}: cannot be written ({error.strerror})") from error
+        with write_owned(path) as partial:
+            partial.write_text(self.text, encoding="utf-8")
         return path
 
 
@@ -85,6 +84,7 @@ def new_config(
         raise UsageError(f"--out {out}: a config is a YAML file; name it {out}.yaml")
     if out.exists() and not overwrite:
         raise UsageError(f"--out {out}: exists; give --overwrite, or another name")
+    require_replaceable(out)
     plain = unicodedata.normalize("NFKD", out.stem).encode("ascii", "ignore").decode()
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", plain).strip("_.-") or "my_boat"
     draft = drafted(logs, out.parent, name, answer)

@@ -42,7 +42,7 @@ from residnet.judge.verdict import objections
 from residnet.report.blocks import Section
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.verdict import evidence
-from residnet.runs.folder import Provenance, RunFolder
+from residnet.runs.folder import Provenance, RunFolder, require_apart
 from residnet.runs.model_store import FolderStore
 from residnet.runs.task import ComputingTask, ExportRequest, Finished, Outcome
 from residnet.tasks.booklet import require_flyable, write_booklet
@@ -223,7 +223,15 @@ class FitConfig(FitSettings, ComputingTask):
             sections += study_sections(study, run.path)
         return sections
 
-    def evaluate_on(self, run: RunFolder, logs: Sequence[Path], out: Path | None) -> Finished:
+    def evaluate_on(
+        self,
+        run: RunFolder,
+        logs: Sequence[Path],
+        out: Path | None,
+        *,
+        resume: bool = False,
+        overwrite: bool = False,
+    ) -> Finished:
         """Free-run every model of a fit on logs that it has never seen.
 
         Its reader, masks, protocols and scales are used; `zero` comes first, then the config's
@@ -231,17 +239,26 @@ class FitConfig(FitSettings, ComputingTask):
 
         Args:
             out: folder of the results; RUN/external-<time> where none is given.
+            resume: carry out an interrupted evaluation of the same logs again in its folder.
+            overwrite: replace an earlier evaluation in its folder.
 
         Raises:
             DataError: where a log cannot be used or is too short.
             UsageError: where a path or a channel is missing, or the folder may not be used.
         """
+        place = out or run.path / time.strftime("external-%Y%m%dT%H%M%S")
+        resolved = dump_config(self)
+        # before the logs are read, which may take long
+        require_apart(place, [run.resolved])
+        RunFolder(place).require(resolved, resume=resume, overwrite=overwrite)
         files, read, prepared = external_logs(self, logs)
         for log in prepared:
             require_window(log, self)
         made_from = Provenance(run.resolved, (), self.seed, files, time.time())
-        place = out or run.path / time.strftime("external-%Y%m%dT%H%M%S")
-        folder = RunFolder.create(place, dump_config(self))
+        if resume:
+            made_from.require_same_inputs(RunFolder(place))
+        if overwrite:
+            require_apart(place, files)
 
         def judge(folder: RunFolder) -> Outcome:
             store, order = FolderStore(run), ["zero", *self.model_names]
@@ -268,7 +285,9 @@ class FitConfig(FitSettings, ComputingTask):
             write_judged(folder, self, judged, names, {SPLIT: prepared})
             return fit_outcome(folder, SPLIT)
 
-        return self.conduct(folder, made_from, judge)
+        with RunFolder(place).held():
+            folder = RunFolder.create(place, resolved, resume=resume, overwrite=overwrite)
+            return self.conduct(folder, made_from, judge)
 
     def monitor(
         self,

@@ -19,6 +19,7 @@ from residnet.core.files import whole
 from residnet.core.format import fixed, number, plural
 from residnet.core.layout import SIX
 from residnet.core.names import nearest
+from residnet.core.ownership import recorded_folder
 from residnet.core.progress import say
 from residnet.data.prepare import samples
 from residnet.data.windows import WindowStore
@@ -338,7 +339,6 @@ def refit_run(service: Service, out: Path) -> RefitRun:
         return RefitRun(found)
     new = refitted(old, found)
     asked = {"split": SPLIT, "protocol": config.evaluation.selection, "manoeuvre": "all"}
-    folder = RunFolder.create(out, dump_config(config))
     made_from = Provenance(service.run.resolved, (), config.seed, service.files, time.time())
     errors: dict[str, Any] = {}
 
@@ -374,7 +374,8 @@ def refit_run(service: Service, out: Path) -> RefitRun:
         outcome = fit_outcome(folder, SPLIT)
         return replace(outcome, verdict=[*outcome.verdict, sentence])
 
-    config.conduct(folder, made_from, judge)
+    with RunFolder(out).held():
+        config.conduct(RunFolder.create(out, dump_config(config)), made_from, judge)
     return RefitRun(found, out, **errors)
 
 
@@ -421,7 +422,10 @@ class PlannedTrials:
 
     def write(self, folder: Path) -> list[Path]:
         """Write the chosen manoeuvres as YAML, tracks as CSV, and a page; returns the files."""
-        folder.mkdir(parents=True, exist_ok=True)
+        with recorded_folder(folder):
+            return self._write(folder)
+
+    def _write(self, folder: Path) -> list[Path]:
         trials, tracks = folder / "next_trials.yaml", folder / "next_tracks.csv"
         flights = [trial.flight for trial in self.plan.chosen]
         chosen = [flight.manoeuvre.model_dump(mode="json") for flight in flights]

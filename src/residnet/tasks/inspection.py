@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from residnet.core.errors import ConfigError, DataError, ResidnetError, UsageError
-from residnet.core.files import whole
+from residnet.core.files import write_owned
 from residnet.core.log import Log
 from residnet.core.progress import report
 from residnet.data.doctor import (
@@ -58,7 +58,7 @@ class Inspection:
         Raises:
             UsageError: where the file cannot be written.
         """
-        with whole(file) as place:
+        with write_owned(file) as place:
             place.write_text(json.dumps(self.content, indent=1) + "\n")
 
 

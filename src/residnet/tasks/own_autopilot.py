@@ -23,7 +23,9 @@ from residnet.core.config import (
     validate,
 )
 from residnet.core.errors import DataError, UsageError
+from residnet.core.files import write_owned
 from residnet.core.log import Log
+from residnet.core.ownership import require_replaceable
 from residnet.core.progress import say
 from residnet.data.channels import noise_of
 from residnet.data.drafting.questions import Marks
@@ -214,6 +216,7 @@ def draft_autopilot(
     for file in (out, vessel_file):
         if file.exists() and not overwrite:
             raise UsageError(f"{file}: exists; give --overwrite, or another name by --out")
+        require_replaceable(file)
     told = {"rudder": rudder, "rate": rate, "speed": speed}
     given = {key: value for key, value in told.items() if value is not None}
     asked = validate(given, _Asked, "residnet autopilot").model_dump(exclude_none=True)
@@ -222,16 +225,18 @@ def draft_autopilot(
         say("  speed unknown: give --speed, or u is measured in multiples of the usual speed")
         asked["speed"] = 1.0
     vessel = vessel._replace(**asked)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    vessel_file.write_text(
-        f"# The steering of your vessel, from {vessel.source}; written by `residnet autopilot`.\n"
-        + yaml.safe_dump(_vessel(vessel, vessel_file.stem), sort_keys=False)
-    )
-    out.write_text(
-        f"# An autopilot for your vessel, drafted from {vessel.source} by `residnet autopilot`.\n"
+    with write_owned(vessel_file) as file:
+        file.write_text(
+            f"# The steering of your vessel, from {vessel.source}; written by `residnet autopilot`."
+            "\n" + yaml.safe_dump(_vessel(vessel, vessel_file.stem), sort_keys=False)
+        )
+    with write_owned(out) as file:
         # each of its own, so that no part is shared under a made-up name
-        + yaml.safe_dump(json.loads(json.dumps(_config(vessel, out, vessel_file))), sort_keys=False)
-    )
+        config = json.loads(json.dumps(_config(vessel, out, vessel_file)))
+        file.write_text(
+            f"# An autopilot for your vessel, drafted from {vessel.source} by `residnet autopilot`."
+            "\n" + yaml.safe_dump(config, sort_keys=False)
+        )
     return out
 
 

@@ -30,7 +30,7 @@ from residnet.export import FORMATS
 from residnet.heads import HeadConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.report.blocks import table_of
-from residnet.runs.folder import RunFolder, seal
+from residnet.runs.folder import RunFolder, require_recorded, seal
 from residnet.runs.task import Task
 
 _BASE, _DOCUMENTS = "residnet.runs.task:Task", "residnet.documents"
@@ -136,6 +136,9 @@ def report_run(path: Path) -> Path:
     """
     run = RunFolder.open(path)
     require_room(path)
+    require_recorded(path)
+    # before the figures are drawn
+    run.manifest.require_recorded_unchanged(run.report.name, run.figures.name)
     page = task_class(run).write_report(run)
     # a study writes its comparison anew with the report
     seal(path)

@@ -515,6 +515,8 @@ class SweepConfig(Task):
             ResidnetError: where the system ends a process, or a journal is damaged.
         """
         journal = folder.path / JOURNAL
+        for file in (journal, journal.with_name(f"{JOURNAL}.lock")):
+            folder.manifest.record(file, None)
         if journal.is_file():
             # a kill may have left the last line without its end
             content = journal.read_bytes()

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from residnet.core.errors import FitError, UsageError
 from residnet.core.files import whole
+from residnet.core.ownership import require_inside, run_manifest_above
 from residnet.core.progress import report
 from residnet.data.module import EpochDataModule, epoch_seed
 from residnet.training.config import MachineConfig, OneStage, TrainingConfig
@@ -243,8 +244,15 @@ def run_epochs(
     logger, last = None, None
     if folder is not None:
         last = folder / "checkpoints" / name / "last.ckpt"
+        tensorboard = folder / "tensorboard" / name
+        for path in (last, tensorboard):
+            require_inside(folder, path)
         last.parent.mkdir(parents=True, exist_ok=True)
         logger = TensorBoardLogger(folder / "tensorboard", name=name, version="")
+        if machine.processes == 1:
+            # the first use of it makes the file of events, which a killed training leaves
+            logger.experiment  # noqa: B018
+            _record_events(logger)
     # a checkpoint that is there is taken up
     checkpoint = last if last is not None and last.is_file() else None
     trainer = L.Trainer(
@@ -276,6 +284,7 @@ def run_epochs(
         )
     if logger is not None:
         _conclude(logger, module)
+        _record_events(logger)
     model.load_state_dict(module.best_state)
     model.eval().requires_grad_(False)
     return {
@@ -333,6 +342,14 @@ def _fit(
                 raise
     if trainer.interrupted:
         raise KeyboardInterrupt
+
+
+def _record_events(logger: TensorBoardLogger) -> None:
+    """Record the files of a TensorBoard log in the manifest of its run folder."""
+    folder = Path(logger.log_dir)
+    if (manifest := run_manifest_above(folder / "events")) is not None:
+        for file in (*folder.iterdir(), folder / "hparams.yaml"):
+            manifest.record(file, None)
 
 
 def _conclude(logger: TensorBoardLogger, module: EpochTraining) -> None:
