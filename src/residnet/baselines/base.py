@@ -73,12 +73,20 @@ class ParametricBaseline(Baseline, ABC):
     def free_names(self) -> list[tuple[str, str]]:
         """Return (axis, term) of each free parameter, as the table of coefficients has them [P]."""
 
-    @abstractmethod
+    @final
     def sensitivity(self, z: Tensor) -> Tensor:
-        """Return the derivatives [B, n, P] of nu_dot with respect to the free parameters.
+        """Return the derivatives [B, n, P] of nu_dot by the free parameters at channels z [B, nz].
 
-        They are taken at channels z [B, nz].
+        They are exact: each row is differentiated in reverse mode, all rows at once.
         """
+
+        def nu_dot(theta: Tensor, channels: Tensor) -> Tensor:
+            out: Tensor = torch.func.functional_call(self, {"theta": theta}, (channels,))
+            return out
+
+        by_theta = torch.func.vmap(torch.func.jacrev(nu_dot), in_dims=(None, 0))
+        jacobian: Tensor = by_theta(self.theta.detach().to(z.dtype), z)
+        return jacobian.flatten(2)[..., self.free_indices()]
 
     @abstractmethod
     def information(self, samples: Samples) -> Tensor:

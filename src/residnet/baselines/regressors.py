@@ -108,19 +108,6 @@ class RegressorBaseline(ParametricBaseline):
             for i in self.free_indices().tolist()
         ]
 
-    def sensitivity(self, z: Tensor) -> Tensor:
-        """Return d nu_dot / d theta [B, n, P]: a coefficient moves its own axis by its term."""
-        free = self.free_indices()
-        phi = self.library(z if self.bound is None else self.bound.held(z))
-        out, begin = z.new_zeros(len(z), self.dof, len(free)), 0
-        for axis in range(self.dof):
-            own = free[free // self.library.count == axis] % self.library.count
-            # all terms need not be picked
-            part = phi if len(own) == self.library.count else phi[:, own]
-            out[:, axis, begin : begin + len(own)] = part
-            begin += len(own)
-        return out
-
     def information(self, samples: Samples) -> Tensor:
         """Return the mean information of a sample [P, P].
 
