@@ -47,7 +47,7 @@ from residnet.data.prepare import PrepareConfig, prepare, samples
 from residnet.data.windows import WindowBatches, WindowStore
 from residnet.dynamics.compiled import CompiledRollout
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import MANY, FreeRun, Rollout, scripted
+from residnet.dynamics.rollout import MANY, FreeRun, Rollout, trace_rollout
 from residnet.heads.base import ZeroHead
 from residnet.heads.lstm import LstmConfig
 from residnet.physics.signals import SignalsConfig
@@ -110,7 +110,7 @@ def rollouts(repeats: int) -> None:
         with torch.no_grad():
             bound = least(partial(_products, *factors), repeats)
             for how, run in (
-                ("compiled", scripted(Rollout(model), _STEPS)),
+                ("compiled", trace_rollout(Rollout(model), _STEPS)),
                 ("not compiled", Rollout(model)),
             ):
                 memory = model.initial_state(_BATCH)
@@ -123,7 +123,7 @@ def rollouts(repeats: int) -> None:
 
 
 WAYS: dict[str, Way] = {
-    "TorchScript": lambda roll, given: scripted(roll, MANY),
+    "TorchScript": lambda roll, given: trace_rollout(roll, MANY),
     "C": lambda roll, given: CompiledRollout(roll, *(one[:64] for one in given)),
 }
 

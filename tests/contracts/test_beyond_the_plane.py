@@ -38,7 +38,7 @@ from residnet.dynamics.actuated import ActuatedDynamics, PlantActuators
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.jacobian import StepJacobian
-from residnet.dynamics.rollout import Rollout, scripted
+from residnet.dynamics.rollout import Rollout, trace_rollout
 from residnet.dynamics.store import save_model
 from residnet.heads.linear import RidgeConfig
 from residnet.heads.recurrent import RecurrentConfig
@@ -90,7 +90,7 @@ def started(
 @pytest.mark.parametrize(("scheme", "head"), [*zip(get_args(Integrator), 2 * HEADS, strict=True)])
 def test_the_roll_angle_moves_by_the_roll_rate(scheme: Integrator, head: Any) -> None:
     model, x, w, s = started(head, ROLLING, scheme, 60)
-    states = scripted(Rollout(model), 10_000)(x, w, s)[0]
+    states = trace_rollout(Rollout(model), 10_000)(x, w, s)[0]
     alone, after = [x], x
     for k in range(60):
         after, s = model.step(after, w[:, k], s)
@@ -147,7 +147,7 @@ def test_attitude_depth_and_place_follow_the_velocities(scheme: Integrator, head
     deep[:, DEPTH] += 50.0
     with torch.no_grad():
         states, other = (Rollout(model)(start, w, s)[0] for start in (x, deep))
-        compiled = scripted(Rollout(model), 10_000)(x, w, s)[0]
+        compiled = trace_rollout(Rollout(model), 10_000)(x, w, s)[0]
     torch.testing.assert_close(compiled, states, rtol=0, atol=1e-9)
     # what the depth is changes nothing else
     other[..., DEPTH] -= 50.0

@@ -24,7 +24,7 @@ from residnet.core.names import CHANNEL_UNITS
 from residnet.core.registry import kinds
 from residnet.data.readers import ReaderConfig
 from residnet.dynamics.compiled import CompiledRollout
-from residnet.dynamics.rollout import Rollout, scripted
+from residnet.dynamics.rollout import Rollout, trace_rollout
 from residnet.dynamics.store import ModelSpec, load_model, save_model
 from residnet.export import FORMATS, exporter, vessel
 from residnet.export.vessel import ExportedVessel
@@ -370,7 +370,7 @@ def test_a_head_leaves_dead_velocities_at_zero(kind: str) -> None:
     assert not set(signals.live.dead) & {name for part in seen for name in part.names}
     x = torch.zeros(2, 6, dtype=torch.float64)
     w = 20.0 * torch.rand(2, 30, 2, generator=torch.Generator().manual_seed(1)).double()
-    run = Rollout(model.double()) if inner.refusal else scripted(Rollout(model.double()), 10_000)
+    run = trace_rollout(Rollout(model.double()), 10_000)
     nu = run(x, w, model.initial_state(2).double())[0][:, -1, VELOCITIES]
     alive = signals.live.mask() > 0
     assert bool((nu[:, ~alive] == 0.0).all())

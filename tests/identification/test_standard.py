@@ -252,7 +252,6 @@ def test_what_was_predicted_wrong_of_the_past_is_told_and_fades() -> None:
         s = missed.remembered(x, told)
         x = x + 0.1 * torch.cat((torch.zeros(1, 3), force), dim=-1) * (k < 1950)
     torch.testing.assert_close(told / force, torch.full_like(force, math.exp(-4.9 / 5.0)))
-    torch.jit.script(missed)
 
 
 TERMS = ("1", "u", "u|u|", "v", "r", "v|v|", "left", "left|left|")

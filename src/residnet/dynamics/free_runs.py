@@ -1,4 +1,4 @@
-"""How a rollout is run where its numbers are wanted quickly: as compiled C, or by TorchScript."""
+"""How a rollout runs where its numbers are wanted quickly: as C, or with a recorded step."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.progress import say
-from residnet.dynamics.rollout import WORTH_COMPILING, FreeRun, Rollout, runs_in_python, scripted
+from residnet.dynamics.rollout import WORTH_COMPILING, FreeRun, Rollout, runs_in_python, trace_rollout
 
 if TYPE_CHECKING:
     from residnet.dynamics.compiled import CompiledRollout
@@ -41,8 +41,8 @@ _KNOWN: dict[bytes, CompiledRollout | Literal[False]] = {}
 def compiled(rollout: Rollout, steps: int) -> FreeRun:
     """Return the rollout as compiled C where that pays and can be done.
 
-    Rollouts that differ in their numbers alone are compiled once. Elsewhere it is as `scripted` has
-    it.
+    Rollouts that differ in their numbers alone are compiled once. Elsewhere the result is that of
+    `trace_rollout`.
 
     Args:
         rollout: on its device, in its type, in training or in evaluation, as it is run.
@@ -62,13 +62,13 @@ def compiled(rollout: Rollout, steps: int) -> FreeRun:
 def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> FreeRun:
     apart = x0.device.type != "cpu" or rollout.source.counts or not w.numel()
     if steps < WORTH_COMPILING or apart or runs_in_python(rollout):
-        return scripted(rollout, steps)
+        return trace_rollout(rollout, steps)
     out = io.BytesIO()
     try:
         _Structure(out, rollout).dump((rollout, x0.dtype, torch.is_grad_enabled()))
     except Exception:
         # parts of somebody else's that cannot be pickled
-        return scripted(rollout, steps)
+        return trace_rollout(rollout, steps)
     key = hashlib.sha256(out.getvalue()).digest()
     if key not in _KNOWN:
         from residnet.dynamics.c_code import CompilerError
@@ -84,7 +84,7 @@ def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> F
             if isinstance(error, CompilerError):
                 _tell(str(error))
     known = _KNOWN[key]
-    return known.of(rollout) if known else scripted(rollout, steps)
+    return known.of(rollout) if known else trace_rollout(rollout, steps)
 
 
 @cache

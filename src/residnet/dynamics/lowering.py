@@ -409,7 +409,8 @@ def recorded(step: Callable[..., Any], examples: Sequence[Tensor], what: str) ->
         first = str(error).strip().splitlines()
         raise ExportError(
             f"{what}: its step cannot be recorded as a fixed sequence of operations"
-            f" ({first[0] if first else type(error).__name__}); export it as torchscript"
+            f" ({first[0] if first else type(error).__name__}); write it with operations on tensors"
+            " alone, torch.where instead of `if`"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""The only time loop: batched, differentiable, scriptable, compiled where that pays.
+"""The only time loop: batched, differentiable, its step recorded where that pays.
 
 Its inputs come from a `Source`: playback of given inputs, or a manoeuvre that steers by the state
 that it sees. Rows whose source says so stop there: their state is held from that sample on.
@@ -82,18 +82,22 @@ class Rollout(nn.Module):
             states [B, T+1, nx] from x0 on, inputs that acted [B, T, m], and the memory after the
             last step [B, n_state].
         """
+        return self.run(self.model.step, x0, w, s)
+
+    def run(self, step: Step, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Run freely by a step that stands in for the model's; see `forward`."""
         x = x0
         states = [x0]
         if self.source.given:
             for row in w.unbind(1):
-                x, s = self.model.step(x, row, s)
+                x, s = step(x, row, s)
                 states.append(x)
             return torch.stack(states, dim=1), w, s
         memory = self.source.initial(x0)
         applied: list[Tensor] = []
         for k in range(w.shape[1]):
             acting, memory = self.source(x, w[:, k], k, memory)
-            after, s = self.model.step(x, acting, s)
+            after, s = step(x, acting, s)
             if self.source.may_stop:
                 finished = self.source.finished(x, k, memory)
                 after = torch.where(finished.unsqueeze(-1), x, after)
@@ -109,10 +113,12 @@ class Rollout(nn.Module):
         return torch.stack(states, dim=1), inputs, s
 
 
+Step = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+"""A step of a model, from x [B, nx], w [B, m] and s [B, n_state] to the next x and s."""
 FreeRun = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 """A free run as `Rollout` gives it, from x0 [B, nx], w [B, T, m] and s [B, n_state]."""
 WORTH_COMPILING = 200
-"""Steps of a rollout that take about as long as compiling it does, by TorchScript or in C: its own
+"""Steps of a rollout that take about as long as compiling it does, or recording its step: its own
 steps alone count, so that numbers do not hang on what ran before. C takes .2 s once for all models
 of a structure, a step in torch .15 to 1.3 ms.
 """
@@ -123,37 +129,58 @@ MANY = 1_000_000
 def runs_in_python(rollout: Rollout) -> bool:
     """Return whether a part of the model answers in Python alone, such as scikit-learn's.
 
-    TorchScript accepts such a part, and fails only when it runs.
+    A recording would hold its answers to the examples as constants.
     """
     return any(bool(getattr(part, "refusal", "")) for part in rollout.modules())
 
 
-def scripted(rollout: Rollout, steps: int) -> FreeRun:
-    """Return the rollout compiled, or as it is where that does not pay or cannot be done.
+def trace_rollout(rollout: Rollout, steps: int) -> FreeRun:
+    """Return the rollout with its model's step recorded as a TorchScript graph.
 
-    The compiled one shares parameters and buffers with the rollout's model as it is now: it must
-    be made anew where the model is moved to another device or type, or changes between training
-    and evaluation. Gradients are those of the rollout.
+    A recorded step takes half the time of Python's. It shares parameters and buffers with the
+    model as it is now: record anew where the model is moved to another device or type, or changes
+    between training and evaluation. Gradients are those of the rollout.
 
     Args:
         rollout: on its device, in its type, in training or in evaluation.
-        steps: that will be run with it altogether.
+        steps: that will be run with it altogether; the rollout is returned as it is where these are
+            too few to pay for the recording.
     """
     if steps < WORTH_COMPILING or runs_in_python(rollout):
         return rollout
-    with warnings.catch_warnings():
-        # TorchScript still works in torch 2.13 but announces its end
-        warnings.simplefilter("ignore")
-        try:
-            compiled: Any = torch.jit.script(rollout)
-        except Exception:
-            # a head, a source or a vessel of somebody else's that TorchScript cannot express
-            return rollout
+    known: dict[tuple[torch.Size, torch.Size], Step] = {}
+
+    def step(x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        # a recording may hold the number of rows as a constant
+        shapes = (x.shape, w.shape)
+        if shapes not in known:
+            known[shapes] = record_step(rollout.model, x, w, s)
+        return known[shapes](x, w, s)
 
     def run(x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         # torch's own optimisation records the first runs, and may round differently afterwards
         with optimized_execution(False):
-            out: tuple[Tensor, Tensor, Tensor] = compiled(x0, w, s)
-        return out
+            return rollout.run(step, x0, w, s)
 
     return run
+
+
+def record_step(model: Dynamics, x: Tensor, w: Tensor, s: Tensor) -> Step:
+    """Return the step of a model as a TorchScript graph, or as it is where it has none."""
+    from residnet.dynamics.lowering import recorded
+
+    # the trial of a step that draws numbers (dropout) must not shift those of the training
+    with warnings.catch_warnings(), torch.random.fork_rng(devices=[]):
+        # TorchScript still works in torch 2.13 but announces its end
+        warnings.simplefilter("ignore")
+        examples = (x.detach(), w.detach(), s.detach())
+        try:
+            # a trace would take the branch of the examples always
+            recorded(model.step, examples, "a step")
+            with torch.no_grad():
+                graph: Any = torch.jit.trace_module(model, {"step": examples}, check_trace=False)
+        except Exception:
+            # a part of somebody else's that torch cannot record
+            return model.step
+    step: Step = graph.step
+    return step

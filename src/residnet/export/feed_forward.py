@@ -19,7 +19,12 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exported, Exporter, Loaded, released
 from residnet.export.guard import Ranges, widening
-from residnet.export.torchscript import TorchScriptExporter, require_shape, size
+from residnet.export.torchscript import (
+    TorchScriptExporter,
+    require_shape,
+    size,
+    trace_function,
+)
 from residnet.export.vessel import ExportedVessel
 from residnet.heads.force import ForceHead
 from residnet.physics.force_model import MOTION
@@ -126,9 +131,6 @@ class GuardedForce(nn.Module):
 
         `outside` is True where a motion is beyond the training range or no number.
         """
-        rows = size(nu, 2, 0)
-        require_shape("nu_dot", nu_dot, [rows, self.dof])
-        require_shape("nu", nu, [rows, self.dof])
         seen = torch.cat((nu_dot, nu), dim=-1).to(torch.float64)
         low, high, used = self.ranges.low, self.ranges.high, self.ranges.replaced(seen)
         believed, more = self.model.parts(used[:, : self.dof], used[:, self.dof :])
@@ -145,6 +147,29 @@ class GuardedForce(nn.Module):
         most = most + free * (believed.abs() + more.abs())
         force = torch.minimum(torch.maximum(force, -most), most)
         return force, ~self.ranges.inside(seen)
+
+
+@final
+class TracedForce(nn.Module):
+    """The TorchScript file of a feed-forward; see `GuardedForce`.
+
+    Tensors of a wrong shape are refused, never broadcast. TorchScript compiles this class; the
+    feed-forward itself is traced.
+    """
+
+    def __init__(self, force: GuardedForce) -> None:
+        super().__init__()
+        self.dof = force.dof
+        examples = (torch.zeros(2, self.dof).double(), torch.zeros(2, self.dof).double())
+        self.force = trace_function(force, examples, "feed-forward")
+
+    def forward(self, nu_dot: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the force tau [B, 3] in N, N, N m and `outside` [B]."""
+        rows = size(nu, 2, 0)
+        require_shape("nu_dot", nu_dot, [rows, self.dof])
+        require_shape("nu", nu, [rows, self.dof])
+        found: tuple[Tensor, Tensor] = self.force(nu_dot.double(), nu.double())
+        return found
 
 
 def required_force(
@@ -207,10 +232,10 @@ class ExportedForce(Exported):
         self.inner, self.ranges, self.lag = model.eval(), ranges, lag
 
     def module(self, dtype: torch.dtype) -> nn.Module:
-        return GuardedForce(self.inner, self.ranges).eval()
+        return TracedForce(self.graph(dtype)).eval()
 
-    def graph(self, dtype: torch.dtype) -> nn.Module:
-        return self.module(dtype)
+    def graph(self, dtype: torch.dtype) -> GuardedForce:
+        return GuardedForce(self.inner, self.ranges).eval()
 
     def check(
         self, loaded: Loaded, what: str, dtype: torch.dtype, tolerance: float | None = None
@@ -229,7 +254,7 @@ class ExportedForce(Exported):
         motion[190:195, 0] = torch.nan
         parts = motion.split(PLANAR.dof, dim=1)
         with torch.no_grad():
-            tau, outside = self.module(dtype)(*parts)
+            tau, outside = self.graph(dtype)(*parts)
         found = [loaded.step(*(part[k].numpy() for part in parts)) for k in range(len(motion))]
         off = (torch.from_numpy(np.stack([force for force, _ in found])) - tau).abs()
         worst = float((off[:180].amax(0) / (tau[:180].amax(0) - tau[:180].amin(0))).max())

@@ -189,15 +189,27 @@ class GuardedDynamics(Dynamics):
         if y_history.shape[1] == 0:
             return torch.zeros(y_history.shape[0], self.n_state)
         good = self.measured(y_history, w_history)
-        place = torch.arange(good.shape[1]).unsqueeze(0).expand_as(good)
-        last = torch.where(good, place, torch.full_like(place, -1)).cummax(dim=1)[0]
-        first = good.to(torch.long).argmax(dim=1, keepdim=True).expand_as(last)
-        chosen = torch.where(last >= 0, last, first).unsqueeze(-1)
-        y = y_history.gather(1, chosen.expand_as(y_history))
-        w = w_history.gather(1, chosen.expand_as(w_history))
+        y, w = hold_measured(y_history, w_history, good)
         s = self.model.warmup(y, w)
         known = (good.any(dim=1) & torch.isfinite(s).all(dim=-1)).unsqueeze(-1)
         return torch.where(known, s, torch.zeros_like(s))
+
+
+def hold_measured(y: Tensor, w: Tensor, good: Tensor) -> tuple[Tensor, Tensor]:
+    """Replace samples that are no measurements by the last measurement before them.
+
+    Samples before the first measurement are replaced by that one. TorchScript compiles this.
+
+    Args:
+        y: states [B, T, nx], oldest first; T at least 1.
+        w: inputs [B, T, m].
+        good: which samples are measurements [B, T].
+    """
+    index = torch.arange(good.shape[1]).unsqueeze(0).expand_as(good)
+    last = torch.where(good, index, torch.full_like(index, -1)).cummax(dim=1)[0]
+    first = good.to(torch.long).argmax(dim=1, keepdim=True).expand_as(last)
+    chosen = torch.where(last >= 0, last, first).unsqueeze(-1)
+    return y.gather(1, chosen.expand_as(y)), w.gather(1, chosen.expand_as(w))
 
 
 def widening(low: float, high: float) -> float:

@@ -24,7 +24,7 @@ from residnet.core.errors import ExportError
 from residnet.core.version import __version__
 from residnet.dynamics.steering_variation import DEPTH, HEADING
 from residnet.export.base import Exported, Loaded, RoundingError
-from residnet.export.torchscript import require_shape, size
+from residnet.export.torchscript import require_shape, size, trace_function
 
 Safe = Literal["hold", "amidships"]
 """Command while inputs are wrong: the last one, or rudder amidships."""
@@ -80,10 +80,8 @@ class _Controller(nn.Module):
         self.travel = min(policy.rate * policy.dt, 2.0 * policy.limit)
         self.limit, self.dt, self.speed = policy.limit, policy.dt, policy.speed
 
-    @torch.jit.export
     def initial_state(self, y: Tensor) -> Tensor:
         """Return the memory s [B, n] at the first measurement y [B, k], rudder amidships."""
-        require_shape("measured", y, [size(y, 2, 0), self.low.numel()])
         y = y.to(self.low.dtype)
         return self.begun(torch.where(self.good(y), y, torch.zeros_like(y)))
 
@@ -122,7 +120,7 @@ class _Controller(nn.Module):
 class ExportedPolicy(_Controller):
     """A heading policy that a controller calls once per step; SI and radians.
 
-    Tensors of a wrong shape are refused, never broadcast; other precisions are converted.
+    Other precisions are converted.
     """
 
     def __init__(
@@ -139,7 +137,6 @@ class ExportedPolicy(_Controller):
     def begun(self, y: Tensor) -> Tensor:
         return torch.cat((self.policy.initial_state(y), torch.zeros_like(y[:, :1])), dim=-1)
 
-    @torch.jit.export
     def step(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the rudder command [B, 1] in rad, memory [B, n] and fault [B].
 
@@ -148,10 +145,6 @@ class ExportedPolicy(_Controller):
             reference: heading [B, 1] in rad, or depth in m.
             s: memory [B, n].
         """
-        rows = size(y, 2, 0)
-        require_shape("measured", y, [rows, self.low.numel()])
-        require_shape("reference", reference, [rows, 1])
-        require_shape("s", s, [rows, self.memory_low.numel()])
         kind = self.low.dtype
         return self.answer(y.to(kind), reference.to(kind), s.to(kind))
 
@@ -178,8 +171,8 @@ class ExportedCourse(_Controller):
 
     The memory s is that of the guidance (place along the course, and the drift where it is
     estimated), of the policy, and the last command; where it is wrong the course begins anew.
-    `arrived` tells that the course has ended; commands go on along its last leg. Tensors of a wrong
-    shape are refused, never broadcast; other precisions are converted.
+    `arrived` tells that the course has ended; commands go on along its last leg. Other precisions
+    are converted.
     """
 
     def __init__(self, policy: HeadingPolicy, guidance: CourseGuidance, safe: Safe) -> None:
@@ -214,7 +207,6 @@ class ExportedCourse(_Controller):
         parts = (self.guidance.initial_state(y), self.follower.initial_state(y))
         return torch.cat((*parts, torch.zeros_like(y[:, :1])), dim=-1)
 
-    @torch.jit.export
     def step(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the rudder command [B, 1] in rad, memory [B, n], fault [B] and arrived [B].
 
@@ -222,9 +214,6 @@ class ExportedCourse(_Controller):
             measured: y [B, 6], the names of `COURSE`.
             s: memory [B, n].
         """
-        rows = size(y, 2, 0)
-        require_shape("measured", y, [rows, self.low.numel()])
-        require_shape("s", s, [rows, self.memory_low.numel()])
         return self.answer(y.to(torch.float64), s.to(torch.float64))
 
     def answer(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -238,6 +227,71 @@ class ExportedCourse(_Controller):
         new = torch.cat((place, memory), dim=-1)
         command, s, fault = self.settled(wish, new, s, begun, last, good & remembers)
         return command, s, fault, s[:, 0] >= self.guidance.length
+
+    def forward(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return what `step` returns."""
+        return self.step(y, s)
+
+
+class _TracedController(nn.Module):
+    """The part that the TorchScript files of all policies share.
+
+    Tensors of a wrong shape are refused, never broadcast. TorchScript compiles this class and its
+    subclasses. The policy's own code is only traced, so that it may be written in any Python.
+    """
+
+    def __init__(self, inner: ExportedPolicy | ExportedCourse, sizes: Sequence[int]) -> None:
+        super().__init__()
+        self.measured, self.memory = inner.low.numel(), inner.memory_low.numel()
+        # its type is that of all numbers
+        self.low = nn.Buffer(inner.low)
+        # two rows: a batch of one would hide where the rows of a batch are confused
+        examples = tuple(torch.zeros(2, size, dtype=inner.low.dtype) for size in sizes)
+        self.first_memory = trace_function(inner.initial_state, examples[:1], "policy")
+        self.answer = trace_function(inner.answer, examples, "policy")
+
+    @torch.jit.export
+    def initial_state(self, y: Tensor) -> Tensor:
+        """Return the memory s [B, n] at the first measurement y [B, k], rudder amidships."""
+        require_shape("measured", y, [size(y, 2, 0), self.measured])
+        s: Tensor = self.first_memory(y.to(self.low.dtype))
+        return s
+
+
+@final
+class TracedPolicy(_TracedController):
+    """The TorchScript file of a heading policy; see `ExportedPolicy`."""
+
+    @torch.jit.export
+    def step(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the rudder command [B, 1] in rad, memory [B, n] and fault [B]."""
+        rows = size(y, 2, 0)
+        require_shape("measured", y, [rows, self.measured])
+        require_shape("reference", reference, [rows, 1])
+        require_shape("s", s, [rows, self.memory])
+        dtype = self.low.dtype
+        found: tuple[Tensor, Tensor, Tensor]
+        found = self.answer(y.to(dtype), reference.to(dtype), s.to(dtype))
+        return found
+
+    def forward(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what `step` returns."""
+        return self.step(y, reference, s)
+
+
+@final
+class TracedCourse(_TracedController):
+    """The TorchScript file of a policy along a course; see `ExportedCourse`."""
+
+    @torch.jit.export
+    def step(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the rudder command [B, 1] in rad, memory [B, n], fault [B] and arrived [B]."""
+        rows = size(y, 2, 0)
+        require_shape("measured", y, [rows, self.measured])
+        require_shape("s", s, [rows, self.memory])
+        found: tuple[Tensor, Tensor, Tensor, Tensor]
+        found = self.answer(y.to(self.low.dtype), s.to(self.low.dtype))
+        return found
 
     def forward(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return what `step` returns."""
@@ -326,7 +380,9 @@ class ExportedController(Exported):
         """Return what the card says of this kind of policy."""
 
     def module(self, dtype: torch.dtype) -> nn.Module:
-        return self.controller(dtype)
+        inner, sizes = self.controller(dtype), [count for _, count in self.arguments]
+        traced = TracedCourse if isinstance(inner, ExportedCourse) else TracedPolicy
+        return traced(inner, sizes).eval()
 
     def graph(self, dtype: torch.dtype) -> nn.Module:
         return _Answer(self.controller(dtype)).eval()

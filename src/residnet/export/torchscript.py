@@ -10,7 +10,7 @@ import io
 import json
 import tempfile
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, final
 
@@ -18,9 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.jit._fuser import optimized_execution
+from torch.jit._trace import TracerWarning
 
 from residnet.core.errors import ExportError
 from residnet.core.files import whole
+from residnet.dynamics.lowering import recorded
 from residnet.export.base import (
     Exported,
     Exporter,
@@ -76,6 +78,43 @@ def require_shape(name: str, tensor: Tensor, shape: list[int]) -> None:
     """
     if list(tensor.shape) != shape:
         raise ValueError(f"{name} has the shape {tensor.shape}, expected {shape}")
+
+
+def trace_function(function: Callable[..., Any], examples: tuple[Tensor, ...], what: str) -> Any:
+    """Record a function of batches as a TorchScript function.
+
+    Numbers that the function reads elsewhere become constants.
+
+    Args:
+        function: of the tensors `examples`, without decisions by values.
+        examples: batches [B, size] of at least two rows.
+        what: is exported, for messages.
+
+    Raises:
+        ExportError: where Python decides by values, or another number of rows is answered wrongly.
+    """
+    other_batches = [
+        tuple(part[:1] for part in examples),
+        tuple(torch.cat((part, part[:1])) for part in examples),
+    ]
+    # a trace would take the branch of the examples always
+    recorded(function, examples, what)
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", category=DeprecationWarning)
+        # sizes that become constants are found by the other batches
+        warnings.filterwarnings("ignore", category=TracerWarning)
+        try:
+            # a function of its own: torch refuses methods of modules
+            graph: Any = torch.jit.trace(lambda *x: function(*x), examples, check_trace=False)
+            for batch in other_batches:
+                torch.testing.assert_close(graph(*batch), function(*batch), equal_nan=True)
+        except Exception as error:  # torch raises whatever it likes
+            line = (str(error).strip() or type(error).__name__).splitlines()[0]
+            raise ExportError(
+                f"{what}: its step cannot be traced for any number of rows ({line}); take sizes"
+                " from `x.shape`, and write it with operations on tensors alone"
+            ) from None
+    return graph
 
 
 class ScriptedModel(Loaded):

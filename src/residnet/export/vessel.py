@@ -20,12 +20,12 @@ from residnet.core.layout import SURGE
 from residnet.core.progress import say
 from residnet.core.version import __version__
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout, scripted
+from residnet.dynamics.rollout import Rollout, trace_rollout
 from residnet.dynamics.store import ModelSpec
 from residnet.export import base
 from residnet.export.base import Exported, Loaded, Numbers, RoundingError
-from residnet.export.guard import GuardedDynamics
-from residnet.export.torchscript import require_shape, size
+from residnet.export.guard import GuardedDynamics, hold_measured
+from residnet.export.torchscript import require_shape, size, trace_function
 from residnet.heads.base import ResidualHead
 
 PARITY_STEPS = 2000
@@ -58,15 +58,25 @@ class ExportedModel(nn.Module):
 
     Bad inputs and memories are treated as `residnet.export.base` says: a flag and a finite answer.
     Tensors of a wrong shape are refused, never broadcast; other precisions are converted.
+
+    TorchScript compiles this class. The model's own code is only traced, so that heads and
+    baselines may be written in any Python.
     """
 
     def __init__(self, model: HybridDynamics, spec: ModelSpec) -> None:
         super().__init__()
-        self.guarded = GuardedDynamics(model, spec)
-        self.simulate = Rollout(self.guarded)
+        model = copy.deepcopy(model).requires_grad_(False)
+        guard = GuardedDynamics(model, spec)
         self.inputs = len(spec.signals.columns)
         self.states = len(spec.signals.live.states)
         self.n_state = model.n_state
+        # two rows: a batch of one would hide where the rows of a batch are confused
+        sizes = (self.states, self.inputs, self.n_state)
+        examples = tuple(torch.zeros(2, size) for size in sizes)
+        what = f"model {spec.name}"
+        self.guarded_step = trace_function(guard.flagged_step, examples, what)
+        self.next_memory = trace_function(lambda x, w, s: model.step(x, w, s)[1], examples, what)
+        self.ranges, self.of_state = guard.ranges, guard.of_state
         known = spec.band
         steps, widths = (
             torch.ones(1),
@@ -97,7 +107,7 @@ class ExportedModel(nn.Module):
     @torch.jit.export
     def initial_state(self, batch: int) -> Tensor:
         """Return the memory s [batch, n_state] without a past."""
-        return self.guarded.initial_state(batch)
+        return torch.zeros(batch, self.n_state)
 
     @torch.jit.export
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
@@ -112,8 +122,16 @@ class ExportedModel(nn.Module):
         rows, steps = size(y_history, 3, 0), size(y_history, 3, 1)
         require_shape("y_history", y_history, [rows, steps, self.states])
         require_shape("w_history", w_history, [rows, steps, self.inputs])
-        s: Tensor = self.guarded.warmup(y_history.float(), w_history.float())
-        return s
+        s = torch.zeros(rows, self.n_state)
+        if steps == 0 or self.n_state == 0:
+            return s
+        y, w = y_history.float(), w_history.float()
+        good = self.ranges.accepted(torch.cat((y, w), dim=-1))
+        y, w = hold_measured(y, w, good)
+        for k in range(steps):
+            s = self.next_memory(y[:, k], w[:, k], s)
+        known = (good.any(dim=1) & torch.isfinite(s).all(dim=-1)).unsqueeze(-1)
+        return torch.where(known, s, torch.zeros_like(s))
 
     @torch.jit.export
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -126,7 +144,8 @@ class ExportedModel(nn.Module):
         require_shape("x", x, [rows, self.states])
         require_shape("w", w, [rows, self.inputs])
         require_shape("s", s, [rows, self.n_state])
-        return self.guarded.flagged_step(x.float(), w.float(), s.float())
+        found: tuple[Tensor, Tensor, Tensor] = self.guarded_step(x.float(), w.float(), s.float())
+        return found
 
     @torch.jit.export
     def rollout(self, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -139,14 +158,14 @@ class ExportedModel(nn.Module):
         require_shape("x0", x0, [rows, self.states])
         require_shape("w", w, [rows, steps, self.inputs])
         require_shape("s", s, [rows, self.n_state])
-        x0 = x0.float()
-        start = torch.cat((self.guarded.of_state.replaced(x0), torch.zeros_like(x0[:, :1])), dim=-1)
+        x, w, s = x0.float(), w.float(), s.float()
+        states, flags = [self.of_state.replaced(x)], [torch.zeros(rows, 0, dtype=torch.bool)]
         # the first step sees x0 as it was given, for its flag
-        states, _, s = self.simulate(
-            torch.cat((x0, torch.zeros_like(x0[:, :1])), dim=-1), w.float(), s.float()
-        )
-        states = torch.cat((start.unsqueeze(1), states[:, 1:]), dim=1)
-        return states[..., : self.states], s, states[:, 1:, self.states] > 0
+        for k in range(steps):
+            x, s, outside = self.guarded_step(x, w[:, k], s)
+            states.append(x)
+            flags.append(outside.unsqueeze(1))
+        return torch.stack(states, dim=1), s, torch.cat(flags, dim=1)
 
     def forward(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return what `step` returns."""
@@ -416,7 +435,7 @@ class ExportedVessel(Exported):
         x0 = torch.cat((torch.zeros(_TRACKS, 3), seen[:, 0, :n], torch.zeros(_TRACKS, 1)), dim=1)
         x0, s0 = x0.to(dtype), guard.initial_state(_TRACKS).to(dtype)
         with torch.no_grad():
-            wanted = scripted(Rollout(guard), PARITY_STEPS)(x0, w, s0)[0]
+            wanted = trace_rollout(Rollout(guard), PARITY_STEPS)(x0, w, s0)[0]
         states = wanted[..., : len(self.states)].numpy()
         x, s = x0[:, : len(self.states)].numpy(), s0.numpy()
         path = [x]

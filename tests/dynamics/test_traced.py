@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from residnet.dynamics import free_runs
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.rollout import MANY, Rollout, Source, scripted
+from residnet.dynamics.rollout import MANY, Rollout, trace_rollout
 
 DT = 0.1
 
@@ -50,11 +50,14 @@ class Forgetful(Dynamics):
 
 
 @final
-class Printed(Source):
-    """A source that TorchScript cannot express."""
+class Undecided(Dynamics):
+    """A pendulum that decides in Python by its angle, which no recording holds."""
 
-    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        return dict.fromkeys(sorted(["w"], key=lambda name: -len(name)), w)["w"], memory
+    def __init__(self) -> None:
+        super().__init__(DT, "euler")
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        return (x + DT * w if bool((x[:, 0] > 0.0).all()) else x - DT * w), s
 
 
 def case() -> tuple[Tensor, Tensor, Tensor]:
@@ -65,7 +68,7 @@ def case() -> tuple[Tensor, Tensor, Tensor]:
 
 def test_numbers_and_gradients_are_the_same_after_a_step_of_the_optimiser_too() -> None:
     rollout = Rollout(Pendulum())
-    run = scripted(rollout, 300)
+    run = trace_rollout(rollout, 300)
     assert run is not rollout
     damping: Any = rollout.model.damping
     before = run(*case())[0]
@@ -106,8 +109,14 @@ def test_what_is_drawn_does_not_hang_on_what_ran_before(monkeypatch: pytest.Monk
     assert torch.equal(*found)
 
 
-def test_what_cannot_be_compiled_or_is_short_runs_as_it_is() -> None:
-    odd = Rollout(Pendulum(), Printed())
-    assert scripted(odd, MANY) is odd
+def test_a_step_that_cannot_be_recorded_runs_as_it_is() -> None:
+    x0, w, s = torch.ones(1, 2), torch.ones(1, 300, 1), torch.zeros(1, 0)
+    for sign in (1.0, -1.0):
+        undecided = Rollout(Undecided())
+        expected = undecided(sign * x0, w, s)[0]
+        assert torch.equal(trace_rollout(undecided, MANY)(sign * x0, w, s)[0], expected)
+
+
+def test_a_short_rollout_is_not_recorded() -> None:
     short = Rollout(Pendulum())
-    assert scripted(short, 10) is short
+    assert trace_rollout(short, 10) is short
