@@ -12,7 +12,13 @@ import torch
 from torch import Tensor
 
 from residnet.core.progress import say
-from residnet.dynamics.rollout import WORTH_COMPILING, FreeRun, Rollout, runs_in_python, trace_rollout
+from residnet.dynamics.rollout import (
+    WORTH_COMPILING,
+    FreeRun,
+    Rollout,
+    runs_in_python,
+    trace_rollout,
+)
 
 if TYPE_CHECKING:
     from residnet.dynamics.compiled import CompiledRollout
