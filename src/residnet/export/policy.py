@@ -270,9 +270,9 @@ class TracedPolicy(_TracedController):
         require_shape("reference", reference, [rows, 1])
         require_shape("s", s, [rows, self.memory])
         dtype = self.low.dtype
-        found: tuple[Tensor, Tensor, Tensor]
-        found = self.answer(y.to(dtype), reference.to(dtype), s.to(dtype))
-        return found
+        y, reference, s = y.to(dtype), reference.to(dtype), s.to(dtype)
+        answer: tuple[Tensor, Tensor, Tensor] = self.answer(y, reference, s)
+        return answer
 
     def forward(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return what `step` returns."""
@@ -289,9 +289,9 @@ class TracedCourse(_TracedController):
         rows = size(y, 2, 0)
         require_shape("measured", y, [rows, self.measured])
         require_shape("s", s, [rows, self.memory])
-        found: tuple[Tensor, Tensor, Tensor, Tensor]
-        found = self.answer(y.to(self.low.dtype), s.to(self.low.dtype))
-        return found
+        y, s = y.to(self.low.dtype), s.to(self.low.dtype)
+        answer: tuple[Tensor, Tensor, Tensor, Tensor] = self.answer(y, s)
+        return answer
 
     def forward(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return what `step` returns."""
