@@ -620,7 +620,10 @@ def export(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="FILE", help="File to write; RUN/exports/<model>.pt where not given."
+            "--out",
+            metavar="FILE",
+            help="File to write; RUN/exports/<model>.pt where not given, and RUN/exports/<run>.c"
+            " for C, whose names begin with the file's.",
         ),
     ] = None,
     anyway: Annotated[

@@ -59,7 +59,7 @@ def exported(variant: str) -> ExportedVessel:
 
 def compiled(file: Path, made: ExportedVessel) -> Loaded:
     library = compile_shared([file], file.with_suffix(".so"))
-    return CompiledModel(library, made, torch.float32)
+    return CompiledModel(library, made, torch.float32, file.stem)
 
 
 LOADED: dict[str, Callable[[Path, ExportedVessel], Loaded]] = {
@@ -214,7 +214,7 @@ def test_casadi_has_exact_derivatives(tmp_path: Path) -> None:
 def test_c_compiles_without_warnings_and_keeps_nothing(tmp_path: Path) -> None:
     made = exported("lstm")
     size = exporter("c").export(made, tmp_path / "boat.c")["size"]
-    assert 0 < size["stack_bytes"]["mine_step"] < size["code_bytes"]
+    assert 0 < size["stack_bytes"]["boat_step"] < size["code_bytes"]
     text = (tmp_path / "boat.c").read_text()
     assert "malloc" not in text
     kept = [line for line in text.splitlines() if line.startswith("static") and "(" not in line]
@@ -222,8 +222,8 @@ def test_c_compiles_without_warnings_and_keeps_nothing(tmp_path: Path) -> None:
     (tmp_path / "main.c").write_text(
         '#include "boat.h"\n#include <stdio.h>\n'
         "int main(void) { float x[6] = {0, 0, 0, 1, 0, 0}, w[4] = {9, 9, 3, 1},"
-        " s[MINE_MEMORY + 1]; int outside;\n"
-        "mine_initial_state(s); outside = mine_step(x, w, s, x, s);"
+        " s[BOAT_MEMORY + 1]; int outside;\n"
+        "boat_initial_state(s); outside = boat_step(x, w, s, x, s);"
         ' printf("%d %.9g", outside, x[3]); return 0; }\n'
     )
     model = made.at(torch.float32)
@@ -262,7 +262,9 @@ def test_what_single_precision_does_not_determine_is_written_in_double(
     loaded = (
         OnnxModel(file, made)
         if name == "onnx"
-        else CompiledModel(compile_shared([file], tmp_path / "boat.so"), made, torch.float64)
+        else CompiledModel(
+            compile_shared([file], tmp_path / "boat.so"), made, torch.float64, file.stem
+        )
     )
     assert max(made.require_parity(loaded, "the file", torch.float64, 1e-7).values()) < 1e-7
 
@@ -416,10 +418,10 @@ def test_half_widths_are_those_of_the_table_in_torchscript_and_in_c(
     card = exporter("torchscript").export(exported, tmp_path / "model.pt")
     loaded = torch.jit.load(str(tmp_path / "model.pt"))
     exporter("c").export(exported, file)
-    library = ctypes.CDLL(str(compile_shared([file], tmp_path / "boat.so", ["-DEXAMPLE_DOUBLE"])))
+    library = ctypes.CDLL(str(compile_shared([file], tmp_path / "boat.so", ["-DBOAT_DOUBLE"])))
     half = np.zeros(len(signals.live.layout.banded))
     for k in (-3, 0, 1, 7, 10, 20, 29, 30, 60):
-        library.example_band(k, half.ctypes.data_as(ctypes.c_void_p))
+        library.boat_band(k, half.ctypes.data_as(ctypes.c_void_p))
         assert half.tolist() == pytest.approx(loaded.band(k).tolist(), rel=1e-6)
     assert loaded.band(0).tolist() == [0.0] * len(half)
     if table is None:

@@ -151,10 +151,10 @@ def test_a_policy_flies_the_course_and_is_exported(
     # a policy that learned nothing in one epoch costs what the law does that it began with
     assert command("export", "run/autopilot", "--format", "c").code == 0
     assert command("export", "run", "--model", "learned_sides", "--format", "c").code == 0
-    card = read_json(Path("run/exports/learned_sides.card.json"))
+    card = read_json(Path("run/exports/run_learned_sides.card.json"))
     assert (card["format"], card["dtype"]) == ("c", "float64")
     assert command("export", "run", "--model", "learned", "--format", "c").code == 2
-    assert Path("run/autopilot/exports/learned.c").is_file()
+    assert Path("run/autopilot/exports/autopilot.c").is_file()
 
 
 def test_vessels_and_currents_fill_their_ranges_and_come_again_with_their_seed() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -20,6 +21,7 @@ from tiny import TINY, Command, read_json, write_yaml
 from residnet.core.config import validate
 from residnet.data.simulated import SimulatedTrials
 from residnet.dynamics.store import load_model
+from residnet.judge.verdict import LEVELS
 
 ALONE: dict[str, Any] = {**TINY, "ensembles": {}, "training": {}, "export": {"models": []}}
 
@@ -42,6 +44,27 @@ def test_the_folder_holds_models_as_plain_numbers_and_what_was_found(tiny_run: P
     assert models == {"zero", "baseline", "ridge", "lstm", "mean"}
     kinds = {path.suffix for path in (tiny_run / "models").rglob("*") if path.is_file()}
     assert kinds == {".json", ".safetensors"}
+
+
+def test_the_card_of_an_export_holds_what_the_run_says(tiny_run: Path) -> None:
+    extra = {"card.json": ""}
+    torch.jit.load(str(tiny_run / "exports" / "lstm.pt"), _extra_files=extra)
+    card, doctor = json.loads(extra["card.json"]), read_json(tiny_run / "doctor.json")
+    summary = read_json(tiny_run / "summary.json")
+    assert card["level"] in LEVELS
+    assert all(sentence.strip() for sentence in card["verdict"])
+    assert card["verdict"]
+    if summary["level"] == card["level"]:
+        assert set(card["verdict"]) & set(summary["verdict"])
+    said = [row for log in doctor["logs"] for row in log["findings"]] + doctor["together"]
+    codes = [row["code"] for row in said if row["level"] != "note"]
+    assert [row["code"] for row in card["findings"]] == codes
+    quality = read_json(tiny_run / "data_quality.json")
+    logs = [name for names in card["split"].values() for name in names]
+    assert sorted(logs) == sorted(row["log"] for row in quality)
+    trained = [row["log"] for row in quality if row["split"] == "train"]
+    assert card["split"]["identification"] == trained
+    assert trained
 
 
 def test_an_ensemble_averages_accelerations(tiny_run: Path) -> None:

@@ -23,6 +23,7 @@ no number: its first answer is the safe command, with the flag.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -36,6 +37,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from torch import nn
 
 from residnet.core.errors import ExportError, WithheldError
+from residnet.core.version import __version__
+from residnet.judge.assessment import Assessment
 
 Numbers = npt.NDArray[Any]
 SINGLE, DOUBLE = 1e-5, 1e-12
@@ -91,6 +94,8 @@ class Exported(ABC):
         precisions: that are tried, one after the other.
         methods: of `module`, beside `forward`.
         objections: sentences on what speaks against its use, for the card; see `released`.
+        assessment: what its run says of it and of its logs, for the card; None where it is exported
+            without a run folder.
     """
 
     name: str
@@ -102,6 +107,7 @@ class Exported(ABC):
     precisions: Sequence[torch.dtype] = (torch.float32, torch.float64)
     methods: Sequence[str] = ()
     objections: Sequence[str] = ()
+    assessment: Assessment | None = None
 
     def require_numbers(self) -> None:  # noqa: B027 (policies are built from finite numbers)
         """Refuse what holds numbers that are not finite.
@@ -128,7 +134,44 @@ class Exported(ABC):
     @final
     def card(self) -> dict[str, Any]:
         """Return the card, without format, precision and parity."""
-        return {**self.contents(), "objections": list(self.objections)}
+        return {**self.contents(), **self.provenance()}
+
+    @final
+    def provenance(self) -> dict[str, Any]:
+        """Return what the card of every format says: build, objections and assessment."""
+        assessment = Assessment() if self.assessment is None else self.assessment
+        return {
+            "build": self.build(),
+            "objections": list(self.objections),
+            **assessment.content(),
+        }
+
+    @final
+    def build(self) -> dict[str, str]:
+        """Return the build identity: the same model under the same version has the same one.
+
+        `model_sha256` covers all parameters, buffers and settings, and neither the time of the
+        export nor the errors that were measured on logs.
+        """
+        digest = hashlib.sha256()
+        settings = {
+            key: value
+            for key, value in self.contents().items()
+            if key not in ("exported", "metrics", "versions")
+        }
+        digest.update(json.dumps(settings, sort_keys=True, default=str).encode())
+        # a module of TorchScript may be a trace, whose numbers have no names
+        module = self.graph(self.precisions[-1])
+        numbers = {**dict(module.named_parameters()), **dict(module.named_buffers())}
+        for name, value in sorted(numbers.items()):
+            digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+            digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+        model = digest.hexdigest()
+        return {
+            "identity": f"{__version__}+{model[:16]}",
+            "residnet": __version__,
+            "model_sha256": model,
+        }
 
     @abstractmethod
     def check(
@@ -155,11 +198,14 @@ class Exporter(ABC):
         name: what `residnet export --format` knows it by.
         suffix: what follows the model's name in the file's name, for example `.pt`.
         about: one line for `residnet list formats`.
+        default_name_from_run: whether a file that is not named takes the name of its run, because
+            the file's name becomes part of symbols that must be unique in a program.
     """
 
     name: ClassVar[str]
     suffix: ClassVar[str]
     about: ClassVar[str]
+    default_name_from_run: ClassVar[bool] = False
 
     @abstractmethod
     def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:

@@ -24,6 +24,7 @@ import numpy as np
 import torch
 
 from residnet.core.errors import ExportError, UsageError
+from residnet.core.progress import say
 from residnet.dynamics.c_code import Body, Tables, compiler, literal
 from residnet.dynamics.lowering import in_numbers, lowered
 from residnet.dynamics.store import BandTable
@@ -61,6 +62,32 @@ def identifier(text: str) -> str:
     """Return a name as an identifier of C."""
     plain = re.sub(r"\W", "_", text.lower(), flags=re.ASCII)
     return plain if re.match(r"[a-z]", plain) else f"m_{plain}"
+
+
+_C_HEADERS: Final = frozenset(
+    {
+        *("assert", "complex", "ctype", "errno", "fenv", "float", "inttypes", "iso646", "limits"),
+        *("locale", "math", "setjmp", "signal", "stdarg", "stdbool", "stddef", "stdint", "stdio"),
+        *("stdlib", "string", "tgmath", "time", "wchar", "wctype", "simstruc"),
+    }
+)
+"""Headers without `.h` that an exported header must not hide from `#include <...>`."""
+
+
+def file_prefix(file: Path) -> str:
+    """Return what all names of a C file begin with: the file's name as an identifier.
+
+    Two exports with different file names can then be linked into one program.
+
+    Raises:
+        UsageError: where the header would hide one of the C library.
+    """
+    if file.stem.lower() in _C_HEADERS:
+        raise UsageError(
+            f"{file.name}: its header {file.stem}.h would hide that of the C library; give another"
+            " file name with --out"
+        )
+    return identifier(file.stem)
 
 
 @dataclass(frozen=True)
@@ -124,6 +151,7 @@ def c_files(
     header: str,
     *,
     double_only: bool = False,
+    build: str = "",
 ) -> tuple[str, str]:
     """Return the source and the header of functions.
 
@@ -134,11 +162,18 @@ def c_files(
         sizes: value and comment of each constant, by name without prefix.
         about: comment at the top of the header, which tells how to use it.
         double_only: whether single precision is not offered.
+        build: identity of what is exported, which ends in hexadecimal digits; empty for none.
     """
     tables = Tables(f"{prefix}_")
     bodies = [function.definition(prefix, tables) for function in functions]
     bodies += [f"{prototype} {{\n{body}}}\n" for _, prototype, body in extra]
-    names = {"prefix": prefix, "macro": f"{prefix.upper()}_DOUBLE"}
+    names = {
+        "prefix": prefix,
+        "macro": f"{prefix.upper()}_DOUBLE",
+        "build": build,
+        # a preprocessor compares integers of 32 bits on every platform, and no strings
+        "build_number": f"0x{build.rpartition('+')[2][:8]}UL",
+    }
     words = set(re.findall(r"\w+", "\n".join(bodies)))
     used = [text for name, text in tables.lines.items() if name in words]
     source = filled("c_source.c", header=header, body="\n".join((*used, *bodies)), **names)
@@ -185,28 +220,117 @@ def compile_shared(
     return out
 
 
-def footprint(source: Path) -> dict[str, Any]:
-    """Return what a C file takes on this machine, built for size, by the compiler's own account.
+STACK_LIMIT: Final = 4096
+"""Bytes of stack above which an export warns: a usual task of a real-time system has no more."""
+CODE_LIMIT: Final = 262_144
+"""Bytes of code and constants above which an export warns: the flash of a small controller."""
 
-    That is the bytes of each function's stack, without those of the C library that it calls, and of
-    code and constants. What the tools here do not tell is left out: a compiler without
-    `-fstack-usage`, or no `size`.
+
+def footprint(source: Path) -> dict[str, Any]:
+    """Return the stack and the size of a C file on this machine, built for size.
+
+    Stack is measured by `-fstack-usage`, size by `size`. What the tools here do not measure is
+    estimated from the source: arrays in memory, four bytes for each operation and constant.
+
+    Returns:
+        `machine`; `stack_bytes` of each function without those that it calls; `largest_stack_bytes`
+        of a call with the functions of the file that it calls, those of the C library aside;
+        `code_bytes` of code and constants; `stack_from` and `code_from`, the tool or "estimate".
     """
+    text = source.read_text()
+    bodies = function_bodies(text)
+    stack = {name: estimated_stack(body) for name, body in bodies.items()}
+    code = estimated_code(text)
+    stack_from = code_from = "estimate"
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "made.o"
-        call = [compiler(), "-std=c99", "-Os", "-fstack-usage", "-c", str(source)]
-        if subprocess.run([*call, "-o", str(made)], capture_output=True).returncode:
-            return {}
-        out: dict[str, Any] = {"machine": f"{platform.machine()}, -Os"}
+        try:
+            tool = compiler()
+        except ExportError:
+            tool = ""
+        call = [tool, "-std=c99", "-Os", "-c", str(source), "-o", str(made)]
+        # a compiler that does not know the flag may still tell the size
+        for flags in (["-fstack-usage"], []) if tool else ():
+            if subprocess.run([*call, *flags], capture_output=True).returncode == 0:
+                break
         usage = made.with_suffix(".su")
         if usage.is_file():
             rows = (line.split("\t") for line in usage.read_text().splitlines())
-            out["stack_bytes"] = {name.rsplit(":", 1)[-1]: int(size) for name, size, *_ in rows}
-        if (tool := shutil.which("size")) is not None:
-            told = subprocess.run([tool, str(made)], capture_output=True, text=True).stdout
+            stack = {name.rsplit(":", 1)[-1]: int(size) for name, size, *_ in rows}
+            stack_from = f"{Path(tool).name} -Os -fstack-usage"
+        if made.is_file() and (program := shutil.which("size")) is not None:
+            lines = subprocess.run([program, str(made)], capture_output=True, text=True).stdout
             # the first column of Berkeley's format holds code and constants
-            out["code_bytes"] = int(told.splitlines()[1].split()[0])
-        return out
+            code = int(lines.splitlines()[1].split()[0])
+            code_from = f"{Path(tool).name} -Os, size"
+    return {
+        "machine": f"{platform.machine()}, -Os",
+        "stack_bytes": stack,
+        "largest_stack_bytes": deepest_stack(stack, bodies),
+        "stack_from": stack_from,
+        "code_bytes": code,
+        "code_from": code_from,
+    }
+
+
+_SPILLED: Final = 32
+"""Single numbers of a function that an estimate puts on the stack; registers hold the others."""
+
+
+def function_bodies(text: str) -> dict[str, str]:
+    """Return the body of each function of a written C file by its name."""
+    found = re.finditer(r"^(?!#)[\w ]+ \*?(\w+)\([^;{]*\) \{\n(.*?)^\}$", text, re.M | re.S)
+    return {match[1]: match[2] for match in found}
+
+
+def estimated_stack(body: str) -> int:
+    """Return an estimate of the bytes of stack that the body of a function takes."""
+    locals_ = re.findall(r"^\s*(?:const )?(?:REAL|int|size_t|\w+_real) ([^=;(]+)", body, re.M)
+    names = [name for declared in locals_ for name in declared.split(",")]
+    arrays = [re.findall(r"\[(\d+)\]", name) for name in names]
+    sizes = [math.prod(map(int, size)) for size in arrays if size]
+    # a compiler holds few single numbers in memory at a time, however many there are in the source
+    single = min(len(names) - len(sizes), _SPILLED)
+    # 64 bytes for the return address and saved registers
+    return 64 + 8 * (sum(sizes) + single)
+
+
+def estimated_code(text: str) -> int:
+    """Return an estimate of the bytes of code and constants of a C file."""
+    return 4 * len(re.findall(r"[-+*/=<>(]|\b\d[\w.]*", text))
+
+
+def deepest_stack(stack: Mapping[str, int], bodies: Mapping[str, str]) -> int:
+    """Return the most bytes of stack of a call with all calls within the file that it makes."""
+
+    def depth(name: str) -> int:
+        called = set(re.findall(r"\b(\w+)\(", bodies.get(name, ""))) & (stack.keys() - {name})
+        return stack[name] + max(map(depth, called), default=0)
+
+    return max(map(depth, stack), default=0)
+
+
+def report_footprint(what: str, size: Mapping[str, Any]) -> list[str]:
+    """Report stack and size to the user before a file is written; return the warnings."""
+    stack, code = size["largest_stack_bytes"], size["code_bytes"]
+    say(
+        f"  {what}: {stack:,} bytes of stack ({size['stack_from']}), {code:,} bytes of code and"
+        f" constants ({size['code_from']}) on {size['machine']}"
+    )
+    warnings = []
+    if stack > STACK_LIMIT:
+        warnings.append(
+            f"{stack:,} bytes of stack exceed {STACK_LIMIT:,}, the stack of a usual real-time task;"
+            " enlarge the task's stack or export a smaller model"
+        )
+    if code > CODE_LIMIT:
+        warnings.append(
+            f"{code:,} bytes of code and constants exceed {CODE_LIMIT:,}, the flash of a small"
+            " controller; export a smaller model"
+        )
+    for warning in warnings:
+        say(f"  warning: {warning}")
+    return warnings
 
 
 _STEP = {
@@ -234,18 +358,24 @@ class CSource(NamedTuple):
 
 
 def c_source(
-    exported: Exported, card: Mapping[str, Any], header: str, *, double_only: bool = False
+    exported: Exported,
+    card: Mapping[str, Any],
+    header: str,
+    prefix: str,
+    *,
+    double_only: bool = False,
 ) -> CSource:
     """Return source and header.
 
     Args:
         card: stands as a comment in the header.
+        header: name of the header.
+        prefix: of all names, see `file_prefix`.
         double_only: whether single precision is not offered.
 
     Raises:
         ExportError: where there is an operation that is not written in C.
     """
-    prefix = identifier(exported.name)
     what = exported.what
     functions: list[CFunction] = []
     extra: list[tuple[str, str, str]] = []
@@ -285,7 +415,10 @@ def c_source(
     if exported.dt is not None:
         sizes["DT"] = (repr(float(exported.dt)), "step in s")
     about = f"{exported.name}: {told}\n\n{json.dumps(card, indent=1)}"
-    files = c_files(prefix, functions, extra, sizes, about, header, double_only=double_only)
+    build = card["build"]["identity"]
+    files = c_files(
+        prefix, functions, extra, sizes, about, header, double_only=double_only, build=build
+    )
     return CSource(prefix, *files)
 
 
@@ -323,11 +456,13 @@ def _vessel_functions(prefix: str, exported: ExportedVessel) -> list[tuple[str, 
 
 
 class CompiledModel(Loaded):
-    """An exported C file as a library."""
+    """An exported C file as a library; `prefix` is that of its names."""
 
-    def __init__(self, library: Path, exported: Exported, dtype: torch.dtype) -> None:
+    def __init__(
+        self, library: Path, exported: Exported, dtype: torch.dtype, prefix: str
+    ) -> None:
         self.real: Any = np.float64 if dtype == torch.float64 else np.float32
-        self.exported, self.prefix = exported, identifier(exported.name)
+        self.exported, self.prefix = exported, prefix
         self.library = ctypes.CDLL(str(library))
         self.outputs = self._sizes()
 
@@ -382,6 +517,7 @@ class CExporter(Exporter):
     name: ClassVar[str] = "c"
     suffix: ClassVar[str] = ".c"
     about: ClassVar[str] = "The model as one C99 file and header, without any runtime."
+    default_name_from_run: ClassVar[bool] = True
 
     def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
         """Write source, header and card, checked in single and in double precision.
@@ -391,6 +527,7 @@ class CExporter(Exporter):
         exported.require_numbers()
         # a header that is asked for names the pair
         file = file.with_suffix(self.suffix) if file.suffix == ".h" else file
+        prefix = file_prefix(file)
         card = exported.card() | {
             "format": "c",
             "dtype": "float32; float64 with the macro _DOUBLE",
@@ -403,7 +540,7 @@ class CExporter(Exporter):
                 double_only = dtype == torch.float64
                 told = card | {"dtype": name_of(dtype)} if double_only else card
                 header = partial.with_suffix(".h")
-                written = c_source(exported, told, header.name, double_only=double_only)
+                written = c_source(exported, told, header.name, prefix, double_only=double_only)
                 partial.write_text(written.source)
                 header.write_text(written.header)
                 macro = [f"-D{written.prefix.upper()}_DOUBLE"]
@@ -413,7 +550,7 @@ class CExporter(Exporter):
                     library = partial.with_name(f"{precision}.so")
                     compile_shared([partial], library, macro if precision == "double" else [])
                     parity[precision] = exported.check(
-                        CompiledModel(library, exported, each),
+                        CompiledModel(library, exported, each, prefix),
                         f"the C file in {precision} precision",
                         each,
                     )
@@ -422,7 +559,9 @@ class CExporter(Exporter):
             dtype, (written, parity) = in_precision(exported, attempt)
             if dtype == torch.float64:
                 card |= {"dtype": name_of(dtype)}
-            card |= {"size": footprint(partial), "parity": parity}
+            size = footprint(partial)
+            size["warnings"] = report_footprint(file.name, size)
+            card |= {"size": size, "parity": parity}
             write_card(file, card)
             file.with_suffix(".h").write_text(written.header)
             file.write_text(written.source)
@@ -505,6 +644,7 @@ class SimulinkExporter(Exporter):
     name: ClassVar[str] = "simulink"
     suffix: ClassVar[str] = "_sfun.c"
     about: ClassVar[str] = "A level-2 S-function for Simulink around the C code."
+    default_name_from_run: ClassVar[bool] = True
 
     def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
         """Write the S-function, the C file and header that it calls, and the card."""
@@ -518,14 +658,18 @@ class SimulinkExporter(Exporter):
             "dtype": "float64",
             "safety": "The file is source code: compile only what you trust.",
         }
-        written = c_source(exported, card, f"{name}_model.h", double_only=True)
+        prefix = f"{name}_model"
+        written = c_source(exported, card, f"{prefix}.h", prefix, double_only=True)
         with tempfile.TemporaryDirectory() as folder:
             partial = Path(folder) / f"{name}_model.c"
             partial.write_text(written.source)
             partial.with_suffix(".h").write_text(written.header)
             library = compile_shared([partial], partial.with_suffix(".so"))
-            loaded = CompiledModel(library, exported, torch.float64)
-            card |= {"parity": exported.check(loaded, "the S-function's code", torch.float64)}
+            loaded = CompiledModel(library, exported, torch.float64, prefix)
+            parity = exported.check(loaded, "the S-function's code", torch.float64)
+            size = footprint(partial)
+            size["warnings"] = report_footprint(partial.name, size)
+            card |= {"size": size, "parity": parity}
         text = s_function(exported, written.prefix, name, loaded.outputs)
         write_card(file, card)
         file.with_name(f"{name}_model.c").write_text(written.source)

@@ -317,4 +317,5 @@ class FeedForwardExporter(Exporter):
         made = released(
             ExportedForce(exported.name, force, ranges), exported.objections, anyway=True
         )
+        made.assessment = exported.assessment
         return TorchScriptExporter().export(made, file)

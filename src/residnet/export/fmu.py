@@ -24,7 +24,7 @@ import torch
 from residnet.core.errors import ExportError, UsageError
 from residnet.core.files import whole
 from residnet.export.base import Exported, Exporter, filled
-from residnet.export.c import CompiledModel, CSource, c_source, compile_shared
+from residnet.export.c import CompiledModel, CSource, c_source, compile_shared, identifier
 from residnet.export.vessel import ExportedVessel
 
 _REFERENCES = (
@@ -65,7 +65,8 @@ class FmuExporter(Exporter):
             "safety": "The unit holds compiled code that runs when loaded: load only what you"
             " trust.",
         }
-        written = c_source(exported, card, "model_code.h")
+        prefix = identifier(file.stem)
+        written = c_source(exported, card, "model_code.h", prefix)
         token = "{" + hashlib.sha256(written.source.encode()).hexdigest()[:32] + "}"
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
@@ -75,7 +76,7 @@ class FmuExporter(Exporter):
             library = compile_shared(
                 _compiled(folder, sources), folder / f"{NAME}{_SUFFIX.get(sys.platform, '.so')}"
             )
-            loaded = CompiledModel(library, exported, torch.float64)
+            loaded = CompiledModel(library, exported, torch.float64, prefix)
             out = {}
             for tool, platforms, suffix in _CROSS:
                 where = platforms[self.version]

@@ -206,6 +206,7 @@ class ParametersExporter(Exporter):
             "share_left_out": found.left_out,
             "terms_left_out": found.terms_left_out,
             "head_left_out": None if spec.head is None else spec.head.kind,
+            **exported.provenance(),
         }
         file.parent.mkdir(parents=True, exist_ok=True)
         for end, text in texts(name, found, rigid).items():

@@ -19,6 +19,7 @@ from residnet.core.frames import wrap_array
 from residnet.core.layout import ALIVE, SIX, Live
 from residnet.core.names import CHANNEL_UNITS, END_UNITS, to_si
 from residnet.core.units import known_unit
+from residnet.judge.assessment import Assessment
 from residnet.judge.metrics import INPUT, columns_of
 from residnet.judge.verdict import by_windows
 
@@ -29,6 +30,9 @@ Content = Mapping[str, Any]
 """What a JSON object holds."""
 _FOCUS = ("test", "external", "validation", "train")
 """Splits by how much they say about data that no fit has seen."""
+
+_FINDING_KEYS = ("level", "code", "text", "action")
+"""What the card of an export says of a finding of doctor.json."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +133,32 @@ class RunFiles:
         """Return a parquet file of the folder as a pandas table, None where there is none."""
         path = self.path / name
         return read_table(path) if path.is_file() else None
+
+    def assessment(self, judged: tuple[str, Sequence[str]] | None = None) -> Assessment:
+        """Return what the run says of its model and of its logs, for the card of an export.
+
+        Args:
+            judged: level and sentences of the verdict on the model; None for those of the run.
+
+        Raises:
+            DataError: where a file of the run cannot be read.
+        """
+        summary, inspection = self.json("summary.json"), self.json("doctor.json")
+        level, verdict = judged or (summary.get("level") or "", summary.get("verdict") or [])
+        findings = None
+        if inspection:
+            logs = [(log["name"], log["findings"]) for log in inspection.get("logs") or []]
+            logs.append(("", inspection.get("together") or []))
+            findings = [
+                {"log": log or None, **{key: row[key] for key in _FINDING_KEYS}}
+                for log, rows in logs
+                for row in rows
+                if row["level"] != "note"
+            ]
+        split: dict[str, list[str]] = {}
+        for entry in self.quality:
+            split.setdefault(str(entry["split"]), []).append(str(entry["log"]))
+        return Assessment(level, tuple(verdict), findings, split or None)
 
     @cached_property
     def metrics(self) -> Content:

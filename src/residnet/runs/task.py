@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import re
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -39,7 +40,8 @@ class ExportRequest(NamedTuple):
     Attributes:
         run: the finished run.
         model: its name; `predictor` and `selected` stand for the one that the run puts first.
-        out: file to write; exports/<model> with the format's suffix where None.
+        out: file to write; where None, exports/<model> with the format's suffix, or for formats of
+            C exports/<run> for the model that is reported first and exports/<run>_<model> else.
         file_format: one of `residnet list formats`.
         anyway: whether a model is wanted that is worse than doing without it, too.
     """
@@ -50,13 +52,20 @@ class ExportRequest(NamedTuple):
     file_format: str = "torchscript"
     anyway: bool = False
 
-    def write(self, exported: Exported, objections: Sequence[str] = (), stem: str = "") -> Path:
+    def write(
+        self,
+        exported: Exported,
+        objections: Sequence[str] = (),
+        stem: str = "",
+        judged: tuple[str, Sequence[str]] | None = None,
+    ) -> Path:
         """Write what was asked for; returns the file.
 
         Args:
             exported: the model, its policy or its force.
             objections: what speaks against it; its card names them.
             stem: name of the file where none was asked for; that of the model where empty.
+            judged: level and sentences of the verdict on this model; None for those of the run.
 
         Raises:
             ConfigError: where there is no such format.
@@ -65,11 +74,18 @@ class ExportRequest(NamedTuple):
         """
         from residnet.export import exporter
         from residnet.export.base import released
+        from residnet.report.run_reader import RunFiles
 
         chosen = exporter(self.file_format)
-        out = self.out or self.run.exports / f"{stem or exported.name}{chosen.suffix}"
+        name = stem or exported.name
+        if chosen.default_name_from_run:
+            # the file's name becomes part of all symbols, and models of two runs have one name
+            run = re.sub(r"\W", "_", self.run.path.resolve().name, flags=re.ASCII)
+            name = run if self.model == "predictor" else f"{run}_{name}"
+        out = self.out or self.run.exports / f"{name}{chosen.suffix}"
         file = out if out.suffix else out.with_name(out.name + chosen.suffix)
         exported = released(exported, objections, anyway=self.anyway)
+        exported.assessment = RunFiles(self.run.path).assessment(judged)
         with staged_files(file, file.parent.glob("*.masses.yaml")) as staged:
             chosen.export(exported, staged)
         return file

@@ -38,7 +38,9 @@ from residnet.judge.band import bands_content
 from residnet.judge.booklet import BookletConfig
 from residnet.judge.goodness import content
 from residnet.judge.soundness import sanity_content
+from residnet.judge.verdict import level as verdict_level
 from residnet.judge.verdict import objections
+from residnet.judge.verdict import verdict as verdict_sentences
 from residnet.report.blocks import Section
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.verdict import evidence
@@ -351,5 +353,8 @@ class FitConfig(FitSettings, ComputingTask):
         rows = [
             row for row in metrics["rows"] if row["model"] == chosen and row["manoeuvre"] == "all"
         ]
-        against = objections(evidence(RunFiles(run.path), chosen))
-        return asked.write(ExportedVessel(spec, model, rows), against, chosen)
+        found = evidence(RunFiles(run.path), chosen)
+        # a model without free runs on the split that counts has no verdict
+        sentences = verdict_sentences(found) if chosen in found.rows else []
+        judged = (verdict_level(found), sentences)
+        return asked.write(ExportedVessel(spec, model, rows), objections(found), chosen, judged)

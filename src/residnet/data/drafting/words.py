@@ -21,6 +21,22 @@ _IN_BRACKETS = re.compile(r"[\[({]([^\])}]*)[\])}]")
 _FULL = 35.0
 """Angle in deg of a rudder that is hard over, as most are built."""
 _GERMAN = {"grad": "deg", "grad/s": "deg/s", "grad/min": "deg/min"}
+_SUFFIXES: dict[str, dict[str, str]] = {
+    "m": {"m": "m"},
+    "s": {"s": "s", "ms": "ms"},
+    "m/s": {"ms": "m/s", "mps": "m/s"},
+    "m/s^2": {"ms2": "m/s^2", "mps2": "m/s^2", "mpss": "m/s^2"},
+    "rad/s": {"degps": "deg/s", "degs": "deg/s", "radps": "rad/s", "rads": "rad/s", "rps": "rad/s"},
+    "rad/s^2": {"degps2": "deg/s^2", "radps2": "rad/s^2"},
+    "1/s": {"rps": "1/s"},
+    "N": {"n": "N"},
+    "N m": {"nm": "N m"},
+}
+"""SI unit of a quantity -> suffix behind an underscore of a name -> unit.
+
+The quantity decides what a suffix means: `_ms` is m/s behind a speed and milliseconds behind a
+time, `_rps` is rad/s behind a yaw rate and revolutions behind a propeller.
+"""
 
 
 def written_unit(column: str, expected: str | None) -> str | None:
@@ -35,6 +51,9 @@ def written_unit(column: str, expected: str | None) -> str | None:
         # `r_deg_s` and `speed_m_s` are quotients
         texts += ["/".join(tail[-2:]), tail[-1]] if len(tail) > 1 else []
         texts += [f"{tail[-3]}/{tail[-1]}"] if len(tail) > 3 and tail[-2] == "per" else []
+        stem, _, suffix = column.strip().rpartition("_")
+        if stem and (unit := _SUFFIXES.get(expected, {}).get(suffix.casefold())):
+            return unit
     for text in texts:
         unit = _GERMAN.get(text.casefold(), text)
         if len(unit) == 1 and unit.isalpha() and text not in _IN_BRACKETS.findall(column):
@@ -398,7 +417,7 @@ _STATES = (
     _Rule("r", "turn_rate"),
     _Rule("r", "heading|turn rate"),
     _Rule("r", "", "", "^r( mid)?$"),
-    _Rule("r", "angular", "", r" [zr](?: (?:dps|deg s|rad s))?$"),
+    _Rule("r", "angular", "", r" [zr](?: (?:dps|degps|radps|rps|deg s|rad s))?$"),
     # of an axis that is not told: what turns is the vessel
     _Rule("r", "angular rate", "x y pitch"),
     *_AXES,
@@ -424,7 +443,9 @@ _DEEP = (
 )
 
 
-_UNIT = re.compile(r"(?<=\b[pqr]) (?:dps|deg s|rad s)$|(?<=\b[uvw]) (?:mps|m s)$")
+_UNIT = re.compile(
+    r"(?<=\b[pqr]) (?:dps|degps|degs|radps|rads|rps|deg s|rad s)$|(?<=\b[uvw]) (?:mps|ms|kn|m s)$"
+)
 """What stands behind the letter of a velocity."""
 
 
@@ -437,6 +458,9 @@ def state_channel(words: Words) -> str | None:
     w, name = words, words.text.replace(" ", "_")
     if name in MOTION:
         return name
+    if re.fullmatch(r"[pqr] rps", w.text):
+        # rad/s of a rate, not revolutions
+        return w.text[0] if w.text[0] != "q" else None
     last = _UNIT.sub("", w.text).rpartition(" ")[2]
     if last in ("psi", "u", "v", "r", "phi", "p") and w.about <= words_of(last).about:
         # what stands before it, as in `body.r`, says nothing

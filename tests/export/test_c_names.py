@@ -1,0 +1,233 @@
+"""C exports by the names of their files: linked side by side, told apart by build, measured before
+they are written.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import torch
+from exported_models import built
+
+from residnet.core.errors import UsageError
+from residnet.core.progress import Progress, listen
+from residnet.core.version import __version__
+from residnet.dynamics import c_code
+from residnet.dynamics.c_code import compiler
+from residnet.export import c, exporter
+from residnet.export.c import STRICT, footprint, identifier
+from residnet.export.vessel import ExportedVessel
+from residnet.judge.assessment import Assessment
+
+pytestmark = pytest.mark.usefixtures("short_parity")
+
+
+def vessel(scale: float = 1.0) -> ExportedVessel:
+    """A model called mine, as that of another run is, with other coefficients."""
+    spec, model = built("plsr")
+    with torch.no_grad():
+        model.baseline.theta.mul_(scale)  # type: ignore[operator, union-attr]
+    return ExportedVessel(spec, model)
+
+
+MAIN = """
+#include <stdio.h>
+#include "steer.h"
+#include "my-boat 2.h"
+
+int main(void)
+{
+    float x[STEER_STATES] = {0, 0, 0, 1, 0, 0}, w[STEER_INPUTS] = {9, 9, 3, 1}, s[1] = {0};
+    float y[MY_BOAT_2_STATES] = {0, 0, 0, 1, 0, 0};
+    steer_step(x, w, s, x, s);
+    my_boat_2_step(y, w, s, y, s);
+    printf("%.9g %.9g %s %s", x[3], y[3], STEER_BUILD, MY_BOAT_2_BUILD);
+    return 0;
+}
+"""
+LINKS = {
+    "objects": [["{cc}", "-c", "steer.c", "my-boat 2.c"],
+                ["{cc}", "main.c", "steer.o", "my-boat 2.o", "-o", "main", "-lm"]],
+    "static libraries": [["{cc}", "-c", "steer.c", "my-boat 2.c"],
+                         ["ar", "rcs", "liba.a", "steer.o"],
+                         ["ar", "rcs", "libb.a", "my-boat 2.o"],
+                         ["{cc}", "main.c", "-L.", "-la", "-lb", "-o", "main", "-lm"]],
+    "one translation unit": [["{cc}", "all.c", "-o", "main", "-lm"]],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("way", LINKS)
+def test_two_exports_of_one_model_name_serve_one_program(way: str, tmp_path: Path) -> None:
+    models = {"steer.c": vessel(), "my-boat 2.c": vessel(0.5)}
+    cards = {name: exporter("c").export(made, tmp_path / name) for name, made in models.items()}
+    (tmp_path / "main.c").write_text(MAIN)
+    parts = ("steer.c", "my-boat 2.c", "main.c")
+    (tmp_path / "all.c").write_text("".join(f'#include "{part}"\n' for part in parts))
+    for command in LINKS[way]:
+        call = [word.format(cc=compiler()) for word in command]
+        flags = STRICT if command[0] == "{cc}" else ()
+        subprocess.run([*call, *flags], cwd=tmp_path, check=True)
+    printed = subprocess.run([tmp_path / "main"], capture_output=True, text=True).stdout.split()
+    x, w = torch.tensor([[0.0, 0, 0, 1, 0, 0]]), torch.tensor([[9.0, 9, 3, 1]])
+    for found, made in zip(printed[:2], models.values(), strict=True):
+        with torch.no_grad():
+            after, _ = made.at(torch.float32).step(x, w, x[:, :0])
+        assert float(found) == pytest.approx(float(after[0, 3]), rel=1e-6)
+    assert printed[0] != printed[1]
+    assert printed[2:] == [card["build"]["identity"] for card in cards.values()]
+    assert printed[2] != printed[3]
+
+
+def defined_symbols(library: Path) -> set[str]:
+    lines = subprocess.run(["nm", "-g", library], capture_output=True, text=True).stdout
+    return set(re.findall(r" [TDBRC] (\w+)", lines))
+
+
+def test_every_name_begins_with_that_of_the_file(tmp_path: Path) -> None:
+    exporter("c").export(vessel(), tmp_path / "2nd Öl.c")
+    subprocess.run([compiler(), "-c", "2nd Öl.c", "-o", "boat.o"], cwd=tmp_path, check=True)
+    symbols = defined_symbols(tmp_path / "boat.o")
+    assert f"{identifier('2nd Öl')}_step" in symbols
+    assert all(name.startswith("m_2nd__l_") for name in symbols)
+    header = (tmp_path / "2nd Öl.h").read_text()
+    assert "#ifndef M_2ND__L_H\n#define M_2ND__L_H\n" in header
+    macros = re.findall(r"^#define (\w+)", header, re.M)
+    assert all(name.startswith("M_2ND__L_") for name in macros)
+    with pytest.raises(UsageError, match=r"math\.c: its header math\.h would hide"):
+        exporter("c").export(vessel(), tmp_path / "math.c")
+    assert not (tmp_path / "math.c").exists()
+
+
+def test_the_build_identity_is_of_the_model_and_the_version(tmp_path: Path) -> None:
+    first, second = vessel().build(), vessel(0.5).build()
+    assert first == vessel().build()
+    assert first["model_sha256"] != second["model_sha256"]
+    assert first["identity"] == f"{__version__}+{first['model_sha256'][:16]}"
+    for name, made in (("a", vessel()), ("b", vessel(0.5))):
+        card = exporter("c").export(made, tmp_path / f"{name}.c")
+        held = json.loads((tmp_path / f"{name}.card.json").read_text())
+        assert held["build"] == card["build"] == made.build()
+        for end in ("c", "h"):
+            assert card["build"]["identity"] in (tmp_path / f"{name}.{end}").read_text()
+    # a header of another export is refused by the compiler
+    header = (tmp_path / "b.h").read_text().replace("B_", "A_").replace("b_", "a_")
+    (tmp_path / "a.h").write_text(header)
+    call = [compiler(), "-c", "a.c"]
+    done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "a.h belongs to another export than this file" in done.stderr
+
+
+def listened(file: Path, made: ExportedVessel) -> list[tuple[str, bool]]:
+    """Messages of an export to C, each with whether the file stood by then."""
+    heard: list[tuple[str, bool]] = []
+
+    def hear(progress: Progress) -> None:
+        heard.append((progress.message, file.exists()))
+
+    with listen(hear):
+        exporter("c").export(made, file)
+    return heard
+
+
+def test_stack_and_size_are_reported_before_the_file_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heard = listened(tmp_path / "boat.c", vessel())
+    assert len(heard) == 1
+    card = json.loads((tmp_path / "boat.card.json").read_text())["size"]
+    stack, code = card["largest_stack_bytes"], card["code_bytes"]
+    for word in (f"{stack:,} bytes of stack", f"{code:,} bytes of code", "-fstack-usage", "size"):
+        assert word in heard[0][0]
+    assert not heard[0][1]
+    assert card["warnings"] == []
+    # warmup calls measured and step, when there is a memory; here step alone is the deepest
+    assert stack == max(card["stack_bytes"].values())
+    monkeypatch.setattr(c, "STACK_LIMIT", 10)
+    monkeypatch.setattr(c, "CODE_LIMIT", 20)
+    heard = listened(tmp_path / "again.c", vessel())
+    assert [stood for _, stood in heard] == [False] * 3
+    assert "bytes of stack exceed 10" in heard[1][0]
+    assert "of code and constants exceed 20" in heard[2][0]
+    warnings = json.loads((tmp_path / "again.card.json").read_text())["size"]["warnings"]
+    assert [f"  warning: {warning}" for warning in warnings] == [text for text, _ in heard[1:]]
+
+
+def test_the_stack_of_a_call_holds_that_of_the_functions_that_it_calls(tmp_path: Path) -> None:
+    spec, model = built("lstm")
+    exporter("c").export(ExportedVessel(spec, model), tmp_path / "boat.c")
+    size = footprint(tmp_path / "boat.c")
+    own = size["stack_bytes"]
+    called = max(own["boat_step"], own["boat_measured"])
+    assert size["largest_stack_bytes"] == own["boat_warmup"] + called
+
+
+def tools(folder: Path, wanted: Sequence[str]) -> str:
+    """A path with a compiler that does not know -fstack-usage, and with `size` where wanted."""
+    folder.mkdir()
+    check = 'for word; do [ "$word" != -fstack-usage ] || exit 1; done'
+    script = f'#!/bin/sh\n{check}\nexec {compiler()} "$@"\n'
+    for name in wanted:
+        if name == "cc":
+            (folder / "cc").write_text(script)
+            (folder / "cc").chmod(0o755)
+        else:
+            found = shutil.which(name)
+            assert found is not None
+            (folder / name).symlink_to(found)
+    return str(folder)
+
+
+@pytest.mark.parametrize("known", [["cc", "size"], ["cc"], []])
+def test_what_the_tools_do_not_measure_is_estimated_and_said_so(
+    known: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec, model = built("lstm")
+    exporter("c").export(ExportedVessel(spec, model), tmp_path / "boat.c")
+    measured = footprint(tmp_path / "boat.c")
+    path = tools(tmp_path / "bin", known)
+    found = {name: f"{path}/{name}" for name in known}
+    monkeypatch.delenv("CC", raising=False)
+    for module in (c, c_code):
+        monkeypatch.setattr(module.shutil, "which", found.get)
+    size = footprint(tmp_path / "boat.c")
+    assert size["stack_from"] == "estimate"
+    assert (size["code_from"] == "estimate") == ("size" not in known)
+    assert size["stack_bytes"].keys() == measured["stack_bytes"].keys()
+    # within a factor of four of what a compiler measures, never far below it
+    for key in ("largest_stack_bytes", "code_bytes"):
+        assert 0.5 * measured[key] <= size[key] <= 4.0 * measured[key], key
+
+
+FORMATS = ("torchscript", "c", "casadi", "fmu")
+KNOWN = Assessment(
+    level="limited",
+    verdict=("After a 40 s free run the position error is 8.6 m.", "Two logs were checked."),
+    findings=(
+        {"log": "zigzag_1", "level": "will mislead", "code": "lag", "text": "r lags", "action": ""},
+    ),
+    split={"train": ["zigzag_1", "zigzag_2"], "validation": ["turn_1"], "test": ["turn_2"]},
+)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_card_holds_verdict_findings_and_split(name: str, tmp_path: Path) -> None:
+    made = vessel()
+    made.assessment = KNOWN
+    card = exporter(name).export(made, tmp_path / f"boat{exporter(name).suffix}")
+    assert (card["level"], card["verdict"]) == ("limited", list(KNOWN.verdict))
+    assert card["findings"] == [dict(row) for row in KNOWN.findings or ()]
+    assert card["split"] == {
+        "identification": ["zigzag_1", "zigzag_2"],
+        "validation": ["turn_1"],
+        "test": ["turn_2"],
+    }
+    made.assessment = None
+    assert (made.card()["level"], made.card()["verdict"]) == (None, [])
+    assert (made.card()["findings"], made.card()["split"]) == (None, None)
