@@ -203,6 +203,10 @@ def plain(table: pd.DataFrame, decimal: str = ".") -> pd.DataFrame:
     return out
 
 
+_LOOKED_AT = 100
+"""Cells of a column that may show at once that it holds words."""
+
+
 def _plain(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
     """Return a column whose numbers have no signs between thousands, and no marks for none (---).
 
@@ -228,6 +232,10 @@ def _plain(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
     ):
         return cells, ""
     unit, told = _without_unit(cells)
+    # where one of the first cells is a word, such as a date, so is the column: no copies of all
+    head = told.iloc[:_LOOKED_AT].map(number)
+    if pd.to_numeric(head, errors="coerce").isna().sum() != head.isna().sum():
+        return cells, ""
     signs = {len(re.findall(r"[^\d+-]", str(cell).strip())) for cell in told.dropna()}
     bare = told.map(number)
     values = pd.to_numeric(bare, errors="coerce")
@@ -242,8 +250,10 @@ def _without_unit(cells: pd.Series) -> tuple[str, pd.Series]:
     """
     written = cells.dropna()
     told = _unit_behind(str(written.iloc[0]).strip()) if len(written) else ""
+    if not told:
+        return "", cells
     bare = written.astype("string").str.strip()
-    if not told or not bare.str.endswith(told).all():
+    if not bare.str.endswith(told).all():
         return "", cells
     numbers = bare.str.removesuffix(told).str.strip().astype(object)
     return known_unit(told), numbers.reindex(cells.index)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
@@ -112,13 +112,27 @@ def unit_of_steps(step: float) -> str:
     return next((unit for unit, most in longest if step <= most), "ns")
 
 
+_PIECE = 250_000
+"""Rows of text that are taken apart at a time: what lies between would be 1 GB of 3 million."""
+
+
 def _parts(cells: pd.Series) -> pd.DataFrame:
-    """Return the parts of dates and times; what stands beside the seconds repeats over rows."""
+    """Return the parts of dates and times; equal texts are one object in memory."""
+    import pandas as pd
+
+    minutes = _MINUTES.fullmatch(str(next(iter(cells), ""))) is not None
+    pieces = [cells.iloc[k : k + _PIECE] for k in range(0, max(len(cells), 1), _PIECE)]
+    found = [_parts_of_piece(piece, minutes=minutes) for piece in pieces]
+    return found[0] if len(found) == 1 else pd.concat(found)
+
+
+def _parts_of_piece(cells: pd.Series, *, minutes: bool) -> pd.DataFrame:
+    """Return the parts of dates and times; with `minutes` times begin with minutes."""
     import pandas as pd
     import pyarrow as pa
     from pyarrow import compute
 
-    if _MINUTES.fullmatch(str(next(iter(cells), ""))):
+    if minutes:
         cells = cells.str.replace(_MINUTES, r"0:\1", regex=True)
     form, texts = re.compile(_FORM), pa.array(cells.tolist(), pa.string())
     before, *seconds, after = compute.extract_regex(texts, _SECOND).flatten()
@@ -129,7 +143,11 @@ def _parts(cells: pd.Series) -> pd.DataFrame:
     table = pd.DataFrame(rows, columns=list(form.groupindex), dtype=object)
     table = table.take(rest.indices.to_numpy()).set_axis(cells.index)
     for name, digits in zip(("second", "fraction"), seconds, strict=True):
-        cut = pd.Series(digits.to_numpy(zero_copy_only=False), index=cells.index)
+        coded = digits.dictionary_encode()
+        codes = coded.indices.to_numpy(zero_copy_only=False)
+        words = np.array([*coded.dictionary.to_pylist(), None], dtype=object)
+        codes = np.where(np.isfinite(codes), codes, -1).astype(np.int64)
+        cut = pd.Series(words[codes], index=cells.index)
         table[name] = cut.where(cut.notna() & (cut != ""), table[name])
     return table
 
@@ -185,8 +203,13 @@ def parse_texts(
     """
     import pandas as pd
 
-    column, known = _filled(pd.Series(np.asarray(texts, dtype=object)))
-    cells = column[known] if dates else column.fillna("")
+    if isinstance(texts, pd.Series) and pd.api.types.is_string_dtype(texts.dtype):
+        # texts that pandas holds side by side take a quarter of what objects take
+        written = texts.reset_index(drop=True)
+    else:
+        written = pd.Series(np.asarray(texts, dtype=object))
+    column, known = _filled(written)
+    cells = (column if known.all() else column[known]) if dates else column.fillna("")
     if not len(cells):
         return Stamps(np.zeros(len(column), dtype=np.int64), False, known)
     if not dates:
@@ -236,8 +259,9 @@ def _dated(cells: pd.Series, zone: str | None, order: Order | None) -> Stamps:
     parts = _parts(cells)
     dated = bool(parts["date"].notna().all())
     _require(cells, (parts["date" if dated else "hour"].isna()).to_numpy(), "date or time")
+    # each part is let go where its number is made
     hour, minute, second = (
-        parts[name].fillna("0").astype("int64").to_numpy() for name in ("hour", "minute", "second")
+        convert_per_text(parts.pop(name).fillna("0"), int) for name in ("hour", "minute", "second")
     )
     if parts["half"].notna().any():
         half = parts["half"].fillna("").str.lower().str.slice(0, 1)
@@ -246,7 +270,7 @@ def _dated(cells: pd.Series, zone: str | None, order: Order | None) -> Stamps:
     whole += (
         _days(cells, parts["date"], order or _order_of(parts) or "dmy") * 86_400 if dated else 0
     )
-    fraction, remarks = _fractions(parts["fraction"], whole)
+    fraction, remarks = _fractions(parts.pop("fraction"), whole)
     ns = whole * _NS + fraction
     if dated:
         return Stamps(_in_utc(ns, parts["zone"], zone), True, None, remarks)
@@ -255,6 +279,14 @@ def _dated(cells: pd.Series, zone: str | None, order: Order | None) -> Stamps:
         text = f"the times of day run past midnight {nights[-1]} times; the days are counted"
         remarks = (*remarks, remark("note", "past_midnight", text, nights=int(nights[-1])))
     return Stamps(ns + nights * _DAY, False, None, remarks)
+
+
+def convert_per_text(column: pd.Series, function: Callable[[str], int]) -> np.ndarray:
+    """Return an integer [T] of each text; one that repeats over many rows is made once."""
+    texts = column.astype("category")
+    made = np.array([function(str(text)) for text in texts.cat.categories], dtype=np.int64)
+    out: np.ndarray = made[texts.cat.codes.to_numpy()]
+    return out
 
 
 def _days(cells: pd.Series, dates: pd.Series, order: Order) -> np.ndarray:
@@ -316,8 +348,7 @@ def _ahead(zone: str) -> int:
 def _fractions(column: pd.Series, whole: np.ndarray) -> tuple[np.ndarray, tuple[Remark, ...]]:
     """Return the fractions of the unit in ns [T] int64, mended where they lost leading zeros."""
     digits = column.fillna("0").str.slice(0, 9)
-    length = digits.str.len().to_numpy(dtype=np.int64)
-    value = digits.astype("int64").to_numpy()
+    length, value = convert_per_text(digits, len), convert_per_text(digits, int)
     padded = value * 10 ** (9 - length)
     longest = int(length.max(initial=0))
     if longest not in (3, 6, 9) or (length == longest).all():
