@@ -23,6 +23,7 @@ __all__ = [
     "VELOCITY",
     "WIND_INPUTS",
     "nearest",
+    "require_plain_name",
     "shown",
     "si_of",
     "si_unit",
@@ -30,6 +31,26 @@ __all__ = [
     "to_si",
     "units",
 ]
+
+_BREAKS_A_COMMENT = ("*/", "/*", "//", "\\", '"')
+
+
+def require_plain_name(name: str) -> str:
+    """Check that a name can stand in a comment or a text of an exported program.
+
+    Exports write the names of models and channels into C, which is compiled and run to compare it
+    with the model: a name that ends a comment would be code.
+
+    Raises:
+        ValueError: if a character is not printable, or a comment or text would end there.
+    """
+    for part in _BREAKS_A_COMMENT:
+        if part in name:
+            raise ValueError(f"the name {name!r} holds {part!r}; rename it")
+    if not name.isprintable():
+        raise ValueError(f"the name {name!r} holds a character that is not printable; rename it")
+    return name
+
 
 POSE = ("x", "y", "psi")
 VELOCITY = ("u", "v", "r")

@@ -181,16 +181,21 @@ def c_files(
     told += [(comment, prototype) for comment, prototype, _ in extra]
     return source, filled(
         "c_header.h",
-        comment="\n".join(f" * {x}".rstrip() for x in about.replace("*/", "* /").splitlines()),
+        comment="\n".join(f" * {x}".rstrip() for x in _comment(about).splitlines()),
         guard=f"{prefix.upper()}_H",
         double_only=double_only,
         **names,
         numbers="\n".join(
-            f"#define {prefix.upper()}_{name} {value} /* {text} */"
+            f"#define {prefix.upper()}_{name} {value} /* {_comment(text)} */"
             for name, (value, text) in sizes.items()
         ),
-        prototypes="\n\n".join(f"/* {text} */\n{line};" for text, line in told),
+        prototypes="\n\n".join(f"/* {_comment(text)} */\n{line};" for text, line in told),
     )
+
+
+def _comment(text: str) -> str:
+    """Return a text that cannot end the comment in which it stands."""
+    return text.replace("*/", "* /").replace("/*", "/ *")
 
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")

@@ -18,7 +18,7 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
 from residnet.core.layout import PLANAR, ROLL, SIX, VERTICAL, Live
-from residnet.core.names import WIND_INPUTS, nearest, si_of
+from residnet.core.names import WIND_INPUTS, nearest, require_plain_name, si_of
 from residnet.core.samples import Samples
 from residnet.physics.actuators import DifferentialThrustConfig
 from residnet.physics.hull import FossenConfig
@@ -60,6 +60,8 @@ class SignalsConfig(Config):
 
     @model_validator(mode="after")
     def _combination(self) -> SignalsConfig:
+        for name in self.inputs:
+            require_plain_name(name)
         for name in self.exogenous:
             if name not in WIND_INPUTS:
                 raise ValueError(
