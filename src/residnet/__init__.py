@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from residnet.api.data import Data, draft, inspect, prepare, read_logs
     from residnet.api.fitting import FreeRuns, Models, fit, free_run, metrics, select
-    from residnet.api.models import Model, Monitor, export_model, load, save
+    from residnet.api.models import Model, Monitor, export_model, load, save, trust
     from residnet.api.tasks import (
         Result,
         Trials,
@@ -43,7 +43,7 @@ _HOME = {
     "core.log": "Log",
     "core.progress": "Progress",
     "api.data": "Data draft inspect prepare read_logs",
-    "api.models": "Model Monitor export_model load save",
+    "api.models": "Model Monitor export_model load save trust",
     "api.fitting": "FreeRuns Models fit free_run metrics select",
     "api.tasks": (
         "Result Trials autopilot available baseline head manoeuvre own_autopilot run simulate"
@@ -82,6 +82,7 @@ __all__ = [
     "save",
     "select",
     "simulate",
+    "trust",
     "vessel",
 ]
 

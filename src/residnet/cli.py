@@ -496,13 +496,15 @@ def evaluate(
 ) -> None:
     """Evaluate the models of a finished run in free run on other logs."""
     from residnet.core.files import require_room
+    from residnet.core.run_loader import name_damaged_key
     from residnet.tasks.registry import finished_task
 
     with drawn_progress(quiet=quiet):
         run, task = finished_task(folder, "evaluate")
         require_room(out or folder)
         named = _named(folder, given, logs)
-        finished = task.evaluate_on(run, named, out, resume=resume, overwrite=overwrite)
+        with name_damaged_key(folder):
+            finished = task.evaluate_on(run, named, out, resume=resume, overwrite=overwrite)
     show(finished)
 
 
@@ -538,6 +540,7 @@ def monitor(
     The exit code is 1 where there is an alarm. A refit leaves the run as it is.
     """
     from residnet.core.files import require_room, whole
+    from residnet.core.run_loader import name_damaged_key
     from residnet.tasks.registry import finished_task
 
     if out is not None:
@@ -548,7 +551,8 @@ def monitor(
     with drawn_progress(quiet=quiet or as_json):
         run, task = finished_task(folder, "monitor")
         named = _named(folder, given, logs)
-        found, refitted = task.monitor(run, named, model, settings, refit)
+        with name_damaged_key(folder):
+            found, refitted = task.monitor(run, named, model, settings, refit)
     content: list[dict[str, Any]] = [log.content() for log in found]
     lines = [line for log in found for line in log.text()]
     if refitted is not None:
@@ -589,6 +593,7 @@ def plan_trial(
 ) -> None:
     """Say which manoeuvres to run next, and by how much they would narrow the predictions."""
     from residnet.core.files import require_room
+    from residnet.core.run_loader import name_damaged_key
     from residnet.tasks.registry import finished_task
 
     if out is not None:
@@ -596,7 +601,8 @@ def plan_trial(
     limits = {"time": time, "area": area, "speed": speed, "rudder": rudder, "count": count}
     with drawn_progress(quiet=quiet):
         run, task = finished_task(folder, "plan-trial")
-        planned = task.plan_trial(run, model, limits)
+        with name_damaged_key(folder):
+            planned = task.plan_trial(run, model, limits)
     print(planned.text())
     for file in planned.write(out) if out is not None else []:
         print(f"written: {file}")
@@ -637,13 +643,15 @@ def export(
 ) -> None:
     """Export a model of a finished run for controllers, after a parity check."""
     from residnet.core.files import require_file_place
+    from residnet.core.run_loader import name_damaged_key
     from residnet.runs.task import ExportRequest
     from residnet.tasks.registry import finished_task
 
     with drawn_progress(quiet=quiet):
         run, task = finished_task(folder, "export")
         require_file_place(out or run.exports / model)
-        written = task.export_model(ExportRequest(run, model, out, file_format, anyway))
+        with name_damaged_key(folder):
+            written = task.export_model(ExportRequest(run, model, out, file_format, anyway))
     print(written)
 
 
@@ -732,6 +740,23 @@ def report(folder: RunPath, quiet: Quiet = False) -> None:
 
 
 @app.command()
+def trust(
+    folder: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Folder of a run, or of a single model.")
+    ],
+) -> None:
+    """Accept a run folder as it stands: list what is new or changed, and write its checksums.
+
+    Do this only if you trust where the folder comes from. Nothing in it runs, but its numbers are
+    taken as those of a run, and later commands may replace the listed files.
+    """
+    from residnet.core.run_loader import accept_run
+
+    lines = accept_run(folder)
+    print("\n".join([*lines, f"{folder}: accepted, {len(lines)} files were new or changed"]))
+
+
+@app.command()
 def compare(
     folders: Annotated[
         list[Path], typer.Argument(metavar="RUN RUN...", help="Folders of finished fits.")
@@ -742,9 +767,10 @@ def compare(
     quiet: Quiet = False,
 ) -> None:
     """Set finished fits side by side: errors on common logs, paired intervals, configs."""
+    from residnet.core.run_loader import name_damaged_key
     from residnet.tasks.compare import compare_runs
 
-    with drawn_progress(quiet=quiet):
+    with drawn_progress(quiet=quiet), name_damaged_key(folders[0]):
         text, page = compare_runs(folders, out)
     print(text)
     print(f"page: {page}")

@@ -349,7 +349,7 @@ def test_metrics_alone_make_a_report_and_folders_without_are_refused(tmp_path: P
     file = tmp_path / "metrics.json"
     for text, error, said in (
         (None, UsageError, r"no metrics\.json"),
-        ("{", DataError, "not readable as JSON"),
+        ("{", UsageError, "not readable as JSON"),
         ("{}", DataError, "holds no rows"),
     ):
         if text is not None:

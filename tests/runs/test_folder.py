@@ -19,6 +19,7 @@ from made_models import nomoto_model
 
 from residnet.core.errors import UsageError
 from residnet.core.files import sha256
+from residnet.core.run_loader import accept_run
 from residnet.core.version import __version__
 from residnet.runs import folder as folders
 from residnet.runs.folder import Provenance, RunFolder, git_revision, require_sealed, seal
@@ -93,9 +94,9 @@ def test_only_a_finished_run_whose_files_are_whole_is_opened(tmp_path: Path) -> 
     folder.write_summary(*given, finished=True)
     with pytest.raises(UsageError, match="no such file"):
         folder.read_metrics()
-    folder.write_json(folder.metrics, {"rows": [1]})
+    folder.write_json(folder.metrics, {"rows": [{"a": 1}]})
     run = RunFolder.open(path)
-    assert run.read_metrics() == {"rows": [1]}
+    assert run.read_metrics() == {"rows": [{"a": 1}]}
     about = dict(zip(("task", "verdict", "figures"), given, strict=True))
     assert run.read_summary() == {"schema": "residnet.summary/1", "finished": True, **about}
     folder.summary.write_text('{"finished": tr')
@@ -197,12 +198,13 @@ def sealed(run: Path) -> Path:
 def test_results_alone_are_sealed(tmp_path: Path) -> None:
     run = sealed(tmp_path)
     assert set(json.loads((run / "checksums.json").read_text())["files"]) == set(SEALED)
-    for name in ("figures/a.png", "external-1/metrics.json", "summary.json"):
+    for name in ("figures/a.png", "external-1/metrics.json"):
         (run / name).write_text("made anew")
     require_sealed(run)
-    # a run of an earlier version is taken as it is
     (run / "checksums.json").unlink()
-    (run / "metrics.json").write_text("other")
+    with pytest.raises(UsageError, match=r"has no checksums.json; .*: residnet trust"):
+        require_sealed(run)
+    accept_run(run)
     require_sealed(run)
 
 

@@ -11,6 +11,7 @@ from read_page import plain
 from tiny import read_json
 
 from residnet.core.errors import UsageError
+from residnet.core.run_loader import accept_run
 from residnet.tasks.compare import compare_runs, judged_runs, paired
 from residnet.tasks.registry import runs_below, runs_text
 
@@ -31,6 +32,7 @@ def judged(folder: Path, size: float, more: str = "") -> Path:
     }
     figures = {"nrmse": {"value": size, "unit": "-"}}
     write_json(folder / "summary.json", {**summary, "figures": figures})
+    accept_run(folder)
     return folder
 
 
@@ -56,6 +58,7 @@ def test_two_runs_side_by_side(two: list[Path], tmp_path: Path) -> None:
     (line,) = [line for line in text.splitlines() if line.startswith("heads")]
     assert line.split() == ["heads.mlp", "there", "(kind", "mlp)", "not", "there"]
     shutil.rmtree(two[1] / "rollouts" / "test")
+    accept_run(two[1])
     assert "no window of a log in common" in compare_runs(two, tmp_path / "again")[0]
 
 
@@ -67,6 +70,7 @@ def test_runs_of_other_velocities_are_compared_by_what_both_move(
     for row in metrics["rows"]:
         row["rmse"] = {"u": row["rmse"]["u"]}
     write_json(two[1] / "metrics.json", metrics)
+    accept_run(two[1])
     entry = paired(judged_runs(two))["whole"]["second"]
     # of u alone
     assert entry["nrmse_mean"] == pytest.approx(-0.04)
@@ -75,6 +79,7 @@ def test_runs_of_other_velocities_are_compared_by_what_both_move(
 
 def test_what_cannot_be_compared(two: list[Path], tmp_path: Path) -> None:
     (two[1] / "metrics.json").unlink()
+    accept_run(two[1])
     for runs, said in (
         (two[:1], "name at least two runs"),
         (two[:1] * 2, "named twice"),

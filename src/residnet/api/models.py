@@ -17,6 +17,7 @@ from residnet.core.config import validate
 from residnet.core.errors import UsageError
 from residnet.core.files import read_json, staged_files
 from residnet.core.ownership import Manifest, recorded_folder
+from residnet.core.run_loader import accept_run, name_damaged_key
 from residnet.core.trust import trusting
 from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
@@ -239,7 +240,7 @@ def load(folder: PathGiven, name: str | None = None, *, trust: bool = False) -> 
     Example:
         model = residnet.load("runs/quickstart", "selected")
     """
-    with trusting(trust):
+    with trusting(trust), name_damaged_key(path(folder, "load")):
         place = path(folder, "load")
         is_model = (place / "model.json").is_file()
         if name is not None or (not is_model and (place / "models").is_dir()):
@@ -256,6 +257,26 @@ def load(folder: PathGiven, name: str | None = None, *, trust: bool = False) -> 
                 bands=read_bands(read_json(bands)).get(place.name, {}) if bands.is_file() else {},
             )
         )
+
+
+def trust(folder: PathGiven) -> list[str]:
+    """Accept the folder of a run or model as it stands, as `residnet trust` does.
+
+    Do this only if you trust where it comes from. Its manifest (`checksums.json`) is written anew.
+
+    Args:
+        folder: of a run or a single model.
+
+    Returns:
+        One line for each file that was new or changed.
+
+    Raises:
+        UsageError: if it is no such folder, or holds a link, a device or a file that is too large.
+
+    Example:
+        residnet.trust("runs/of_an_earlier_version")
+    """
+    return accept_run(path(folder, "trust"))
 
 
 def export_model(

@@ -19,7 +19,9 @@ from residnet.core.errors import UsageError
 from residnet.core.files import read_table
 from residnet.core.log import Log
 from residnet.core.names import nearest
+from residnet.core.ownership import read_regular, require_inside, resolve_name
 from residnet.core.progress import ProgressCallback
+from residnet.core.run_loader import SIZE_LIMITS
 from residnet.core.trust import trusting
 from residnet.data.simulated import Flight
 from residnet.heads import HeadConfig
@@ -260,13 +262,14 @@ class Result:
         Example:
             result.read("indices.json")["rows"]
         """
-        file = self.folder / name
+        file = resolve_name(self.folder, name)
         if not file.is_file():
             raise UsageError(f"{self.folder}: no file '{name}'{nearest(str(name), self.files)}")
         if file.suffix == ".parquet":
             return read_table(file)
         try:
-            text = file.read_text(encoding="utf-8")
+            require_inside(self.folder, file)
+            text = read_regular(file, SIZE_LIMITS[".json"]).decode("utf-8")
             return json.loads(text) if file.suffix == ".json" else text
         except (OSError, ValueError, RecursionError) as error:
             raise UsageError(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import json
 import os
 import re
 import secrets
@@ -21,10 +20,12 @@ from residnet.core.ownership import (
     FILE_MANIFEST,
     Manifest,
     manifest_for,
+    require_regular,
     require_replaceable,
     run_manifest_above,
 )
 from residnet.core.ownership import sha256 as sha256
+from residnet.core.run_loader import SIZE_LIMITS, read_json_value
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -147,20 +148,18 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         UsageError: where there is no such file, or it does not hold a JSON object.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UsageError(f"{path}: no such file; is this the folder of a finished run?") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise UsageError(
-            f"{path}: not readable as JSON ({error}); restore the file or run it again"
-        ) from error
+    content = read_json_value(path)
     if not isinstance(content, dict):
         raise UsageError(
-            f"{path}: expected a JSON object, found {type(content).__name__}; restore the file or"
+            f"{path}: expected a JSON object, found {_json_kind(content)}; restore the file or"
             " run it again"
         )
     return content
+
+
+def _json_kind(value: Any) -> str:
+    """Return the name of a JSON value's type for a message."""
+    return "list" if isinstance(value, list) else type(value).__name__
 
 
 def read_table(path: Path) -> pd.DataFrame:
@@ -173,6 +172,7 @@ def read_table(path: Path) -> pd.DataFrame:
     import pyarrow as pa
 
     try:
+        require_regular(path, SIZE_LIMITS[".parquet"])
         return pd.read_parquet(path)
     except (OSError, ValueError, TypeError, KeyError, pa.ArrowException) as error:
         first = next(iter(str(error).splitlines()), "")

@@ -120,6 +120,20 @@ def read_regular(path: Path, limit: int) -> bytes:
     return content
 
 
+def require_regular(path: Path, limit: int) -> None:
+    """Check that a file can be read to its end: regular, no symbolic link, below a size.
+
+    Raises:
+        OSError: if the file is missing.
+        ValueError: if it is a device, a FIFO or a link, or larger than the limit in bytes.
+    """
+    status = path.lstat()
+    if not stat.S_ISREG(status.st_mode):
+        raise ValueError("it is no regular file")
+    if status.st_size > limit:
+        raise ValueError(f"it is larger than {limit / 1e6:.0f} MB")
+
+
 @final
 class Manifest:
     """The record of the files that residnet wrote into a folder and the folders below it.

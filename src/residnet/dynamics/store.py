@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 from torch import Tensor, nn
 
 from residnet.baselines import BaselineConfig
@@ -21,8 +21,9 @@ from residnet.core.config import Config, validate
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.files import read_json, whole
 from residnet.core.layout import PLANAR, ROLL, SIX
-from residnet.core.names import nearest
-from residnet.core.ownership import run_manifest_above
+from residnet.core.names import nearest, require_plain_name
+from residnet.core.ownership import read_regular, run_manifest_above
+from residnet.core.run_loader import SIZE_LIMITS, require_trustworthy
 from residnet.core.version import __version__
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
@@ -185,6 +186,11 @@ class ModelSpec(Stored):
                 model.turn_about((), 0)
         return model
 
+    @field_validator("name")
+    @classmethod
+    def _is_plain(cls, name: str) -> str:
+        return require_plain_name(name)
+
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
         """The training range of each velocity and input."""
@@ -297,9 +303,10 @@ def read_weights(folder: Path, module: nn.Module) -> None:
     file = folder / _WEIGHTS
     again = "restore the folder or run the fit again"
     try:
-        weights = file.read_bytes()
-    except OSError as error:
-        raise UsageError(f"{file}: cannot be read ({error.strerror}); {again}") from None
+        weights = read_regular(file, SIZE_LIMITS[".safetensors"])
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UsageError(f"{file}: cannot be read ({reason}); {again}") from None
     if hashlib.sha256(weights).hexdigest() != _description(folder).get("sha256"):
         raise UsageError(
             f"{file}: its SHA-256 is not the one in {_DESCRIPTION}, so it is cut off, edited or"
@@ -372,6 +379,7 @@ def chosen_model(run: Path, name: str) -> str:
             f"{run}: no such folder; run the fit first that identifies the model (residnet run"
             f" CONFIG --out {run})"
         )
+    require_trustworthy(run)
     names = model_names(run / "models")
     meant = name in ("selected", "predictor")
     if not meant and name in names:

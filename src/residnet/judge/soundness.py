@@ -14,7 +14,6 @@ nobody measured may swing a little in a steady turn, as the vessel did.
 from __future__ import annotations
 
 import copy
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -27,6 +26,7 @@ from torch import Tensor
 
 from residnet.core.columns import velocities_on
 from residnet.core.errors import DataError
+from residnet.core.files import read_json
 from residnet.core.format import interval, number, shown_unit
 from residnet.core.layout import LATERAL, POSE, SURGE, SWAY
 from residnet.core.names import WIND_INPUTS
@@ -592,7 +592,7 @@ def read_findings(run: Path) -> list[Finding]:
     if not path.is_file():
         return []
     try:
-        return [Finding(**row) for row in json.loads(path.read_text(encoding="utf-8"))["findings"]]
+        return [Finding(**row) for row in read_json(path)["findings"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(
             f"{path}: not readable as the findings of a run ({error}); delete the file"

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from residnet.core.files import file_stem, whole
-from residnet.core.ownership import require_inside, run_manifest_above
+from residnet.core.errors import UsageError
+from residnet.core.files import file_stem, read_json, whole
+from residnet.core.ownership import require_inside, resolve_name, run_manifest_above
 from residnet.core.progress import begin
 from residnet.report.blocks import Section
 from residnet.report.figure import Case, Curve, Figure, Look, Panel, joined, parts, thinned
@@ -129,7 +130,7 @@ def figures_section(folder: Path) -> list[Section]:
 
 def _read(path: Path) -> Figure | None:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         for case in content["cases"]:
             case["curves"] = [
                 {
@@ -144,8 +145,20 @@ def _read(path: Path) -> Figure | None:
             looks={name: Look(**look) for name, look in content["looks"].items()},
             panels=[Panel(**panel) for panel in content["panels"]],
             cases=[Case(**case) for case in content["cases"]],
-            stills=[path.parent / name for name in content["stills"]],
+            stills=[_still_path(path, name) for name in content["stills"]],
         )
-    except (OSError, ValueError, TypeError, KeyError):
+    except (UsageError, OSError, ValueError, TypeError, KeyError, AttributeError):
         # damaged: it is drawn again, or is not one of residnet
         return None
+
+
+def _still_path(figure: Path, name: object) -> Path:
+    """Return the picture of a figure: a PNG in the folder of the figure.
+
+    Raises:
+        UsageError: if the name leads elsewhere, or is that of another file.
+    """
+    still = resolve_name(figure.parent, name, figure)
+    if still.parent != figure.parent or still.suffix != ".png":
+        raise UsageError(f"{figure}: {name!r} is not the name of a picture beside it")
+    return still

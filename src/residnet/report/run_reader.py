@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,6 +18,7 @@ from residnet.core.format import SHOWN_UNITS, shown_unit
 from residnet.core.frames import wrap_array
 from residnet.core.layout import ALIVE, SIX, Live
 from residnet.core.names import CHANNEL_UNITS, END_UNITS, to_si
+from residnet.core.run_loader import read_json_value, require_listed
 from residnet.core.units import known_unit
 from residnet.judge.assessment import Assessment
 from residnet.judge.metrics import INPUT, columns_of
@@ -117,22 +118,21 @@ class RunFiles:
         """Return what a JSON file of the folder holds, an empty object where there is none.
 
         Raises:
-            DataError: where the file cannot be read.
+            UsageError: if the file cannot be read.
         """
         path = self.path / name
-        if not path.is_file():
+        if not os.path.lexists(path):
             return {}
-        try:
-            return json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            raise DataError(
-                f"{path}: not readable as JSON ({error}); restore the file or run it again"
-            ) from None
+        require_listed(self.path, name)
+        return read_json_value(path, self.path)
 
     def frame(self, name: str) -> Any:
         """Return a parquet file of the folder as a pandas table, None where there is none."""
         path = self.path / name
-        return read_table(path) if path.is_file() else None
+        if not os.path.lexists(path):
+            return None
+        require_listed(self.path, name)
+        return read_table(path)
 
     def assessment(self, judged: tuple[str, Sequence[str]] | None = None) -> Assessment:
         """Return what the run says of its model and of its logs, for the card of an export.

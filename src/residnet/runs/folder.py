@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import stat
 import subprocess
 import sys
 import time
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from residnet.core.errors import UsageError
 from residnet.core.files import read_json, require_room, sha256, whole
 from residnet.core.ownership import RUN_MANIFEST, Manifest
+from residnet.core.run_loader import require_trustworthy
 from residnet.core.version import __version__
 
 if TYPE_CHECKING:
@@ -184,7 +186,7 @@ class RunFolder:
                 written.
         """
         folder = cls(path)
-        if not folder.resolved.is_file():
+        if not stat.S_ISREG(folder.resolved.lstat().st_mode if folder.resolved.exists() else 0):
             what = "not a run folder (no resolved.yaml)" if path.exists() else "no such folder"
             raise UsageError(f"{path}: {what}; `residnet runs` lists what there is")
         if not folder.finished:
@@ -330,14 +332,11 @@ def seal(run: Path) -> None:
 def require_sealed(run: Path) -> None:
     """Check that the results of a finished run are those that it wrote.
 
-    A run of an earlier version has no checksums, and is taken as it is.
-
     Raises:
-        UsageError: where a file is missing, cut off, edited or from elsewhere.
+        UsageError: if the manifest is missing or does not list a file, or if a file is missing, cut
+            off, edited, from elsewhere, or no regular file.
     """
-    manifest = Manifest(run)
-    if os.path.lexists(manifest.path) or os.path.lexists(manifest.journal):
-        manifest.verify(skipped={*_ELSEWHERE, "report.html"})
+    require_trustworthy(run)
 
 
 def _results(folder: Path, run: Path) -> Iterator[Path]:
@@ -345,7 +344,7 @@ def _results(folder: Path, run: Path) -> Iterator[Path]:
         if path.is_dir():
             if path.name not in _ELSEWHERE and not (path / "summary.json").is_file():
                 yield from _results(path, run)
-        elif path.suffix in _RESULTS and path not in (run / CHECKSUMS, run / "summary.json"):
+        elif path.suffix in _RESULTS and path != run / CHECKSUMS:
             yield path
 
 

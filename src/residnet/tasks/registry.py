@@ -5,7 +5,6 @@ Nothing here waits for PyTorch: a task is imported when a config names it.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,8 +13,9 @@ from typing import Annotated, Any
 from residnet.baselines import BaselineConfig
 from residnet.core.config import load_config, load_mapping
 from residnet.core.errors import ConfigError, ResidnetError, UsageError
-from residnet.core.files import config_folder, require_room, shipped_configs
+from residnet.core.files import config_folder, read_json, require_room, shipped_configs
 from residnet.core.names import nearest
+from residnet.core.ownership import require_regular
 from residnet.core.registry import (
     Kinds,
     ThirdParty,
@@ -25,6 +25,7 @@ from residnet.core.registry import (
     marker,
     vessel_files,
 )
+from residnet.core.run_loader import SIZE_LIMITS, name_damaged_key
 from residnet.data.readers import ReaderConfig
 from residnet.export import FORMATS
 from residnet.heads import HeadConfig
@@ -139,7 +140,8 @@ def report_run(path: Path) -> Path:
     require_recorded(path)
     # before the figures are drawn
     run.manifest.require_recorded_unchanged(run.report.name, run.figures.name)
-    page = task_class(run).write_report(run)
+    with name_damaged_key(path):
+        page = task_class(run).write_report(run)
     # a study writes its comparison anew with the report
     seal(path)
     return page
@@ -215,13 +217,14 @@ def _entry(folder: Path) -> dict[str, Any]:
     entry: dict[str, Any] = {"run": str(folder), "task": "unknown", "state": "unfinished"}
     entry |= {"best": None, "age": time.time() - (folder / "resolved.yaml").stat().st_mtime}
     try:
+        require_regular(folder / "resolved.yaml", SIZE_LIMITS[".yaml"])
         entry["task"] = str(load_mapping(folder / "resolved.yaml").get("task", "unknown"))
         if not (folder / "summary.json").is_file():
             return entry
-        content = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        content = read_json(folder / "summary.json")
         entry["state"] = "finished" if content.get("finished") else "unfinished"
         for name, figure in list((content.get("figures") or {}).items())[:1]:
             entry["best"] = {"name": name, "value": figure["value"], "unit": figure["unit"]}
-    except (ConfigError, ValueError, AttributeError, KeyError, TypeError, OSError):
+    except (UsageError, ValueError, AttributeError, KeyError, TypeError, OSError):
         return {**entry, "state": "damaged"}
     return entry

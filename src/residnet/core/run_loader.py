@@ -1,0 +1,290 @@
+"""Run folders that may come from somebody else: checked before anything in them is read.
+
+A folder is read only if it holds regular files and folders (no symbolic links, devices or FIFOs),
+each below the size limit of its kind, and if its manifest lists every file that is read, with the
+SHA-256 that it has. A folder without a manifest is refused; `residnet trust RUN` accepts it.
+
+Values inside of the files are checked where they are used. `JsonObject` and `JsonArray` remember
+the last key that was read, so that `name_damaged_key` can say which file and key an error is about.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any
+
+from residnet.core.errors import ResidnetError, UsageError
+from residnet.core.ownership import (
+    Manifest,
+    read_regular,
+    require_inside,
+    run_manifest_above,
+    sha256,
+)
+from residnet.core.run_shapes import require_shape
+
+SIZE_LIMITS = {
+    ".json": 256_000_000,
+    ".yaml": 4_000_000,
+    ".safetensors": 4_000_000_000,
+    ".parquet": 8_000_000_000,
+    ".png": 64_000_000,
+}
+"""Bytes of the largest file of each kind that is read from a run folder."""
+UNREAD_FOLDERS = frozenset({"exports", "tensorboard", "checkpoints"})
+"""Folders whose files no command reads back as a result."""
+READ_FOLDERS = frozenset({"figures", "logs", "models", "rollouts"})
+"""Folders of which every file of these kinds is read, whatever its name."""
+READ_NAMES = frozenset(
+    {
+        "bands.json",
+        "controllers.json",
+        "metrics.json",
+        "model.json",
+        "model.safetensors",
+        "fit.json",
+        "provenance.json",
+        "resolved.yaml",
+        "sanity.json",
+        "summary.json",
+    }
+)
+"""Files at the top of a run folder or model that are read; `RunFiles` checks the others itself."""
+_MOST_ENTRIES = 1_000_000
+_DEEPEST = 32
+_ACCEPT = "if you trust where it comes from, accept it as it is with: residnet trust"
+
+
+def files_of_run(run: Path) -> Iterator[Path]:
+    """Yield the regular files of a run folder, those of folders in it with a run too.
+
+    Raises:
+        UsageError: if an entry is a symbolic link, a device, a FIFO or too large, or if there are
+            too many.
+    """
+    count = 0
+    folders = [(run, 0)]
+    while folders:
+        folder, depth = folders.pop()
+        for entry in sorted(folder.iterdir()):
+            count += 1
+            if depth > _DEEPEST or count > _MOST_ENTRIES:
+                raise UsageError(f"{entry}: lies too deep, or the folder has too many files")
+            status = entry.lstat()
+            if stat.S_ISDIR(status.st_mode):
+                folders.append((entry, depth + 1))
+            elif stat.S_ISREG(status.st_mode):
+                limit = SIZE_LIMITS.get(entry.suffix)
+                if limit is not None and status.st_size > limit:
+                    raise UsageError(
+                        f"{entry}: has {status.st_size / 1e6:.0f} MB, expected at most"
+                        f" {limit / 1e6:.0f} MB; restore the folder or run it again"
+                    )
+                yield entry
+            elif not (stat.S_ISLNK(status.st_mode) and entry.suffix == ".lock"):
+                # the journal of a sweep is locked by a link, which nothing reads
+                kind = "symbolic link" if stat.S_ISLNK(status.st_mode) else "device or FIFO"
+                raise UsageError(
+                    f"{entry}: is a {kind}; residnet reads only regular files of a run folder, so"
+                    " replace it by the file itself or remove it"
+                )
+
+
+def require_trustworthy(run: Path) -> None:
+    """Check a run folder, or that of a single model, before anything in it is read.
+
+    Raises:
+        UsageError: if the manifest is missing, if an entry is no regular file or too large, or if a
+            file that may be read is not listed, missing, cut off, edited or from elsewhere.
+    """
+    try:
+        files = [*files_of_run(run)]
+    except OSError as error:
+        place = error.filename or run
+        raise UsageError(f"{place}: cannot be read ({error.strerror})") from None
+    manifest = Manifest(run)
+    if not os.path.lexists(manifest.path) and not os.path.lexists(manifest.journal):
+        raise UsageError(f"{run}: has no {manifest.path.name}; {_ACCEPT} {run}")
+    recorded = manifest.read()
+    manifest.verify(skipped={*UNREAD_FOLDERS, "report.html"})
+    nested = {file.parent for file in files if file.name == manifest.path.name} - {run}
+    for file in files:
+        name = file.relative_to(run)
+        in_folder = len(name.parts) > 1 and name.parts[0] in READ_FOLDERS and file.suffix != ".png"
+        is_read = file.suffix in SIZE_LIMITS and (in_folder or str(name) in READ_NAMES)
+        if file == manifest.path or not is_read or nested.intersection(file.parents):
+            continue
+        if name.as_posix() not in recorded:
+            raise _unlisted(file, run)
+
+
+def require_listed(run: Path, name: str) -> None:
+    """Check that the manifest around a file of a run folder, if there is one, lists it.
+
+    A model has a manifest of its own inside of its run.
+
+    Raises:
+        UsageError: if it does not.
+    """
+    path = run / name
+    manifest = run_manifest_above(path)
+    if manifest is None or not manifest.folder.is_relative_to(run):
+        # not a run folder: what opens one has checked that there is a manifest
+        return
+    if path.relative_to(manifest.folder).as_posix() not in manifest.read():
+        raise _unlisted(path, run)
+
+
+def _unlisted(file: Path, run: Path) -> UsageError:
+    return UsageError(f"{file}: is not listed in {Manifest(run).path.name}; {_ACCEPT} {run}")
+
+
+def accept_run(run: Path) -> list[str]:
+    """Write the manifest of a run folder anew, so that it is taken as it stands.
+
+    Returns:
+        One line for each file that the manifest did not list, or listed with another SHA-256.
+
+    Raises:
+        UsageError: if there is no such folder, if an entry is no regular file or too large, or if
+            the manifest cannot be written.
+    """
+    if not run.is_dir():
+        raise UsageError(f"{run}: no such folder; give the folder of a run")
+    files = [*files_of_run(run)]
+    if not any(file.name in ("resolved.yaml", "model.json") for file in files):
+        raise UsageError(f"{run}: neither the folder of a run nor that of a model")
+    name = Manifest(run).path.name
+    # the folder of a model has a manifest of its own, since a model may be copied out of its run
+    nested = {file.parent for file in files if file.name in (name, "model.json")} - {run}
+    lines = []
+    for folder in (*sorted(nested, key=lambda path: -len(path.parts)), run):
+        manifest = Manifest(folder)
+        try:
+            before = manifest.read()
+        except UsageError:
+            before = {}
+        manifest.path.unlink(missing_ok=True)
+        manifest.journal.unlink(missing_ok=True)
+        manifest.begin()
+        inner = {path for path in nested if path != folder and path.is_relative_to(folder)}
+        for file in files:
+            is_covered = file.is_relative_to(folder) and not inner.intersection(file.parents)
+            is_manifest = file.name in (name, manifest.journal.name)
+            if not is_covered or is_manifest or file.suffix not in SIZE_LIMITS:
+                continue
+            digest = sha256(file)
+            manifest.record(file, digest)
+            if digest not in before.get(file.relative_to(folder).as_posix(), ()):
+                lines.append(f"{file}: {file.stat().st_size} bytes, SHA-256 {digest}")
+        manifest.compact()
+    return lines
+
+
+# ------------------------------------------------------------------------------ JSON of a run
+
+_last_key: ContextVar[tuple[Path, str] | None] = ContextVar("residnet_last_key", default=None)
+
+
+class JsonObject(dict[str, Any]):
+    """A JSON object that remembers which of its keys was read last."""
+
+    place: tuple[Path, str]
+
+    def __getitem__(self, key: str) -> Any:
+        _last_key.set((self.place[0], f"{self.place[1]}.{key}".lstrip(".")))
+        return super().__getitem__(key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        _last_key.set((self.place[0], f"{self.place[1]}.{key}".lstrip(".")))
+        return super().get(key, default)
+
+
+class JsonArray(list[Any]):
+    """A JSON array that remembers which of its elements was read last."""
+
+    place: tuple[Path, str]
+
+    def __getitem__(self, index: Any) -> Any:
+        _last_key.set((self.place[0], f"{self.place[1]}.{index}".lstrip(".")))
+        return super().__getitem__(index)
+
+
+def _tracked(value: Any, file: Path, key: str) -> Any:
+    """Return JSON whose objects and arrays know their file and key."""
+    if isinstance(value, dict):
+        prefix = f"{key}." if key else ""
+        found = JsonObject(
+            (name, _tracked(part, file, f"{prefix}{name}")) for name, part in value.items()
+        )
+        found.place = (file, key)
+        return found
+    if isinstance(value, list):
+        array = JsonArray(
+            _tracked(part, file, f"{key}.{place}".lstrip(".")) for place, part in enumerate(value)
+        )
+        array.place = (file, key)
+        return array
+    return value
+
+
+def read_json_value(path: Path, folder: Path | None = None) -> Any:
+    """Return what a JSON file of a run folder holds, as objects that know their keys.
+
+    Args:
+        path: of the file.
+        folder: that no symbolic link may lead out of; that of the file if None.
+
+    Raises:
+        UsageError: if there is no such regular file, or it is too large or no JSON.
+    """
+    require_inside(folder or path.parent, path)
+    try:
+        text = read_regular(path, SIZE_LIMITS[".json"]).decode("utf-8")
+        _last_key.set((path, ""))
+        content = json.loads(text)
+    except FileNotFoundError:
+        raise UsageError(f"{path}: no such file; is this the folder of a finished run?") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise UsageError(
+            f"{path}: not readable as JSON ({error}); restore the file or run it again"
+        ) from error
+    require_shape(path, content)
+    try:
+        return _tracked(content, path, "")
+    except RecursionError:
+        raise UsageError(f"{path}: is nested too deeply; restore the file") from None
+
+
+@contextmanager
+def name_damaged_key(run: Path) -> Iterator[None]:
+    """Turn an error about a value of a run folder into one line that names its file and key.
+
+    Raises:
+        UsageError: if anything but a `ResidnetError` or an error of the system is raised within.
+    """
+    token = _last_key.set(None)
+    try:
+        yield
+    except (ResidnetError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        last = _last_key.get()
+        if last is None:
+            # nothing was read from the folder, so its files are not at fault
+            raise
+        file, key = last
+        first = next(iter(str(error).splitlines()), "")
+        where = f"key '{key}'" if key else "its contents"
+        raise UsageError(
+            f"{file}: {where} cannot be used ({type(error).__name__}: {first[:200]}); restore the"
+            f" folder or run it again, and report it if {run} is as residnet wrote it"
+        ) from error
+    finally:
+        _last_key.reset(token)

@@ -1,0 +1,153 @@
+"""Types of the values in the JSON files of a run that commands read back.
+
+Keys that are not listed here are free. A value of another type ends in one line that names the file
+and the key.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictStr, TypeAdapter
+from pydantic import ValidationError as ShapeError
+
+from residnet.core.errors import UsageError
+
+Number = Annotated[float, Field(strict=True)] | None
+"""A number; None stands for one that is not finite."""
+Texts = list[StrictStr]
+
+
+class _Shape(BaseModel):
+    """An object whose listed keys have a type; others may be there."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class _Row(_Shape):
+    """A row of metrics.json."""
+
+    model: StrictStr
+    kind: StrictStr = "head"
+    split: StrictStr
+    protocol: StrictStr = ""
+    manoeuvre: StrictStr = "all"
+    rmse: dict[str, Number] = {}
+    mae: dict[str, Number] = {}
+    nrmse: dict[str, Number] = {}
+    rmse_ci95: dict[str, list[Number] | None] = {}
+    nrmse_mean_ci95: list[Number] | None = None
+    windows: Number = None
+    n: Number = None
+    diverged: Number = None
+    position_error_end: Number = None
+    heading_error_end: Number = None
+
+
+class _FitMetrics(_Shape):
+    """The contents of metrics.json of a fit."""
+
+    selected: StrictStr | None = None
+    predictor: StrictStr | None = None
+    channels: dict[str, StrictStr] = {}
+    scales: dict[str, Number] = {}
+    rows: list[_Row]
+
+
+class _Metrics(_Shape):
+    """The contents of metrics.json of any task."""
+
+    rows: list[dict[str, Any]] = []
+
+
+class _FitNotes(_Shape):
+    """The contents of models/<model>/fit.json."""
+
+    seconds: Number = None
+    validation: Number | list[Any] | dict[str, Any] = None
+
+
+class _Figure(_Shape):
+    """A main figure in summary.json."""
+
+    value: Number | StrictStr = None
+    unit: StrictStr = ""
+
+
+class _Summary(_Shape):
+    """The contents of summary.json."""
+
+    task: StrictStr = ""
+    finished: StrictBool = False
+    level: StrictStr = ""
+    verdict: Texts = []
+    figures: dict[str, _Figure] = {}
+
+
+class _Provenance(_Shape):
+    """The contents of provenance.json."""
+
+    residnet: StrictStr | None = None
+    started: StrictStr | None = None
+    seconds: Number = None
+    overrides: Texts | None = None
+    packages: dict[str, StrictStr | None] | None = None
+    inputs: dict[str, StrictStr | None] | None = None
+
+
+class _Export(_Shape):
+    """A row of exports.json."""
+
+    model: StrictStr
+    file: StrictStr | None
+    fault: StrictStr | None
+
+
+class _Exports(_Shape):
+    """The contents of exports.json."""
+
+    exports: list[_Export] = []
+
+
+_SHAPES: dict[str, type[BaseModel]] = {
+    "fit.json": _FitNotes,
+    "summary.json": _Summary,
+    "provenance.json": _Provenance,
+    "exports.json": _Exports,
+}
+
+
+@cache
+def _adapter(shape: type[BaseModel]) -> TypeAdapter[BaseModel]:
+    return TypeAdapter(shape)
+
+
+def require_shape(path: Path, content: Any) -> None:
+    """Check the types of the known keys of a JSON file of a run.
+
+    Args:
+        path: of the file; its name says what it holds.
+        content: what was read from it.
+
+    Raises:
+        UsageError: if a value has another type, or a key is missing.
+    """
+    shape = _SHAPES.get(path.name)
+    if path.name == "metrics.json":
+        is_fit = isinstance(content, dict) and content.get("schema") == "residnet.metrics/1"
+        shape = _FitMetrics if is_fit else _Metrics
+    if shape is None or not isinstance(content, dict):
+        # whoever reads the file says what it expects in place of a list or a number
+        return
+    try:
+        _adapter(shape).validate_python(content)
+    except ShapeError as error:
+        first = error.errors(include_url=False)[0]
+        # the alternatives of a union stand behind the key that they are of
+        key = ".".join(str(part) for part in first["loc"] if "[" not in str(part))
+        where = f"key '{key}'" if key else "its contents"
+        raise UsageError(
+            f"{path}: {where}: {first['msg'].lower()}; restore the folder or run it again"
+        ) from None

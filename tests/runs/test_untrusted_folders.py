@@ -1,0 +1,391 @@
+"""Run folders from somebody else: mutated at random, they run nothing and end in one line."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pickle
+import random
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from forged_run import forge_sums
+from made_once import made_once
+from tiny import TINY, Command, call, read_json, write_yaml
+from tiny_tasks import flown
+
+import residnet
+from residnet.core.errors import ResidnetError, UsageError
+from residnet.core.run_loader import accept_run, name_damaged_key
+from residnet.report import figure_files, page
+from residnet.report.run_reader import RunFiles
+from residnet.runs.folder import RunFolder
+from residnet.tasks import registry
+
+SECONDS = 5.0
+"""Time after which a folder counts as one that hangs a command."""
+SKLEARN = {
+    "name": "boosted",
+    "heads": {"trees": {"kind": "sklearn", "samples": 100}},
+    "bands": None,
+    "ensembles": {},
+    "training": {},
+    "export": {"models": []},
+}
+CONFIGS: dict[str, Callable[[Path], dict[str, Any]]] = {
+    "fit": lambda folder: TINY | {"export": {"models": []}},
+    "simulate": flown,
+    "sklearn": lambda folder: TINY | SKLEARN | {"data": TINY["data"] | {"duration": 25}},
+}
+
+
+@pytest.fixture(scope="session", params=CONFIGS)
+def finished(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of each kind."""
+
+    def make(folder: Path) -> None:
+        place = tmp_path_factory.mktemp("config")
+        config = write_yaml(place / "config.yaml", CONFIGS[request.param](place))
+        with pytest.MonkeyPatch.context() as patch:
+            assert call(patch, "run", config, "--out", folder, "--quiet") == 0
+
+    return made_once(tmp_path_factory, f"untrusted_{request.param}", make)
+
+
+# ------------------------------------------------------------------------------ mutations
+
+HOSTILE_VALUES: list[Any] = [
+    "text", "", None, True, -1, 0, 1e308, 10**400, float("nan"), [], {}, [[]], {"a": {}},
+    "../../victim.txt", "/etc/passwd", "/dev/zero", "sklearn.datasets.load_iris", "\0", "\ud800",
+    "{{ 7*7 }}", "x" * 100_000, [0] * 10_000,
+]  # fmt: skip
+
+
+def _edit_json(path: Path, rng: random.Random) -> None:
+    """Replace, remove or add a value at a random place of a JSON file."""
+    content = json.loads(path.read_text())
+    here, places = content, []
+    while isinstance(here, dict | list) and here:
+        key = rng.choice([*here] if isinstance(here, dict) else range(len(here)))
+        places.append((here, key))
+        if rng.random() < 0.25:
+            break
+        here = here[key]
+    if not places:
+        content = rng.choice(HOSTILE_VALUES)
+    else:
+        parent, key = places[-1]
+        if rng.random() < 0.3:
+            del parent[key]
+        else:
+            parent[key] = rng.choice(HOSTILE_VALUES)
+    path.write_text(json.dumps(content))
+
+
+def mutate(run: Path, victim: Path, rng: random.Random) -> str:
+    """Change one file of a run folder; returns what was done."""
+    files = [path for path in sorted(run.rglob("*")) if path.is_file()]
+    texts = [path for path in files if path.suffix == ".json" and path.name != "checksums.json"]
+    kind = rng.choice(
+        ["truncate", "swap", "link", "folder_link", "device", "fifo", "enlarge", "flip", "delete"]
+        + 9 * ["edit"]
+    )
+    path = rng.choice(texts if kind == "edit" else files)
+    content = path.read_bytes()
+    if kind == "truncate":
+        path.write_bytes(content[: rng.randrange(len(content) + 1)])
+    elif kind == "swap":
+        other = rng.choice(files)
+        path.write_bytes(other.read_bytes())
+        other.write_bytes(content)
+    elif kind == "link":
+        path.unlink()
+        path.symlink_to(rng.choice([victim, rng.choice(files), Path("nowhere"), path]))
+    elif kind == "folder_link":
+        folder = rng.choice([place for place in run.rglob("*") if place.is_dir()])
+        shutil.rmtree(folder)
+        folder.symlink_to(rng.choice([victim.parent, run, Path("/")]))
+    elif kind == "device":
+        path.unlink()
+        path.symlink_to("/dev/zero")
+    elif kind == "fifo":
+        path.unlink()
+        os.mkfifo(path)
+    elif kind == "enlarge":
+        with path.open("r+b") as file:
+            file.truncate(rng.choice([len(content) + 7, 300_000_000]))
+    elif kind == "flip" and content:
+        damaged = bytearray(content)
+        for _ in range(rng.randrange(1, 9)):
+            damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+        path.write_bytes(damaged)
+    elif kind == "delete":
+        path.unlink()
+    elif kind == "edit":
+        _edit_json(path, rng)
+    return f"{kind} {path.relative_to(run)}"
+
+
+# -------------------------------------------------------------------------------- reading
+
+
+class Hang(BaseException):
+    """The alarm of a command that takes too long."""
+
+
+@contextmanager
+def limited(seconds: float) -> Iterator[None]:
+    """End whatever computes for longer within the context, or waits for half a minute more.
+
+    Time of the processor is counted, since tests run beside others.
+    """
+
+    def alarm(*_: object) -> None:
+        raise Hang
+
+    kinds = {signal.SIGPROF: signal.ITIMER_PROF, signal.SIGALRM: signal.ITIMER_REAL}
+    before = {number: signal.signal(number, alarm) for number in kinds}
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+    signal.setitimer(signal.ITIMER_REAL, seconds + 30.0)
+    try:
+        yield
+    finally:
+        for number, timer in kinds.items():
+            signal.setitimer(timer, 0)
+            signal.signal(number, before[number])
+
+
+def _load_models(run: Path) -> None:
+    for name in [path.name for path in sorted((run / "models").glob("*"))][:4] or ["selected"]:
+        try:
+            residnet.load(run, name)
+        except ResidnetError:
+            # each model has to be refused or loaded by itself
+            continue
+
+
+def _read_report(run: Path) -> None:
+    registry.report_run(run)
+
+
+def _list_runs(run: Path) -> None:
+    registry.runs_text(run.parent, registry.runs_below(run.parent))
+
+
+def _read_task(run: Path) -> None:
+    folder = RunFolder.open(run)
+    with name_damaged_key(run):
+        registry.finished_task(run, registry.task_class(folder).verbs[0])
+        RunFiles(run).json("metrics.json")
+
+
+ENTRANCES = [_load_models, _read_report, _list_runs, _read_task]
+
+
+@pytest.fixture
+def no_execution(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make every start of a program and every pickle an error; pictures are not drawn."""
+
+    def forbidden(*args: object, **_: object) -> None:
+        raise AssertionError(f"something was executed: {args}")
+
+    for owner, name in (
+        (os, "system"), (os, "popen"), (os, "execv"), (os, "posix_spawn"), (subprocess, "Popen"),
+        (pickle, "load"), (pickle, "loads"), (pickle, "Unpickler"),
+    ):  # fmt: skip
+        monkeypatch.setattr(owner, name, forbidden)
+    monkeypatch.setattr(page, "draw_sections", lambda sections: {})
+    monkeypatch.setattr(figure_files, "still", lambda figure, case: None)
+    monkeypatch.setattr(figure_files, "save", lambda still, path, *_: path.write_bytes(PIXEL))
+
+
+PIXEL = bytes.fromhex(
+    "89504e470d0a1a0a0000000d4948445200000001000000010804000000b51c0c02"
+    "0000000b4944415478da6364f80f00010501012718e3660000000049454e44ae426082"
+)
+
+
+def _hashes(folder: Path) -> dict[str, str]:
+    return {
+        str(path): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def fuzz(finished: Path, folder: Path, seeds: range) -> None:
+    """Mutate a run once for each seed, and read it by every entrance.
+
+    Raises:
+        AssertionError: with all seeds that were not refused in one line.
+    """
+    outside = folder / "outside"
+    outside.mkdir()
+    victim = outside / "victim.txt"
+    victim.write_text("the user's thesis")
+    before, faults = _hashes(outside), []
+    # what a report costs by itself is no hang
+    shutil.copytree(finished, folder / "runs" / "stranger")
+    begin = time.process_time()
+    _read_report(folder / "runs" / "stranger")
+    usual = time.process_time() - begin
+    shutil.rmtree(folder / "runs" / "stranger")
+    for seed in seeds:
+        rng = random.Random(seed)
+        run = folder / "runs" / "stranger"
+        shutil.copytree(finished, run)
+        done = mutate(run, victim, rng)
+        if rng.random() < 0.7:
+            try:
+                forge_sums(run)
+                done += ", sums corrected"
+            except OSError:
+                # a device or a link has no sum
+                pass
+        for read in rng.sample(ENTRANCES, 2):
+            try:
+                with limited(usual + SECONDS):
+                    read(run)
+            except ResidnetError as error:
+                if "\n" in str(error):
+                    faults.append((seed, done, read.__name__, "several lines"))
+            except (Hang, Exception) as error:
+                faults.append((seed, done, read.__name__, f"{type(error).__name__}: {error}"[:200]))
+        assert _hashes(outside) == before, (seed, done)
+        shutil.rmtree(run)
+    assert not faults, "\n".join(map(str, faults))
+
+
+@pytest.mark.usefixtures("no_execution")
+def test_mutated_folders_end_in_one_line(finished: Path, tmp_path: Path) -> None:
+    fuzz(finished, tmp_path, range(12))
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("no_execution")
+def test_a_thousand_mutated_folders_end_in_one_line(finished: Path, tmp_path: Path) -> None:
+    fuzz(finished, tmp_path, range(1_000, 1_334))
+
+
+# ------------------------------------------------------------------------- single attacks
+
+
+@pytest.fixture
+def stranger(tiny_run: Path, tmp_path: Path) -> Path:
+    shutil.copytree(tiny_run, tmp_path / "stranger")
+    return tmp_path / "stranger"
+
+
+@pytest.mark.parametrize("absolute", [True, False])
+def test_a_report_deletes_no_file_of_the_user(
+    absolute: bool, command: Command, stranger: Path, tmp_path: Path
+) -> None:
+    thesis = tmp_path / "thesis.png"
+    thesis.write_text("years of work")
+    figure = sorted((stranger / "figures").glob("*.json"))[0]
+    name = str(thesis) if absolute else "../../thesis.png"
+    figure.write_text(json.dumps({**read_json(figure), "stills": [name]}))
+    ended = command("report", stranger, "--quiet")
+    assert (ended.code, ended.err.count("\n")) == (2, 1)
+    forge_sums(stranger)
+    command("report", stranger, "--quiet")
+    assert thesis.read_text() == "years of work"
+
+
+@pytest.mark.parametrize("name", ["metrics.json", "resolved.yaml", "summary.json", "figures"])
+def test_a_link_or_fifo_is_refused_by_every_command(
+    name: str, command: Command, stranger: Path, tmp_path: Path
+) -> None:
+    place = stranger / name
+    shutil.rmtree(place) if place.is_dir() else place.unlink()
+    for plant in (lambda: place.symlink_to("/dev/zero"), lambda: os.mkfifo(place)):
+        plant()
+        for words in (["report"], ["export"], ["plan-trial"], ["compare", stranger]):
+            with limited(SECONDS):
+                ended = command(words[0], *words[1:], stranger)
+            assert (ended.code, ended.err.count("\n")) == (2, 1), words
+        with limited(SECONDS):
+            assert command("runs", tmp_path).code == 0
+        place.unlink()
+
+
+def test_a_missing_manifest_is_refused_until_it_is_accepted(
+    command: Command, stranger: Path
+) -> None:
+    for manifest in stranger.rglob("checksums.json"):
+        manifest.unlink()
+    ended = command("export", stranger)
+    assert (ended.code, ended.err.count("\n")) == (2, 1)
+    assert "has no checksums.json; if you trust where it comes from" in ended.err
+    accepted = command("trust", stranger)
+    assert accepted.code == 0
+    assert "metrics.json: " in accepted.out
+    assert "files were new or changed" in accepted.out
+    assert command("trust", stranger).out.startswith(f"{stranger}: accepted, 0 files")
+    assert residnet.load(stranger, "ridge").name == "ridge"
+
+
+def test_an_unlisted_file_is_refused_until_it_is_accepted(
+    command: Command, stranger: Path
+) -> None:
+    shutil.copytree(stranger / "models" / "ridge", stranger / "models" / "planted")
+    (stranger / "models" / "planted" / "checksums.json").unlink()
+    ended = command("export", stranger, "--model", "planted")
+    assert (ended.code, ended.err.count("\n")) == (2, 1)
+    assert "is not listed in checksums.json" in ended.err
+    assert any("planted" in line for line in residnet.trust(stranger))
+
+
+def test_a_folder_that_is_no_run_is_not_accepted(tmp_path: Path) -> None:
+    (tmp_path / "notes.json").write_text("{}")
+    with pytest.raises(UsageError, match="neither the folder of a run nor that of a model"):
+        accept_run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "keys", "value"),
+    [
+        ("models/ridge/fit.json", ["seconds"], "soon"),
+        ("provenance.json", ["seconds"], "soon"),
+        ("metrics.json", ["rows", 0, "rmse"], "small"),
+    ],
+)
+def test_a_value_of_the_wrong_type_is_named(
+    file: str, keys: list[Any], value: Any, command: Command, stranger: Path
+) -> None:
+    content = read_json(stranger / file)
+    parent = content
+    for key in keys[:-1]:
+        parent = parent[key]
+    parent[keys[-1]] = value
+    (stranger / file).write_text(json.dumps(content))
+    forge_sums(stranger)
+    ended = command("report", stranger, "--quiet")
+    assert (ended.code, ended.err.count("\n")) == (2, 1)
+    assert f"{stranger / file}: key '{'.'.join(map(str, keys))}" in ended.err
+
+
+def test_files_of_the_user_in_a_run_folder_disturb_no_command(
+    command: Command, stranger: Path
+) -> None:
+    (stranger / "notes.json").write_text("not JSON")
+    (stranger / "figures" / "photo.png").write_bytes(b"no picture")
+    (stranger / "sub").mkdir()
+    (stranger / "sub" / "table.parquet").write_bytes(b"no table")
+    assert command("export", stranger, "--model", "ridge", "--anyway", "--quiet").code == 0
+
+
+def test_a_planted_result_is_refused(command: Command, stranger: Path) -> None:
+    """A report reads results by their name, whether the run wrote them or not."""
+    (stranger / "currents.json").write_text('{"a": 1}')
+    ended = command("report", stranger, "--quiet")
+    assert (ended.code, ended.err.count("\n")) == (2, 1)
+    assert "currents.json: is not listed in checksums.json" in ended.err
