@@ -15,11 +15,11 @@ import pytest
 from tiny import TINY, read_json
 
 import residnet
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ResidnetError
 from residnet.data.prepare import PrepareConfig
 from residnet.export import vessel
-from residnet.judge.metrics import metrics_table
+from residnet.judge.metrics import build_metrics_table
 from residnet.judge.protocol import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
 
@@ -62,12 +62,12 @@ def logs(trials: Path) -> list[residnet.Log]:
 
 
 @pytest.fixture(scope="module")
-def data(logs: list[residnet.Log]) -> residnet.Data:
+def data(logs: list[residnet.Log]) -> residnet.Dataset:
     return residnet.prepare(logs, ["n_port", "n_stbd"])
 
 
 @pytest.fixture(scope="module")
-def models(data: residnet.Data) -> residnet.Models:
+def models(data: residnet.Dataset) -> residnet.Models:
     return residnet.fit(data, heads={"ridge": "ridge", "net": {"kind": "mlp", "hidden": (8,)}})
 
 
@@ -85,12 +85,12 @@ def test_the_face_loads_nothing_and_every_name_is_there_and_documented() -> None
         _ = residnet.fitt  # type: ignore[attr-defined]
 
 
-def test_logs_have_one_recipe_whoever_asks(trials: Path, data: residnet.Data) -> None:
+def test_logs_have_one_recipe_whoever_asks(trials: Path, data: residnet.Dataset) -> None:
     assert data.prepare.grid.step == 0.1
     assert dict(data.table["split"].value_counts()) == {"train": 5, "validation": 2, "test": 3}
     assert data.prepare.hold == "mean"
     assert data.evaluation.selection == next(iter(data.evaluation.protocols))
-    draft = residnet.draft(trials, folder=trials.parent)
+    draft = residnet.draft_config(trials, folder=trials.parent)
     logs = residnet.read_logs(trials, reader=draft.config["data"]["reader"])
     heard: list[residnet.Progress] = []
     fitted = residnet.fit(logs, "regressors", bands=None, progress=heard.append).settings
@@ -101,7 +101,7 @@ def test_logs_have_one_recipe_whoever_asks(trials: Path, data: residnet.Data) ->
         ("signals", SignalsConfig),
         ("evaluation", EvaluationConfig),
     ):
-        drafted = validate(draft.config[key], kind, key)
+        drafted = validate_config(draft.config[key], kind, key)
         assert getattr(prepared, key) == drafted, key
         assert getattr(fitted, key) == drafted, key
     residnet.read_logs(trials, channels=CHANNELS, time="time", progress=heard.append)
@@ -121,7 +121,7 @@ def test_fifteen_lines(trials: Path) -> None:
     assert (trials.parent / "track.png").stat().st_size > 10_000
 
 
-def test_tables_and_figures(models: residnet.Models, data: residnet.Data) -> None:
+def test_tables_and_figures(models: residnet.Models, data: residnet.Dataset) -> None:
     table = residnet.metrics(models, split="test")
     assert set(table["model"]) == {"zero", "baseline", "ridge", "net"}
     error = table[table["protocol"] == "T30"].set_index("model")["nrmse_mean"]
@@ -139,19 +139,19 @@ def test_tables_and_figures(models: residnet.Models, data: residnet.Data) -> Non
     assert found == pytest.approx(np.mean(rmse), rel=1e-12)
     for figure in (runs.plot_track(models=["ridge"]), runs.plot_history(protocol="T30")):
         assert len(figure.axes) in (1, 4)
-    assert residnet.select(models).name == models.selected
-    assert models.verdict[0].startswith(f"10 s ahead {models.selected} is off by ")
-    told = f"On test data model {models.selected} is "
+    assert residnet.select_model(models).name == models.selected_name
+    assert models.verdict[0].startswith(f"10 s ahead {models.selected_name} is off by ")
+    told = f"On test data model {models.selected_name} is "
     assert any(sentence.startswith(told) for sentence in models.verdict)
     assert models.selection.reason in models.verdict
     assert list(models["baseline"].coefficients["axis"].unique()) == ["u_dot", "v_dot", "r_dot"]
 
 
 def test_other_logs_are_judged_as_those_of_the_fit(
-    models: residnet.Models, data: residnet.Data, logs: list[residnet.Log]
+    models: residnet.Models, data: residnet.Dataset, logs: list[residnet.Log]
 ) -> None:
     names = {log.log.name for log in data.logs("test")}
-    other = residnet.prepare([log for log in logs if log.name in names], like=data)
+    other = residnet.prepare([log for log in logs if log.name in names], settings_from=data)
     again = residnet.metrics(models, other, manoeuvre=None)
     table = residnet.metrics(models, split="test", manoeuvre=None)
     columns = ["nrmse_mean", "position_error_end"]
@@ -159,7 +159,7 @@ def test_other_logs_are_judged_as_those_of_the_fit(
     assert set(again["split"]) == {"external"}
 
 
-def test_stepping_with_arrays(models: residnet.Models, data: residnet.Data) -> None:
+def test_stepping_with_arrays(models: residnet.Models, data: residnet.Dataset) -> None:
     model, log = models["ridge"], data.logs("test")[0]
     x0, w = log.y[0], log.w[:20]
     states = model.rollout(x0, w)
@@ -173,7 +173,7 @@ def test_stepping_with_arrays(models: residnet.Models, data: residnet.Data) -> N
 
 
 def test_save_load_export(
-    models: residnet.Models, data: residnet.Data, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    models: residnet.Models, data: residnet.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
     residnet.save(models["net"], tmp_path / "net")
@@ -196,7 +196,7 @@ def test_save_load_export(
 def test_a_fit_by_function_mapping_and_command_line_is_one(tiny_run: Path) -> None:
     config = copy.deepcopy(TINY)
     metrics = read_json(tiny_run / "metrics.json")
-    table = metrics_table(metrics["rows"])
+    table = build_metrics_table(metrics["rows"])
     result = residnet.run(config, report=False)
     pd.testing.assert_frame_equal(result.metrics, table, rtol=1e-12)
     prepared, evaluation = config["prepare"], config["evaluation"]
@@ -207,7 +207,7 @@ def test_a_fit_by_function_mapping_and_command_line_is_one(tiny_run: Path) -> No
         step=prepared["grid"]["step"],
         derivative=prepared["derivative"],
         hold="start",
-        held=(),
+        held_channels=(),
         **{key: evaluation[key] for key in ("protocols", "selection", "scales")},
     )
     models = residnet.fit(
@@ -218,7 +218,7 @@ def test_a_fit_by_function_mapping_and_command_line_is_one(tiny_run: Path) -> No
         training=config["training"],
     )
     pd.testing.assert_frame_equal(models.metrics, table, rtol=1e-9)
-    assert models.selected == metrics["selected"]
+    assert models.selected_name == metrics["selected"]
     loaded = residnet.load(tiny_run, "ridge")
     assert loaded.coefficients.empty
     assert loaded.notes["validation"] == pytest.approx(models["ridge"].notes["validation"])
@@ -243,11 +243,11 @@ def test_a_simulation_by_function_and_mapping_is_one() -> None:
         for name, values in log.channels.items():
             np.testing.assert_array_equal(stored[name], values)
     overshoot = trials.indices["first_overshoot"].iloc[0]
-    found = result.read("indices.json")["rows"][0]["indices"]
+    found = result.read_file("indices.json")["rows"][0]["indices"]
     assert found["first_overshoot"] == pytest.approx(overshoot, rel=1e-12)
-    assert result.read("summary.json")["figures"]["logs"]["value"] == 2
+    assert result.read_file("summary.json")["figures"]["logs"]["value"] == 2
     assert result.verdict[0].startswith("All 2 manoeuvres ended as they should")
-    assert "logs/zigzag_01.parquet" in result.files
+    assert "logs/zigzag_01.parquet" in result.file_names
     folder = result.folder
     assert folder.exists()
     del result
@@ -256,12 +256,12 @@ def test_a_simulation_by_function_and_mapping_is_one() -> None:
 
 @pytest.mark.long
 def test_logs_alone_are_fitted_by_the_recipe(logs: list[residnet.Log]) -> None:
-    coarse = [log.rows(slice(None, None, 8)).replace(masks={}) for log in logs[:6]]
+    coarse = [log.select_rows(slice(None, None, 8)).replace(masks={}) for log in logs[:6]]
     models = residnet.fit(coarse, effort=0.01)
     assert models.settings.recipe == "standard"
     assert models.settings.signals.inputs == ("n_port", "n_stbd")
     assert {"zero", "baseline", "hull", "hull_network", "mean"} <= set(models)
-    assert models.selected in models
+    assert models.selected_name in models
 
 
 WRONG = [
@@ -328,7 +328,7 @@ def test_what_a_stranger_does_wrong_is_answered_in_one_plain_line(
     message: str,
     trials: Path,
     logs: list[residnet.Log],
-    data: residnet.Data,
+    data: residnet.Dataset,
     models: residnet.Models,
 ) -> None:
     (trials / "empty").mkdir(exist_ok=True)

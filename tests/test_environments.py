@@ -14,9 +14,9 @@ import pytest
 from random_vessels import random_logs
 from tiny import write_yaml
 
-from residnet.tasks.drafting import new_config
+from residnet.tasks.drafting import write_new_config
 from residnet.tasks.inspection import inspect_logs
-from residnet.tasks.registry import finished_task, load_task
+from residnet.tasks.registry import load_task, open_finished_task
 
 pytestmark = pytest.mark.long
 
@@ -27,7 +27,9 @@ def written(folder: Path, names: list[str]) -> Path:
     logs.mkdir()
     length = len(source[0]) // -(-len(names) // 3)
     for number, name in enumerate(names):
-        log = source[number % 3].rows(slice(number // 3 * length, (number // 3 + 1) * length))
+        log = source[number % 3].select_rows(
+            slice(number // 3 * length, (number // 3 + 1) * length)
+        )
         # pyarrow opens no file whose name is not UTF-8
         bare = name.replace("/", "_").replace("\0", "_").encode("utf-8", "replace")[:200]
         path = logs / os.fsdecode(b"%03d_%b.parquet" % (number, bare))
@@ -83,11 +85,11 @@ def test_hostile_names_of_manoeuvres_logs_and_files(part: int, tmp_path: Path) -
     config = written(work, names)
     before = set(tmp_path.rglob("*"))
     run = work / "run"
-    load_task(config, []).run(out=run)
-    ended, task = finished_task(run, "evaluate")
-    task.evaluate_on(ended, [work / "logs"], work / "run" / "other")
+    load_task(config, []).run(output_folder=run)
+    ended, task = open_finished_task(run, "evaluate")
+    task.evaluate_on_logs(ended, [work / "logs"], work / "run" / "other")
     inspect_logs([work / "logs"], None)
-    new_config([work / "logs"], work / "run" / "drafted.yaml", None, overwrite=False)
+    write_new_config([work / "logs"], work / "run" / "drafted.yaml", None, overwrite=False)
     made = set(tmp_path.rglob("*")) - before
     assert [path for path in made if path != run and run not in path.parents] == []
     assert (run / "report.html").is_file()

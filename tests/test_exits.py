@@ -14,7 +14,7 @@ from typing import NoReturn
 import pytest
 
 from residnet.core.errors import DataError, UsageError
-from residnet.exits import enter, without_secrets
+from residnet.exits import remove_secrets, run_cli
 
 
 def ended(
@@ -22,7 +22,7 @@ def ended(
 ) -> tuple[object, list[str]]:
     """Return the exit code and the lines on standard error."""
     with pytest.raises(SystemExit) as caught:
-        enter(command)
+        run_cli(command)
     return caught.value.code, capsys.readouterr().err.splitlines()
 
 
@@ -127,7 +127,7 @@ def test_secrets_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/home/eve")
     text = "at /home/eve/x.py\nAPI_TOKEN = 'abc'\npassword: def\nmqtt://u:p@host/x\nn: 3\n"
     left = "at ~/x.py\nAPI_TOKEN = ***\npassword: ***\nmqtt://***@host/x\nn: 3\n"
-    assert without_secrets(text) == left
+    assert remove_secrets(text) == left
 
 
 @pytest.mark.parametrize("closed", ["1>&-", "2>&-"])

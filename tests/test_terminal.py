@@ -9,26 +9,26 @@ import time
 import pytest
 
 from residnet import cli
-from residnet.cli import drawn_progress
-from residnet.core.progress import begin, report, say
+from residnet.cli import show_progress
+from residnet.core.progress import begin_stage, log_message, report_progress
 
 
 def test_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     """A message stands for the end of its stage, and one that begins again is told again."""
-    with drawn_progress():
-        say("reading logs")
+    with show_progress():
+        log_message("reading logs")
         for done in range(4):
-            report("training lstm", done, 3)
-        report("training lstm", 3, 3)
-        report("searching")
-        report("training mlp", 2, 2, "mlp: epoch 2/2")
+            report_progress("training lstm", done, 3)
+        report_progress("training lstm", 3, 3)
+        report_progress("searching")
+        report_progress("training mlp", 2, 2, "mlp: epoch 2/2")
         for _ in range(2):
-            report("free runs", 1, 2)
-            report("free runs", 2, 2)
+            report_progress("free runs", 1, 2)
+            report_progress("free runs", 2, 2)
     ran = "  free runs: all 2 done\n" * 2
     told = f"reading logs\n  training lstm: all 3 done\nmlp: epoch 2/2\n{ran}"
     assert capsys.readouterr() == ("", told)
-    say("nobody listens")
+    log_message("nobody listens")
     assert capsys.readouterr() == ("", "")
 
 
@@ -43,11 +43,11 @@ def test_bars_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
     monkeypatch.setenv("TERM", "xterm")
-    with drawn_progress():
-        say("reading [logs]")
-        report("training lstm", 1, 4)
-        begin("searching")
-        report("training lstm", 4, 4)
+    with show_progress():
+        log_message("reading [logs]")
+        report_progress("training lstm", 1, 4)
+        begin_stage("searching")
+        report_progress("training lstm", 4, 4)
     text = screen.getvalue()
     assert "reading [logs]" in text
     assert "searching" in text
@@ -57,11 +57,11 @@ def test_long_work_is_never_silent(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cli, "SILENCE", 0.05)
-    with drawn_progress():
-        begin("calibrating bands")
-        say("  First fix this: a clock")
+    with show_progress():
+        begin_stage("calibrating bands")
+        log_message("  First fix this: a clock")
         time.sleep(0.3)
-        report("free runs", 3, 8)
+        report_progress("free runs", 3, 8)
         time.sleep(0.3)
     told = capsys.readouterr().err.splitlines()
     assert told[0] == "  calibrating bands"

@@ -21,7 +21,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from residnet.core.config import Quantity
-from residnet.core.registry import Kinds, kinds
+from residnet.core.registry import PluginUnion, load_kinds
 from residnet.physics.vessel import VesselConfig
 from residnet.tasks.registry import TaskConfig
 
@@ -59,14 +59,14 @@ def parts(annotation: object) -> tuple[Any, ...]:
     if typing.get_origin(annotation) is Literal:
         return ()
     if typing.get_origin(annotation) is typing.Annotated and marked(annotation.__metadata__):
-        return tuple(kinds(annotation).values())
+        return tuple(load_kinds(annotation).values())
     aliased = getattr(annotation, "__value__", None)
     return (aliased,) if aliased is not None else typing.get_args(annotation)
 
 
-def marked(metadata: typing.Sequence[object]) -> Kinds | None:
+def marked(metadata: typing.Sequence[object]) -> PluginUnion | None:
     """Return the kinds that an annotation takes; None where it is no choice of kinds."""
-    return next((item for item in metadata if isinstance(item, Kinds)), None)
+    return next((item for item in metadata if isinstance(item, PluginUnion)), None)
 
 
 def config_classes() -> list[type[BaseModel]]:
@@ -136,7 +136,7 @@ def described_type(annotation: Any, metadata: typing.Sequence[object] = ()) -> s
     if (aliased := getattr(annotation, "__value__", None)) is not None:
         return described_type(aliased)
     if (mark := marked(metadata)) is not None:
-        of_kind = kinds(typing.Annotated[annotation, mark])
+        of_kind = load_kinds(typing.Annotated[annotation, mark])
         return " or ".join(described_type(member) for member in of_kind.values())
     if origin is typing.Annotated:
         return described_type(arguments[0], arguments[1:])

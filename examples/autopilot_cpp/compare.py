@@ -80,12 +80,12 @@ def eager(folder: Path, card: dict[str, Any]) -> Any:
         ObservedPolicySpec,
         load_recurrent,
     )
-    from residnet.export.policy import for_export
+    from residnet.export.policy import guard_policy
 
     kinds = {"observed": ObservedPolicySpec, "network": NetworkPolicySpec}
     policy = load_recurrent(folder, kinds[card["kind"]])
-    policy.at(card["dt"])
-    return for_export(policy, "hold" if "held" in card["fault"] else "amidships")
+    policy.set_step(card["dt"])
+    return guard_policy(policy, "hold" if "held" in card["fault"] else "amidships")
 
 
 def main() -> None:

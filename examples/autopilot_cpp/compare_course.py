@@ -64,16 +64,16 @@ def eager(run: Path, card: dict[str, Any]) -> Any:
     called one by one from Python.
     """
     from residnet.core.config import load_config
-    from residnet.export.policy import ExportedCourse
+    from residnet.export.policy import GuardedCoursePolicy
     from residnet.runs.folder import RunFolder
     from residnet.tasks.course import CourseTaskConfig
-    from residnet.tasks.course_run import load_policy, plan_for, ready
+    from residnet.tasks.course_run import load_policy, open_autopilot_run, plan_with_guidance
 
     folder = RunFolder.open(run)
-    config = load_config(folder.resolved, [], CourseTaskConfig)
-    known = ready(config, folder)
-    _, guidance = plan_for(config, known, card["protocol"])
-    return ExportedCourse(load_policy(known, config.policy), guidance, config.safe).eval()
+    config = load_config(folder.resolved_config, [], CourseTaskConfig)
+    known = open_autopilot_run(config, folder)
+    _, guidance = plan_with_guidance(config, known, card["protocol"])
+    return GuardedCoursePolicy(load_policy(known, config.policy), guidance, config.safe).eval()
 
 
 def main() -> None:

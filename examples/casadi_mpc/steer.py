@@ -26,7 +26,7 @@ from controllers import FeedForwardPID, Gains, Predictive
 from model import Identified
 from track import Track
 
-from residnet.simulators.vehicle import Vehicle, vehicle
+from residnet.simulators.vehicle import Vehicle, load_vehicle
 
 WAYPOINTS = [[0, 0], [40, 0], [60, 30], [100, 30], [100, 70], [60, 80], [30, 60]]
 _START = 5.0
@@ -42,8 +42,8 @@ class Plant:
     """
 
     def __init__(self, source: str, model: Identified) -> None:
-        self.vehicle: Vehicle = vehicle(source, dt=model.dt)
-        commands = self.vehicle.inputs[: self.vehicle.commands]
+        self.vehicle: Vehicle = load_vehicle(source, dt=model.dt)
+        commands = self.vehicle.inputs[: self.vehicle.n_commands]
         short = {name.removeprefix("cmd_"): k for k, name in enumerate(commands)}
         names = [name.removeprefix("cmd_") for name in model.inputs]
         places = [short.get(name, short.get(name.removeprefix("n_"), -1)) for name in names]
@@ -59,7 +59,7 @@ class Plant:
 
     def reset(self) -> None:
         """Put the vessel at rest at the origin."""
-        self.x = self.vehicle.start.double().clone()
+        self.x = self.vehicle.initial_state.double().clone()
         self.x[:6] = 0.0
         self.x[6:] = 0.0
         self.given = np.zeros(2)
@@ -68,7 +68,7 @@ class Plant:
         """Move one step of the model under inputs [2] in the model's order."""
         self.given = given
         commands = torch.from_numpy(given[self.order]).unsqueeze(0)
-        w = self.vehicle.inputs_at(commands.to(self.vehicle.low.dtype))
+        w = self.vehicle.inputs_at(commands.to(self.vehicle.lower_commands.dtype))
         memory = self.vehicle.dynamics.initial_state(1).to(self.x.dtype)
         self.x = self.vehicle.dynamics.step(self.x.unsqueeze(0), w.to(self.x.dtype), memory)[0][0]
 

@@ -26,7 +26,7 @@ import pandas as pd
 import yaml
 from large_data import called
 
-from residnet.tasks.own_autopilot import draft_autopilot
+from residnet.tasks.own_autopilot import draft_autopilot_config
 
 DEG = 180.0 / math.pi
 
@@ -137,10 +137,10 @@ def trained(name: str, vessel: Drawn, out: Path, rng: np.random.Generator, *, lo
         return run
     if logs:
         source = [str(vessel.zigzag(out / f"{name}_{a}.csv", a, rng)) for a in (10, 20)]
-        draft_autopilot(source, file, overwrite=True)
+        draft_autopilot_config(source, file, overwrite=True)
     else:
         source = [f"{vessel.gain:.6g},{vessel.time:.6g}"]
-        draft_autopilot(source, file, rate=f"{vessel.rate:.4g} deg/s", overwrite=True)
+        draft_autopilot_config(source, file, rate=f"{vessel.rate:.4g} deg/s", overwrite=True)
         config = yaml.safe_load(file.read_text())
         conditions = config["conditions"]
         for one in (conditions["stated"], *conditions["beyond"].values()):

@@ -30,19 +30,19 @@ import bench
 import numpy as np
 
 from residnet.core.config import load_config
-from residnet.core.layout import PLANAR
+from residnet.core.layout import PLANAR_LAYOUT
 from residnet.core.log import Log
-from residnet.data.simulated import simulate
-from residnet.identification.bands import fold_numbers
-from residnet.identification.fit import fit
-from residnet.identification.identified import Evaluation, candidates, evaluate
-from residnet.identification.prepared import prepare_logs
-from residnet.judge.band import Band, covered, interval_score, worst
-from residnet.judge.bands import RunErrors, calibrate, run_errors
+from residnet.data.simulated import simulate_trial_logs
+from residnet.identification.bands import assign_logs_to_folds
+from residnet.identification.fit import fit_models
+from residnet.identification.identified import SplitEvaluation, evaluate_splits, make_candidates
+from residnet.identification.prepared import prepare_splits
+from residnet.judge.band import Band, interval_score, is_covered, largest_error_ratios
+from residnet.judge.bands import RunErrors, calibrate_band, compute_run_errors
 from residnet.runs.folder import RunFolder
-from residnet.runs.model_store import FolderStore
+from residnet.runs.model_store import RunModelStore
 from residnet.tasks.fit import FitConfig
-from residnet.tasks.fit_outcome import limit_of
+from residnet.tasks.fit_outcome import divergence_limit
 
 Judged = tuple[RunErrors, Band]
 Found = dict[tuple[str, str, int], list[Judged]]
@@ -63,12 +63,12 @@ _ASKED = 0.02
 """Largest distance of the mean coverage from 0.9 that is asked for."""
 
 
-def add(found: Found, judged: Evaluation, models: Sequence[str], draw: int = 0) -> None:
+def add(found: Found, judged: SplitEvaluation, models: Sequence[str], draw: int = 0) -> None:
     """Add the free runs of models, where they have bands."""
-    for run in judged.runs:
+    for run in judged.free_runs:
         for name in models:
-            if band := judged.bands[name].get(run.protocol):
-                own = run_errors(run.windows, run.predictions[name], judged.logs)
+            if band := judged.bands_by_model[name].get(run.protocol):
+                own = compute_run_errors(run.windows, run.predictions[name], judged.logs)
                 place = found.setdefault((run.protocol, name, draw), [])
                 place.extend((one, band) for one in own)
 
@@ -76,18 +76,18 @@ def add(found: Found, judged: Evaluation, models: Sequence[str], draw: int = 0) 
 def stored(folder: Path, model: str | None) -> Found:
     """Return the free runs of one model of a finished run over its test logs."""
     run, config = RunFolder(folder), load_config(folder / "resolved.yaml", [], FitConfig)
-    store, found = FolderStore(run), Found()
+    store, found = RunModelStore(run), Found()
     fitted = [store.load(name) for name in store.names()]
-    logs = {"test": prepare_logs(config.logs(), config)["test"]}
-    limit, step = limit_of(fitted[-1].spec, config), config.prepare.grid.step
-    judged = evaluate(candidates(fitted), logs, config.evaluation, step, limit)["test"]
+    logs = {"test": prepare_splits(config.load_logs(), config)["test"]}
+    limit, step = divergence_limit(fitted[-1].spec, config), config.prepare.grid.step
+    judged = evaluate_splits(make_candidates(fitted), logs, config.evaluation, step, limit)["test"]
     add(found, judged, [model or str(run.read_metrics()["selected"])])
     return found
 
 
 def alone(config: FitConfig, model: str) -> list[str]:
     """Return overrides that leave out all models of a config that one does not stand on."""
-    needed = {model, config.baseline_name_of(model) if model in config.heads else model}
+    needed = {model, config.get_baseline_name(model) if model in config.heads else model}
     out = ["~ensembles"] if config.ensembles else []
     for key in ("heads", "base_of", "training", "baselines", "refit"):
         given = getattr(config, key)
@@ -98,20 +98,26 @@ def alone(config: FitConfig, model: str) -> list[str]:
 
 def crossed(config: FitConfig, model: str, seed: int, by_kind: bool) -> Found:
     """Return free runs over all logs of a config with bands of fits that have not seen them."""
-    logs = [log for members in prepare_logs(config.logs(), config).values() for log in members]
+    logs = [
+        log for members in prepare_splits(config.load_logs(), config).values() for log in members
+    ]
     kinds = [log.log.manoeuvre for log in logs]
-    number = np.unique(kinds, return_inverse=True)[1] if by_kind else fold_numbers(kinds, 5, seed)
+    number = (
+        np.unique(kinds, return_inverse=True)[1]
+        if by_kind
+        else assign_logs_to_folds(kinds, 5, seed)
+    )
     found = Found()
     for k in range(int(number.max()) + 1):
         others = [log for log, own in zip(logs, number, strict=True) if own != k]
         # every fifth of the others chooses and calibrates, as validation logs do
-        inner = fold_numbers([log.log.manoeuvre for log in others], 5, seed + 1)
+        inner = assign_logs_to_folds([log.log.manoeuvre for log in others], 5, seed + 1)
         parts = {
             "train": [log for log, own in zip(others, inner, strict=True) if own != 0],
             "validation": [log for log, own in zip(others, inner, strict=True) if own == 0],
         }
         held = [log for log, own in zip(logs, number, strict=True) if own == k]
-        add(found, fit(parts, config).evaluate({"test": held})["test"], [model])
+        add(found, fit_models(parts, config).evaluate({"test": held})["test"], [model])
         print(f"fold {k + 1}: {len(held)} logs", flush=True)
     return found
 
@@ -154,7 +160,9 @@ def trials(
         )
         manoeuvres = config.draw()
         out: dict[str, list[Log]] = {}
-        for log, split in zip(simulate(manoeuvres, config), config.splits(manoeuvres), strict=True):
+        for log, split in zip(
+            simulate_trial_logs(manoeuvres, config), config.splits(manoeuvres), strict=True
+        ):
             out.setdefault("test" if log.manoeuvre in judges else split, []).append(log)
     return out
 
@@ -177,26 +185,28 @@ def drawn(found: Found, vessel: str, number: int, logs: dict[str, list[Log]]) ->
             "scales": {name: float(values.std()) for name, values in joined.items()},
         },
     )
-    prepared = prepare_logs(logs, settings)
-    models = fit(prepared, settings)
+    prepared = prepare_splits(logs, settings)
+    models = fit_models(prepared, settings)
     judged = models.evaluate({"test": prepared["test"]})["test"]
     add(found, judged, [name for name in models if name != "zero"], number)
 
 
 def coverage(judged: Sequence[Judged]) -> np.ndarray:
     """Return the shares held of each channel, their mean, and that of whole runs [c + 2]."""
-    widths = [run.within(band) for run, band in judged]
+    widths = [run.half_widths(band) for run, band in judged]
     pairs = list(zip(judged, widths, strict=True))
-    share = np.nanmean(np.concatenate([covered(run.error, width) for (run, _), width in pairs]), 0)
-    largest = np.stack([worst([run.error], [width])[0] for (run, _), width in pairs])
-    allowed = np.stack([band.whole for _, band in judged])
+    share = np.nanmean(
+        np.concatenate([is_covered(run.error, width) for (run, _), width in pairs]), 0
+    )
+    largest = np.stack([largest_error_ratios([run.error], [width])[0] for (run, _), width in pairs])
+    allowed = np.stack([band.simultaneous_factor for _, band in judged])
     whole = np.where(np.isnan(largest), np.nan, largest <= allowed)
     return np.array([*share, np.nanmean(share), np.nanmean(whole)])
 
 
 def score(judged: Sequence[Judged], widths: Sequence[np.ndarray]) -> np.ndarray:
     """Return the mean interval score of each channel [c], in errors of `zero`."""
-    level, unit = judged[0][1].level, judged[0][1].unit
+    level, unit = judged[0][1].level, judged[0][1].score_unit
     pairs = zip(judged, widths, strict=True)
     each = [interval_score(run.error, width, level) for (run, _), width in pairs]
     return np.asarray(np.nanmean(np.concatenate(each), axis=0) / unit)
@@ -205,11 +215,13 @@ def score(judged: Sequence[Judged], widths: Sequence[np.ndarray]) -> np.ndarray:
 def compared(judged: Sequence[Judged]) -> dict[str, np.ndarray]:
     """Return scores over those of simpler bands: by channel, the mean of these, of mean scores."""
     first = judged[0][1]
-    after = calibrate([run for run, _ in judged], first.level, first.step, first.unit)
-    own = score(judged, [run.within(band) for run, band in judged])
+    after = calibrate_band([run for run, _ in judged], first.level, first.step, first.score_unit)
+    own = score(judged, [run.half_widths(band) for run, band in judged])
     peers = {
-        "one width": [np.broadcast_to(band.constant, run.error.shape) for run, band in judged],
-        "hindsight": [after.tabled(after.plain, len(run)) for run, _ in judged],
+        "one width": [
+            np.broadcast_to(band.constant_width, run.error.shape) for run, band in judged
+        ],
+        "hindsight": [after.interpolate(after.unconditional_width, len(run)) for run, _ in judged],
     }
     out = {}
     for name, widths in peers.items():
@@ -220,7 +232,7 @@ def compared(judged: Sequence[Judged]) -> dict[str, np.ndarray]:
 
 def show(found: Found) -> None:
     """Print coverage by protocol, kind and channel, and scores, as means over models and draws."""
-    names = (*PLANAR.banded, "mean", "whole")
+    names = (*PLANAR_LAYOUT.band_channels, "mean", "whole")
     for protocol in dict.fromkeys(protocol for protocol, _, _ in found):
         each = [judged for (under, _, _), judged in found.items() if under == protocol]
         kinds = sorted({run.manoeuvre for judged in each for run, _ in judged})

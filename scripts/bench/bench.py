@@ -98,7 +98,7 @@ def scattered(vessel: str, random: np.random.Generator, folder: Path) -> str:
 
 def programme(vessel: str, seed: int, trials: list[dict[str, Any]], **keys: Any) -> Any:
     """Return `SimulatedTrials` of a minute at 10 Hz in noise; `keys` are further ones."""
-    from residnet.core.config import validate
+    from residnet.core.config import validate_config
     from residnet.data.simulated import SimulatedTrials
 
     content: dict[str, Any] = {
@@ -113,12 +113,12 @@ def programme(vessel: str, seed: int, trials: list[dict[str, Any]], **keys: Any)
         "validation": {},
         **keys,
     }
-    return validate(content, SimulatedTrials, "bench")
+    return validate_config(content, SimulatedTrials, "bench")
 
 
 def settings(vessel: str, **parts: Any) -> Any:
     """Return the `FitSettings` of a fit to such trials; `parts` are its baseline and others."""
-    from residnet.core.config import validate
+    from residnet.core.config import validate_config
     from residnet.identification.settings import FitSettings
 
     content: dict[str, Any] = {
@@ -135,4 +135,4 @@ def settings(vessel: str, **parts: Any) -> Any:
         },
         **parts,
     }
-    return validate(content, FitSettings, "bench")
+    return validate_config(content, FitSettings, "bench")

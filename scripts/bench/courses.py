@@ -30,12 +30,12 @@ from residnet.control.courses.config import (
 )
 from residnet.control.guidance import CourseGuidance, DriftEstimate, TrackKeeping
 from residnet.control.heading.classical import HeadingPD
-from residnet.control.heading.controllers import Steering
+from residnet.control.heading.controllers import ControlTask
 from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ResidnetError
 from residnet.dynamics.steering_variation import Vessels
 from residnet.physics.vessel import load_vessel
-from residnet.tasks.course_run import fly
+from residnet.tasks.course_run import simulate_course
 
 Array = NDArray[np.float64]
 RUDDER = math.radians(5.0)
@@ -114,7 +114,7 @@ class Ship:
 
     def __init__(self, vessel: str) -> None:
         self.vessel = SteeredPlant(load_vessel(vessel).build())
-        self.turning = self.vessel.turning(RUDDER, 300.0, 0.1)
+        self.turning = self.vessel.estimate_nomoto(RUDDER, 300.0, 0.1)
         scale = self.turning.speed / (self.turning.gain * RUDDER)
         self.dt = 0.05 * max(self.turning.time / 3.94, 1.0)
         self.lookahead = 1.1 * scale if scale < 50 else 0.5 * scale
@@ -141,7 +141,7 @@ class Ship:
     def tracks(self, planned: PlannedCourse, currents: np.ndarray) -> list[Any]:
         """Return the flights of the nominal vessel in steady currents [B, 2] in m/s."""
         turning, vessel = self.turning, self.vessel
-        law = HeadingPD.placed(
+        law = HeadingPD.from_pole_placement(
             vessel.state,
             gain=turning.gain,
             time=turning.time,
@@ -157,8 +157,8 @@ class Ship:
             DriftEstimate(self.lookahead, 0.25 * turning.speed, self.dt),
         )
         nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(len(currents), -1)
-        return fly(
-            Steering(vessel, turning, RUDDER, self.dt),
+        return simulate_course(
+            ControlTask(vessel, turning, RUDDER, self.dt),
             steered,
             guidance,
             planned,

@@ -27,8 +27,8 @@ from random_vessels import KINDS, random_logs, ship_of
 
 from residnet.core.errors import ResidnetError
 from residnet.core.log import Log
-from residnet.data.doctor import Finding, inspect, inspect_together, statistics
-from residnet.data.masks import Mask
+from residnet.data.doctor import Finding, inspect_log, inspect_log_set, statistics
+from residnet.data.masks import MaskRule
 
 _TOGETHER, _MEASURED = 3, 4
 """Measured logs that are looked at together, and how often."""
@@ -41,7 +41,7 @@ class Host:
     ship: Ship
     logs: list[Log]
     inputs: tuple[str, ...] | None = None
-    masks: tuple[Mask, ...] = ()
+    masks: tuple[MaskRule, ...] = ()
 
 
 def simulated(seed: int, count: int) -> Iterator[Host]:
@@ -79,8 +79,8 @@ def measured(seed: int) -> list[Host]:
 def named(fault: Fault, host: Host, logs: list[Log]) -> bool:
     """Return whether the doctor names a fault of the first log, or of all together."""
     try:
-        said = list(inspect(logs[0], host.inputs, host.masks).findings)
-        said += inspect_together(logs, host.inputs).findings
+        said = list(inspect_log(logs[0], host.inputs, host.masks).findings)
+        said += inspect_log_set(logs, host.inputs).findings
     except ResidnetError as error:
         said = [Finding("fatal", fault.codes[0], str(error))]
     # what the masks of the run leave out is a note
@@ -97,16 +97,16 @@ def loud(log: Log, longest: float) -> set[str]:
 
     An unreadable log has none but `unreadable`.
     """
-    statistics._LONG = longest
+    statistics._MAX_SUBSAMPLE = longest
     try:
-        return {f.code for f in inspect(log).findings if f.level != "note"}
+        return {f.code for f in inspect_log(log).findings if f.level != "note"}
     except ResidnetError:
         return {"unreadable"}
 
 
 def long_logs(rows: int, seed: int, faults: Sequence[Fault]) -> None:
     """Print of each fault in a long log what either look alone finds."""
-    usual, alike, count = statistics._LONG, 0, 0
+    usual, alike, count = statistics._MAX_SUBSAMPLE, 0, 0
     ship = next(one for one in SHIPS if one.name == "wam_v")
     hosts = simulate(2, rows, seed)
     for number, fault in enumerate([None, *faults]):
@@ -139,7 +139,7 @@ def main() -> None:
     checked, loud = 0, 0
     for number, host in enumerate(hosts):
         for log in host.logs if not given.faults else ():
-            said = inspect(log, host.inputs, host.masks).findings
+            said = inspect_log(log, host.inputs, host.masks).findings
             told = [f"{f.code} ({f.effect}): {f.text}" for f in said if f.level != "note"]
             checked, loud = checked + 1, loud + bool(told)
             if told:

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from residnet.dynamics.c_code import compiler
-from residnet.export import exporter, vessel
+from residnet.export import get_exporter, vessel
 from residnet.export.c import CasadiModel
 from residnet.export.guard import GuardedDynamics
 from residnet.export.onnx_file import OnnxModel
@@ -93,7 +93,7 @@ def ways(variant: str, folder: Path, cpp: Path, aoti: bool) -> dict[str, Way]:
     formats = ["torchscript", "c", "onnx", "casadi", *(["aoti"] if aoti else [])]
     files = {}
     for name in formats:
-        kind = exporter(name)
+        kind = get_exporter(name)
         files[name] = folder / f"boat{kind.suffix}"
         print(f"  {variant}: {name}", file=sys.stderr, flush=True)
         kind.export(exported, files[name])

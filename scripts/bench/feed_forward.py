@@ -22,9 +22,9 @@ from torch import Tensor, nn
 
 from residnet.documents.jervan2020.ferry import (
     FerryStudyConfig,
-    objections,
-    study,
-    written,
+    list_feed_forward_objections,
+    run_ferry_study,
+    write_results,
 )
 from residnet.export.feed_forward import ExportedForce, RequiredForce
 from residnet.export.torchscript import TorchScriptExporter
@@ -42,7 +42,7 @@ class AsExported(nn.Module):
 
     def __init__(self, model: Any, ranges: list[list[float]]) -> None:
         super().__init__()
-        force = RequiredForce(*model.force.parts(), mirrored=True)
+        force = RequiredForce(*model.force.parts(), is_mirrored=True)
         limits = [(low, high) for low, high in ranges]
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "feed_forward.pt"
@@ -106,18 +106,21 @@ def judge_ferry(number: int, random: torch.Generator, folder: Path) -> str:
         "models": {"plsr": {"fit": {"kind": "plsr"}, "fly": True}},
     }
     config = FerryStudyConfig.model_validate(content)
-    found = study(config)
-    results, _ = written(config, found, RunFolder(folder / f"run_{number}"))
-    against = objections("plsr", results)
-    model = found.whole.get("plsr", found.models["plsr"])
+    found = run_ferry_study(config)
+    results, _ = write_results(config, found, RunFolder(folder / f"run_{number}"))
+    against = list_feed_forward_objections("plsr", results)
+    model = found.whole_course_models.get("plsr", found.models["plsr"])
     required = AsExported(model, results["models"]["plsr"]["exported"]["range"])
     hull = load_vessel("milliampere").build()
     assert isinstance(hull, HullPlant)
-    ferry, told = config.ferry(str(true)), []
+    ferry, told = config.build_loop(str(true)), []
     for kind in ("ahead", "astern"):
         path = config.course.model_validate(drawn_course(random, kind=kind, count=6))
         feeds: list[Any] = [(ForceModel(hull.hull), None), (required, model.lag)]
-        known, own = (flight.tracking.row()["position_mae"] for flight in ferry.fly(path, feeds))
+        known, own = (
+            flight.tracking_metrics.to_json()["position_mae"]
+            for flight in ferry.simulate(path, feeds)
+        )
         told.append(f"{kind} {known:.4f} -> {own:.4f} m ({own / known:.2f})")
     chosen = f"order {model.fit.notes.get('order')}, {'with' if model.lag else 'without'} lag"
     state = f"withheld: {'; '.join(against)}" if against else "exported"

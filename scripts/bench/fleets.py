@@ -16,7 +16,7 @@ import bench
 import numpy as np
 from fleets import CONTRADICTIONS, SHARED, drawn
 
-from residnet.data.doctor import inspect_together
+from residnet.data.doctor import inspect_log_set
 
 
 def main() -> None:
@@ -35,7 +35,7 @@ def main() -> None:
             if what != "clean":
                 logs, concerned, cause = planted[what](fleet, random)
             logs = [log.replace(name=f"log_{i:02d}") for i, log in enumerate(logs)]
-            found = inspect_together(logs, fleet.inputs).findings
+            found = inspect_log_set(logs, fleet.inputs).findings
             loud = [one for one in found if one.level != "note"]
             names = [f"log_{i:02d}" for i in concerned] or [fleet.steering]
             about = [[one for one in loud if one.text.startswith(name)] for name in names]

@@ -32,7 +32,7 @@ import torch
 import yaml
 
 import residnet
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.log import Log
 from residnet.data.readers import ReaderConfig
 
@@ -194,7 +194,7 @@ def imported(file: Path) -> None:
     names = [name for name in pd.read_csv(file, nrows=0).columns if name != "t [s]"]
     channels = {n.split()[0]: {"column": n, "unit": n.split("[")[1][:-1]} for n in names}
     content = {"kind": "csv", "time": {"column": "t [s]", "unit": "s"}, "channels": channels}
-    reader = validate(content, ReaderConfig, "bench").build()
+    reader = validate_config(content, ReaderConfig, "bench").build()
     plain = bench.least(lambda: pd.read_csv(file), 3)
     ours = bench.least(lambda: reader.read(file), 3)
     print(f"pandas.read_csv {plain:.2f} s, import {ours:.2f} s, ratio {ours / plain:.2f}")

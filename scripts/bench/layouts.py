@@ -24,14 +24,14 @@ import bench
 import numpy as np
 import pandas as pd
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ResidnetError
 from residnet.core.log import Log
-from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.questions import DraftNotes
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.readers import ReaderConfig
-from residnet.data.simulated import SimulatedTrials, simulate
-from residnet.tasks.demo import TRIALS
+from residnet.data.simulated import SimulatedTrials, simulate_trial_logs
+from residnet.tasks.demo import DEMO_TRIALS
 
 DEG, KN = 180.0 / math.pi, 3600.0 / 1852.0
 KEYS = ["t", "x", "y", "lat", "lon", "psi", "u", "v", "r", "delta", "n", "throttle"]
@@ -215,10 +215,10 @@ def wrong(read: Log, truth: Log) -> list[str]:
 
 def judged(files: Sequence[Path], logs: Sequence[Log], layout: Layout) -> tuple[str, str]:
     """What became of a layout, and what is to be said of it."""
-    marks = Marks()
+    marks = DraftNotes()
     try:
         content = draft_tables(files, marks)[0]
-        reader = validate(content, ReaderConfig, "bench").build()
+        reader = validate_config(content, ReaderConfig, "bench").build()
         faults = {
             fault
             for f, log in zip(files, logs, strict=True)
@@ -227,7 +227,7 @@ def judged(files: Sequence[Path], logs: Sequence[Log], layout: Layout) -> tuple[
     except ResidnetError as error:
         return ("refused", str(error)) if "\n" not in str(error) else ("FAILED", str(error))
     lacking = {"psi", "delta"} - set(content["channels"])
-    told = {key[-1] for key, _ in marks.guesses}
+    told = {key[-1] for key, _ in marks.guessed_values}
     # to which side a rudder turns the vessel is found later, from the logs themselves
     faults -= {"delta"} if layout.rudder == "to port" else set()
     unmarked = sorted(faults - told)
@@ -239,10 +239,14 @@ def judged(files: Sequence[Path], logs: Sequence[Log], layout: Layout) -> tuple[
 def main() -> int:
     """Draw layouts; return 1 where one is wrong without a mark."""
     given = bench.options(__doc__, count=20, seed=0)
-    sensors = {**TRIALS["noise"]["sensors"], "delta": {"noise": "0.1 deg"}}
-    settings = {**TRIALS, "step": "0.2 s", "noise": {**TRIALS["noise"], "sensors": sensors}}
-    config = validate(settings, SimulatedTrials, "bench")
-    logs = simulate(config.draw(), config)[::5]
+    sensors = {**DEMO_TRIALS["noise"]["sensors"], "delta": {"noise": "0.1 deg"}}
+    settings = {
+        **DEMO_TRIALS,
+        "step": "0.2 s",
+        "noise": {**DEMO_TRIALS["noise"], "sensors": sensors},
+    }
+    config = validate_config(settings, SimulatedTrials, "bench")
+    logs = simulate_trial_logs(config.draw_manoeuvres(), config)[::5]
     counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as temporary:
         for seed in range(given.seed, given.seed + given.count):

@@ -20,12 +20,17 @@ import numpy as np
 import yaml
 
 from residnet.core.log import Log
-from residnet.data.prepare import Prepared, prepare
-from residnet.data.simulated import simulate
-from residnet.identification.fit import fit
+from residnet.data.prepare import PreparedLog, prepare_log
+from residnet.data.simulated import simulate_trial_logs
+from residnet.identification.fit import fit_models
 from residnet.identification.fitter import FittedModel
-from residnet.identification.monitoring import MonitorConfig, Verdict, Watch, Watcher
-from residnet.identification.prepared import prepare_logs, through_currents
+from residnet.identification.monitoring import (
+    ChangeDetector,
+    MonitorConfig,
+    MonitorVerdict,
+    OnlineChangeDetector,
+)
+from residnet.identification.prepared import convert_to_motion_through_water, prepare_splits
 from residnet.identification.settings import FitSettings
 
 PER_SEED = 5
@@ -49,14 +54,14 @@ def trials(vessel: str, sea: dict[str, Any], seed: int, count: int) -> list[Log]
     ]
     sea = {"current_each": [0.0, 0.3], **sea}
     config = bench.programme(vessel, seed, drawn, disturbance=sea)
-    logs = simulate(config.draw(), config)
+    logs = simulate_trial_logs(config.draw(), config)
     order = np.random.default_rng(seed).permutation(len(logs))[:count]
     return [logs[i] for i in order]
 
 
 def identified(
     vessel: str, flown: str, seed: int
-) -> tuple[FitSettings, FittedModel, list[Prepared]]:
+) -> tuple[FitSettings, FittedModel, list[PreparedLog]]:
     """Return a model of the clean vessel, and the logs that fitted it, over ground."""
     logs = trials(flown, SEA[vessel], seed, 40)
     settings = bench.settings(
@@ -66,8 +71,8 @@ def identified(
         current={"spread": 0.3},
         bands=None,
     )
-    prepared = prepare_logs({"train": logs[8:], "validation": logs[:8]}, settings)
-    found = fit(through_currents(prepared, settings)[0], settings)
+    prepared = prepare_splits({"train": logs[8:], "validation": logs[:8]}, settings)
+    found = fit_models(convert_to_motion_through_water(prepared, settings)[0], settings)
     return settings, found["baseline"], [*prepared["train"], *prepared["validation"]]
 
 
@@ -120,28 +125,32 @@ def cases(vessel: str, flown: str, folder: Path) -> dict[str, tuple[str, Change,
     return out
 
 
-def watched(watch: Watch, settings: FitSettings, logs: Sequence[Log]) -> list[Verdict]:
+def watched(
+    watch: ChangeDetector, settings: FitSettings, logs: Sequence[Log]
+) -> list[MonitorVerdict]:
     """Return what the monitor says, window by window."""
-    watcher, out = Watcher(watch), []
+    watcher, out = OnlineChangeDetector(watch), []
     for log in logs:
-        watcher.restart()
-        known = prepare(log, "external", settings.signals.columns, settings.prepare)
-        out += [watcher.take(sums) for sums in watch.sums(watch.windows(known))]
+        watcher.start_new_log()
+        known = prepare_log(log, "external", settings.signals.input_columns, settings.prepare)
+        out += [
+            watcher.update_with_sums(sums) for sums in watch.compute_sums(watch.make_windows(known))
+        ]
     return out
 
 
-def told(verdict: Verdict) -> str:
+def told(verdict: MonitorVerdict) -> str:
     """Return what scores highest, with its size."""
-    top = max(verdict.suspects, key=lambda suspect: suspect.score)
-    size = f"{top.size:+.3f} +- {top.error:.3f}"
-    return f"{top.change.name} {size} scores {top.score:.2f} of {verdict.threshold:.2f}"
+    top = max(verdict.hypotheses, key=lambda suspect: suspect.test_statistic)
+    size = f"{top.estimated_size:+.3f} +- {top.standard_error:.3f}"
+    return f"{top.change.name} {size} scores {top.test_statistic:.2f} of {verdict.threshold:.2f}"
 
 
 def judge(vessel: str, sailed: str, seed: int, seeds: int, hours: float, folder: Path) -> None:
     """Print what is found of each planted change, and the alarms in clean logs."""
     settings, model, clean = identified(vessel, sailed, 100 + seed)
     config = MonitorConfig()
-    watch = Watch.of(model.spec, model.model, clean, config)
+    watch = ChangeDetector.from_logs(model.spec, model.model, clean, config)
     print(f"{vessel}: threshold {watch.threshold:.2f}", flush=True)
     planted = cases(vessel, sailed, folder) if seeds else {}
     for name, (flown, change, right) in planted.items():
@@ -149,8 +158,8 @@ def judge(vessel: str, sailed: str, seed: int, seeds: int, hours: float, folder:
         alarmed, firsts = [], []
         for k in range(seeds):
             verdicts = watched(watch, settings, logs[PER_SEED * k : PER_SEED * (k + 1)])
-            alarmed.append(any(verdict.alarm for verdict in verdicts))
-            firsts.append(verdicts[-1].suspects[0].change.name)
+            alarmed.append(any(verdict.is_alarm for verdict in verdicts))
+            firsts.append(verdicts[-1].hypotheses[0].change.name)
         first = sum(a and named == right for a, named in zip(alarmed, firsts, strict=True))
         print(
             f"  {name:18s} found {sum(alarmed)}/{seeds}, right cause first"
@@ -158,7 +167,7 @@ def judge(vessel: str, sailed: str, seed: int, seeds: int, hours: float, folder:
             flush=True,
         )
     verdicts = watched(watch, settings, trials(sailed, SEA[vessel], 23 + seed, round(60 * hours)))
-    alarms = [False, *(verdict.alarm for verdict in verdicts)]
+    alarms = [False, *(verdict.is_alarm for verdict in verdicts)]
     begun = [k for k in range(len(verdicts)) if alarms[k + 1] and not alarms[k]]
     hour = config.window / 3600
     print(f"  clean: {len(begun)} alarms in {len(verdicts) * hour:.1f} h", flush=True)

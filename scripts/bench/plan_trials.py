@@ -22,14 +22,21 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import ResidnetError
-from residnet.data.prepare import Prepared, samples
-from residnet.data.simulated import simulate
+from residnet.data.prepare import PreparedLog, make_samples
+from residnet.data.simulated import simulate_trial_logs
 from residnet.data.windows import WindowStore
 from residnet.dynamics.actuated import InputShare
-from residnet.identification.fit import fit
+from residnet.identification.fit import fit_models
 from residnet.identification.fitter import FittedModel
-from residnet.identification.planning import Aim, TrialLimits, candidates, moments, plan, spread
-from residnet.identification.prepared import prepare_logs, velocity_limit
+from residnet.identification.planning import (
+    PredictionGoal,
+    TrialLimits,
+    compute_expected_uncertainty,
+    moments,
+    plan_trials,
+    propose_manoeuvres,
+)
+from residnet.identification.prepared import compute_velocity_limits, prepare_splits
 from residnet.identification.settings import FitSettings
 from residnet.physics.vessel import load_vessel
 from residnet.training.left_out import LeftOpen, left_open
@@ -54,9 +61,12 @@ def shares_of(vessel: str, flown: str) -> dict[str, InputShare]:
     """Return how a vessel's commands follow drive and steer, as its booklet would say."""
     plant = load_vessel(flown).build()
     one, none = torch.ones(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
-    drive, steer = plant.demand(one, none)[0].tolist(), plant.demand(none, one)[0].tolist()
+    drive, steer = (
+        plant.commands_for_demand(one, none)[0].tolist(),
+        plant.commands_for_demand(none, one)[0].tolist(),
+    )
     # a plant has an order of its own, such as the rudder before the propeller
-    found = dict(zip(plant.inputs, zip(drive, steer, strict=True), strict=False))
+    found = dict(zip(plant.input_names, zip(drive, steer, strict=True), strict=False))
     out = {}
     for name in bench.SIGNALS[vessel]["inputs"]:
         d, s = found[COMMANDS[name]]
@@ -64,14 +74,14 @@ def shares_of(vessel: str, flown: str) -> dict[str, InputShare]:
     return out
 
 
-def left(fitted: FittedModel, settings: FitSettings, logs: Sequence[Prepared]) -> LeftOpen:
+def left(fitted: FittedModel, settings: FitSettings, logs: Sequence[PreparedLog]) -> LeftOpen:
     """Return what a refit of this model with such logs leaves open."""
     return left_open(
         fitted.model.double(),
-        samples(logs, settings.signals.build()),
-        WindowStore.gather(logs, torch.float64),
+        make_samples(logs, settings.signals.build()),
+        WindowStore.from_logs(logs, torch.float64),
         settings.refit["baseline"],
-        torch.from_numpy(settings.evaluation.scales.array()),
+        torch.from_numpy(settings.evaluation.scales.to_array()),
         fitted.notes["refit"].get("at_rest", ()),
     )
 
@@ -94,20 +104,20 @@ def drawn(vessel: str, seed: int, times: int) -> tuple[float, float, np.ndarray]
             [{"kind": "zigzag", "count": 7, "heading": ["10 deg"], "drive": [0.3, 0.7]}],
             disturbance={"force_x": 10, "force_y": 10, "force_n": 10},
         )
-        first = simulate(programme.draw(), programme)
-        others = sorted(candidates(limits), key=lambda one: one.kind)
-        later = simulate(others, programme.model_copy(update={"seed": seed + 1}))
+        first = simulate_trial_logs(programme.draw(), programme)
+        others = sorted(propose_manoeuvres(limits), key=lambda one: one.kind)
+        later = simulate_trial_logs(others, programme.model_copy(update={"seed": seed + 1}))
         shares = shares_of(vessel, programme.vessel)
     split = {"train": first[:6], "validation": first[6:], "later": later}
-    prepared = prepare_logs(split, settings)
-    fitted = fit(prepared, settings)["baseline"]
+    prepared = prepare_splits(split, settings)
+    fitted = fit_models(prepared, settings)["baseline"]
     open_ = left(fitted, settings, prepared["train"])
     low, high = np.array(fitted.spec.low), np.array(fitted.spec.high)
     most = 10.0 * settings.evaluation.divergence
-    wide = velocity_limit(low, high, most, fitted.spec.signals.live)
+    wide = compute_velocity_limits(low, high, most, fitted.spec.signals.dof)
     refit = settings.refit["baseline"]
-    aim = Aim([one for one in others if one.name.startswith(BOOKLET)], SECONDS, {})
-    found = plan(fitted, open_, refit, scales, shares, wide, limits, aim)
+    aim = PredictionGoal([one for one in others if one.name.startswith(BOOKLET)], SECONDS, {})
+    found = plan_trials(fitted, open_, refit, scales, shares, wide, limits, aim)
     runs = [
         (torch.from_numpy(log.y), torch.from_numpy(log.w[:-1]))
         for log, one in zip(prepared["later"], others, strict=True)
@@ -116,17 +126,17 @@ def drawn(vessel: str, seed: int, times: int) -> tuple[float, float, np.ndarray]
     steps = round(refit.horizon / STEP)
     # squared sensitivities [P, P] of velocities over the booklet's manoeuvres
     goal = moments(fitted.model.double(), runs, steps, torch.from_numpy(scales)).sum(dim=0)
-    before = spread(open_.covariance, goal)
+    before = compute_expected_uncertainty(open_.covariance, goal)
 
     def shrinks(covariance: Tensor) -> float:
-        return 1.0 - spread(covariance, goal) / before
+        return 1.0 - compute_expected_uncertainty(covariance, goal) / before
 
     names = [one.name for one in others]
-    picked = [names.index(trial.flight.manoeuvre.name) for trial in found.chosen]
+    picked = [names.index(trial.simulated_run.manoeuvre.name) for trial in found.selected_trials]
     chosen = [*prepared["train"], *(prepared["later"][i] for i in picked)]
-    again = fit({**prepared, "train": chosen}, settings)["baseline"]
+    again = fit_models({**prepared, "train": chosen}, settings)["baseline"]
     assert again.covariance is not None
-    total = sum((trial.moments for trial in found.chosen), torch.zeros_like(goal))
+    total = sum((trial.information for trial in found.selected_trials), torch.zeros_like(goal))
     eye = torch.eye(len(goal), dtype=goal.dtype)
     predicted = shrinks(open_.covariance @ torch.linalg.inv(eye + total @ open_.covariance))
     at_random = []

@@ -41,10 +41,10 @@ import residnet
 from residnet.core.config import load_mapping
 from residnet.core.layout import VELOCITIES
 from residnet.core.log import Log
-from residnet.data.prepare import Prepared
-from residnet.data.simulated import simulate
+from residnet.data.prepare import PreparedLog
+from residnet.data.simulated import simulate_trial_logs
 from residnet.identification import fit, settings
-from residnet.judge.freerun import Errors
+from residnet.judge.freerun import FreeRunErrors
 from residnet.judge.protocol import Window
 
 SHIPPED: dict[str, dict[str, Any]] = {
@@ -92,7 +92,7 @@ def of_shipped(name: str, seconds: float, _: int, random: np.random.Generator) -
         noise={"u": noise, "v": noise, "r": f"{random.uniform(0.05, 0.5)} deg/s"},
         disturbance=dict(forces),
     )
-    logs = simulate(config.draw(), config)
+    logs = simulate_trial_logs(config.draw(), config)
     return [logs[i] for i in random.permutation(len(logs))]
 
 
@@ -123,7 +123,7 @@ SOURCES = {
 class Peer(nn.Module):
     """A GRU in free run, started by another one that reads the past, trained on one data set."""
 
-    def __init__(self, data: residnet.Data, size: int = 32) -> None:
+    def __init__(self, data: residnet.Dataset, size: int = 32) -> None:
         super().__init__()
         self.data = data
         self.past = max(round(PAST / data.prepare.grid.step), 1)
@@ -148,11 +148,11 @@ class Peer(nn.Module):
         return torch.stack(out, 1)
 
     @staticmethod
-    def rows(log: Prepared) -> np.ndarray:
+    def rows(log: PreparedLog) -> np.ndarray:
         """Velocities and inputs [T, 3 + m]."""
         return np.concatenate((log.y[:, VELOCITIES], log.w), 1)
 
-    def scaled(self, log: Prepared) -> Tensor:
+    def scaled(self, log: PreparedLog) -> Tensor:
         """The same in standard deviations."""
         return torch.from_numpy(np.nan_to_num((self.rows(log) - self.mean) / self.spread)).float()
 
@@ -161,7 +161,7 @@ class Peer(nn.Module):
         protocol = self.data.evaluation.protocols[self.data.evaluation.selection]
         step = self.data.prepare.grid.step
         logs = enumerate(self.data.logs(split))
-        return [w for i, log in logs for w in protocol.windows(log, i, step)]
+        return [w for i, log in logs for w in protocol.make_windows(log, i, step)]
 
     def fit(self, length: int, steps: int = 600) -> None:
         """Free runs of some length from anywhere; the best of the validations is kept."""
@@ -192,14 +192,14 @@ class Peer(nn.Module):
     @torch.no_grad()
     def error(self, split: str) -> float:
         """Mean NRMSE over the windows of a split, as the rows of metrics.json have it."""
-        logs, scales, out = self.data.logs(split), self.data.evaluation.scales.array(), []
+        logs, scales, out = self.data.logs(split), self.data.evaluation.scales.to_array(), []
         for window in self.windows(split):
-            z = self.scaled(logs[window.log])
+            z = self.scaled(logs[window.log_index])
             begin = max(window.start - self.past, 0)
             past = z[begin : window.start] if window.start > begin else z[:1]
             ahead = z[None, window.start : window.stop - 1, 3:]
             nu = self(past[None], z[None, window.start, :3], ahead)[0].numpy()
-            truth = logs[window.log].y[window.start + 1 : window.stop, VELOCITIES]
+            truth = logs[window.log_index].y[window.start + 1 : window.stop, VELOCITIES]
             apart = nu * self.spread[:3] + self.mean[:3] - truth
             out.append(float((np.sqrt(np.mean(apart**2, 0)) / scales).mean()))
         return float(np.mean(out))
@@ -242,12 +242,15 @@ class Missed:
 
     def __init__(self, models: residnet.Models, names: Sequence[str], split: str) -> None:
         evaluation, found = models.data.evaluation, models.runs[split].evaluation
-        run = next(run for run in found.runs if run.protocol == evaluation.selection)
-        errors = [Errors.of(run.windows, run.predictions[name], found.logs) for name in names]
-        every = [np.where(one.scored, one.velocities, np.nan) for one in errors]
-        axes = list(errors[0].live.axes)
-        self.each = (np.stack(every) / evaluation.scales.array())[..., axes]
-        self.begins = errors[0].begins
+        run = next(run for run in found.free_runs if run.protocol == evaluation.selection)
+        errors = [
+            FreeRunErrors.from_predictions(run.windows, run.predictions[name], found.logs)
+            for name in names
+        ]
+        every = [np.where(one.is_scored, one.velocity_errors, np.nan) for one in errors]
+        axes = list(errors[0].dof.active_indices)
+        self.each = (np.stack(every) / evaluation.scales.to_array())[..., axes]
+        self.begins = errors[0].window_starts
 
     def error(self, weights: np.ndarray) -> float:
         """Return the mean NRMSE over windows and axes of a mean with weights [K]."""
@@ -272,7 +275,7 @@ class Missed:
 
 def means(models: residnet.Models, first: residnet.Models | None) -> dict[str, float]:
     """Return the test errors of the means of fewer members, and of weighed ones."""
-    names = models["mean"].fitted.notes["members"] if "mean" in models else ["hull"]
+    names = models["mean"].fitted_model.notes["members"] if "mean" in models else ["hull"]
     test, out = Missed(models, names, "test"), {}
     for count in range(1, len(names) + 1):
         for some in combinations(names, count):

@@ -41,10 +41,10 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, TensorDataset
 
 from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
-from residnet.core.columns import velocities_on
-from residnet.core.processes import keep_freed_memory
-from residnet.data.prepare import PrepareConfig, prepare, samples
-from residnet.data.windows import WindowBatches, WindowStore
+from residnet.core.columns import all_but_pose
+from residnet.core.processes import retain_freed_memory
+from residnet.data.prepare import PrepareConfig, make_samples, prepare_log
+from residnet.data.windows import WindowSampler, WindowStore
 from residnet.dynamics.compiled import CompiledRollout
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import MANY, FreeRun, Rollout, trace_rollout
@@ -191,12 +191,12 @@ def epochs(repeats: int) -> None:
     data = [
         torch.from_numpy(random.normal(size=(50_000, width)).astype(np.float32)) for width in (5, 3)
     ]
-    starts = WindowBatches(torch.arange(len(data[0]) - _WINDOW), _WINDOWS, _BATCHES)
+    starts = WindowSampler(torch.arange(len(data[0]) - _WINDOW), _WINDOWS, _BATCHES)
     unfolded = (part.unfold(0, _WINDOW, 1).transpose(1, 2) for part in data)
     loader = DataLoader(TensorDataset(*unfolded), batch_size=_WINDOWS, shuffle=True)
 
     def windows() -> Iterator[list[Tensor]]:
-        for first in starts.epoch(0, 0):
+        for first in starts.draw_epoch(0, 0):
             rows = (first[:, None] + torch.arange(_WINDOW)).reshape(-1)
             yield [part.index_select(0, rows).unflatten(0, (_WINDOWS, _WINDOW)) for part in data]
 
@@ -212,7 +212,7 @@ def epochs(repeats: int) -> None:
         ours = torch.optim.AdamW(head.parameters())
         cell, out = nn.LSTMCell(5, hidden), nn.Linear(hidden, 3)
         usual = torch.optim.AdamW([*cell.parameters(), *out.parameters()])
-        own = least(partial(_epoch, windows, head.sequence, ours), repeats)
+        own = least(partial(_epoch, windows, head.teacher_forced_residuals, ours), repeats)
         batches = partial(islice, loader, _BATCHES)
         other = least(partial(_epoch, batches, partial(stepped, cell, out), usual), repeats)
         print(
@@ -234,21 +234,21 @@ def refits(repeats: int) -> None:
     }
     config, signals = PrepareConfig.model_validate(settings), SignalsConfig(inputs=_INPUTS)
     flown = large_data.simulate(12, 1_000, 1)
-    logs = [prepare(log, "train", signals.columns, config) for log in flown]
+    logs = [prepare_log(log, "train", signals.input_columns, config) for log in flown]
     built = signals.build()
     baseline = RegressorBaseline([_TERMS] * 3, built.names)
     model = HybridDynamics(built, baseline, ZeroHead(built.names), large_data.STEP, "rk4")
     model.positions = False
-    known = samples(logs, built)
-    RegressorsConfig(terms=_TERMS).fit(baseline, known)
-    store = WindowStore.gather(logs, torch.float64)
+    known = make_samples(logs, built)
+    RegressorsConfig(terms=_TERMS).fit_preferred(baseline, known)
+    store = WindowStore.from_logs(logs, torch.float64)
     plan = RefitConfig(horizon=20.0, every=10.0)
-    start = baseline.free()
+    start = baseline.get_free()
     problem = problem_of(model, known, store, plan, _SCALES)
     windows, steps = problem.inputs.shape[:2]
     found = []
     for _ in range(1 + repeats):
-        baseline.place(start)
+        baseline.set_free(start)
         begun = spent()
         notes = refit(model, known, store, plan, _SCALES).notes
         found.append(spent() - begun)
@@ -261,15 +261,15 @@ def refits(repeats: int) -> None:
     each = np.sqrt(problem.measured.numel())
 
     def errors(values: np.ndarray) -> np.ndarray:
-        baseline.place(torch.from_numpy(values))
+        baseline.set_free(torch.from_numpy(values))
         flown = Rollout(model)(problem.x0, problem.inputs, problem.x0[:, :0])[0]
-        error = (velocities_on(flown[:, 1:]) - problem.measured) * problem.weight / each
+        error = (all_but_pose(flown[:, 1:]) - problem.measured) * problem.weight / each
         return np.append(error.numpy().ravel(), root @ (values - problem.prior_mean.numpy()))
 
     begun = spent()
     best = least_squares(errors, problem.prior_mean.numpy(), method="lm", x_scale="jac", xtol=1e-4)
     taken = spent() - begun
-    baseline.place(torch.from_numpy(best.x))
+    baseline.set_free(torch.from_numpy(best.x))
     level = simulate(model, problem)[0]
     print(f"scipy: {taken:.2f} s, {best.nfev} free runs, cost {level:.9f}")
 
@@ -286,7 +286,7 @@ PARTS = {
 def main() -> None:
     """Print the parts that were asked for."""
     given = bench.options(__doc__, parts=PARTS, repeats=5)
-    keep_freed_memory()
+    retain_freed_memory()
     print(f"torch {torch.__version__}, {platform.platform()}, load {os.getloadavg()[0]:.1f}")
     for part in given.parts:
         PARTS[part](given.repeats)

@@ -17,8 +17,8 @@ import time
 import bench
 import numpy as np
 
-from residnet.simulators.ardupilot import ArduPilotBackEnd, servos
-from residnet.simulators.vehicle import Vehicle, vehicle
+from residnet.simulators.ardupilot import ArduPilotBackend, assign_servos
+from residnet.simulators.vehicle import Vehicle, load_vehicle
 
 RATE = 400
 
@@ -30,7 +30,7 @@ def packet(frame: int, *pulses: int) -> bytes:
 
 def answered(boat: Vehicle, packets: int) -> tuple[float, float, float, int]:
     """Return packets answered in a second of wall time, CPU and slowest time in ms, the refused."""
-    end = ArduPilotBackEnd(boat, servos(boat), port=0)
+    end = ArduPilotBackend(boat, assign_servos(boat), port=0)
     random = np.random.default_rng(0)
     sent = [frame for frame in range(1, packets + 1) if frame % 100]
     wrong = sum((frame % 70 == 0) + (frame % 90 == 0) for frame in sent)
@@ -55,8 +55,10 @@ def answered(boat: Vehicle, packets: int) -> tuple[float, float, float, int]:
                 raise SystemExit(f"simulators.py: the answer to frame {frame} is not finite")
         taken, cpu = time.perf_counter() - begun, time.process_time() - working
     server.join()
-    if end.refused != wrong:
-        raise SystemExit(f"simulators.py: {end.refused} packets were refused, {wrong} were wrong")
+    if end.n_invalid_packets != wrong:
+        raise SystemExit(
+            f"simulators.py: {end.n_invalid_packets} packets were refused, {wrong} were wrong"
+        )
     end.close()
     return len(sent) / taken, 1e3 * cpu / len(sent), 1e3 * slowest, wrong
 
@@ -64,7 +66,7 @@ def answered(boat: Vehicle, packets: int) -> tuple[float, float, float, int]:
 def main() -> None:
     """Measure and print."""
     given = bench.options(__doc__, source="wam_v_cal", packets=4000)
-    rate, cpu, slowest, wrong = answered(vehicle(given.source, dt=1 / RATE), given.packets)
+    rate, cpu, slowest, wrong = answered(load_vehicle(given.source, dt=1 / RATE), given.packets)
     print(
         f"ArduPilot: {rate:.0f} packets a second answered, {cpu:.2f} ms of CPU time each with the"
         f" client's, the slowest after {slowest:.1f} ms; {wrong} malformed ones left out",

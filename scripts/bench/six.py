@@ -20,35 +20,35 @@ import torch
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.config import load_config
 from residnet.core.log import Log
-from residnet.data.simulated import Flight, SimulatedTrials, fly_trials, surrounded
+from residnet.data.simulated import ManoeuvreRun, SimulatedTrials, build_plant, simulate_trials
 from residnet.identification.fitter import FitStore, Fitter
-from residnet.identification.prepared import prepare_logs
+from residnet.identification.prepared import prepare_splits
 from residnet.tasks.fit import FitConfig
 
 _DETERMINED, _ASKED, _NOTHING = 2.5, 5.0, 1e-9
 
 
 def true_rows(
-    flights: Sequence[Flight], config: FitConfig, baseline: RegressorBaseline
+    flights: Sequence[ManoeuvreRun], config: FitConfig, baseline: RegressorBaseline
 ) -> torch.Tensor:
     """Return the true coefficients [n, J]."""
     assert isinstance(config.data, SimulatedTrials)
-    signals, plant = config.signals, surrounded(config.data.vessel, config.data.disturbance)
-    moved = [flight.motion for flight in flights]
-    columns = [list(plant.state), list(plant.inputs[: plant.commands])]
+    signals, plant = config.signals, build_plant(config.data.vessel, config.data.disturbance)
+    moved = [flight.true_log for flight in flights]
+    columns = [list(plant.state_names), list(plant.input_names[: plant.n_commands])]
     x, w = (
         torch.cat([torch.from_numpy(log.stack(tuple(names))) for log in moved]) for names in columns
     )
-    live = baseline.axes
+    live = baseline.axis_names
     own = torch.cat([torch.from_numpy(log.stack(("x", "y", "psi", *live))) for log in moved])
-    seen = torch.cat([torch.from_numpy(log.stack(signals.columns)) for log in moved])
+    seen = torch.cat([torch.from_numpy(log.stack(signals.input_columns)) for log in moved])
     built = signals.build()
     with torch.no_grad():
-        rates = plant.rate(x, w)
+        rates = plant.derivative(x, w)
         phi = baseline.library(built(own, built.prepare(seen)))
     theta = torch.zeros_like(baseline.theta)
     for axis, name in enumerate(live):
-        own_terms, target = baseline.columns(axis), rates[:, plant.state.index(name)]
+        own_terms, target = baseline.term_columns(axis), rates[:, plant.state_names.index(name)]
         if own_terms:
             found = torch.linalg.lstsq(phi[:, own_terms], target[:, None], driver="gelsd").solution
             theta[axis, own_terms] = found[:, 0]
@@ -60,14 +60,14 @@ def drawn(vessel: str, seed: int, overrides: Sequence[str]) -> tuple[list[str], 
     given = [f"data.seed={seed}", "heads={}", "base_of={}", "training={}", *overrides]
     config = load_config(bench.CONFIGS / f"{vessel}.yaml", given, FitConfig)
     assert isinstance(config.data, SimulatedTrials)
-    manoeuvres = config.data.draw()
-    flights = fly_trials(manoeuvres, config.data)
+    manoeuvres = config.data.draw_manoeuvres()
+    flights = simulate_trials(manoeuvres, config.data)
     logs: dict[str, list[Log]] = {"train": [], "validation": [], "test": []}
-    for flight, split in zip(flights, config.data.splits(manoeuvres), strict=True):
-        logs[split].append(flight.log)
-    prepared = prepare_logs(logs, config)
+    for flight, split in zip(flights, config.data.assign_splits(manoeuvres), strict=True):
+        logs[split].append(flight.measured_log)
+    prepared = prepare_splits(logs, config)
     begun = time.process_time()
-    fitted = Fitter(prepared, config, FitStore()).baseline("hull")
+    fitted = Fitter(prepared, config, FitStore()).fit_baseline("hull")
     seconds, baseline = time.process_time() - begun, fitted.model.baseline
     assert isinstance(baseline, RegressorBaseline)
     true = true_rows(flights, config, baseline)
@@ -78,7 +78,7 @@ def drawn(vessel: str, seed: int, overrides: Sequence[str]) -> tuple[list[str], 
     )
     names, found = [], []
     for row in fitted.notes["coefficients"]:
-        place = baseline.outputs.index(row["axis"]), baseline.library.terms.index(row["term"])
+        place = baseline.output_names.index(row["axis"]), baseline.library.terms.index(row["term"])
         names.append(f"{row['axis']:6} {row['term']}")
         found.append([row["value"], float(true[place])])
     return names, torch.tensor(found, dtype=torch.float64)

@@ -50,11 +50,11 @@ from made_odin import (
 from residnet.baselines.given import EquationsConfig
 from residnet.core.config import load_mapping
 from residnet.core.errors import ConfigError
-from residnet.core.names import ACCELERATION, to_si
+from residnet.core.names import ACCELERATION_NAMES, to_si
 from residnet.heads.genetic import GeneticConfig
-from residnet.heads.symbolic import Past, SymbolicConfig, best_delay
+from residnet.heads.symbolic import SegmentedSamples, SymbolicConfig, find_best_delay
 from residnet.physics.terms import CandidatesConfig, TermLibrary, parse_term
-from residnet.regression.sparse import SearchConfig, find, reduce
+from residnet.regression.sparse import SparseSearchConfig, find_equation, reduce_problem
 
 Log = dict[str, np.ndarray]
 Signal = Callable[[np.ndarray], np.ndarray]
@@ -138,23 +138,25 @@ def regress(
 ) -> tuple[list[dict[str, float]], float]:
     """Return the coefficients of each target, and the seconds that it took."""
     started = time.perf_counter()
-    candidates = space.candidates(names)
+    candidates = space.generate_candidates(names)
     z = torch.from_numpy(np.stack([log[name] for name in names], axis=1))
     values = TermLibrary([c.term for c in candidates], names)(z).numpy()
-    reduced = reduce(
+    reduced = reduce_problem(
         values,
         targets,
         [c.term for c in candidates],
         [c.degree for c in candidates],
-        effort=[c.effort for c in candidates],
+        complexity=[c.complexity for c in candidates],
     )
-    equations = [find(reduced, k, SearchConfig())[0] for k in range(targets.shape[1])]
+    equations = [
+        find_equation(reduced, k, SparseSearchConfig())[0] for k in range(targets.shape[1])
+    ]
     seconds = time.perf_counter() - started
     return [dict(zip(e.terms, map(float, e.values), strict=True)) for e in equations], seconds
 
 
 def accelerations(log: Log) -> np.ndarray:
-    return np.stack([log[name] for name in ACCELERATION], axis=1)
+    return np.stack([log[name] for name in ACCELERATION_NAMES], axis=1)
 
 
 def right(found: Mapping[str, float], truth: Mapping[str, float], within: float = np.inf) -> bool:
@@ -190,8 +192,8 @@ def delay(_: int, __: int) -> None:
         }
         started = time.perf_counter()
         chosen = np.stack([z[name] for name in SPRING], axis=1)
-        past = Past(chosen, z["w_dot"][:, None], zeros, 0.1)
-        found, _ = best_delay(past, [("u", "v", "tau")], names, np.array([2]), 20)
+        past = SegmentedSamples(chosen, z["w_dot"][:, None], zeros, 0.1)
+        found, _ = find_best_delay(past, [("u", "v", "tau")], names, np.array([2]), 20)
         times.append(time.perf_counter() - started)
         hits += found == 5
     print(f"delay       0.5 s found in {hits} of 20, each in {1e3 * np.median(times):.2f} ms")
@@ -270,10 +272,10 @@ def drawn(
         head = kind.model_validate(config).build(CHANNELS)
         head.calibrate(design.samples)
         started = time.perf_counter()
-        notes = head.solve(design.samples)
+        notes = head.fit_preferred(design.samples)
         times.append(time.perf_counter() - started)
         late += int(notes.get("delay", {"steps": 0})["steps"] == delay)
-        for axis, truth in zip(ACCELERATION, design.truth, strict=True):
+        for axis, truth in zip(ACCELERATION_NAMES, design.truth, strict=True):
             found = {c["term"]: c["value"] for c in notes["coefficients"] if c["axis"] == axis}
             good, count = good + int(alike(found) == alike(truth)), count + 1
     print(

@@ -53,9 +53,9 @@ def tables() -> dict[str, pd.DataFrame]:
         columns = {"t_s": t.round(3), "command_rpm": command, "rpm": measured}
         out[f"step_{name}"] = pd.DataFrame(columns)
     n = np.concatenate((np.linspace(-2380, -240, 16), np.linspace(240, 2380, 16)))
-    pull = 2 * unit.forces.thrust(torch.from_numpy(n * RPM)[:, None])[:, 0].numpy() + random.normal(
-        0, 3, n.size
-    )
+    pull = 2 * unit.thruster_forces.thrust_at(torch.from_numpy(n * RPM)[:, None])[
+        :, 0
+    ].numpy() + random.normal(0, 3, n.size)
     shown = (n + random.normal(0, 1, n.size)).round(1)
     out["bollard"] = pd.DataFrame({"rpm": shown, "pull_N": pull.round(1)})
     return out

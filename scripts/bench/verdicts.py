@@ -18,7 +18,7 @@ import bench
 from fleets import drawn
 
 import residnet
-from residnet.judge.verdict import good_until, horizons, level
+from residnet.judge.verdict import known_horizons, longest_good_horizon, rate_model
 
 _FITTED, _NEW = 20, 8
 
@@ -26,13 +26,14 @@ _FITTED, _NEW = 20, 8
 def judged(models: residnet.Models, new: Any) -> tuple[list[int], str]:
     """Return where errors called good lie: below the interval (-1), within or above; and a line."""
     evidence = models.evidence
-    own, until = evidence.selected, good_until(evidence)
-    found = residnet.free_run(models, residnet.prepare(new, like=models.data), "external")
+    own, until = evidence.selected, longest_good_horizon(evidence)
+    found = residnet.free_run(models, residnet.prepare(new, settings_from=models.data), "external")
     seen = {
-        entry["seconds"]: entry for entry in found.evaluation.limits[evidence.protocol]["horizons"]
+        entry["seconds"]: entry
+        for entry in found.evaluation.limits_by_protocol[evidence.protocol]["horizons"]
     }
     places, texts = [], []
-    for entry in horizons(evidence):
+    for entry in known_horizons(evidence):
         if entry["seconds"] > until:
             continue
         fresh = seen[entry["seconds"]]["models"][own]
@@ -40,7 +41,7 @@ def judged(models: residnet.Models, new: Any) -> tuple[list[int], str]:
             low, high = entry["models"][own]["intervals"][of]
             places.append(int(fresh[of] > high) - int(fresh[of] < low))
             texts.append(f"{of} {fresh[of]:.3g} of {low:.3g} to {high:.3g}")
-    return places, f"{level(evidence):12s} {until:6.4g} s  {'; '.join(texts)}"
+    return places, f"{rate_model(evidence):12s} {until:6.4g} s  {'; '.join(texts)}"
 
 
 def main() -> None:
@@ -58,7 +59,7 @@ def main() -> None:
             found += places
             called += bool(places)
             took = time.process_time() - began
-            print(f"{fleet.name:8s} {models.predictor:14s} {text}  ({took:.0f} s)", flush=True)
+            print(f"{fleet.name:8s} {models.predictor_name:14s} {text}  ({took:.0f} s)", flush=True)
     print(
         f"called good: {called} vessels; of {len(found)} errors {found.count(0)} within the"
         f" interval, {found.count(1)} above"

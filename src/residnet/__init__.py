@@ -16,18 +16,18 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from residnet.api.data import Data, draft, inspect, prepare, read_logs
-    from residnet.api.fitting import FreeRuns, Models, fit, free_run, metrics, select
+    from residnet.api.data import Dataset, draft_config, inspect, prepare, read_logs
+    from residnet.api.fitting import FreeRuns, Models, fit, free_run, metrics, select_model
     from residnet.api.models import Model, Monitor, export_model, load, save, trust
     from residnet.api.tasks import (
-        Result,
-        Trials,
+        RunResult,
+        SimulationResult,
         autopilot,
-        available,
         baseline,
+        design_autopilot,
         head,
+        list_available,
         manoeuvre,
-        own_autopilot,
         run,
         simulate,
         vessel,
@@ -52,7 +52,7 @@ _HOME = {
 }
 
 __all__ = [
-    "Data",
+    "Dataset",
     "FreeRuns",
     "Log",
     "Model",
@@ -60,27 +60,27 @@ __all__ = [
     "Monitor",
     "Progress",
     "ResidnetError",
-    "Result",
-    "Trials",
+    "RunResult",
+    "SimulationResult",
     "__version__",
     "autopilot",
-    "available",
     "baseline",
-    "draft",
+    "design_autopilot",
+    "draft_config",
     "export_model",
     "fit",
     "free_run",
     "head",
     "inspect",
+    "list_available",
     "load",
     "manoeuvre",
     "metrics",
-    "own_autopilot",
     "prepare",
     "read_logs",
     "run",
     "save",
-    "select",
+    "select_model",
     "simulate",
     "trust",
     "vessel",

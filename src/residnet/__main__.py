@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 
-from residnet.exits import enter
+from residnet.exits import run_cli
 
 _OBJECTS = 100_000
 """New objects after which Python looks for cycles. By default it does so every 700, all through the
@@ -21,7 +21,7 @@ def _command() -> None:
 def main() -> None:
     """Run the command line; interruptions are heard before it is imported."""
     gc.set_threshold(_OBJECTS)
-    enter(_command)
+    run_cli(_command)
 
 
 if __name__ == "__main__":

@@ -16,96 +16,98 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, final
 import typer
 
 from residnet.core.errors import ResidnetError
-from residnet.core.ownership import Manifest, manifest_for, recorded_folder, require_replaceable
-from residnet.core.progress import Progress, ProgressCallback, listen
-from residnet.exits import enter
+from residnet.core.ownership import Manifest, find_manifest, record_folder, require_replaceable
+from residnet.core.progress import Progress, ProgressCallback, on_progress
+from residnet.exits import run_cli
 
 if TYPE_CHECKING:
-    from residnet.data.drafting.questions import Answer, Question
-    from residnet.runs.task import Finished
+    from residnet.data.drafting.questions import AnswerCallback, Question
+    from residnet.runs.task import FinishedRun
 
 
-SILENCE = 5.0
+SILENCE_SECONDS = 5.0
 """Seconds without a line after which one says what is still being done."""
-Keep = Callable[[str], None]
+LineSink = Callable[[str], None]
 """Is given one line after the other."""
 
 
 @contextmanager
-def drawn_progress(*, quiet: bool = False, kept: Keep | None = None) -> Iterator[None]:
+def show_progress(*, quiet: bool = False, sink: LineSink | None = None) -> Iterator[None]:
     """Draw the progress of everything within the context on standard error.
 
     Args:
         quiet: draw nothing.
-        kept: is given every line, whatever is drawn.
+        sink: is given every line, whatever is drawn.
     """
-    drawn: AbstractContextManager[ProgressCallback | None] = nullcontext()
+    progress_display: AbstractContextManager[ProgressCallback | None] = nullcontext()
     if not quiet:
-        drawn = _bars() if sys.stderr.isatty() else _Lines()
-    with drawn as then:
+        progress_display = _progress_bars() if sys.stderr.isatty() else _PlainProgress()
+    with progress_display as display_callback:
 
-        def hear(progress: Progress) -> None:
-            ended = progress.done is not None and progress.done == progress.total
-            if kept is not None and (progress.message or ended):
-                kept(progress.message or f"{progress.stage}: done")
-            if then is not None:
-                then(progress)
+        def forward(progress: Progress) -> None:
+            is_complete = progress.done is not None and progress.done == progress.total
+            if sink is not None and (progress.message or is_complete):
+                sink(progress.message or f"{progress.stage}: done")
+            if display_callback is not None:
+                display_callback(progress)
 
-        with listen(hear):
+        with on_progress(forward):
             yield
 
 
-class _Lines:
+class _PlainProgress:
     """One line for each message, and one for each counted stage that ends without a message.
 
     Where neither comes for a while, a line tells what is still being done, how far, and since when.
     """
 
     def __init__(self) -> None:
-        self._complete: set[str] = set()
-        self._ended = threading.Event()
-        self._doing = self._begun = self._stage = ""
-        self._since = self._told = time.monotonic()
+        self._completed_stages: set[str] = set()
+        self._stop_event = threading.Event()
+        self._current_work = self._started_stage = self._stage = ""
+        self._stage_start = self._last_print_time = time.monotonic()
 
-    def __enter__(self) -> _Lines:
-        threading.Thread(target=self._watch, daemon=True).start()
+    def __enter__(self) -> _PlainProgress:
+        threading.Thread(target=self._print_if_silent, daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._ended.set()
+        self._stop_event.set()
 
-    def _watch(self) -> None:
-        while not self._ended.wait(SILENCE / 5):
-            now = time.monotonic()
-            if self._doing and now - self._told >= SILENCE:
-                self._print(f"  {self._doing}: {now - self._since:.0f} s so far")
+    def _print_if_silent(self) -> None:
+        while not self._stop_event.wait(SILENCE_SECONDS / 5):
+            current_time = time.monotonic()
+            if self._current_work and current_time - self._last_print_time >= SILENCE_SECONDS:
+                self._print(
+                    f"  {self._current_work}: {current_time - self._stage_start:.0f} s so far"
+                )
 
     def _print(self, line: str) -> None:
-        self._told = time.monotonic()
+        self._last_print_time = time.monotonic()
         print(line, file=sys.stderr, flush=True)
 
     def __call__(self, progress: Progress) -> None:
         if progress.message:
             self._print(progress.message)
         if progress.stage and progress.done is None:
-            self._begun = self._doing = progress.stage
-            self._since = self._told
+            self._started_stage = self._current_work = progress.stage
+            self._stage_start = self._last_print_time
         if progress.done is None or progress.total is None:
             return
         if progress.stage != self._stage:
-            self._stage, self._since = progress.stage, time.monotonic()
+            self._stage, self._stage_start = progress.stage, time.monotonic()
         if progress.done < progress.total:
-            self._complete.discard(progress.stage)
-            self._doing = f"{progress.stage}, {progress.done:g} of {progress.total:g}"
-        elif progress.stage not in self._complete:
-            self._complete.add(progress.stage)
-            self._doing = self._begun
+            self._completed_stages.discard(progress.stage)
+            self._current_work = f"{progress.stage}, {progress.done:g} of {progress.total:g}"
+        elif progress.stage not in self._completed_stages:
+            self._completed_stages.add(progress.stage)
+            self._current_work = self._started_stage
             if not progress.message:
                 self._print(f"  {progress.stage}: all {progress.total:g} done")
 
 
 @contextmanager
-def _bars() -> Iterator[ProgressCallback]:
+def _progress_bars() -> Iterator[ProgressCallback]:
     """Draw one bar for each counted stage that is under way, and one for the stage begun last.
 
     Bars move, and tell the time that is gone, without a word of the work.
@@ -121,84 +123,86 @@ def _bars() -> Iterator[ProgressCallback]:
         rich.TimeElapsedColumn(),
     )
     console = Console(stderr=True, highlight=False, markup=False)
-    stages: dict[str, rich.TaskID] = {}
+    task_of_stage: dict[str, rich.TaskID] = {}
 
-    def hear(progress: Progress) -> None:
+    def update_bars(progress: Progress) -> None:
         if progress.message:
             console.print(progress.message)
         if progress.done is None and progress.total is None:
             if progress.stage:
-                if "" in stages:
-                    bars.remove_task(stages.pop(""))
-                stages[""] = bars.add_task(progress.stage, total=None)
+                if "" in task_of_stage:
+                    bars.remove_task(task_of_stage.pop(""))
+                task_of_stage[""] = bars.add_task(progress.stage, total=None)
             return
-        if progress.stage not in stages:
-            stages[progress.stage] = bars.add_task(progress.stage, total=None)
-        bars.update(stages[progress.stage], completed=progress.done or 0, total=progress.total)
+        if progress.stage not in task_of_stage:
+            task_of_stage[progress.stage] = bars.add_task(progress.stage, total=None)
+        bars.update(
+            task_of_stage[progress.stage], completed=progress.done or 0, total=progress.total
+        )
         if progress.total is not None and (progress.done or 0) >= progress.total:
-            bars.remove_task(stages.pop(progress.stage))
+            bars.remove_task(task_of_stage.pop(progress.stage))
 
     with rich.Progress(*columns, console=console, transient=True) as bars:
-        yield hear
+        yield update_bars
 
 
-def asked() -> Answer | None:
+def interactive_prompt() -> AnswerCallback | None:
     """Return what asks the user; None where nobody sits at the terminal."""
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         return None
-    return _ask
+    return _prompt_for_answer
 
 
-def _ask(question: Question) -> str:
+def _prompt_for_answer(question: Question) -> str:
     """Ask one question until its answer can be used; an empty answer takes the default."""
     options = f" ({', '.join(question.options)})" if question.options else ""
     print(f"{question.text}: {question.reason}", file=sys.stderr)
-    asking = f"  {'.'.join(question.key)}{options} [{question.default}]: "
+    prompt = f"  {'.'.join(question.key)}{options} [{question.default}]: "
     while True:
-        print(asking, end="", file=sys.stderr, flush=True)
-        given = input().strip() or question.default
-        if not question.options or given in question.options:
-            return given
-        print(f"  '{given}' is none of {', '.join(question.options)}", file=sys.stderr)
+        print(prompt, end="", file=sys.stderr, flush=True)
+        answer = input().strip() or question.default
+        if not question.options or answer in question.options:
+            return answer
+        print(f"  '{answer}' is none of {', '.join(question.options)}", file=sys.stderr)
 
 
 @final
-class RunLog:
+class ProgressLogFile:
     """Lines with the time of day, written as they come once the run's folder stands.
 
     Args:
         folder: that the run will have; a run that ends before it stands has its log beside it.
-        wanted: keep the lines; else nothing is written.
+        is_enabled: keep the lines; else nothing is written.
     """
 
-    def __init__(self, folder: Path, *, wanted: bool = True) -> None:
-        self._beside = folder.with_name(f"{folder.name}.log.txt")
-        self._wanted, self._held = wanted, ""
+    def __init__(self, folder: Path, *, is_enabled: bool = True) -> None:
+        self._fallback_path = folder.with_name(f"{folder.name}.log.txt")
+        self._is_enabled, self._buffer = is_enabled, ""
         self._file: Path | None = None
 
-    def line(self, text: str) -> None:
+    def add_line(self, text: str) -> None:
         """Add one line with the time of day."""
-        self._add(f"{time.strftime('%H:%M:%S')} {text.strip()}\n")
+        self._append(f"{time.strftime('%H:%M:%S')} {text.strip()}\n")
 
-    def open(self, folder: Path) -> None:
+    def start_file(self, folder: Path) -> None:
         """Write into a folder from now on, behind what an interrupted run left there."""
         self._file = folder / "log.txt"
-        if self._wanted:
+        if self._is_enabled:
             self._claim(self._file)
-        self._add("")
+        self._append("")
 
     @contextmanager
-    def until_the_end(self) -> Iterator[None]:
+    def log_traceback(self) -> Iterator[None]:
         """Add the traceback where what is done within the context ends badly, Ctrl-C included."""
         try:
             yield
         except BaseException as error:
-            if self._file is None and self._wanted:
+            if self._file is None and self._is_enabled:
                 # the error under way counts more than a log that cannot be written
                 with suppress(ResidnetError):
-                    self._claim(self._beside)
-                    self._file = self._beside
-            self._add("".join(traceback.format_exception(error)))
+                    self._claim(self._fallback_path)
+                    self._file = self._fallback_path
+            self._append("".join(traceback.format_exception(error)))
             raise
 
     @staticmethod
@@ -208,16 +212,16 @@ class RunLog:
         Raises:
             UsageError: if the file is the user's.
         """
-        manifest = manifest_for(file)
+        manifest = find_manifest(file)
         manifest.require_replaceable(file)
         manifest.record(file, None)
 
-    def _add(self, text: str) -> None:
-        self._held += text
-        if self._file is not None and self._wanted:
+    def _append(self, text: str) -> None:
+        self._buffer += text
+        if self._file is not None and self._is_enabled:
             with self._file.open("a", encoding="utf-8", errors="backslashreplace") as stream:
-                stream.write(self._held)
-            self._held = ""
+                stream.write(self._buffer)
+            self._buffer = ""
 
 
 app = typer.Typer(
@@ -233,9 +237,9 @@ app = typer.Typer(
 )
 
 
-def _version(wanted: bool) -> None:
+def _print_version(is_requested: bool) -> None:
     """Print the version and end, where it was asked for."""
-    if wanted:
+    if is_requested:
         from residnet.core.version import __version__
 
         print(f"residnet {__version__}")
@@ -243,9 +247,12 @@ def _version(wanted: bool) -> None:
 
 
 @app.callback()
-def _common(
+def _set_thread_limits(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
 ) -> None:
     """Options of all commands."""
@@ -254,9 +261,9 @@ def _common(
         os.environ.setdefault(name, "1")
 
 
-Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress, the result only.")]
-RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
-Overrides = Annotated[
+QuietOption = Annotated[bool, typer.Option("--quiet", help="Show no progress, the result only.")]
+RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
+OverridesOption = Annotated[
     list[str] | None,
     typer.Option(
         "-s",
@@ -265,11 +272,11 @@ Overrides = Annotated[
         help="Override a key of the config, or take one away with ~KEY; may be repeated.",
     ),
 ]
-Given = Annotated[
+LogArguments = Annotated[
     list[Path] | None,
     typer.Argument(metavar="[PATH]...", help="Logs in the order of time: files or folders."),
 ]
-Logs = Annotated[
+LogOptions = Annotated[
     list[Path] | None,
     typer.Option("--logs", metavar="PATH", help="The same, one at a time; may be repeated."),
 ]
@@ -293,14 +300,14 @@ Trust = Annotated[
         " scikit-learn. They can run code: only for configs and runs whose source you trust.",
     ),
 ]
-_CONFIG = "YAML file of one run, or the name of a config that comes with residnet."
+_CONFIG_HELP = "YAML file of one run, or the name of a config that comes with residnet."
 
 
 @app.command()
 def run(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG", help=_CONFIG)],
-    overrides: Overrides = None,
-    out: Annotated[
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help=_CONFIG_HELP)],
+    overrides: OverridesOption = None,
+    output_folder: Annotated[
         Path | None,
         typer.Option("--out", metavar="DIR", help="Run folder; runs/<name> where not given."),
     ] = None,
@@ -320,7 +327,7 @@ def run(
         ),
     ] = None,
     trust: Trust = False,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print summary.json and the run's folder, for machines.")
     ] = False,
@@ -329,26 +336,29 @@ def run(
     ] = False,
 ) -> None:
     """Carry out a run: fit, evaluate, report and export, or any other task."""
-    from residnet.core.processes import spread
-    from residnet.tasks.registry import config_file, load_task
+    from residnet.core.processes import worker_limit
+    from residnet.tasks.registry import load_task, resolve_config_file
 
     task = load_task(config, overrides or [])
-    log = RunLog(task.place(out), wanted=verbose)
-    drawn = drawn_progress(quiet=quiet or as_json, kept=log.line)
-    with log.until_the_end(), drawn, spread(workers):
-        finished = task.run(
-            source=config_file(config),
+    log_file = ProgressLogFile(task.resolve_folder(output_folder), is_enabled=verbose)
+    progress_display = show_progress(quiet=quiet or as_json, sink=log_file.add_line)
+    with log_file.log_traceback(), progress_display, worker_limit(workers):
+        finished_run = task.run(
+            source=resolve_config_file(config),
             overrides=overrides or [],
-            out=out,
+            output_folder=output_folder,
             resume=resume,
             overwrite=overwrite,
-            opened=log.open,
+            on_open=log_file.start_file,
         )
     if as_json:
-        place = {"folder": str(finished.folder.path), "report": str(finished.folder.report)}
-        print(json.dumps({**finished.folder.read_summary(), **place}, indent=1))
+        folder_fields = {
+            "folder": str(finished_run.folder.path),
+            "report": str(finished_run.folder.report),
+        }
+        print(json.dumps({**finished_run.folder.read_summary(), **folder_fields}, indent=1))
     else:
-        show(finished)
+        print_result(finished_run)
 
 
 @app.command()
@@ -356,7 +366,7 @@ def new(
     logs: Annotated[
         list[Path], typer.Argument(metavar="LOGS...", help="Files, folders and bags of any format.")
     ],
-    out: Annotated[
+    output_file: Annotated[
         Path | None,
         typer.Option("--out", metavar="CONFIG", help="File to write; my_boat.yaml if not given."),
     ] = None,
@@ -366,18 +376,21 @@ def new(
     defaults: Annotated[
         bool, typer.Option("--defaults", help="Ask nothing: take and mark every default.")
     ] = False,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Draft a complete config from logs: `residnet run` takes it as it is.
 
     Channels, units, frames, inputs, splits, protocols and models are proposed. What the logs do
     not tell is asked on a terminal; elsewhere the default is taken and marked as a guess.
     """
-    from residnet.tasks.drafting import new_config
+    from residnet.tasks.drafting import write_new_config
 
-    with drawn_progress(quiet=quiet):
-        ask, file = None if defaults else asked(), out or Path("my_boat.yaml")
-        lines = new_config(logs, file, ask, overwrite=overwrite)
+    with show_progress(quiet=quiet):
+        prompt, config_file = (
+            None if defaults else interactive_prompt(),
+            output_file or Path("my_boat.yaml"),
+        )
+        lines = write_new_config(logs, config_file, prompt, overwrite=overwrite)
     print("\n".join(lines))
 
 
@@ -389,27 +402,27 @@ def demo(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the logs of an earlier demo.")
     ] = False,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Write realistic logs of a simulated boat to try things on, in several layouts."""
     from residnet.tasks.demo import write_demo
 
-    with drawn_progress(quiet=quiet):
+    with show_progress(quiet=quiet):
         lines = write_demo(folder, overwrite=overwrite)
     print("\n".join(lines))
 
 
 @app.command()
 def check(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG", help=_CONFIG)],
-    overrides: Overrides = None,
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help=_CONFIG_HELP)],
+    overrides: OverridesOption = None,
     trust: Trust = False,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Validate a config and everything that it names, without running it."""
     from residnet.tasks.registry import load_task
 
-    with drawn_progress(quiet=quiet):
+    with show_progress(quiet=quiet):
         task = load_task(config, overrides or [])
         task.check()
     print(f"{config}: the config is valid (task {task.task}, run {task.name})")
@@ -438,29 +451,29 @@ def inspect(
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the findings as JSON, for machines.")
     ] = False,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Check logs for faults that would mislead a fit.
 
     Clocks, gaps, jumps, frozen channels, reference frames, lags, copied channels and excitation
     are checked. The exit code is 1 where a fit would be misled.
     """
-    from residnet.core.files import require_file_place
+    from residnet.core.files import require_writable_file
     from residnet.tasks.inspection import inspect_logs
 
     if out is not None:
-        require_file_place(out)
+        require_writable_file(out)
         require_replaceable(out)
-    with drawn_progress(quiet=quiet or as_json):
+    with show_progress(quiet=quiet or as_json):
         findings = inspect_logs(logs, config)
     print(json.dumps(findings.content, indent=1) if as_json else findings.text)
     if out is not None:
         findings.write(out)
-    if findings.misled:
+    if findings.has_problems:
         raise typer.Exit(1)
 
 
-def _named(run: Path, *parts: list[Path] | None) -> list[Path]:
+def _collect_log_paths(run: Path, *path_groups: list[Path] | None) -> list[Path]:
     """Return the logs that a command line names.
 
     Raises:
@@ -468,7 +481,7 @@ def _named(run: Path, *parts: list[Path] | None) -> list[Path]:
     """
     from residnet.core.errors import UsageError
 
-    logs = [path for part in parts for path in part or ()]
+    logs = [path for path_group in path_groups for path in path_group or ()]
     if not logs:
         raise UsageError(f"{run}: which logs? Name files or folders of logs behind the run")
     return logs
@@ -476,10 +489,10 @@ def _named(run: Path, *parts: list[Path] | None) -> list[Path]:
 
 @app.command()
 def evaluate(
-    folder: RunPath,
-    given: Given = None,
-    logs: Logs = None,
-    out: Annotated[
+    folder: RunArgument,
+    log_arguments: LogArguments = None,
+    log_options: LogOptions = None,
+    output_folder: Annotated[
         Path | None,
         typer.Option(
             "--out", metavar="DIR", help="Where results go; RUN/external-<time> where not given."
@@ -492,32 +505,34 @@ def evaluate(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier evaluation in its folder.")
     ] = False,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Evaluate the models of a finished run in free run on other logs."""
-    from residnet.core.files import require_room
+    from residnet.core.files import require_free_space
     from residnet.core.run_loader import name_damaged_key
-    from residnet.tasks.registry import finished_task
+    from residnet.tasks.registry import open_finished_task
 
-    with drawn_progress(quiet=quiet):
-        run, task = finished_task(folder, "evaluate")
-        require_room(out or folder)
-        named = _named(folder, given, logs)
+    with show_progress(quiet=quiet):
+        run, task = open_finished_task(folder, "evaluate")
+        require_free_space(output_folder or folder)
+        named = _collect_log_paths(folder, log_arguments, log_options)
         with name_damaged_key(folder):
-            finished = task.evaluate_on(run, named, out, resume=resume, overwrite=overwrite)
-    show(finished)
+            finished_run = task.evaluate_on_logs(
+                run, named, output_folder, resume=resume, overwrite=overwrite
+            )
+    print_result(finished_run)
 
 
 @app.command()
 def monitor(
-    folder: RunPath,
-    given: Given = None,
-    logs: Logs = None,
+    folder: RunArgument,
+    log_arguments: LogArguments = None,
+    log_options: LogOptions = None,
     model: Annotated[str, typer.Option(help="Name of the model.")] = "selected",
     window: Annotated[str, typer.Option(help="Length of the short free runs.")] = "10 s",
     stretch: Annotated[str, typer.Option(help="Time that is looked back over.")] = "300 s",
     false_alarm: Annotated[str, typer.Option(help="Mean time between false alarms.")] = "10 h",
-    out: Annotated[
+    output_folder: Annotated[
         Path | None,
         typer.Option("--out", metavar="DIR", help="Folder for a page and monitor.json."),
     ] = None,
@@ -533,47 +548,47 @@ def monitor(
     as_json: Annotated[
         bool, typer.Option("--json", help="Print what was found as JSON, for machines.")
     ] = False,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Watch new logs with a model of a finished fit, and name what has changed.
 
     The exit code is 1 where there is an alarm. A refit leaves the run as it is.
     """
-    from residnet.core.files import require_room, whole
+    from residnet.core.files import atomic_write, require_free_space
     from residnet.core.run_loader import name_damaged_key
-    from residnet.tasks.registry import finished_task
+    from residnet.tasks.registry import open_finished_task
 
-    if out is not None:
-        require_room(out)
-        Manifest(out).require_replaceable(out / "monitor.json")
-        Manifest(out).require_replaceable(out / "report.html")
+    if output_folder is not None:
+        require_free_space(output_folder)
+        Manifest(output_folder).require_replaceable(output_folder / "monitor.json")
+        Manifest(output_folder).require_replaceable(output_folder / "report.html")
     settings = {"window": window, "stretch": stretch, "false_alarm": false_alarm}
-    with drawn_progress(quiet=quiet or as_json):
-        run, task = finished_task(folder, "monitor")
-        named = _named(folder, given, logs)
+    with show_progress(quiet=quiet or as_json):
+        run, task = open_finished_task(folder, "monitor")
+        log_paths = _collect_log_paths(folder, log_arguments, log_options)
         with name_damaged_key(folder):
-            found, refitted = task.monitor(run, named, model, settings, refit)
-    content: list[dict[str, Any]] = [log.content() for log in found]
-    lines = [line for log in found for line in log.text()]
-    if refitted is not None:
-        lines += refitted.text()
-        content.append({"refit": refitted.content()})
+            monitored_logs, refit_result = task.monitor(run, log_paths, model, settings, refit)
+    content: list[dict[str, Any]] = [log.content() for log in monitored_logs]
+    lines = [line for log in monitored_logs for line in log.text()]
+    if refit_result is not None:
+        lines += refit_result.text()
+        content.append({"refit": refit_result.content()})
     document = json.dumps(content, indent=1)
-    if out is not None:
-        from residnet.tasks.fit_service import write_watched
+    if output_folder is not None:
+        from residnet.tasks.fit_service import write_monitoring_page
 
-        with recorded_folder(out):
-            lines.append(f"page: {write_watched(out, found)}")
-            with whole(out / "monitor.json") as part:
-                part.write_text(document + "\n")
+        with record_folder(output_folder):
+            lines.append(f"page: {write_monitoring_page(output_folder, monitored_logs)}")
+            with atomic_write(output_folder / "monitor.json") as temporary_file:
+                temporary_file.write_text(document + "\n")
     print(document if as_json else "\n".join(lines))
-    if any(log.since is not None for log in found):
+    if any(log.since is not None for log in monitored_logs):
         raise typer.Exit(1)
 
 
 @app.command(name="plan-trial")
 def plan_trial(
-    folder: RunPath,
+    folder: RunArgument,
     model: Annotated[
         str, typer.Option(help="Refitted baseline; the booklet's or the first if not given.")
     ] = "",
@@ -584,33 +599,33 @@ def plan_trial(
     speed: Annotated[str | None, typer.Option(help="Largest speed, such as '3 m/s'.")] = None,
     rudder: Annotated[float, typer.Option(help="Largest share of full steer.")] = 1.0,
     count: Annotated[int, typer.Option(help="Number of trials to choose.")] = 3,
-    out: Annotated[
+    output_folder: Annotated[
         Path | None,
         typer.Option("--out", metavar="DIR", help="Folder for next_trials.yaml and tracks."),
     ] = None,
     trust: Trust = False,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Say which manoeuvres to run next, and by how much they would narrow the predictions."""
-    from residnet.core.files import require_room
+    from residnet.core.files import require_free_space
     from residnet.core.run_loader import name_damaged_key
-    from residnet.tasks.registry import finished_task
+    from residnet.tasks.registry import open_finished_task
 
-    if out is not None:
-        require_room(out)
+    if output_folder is not None:
+        require_free_space(output_folder)
     limits = {"time": time, "area": area, "speed": speed, "rudder": rudder, "count": count}
-    with drawn_progress(quiet=quiet):
-        run, task = finished_task(folder, "plan-trial")
+    with show_progress(quiet=quiet):
+        run, task = open_finished_task(folder, "plan-trial")
         with name_damaged_key(folder):
-            planned = task.plan_trial(run, model, limits)
-    print(planned.text())
-    for file in planned.write(out) if out is not None else []:
+            next_trials = task.plan_trial(run, model, limits)
+    print(next_trials.text())
+    for file in next_trials.write(output_folder) if output_folder is not None else []:
         print(f"written: {file}")
 
 
 @app.command()
 def export(
-    folder: RunPath,
+    folder: RunArgument,
     model: Annotated[
         str,
         typer.Option(
@@ -623,7 +638,7 @@ def export(
     file_format: Annotated[
         str, typer.Option("--format", metavar="FORMAT", help="One of `residnet list formats`.")
     ] = "torchscript",
-    out: Annotated[
+    output_file: Annotated[
         Path | None,
         typer.Option(
             "--out",
@@ -632,27 +647,29 @@ def export(
             " for C, whose names begin with the file's.",
         ),
     ] = None,
-    anyway: Annotated[
+    allows_objections: Annotated[
         bool,
         typer.Option(
             "--anyway", help="Write what is worse than doing without it, too; its card says so."
         ),
     ] = False,
     trust: Trust = False,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Export a model of a finished run for controllers, after a parity check."""
-    from residnet.core.files import require_file_place
+    from residnet.core.files import require_writable_file
     from residnet.core.run_loader import name_damaged_key
     from residnet.runs.task import ExportRequest
-    from residnet.tasks.registry import finished_task
+    from residnet.tasks.registry import open_finished_task
 
-    with drawn_progress(quiet=quiet):
-        run, task = finished_task(folder, "export")
-        require_file_place(out or run.exports / model)
+    with show_progress(quiet=quiet):
+        run, task = open_finished_task(folder, "export")
+        require_writable_file(output_file or run.exported_models / model)
         with name_damaged_key(folder):
-            written = task.export_model(ExportRequest(run, model, out, file_format, anyway))
-    print(written)
+            exported_file = task.export_model(
+                ExportRequest(run, model, output_file, file_format, allows_objections)
+            )
+    print(exported_file)
 
 
 @app.command()
@@ -664,7 +681,7 @@ def autopilot(
             help="A finished fit, logs with turns, or K in 1/s and T in s, such as 0.31,7.4.",
         ),
     ],
-    out: Annotated[
+    output_file: Annotated[
         Path, typer.Option("--out", metavar="CONFIG", help="Config to write, and the run's name.")
     ] = Path("my_autopilot.yaml"),
     rudder: Annotated[
@@ -680,22 +697,22 @@ def autopilot(
         bool, typer.Option("--overwrite", help="Replace earlier files and an earlier run.")
     ] = False,
     trust: Trust = False,
-    quiet: Quiet = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Train a heading autopilot for your vessel under the conditions that its logs show."""
-    from residnet.tasks.own_autopilot import draft_autopilot
+    from residnet.tasks.own_autopilot import draft_autopilot_config
     from residnet.tasks.registry import load_task
 
-    with drawn_progress(quiet=quiet):
-        config = draft_autopilot(
-            source, out, rudder=rudder, rate=rate, speed=speed, overwrite=overwrite
+    with show_progress(quiet=quiet):
+        config = draft_autopilot_config(
+            source, output_file, rudder=rudder, rate=rate, speed=speed, overwrite=overwrite
         )
         print(f"config: {config}")
         if draft:
             return
-        finished = load_task(config, []).run(source=config, overwrite=overwrite)
-    show(finished)
-    print(f"next: residnet export {finished.folder.path} --format c")
+        finished_run = load_task(config, []).run(source=config, overwrite=overwrite)
+    print_result(finished_run)
+    print(f"next: residnet export {finished_run.folder.path} --format c")
 
 
 @app.command()
@@ -718,23 +735,26 @@ def ardupilot(
     trust: Trust = False,
 ) -> None:
     """Simulate a vessel or a learned model for ArduPilot (sim_vehicle.py --model JSON)."""
-    from residnet.simulators.ardupilot import ArduPilotBackEnd, servos
-    from residnet.simulators.vehicle import vehicle
+    from residnet.simulators.ardupilot import ArduPilotBackend, assign_servos
+    from residnet.simulators.vehicle import load_vehicle
 
-    boat = vehicle(source, model=model, dt=0.0025)
-    end = ArduPilotBackEnd(boat, servos(boat, servo or ()), port)
-    print(f"{boat.name} listens at UDP port {end.port}; Ctrl-C ends it", flush=True)
-    for name, at in zip(boat.inputs, end.servos, strict=False):
-        print(f"  {name}: servo output {at.channel}, {at.low:g} to {at.high:g}", flush=True)
-    end.serve()
+    vehicle_model = load_vehicle(source, model=model, dt=0.0025)
+    back_end = ArduPilotBackend(vehicle_model, assign_servos(vehicle_model, servo or ()), port)
+    print(f"{vehicle_model.name} listens at UDP port {back_end.port}; Ctrl-C ends it", flush=True)
+    for name, servo_output in zip(vehicle_model.inputs, back_end.servos, strict=False):
+        print(
+            f"  {name}: servo output {servo_output.channel}, {servo_output.lower_command:g} to {servo_output.upper_command:g}",
+            flush=True,
+        )
+    back_end.serve()
 
 
 @app.command()
-def report(folder: RunPath, quiet: Quiet = False) -> None:
+def report(folder: RunArgument, quiet: QuietOption = False) -> None:
     """Write the figures and the report of a finished run again."""
     from residnet.tasks.registry import report_run
 
-    with drawn_progress(quiet=quiet):
+    with show_progress(quiet=quiet):
         page = report_run(folder)
     print(page)
 
@@ -761,17 +781,17 @@ def compare(
     folders: Annotated[
         list[Path], typer.Argument(metavar="RUN RUN...", help="Folders of finished fits.")
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the page.")] = Path(
-        "comparison"
-    ),
-    quiet: Quiet = False,
+    output_folder: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder of the page.")
+    ] = Path("comparison"),
+    quiet: QuietOption = False,
 ) -> None:
     """Set finished fits side by side: errors on common logs, paired intervals, configs."""
     from residnet.core.run_loader import name_damaged_key
     from residnet.tasks.compare import compare_runs
 
-    with drawn_progress(quiet=quiet), name_damaged_key(folders[0]):
-        text, page = compare_runs(folders, out)
+    with show_progress(quiet=quiet), name_damaged_key(folders[0]):
+        text, page = compare_runs(folders, output_folder)
     print(text)
     print(f"page: {page}")
 
@@ -782,15 +802,15 @@ def runs(
     as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
 ) -> None:
     """List the runs below a folder with task, state, best figure and age."""
-    from residnet.tasks.registry import runs_below, runs_text
+    from residnet.tasks.registry import format_runs, list_runs
 
-    entries = runs_below(folder)
-    print(json.dumps(entries, indent=1) if as_json else runs_text(folder, entries))
+    entries = list_runs(folder)
+    print(json.dumps(entries, indent=1) if as_json else format_runs(folder, entries))
 
 
 @app.command(name="list")
 def list_names(
-    what: Annotated[
+    part_kind: Annotated[
         Literal[
             "vessels", "heads", "manoeuvres", "readers", "tasks", "baselines", "formats", "configs"
         ],
@@ -798,29 +818,29 @@ def list_names(
     ],
 ) -> None:
     """List the parts that a config may name, with a line about each."""
-    from residnet.tasks.registry import catalogue
+    from residnet.tasks.registry import list_catalogue
 
-    for name, about in catalogue(what):
-        print(f"{name:28s} {about}")
+    for name, description in list_catalogue(part_kind):
+        print(f"{name:28s} {description}")
 
 
-def show(finished: Finished) -> None:
+def print_result(finished_run: FinishedRun) -> None:
     """Print the verdict and table of a run, its exported files and its report."""
-    if finished.outcome.level:
-        print(f"{finished.outcome.level.capitalize()}:")
-    for sentence in finished.outcome.verdict:
+    if finished_run.outcome.level:
+        print(f"{finished_run.outcome.level.capitalize()}:")
+    for sentence in finished_run.outcome.verdict:
         print(sentence)
-    if finished.outcome.table:
-        print(finished.outcome.table)
-    for file in finished.exports:
+    if finished_run.outcome.table:
+        print(finished_run.outcome.table)
+    for file in finished_run.exports:
         print(f"exported: {file}")
-    if finished.folder.report.is_file():
-        print(f"report: {finished.folder.report}")
+    if finished_run.folder.report.is_file():
+        print(f"report: {finished_run.folder.report}")
 
 
 def main() -> None:
     """Run the command line; an error that a user can cause is one line and an exit code."""
-    enter(app)
+    run_cli(app)
 
 
 if __name__ == "__main__":

@@ -19,11 +19,11 @@ from types import FrameType
 
 from residnet.core.errors import ResidnetError, Terminated
 
-INTERRUPTED = 130
+EXIT_INTERRUPTED = 130
 """Exit code after Ctrl-C."""
-TERMINATED = 143
+EXIT_TERMINATED = 143
 """Exit code after SIGTERM."""
-_OF_THE_SYSTEM = {
+_SYSTEM_ERRNOS = {
     errno.EACCES,
     errno.EDQUOT,
     errno.EFBIG,
@@ -39,37 +39,37 @@ _OF_THE_SYSTEM = {
 """Faults that are the machine's: nothing in residnet could be repaired to avoid them."""
 
 
-class _Signals:
+class _SignalHandler:
     """Remembers that the user asked for the end, whatever a library makes of the exception."""
 
     def __init__(self) -> None:
-        self.interrupted = False
+        self.is_interrupted = False
 
     def interrupt(self, number: int, frame: FrameType | None) -> None:
-        self.interrupted = True
+        self.is_interrupted = True
         raise KeyboardInterrupt
 
     def terminate(self, number: int, frame: FrameType | None) -> None:
         raise Terminated
 
     @contextmanager
-    def heard(self) -> Iterator[None]:
+    def handle_signals(self) -> Iterator[None]:
         """Hear the signals within the context; only a main thread can."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        before = {
+        previous_handlers = {
             signal.SIGINT: signal.signal(signal.SIGINT, self.interrupt),
             signal.SIGTERM: signal.signal(signal.SIGTERM, self.terminate),
         }
         try:
             yield
         finally:
-            for number, handler in before.items():
+            for number, handler in previous_handlers.items():
                 signal.signal(number, handler)
 
 
-def enter(command: Callable[[], object]) -> None:
+def run_cli(command: Callable[[], object]) -> None:
     """Carry out a command; whatever goes wrong is told in one line on standard error.
 
     Args:
@@ -78,33 +78,33 @@ def enter(command: Callable[[], object]) -> None:
     Raises:
         SystemExit: with the exit code, where it is not 0.
     """
-    signals = _Signals()
+    signals = _SignalHandler()
     # a service may start a command with closed streams
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             stream = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115 (to the end)
             setattr(sys, name, stream)
     try:
-        with signals.heard():
+        with signals.handle_signals():
             command()
         _report_skipped_packages()
-    except SystemExit as end:
-        if not signals.interrupted:
+    except SystemExit as exception:
+        if not signals.is_interrupted:
             _report_skipped_packages()
             raise
-        _leave(_continue("interrupted"), INTERRUPTED, end)
-    except KeyboardInterrupt as end:
-        _leave(_continue("interrupted"), INTERRUPTED, end)
-    except Terminated as end:
-        _leave(_continue("terminated"), TERMINATED, end)
+        _exit(_interruption_message("interrupted"), EXIT_INTERRUPTED, exception)
+    except KeyboardInterrupt as exception:
+        _exit(_interruption_message("interrupted"), EXIT_INTERRUPTED, exception)
+    except Terminated as exception:
+        _exit(_interruption_message("terminated"), EXIT_TERMINATED, exception)
     except BrokenPipeError:
         # whoever read the output has seen enough
         sys.exit(0)
     except Exception as error:
-        if signals.interrupted:
+        if signals.is_interrupted:
             # a library has turned the interruption into an error of its own
-            _leave(_continue("interrupted"), INTERRUPTED, error)
-        _leave(*_told(error), error)
+            _exit(_interruption_message("interrupted"), EXIT_INTERRUPTED, error)
+        _exit(*_error_message(error), error)
 
 
 def _report_skipped_packages() -> None:
@@ -115,45 +115,50 @@ def _report_skipped_packages() -> None:
         print(f"residnet: warning: {ResidnetError(line)}", file=sys.stderr)
 
 
-def _told(error: Exception) -> tuple[str, int]:
+def _error_message(error: Exception) -> tuple[str, int]:
     """Return the line about an error and the exit code."""
     if isinstance(error, ResidnetError):
         return str(error), error.exit_code
     # PyTorch has no error of its own for memory
     if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
         return "the memory of this machine is used up; take fewer or shorter logs", 1
-    if isinstance(error, OSError) and error.errno in _OF_THE_SYSTEM:
-        place = "" if error.filename is None else f"{error.filename}: "
-        return f"{place}{error.strerror}; make room or give another place", 2
+    if isinstance(error, OSError) and error.errno in _SYSTEM_ERRNOS:
+        location = "" if error.filename is None else f"{error.filename}: "
+        return f"{location}{error.strerror}; make room or give another place", 2
     if isinstance(error, ModuleNotFoundError) and "residnet" not in str(error.name):
-        what = f"{sys.executable} has no package '{error.name}'"
-        return f"{what}; install residnet for this Python, or take that of its .venv", 2
+        problem = f"{sys.executable} has no package '{error.name}'"
+        return f"{problem}; install residnet for this Python, or take that of its .venv", 2
     file = write_crash_file(error)
-    first = next(iter(str(error).splitlines()), "")
-    place = "it could not be described in a file" if file is None else f"attach {file} to an issue"
-    return f"this is a defect of residnet, {type(error).__name__}: {first[:200]}; {place}", 1
+    first_line = next(iter(str(error).splitlines()), "")
+    location = (
+        "it could not be described in a file" if file is None else f"attach {file} to an issue"
+    )
+    return (
+        f"this is a defect of residnet, {type(error).__name__}: {first_line[:200]}; {location}",
+        1,
+    )
 
 
-def _continue(what: str) -> str:
+def _interruption_message(event: str) -> str:
     """Return the line of a command that was stopped from outside."""
     if "run" in sys.argv[1:2]:
-        return f"{what}; continue the run with the same command and --resume"
-    return f"{what}; nothing is left half written, give the same command again"
+        return f"{event}; continue the run with the same command and --resume"
+    return f"{event}; nothing is left half written, give the same command again"
 
 
-def _leave(line: str, code: int, cause: BaseException) -> None:
+def _exit(message: str, code: int, original_error: BaseException) -> None:
     # whatever the line quotes, it stays one line
-    print(f"residnet: {ResidnetError(line)}", file=sys.stderr)
-    raise SystemExit(code) from cause
+    print(f"residnet: {ResidnetError(message)}", file=sys.stderr)
+    raise SystemExit(code) from original_error
 
 
-_LONGEST_CONFIG = 100_000
+_MAX_CONFIG_LENGTH = 100_000
 """Letters of each config in a report of a defect; chosen by hand, above those of any config."""
-_SECRET = re.compile(
+_SECRET_PATTERN = re.compile(
     r"(?i)((?:[\w.-]*(?:password|passwd|secret|token|api[_-]?key|credential)[\w.-]*)"
     r"[\"']?\s*[:=]\s*)\S.*"
 )
-_ACCOUNT = re.compile(r"://[^/\s@]+@")
+_ACCOUNT_PATTERN = re.compile(r"://[^/\s@]+@")
 
 
 def write_crash_file(error: BaseException) -> Path | None:
@@ -170,30 +175,30 @@ def write_crash_file(error: BaseException) -> Path | None:
 
     from residnet.core.version import __version__
 
-    found = []
+    package_versions = []
     for requirement in requires("residnet") or ():
         name = re.split(r"[^A-Za-z0-9._-]", requirement, maxsplit=1)[0]
         try:
-            found.append(f"{name} {version(name)}")
+            package_versions.append(f"{name} {version(name)}")
         except PackageNotFoundError:
             continue
     parts = [
         f"residnet {__version__}, Python {platform.python_version()}, {platform.platform()}",
-        "packages: " + ", ".join(sorted(set(found))),
+        "packages: " + ", ".join(sorted(set(package_versions))),
         f"command: residnet {' '.join(sys.argv[1:])}",
         "".join(traceback.format_exception(error)),
     ]
-    out = []
-    for word in sys.argv[1:]:
+    config_texts = []
+    for argument in sys.argv[1:]:
         try:
-            file = Path(word) / "resolved.yaml" if Path(word).is_dir() else Path(word)
+            file = Path(argument) / "resolved.yaml" if Path(argument).is_dir() else Path(argument)
             if file.suffix in (".yaml", ".yml") and file.is_file():
                 text = file.read_text(encoding="utf-8", errors="backslashreplace")
-                out.append(f"{file}:\n{text[:_LONGEST_CONFIG]}")
+                config_texts.append(f"{file}:\n{text[:_MAX_CONFIG_LENGTH]}")
         except (OSError, ValueError):
             # a word that is no path, or a file that cannot be read
             continue
-    text = without_secrets("\n\n".join([*parts, *out]) + "\n")
+    text = remove_secrets("\n\n".join([*parts, *config_texts]) + "\n")
     name = f"residnet-crash-{time.strftime('%Y%m%dT%H%M%S')}-{os.getpid()}.txt"
     for folder in (Path.cwd, lambda: Path(tempfile.gettempdir())):
         try:
@@ -205,7 +210,7 @@ def write_crash_file(error: BaseException) -> Path | None:
     return None
 
 
-def without_secrets(text: str) -> str:
+def remove_secrets(text: str) -> str:
     """Return text without passwords, tokens and the home folder's name."""
     try:
         home = str(Path.home())
@@ -213,4 +218,4 @@ def without_secrets(text: str) -> str:
         home = ""
     if len(home) > 1:
         text = text.replace(home, "~")
-    return _ACCOUNT.sub("://***@", _SECRET.sub(r"\1***", text))
+    return _ACCOUNT_PATTERN.sub("://***@", _SECRET_PATTERN.sub(r"\1***", text))

@@ -52,7 +52,7 @@ def test_the_factor_is_that_of_the_matrices() -> None:
 def test_a_resolved_config_needs_no_vessel_file(tmp_path: Path) -> None:
     copy = tmp_path / "mine.yaml"
     copy.write_text(vessel_files()["milliampere"].read_text())
-    resolved = BelievedConfig(vessel=str(copy)).resolved()
+    resolved = BelievedConfig(vessel=str(copy)).without_file_references()
     copy.unlink()
     written = resolved.model_dump_json()
     assert "mine.yaml" not in written
@@ -65,8 +65,8 @@ def test_forces_made_by_thrusters() -> None:
     baseline = BelievedConfig(vessel="wam_v_cal").build(signals.names)
     plant = load_vessel("wam_v_cal").build()
     x, w = torch.randn(5, 6, dtype=torch.float64), torch.randn(5, 2, dtype=torch.float64) * 10
-    full = torch.zeros(5, len(plant.inputs), dtype=torch.float64)
-    rate = plant.rate(torch.cat((x, w), dim=1), full)[:, 3:6]
+    full = torch.zeros(5, len(plant.input_names), dtype=torch.float64)
+    rate = plant.derivative(torch.cat((x, w), dim=1), full)[:, 3:6]
     found = baseline(signals(x, signals.prepare(w)))
     torch.testing.assert_close(found, rate, rtol=1e-12, atol=1e-12)
 
@@ -101,7 +101,7 @@ def test_values_by_hand() -> None:
     yaw = -0.1422 * r * np.abs(r) - 0.06111 * r + 4.78e-5 * tau_n - 0.061123 * v
     wanted = np.stack((surge, 0 * surge, yaw), axis=1)
     np.testing.assert_allclose(baseline(channels()), wanted, rtol=1e-11)
-    assert baseline.parameter_count() == [4, 0, 4]
+    assert baseline.parameter_counts() == [4, 0, 4]
 
 
 JETS = ("u", "v", "r", "cmd_n", "cmd_nozzle")
@@ -145,4 +145,4 @@ def test_what_does_not_go_with_the_channels_is_said(build: Any, message: str) ->
 def test_terms_of_the_published_models(file: str, model: str, counts: list[int]) -> None:
     """Correction E9: (7.2) 14, (7.3) 8, (7.4) 14, (7.5) 14, (7.6) 10, (7.7) 11 terms."""
     config = load_config(STUDIES / f"{file}.yaml", [], FitConfig)
-    assert config.baselines[model].build(config.signals.build().names).parameter_count() == counts
+    assert config.baselines[model].build(config.signals.build().names).parameter_counts() == counts

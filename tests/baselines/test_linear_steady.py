@@ -64,12 +64,12 @@ for i, axis in ((1, "v"), (2, "r")):
 
 def test_a_linear_system_is_found_exactly_with_its_steady_states() -> None:
     baseline = CONFIG.build(NAMES)
-    found = by_name(CONFIG.fit(baseline, trials()))
+    found = by_name(CONFIG.fit_preferred(baseline, trials()))
     assert found == {key: pytest.approx(value, 1e-4, 1e-8) for key, value in TRUTH.items()}
     z = torch.from_numpy(np.random.default_rng(1).normal(size=(20, 5)) * [1, 0.3, 0.3, 300, 200])
     wanted = z[:, :3].numpy() @ A.T + z[:, 3:].numpy() @ B.T + C
     np.testing.assert_allclose(baseline(z), wanted, rtol=1e-4, atol=1e-6)
-    (solution,) = CONFIG.solutions(baseline, trials())
+    (solution,) = CONFIG.fit_solutions(baseline, trials())
     constraints = solution.notes["steady_constraints"]
     for axis, (state, column) in enumerate((("u", 0), ("v", 1), ("r", 1))):
         assert constraints[state]["phi"] == pytest.approx(PHI[axis, column], rel=1e-4)
@@ -81,7 +81,7 @@ def test_a_linear_system_is_found_exactly_with_its_steady_states() -> None:
 
 def test_the_relation_holds_whatever_the_noise_and_errors_cover_the_truth() -> None:
     """Phi comes from the steady runs alone; noise in the accelerations moves A, and B with it."""
-    table = CONFIG.fit(CONFIG.build(NAMES), trials(noise=0.05))
+    table = CONFIG.fit_preferred(CONFIG.build(NAMES), trials(noise=0.05))
     found = by_name(table)
     a = np.array([[found[i, j] for j in "vr"] for i in "vr"])
     b = np.array([found[i, "tau_n"] for i in "vr"])
@@ -89,13 +89,13 @@ def test_the_relation_holds_whatever_the_noise_and_errors_cover_the_truth() -> N
     assert abs(a[1, 1] - A[2, 2]) > 1e-6
     for entry in table:
         off = abs(entry.value - TRUTH[entry.axis[0], entry.term])
-        assert off < 5 * entry.error + 1e-9
+        assert off < 5 * entry.standard_error + 1e-9
 
 
 @pytest.mark.parametrize("model", ["nomoto", "nomoto_sideslip"])
 def test_nomoto_keeps_the_steady_states_and_its_own_structure(model: str) -> None:
     config = LinearSteadyConfig.model_validate({"settled": 400.0, "steering_model": model})
-    found = by_name(config.fit(config.build(NAMES), trials()))
+    found = by_name(config.fit_preferred(config.build(NAMES), trials()))
     # whatever the time constant, the yaw rate settles where the constant manoeuvres did
     assert -found["r", "tau_n"] / found["r", "r"] == pytest.approx(PHI[2, 1], rel=1e-4)
     assert -found["r", "1"] / found["r", "r"] == pytest.approx(BIAS[2], rel=1e-4)
@@ -121,4 +121,4 @@ def test_what_is_missing_is_named(left_out: tuple[str, ...], settled: float, mes
     samples, config = trials(), LinearSteadyConfig(settled=settled)
     keep = torch.tensor([kind not in left_out for kind in samples.kinds])
     with pytest.raises(FitError, match=message):
-        config.fit(config.build(NAMES), samples.where(keep[samples.group]))
+        config.fit_preferred(config.build(NAMES), samples.select(keep[samples.group]))

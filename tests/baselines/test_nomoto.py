@@ -14,7 +14,7 @@ import torch
 from made_samples import sampled
 
 from residnet.baselines.regressors import RegressorBaseline
-from residnet.baselines.steering import NomotoConfig, NomotoSideslipConfig
+from residnet.baselines.steering import NomotoBaselineConfig, NomotoSideslipBaselineConfig
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
@@ -45,7 +45,8 @@ def parameters(config: Any, samples: Samples) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("config", "truth"), [(NomotoSideslipConfig(), LAGS | SLIP), (NomotoConfig(), LAGS)]
+    ("config", "truth"),
+    [(NomotoSideslipBaselineConfig(), LAGS | SLIP), (NomotoBaselineConfig(), LAGS)],
 )
 def test_parameters_of_known_lags_are_exact(config: Any, truth: dict[str, float]) -> None:
     found = {name: entry.value for name, entry in parameters(config, made()).items()}
@@ -57,7 +58,8 @@ def test_errors_of_parameters_are_their_spread() -> None:
     coefficients' covariance.
     """
     runs = [
-        parameters(NomotoSideslipConfig(), made(1.0, seed=seed, groups=40)) for seed in range(60)
+        parameters(NomotoSideslipBaselineConfig(), made(1.0, seed=seed, groups=40))
+        for seed in range(60)
     ]
     for name in LAGS | SLIP:
         values = np.array([run[name].value for run in runs])
@@ -65,10 +67,10 @@ def test_errors_of_parameters_are_their_spread() -> None:
         assert 0.7 < claimed / values.std() < 1.4, name
 
 
-def hybrid(config: NomotoConfig | NomotoSideslipConfig) -> HybridDynamics:
+def hybrid(config: NomotoBaselineConfig | NomotoSideslipBaselineConfig) -> HybridDynamics:
     signals = SignalsConfig(inputs=("n", "delta")).build()
     baseline = config.build(signals.names)
-    config.fit(baseline, made())
+    config.fit_preferred(baseline, made())
     return HybridDynamics(signals, baseline, ZeroHead(), 0.05, "rk4")
 
 
@@ -76,7 +78,7 @@ def test_step_response_in_closed_form() -> None:
     """r = (K delta + b)(1 - exp(-t/T)); u likewise; side slip at constant speed follows r through
     its own lag.
     """
-    model = hybrid(NomotoSideslipConfig())
+    model = hybrid(NomotoSideslipBaselineConfig())
     n = 8.0
     speed = LAGS["K_u"] * n + LAGS["b_u"]
     w = torch.tensor([n, 0.2], dtype=torch.float64).expand(1, 400, 2)
@@ -94,7 +96,7 @@ def test_step_response_in_closed_form() -> None:
 
 
 def test_first_order_model_lets_sway_die_out_with_t() -> None:
-    model = hybrid(NomotoConfig())
+    model = hybrid(NomotoBaselineConfig())
     x0 = torch.tensor([[0, 0, 0, 0.5, 0.1, 0.02]], dtype=torch.float64)
     with torch.no_grad():
         states = Rollout(model)(x0, torch.zeros(1, 200, 2, dtype=torch.float64), x0[:, :0])[0][0]
@@ -105,31 +107,31 @@ def test_a_refit_may_not_move_what_nothing_determines() -> None:
     """The decay of sway is no observation: a refit would make it grow where sway is left
     unexplained.
     """
-    baseline = NomotoConfig().build(NAMES)
-    terms, size = baseline.library.terms, baseline.library.count
+    baseline = NomotoBaselineConfig().build(NAMES)
+    terms, size = baseline.library.terms, baseline.library.n_terms
     movable = {(i // size, terms[i % size]) for i in baseline.free_indices().tolist()}
     assert movable == {(0, "u"), (0, "n"), (0, "1"), (2, "r"), (2, "delta"), (2, "1")}
-    assert len(NomotoSideslipConfig().build(NAMES).free_indices()) == 9
+    assert len(NomotoSideslipBaselineConfig().build(NAMES).free_indices()) == 9
 
 
 def test_parameters_follow_moved_coefficients() -> None:
-    config = NomotoConfig()
+    config = NomotoBaselineConfig()
     baseline = config.build(NAMES)
-    table = config.fit(baseline, made())
+    table = config.fit_preferred(baseline, made())
     assert isinstance(baseline, RegressorBaseline)
     terms = baseline.library.terms
     with torch.no_grad():
         baseline.theta[2, terms.index("r")] = -0.5
         baseline.theta[2, terms.index("delta")] = 0.4
     errors = torch.full((baseline.free_indices().numel(),), 0.125, dtype=torch.float64)
-    restated = baseline.updated_table(table, errors)
+    restated = baseline.refresh_table(table, errors)
     after = {(c.axis, c.term): c.value for c in restated}
     assert after["r_dot", "T"] == pytest.approx(2.0)
     assert after["r_dot", "K"] == pytest.approx(0.8)
     assert after["r_dot", "r"] == -0.5
-    before = [c.error for c in table if c.ratio is not None]
-    assert [c.error for c in restated if c.ratio is not None] == before
-    assert [c.error for c in restated if (c.axis, c.term) == ("r_dot", "r")] == [0.125]
+    before = [c.standard_error for c in table if c.ratio is not None]
+    assert [c.standard_error for c in restated if c.ratio is not None] == before
+    assert [c.standard_error for c in restated if (c.axis, c.term) == ("r_dot", "r")] == [0.125]
 
 
 def test_other_channels_and_manoeuvres() -> None:
@@ -137,7 +139,7 @@ def test_other_channels_and_manoeuvres() -> None:
     samples = dataclasses.replace(made(), names=names, kinds=("turning", "zigzag") * 6)
     spoiled = samples.target.clone()
     spoiled[samples.group % 2 == 0] = 99.0
-    config = NomotoConfig(drive="tau_x", steer="tau_n", manoeuvres=("zigzag",))
+    config = NomotoBaselineConfig(drive="tau_x", steer="tau_n", manoeuvres=("zigzag",))
     found = parameters(config, samples.with_target(spoiled))
     assert {name: entry.value for name, entry in found.items()} == pytest.approx(LAGS, rel=1e-9)
 
@@ -145,8 +147,8 @@ def test_other_channels_and_manoeuvres() -> None:
 def test_what_does_not_settle_or_is_not_there_is_an_error() -> None:
     samples = made()
     unstable = samples.target.clone()
-    unstable[:, 2] += samples.column("r")
+    unstable[:, 2] += samples.channel("r")
     with pytest.raises(FitError, match="needs r to settle, but r_dot rises with r"):
-        parameters(NomotoConfig(), samples.with_target(unstable))
+        parameters(NomotoBaselineConfig(), samples.with_target(unstable))
     with pytest.raises(FitError, match="turning"):
-        parameters(NomotoConfig(manoeuvres=("turning",)), samples)
+        parameters(NomotoBaselineConfig(manoeuvres=("turning",)), samples)

@@ -13,10 +13,10 @@ from made_samples import sampled
 from sklearn.linear_model import Ridge
 from sklearn.preprocessing import PolynomialFeatures
 
-from residnet.baselines.given import StillConfig
-from residnet.baselines.regressors import RegressorsConfig, _undamped
-from residnet.baselines.sets import merged
-from residnet.core.config import validate
+from residnet.baselines.given import ZeroBaselineConfig
+from residnet.baselines.regressors import RegressorsConfig, _find_undamped_term
+from residnet.baselines.sets import drop_equivalent_terms
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
 from residnet.physics.terms import TermLibrary
@@ -48,25 +48,27 @@ def made(noise: float = 0.0, count: int = 400, groups: int = 8) -> Samples:
 
 def test_exact_coefficients_from_noise_free_samples() -> None:
     baseline = OWN.build(NAMES)
-    table = OWN.fit(baseline, made())
+    table = OWN.fit_preferred(baseline, made())
     rows = [(f"{axis}_dot", term) for axis, row in TRUTH.items() for term in row]
     assert [(entry.axis, entry.term) for entry in table] == rows
     for entry in table:
         assert entry.value == pytest.approx(TRUTH[entry.axis[0]][entry.term], rel=1e-10)
-        assert entry.error < 1e-10 * max(abs(entry.value), 1.0)
+        assert entry.standard_error < 1e-10 * max(abs(entry.value), 1.0)
     z = np.random.default_rng(1).normal(size=(2, 30, 5)) * [1, 0.3, 0.3, 300, 200]
     found, wanted = baseline(torch.from_numpy(z)), accelerations(z.reshape(-1, 5))
     np.testing.assert_allclose(found.reshape(-1, 3), wanted, rtol=1e-9, atol=1e-12)
     # terms of all axes, and the linear ones where none are named
     assert RegressorsConfig().build(NAMES).library.terms == ("1", *NAMES)
     shared = RegressorsConfig(terms=tuple({term: 0 for row in TRUTH.values() for term in row}))
-    for entry in shared.fit(shared.build(NAMES), made()):
+    for entry in shared.fit_preferred(shared.build(NAMES), made()):
         assert entry.value == pytest.approx(TRUTH[entry.axis[0]].get(entry.term, 0.0), abs=1e-10)
 
 
 def test_standard_errors_cover_the_truth() -> None:
-    table = OWN.fit(OWN.build(NAMES), made(noise=0.05, count=4000, groups=40))
-    score = [(entry.value - TRUTH[entry.axis[0]][entry.term]) / entry.error for entry in table]
+    table = OWN.fit_preferred(OWN.build(NAMES), made(noise=0.05, count=4000, groups=40))
+    score = [
+        (entry.value - TRUTH[entry.axis[0]][entry.term]) / entry.standard_error for entry in table
+    ]
     assert max(map(abs, score)) < 4
     assert 0.5 < np.sqrt(np.mean(np.square(score))) < 1.6
 
@@ -76,16 +78,16 @@ def test_only_the_chosen_manoeuvres() -> None:
     spoiled = samples.target.clone()
     spoiled[(samples.group % 2) == 0] = 99.0
     config = OWN.model_copy(update={"manoeuvres": ("zigzag",)})
-    for entry in config.fit(config.build(NAMES), samples.with_target(spoiled)):
+    for entry in config.fit_preferred(config.build(NAMES), samples.with_target(spoiled)):
         assert entry.value == pytest.approx(TRUTH[entry.axis[0]][entry.term], rel=1e-9)
     other = RegressorsConfig(manoeuvres=("turning",))
     with pytest.raises(FitError, match=r"turning.*kinds in the data: \['constant', 'zigzag'\]"):
-        other.fit(other.build(NAMES), samples)
+        other.fit_preferred(other.build(NAMES), samples)
 
 
 def test_still_knows_nothing() -> None:
-    baseline = StillConfig().build(NAMES)
-    assert StillConfig().fit(baseline, made()) == []
+    baseline = ZeroBaselineConfig().build(NAMES)
+    assert ZeroBaselineConfig().fit_preferred(baseline, made()) == []
     assert torch.equal(baseline(torch.randn(4, 7, 5)), torch.zeros(4, 7, 3))
 
 
@@ -96,7 +98,9 @@ LINEAR = ("1", "u", "v", "r", "n", "delta")
 
 
 def terms(names: tuple[str, ...], **config: Any) -> tuple[str, ...]:
-    rows = validate({"kind": "regressors", **config}, RegressorsConfig, "here").rows(names)
+    rows = validate_config({"kind": "regressors", **config}, RegressorsConfig, "here").axis_terms(
+        names
+    )
     assert rows[0] == rows[1] == rows[2]
     return tuple(rows[0])
 
@@ -135,7 +139,7 @@ def test_a_ridge_polynomial_is_scikit_learn_s() -> None:
     samples = sampled(z, y, SHIP, groups=10)
     config = RegressorsConfig(sets=("polynomial_2",), ridge=0.05)
     baseline = config.build(SHIP)
-    config.fit(baseline, samples)
+    config.fit_preferred(baseline, samples)
     features = PolynomialFeatures(2).fit_transform(z)
     own = TermLibrary(terms(SHIP, sets=["polynomial_2"]), SHIP)(samples.z)
     np.testing.assert_allclose(own, features, rtol=1e-12)
@@ -151,12 +155,12 @@ def test_what_is_said_twice_stands_once() -> None:
         " v|v| u"
     )
     once = "u v, n^2, n|n|, u|u|, u^2, 1, wind_u wind_mag^-1, u v^2, v|v| u"
-    assert merged(tuple(said.split(", ")), TANKER) == tuple(once.split(", "))
+    assert drop_equivalent_terms(tuple(said.split(", ")), TANKER) == tuple(once.split(", "))
     both = terms(TANKER, sets=["fossen", "linear"], terms=["r u", "n v", "|v|r"])
     assert both == (*terms(TANKER, sets=["fossen"]), "delta", "n v")
     # terms of one axis join a set
     axes: dict[Any, tuple[str, ...]] = {"u": ("u|u|",), "v": (), "r": ("r|r|", "r")}
-    rows = RegressorsConfig(sets=("linear",), terms=axes).rows(TANKER)
+    rows = RegressorsConfig(sets=("linear",), terms=axes).axis_terms(TANKER)
     assert rows == [(*LINEAR, "u|u|"), LINEAR, (*LINEAR, "r|r|")]
 
 
@@ -182,7 +186,7 @@ def test_what_cannot_be_is_a_config_error(
     names: tuple[str, ...], config: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ConfigError, match=message):
-        validate({"kind": "regressors", **config}, RegressorsConfig, "here").build(names)
+        validate_config({"kind": "regressors", **config}, RegressorsConfig, "here").build(names)
 
 
 def test_each_of_several_penalties_is_the_fit_with_it() -> None:
@@ -191,11 +195,11 @@ def test_each_of_several_penalties_is_the_fit_with_it() -> None:
     samples, penalties = sampled(z, y, SHIP, groups=10), (0.0, 1e-2, 1.0)
     several = RegressorsConfig(sets=("linear",), ridge=penalties)
     baseline = several.build(SHIP)
-    found = several.solutions(baseline, samples)
-    assert [solution.choice["ridge"] for solution in found] == [*penalties]
+    found = several.fit_solutions(baseline, samples)
+    assert [solution.hyperparameters["ridge"] for solution in found] == [*penalties]
     for solution, ridge in zip(found, penalties, strict=True):
-        (alone,) = RegressorsConfig(sets=("linear",), ridge=ridge).solutions(baseline, samples)
-        assert alone.choice == {}
+        (alone,) = RegressorsConfig(sets=("linear",), ridge=ridge).fit_solutions(baseline, samples)
+        assert alone.hyperparameters == {}
         torch.testing.assert_close(solution.state["theta"], alone.state["theta"])
         assert solution.table == alone.table
 
@@ -207,14 +211,14 @@ def test_a_penalty_decides_between_regressors_that_the_data_cannot_tell_apart() 
     samples = sampled(z, z[:, :3], SHIP, groups=10)
     plain, ridge = (RegressorsConfig(sets=("fossen", "astern"), ridge=r) for r in (0.0, 1e-6))
     with pytest.raises(FitError, match=r"cannot tell apart regressors.*or give a ridge penalty"):
-        plain.fit(plain.build(SHIP), samples)
+        plain.fit_preferred(plain.build(SHIP), samples)
     baseline = ridge.build(SHIP)
-    ridge.fit(baseline, samples)
+    ridge.fit_preferred(baseline, samples)
     np.testing.assert_allclose(baseline(samples.z), z[:, :3], atol=1e-2)
 
 
 def test_what_feeds_an_axis_most_is_named_by_its_share_and_not_its_slope() -> None:
     theta = torch.tensor([2.0, 0.5, -0.1], dtype=torch.float64)
     slopes = torch.tensor([[1.0, 3.0, 1.0]], dtype=torch.float64)
-    assert _undamped(theta, slopes) == 0
-    assert _undamped(-theta, slopes) is None
+    assert _find_undamped_term(theta, slopes) == 0
+    assert _find_undamped_term(-theta, slopes) is None

@@ -17,22 +17,28 @@ from torch import Tensor
 
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.control.heading.vessels import SteeredModel, SteeredPlant
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ResidnetError, UsageError
-from residnet.core.frames import rotated, to_earth, turn_between, upright
-from residnet.core.layout import ATTITUDE, ROLL, SIX, Live, levelled
+from residnet.core.frames import compose_rotation, rotation_angle_between, to_earth, to_level_axes
+from residnet.core.layout import (
+    ATTITUDE,
+    ROLL_LAYOUT,
+    SIX_DOF_LAYOUT,
+    DegreesOfFreedom,
+    to_horizontal_plane,
+)
 from residnet.core.log import Log
-from residnet.data.doctor import inspect
+from residnet.data.doctor import inspect_log
 from residnet.data.motion import MotionConfig, complete_motion
-from residnet.data.prepare import PrepareConfig, prepare, samples
+from residnet.data.prepare import PrepareConfig, make_samples, prepare_log
 from residnet.data.simulated import (
-    Craft,
-    Disturbance,
-    Sea,
-    SensorNoise,
+    DisturbanceConfig,
+    SensorsConfig,
     SimulatedTrials,
-    fly,
-    fly_trials,
+    SimulatedVessel,
+    TrialEnvironment,
+    simulate_manoeuvres,
+    simulate_trials,
 )
 from residnet.dynamics.actuated import ActuatedDynamics, PlantActuators
 from residnet.dynamics.base import Integrator
@@ -41,33 +47,48 @@ from residnet.dynamics.jacobian import StepJacobian
 from residnet.dynamics.rollout import Rollout, trace_rollout
 from residnet.dynamics.store import save_model
 from residnet.heads.linear import RidgeConfig
-from residnet.heads.recurrent import RecurrentConfig
-from residnet.identification.changes import Change, ChangedDynamics, causes
-from residnet.identification.monitoring import MonitorConfig, Piece, Watch, Watcher
-from residnet.identification.recipe import Preparation, integrator
-from residnet.judge.freerun import drift, integrate
+from residnet.heads.recurrent import GRUEnsembleConfig
+from residnet.identification.changes import PerturbedDynamics, SystemChange, make_fault_hypotheses
+from residnet.identification.monitoring import (
+    ChangeDetector,
+    MeasuredWindow,
+    MonitorConfig,
+    OnlineChangeDetector,
+)
+from residnet.identification.recipe import PreparationPlan, choose_integrator
+from residnet.judge.freerun import compute_integration_errors, integrate_pose
 from residnet.manoeuvres.base import Helm
 from residnet.manoeuvres.open_loop import ConstantInput
-from residnet.physics.hull import SubmergedConfig
+from residnet.physics.hull import SubmergedHullConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
-from residnet.simulators.ardupilot import ArduPilotBackEnd, servos
-from residnet.simulators.vehicle import vehicle
-from residnet.testing import example_samples
-from residnet.testing.checks import ROLLING, STEP, SUBMERGED, example_model, example_spec
+from residnet.simulators.ardupilot import ArduPilotBackend, assign_servos
+from residnet.simulators.vehicle import load_vehicle
+from residnet.testing import make_example_samples
+from residnet.testing.checks import (
+    EXAMPLE_TIME_STEP,
+    ROLLING_SIGNALS,
+    SUBMERGED_SIGNALS,
+    make_example_model,
+    make_example_spec,
+)
 
-PHI, P, DEPTH = ROLL.names.index("phi"), ROLL.names.index("p"), SIX.names.index("z")
+PHI, P, DEPTH = (
+    ROLL_LAYOUT.state_names.index("phi"),
+    ROLL_LAYOUT.state_names.index("p"),
+    SIX_DOF_LAYOUT.state_names.index("z"),
+)
 HULL = RegressorsConfig(sets=("fossen",), ridge=1e-4)
-HEADS = [RidgeConfig(), RecurrentConfig(hidden_size=6)]
+HEADS = [RidgeConfig(), GRUEnsembleConfig(hidden_size=6)]
 
 
 def test_an_angle_has_no_equation_of_its_own_and_restores() -> None:
-    samples = example_samples(signals=ROLLING)
+    samples = make_example_samples(signals=ROLLING_SIGNALS)
     config = RegressorsConfig(bounded=True, dissipative=True)
     baseline = config.build(samples.names)
-    table = config.fit(baseline, samples)
+    table = config.fit_preferred(baseline, samples)
     assert {entry.axis for entry in table} == {"u_dot", "v_dot", "r_dot", "p_dot"}
-    assert not samples.target[:, ROLL.moving.index("phi")].any()
+    assert not samples.target[:, ROLL_LAYOUT.dynamic_states.index("phi")].any()
     roll = {entry.term: entry.value for entry in table if entry.axis == "p_dot"}
     # 2 pi over the natural period of 6.76 s of document 004, Table 5.2
     assert (-roll["phi"]) ** 0.5 == pytest.approx(2 * np.pi / 6.76, rel=0.1)
@@ -78,8 +99,8 @@ def started(
     head: Any, signals: SignalsConfig, scheme: Integrator, steps: int
 ) -> tuple[HybridDynamics, Tensor, Tensor, Tensor]:
     """A model of an integrator under way, inputs [2, T, m] that push it, and its memory."""
-    spec = example_spec(head, signals).model_copy(update={"integrator": scheme})
-    model, n = example_model(spec).double(), len(signals.live.moving)
+    spec = make_example_spec(head, signals).model_copy(update={"integrator": scheme})
+    model, n = make_example_model(spec).double(), len(signals.dof.dynamic_states)
     low, high = torch.tensor(spec.low).double(), torch.tensor(spec.high).double()
     x = torch.zeros(2, 3 + n, dtype=torch.float64)
     x[:, 3:] = low[:n] * 0.3 + high[:n] * 0.7
@@ -89,7 +110,7 @@ def started(
 
 @pytest.mark.parametrize(("scheme", "head"), [*zip(get_args(Integrator), 2 * HEADS, strict=True)])
 def test_the_roll_angle_moves_by_the_roll_rate(scheme: Integrator, head: Any) -> None:
-    model, x, w, s = started(head, ROLLING, scheme, 60)
+    model, x, w, s = started(head, ROLLING_SIGNALS, scheme, 60)
     states = trace_rollout(Rollout(model), 10_000)(x, w, s)[0]
     alone, after = [x], x
     for k in range(60):
@@ -102,12 +123,14 @@ def test_the_roll_angle_moves_by_the_roll_rate(scheme: Integrator, head: Any) ->
     apart = np.abs(np.diff(p)).max() + 1e-9
     assert np.abs(rate - 0.5 * (p[1:] + p[:-1])).max() <= 0.51 * apart
     assert np.ptp(moved[:, PHI]) > 0.01
-    pose = integrate(moved[0, :3], moved[:, 3:], model.dt)
+    pose = integrate_pose(moved[0, :3], moved[:, 3:], model.dt)
     np.testing.assert_allclose(moved[:, :3], pose, atol=0.05 * np.ptp(moved[:, 0]))
     nu = np.array([[1.0, 0.5, 0.2, 0.0, 1.0]])
-    np.testing.assert_allclose(levelled(nu), [[1.0, 0.5 * np.cos(1.0), 0.2 * np.cos(1.0)]])
-    assert levelled(nu[:, :3]) is not nu
-    np.testing.assert_array_equal(levelled(nu[:, :3]), nu[:, :3])
+    np.testing.assert_allclose(
+        to_horizontal_plane(nu), [[1.0, 0.5 * np.cos(1.0), 0.2 * np.cos(1.0)]]
+    )
+    assert to_horizontal_plane(nu[:, :3]) is not nu
+    np.testing.assert_array_equal(to_horizontal_plane(nu[:, :3]), nu[:, :3])
 
 
 def test_rotations_are_those_of_quaternions() -> None:
@@ -118,31 +141,31 @@ def test_rotations_are_those_of_quaternions() -> None:
     def known(a: torch.Tensor) -> Rotation:
         return Rotation.from_euler("ZYX", a.numpy()[:, ::-1])
 
-    after = rotated(angles, turn)
+    after = compose_rotation(angles, turn)
     wanted = known(angles) * Rotation.from_rotvec(turn.numpy())
     assert float((known(after).inv() * wanted).magnitude().max()) < 1e-7
     u, v, w = vector.T
-    ahead, across, down = upright(u, v, w, angles[:, 0], angles[:, 1])
+    ahead, across, down = to_level_axes(u, v, w, angles[:, 0], angles[:, 1])
     north, east = to_earth(ahead, across, angles[:, 2])
     np.testing.assert_allclose(
         torch.stack((north, east, down), dim=1), known(angles).apply(vector.numpy()), atol=1e-12
     )
-    size = turn_between(angles.numpy(), after.numpy())
+    size = rotation_angle_between(angles.numpy(), after.numpy())
     full = turn.norm(dim=-1).numpy() % (2.0 * np.pi)
     np.testing.assert_allclose(size, np.minimum(full, 2.0 * np.pi - full), atol=1e-7)
     # whole turns are counted, and a loop through the vertical ends where it began
     angles = torch.zeros(1, 3, dtype=torch.float64)
     for _ in range(100):
-        angles = rotated(angles, torch.tensor([[0.0, 0.0, 0.1 * np.pi]]).double())
+        angles = compose_rotation(angles, torch.tensor([[0.0, 0.0, 0.1 * np.pi]]).double())
     assert float(angles[0, 2]) == pytest.approx(10 * np.pi)
     for _ in range(20):
-        angles = rotated(angles, torch.tensor([[0.0, 0.1 * np.pi, 0.0]]).double())
-    assert turn_between(angles.numpy(), np.array([[0.0, 0.0, 10 * np.pi]]))[0] < 1e-6
+        angles = compose_rotation(angles, torch.tensor([[0.0, 0.1 * np.pi, 0.0]]).double())
+    assert rotation_angle_between(angles.numpy(), np.array([[0.0, 0.0, 10 * np.pi]]))[0] < 1e-6
 
 
 @pytest.mark.parametrize(("scheme", "head"), [*zip(get_args(Integrator), 2 * HEADS, strict=True)])
 def test_attitude_depth_and_place_follow_the_velocities(scheme: Integrator, head: Any) -> None:
-    model, x, w, s = started(head, SUBMERGED, scheme, 40)
+    model, x, w, s = started(head, SUBMERGED_SIGNALS, scheme, 40)
     deep = x.clone()
     deep[:, DEPTH] += 50.0
     with torch.no_grad():
@@ -153,7 +176,7 @@ def test_attitude_depth_and_place_follow_the_velocities(scheme: Integrator, head
     other[..., DEPTH] -= 50.0
     torch.testing.assert_close(other, states, rtol=0, atol=1e-9)
     path = states[0].numpy()
-    turned = turn_between(path[1:, ATTITUDE], path[:-1, ATTITUDE])
+    turned = rotation_angle_between(path[1:, ATTITUDE], path[:-1, ATTITUDE])
     omega = np.linalg.norm(path[:, [7, 8, 5]], axis=1) * model.dt
     # an angle of rotation is that of the velocities at one end of a step or between both
     assert np.abs(turned - 0.5 * (omega[1:] + omega[:-1])).max() < 0.6 * np.ptp(omega)
@@ -165,10 +188,10 @@ def test_attitude_depth_and_place_follow_the_velocities(scheme: Integrator, head
 
 @pytest.mark.parametrize("scheme", get_args(Integrator))
 def test_sensitivities_are_the_derivatives_of_the_step(scheme: Integrator) -> None:
-    spec = example_spec(None, SUBMERGED)
+    spec = make_example_spec(None, SUBMERGED_SIGNALS)
     spec = spec.model_copy(update={"integrator": scheme, "baseline": HULL})
     model = spec.build().double()
-    HULL.fit(model.baseline, example_samples(signals=SUBMERGED))
+    HULL.fit_preferred(model.baseline, make_example_samples(signals=SUBMERGED_SIGNALS))
     random = torch.Generator().manual_seed(0)
     spread = torch.tensor([0, 0, 1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.3, 1, 0.6, 0.6]).double()
     x = torch.randn(3, 12, generator=random, dtype=torch.float64) * spread
@@ -198,8 +221,8 @@ def test_a_drafted_model_swings_as_its_vessel() -> None:
     rate, none = 6.3, ("u v",)
     rows = dict.fromkeys(("u", "v", "r", "w", "q"), none) | {"p": ("cos(theta) sin(phi)",)}
     swing = RegressorsConfig.model_validate({"terms": rows})
-    changes = {"integrator": integrator(SUBMERGED.live), "baseline": swing, "dt": 0.1}
-    model = example_spec(None, SUBMERGED).model_copy(update=changes).build().double()
+    changes = {"integrator": choose_integrator(SUBMERGED_SIGNALS.dof), "baseline": swing, "dt": 0.1}
+    model = make_example_spec(None, SUBMERGED_SIGNALS).model_copy(update=changes).build().double()
     baseline: Any = model.baseline
     with torch.no_grad():
         row = baseline.outputs.index("p_dot")
@@ -212,27 +235,29 @@ def test_a_drafted_model_swings_as_its_vessel() -> None:
 
 
 def test_what_logs_tell() -> None:
-    def told(*names: str, moving: bool = True) -> Live:
-        return Live.told({name: moving * np.arange(99.0) for name in names})
+    def told(*names: str, moving: bool = True) -> DegreesOfFreedom:
+        return DegreesOfFreedom.from_channels({name: moving * np.arange(99.0) for name in names})
 
     assert told("x", "y", "psi", "phi").velocities == ("u", "v", "r", "p")
-    assert told("x", "y", "psi", "p").planar
-    assert told("x", "y", "psi", "phi", "p", moving=False).planar
+    assert told("x", "y", "psi", "p").is_planar
+    assert told("x", "y", "psi", "phi", "p", moving=False).is_planar
     motion, noise = 0.1 * np.sin(np.arange(0.0, 60.0, 0.1)), np.random.default_rng(0)
     for size, moves in ((0.05, True), (0.2, False)):
         phi = motion + size * noise.normal(size=motion.size)
-        assert Live.told({"u": motion, "phi": phi}).rolls == moves
-    rolls, planar = told("u", "r", "phi", "p"), Live()
-    assert rolls.dead == ("v",)
-    assert rolls.channels == ("u", "r", "p", "phi")
-    assert Live.shared([rolls, planar]).velocities == ("u", "r")
-    assert Live.shared([Live(("u",)), Live(("r",))]).planar
+        assert DegreesOfFreedom.from_channels({"u": motion, "phi": phi}).has_roll == moves
+    rolls, planar = told("u", "r", "phi", "p"), DegreesOfFreedom()
+    assert rolls.fixed_states == ("v",)
+    assert rolls.active_states == ("u", "r", "p", "phi")
+    assert DegreesOfFreedom.intersection([rolls, planar]).velocities == ("u", "r")
+    assert DegreesOfFreedom.intersection(
+        [DegreesOfFreedom(("u",)), DegreesOfFreedom(("r",))]
+    ).is_planar
     low, high = -np.ones(12), 2.0 * np.ones(12)
     # a depth and a loop are no runaway
-    reach = SUBMERGED.live.largest(low, high)
+    reach = SUBMERGED_SIGNALS.dof.range_limits(low, high)
     assert reach[:6].tolist() == [2.0] * 6
     assert np.isinf(reach[6:]).all()
-    assert planar.largest(low, high).tolist() == [2.0] * 3
+    assert planar.range_limits(low, high).tolist() == [2.0] * 3
 
 
 def trials(count: int, duration: float) -> SimulatedTrials:
@@ -244,7 +269,7 @@ def trials(count: int, duration: float) -> SimulatedTrials:
     ]
     content: dict[str, Any] = {
         "vessel": "remus_100",
-        "step": STEP,
+        "step": EXAMPLE_TIME_STEP,
         "substeps": 2,
         "duration": duration,
     }
@@ -255,37 +280,43 @@ def trials(count: int, duration: float) -> SimulatedTrials:
 
 def test_what_logs_of_a_torpedo_tell_and_lack() -> None:
     config = trials(2, 15.0)
-    log = fly_trials(config.draw(), config)[0].log
-    live = Live.told(log.channels)
-    assert live.spatial
-    assert live.whole
-    assert live.channels == ("u", "v", "r", "w", "p", "q", "z", "phi", "theta")
-    assert Live.shared([live, live]) == live
-    assert Live.shared([live, Live()]).planar
+    log = simulate_trials(config.draw_manoeuvres(), config)[0].measured_log
+    live = DegreesOfFreedom.from_channels(log.channels)
+    assert live.is_six_dof
+    assert live.is_complete
+    assert live.active_states == ("u", "v", "r", "w", "p", "q", "z", "phi", "theta")
+    assert DegreesOfFreedom.intersection([live, live]) == live
+    assert DegreesOfFreedom.intersection([live, DegreesOfFreedom()]).is_planar
     held = {name: values for name, values in log.channels.items() if name != "z"}
-    assert not Live.told(held).spatial
+    assert not DegreesOfFreedom.from_channels(held).is_six_dof
     with pytest.raises(UsageError, match="z is not measured at every sample"):
         complete_motion(log.replace(channels=held), MotionConfig(), live)
     with pytest.raises(ResidnetError, match="all six"):
-        validate({"inputs": ["n"], "velocities": ["u", "v", "w"]}, SignalsConfig, "here")
+        validate_config({"inputs": ["n"], "velocities": ["u", "v", "w"]}, SignalsConfig, "here")
     assert {"damping heave", "damping pitch", "restoring pitch"} <= {
-        c.name for c in causes(SUBMERGED)
+        c.name for c in make_fault_hypotheses(SUBMERGED_SIGNALS)
     }
     # the rates of the pose are those of the log
     rate = np.gradient(log["psi"], log.t)
-    assert np.abs(rate - levelled(log.stack(live.moving))[:, 2])[5:-5].max() < 0.03
+    assert (
+        np.abs(rate - to_horizontal_plane(log.stack(live.dynamic_states))[:, 2])[5:-5].max() < 0.03
+    )
 
 
 @functools.cache
 def flown() -> list[Log]:
     config = trials(4, 40.0)
-    return [flight.log for flight in fly_trials(config.draw(), config)]
+    return [flight.measured_log for flight in simulate_trials(config.draw_manoeuvres(), config)]
 
 
 def test_measured_velocities_lead_to_the_measured_pose() -> None:
-    y = np.stack([log.stack(SIX.names) for log in flown()])
-    off = drift(y, SUBMERGED.live, STEP)
-    assert list(off) == list(SUBMERGED.live.ends) == ["position", "depth", "attitude"]
+    y = np.stack([log.stack(SIX_DOF_LAYOUT.state_names) for log in flown()])
+    off = compute_integration_errors(y, SUBMERGED_SIGNALS.dof, EXAMPLE_TIME_STEP)
+    assert (
+        list(off)
+        == list(SUBMERGED_SIGNALS.dof.pose_error_names)
+        == ["position", "depth", "attitude"]
+    )
     way = np.hypot(*np.diff(y[:, :, :2], axis=1).T).sum(axis=0)
     assert (off["position"] < 0.01 * way).all()
     assert (off["depth"] < 0.01 * way).all()
@@ -295,19 +326,27 @@ def test_measured_velocities_lead_to_the_measured_pose() -> None:
 @pytest.mark.parametrize("beside", ["samples", "means"])
 def test_least_squares_find_the_vessel(beside: str) -> None:
     """Of noiseless trials: what the trials determine is that of the vessel's file."""
-    signals = SUBMERGED.build()
+    signals = SUBMERGED_SIGNALS.build()
     # means are right by a smoother that softens the swing in roll
     smoother = {"kind": "savitzky_golay", "window": 0.5, "order": 2 if beside == "means" else 4}
     how = PrepareConfig.model_validate(
-        {"grid": {"step": STEP}, "derivative": smoother, "beside": beside, "hold": "mean"}
+        {
+            "grid": {"step": EXAMPLE_TIME_STEP},
+            "derivative": smoother,
+            "beside": beside,
+            "hold": "mean",
+        }
     )
-    logs = [prepare(log, "train", SUBMERGED.columns, how, SUBMERGED.live) for log in flown()]
-    found_in = samples(logs, signals)
+    logs = [
+        prepare_log(log, "train", SUBMERGED_SIGNALS.input_columns, how, SUBMERGED_SIGNALS.dof)
+        for log in flown()
+    ]
+    found_in = make_samples(logs, signals)
     exact = RegressorsConfig(sets=("fossen",), ridge=1e-9)
-    table = exact.fit(exact.build(found_in.names), found_in)
+    table = exact.fit_preferred(exact.build(found_in.names), found_in)
     vessel = load_vessel("remus_100")
-    assert isinstance(vessel, SubmergedConfig)
-    terms, rows = vessel.hull().equations()
+    assert isinstance(vessel, SubmergedHullConfig)
+    terms, rows = vessel.build_hull().acceleration_equations()
     axes = zip(("u", "v", "w", "p", "q", "r"), rows, strict=True)
     true = {(axis, term): row[i] for axis, row in axes for i, term in enumerate(terms)}
     for axis, term in (
@@ -326,96 +365,117 @@ def test_least_squares_find_the_vessel(beside: str) -> None:
 def test_a_draft_sets_the_rates_of_a_roll_beside_means() -> None:
     t = np.arange(0.0, 60.0, 0.1)
     log = Log("swing", t, dict.fromkeys(("u", "v", "r", "p", "phi", "delta"), np.sin(t)))
-    for live, beside in ((Live(("u", "v", "r", "p")), "means"), (Live(), None)):
-        drafted = Preparation.of([log], ["delta"], live).content()
+    for live, beside in (
+        (DegreesOfFreedom(("u", "v", "r", "p")), "means"),
+        (DegreesOfFreedom(), None),
+    ):
+        drafted = PreparationPlan.from_logs([log], ["delta"], live).to_config()
         assert drafted.get("beside") == beside
 
 
 @pytest.mark.parametrize(
     ("signals", "names"),
     [
-        (ROLLING, ("restoring", "damping roll")),
-        pytest.param(SUBMERGED, ("restoring pitch", "damping pitch"), marks=pytest.mark.long),
+        (ROLLING_SIGNALS, ("restoring", "damping roll")),
+        pytest.param(
+            SUBMERGED_SIGNALS, ("restoring pitch", "damping pitch"), marks=pytest.mark.long
+        ),
     ],
     ids=["roll", "six"],
 )
 def test_a_monitor_tells_stiffness_from_damping(
     signals: SignalsConfig, names: tuple[str, ...]
 ) -> None:
-    spec, live = example_spec(None, signals), signals.live
-    model = example_model(spec).double()
-    noise = np.full(len(live.states), 0.003)
+    spec, live = make_example_spec(None, signals), signals.dof
+    model = make_example_model(spec).double()
+    noise = np.full(len(live.state_names), 0.003)
     noise[:5] = 0.0, 0.0, 0.002, 0.02, 0.02
-    low, high = (np.array(ends[live.size :]) for ends in (spec.low, spec.high))
+    low, high = (np.array(ends[live.n_dynamic :]) for ends in (spec.low, spec.high))
 
-    def logs(change: Change, count: int, seed: int) -> list[list[Piece]]:
+    def logs(change: SystemChange, count: int, seed: int) -> list[list[MeasuredWindow]]:
         random = np.random.default_rng(seed)
         w = random.uniform(low, high, size=(count, 6, low.size)).repeat(50, axis=1)
         x = torch.zeros(count, noise.size).double()
         x[:, 3] = 0.7 * spec.high[0]
-        changed = ChangedDynamics(model, [change], count, low.size)
+        changed = PerturbedDynamics(model, [change], count, low.size)
         with torch.no_grad():
             states = Rollout(changed)(x, torch.from_numpy(w), x[:, :0])[0].numpy()
         y = states + noise * random.normal(size=states.shape)
         return [
-            [Piece(a[k : k + 101], b[k : k + 100], a[:0], b[:0]) for k in (0, 100, 200)]
+            [MeasuredWindow(a[k : k + 101], b[k : k + 100], a[:0], b[:0]) for k in (0, 100, 200)]
             for a, b in zip(y, w, strict=True)
         ]
 
-    watch = Watch(spec, model, logs(Change("none", "", "", 1.0), 24, 0), MonitorConfig())
-    assert list(watch.seen) == [*live.channels, "heading"]
+    watch = ChangeDetector(
+        spec, model, logs(SystemChange("none", "", "", 1.0), 24, 0), MonitorConfig()
+    )
+    assert list(watch.innovation_columns_) == [*live.active_states, "heading"]
     for cause in names:
-        watcher = Watcher(watch)
-        (known,) = (one for one in watch.causes if one.name == cause)
+        watcher = OnlineChangeDetector(watch)
+        (known,) = (one for one in watch.hypotheses if one.name == cause)
         for log in logs(replace(known, size=-0.3), 3, 1):
-            watcher.restart()
-            for sums in watch.sums(log):
-                verdict = watcher.take(sums)
-        first = verdict.suspects[0]
-        assert verdict.alarm
+            watcher.start_new_log()
+            for sums in watch.compute_sums(log):
+                verdict = watcher.update_with_sums(sums)
+        first = verdict.hypotheses[0]
+        assert verdict.is_alarm
         assert first.change.name == cause
-        assert first.size == pytest.approx(-0.3, rel=0.3)
+        assert first.estimated_size == pytest.approx(-0.3, rel=0.3)
 
 
 def test_a_model_that_rolls_flies_behind_the_gear_of_its_vessel() -> None:
-    spec, plant = example_spec(RidgeConfig(), ROLLING), load_vessel("patrol_p06_linear").build()
-    model, columns = example_model(spec).double(), spec.signals.columns
+    spec, plant = (
+        make_example_spec(RidgeConfig(), ROLLING_SIGNALS),
+        load_vessel("patrol_p06_linear").build(),
+    )
+    model, columns = make_example_model(spec).double(), spec.signals.input_columns
     gear = PlantActuators(plant, spec.dt)
     flown = ActuatedDynamics(model, columns, "start", gear)
     helm = Helm(gear.demand, flown.state, gear.inputs)
-    craft = Craft("own", flown, helm, gear.commands, flown.approach(1))
+    craft = SimulatedVessel("own", flown, helm, gear.commands, flown.approach(1))
     turn = ConstantInput(drive=0.8, steer=0.5, duration=12.0)
-    log = fly(craft, [turn], Sea(None, Disturbance(), SensorNoise(), 0), 12.0, spec.dt)[0].motion
-    x, w = flown.approach(1)[:, : len(ROLL.names)], torch.from_numpy(log.stack(columns))[None]
+    log = simulate_manoeuvres(
+        craft,
+        [turn],
+        TrialEnvironment(None, DisturbanceConfig(), SensorsConfig(), 0),
+        12.0,
+        spec.dt,
+    )[0].true_log
+    x, w = (
+        flown.approach(1)[:, : len(ROLL_LAYOUT.state_names)],
+        torch.from_numpy(log.stack(columns))[None],
+    )
     with torch.no_grad():
         alone = Rollout(model)(x, w[:, :-1], model.initial_state(1).double())[0][0].numpy()
-    np.testing.assert_allclose(log.stack(ROLL.names), alone, atol=1e-9)
+    np.testing.assert_allclose(log.stack(ROLL_LAYOUT.state_names), alone, atol=1e-9)
     assert np.ptp(log["phi"]) > 0.01
     # a heading controller sees the same steps
     steered = SteeredModel(model, columns, "start", SteeredPlant(plant))
-    straight, held = steered.start(torch.ones(1).double())
+    straight, held = steered.straight_course(torch.ones(1).double())
     memory = steered.memory(torch.tensor([[1.0, 1.0, 0.0]]).double())
     with torch.no_grad():
         moved = steered.model(spec.dt).step(straight, held, memory)[0]
         wanted = model.step(straight[:, :8], held[:, :2], model.initial_state(1).double())[0]
-    assert steered.state[:8] == ROLL.names
+    assert steered.state[:8] == ROLL_LAYOUT.state_names
     torch.testing.assert_close(moved[:, :8], wanted)
 
 
 def test_a_simulator_shows_the_roll(tmp_path: Path) -> None:
-    spec = example_spec(RidgeConfig(), ROLLING)
-    save_model(tmp_path / "models" / "example", spec, example_model(spec))
-    known = vehicle(tmp_path, model="example")
-    assert known.states == ROLL.names
-    assert known.low.tolist() == pytest.approx(spec.low[5:])
-    back = ArduPilotBackEnd(known, servos(known), port=0)
+    spec = make_example_spec(RidgeConfig(), ROLLING_SIGNALS)
+    save_model(tmp_path / "models" / "example", spec, make_example_model(spec))
+    known = load_vehicle(tmp_path, model="example")
+    assert known.states == ROLL_LAYOUT.state_names
+    assert known.lower_commands.tolist() == pytest.approx(spec.low[5:])
+    back = ArduPilotBackend(known, assign_servos(known), port=0)
     try:
         pulses = [1900, 1500, 1900, *[0] * 13]
         for frame in range(1, 200):
-            said = json.loads(back.answer(struct.pack("<HHI16H", 18458, 50, frame, *pulses)) or b"")
+            said = json.loads(
+                back.reply_to(struct.pack("<HHI16H", 18458, 50, frame, *pulses)) or b""
+            )
     finally:
         back.close()
-    phi, p = (float(back.after[0, place]) for place in (PHI, P))
+    phi, p = (float(back.current_state[0, place]) for place in (PHI, P))
     assert abs(phi) > 0.01
     assert said["attitude"][0] == pytest.approx(phi, abs=0.1 * abs(p) + 1e-6)
     assert said["imu"]["gyro"][0] == pytest.approx(p, abs=0.05)
@@ -428,6 +488,6 @@ def test_the_doctor_sets_the_roll_rate_against_the_roll_angle(gain: float) -> No
     p = gain * 0.05 * 0.9 * np.cos(0.9 * t) + 0.001 * random.normal(size=t.size)
     still = dict.fromkeys(("x", "y", "psi", "u", "v", "r"), 0.0 * t)
     log = Log("rolls", t, {**still, "phi": phi, "p": p}, {"phi": "rad", "p": "rad/s"})
-    found = [one.text for one in inspect(log, []).findings if one.code == "roll_rate"]
+    found = [one.text for one in inspect_log(log, []).findings if one.code == "roll_rate"]
     assert len(found) == (gain != 1.0)
     assert all(text.startswith(f"phi moves by {1.0 / gain:.2g} times") for text in found)

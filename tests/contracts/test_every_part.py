@@ -16,17 +16,17 @@ from torch import Tensor
 
 from residnet.baselines import BaselineConfig
 from residnet.baselines.regressors import RegressorsConfig
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, ResidnetError, UsageError
-from residnet.core.layout import VELOCITIES, Live
+from residnet.core.layout import VELOCITIES, DegreesOfFreedom
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
-from residnet.core.registry import kinds
+from residnet.core.registry import load_kinds
 from residnet.data.readers import ReaderConfig
 from residnet.dynamics.compiled import CompiledRollout
 from residnet.dynamics.rollout import Rollout, trace_rollout
 from residnet.dynamics.store import ModelSpec, load_model, save_model
-from residnet.export import FORMATS, exporter, vessel
+from residnet.export import EXPORT_FORMATS, get_exporter, vessel
 from residnet.export.vessel import ExportedVessel
 from residnet.heads import HeadConfig
 from residnet.heads.base import Features
@@ -41,15 +41,15 @@ from residnet.testing import (
     check_manoeuvre,
     check_reader,
     check_vessel,
-    example_samples,
+    make_example_samples,
 )
 from residnet.testing.checks import (
-    ROLLING,
-    SIGNALS,
-    STEP,
-    SUBMERGED,
-    example_model,
-    example_spec,
+    EXAMPLE_SIGNALS,
+    EXAMPLE_TIME_STEP,
+    ROLLING_SIGNALS,
+    SUBMERGED_SIGNALS,
+    make_example_model,
+    make_example_spec,
 )
 
 RUDDER = SignalsConfig(inputs=("n", "delta"))
@@ -139,29 +139,29 @@ def _canonical(log: Log, folder: Path) -> Path:
 def head_of(kind: str, **settings: Any) -> Any:
     if kind == "genetic":
         pytest.importorskip("deap", reason="genetic programming needs the extra gp")
-    return validate({"kind": kind, **HEADS.get(kind, {}), **settings}, HeadConfig, "here")
+    return validate_config({"kind": kind, **HEADS.get(kind, {}), **settings}, HeadConfig, "here")
 
 
-@pytest.mark.parametrize("signals", [SIGNALS, SUBMERGED], ids=["planar", "six"])
-@pytest.mark.parametrize("kind", kinds(HeadConfig))
+@pytest.mark.parametrize("signals", [EXAMPLE_SIGNALS, SUBMERGED_SIGNALS], ids=["planar", "six"])
+@pytest.mark.parametrize("kind", load_kinds(HeadConfig))
 def test_head(kind: str, signals: SignalsConfig) -> None:
     check_head(head_of(kind), signals)
 
 
 @pytest.mark.parametrize("kind", HEAD_VARIANTS)
 def test_head_with_settings_of_its_own(kind: str) -> None:
-    check_head(validate(HEAD_VARIANTS[kind], HeadConfig, "here"))
+    check_head(validate_config(HEAD_VARIANTS[kind], HeadConfig, "here"))
 
 
-@pytest.mark.parametrize("kind", kinds(HeadConfig))
+@pytest.mark.parametrize("kind", load_kinds(HeadConfig))
 def test_features_choose_what_a_head_sees(kind: str) -> None:
-    model = example_model(example_spec(head_of(kind, features=["u", "v", "r"])))
-    z = example_samples().z[30:78].reshape(4, 12, -1)
+    model = make_example_model(make_example_spec(head_of(kind, features=["u", "v", "r"])))
+    z = make_example_samples().z[30:78].reshape(4, 12, -1)
     changed = z.clone()
     changed[..., 3:] += 1000.0
     with torch.no_grad():
         head = model.head.double()
-        assert torch.equal(head.sequence(z), head.sequence(changed))
+        assert torch.equal(head.teacher_forced_residuals(z), head.teacher_forced_residuals(changed))
     with pytest.raises(ConfigError, match=r"'tau_z' is not a channel.*; did you mean 'tau_y'"):
         head_of(kind, features=["u", "tau_z"]).build(model.signals.names)
 
@@ -169,8 +169,8 @@ def test_features_choose_what_a_head_sees(kind: str) -> None:
 @pytest.mark.parametrize("kind", ["mlp", "ridge", "recurrent", "sklearn"])
 def test_a_model_stored_in_single_precision_keeps_its_answers(kind: str, tmp_path: Path) -> None:
     """Training leaves float32 weights; they come back as they were."""
-    spec = example_spec(head_of(kind))
-    model = example_model(spec).float()
+    spec = make_example_spec(head_of(kind))
+    model = make_example_model(spec).float()
     save_model(tmp_path / "mine", spec, model)
     again = load_model(tmp_path / "mine")[1].float().eval()
     torch.testing.assert_close(again.state_dict(), model.state_dict(), rtol=0, atol=0)
@@ -180,15 +180,15 @@ def test_a_model_stored_in_single_precision_keeps_its_answers(kind: str, tmp_pat
             assert torch.equal(one, other)
 
 
-@pytest.mark.parametrize("kind", sorted({*kinds(HeadConfig)} - {"sklearn"}))
+@pytest.mark.parametrize("kind", sorted({*load_kinds(HeadConfig)} - {"sklearn"}))
 def test_a_head_flies_in_c_as_it_does_in_torch(kind: str) -> None:
     config = head_of(kind)
-    model, z = example_model(example_spec(config)).eval(), example_samples().z
+    model, z = make_example_model(make_example_spec(config)).eval(), make_example_samples().z
     model.positions = False
     z = z[torch.arange(3)[:, None] * 100 + torch.arange(100)]
     given = (
         torch.cat((torch.zeros_like(z[:, 0, :3]), z[:, 0, :3]), dim=1),
-        z[..., 3 : 3 + model.signals.inputs].repeat(1, 6, 1),
+        z[..., 3 : 3 + model.signals.n_inputs].repeat(1, 6, 1),
         0.1 * torch.rand(3, model.n_state).double(),
     )
     trained = [p for p in model.head.parameters() if p.requires_grad]
@@ -221,45 +221,47 @@ def test_a_head_flies_in_c_as_it_does_in_torch(kind: str) -> None:
                     assert float((one - other).abs().max()) <= 100 * share * largest
 
 
-@pytest.mark.parametrize("kind", kinds(BaselineConfig))
+@pytest.mark.parametrize("kind", load_kinds(BaselineConfig))
 def test_baseline(kind: str) -> None:
     settings, vessel = BASELINES.get(kind, ({}, "wam_v_cal"))
-    config = validate({"kind": kind, **settings}, BaselineConfig, "here")
+    config = validate_config({"kind": kind, **settings}, BaselineConfig, "here")
     boat = vessel == "example_rudder_boat"
-    check_baseline(config, example_samples(vessel, RUDDER) if boat else None)
+    check_baseline(config, make_example_samples(vessel, RUDDER) if boat else None)
 
 
 @pytest.mark.parametrize(
     ("signals", "refusal"),
-    [(ROLLING, "knows no roll"), (SUBMERGED, "knows no depth and pitch")],
+    [(ROLLING_SIGNALS, "knows no roll"), (SUBMERGED_SIGNALS, "knows no depth and pitch")],
     ids=["roll", "six"],
 )
-@pytest.mark.parametrize("kind", kinds(BaselineConfig))
+@pytest.mark.parametrize("kind", load_kinds(BaselineConfig))
 def test_baseline_beyond_the_plane(kind: str, signals: SignalsConfig, refusal: str) -> None:
     """It keeps its contract, or says why not."""
-    config = validate({"kind": kind, **BASELINES.get(kind, ({}, ""))[0]}, BaselineConfig, "here")
+    config = validate_config(
+        {"kind": kind, **BASELINES.get(kind, ({}, ""))[0]}, BaselineConfig, "here"
+    )
     if kind in ("regressors", "still"):
         config = RegressorsConfig() if kind == "regressors" else config
-        check_baseline(config, example_samples(signals=signals))
+        check_baseline(config, make_example_samples(signals=signals))
         return
     with pytest.raises(ResidnetError, match=refusal):
         config.build(signals.build().names)
 
 
-@pytest.mark.parametrize("signals", [ROLLING, SUBMERGED], ids=["roll", "six"])
+@pytest.mark.parametrize("signals", [ROLLING_SIGNALS, SUBMERGED_SIGNALS], ids=["roll", "six"])
 def test_zero_goes_on_level(signals: SignalsConfig) -> None:
-    content = example_spec(None, signals).model_dump(mode="json", by_alias=True)
+    content = make_example_spec(None, signals).model_dump(mode="json", by_alias=True)
     content |= {"role": "zero", "baseline": {"kind": "still"}}
-    model, live = ModelSpec.model_validate(content).build().double(), signals.live
-    x = torch.zeros(1, len(live.states), dtype=torch.float64)
-    x[0, 3:] = torch.tensor([1.5, *[0.1] * (live.size - 1)])
-    w = torch.zeros(1, len(signals.columns), dtype=torch.float64)
+    model, live = ModelSpec.model_validate(content).build().double(), signals.dof
+    x = torch.zeros(1, len(live.state_names), dtype=torch.float64)
+    x[0, 3:] = torch.tensor([1.5, *[0.1] * (live.n_dynamic - 1)])
+    w = torch.zeros(1, len(signals.input_columns), dtype=torch.float64)
     after, _ = model.step(x, w, model.initial_state(1).double())
     torch.testing.assert_close(after[:, 3:], x[:, 3:], rtol=0, atol=0)
-    assert not live.spatial or float(after[0, 2]) == pytest.approx(0.1 * STEP)
+    assert not live.is_six_dof or float(after[0, 2]) == pytest.approx(0.1 * EXAMPLE_TIME_STEP)
 
 
-@pytest.mark.parametrize("kind", kinds(ManoeuvreConfig))
+@pytest.mark.parametrize("kind", load_kinds(ManoeuvreConfig))
 def test_manoeuvre(kind: str, tmp_path: Path) -> None:
     settings = dict(MANOEUVRES.get(kind, {}))
     if kind == "replay":
@@ -268,7 +270,7 @@ def test_manoeuvre(kind: str, tmp_path: Path) -> None:
         channels |= {"cmd_port": 20 + 5 * np.sin(t), "cmd_stbd": 15 * np.cos(t)}
         Log("flown", t, channels).save(tmp_path / "flown.parquet")
         settings = {"log": str(tmp_path / "flown.parquet")}
-    manoeuvre = validate({"kind": kind, **settings}, ManoeuvreConfig, "here")
+    manoeuvre = validate_config({"kind": kind, **settings}, ManoeuvreConfig, "here")
     check_manoeuvre(manoeuvre, VESSELS.get(kind, "wam_v_cal"))
 
 
@@ -291,7 +293,7 @@ READERS: dict[str, tuple[Callable[[Log, Path], Path], str]] = {
 }
 
 
-@pytest.mark.parametrize("kind", kinds(ReaderConfig))
+@pytest.mark.parametrize("kind", load_kinds(ReaderConfig))
 def test_reader(kind: str, tmp_path: Path) -> None:
     write, needs = READERS[kind]
     if needs:
@@ -304,7 +306,7 @@ def test_reader(kind: str, tmp_path: Path) -> None:
     if kind == "joined":
         settings = {"parts": written_logs.PARTS, "shift": {"cmd": 0.0}}
     read = check_reader(
-        validate({"kind": kind, **settings}, ReaderConfig, "here"), write(log, tmp_path)
+        validate_config({"kind": kind, **settings}, ReaderConfig, "here"), write(log, tmp_path)
     )
     # MOOS tells no velocities of the body: they follow from the pose when logs are prepared
     least = {"y", "psi"} if kind == "moos" else {"u", "psi"}
@@ -314,7 +316,9 @@ def test_reader(kind: str, tmp_path: Path) -> None:
 def formats(*quick: str) -> list[Any]:
     """Every format, those that need compilers or other packages at length."""
     slow = pytest.mark.exporters
-    return [pytest.param(one, marks=() if one in quick else slow) for one in FORMATS.names()]
+    return [
+        pytest.param(one, marks=() if one in quick else slow) for one in EXPORT_FORMATS.kind_names()
+    ]
 
 
 @pytest.fixture(autouse=True)
@@ -324,24 +328,27 @@ def _short_parity(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", formats("torchscript", "feed_forward", "parameters"))
 def test_export_format(name: str) -> None:
-    check_exporter(exporter(name))
+    check_exporter(get_exporter(name))
 
 
-LAYOUTS = {"drawn": None, "roll": ROLLING, "six": SUBMERGED}
+LAYOUTS = {"drawn": None, "roll": ROLLING_SIGNALS, "six": SUBMERGED_SIGNALS}
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("name", formats("torchscript", "c", "parameters"))
 def test_a_format_holds_what_its_layout_names(name: str, layout: str, tmp_path: Path) -> None:
     signals = LAYOUTS[layout] or _drawn(name)
-    spec, file = example_spec(RidgeConfig(), signals), tmp_path / f"model{exporter(name).suffix}"
-    exported = ExportedVessel(spec, example_model(spec))
+    spec, file = (
+        make_example_spec(RidgeConfig(), signals),
+        tmp_path / f"model{get_exporter(name).suffix}",
+    )
+    exported = ExportedVessel(spec, make_example_model(spec))
     if name in ("feed_forward", "parameters"):
         with pytest.raises(UsageError, match="fit a"):
-            exporter(name).export(exported, file)
+            get_exporter(name).export(exported, file)
         return
-    card = exporter(name).export(exported, file)
-    assert [state["name"] for state in card["states"]] == [*signals.live.states]
+    card = get_exporter(name).export(exported, file)
+    assert [state["name"] for state in card["states"]] == [*signals.dof.state_names]
     assert card["velocities"] == list(signals.velocities)
 
 
@@ -357,40 +364,42 @@ PARTIAL = [("u",), ("v",), ("r",), ("u", "v"), ("u", "r"), ("v", "r")]
 def _drawn(kind: str) -> SignalsConfig:
     """Return signals of some velocities, others for each kind."""
     chosen = random.Random(kind).choice(PARTIAL)
-    return SIGNALS.model_copy(update={"velocities": chosen})
+    return EXAMPLE_SIGNALS.model_copy(update={"velocities": chosen})
 
 
-@pytest.mark.parametrize("kind", kinds(HeadConfig))
+@pytest.mark.parametrize("kind", load_kinds(HeadConfig))
 def test_a_head_leaves_dead_velocities_at_zero(kind: str) -> None:
     signals = _drawn(kind)
-    model = example_model(example_spec(head_of(kind), signals))
+    model = make_example_model(make_example_spec(head_of(kind), signals))
     inner = getattr(model, "members", [model])[0].head
     seen = [part for part in inner.modules() if isinstance(part, Features)]
     assert seen
-    assert not set(signals.live.dead) & {name for part in seen for name in part.names}
+    assert not set(signals.dof.fixed_states) & {name for part in seen for name in part.names}
     x = torch.zeros(2, 6, dtype=torch.float64)
     w = 20.0 * torch.rand(2, 30, 2, generator=torch.Generator().manual_seed(1)).double()
     run = trace_rollout(Rollout(model.double()), 10_000)
     nu = run(x, w, model.initial_state(2).double())[0][:, -1, VELOCITIES]
-    alive = signals.live.mask() > 0
+    alive = signals.dof.equation_mask() > 0
     assert bool((nu[:, ~alive] == 0.0).all())
     assert bool((nu[:, alive] != 0.0).all())
 
 
-@pytest.mark.parametrize("kind", kinds(BaselineConfig))
+@pytest.mark.parametrize("kind", load_kinds(BaselineConfig))
 def test_a_baseline_has_no_terms_of_dead_velocities(kind: str) -> None:
     settings, name = BASELINES.get(kind, ({}, "wam_v_cal"))
-    config = validate({"kind": kind, **settings}, BaselineConfig, "here")
+    config = validate_config({"kind": kind, **settings}, BaselineConfig, "here")
     boat = name == "example_rudder_boat"
     for velocities in (("u",), ("r",), ("u", "r")):
-        signals = (RUDDER if boat else SIGNALS).model_copy(update={"velocities": velocities})
+        signals = (RUDDER if boat else EXAMPLE_SIGNALS).model_copy(
+            update={"velocities": velocities}
+        )
         if kind not in ("equations", "nomoto", "regressors", "still"):
             with pytest.raises(ConfigError, match=r"signals\.velocities"):
                 config.build(signals.build().names)
             continue
         baseline = config.build(signals.build().names)
-        table = config.fit(baseline, example_samples(name, signals))
-        dead = {*signals.live.dead, *(f"{one}_dot" for one in signals.live.dead)}
+        table = config.fit(baseline, make_example_samples(name, signals))
+        dead = {*signals.dof.fixed_states, *(f"{one}_dot" for one in signals.dof.fixed_states)}
         assert not any({entry.axis, entry.term} & dead for entry in table)
         assert kind in ("equations", "still") or {entry.axis for entry in table} == {
             f"{one}_dot" for one in velocities
@@ -399,13 +408,13 @@ def test_a_baseline_has_no_terms_of_dead_velocities(kind: str) -> None:
 
 @pytest.mark.parametrize("velocities", PARTIAL)
 def test_what_logs_tell(velocities: tuple[str, ...]) -> None:
-    def told(*names: str) -> Live:
-        return Live.told({name: np.arange(99.0) for name in names})
+    def told(*names: str) -> DegreesOfFreedom:
+        return DegreesOfFreedom.from_channels({name: np.arange(99.0) for name in names})
 
     live = told(*velocities, "x", "p")
     assert live.velocities == velocities
-    assert told(*velocities, "x", "y", "psi").whole
-    assert told(*({*velocities, "psi"} - {"r"})).turns
-    assert live.text.endswith("drift") == ({*velocities} == {"u", "r"})
-    assert {*live.dead, *live.velocities} == {"u", "v", "r"}
-    assert np.flatnonzero(live.mask()).tolist() == live.axes
+    assert told(*velocities, "x", "y", "psi").is_complete
+    assert told(*({*velocities, "psi"} - {"r"})).has_heading
+    assert live.description.endswith("drift") == ({*velocities} == {"u", "r"})
+    assert {*live.fixed_states, *live.velocities} == {"u", "v", "r"}
+    assert np.flatnonzero(live.equation_mask()).tolist() == live.active_indices

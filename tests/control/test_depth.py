@@ -12,9 +12,14 @@ import yaml
 from pydantic import ValidationError
 from tiny import write_yaml
 
-from residnet.control.heading.conditions import ConditionedRun, ConditionsConfig, DepthChanges, fly
-from residnet.control.heading.controllers import DepthConfig, DepthPolicySpec, Steering
-from residnet.control.heading.turning import Turning
+from residnet.control.heading.conditions import (
+    ClosedLoopSimulation,
+    ConditionsConfig,
+    DepthStepConfig,
+    simulate_heading_steps,
+)
+from residnet.control.heading.controllers import ControlTask, DepthConfig, DepthPolicySpec
+from residnet.control.heading.turning import NomotoModel
 from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError, FitError
 from residnet.dynamics.rollout import Rollout
@@ -25,7 +30,7 @@ from residnet.tasks.autopilot import AutopilotConfig
 
 DEG = math.pi / 180
 CONFIG = Path(__file__).parents[2] / "configs" / "autopilot_remus_depth.yaml"
-TURNING = Turning(0.88, 0.81, 2.55, 0.28)
+TURNING = NomotoModel(0.88, 0.81, 2.55, 0.28)
 LAW: dict[str, Any] = {
     "kind": "ptos", "lag": 1.0, "steepness": 6.2, "share": 0.34, "damping": 0.8,
     "heading_rate": 4.0, "yaw_rate_rate": 15.0, "push_rate": 0.25, "cross_rate": 1.2,
@@ -42,36 +47,38 @@ def vessel() -> SteeredPlant:
 def test_the_planes_come_first_and_nothing_varied_is_the_plant(vessel: SteeredPlant) -> None:
     plant = vessel.plant
     assert vessel.inputs == ("cmd_delta_s", "cmd_delta", "cmd_n")
-    x, w = vessel.start(torch.ones(1, dtype=torch.float64))
+    x, w = vessel.straight_course(torch.ones(1, dtype=torch.float64))
     w[:, 0], w[:, 1] = 0.1, -0.05
     mine, _, _ = Rollout(VariedPlant(plant, 0.1, axis=DEPTH))(
         x, w.expand(1, 50, -1), torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
     )
-    own = w[:, [vessel.inputs.index(name) for name in plant.inputs]]
+    own = w[:, [vessel.inputs.index(name) for name in plant.input_names]]
     truth, _, _ = Rollout(PlantDynamics(plant, 0.1))(x, own.expand(1, 50, -1), x[:, :0])
     assert torch.allclose(mine, truth, rtol=0, atol=1e-12)
-    assert mine[0, -1, vessel.column("z")] > 1.0
+    assert mine[0, -1, vessel.state_column("z")] > 1.0
 
 
 def test_a_depth_is_held_to_a_centimetre_with_a_trim_that_is_off(vessel: SteeredPlant) -> None:
-    policy = COMPLETE.build(Steering(vessel, TURNING, 15 * DEG, 0.1))
+    policy = COMPLETE.build(ControlTask(vessel, TURNING, 15 * DEG, 0.1))
     biased = torch.tensor([[1.0, 1.0, 2 * DEG], [0.8, 1.2, -DEG]])
-    flown = fly(vessel, policy, torch.tensor([3.0, -2.0]), biased, dt=0.1, duration=45.0)
+    flown = simulate_heading_steps(
+        vessel, policy, torch.tensor([3.0, -2.0]), biased, dt=0.1, duration=45.0
+    )
     assert float(flown.error[:, -100:].abs().max()) < 0.01
     assert float(flown.state("theta").abs().max()) < 35 * DEG
     assert float(flown.overshoot().max()) < 1.0
 
 
 def test_rows_are_the_policies_of_their_own_constants(vessel: SteeredPlant) -> None:
-    steering = Steering(vessel, TURNING, 15 * DEG, 0.1)
-    wanted = COMPLETE.complete()
+    steering = ControlTask(vessel, TURNING, 15 * DEG, 0.1)
+    wanted = COMPLETE.complete_parameters()
     open_ = DepthConfig.model_validate({"pitch": {"kind": "ptos", "lag": 1.0}})
-    assert list(open_.parameters()) == list(wanted) == list(open_.axes(TURNING))
-    assert open_.tuned(wanted) == COMPLETE
+    assert list(open_.parameter_values()) == list(wanted) == list(open_.search_ranges(TURNING))
+    assert open_.with_parameters(wanted) == COMPLETE
     rows = {name: torch.tensor([value, 2.0 * value]) for name, value in wanted.items()}
-    many, one = open_.rows(rows, steering).float(), COMPLETE.build(steering).float()
+    many, one = open_.build_batched(rows, steering).float(), COMPLETE.build(steering).float()
     x = torch.zeros(2, len(vessel.state))
-    x[:, vessel.column("u")], x[:, vessel.column("theta")] = 2.5, -0.1
+    x[:, vessel.state_column("u")], x[:, vessel.state_column("theta")] = 2.5, -0.1
     reference, s = torch.tensor([[0.5], [0.5]]), one.initial_state(x)
     with torch.no_grad():
         got, alone = many(x, reference, s)[0], one(x, reference, s)[0]
@@ -87,13 +94,13 @@ def test_gradients_of_the_cost_reach_law_line_of_sight_and_network(vessel: Steer
     }  # fmt: skip
     law: Any = described
     policy = DepthPolicySpec(law=law, steepest=0.5, sight=SIGHT).build().float()
-    conditions = ConditionsConfig(depth=DepthChanges(), hold=0.0, duration=6.0, dt=0.1)
+    conditions = ConditionsConfig(depth=DepthStepConfig(), hold=0.0, duration=6.0, dt=0.1)
     assert conditions.axis is DEPTH
-    changes = conditions.draw(4, 0.1, torch.Generator().manual_seed(1))
+    changes = conditions.sample_steps(4, 0.1, torch.Generator().manual_seed(1))
     assert changes.noise.shape == (4, 60, 3)
-    run = ConditionedRun(vessel, policy, 0.1, "heun", torch.float32)
-    flown = run.flights(changes, *run.rollout(4)(*run.given(changes))[:2])
-    flown.measured(conditions)["cost"].mean().backward()
+    run = ClosedLoopSimulation(vessel, policy, 0.1, "heun", torch.float32)
+    flown = run.to_trajectories(changes, *run.rollout(4)(*run.rollout_arguments(changes))[:2])
+    flown.step_metrics(conditions)["cost"].mean().backward()
     network: Any = policy.law
     for part in (policy.constants, network.constants, network.network.out.weight):
         assert part.grad is not None
@@ -113,7 +120,7 @@ def test_planes_that_are_reversed_and_a_vessel_that_nothing_rights_are_refused(
     ):
         torpedo = SteeredPlant(load_vessel(name).build(), axis=axis)
         with pytest.raises(FitError, match=said):
-            torpedo.turning(15 * DEG, seconds, 0.1)
+            torpedo.estimate_nomoto(15 * DEG, seconds, 0.1)
 
 
 def test_vessels_without_planes_and_mixed_axes_are_refused() -> None:
@@ -132,4 +139,4 @@ def test_vessels_without_planes_and_mixed_axes_are_refused() -> None:
         with pytest.raises(ValidationError, match=message):
             AutopilotConfig.model_validate({**given, **change})
     with pytest.raises(ValidationError, match="waves"):
-        ConditionsConfig(depth=DepthChanges(), waves=0.01)
+        ConditionsConfig(depth=DepthStepConfig(), waves=0.01)

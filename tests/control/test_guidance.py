@@ -24,14 +24,14 @@ from residnet.control.guidance import (
     EnclosureConfig,
     IntegralLookAheadConfig,
     LineOfSight,
-    LookAhead,
     LookAheadConfig,
+    LookAheadLineOfSight,
     TrackKeeping,
     WaypointGuidance,
     WheelOver,
 )
 from residnet.control.heading.classical import HeadingPD
-from residnet.control.heading.turning import Turning
+from residnet.control.heading.turning import NomotoModel
 from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Rollout
@@ -40,9 +40,11 @@ from residnet.physics.vessel import load_vessel
 
 STATE = ("x", "y", "psi", "u", "v", "r")
 DT, LIMIT, SPEED, LEG = 0.1, math.radians(5), 3.2, 0.7
-TURNING = Turning(3.47, 3.94, SPEED)
+TURNING = NomotoModel(3.47, 3.94, SPEED)
 VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())
-LAW = HeadingPD.placed(VESSEL.state, gain=3.47, time=3.94, frequency=2.0, damping=1.0, limit=LIMIT)
+LAW = HeadingPD.from_pole_placement(
+    VESSEL.state, gain=3.47, time=3.94, frequency=2.0, damping=1.0, limit=LIMIT
+)
 FOLLOWER = TrackKeeping(LAW, VESSEL.state, limit=LIMIT, dt=DT)
 
 
@@ -78,7 +80,7 @@ def test_it_steers_for_a_point_ahead_on_the_leg(turn: float) -> None:
         x = at(aside(turn, 20.0, across))
         heading, s = guidance(x, 0, s)
         assert apart(heading, turn - math.atan(across / 4)) < 1e-12
-        _, ahead, error = guidance.leg(x, s[:, 0].long(), s)
+        _, ahead, error = guidance.leg_geometry(x, s[:, 0].long(), s)
         assert float(ahead) == pytest.approx(80.0)
         assert float(error) == pytest.approx(across, abs=1e-12)
 
@@ -184,7 +186,9 @@ def test_legs_change_at_the_wheel_over_on_the_leg_but_in_the_circle_beside_it() 
     quick, slow = over(d(0.0, 1.0)), WheelOver(TURNING, LIMIT, 3.4, rate=LIMIT / 2.0)(d(0.0, 1.0))
     assert float(quick[0]) == 0.0
     assert (slow - quick).tolist() == pytest.approx([3.2, 3.2])
-    guidance = WaypointGuidance([(100.0, 0.0), (100.0, 100.0)], 3.4, LookAhead(10.0), STATE, over)
+    guidance = WaypointGuidance(
+        [(100.0, 0.0), (100.0, 100.0)], 3.4, LookAheadLineOfSight(10.0), STATE, over
+    )
     before = float(over(d(0.5 * math.pi)))
     assert before > 3.4
     # short of it, there, there but aside of the leg, in the circle; the last way-point, which has
@@ -218,7 +222,7 @@ def test_a_course_asks_for_tangent_yaw_rate_and_line_of_sight_on_a_circle() -> N
     for _ in range(4):
         reference, s = guidance(x, 0, s)
     assert float(s) == pytest.approx(20 * angle, abs=1e-3)
-    assert float(guidance.error(x, s[:, 0])[1]) == pytest.approx(-across, abs=1e-3)
+    assert float(guidance.track_error(x, s[:, 0])[1]) == pytest.approx(-across, abs=1e-3)
     asked = [angle + math.atan(across / 8.0), 3.0 / away, 0.04]
     assert reference[0, :3].tolist() == pytest.approx(asked, rel=1e-3)
 
@@ -242,7 +246,7 @@ def legs(sight: LineOfSight) -> WaypointGuidance:
 
 def left(reference: Reference, policy: Policy) -> float:
     """Cross-track error after a minute in a current of 0.8 m/s across the leg to starboard."""
-    x, w = VESSEL.start(torch.ones(1, dtype=torch.float64))
+    x, w = VESSEL.straight_course(torch.ones(1, dtype=torch.float64))
     x[:, 2] = LEG
     memory = torch.cat((d(*aside(LEG, 0.0, 0.8)), d(1.0, 1.0, 0.0)))[None]
     model = InAmbientCurrent(VESSEL.model(DT), VESSEL.state)
@@ -263,12 +267,12 @@ def test_without_integral_action_the_error_that_makes_the_crab_angle_stays() -> 
         damped = LAW.kd * 0.8 / 12.0 / (1.0 + (e / 12.0) ** 2)
         return float(LAW.kp * (crab - math.atan(e / 12.0)) + damped)
 
-    error = left(legs(LookAhead(12.0)), LAW)
+    error = left(legs(LookAheadLineOfSight(12.0)), LAW)
     assert error == pytest.approx(12.0 * math.tan(crab), rel=1e-3)
     assert left(along(None), FOLLOWER) == pytest.approx(brentq(balance, 0.0, 12.0), rel=1e-3)
     # with it none stays
     drift = DriftEstimate(12.0, 0.8, DT)
-    assert abs(left(legs(LookAhead(12.0, drift)), LAW)) < 0.1
+    assert abs(left(legs(LookAheadLineOfSight(12.0, drift)), LAW)) < 0.1
     assert abs(left(along(drift), FOLLOWER)) < 0.1
 
 
@@ -277,14 +281,14 @@ def test_a_quarter_of_the_speed_returns_to_the_leg_as_two_equal_poles_do() -> No
     turns at once.
     """
     drift, a = DriftEstimate(12.0, 0.8, 0.01), SPEED / 24.0
-    sight = LookAhead(12.0, drift)
+    sight = LookAheadLineOfSight(12.0, drift)
     assert sight.n_state == 2
     error, s, direction = d(0.1), d(0.0, 0.0)[None], d(LEG)
     for _ in range(1000):
         angle, s = sight(error, direction, s)
         error = error + 0.01 * SPEED * torch.sin(angle)
     assert float(error) == pytest.approx(0.1 * (1 - 10.0 * a) * math.exp(-10.0 * a), abs=1e-4)
-    assert float(drift.along(direction, s)) == pytest.approx(0.0, abs=1e-12)
+    assert float(drift.along_component(direction, s)) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_what_one_leg_has_taught_is_known_on_the_next() -> None:
@@ -294,11 +298,11 @@ def test_what_one_leg_has_taught_is_known_on_the_next() -> None:
     drift, s, north = DriftEstimate(10.0, 0.5, 0.1), d(0.0, 0.0)[None], d(0.0)
     for _ in range(20):
         s = drift(d(1.0), north, s)
-    learnt = float(drift.across(north, s))
+    learnt = float(drift.cross_component(north, s))
     assert learnt > 0
-    assert float(drift.along(north + 0.5 * math.pi, s)) == pytest.approx(learnt)
-    assert float(drift.across(north + math.pi, s)) == pytest.approx(-learnt)
+    assert float(drift.along_component(north + 0.5 * math.pi, s)) == pytest.approx(learnt)
+    assert float(drift.cross_component(north + math.pi, s)) == pytest.approx(-learnt)
     # it stays at most at 45 deg
     for _ in range(1000):
         s = drift(d(5.0), north, s)
-    assert float(drift.across(north, s)) == pytest.approx(1.0)
+    assert float(drift.cross_component(north, s)) == pytest.approx(1.0)

@@ -18,27 +18,27 @@ from scipy.integrate import solve_ivp
 from torch import Tensor
 
 from residnet.baselines.regressors import RegressorsConfig
-from residnet.control import BangBangHeading, ClosedLoop, GivenReference, HeadingPD, Policy
+from residnet.control import BangBangHeading, ClosedLoop, HeadingPD, Policy, RecordedReference
 from residnet.control.heading.classical import RatedBangBangHeading
-from residnet.control.heading.conditions import Flights, fly
-from residnet.control.heading.controllers import BangBangConfig, PdConfig, PidConfig, Steering
-from residnet.control.heading.turning import Turning
+from residnet.control.heading.conditions import ClosedLoopTrajectories, simulate_heading_steps
+from residnet.control.heading.controllers import BangBangConfig, ControlTask, PdConfig, PidConfig
+from residnet.control.heading.turning import NomotoModel
 from residnet.control.heading.vessels import SteeredModel, SteeredPlant
 from residnet.core.errors import ConfigError
 from residnet.documents.gouletas2020.law import DocumentAutopilot, Predictor, SimulatedPredictor
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.dynamics.steering_variation import DEPTH, HEADING
-from residnet.judge.autopilots import sea_row
-from residnet.physics.nomoto import SteeringVessel
+from residnet.judge.autopilots import build_sea_row
+from residnet.physics.nomoto import NomotoVessel
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
-from residnet.testing.checks import SUBMERGED, example_spec
+from residnet.testing.checks import SUBMERGED_SIGNALS, make_example_spec
 
 DEG = math.pi / 180
 GAIN, TIME, LIMIT = 3.47, 3.94, 5 * DEG
 STATE = ("x", "y", "psi", "u", "v", "r")
-OCEANOS = of_kind(load_vessel("nomoto_oceanos").build(), SteeringVessel)
+OCEANOS = of_kind(load_vessel("nomoto_oceanos").build(), NomotoVessel)
 RATED = SteeredPlant(load_vessel("nomoto_oceanos_rate10").build())
 NOMINAL = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
 NONE = torch.zeros(1, 0, dtype=torch.float64)
@@ -56,8 +56,10 @@ def flown(
     policy: Policy, target: float, seconds: float, dt: float = 0.01
 ) -> tuple[np.ndarray, np.ndarray]:
     """Headings and rudder angles of a step of heading."""
-    x0 = OCEANOS.approach(1)
-    source = ClosedLoop(policy, GivenReference(torch.full((1, 1, 1), target, dtype=torch.float64)))
+    x0 = OCEANOS.make_initial_state(1)
+    source = ClosedLoop(
+        policy, RecordedReference(torch.full((1, 1, 1), target, dtype=torch.float64))
+    )
     w = torch.zeros(1, round(seconds / dt), 1, dtype=torch.float64)
     with torch.no_grad():
         states, inputs, _ = Rollout(NomotoDynamics(OCEANOS, dt), source)(x0, w, x0[:, :0])
@@ -80,7 +82,9 @@ def test_placed_poles_show_in_the_response() -> None:
     """Overshoot of a second-order system of damping 0.6, while nothing saturates: exp(-pi zeta /
     sqrt(1 - zeta^2)).
     """
-    policy = HeadingPD.placed(STATE, gain=GAIN, time=TIME, frequency=0.5, damping=0.6, limit=LIMIT)
+    policy = HeadingPD.from_pole_placement(
+        STATE, gain=GAIN, time=TIME, frequency=0.5, damping=0.6, limit=LIMIT
+    )
     target = 0.05
     psi, rudder = flown(policy, target, 40.0, 0.02)
     assert np.abs(rudder).max() < LIMIT
@@ -105,7 +109,7 @@ def test_integral_action_against_a_bias_without_winding_up() -> None:
     target = 30 * DEG
     pd = HeadingPD(STATE, kp=1.0, kd=1.0, limit=LIMIT)
     gains = PidConfig(kp=1.0, damping_time=1.0, integral_time=5.0, filter_time=0.0)
-    steering = Steering(SteeredPlant(OCEANOS), Turning(GAIN, TIME, 3.2), LIMIT, 0.05)
+    steering = ControlTask(SteeredPlant(OCEANOS), NomotoModel(GAIN, TIME, 3.2), LIMIT, 0.05)
     assert flown(Askew(pd), target, 40.0, 0.05)[0][-1] - target == pytest.approx(0.01, rel=1e-3)
     psi, _ = flown(Askew(gains.build(steering)), target, 60.0, 0.05)
     assert psi[-1] == pytest.approx(target, abs=1e-5)
@@ -180,12 +184,12 @@ def test_the_document_s_autopilot_creeps_as_errata_says() -> None:
 
 
 def test_a_simulated_predictor_is_the_simulation_of_each_candidate() -> None:
-    plant = of_kind(load_vessel("patrol_p06").build(), HullPlant).in_calm_water()
+    plant = of_kind(load_vessel("patrol_p06").build(), HullPlant).without_environment()
     model, held = PlantDynamics(plant, 0.25), torch.tensor([1e5], dtype=torch.float64)
-    x = plant.approach(2)
+    x = plant.make_initial_state(2)
     x[1, 3], x[1, 7] = 0.3, 0.02
     rudder, targets = torch.tensor([-0.08, 0.0, 0.08]).double(), torch.tensor([0.5, 0.4]).double()
-    error, rate = SimulatedPredictor(model, plant.state, 8, held)(x, targets, rudder)
+    error, rate = SimulatedPredictor(model, plant.state_names, 8, held)(x, targets, rudder)
     assert error.shape == rate.shape == (2, 3)
     for row, target in enumerate(targets.tolist()):
         for column, angle in enumerate(rudder.tolist()):
@@ -209,11 +213,11 @@ def test_wrong_numbers_stop(make: Callable[[], object], message: str) -> None:
         make()
 
 
-def made(error: list[list[float]], dt: float = 0.5) -> Flights:
+def made(error: list[list[float]], dt: float = 0.5) -> ClosedLoopTrajectories:
     errors = torch.tensor(error, dtype=torch.float64)
     rudder, start = torch.full_like(errors[:, 1:], 0.2), torch.zeros(len(errors))
     about = (dt, ("psi",), HEADING, start, errors.shape[1])
-    return Flights(-errors.unsqueeze(-1), rudder, 0.0 * errors[:, 0], *about)
+    return ClosedLoopTrajectories(-errors.unsqueeze(-1), rudder, 0.0 * errors[:, 0], *about)
 
 
 def test_what_is_read_from_a_flight() -> None:
@@ -226,27 +230,31 @@ def test_what_is_read_from_a_flight() -> None:
             [3.0, 2.0, 2.0, 2.0, 1.5],
         ]
     )
-    assert flights.settled(1.0).tolist() == pytest.approx([0.75, 1.25, 0.0, 2.0])
-    assert float(made([[3.0, 0.5, math.nan, math.nan]]).settled(1.0)[0]) == 1.5
+    assert flights.settling_time(1.0).tolist() == pytest.approx([0.75, 1.25, 0.0, 2.0])
+    assert float(made([[3.0, 0.5, math.nan, math.nan]]).settling_time(1.0)[0]) == 1.5
     flights = made([[3.0, 1.0, -1.0, 1.0, -1.0]])
-    assert float(flights.effort()[0]) == pytest.approx(4 * 0.04 * 0.5)
-    row = sea_row("pd", "classical", flights, 0.5)
+    assert float(flights.control_effort()[0]) == pytest.approx(4 * 0.04 * 0.5)
+    row = build_sea_row("pd", "classical", flights, 0.5)
     assert row["heading_rms"]["mean"] == pytest.approx(1.0)
     assert row["rudder_rms"]["mean"] == pytest.approx(0.2)
 
 
 def test_the_floor_of_a_slow_rudder_comes_to_rest_in_the_least_time() -> None:
-    floor = BangBangConfig().build(Steering(RATED, RATED.turning(LIMIT, 60.0), LIMIT, 0.01))
+    floor = BangBangConfig().build(
+        ControlTask(RATED, RATED.estimate_nomoto(LIMIT, 60.0), LIMIT, 0.01)
+    )
     assert isinstance(floor, RatedBangBangHeading)
     changes = torch.tensor([30 * DEG, -30 * DEG])
-    flights = fly(RATED, floor, changes, NOMINAL.float().expand(2, -1), dt=0.01, duration=10.0)
+    flights = simulate_heading_steps(
+        RATED, floor, changes, NOMINAL.float().expand(2, -1), dt=0.01, duration=10.0
+    )
     # least time from rest to rest with the rudder amidships at both ends, by linear programmes over
     # rudder sequences 0.1 s apart
     least = 6.0
     # on the way to rest the rudder comes back at its rate: heading K/T rate t^3 / 6 is left a time
     # t before
     early = (0.1 * DEG * 6.0 * TIME / (GAIN * 10 * DEG)) ** (1 / 3)
-    assert float(flights.settled(0.1 * DEG).max()) == pytest.approx(least - early, abs=0.15)
+    assert float(flights.settling_time(0.1 * DEG).max()) == pytest.approx(least - early, abs=0.15)
     assert float(flights.overshoot().max()) < 0.05 * DEG
     assert torch.allclose(flights.states[0, :, 2], -flights.states[1, :, 2], atol=1e-9)
 
@@ -261,7 +269,9 @@ def test_a_flight_is_what_an_ode_solver_says() -> None:
     equation.
     """
     varied = torch.tensor([[0.9, 1.1, 0.0]])
-    flights = fly(RATED, HardOver(), torch.tensor([1.0]), varied, dt=0.005, duration=3.0)
+    flights = simulate_heading_steps(
+        RATED, HardOver(), torch.tensor([1.0]), varied, dt=0.005, duration=3.0
+    )
 
     def rates(t: float, y: np.ndarray) -> list[float]:
         return [y[1], (0.9 * GAIN * min(10 * DEG * t, LIMIT) - y[1]) / (1.1 * TIME)]
@@ -274,26 +284,28 @@ def test_a_flight_is_what_an_ode_solver_says() -> None:
 
 def test_the_turn_of_a_slow_vessel_is_waited_for() -> None:
     """Nomoto's model of second order: the area above the answer is T1 + T2 - T3."""
-    turning = SteeredPlant(load_vessel("nomoto_mariner_yaw").build()).turning(LIMIT, 100.0, 0.5)
+    turning = SteeredPlant(load_vessel("nomoto_mariner_yaw").build()).estimate_nomoto(
+        LIMIT, 100.0, 0.5
+    )
     assert turning.gain == pytest.approx(0.18499155, rel=0.01)
     assert turning.time == pytest.approx(117.97831 + 7.7630075 - 18.530161, rel=0.02)
     # the Mariner turns far less in a hard turn than about straight ahead: a yaw rate that
     # overshoots has the time constant of a zigzag
-    turning = SteeredPlant(load_vessel("mariner").build()).turning(20 * DEG, 60.0, 0.8)
+    turning = SteeredPlant(load_vessel("mariner").build()).estimate_nomoto(20 * DEG, 60.0, 0.8)
     assert 0.02 < turning.gain < 0.06
     assert 15.0 < turning.time < 40.0
 
 
 def test_a_vessel_that_starts_at_rest_runs_up_and_has_the_rate_of_its_lagging_rudder() -> None:
     boat = SteeredPlant(load_vessel("example_rudder_boat").build())
-    x, w = boat.start(torch.ones(1, dtype=torch.float64))
-    speed = float(x[0, boat.column("u")])
+    x, w = boat.straight_course(torch.ones(1, dtype=torch.float64))
+    speed = float(x[0, boat.state_column("u")])
     assert speed > 3.0
     assert boat.rate == pytest.approx(25 * DEG)
     variation = NOMINAL
     for _ in range(50):
         x, variation = boat.model(0.1).step(x, w, variation)
-    assert float(x[0, boat.column("u")]) == pytest.approx(speed, rel=1e-4)
+    assert float(x[0, boat.state_column("u")]) == pytest.approx(speed, rel=1e-4)
 
 
 VARIED = torch.tensor(
@@ -304,7 +316,7 @@ VARIED = torch.tensor(
 def steered(name: str) -> tuple[SteeredPlant, SteeredModel]:
     vessel = SteeredPlant(load_vessel(name).build())
     spec, model = nomoto_model(GAIN, TIME, 0.1)
-    return vessel, SteeredModel(model, spec.signals.columns, spec.hold, vessel)
+    return vessel, SteeredModel(model, spec.signals.input_columns, spec.hold, vessel)
 
 
 @pytest.mark.long
@@ -312,23 +324,23 @@ def steered(name: str) -> tuple[SteeredPlant, SteeredModel]:
 def test_a_perfect_model_flies_as_its_vessel(name: str) -> None:
     """A learned model that is Nomoto's own: with any variation both move alike."""
     pair, flights = steered(name), []
-    turning, changes = pair[0].turning(LIMIT, 60.0), torch.tensor([0.5, 0.3, -0.4])
+    turning, changes = pair[0].estimate_nomoto(LIMIT, 60.0), torch.tensor([0.5, 0.3, -0.4])
     for vessel in pair:
-        pd = PdConfig(kp=3.0, damping_time=1.5).build(Steering(vessel, turning, LIMIT, 0.01))
-        flights.append(fly(vessel, pd, changes, VARIED, dt=0.01, duration=8.0))
+        pd = PdConfig(kp=3.0, damping_time=1.5).build(ControlTask(vessel, turning, LIMIT, 0.01))
+        flights.append(simulate_heading_steps(vessel, pd, changes, VARIED, dt=0.01, duration=8.0))
     # the model divides what a step changes by `time`, which is of first order in the step
     assert float((flights[0].state("psi") - flights[1].state("psi")).abs().max()) < 1e-3
     assert float((flights[0].command - flights[1].command).abs().max()) < 0.1 * DEG
 
 
 def test_turning_is_that_of_the_model_and_of_a_rudder_that_lags() -> None:
-    turning = steered("nomoto_oceanos")[1].turning(LIMIT, 60.0)
+    turning = steered("nomoto_oceanos")[1].estimate_nomoto(LIMIT, 60.0)
     assert turning.gain == pytest.approx(GAIN, rel=1e-6)
     assert turning.time == pytest.approx(TIME, rel=1e-3)
     # fins of a torpedo in six degrees of freedom follow with a time constant of a second
     vessel, learned = steered("remus_100")
     assert (vessel.rate, vessel.lag) == (None, pytest.approx(1.0, rel=1e-3))
-    turning = learned.turning(LIMIT, 60.0)
+    turning = learned.estimate_nomoto(LIMIT, 60.0)
     assert turning.gain == pytest.approx(GAIN, rel=1e-6)
     assert turning.time == pytest.approx(TIME + 1.0, rel=1e-2)
 
@@ -342,17 +354,17 @@ def test_planes_of_a_learned_torpedo_pitch_it_as_the_vessel_does() -> None:
         "q": {"q": -1.44, "q|q|": -2.7, "sin(theta)": -0.81, "u^2 delta_s": -0.383},
     }
     known["u"]["u^2 delta_s^2"] = -0.113
-    rows = {axis: tuple(known.get(axis, ("u v",))) for axis in SUBMERGED.live.velocities}
+    rows = {axis: tuple(known.get(axis, ("u v",))) for axis in SUBMERGED_SIGNALS.dof.velocities}
     changes = {"baseline": RegressorsConfig.model_validate({"terms": rows}), "integrator": "rk4"}
-    model = example_spec(None, SUBMERGED).model_copy(update=changes).build().double()
+    model = make_example_spec(None, SUBMERGED_SIGNALS).model_copy(update=changes).build().double()
     baseline: Any = model.baseline
     with torch.no_grad():
         for axis, row in known.items():
             for term, value in row.items():
                 place = baseline.outputs.index(f"{axis}_dot"), baseline.library.terms.index(term)
                 baseline.theta[place] = value
-    learned = SteeredModel(model, SUBMERGED.columns, "start", vessel)
-    found, wanted = (one.turning(5 * DEG, 20.0, 0.1) for one in (learned, vessel))
+    learned = SteeredModel(model, SUBMERGED_SIGNALS.input_columns, "start", vessel)
+    found, wanted = (one.estimate_nomoto(5 * DEG, 20.0, 0.1) for one in (learned, vessel))
     assert found.gain == pytest.approx(wanted.gain, rel=0.05)
     assert found.time == pytest.approx(wanted.time, rel=0.1)
     with pytest.raises(ConfigError, match="depth control needs a model that tells z"):
@@ -362,7 +374,7 @@ def test_planes_of_a_learned_torpedo_pitch_it_as_the_vessel_does() -> None:
 def test_gradients_pass_through_the_model_in_single_precision() -> None:
     _, learned = steered("nomoto_oceanos_rate10")
     model = learned.model(0.1)
-    x, w = learned.start(torch.ones(3))
+    x, w = learned.straight_course(torch.ones(3))
     command = torch.full((3, 20, 1), 0.02, requires_grad=True)
     states, _, _ = Rollout(model, None)(x, command, learned.memory(VARIED.float()))
     states[:, -1, 2].sum().backward()

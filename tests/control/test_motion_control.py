@@ -13,12 +13,12 @@ from kinds import of_kind
 from scipy.signal import step
 
 from residnet.control import (
-    Allocated,
+    AllocatedPolicy,
     ClosedLoop,
-    GivenReference,
     HullFeedForward,
     MotionPID,
     MotionPIDConfig,
+    RecordedReference,
     ReferenceFilter,
     ReferenceFilterConfig,
 )
@@ -159,15 +159,15 @@ def test_allocated_to_azimuth_thrusters() -> None:
     controller = MotionPID([GAINS], dt, HullFeedForward(ferry("milliampere").hull))
     point = torch.zeros(1, 1, 9, dtype=torch.float64)
     point[0, 0, :3] = torch.tensor([0.5, -0.3, 0.2], dtype=torch.float64)
-    x0 = plant.approach(1)
-    allocated = Allocated(controller, plant.actuators.allocate)
+    x0 = plant.make_initial_state(1)
+    allocated = AllocatedPolicy(controller, plant.actuators.allocate)
     begin = torch.zeros(1, 3, dtype=torch.float64)
     asked_for, command = (one(x0, point[:, 0], begin)[0] for one in (controller, allocated))
     made = plant.actuators.force(x0[:, 6:], command, x0[:, 3:6])
     torch.testing.assert_close(made, asked_for, rtol=1e-9, atol=1e-9)
-    w = torch.zeros(1, 600, len(plant.inputs), dtype=torch.float64)
-    w[..., plant.inputs.index("force_north")] = 40.0
-    loop = ClosedLoop(allocated, GivenReference(point))
+    w = torch.zeros(1, 600, len(plant.input_names), dtype=torch.float64)
+    w[..., plant.input_names.index("force_north")] = 40.0
+    loop = ClosedLoop(allocated, RecordedReference(point))
     with torch.no_grad():
         states, _, _ = Rollout(RecordedPlantDynamics(plant, dt), loop)(x0, w, x0[:, :0])
     torch.testing.assert_close(states[0, -1, :3], point[0, 0, :3], atol=0.02, rtol=0)

@@ -9,16 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from residnet.control.heading.conditions import ConditionedRun, ConditionsConfig
+from residnet.control.heading.conditions import ClosedLoopSimulation, ConditionsConfig
 from residnet.control.heading.controllers import (
+    ControlTask,
     NetworkPolicySpec,
     ObservedLqrConfig,
     ObservedPolicySpec,
     PtosConfig,
-    Steering,
 )
 from residnet.control.heading.policies import ObservedPolicy
-from residnet.control.heading.turning import Turning
+from residnet.control.heading.turning import NomotoModel
 from residnet.control.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError
 from residnet.physics.vessel import load_vessel
@@ -62,13 +62,13 @@ def trained(units: int, rate: float | None = None) -> ObservedPolicy:
 def test_the_predictor_is_the_model_run_forward_with_the_pending_commands() -> None:
     made = policy()
     observer = made.observer
-    assert observer.pending == 15
+    assert observer.n_pending == 15
     heading, r, push = (torch.full((3, 1), v).double() for v in (0.2, 0.1, 0.01))
     pending = 0.05 * torch.randn(3, 15, dtype=torch.float64)
     ratio = torch.tensor([[0.5], [1.0], [1.4]]).double()
-    ahead, r_ahead = observer._ahead(heading, r, push, pending, ratio)
+    ahead, r_ahead = observer._predict_pending(heading, r, push, pending, ratio)
     for k in range(15):
-        heading, r = observer.expected(heading, r, push, pending[:, k : k + 1], ratio)
+        heading, r = observer.predict_step(heading, r, push, pending[:, k : k + 1], ratio)
     assert torch.allclose(ahead, heading, atol=1e-12)
     assert torch.allclose(r_ahead, r, atol=1e-12)
 
@@ -128,12 +128,12 @@ def test_a_jump_of_the_reference_and_full_turns_leave_the_estimate_alone() -> No
 @pytest.mark.parametrize("law", [PTOS, LQR])
 def test_a_constant_push_is_taken_away(law: PtosConfig | ObservedLqrConfig) -> None:
     vessel = SteeredPlant(load_vessel("nomoto_oceanos").build())
-    steering = Steering(vessel, Turning(3.47, 3.94, 3.2), 5 * DEG, 0.05)
+    steering = ControlTask(vessel, NomotoModel(3.47, 3.94, 3.2), 5 * DEG, 0.05)
     pushed = ConditionsConfig(
         bias=DEG, push=0.0, noise_psi=0.0, noise_r=0.0, dt=0.05, duration=30.0, hold=0.0
     )
-    changes = pushed.draw(8, 0.05, torch.Generator().manual_seed(2))
-    flown = ConditionedRun(vessel, law.build(steering), 0.05).fly(changes)
+    changes = pushed.sample_steps(8, 0.05, torch.Generator().manual_seed(2))
+    flown = ClosedLoopSimulation(vessel, law.build(steering), 0.05).simulate(changes)
     assert float(flown.error[:, -1].abs().max()) < 0.02 * DEG
 
 
@@ -152,4 +152,4 @@ def test_the_memory_does_not_depend_on_the_step_to_first_order() -> None:
 
 def test_missing_constants_are_named() -> None:
     with pytest.raises(ConfigError, match="without steepness, share, damping"):
-        PtosConfig(**RATES).complete()
+        PtosConfig(**RATES).complete_parameters()

@@ -32,10 +32,10 @@ from residnet.core.config import (
     dump_config,
     load_config,
     load_mapping,
-    quantity,
-    validate,
+    quantity_type,
+    validate_config,
 )
-from residnet.core.config_yaml import parse
+from residnet.core.config_yaml import parse_yaml
 from residnet.core.errors import ConfigError, UsageError
 
 
@@ -156,7 +156,7 @@ def failure(load: Callable[..., Fit], tmp_path: Path) -> Failure:
         (Newtons, "1.5 kN", 1500.0),
         (NewtonMetres, "2 kN m", 2000.0),
         (Annotated[float, Quantity("kg")], "3 t", 3000.0),
-        (quantity("-"), "5 %", 0.05),
+        (quantity_type("-"), "5 %", 0.05),
     ],
 )
 def test_quantity_is_si(kind: Any, value: object, expected: float) -> None:
@@ -187,7 +187,7 @@ def test_quantity_refuses(kind: Any, value: object, told: str) -> None:
 
 def test_quantity_takes_si_units_only() -> None:
     with pytest.raises(UsageError, match="unit 'deg' is not SI; the SI unit is 'rad'"):
-        quantity("deg")
+        quantity_type("deg")
 
 
 class Wrong(Config):
@@ -423,17 +423,17 @@ def test_root_may_be_a_union(
 
 
 def test_validate_names_its_source_and_takes_a_union(tmp_path: Path) -> None:
-    assert validate({"kind": "mlp", "hidden": [4]}, Head, "card.json") == Mlp(hidden=(4,))
-    assert validate({"hidden_size": 4, "washout": "20 s"}, Lstm, "card.json").washout == 20.0
+    assert validate_config({"kind": "mlp", "hidden": [4]}, Head, "card.json") == Mlp(hidden=(4,))
+    assert validate_config({"hidden_size": 4, "washout": "20 s"}, Lstm, "card.json").washout == 20.0
     for given, told in (
         ({}, r"hidden_size: missing \(kind 'lstm'\)$"),
         (3, r"expected a mapping \(given 3\)$"),
         ({"hidden_size": object()}, "holds a value that YAML cannot"),
     ):
         with pytest.raises(ConfigError, match=rf"^card\.json: {told}"):
-            validate(given, Lstm, "card.json")
+            validate_config(given, Lstm, "card.json")
     (tmp_path / "a.csv").touch()
-    found = validate({"task": "fit", "logs": ["a.csv"]}, Fit, "card.json", tmp_path)
+    found = validate_config({"task": "fit", "logs": ["a.csv"]}, Fit, "card.json", tmp_path)
     assert found.logs == (tmp_path / "a.csv",)
 
 
@@ -514,7 +514,7 @@ def test_a_fault_is_of_what_set_the_value(
 def test_keys_that_are_gone_may_stand_where_they_did_nothing(failure: Failure) -> None:
     lstm = {"kind": "lstm", "hidden_size": 3}
     given = {"task": "fit", "heads": {"a": lstm | {"encoder": False}}, "policy": lstm}
-    assert validate(given, Fit, "run").heads["a"] == Lstm(hidden_size=3)
+    assert validate_config(given, Fit, "run").heads["a"] == Lstm(hidden_size=3)
     assert failure("heads: {a: {kind: lstm, hidden_size: 3, encoder: true}}\n").startswith(
         "run.yaml:2: heads.a.encoder: unknown key; it is gone: the memory"
     )
@@ -610,7 +610,7 @@ _MERGES = "\n".join(
 def test_what_would_take_minutes_is_one_line_at_once(text: str, told: str) -> None:
     started = time.process_time()
     with pytest.raises(ConfigError, match=told) as caught:
-        parse(text, "x.yaml")
+        parse_yaml(text, "x.yaml")
     assert str(caught.value).startswith("x.yaml")
     assert len(str(caught.value)) < 200
     assert time.process_time() - started < 2.0

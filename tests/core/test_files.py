@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from residnet.core.errors import UsageError
-from residnet.core.files import file_stem, whole
+from residnet.core.files import atomic_write, make_file_stem
 
 
 def test_a_file_takes_its_place_when_it_is_complete(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "values.json"
-    with whole(path) as file:
+    with atomic_write(path) as file:
         file.write_text("new")
         assert not path.exists()
     assert path.read_text() == "new"
@@ -25,7 +25,7 @@ def test_what_breaks_off_leaves_the_old_file(tmp_path: Path, error: BaseExceptio
     path.write_text("old")
 
     def broken_off() -> None:
-        with whole(path) as file:
+        with atomic_write(path) as file:
             file.write_text("half")
             raise error
 
@@ -39,7 +39,7 @@ def test_what_breaks_off_leaves_the_old_file(tmp_path: Path, error: BaseExceptio
 def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").write_text("no folder")
     path = tmp_path / name
-    with pytest.raises(UsageError, match="cannot be written") as caught, whole(path) as file:
+    with pytest.raises(UsageError, match="cannot be written") as caught, atomic_write(path) as file:
         file.write_text("new")
     assert str(path) in str(caught.value)
 
@@ -59,8 +59,8 @@ def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path, name: str) -
     ],
 )
 def test_a_name_becomes_one_file_of_one_folder(name: str, tmp_path: Path) -> None:
-    stem = file_stem(name)
+    stem = make_file_stem(name)
     (tmp_path / f"{stem}.txt").write_text("here")
     assert [path.name for path in tmp_path.iterdir()] == [f"{stem}.txt"]
-    assert stem != file_stem(f"{name}/") != file_stem(f"{name}:")
-    assert file_stem("Zigzag 10, 20°_ä (2)") == "Zigzag 10, 20°_ä (2)"
+    assert stem != make_file_stem(f"{name}/") != make_file_stem(f"{name}:")
+    assert make_file_stem("Zigzag 10, 20°_ä (2)") == "Zigzag 10, 20°_ä (2)"

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from residnet.core.errors import UsageError
-from residnet.core.names import CHANNEL_UNITS, nearest, si_unit, to_si, units
+from residnet.core.names import CHANNEL_UNITS, si_unit, suggest_name, to_si, units
 
 
 @pytest.mark.parametrize(
@@ -45,8 +45,8 @@ def test_a_wrong_unit_names_those_that_fit(given: tuple[str, ...], told: str) ->
 
 
 def test_nearest() -> None:
-    assert nearest("hiden", ["hidden", "kind"]) == "; did you mean 'hidden'?"
-    assert nearest("zzz", ["b", "a", "b"]) == "; valid: a, b"
-    many = nearest("zzz", [f"key{i:02d}" for i in range(30)])
+    assert suggest_name("hiden", ["hidden", "kind"]) == "; did you mean 'hidden'?"
+    assert suggest_name("zzz", ["b", "a", "b"]) == "; valid: a, b"
+    many = suggest_name("zzz", [f"key{i:02d}" for i in range(30)])
     assert many.endswith("key23, ...")
     assert "key24" not in many

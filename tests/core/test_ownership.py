@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from residnet.core.errors import UsageError
-from residnet.core.files import staged_files, whole, write_owned
+from residnet.core.files import atomic_write, stage_files, write_owned
 from residnet.core.ownership import (
     FILE_MANIFEST,
     Manifest,
+    find_run_manifest,
     require_replaceable,
     resolve_name,
-    run_manifest_above,
 )
 
 
@@ -24,7 +24,7 @@ def run(tmp_path: Path) -> Manifest:
     """Return the manifest of a folder with two files that were written by residnet."""
     manifest = Manifest(tmp_path / "run")
     for name in ("a.json", "figures/b.json"):
-        with whole(manifest.folder / name, manifest) as file:
+        with atomic_write(manifest.folder / name, manifest) as file:
             file.write_text(name)
     return manifest
 
@@ -43,8 +43,9 @@ def test_file_of_the_user_is_named_and_nothing_deleted(run: Manifest) -> None:
     with pytest.raises(UsageError, match=r"figures/NOTES\.md: exists"):
         run.remove_owned()
     assert (run.folder / "a.json").read_text() == "a.json"
-    with pytest.raises(UsageError, match=r"NOTES\.md: exists"), whole(
-        run.folder / "figures" / "NOTES.md"
+    with (
+        pytest.raises(UsageError, match=r"NOTES\.md: exists"),
+        atomic_write(run.folder / "figures" / "NOTES.md"),
     ):
         raise AssertionError("the file was opened for writing")
 
@@ -68,7 +69,7 @@ def test_remove_owned_leaves_the_folder_alone(run: Manifest) -> None:
 
 def test_both_versions_are_recognised_after_a_kill(run: Manifest) -> None:
     path = run.folder / "a.json"
-    with pytest.raises(KeyboardInterrupt), whole(path):
+    with pytest.raises(KeyboardInterrupt), atomic_write(path):
         raise KeyboardInterrupt
     run.require_all_owned()
     # killed between the entry and the replacement
@@ -84,8 +85,9 @@ def test_links_lead_nowhere(run: Manifest, tmp_path: Path) -> None:
     outside = tmp_path / "outside"
     outside.mkdir()
     (run.folder / "exports").symlink_to(outside)
-    with pytest.raises(UsageError, match="exports: is a symbolic link"), whole(
-        run.folder / "exports" / "x.pt"
+    with (
+        pytest.raises(UsageError, match="exports: is a symbolic link"),
+        atomic_write(run.folder / "exports" / "x.pt"),
     ):
         raise AssertionError("the file was opened for writing")
     assert list(outside.iterdir()) == []
@@ -114,9 +116,9 @@ def test_damaged_manifest_is_refused(run: Manifest) -> None:
 
 def test_nested_run_folder_has_its_own_manifest(run: Manifest) -> None:
     nested = Manifest(run.folder / "external")
-    with whole(nested.folder / "metrics.json", nested) as file:
+    with atomic_write(nested.folder / "metrics.json", nested) as file:
         file.write_text("{}")
-    above = run_manifest_above(nested.folder / "metrics.json")
+    above = find_run_manifest(nested.folder / "metrics.json")
     assert above is not None
     assert above.folder == nested.folder
     run.require_all_owned()
@@ -138,7 +140,7 @@ def test_single_files_are_recorded_beside_them(tmp_path: Path) -> None:
 
 
 def _write_source_and_header(out: Path, text: str) -> None:
-    with staged_files(out) as file:
+    with stage_files(out) as file:
         file.write_text(text)
         file.with_suffix(".h").write_text("header")
 

@@ -10,26 +10,26 @@ import pytest
 from sample_package import install
 
 from residnet.core import registry
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError
 from residnet.data.readers import ReaderConfig
-from residnet.exits import enter
-from residnet.export import FORMATS, exporter
+from residnet.exits import run_cli
+from residnet.export import EXPORT_FORMATS, get_exporter
 from residnet.heads import HeadConfig
 from residnet.heads.linear import PlsrConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.physics.vessel import load_vessel
-from residnet.tasks.registry import catalogue
+from residnet.tasks.registry import list_catalogue
 
 
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder on the path that the sample package is installed in."""
     monkeypatch.syspath_prepend(install(tmp_path / "site"))
-    registry.forget()
+    registry.clear_caches()
     yield tmp_path
     monkeypatch.undo()
-    registry.forget()
+    registry.clear_caches()
     for name in [name for name in sys.modules if name.startswith("residnet_sample")]:
         del sys.modules[name]
 
@@ -41,31 +41,31 @@ def declare(site: Path, group: str, **points: str) -> None:
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: made\nVersion: 1.0\n")
     lines = "".join(f"{name} = {target}\n" for name, target in points.items())
     (info / "entry_points.txt").write_text(f"[{group}]\n{lines}")
-    registry.forget()
+    registry.clear_caches()
 
 
 @pytest.mark.usefixtures("installed")
 def test_parts_are_found_by_name() -> None:
-    head = validate({"kind": "slow_water", "time_constant": "3 s"}, HeadConfig, "here")
+    head = validate_config({"kind": "slow_water", "time_constant": "3 s"}, HeadConfig, "here")
     assert type(head).__module__ == "residnet_sample.slow_water"
     assert head.time_constant == 3.0
-    assert validate({"kind": "knots"}, ReaderConfig, "here").build() is not None
-    assert validate({"kind": "pulse"}, ManoeuvreConfig, "here").kind == "pulse"
-    assert load_vessel("sample_ferry").build().commands == 2
-    assert exporter("numbers").suffix == ".csv"
+    assert validate_config({"kind": "knots"}, ReaderConfig, "here").build() is not None
+    assert validate_config({"kind": "pulse"}, ManoeuvreConfig, "here").kind == "pulse"
+    assert load_vessel("sample_ferry").build().n_commands == 2
+    assert get_exporter("numbers").suffix == ".csv"
     for given, told in (
         ({"kind": "slow_water", "time_konstant": 3}, "unknown key; did you mean 'time_const"),
         ({"kind": "slow_watr"}, "'slow_watr'; did you mean 'slow_water'"),
     ):
         with pytest.raises(ConfigError, match=told):
-            validate(given, HeadConfig, "here")
+            validate_config(given, HeadConfig, "here")
 
 
 @pytest.mark.usefixtures("installed")
 def test_a_broken_part_says_so_where_it_is_used_and_disturbs_nothing_else() -> None:
     with pytest.raises(ConfigError, match=r"residnet-sample 0\.1\.0 cannot be used: ModuleNotF"):
-        validate({"kind": "absent", "anything": 1}, HeadConfig, "here")
-    listed = dict(catalogue("heads"))
+        validate_config({"kind": "absent", "anything": 1}, HeadConfig, "here")
+    listed = dict(list_catalogue("heads"))
     assert listed["absent"].startswith("(cannot be used: ModuleNotFoundError")
     assert listed["slow_water"] == "A linear map of the channels and of their running means."
 
@@ -74,7 +74,7 @@ def test_a_broken_part_says_so_where_it_is_used_and_disturbs_nothing_else() -> N
     ("target", "fault"),
     [
         ("residnet.heads.linear:PlsrConfig", "no subclass of residnet.heads.base.HeadKind"),
-        ("residnet.heads.base:HeadKind", "HeadKind lacks build"),
+        ("residnet.heads.base:BaseHeadConfig", "HeadKind lacks build"),
         ("residnet_sample.slow_water:SlowWaterConfig", "has no field `kind: Literal['odd']`"),
         ("residnet_sample.slow_water:Nothing", "AttributeError"),
         ("os", "no subclass"),
@@ -87,10 +87,10 @@ def test_faults_of_kinds(installed: Path, target: str, fault: str) -> None:
         odd=target,
         plsr="residnet_sample.slow_water:SlowWaterConfig",
     )
-    listed = dict(registry.listed(HeadConfig))
+    listed = dict(registry.list_parts(HeadConfig))
     assert fault in listed["odd"]
     # no package takes a name away
-    assert isinstance(validate({"kind": "plsr"}, HeadConfig, "here"), PlsrConfig)
+    assert isinstance(validate_config({"kind": "plsr"}, HeadConfig, "here"), PlsrConfig)
     assert "residnet has a kind of that name" in listed["plsr"]
 
 
@@ -108,7 +108,7 @@ def test_a_package_that_ends_the_process_is_skipped_and_reported(
     (installed / "site" / "made_package.py").write_text(statement + "\n")
     declare(installed / "site", "residnet.heads", boom="made_package:Head")
     listed: dict[str, str] = {}
-    enter(lambda: listed.update(catalogue("heads")))
+    run_cli(lambda: listed.update(list_catalogue("heads")))
     assert listed["boom"].startswith(f"(cannot be used: {fault}; from made 1.0")
     assert "slow_water" in listed
     lines = [line for line in capsys.readouterr().err.splitlines() if "boom" in line]
@@ -122,19 +122,19 @@ def test_an_interruption_while_a_package_is_loaded_is_not_swallowed(installed: P
     (installed / "site" / "made_stop.py").write_text("raise KeyboardInterrupt\n")
     declare(installed / "site", "residnet.heads", boom="made_stop:Head")
     with pytest.raises(KeyboardInterrupt):
-        catalogue("heads")
+        list_catalogue("heads")
 
 
 def test_faults_of_formats_and_vessels(installed: Path) -> None:
     declare(installed / "site", "residnet.exporters", odd="residnet_sample.knots:KnotsReader")
-    assert isinstance(FORMATS.find("odd"), registry.ThirdParty)
+    assert isinstance(EXPORT_FORMATS.find_kind("odd"), registry.EntryPointPart)
     with pytest.raises(ConfigError, match=r"format 'odd' of the package made 1\.0 cannot be"):
-        exporter("odd")
+        get_exporter("odd")
     with pytest.raises(ConfigError, match=r"no export format 'gguf'; valid: .*torchscript"):
-        exporter("gguf")
+        get_exporter("gguf")
 
 
 def test_a_vessel_package_without_files(installed: Path) -> None:
     declare(installed / "site", "residnet.vessels", odd="residnet_sample.pulse:Pulse")
-    assert "no package with files" in dict(catalogue("vessels"))["odd"]
-    assert "sample package" in dict(catalogue("vessels"))["sample_ferry"]
+    assert "no package with files" in dict(list_catalogue("vessels"))["odd"]
+    assert "sample package" in dict(list_catalogue("vessels"))["sample_ferry"]

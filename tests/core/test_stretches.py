@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from residnet.core.stretches import stretch_bounds, stretch_numbers, stretches
+from residnet.core.stretches import find_run_bounds, find_runs, number_runs
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -19,9 +19,9 @@ def test_stretches_are_found_sample_by_sample(seed: int) -> None:
         stop = place + len(list(group))
         expected += [(place, stop)] if label >= 0 else []
         place = stop
-    starts, stops = stretches(labels)
+    starts, stops = find_runs(labels)
     assert list(zip(starts.tolist(), stops.tolist(), strict=True)) == expected
-    numbers, (begins, ends) = stretch_numbers(labels), stretch_bounds(labels)
+    numbers, (begins, ends) = number_runs(labels), find_run_bounds(labels)
     for place, label in enumerate(labels.tolist()):
         if label < 0:
             assert (numbers[place], begins[place], ends[place]) == (-1, place, place)
@@ -33,8 +33,8 @@ def test_stretches_are_found_sample_by_sample(seed: int) -> None:
 
 def test_flags_are_stretches_of_true_samples() -> None:
     flags = np.array([True, True, False, True, False, False, True])
-    assert [part.tolist() for part in stretches(flags)] == [[0, 3, 6], [2, 4, 7]]
-    assert stretch_numbers(flags).tolist() == [0, 0, -1, 1, -1, -1, 2]
+    assert [part.tolist() for part in find_runs(flags)] == [[0, 3, 6], [2, 4, 7]]
+    assert number_runs(flags).tolist() == [0, 0, -1, 1, -1, -1, 2]
     for nothing in (flags & False, flags[:0], np.zeros(0, dtype=int)):
-        assert [part.tolist() for part in stretches(nothing)] == [[], []]
-    assert stretch_numbers(flags[:0]).size == 0
+        assert [part.tolist() for part in find_runs(nothing)] == [[], []]
+    assert number_runs(flags[:0]).size == 0

@@ -24,9 +24,9 @@ import yaml
 import residnet
 from residnet.core.errors import ResidnetError
 from residnet.core.log import Log
-from residnet.tasks.drafting import new_config
+from residnet.tasks.drafting import write_new_config
 from residnet.tasks.inspection import inspect_logs
-from residnet.tasks.registry import finished_task, load_task
+from residnet.tasks.registry import load_task, open_finished_task
 
 HERE = Path(__file__).parent
 FOLDERS = sorted(path.parent.name for path in HERE.glob("*/case.yaml"))
@@ -56,10 +56,10 @@ def drafted(case: dict[str, Any], folder: Path, config: Path) -> str:
     """Return what `new` says, after the words that it must end with."""
     if "refused" in case:
         with pytest.raises(ResidnetError, match=case["refused"]) as refused:
-            new_config([folder], config, None, overwrite=False)
+            write_new_config([folder], config, None, overwrite=False)
         assert "\n" not in str(refused.value)
         return ""
-    told = new_config([folder], config, None, overwrite=False)
+    told = write_new_config([folder], config, None, overwrite=False)
     load_task(config, []).check()
     return "\n".join([*told, config.read_text()])
 
@@ -74,7 +74,7 @@ def test_a_layout_is_read_and_told_for_what_it_is(name: str, tmp_path: Path) -> 
         return
     if {"told", "never", "misled"} & {*case}:
         found = inspect_logs([folder], None)
-        assert case.get("misled", False) in (None, found.misled), found.text
+        assert case.get("misled", False) in (None, found.has_problems), found.text
         said["told"] = found.text
     text = {door: re.sub(r"\s*\n\s*#?\s*", " ", words) for door, words in said.items()}
     for door in text:
@@ -99,11 +99,11 @@ def test_a_layout_is_fitted_and_judged(name: str, tmp_path: Path) -> None:
     case, folder = case_in(name, tmp_path)
     if "refused" in case:
         pytest.skip("cannot be fitted, as the test of its doors says")
-    new_config([folder], tmp_path / "boat.yaml", None, overwrite=False)
+    write_new_config([folder], tmp_path / "boat.yaml", None, overwrite=False)
     run = tmp_path / "run"
-    load_task(tmp_path / "boat.yaml", ["effort=0.02"]).run(out=run)
-    ended, task = finished_task(run, "evaluate")
-    task.evaluate_on(ended, [folder], tmp_path / "other")
+    load_task(tmp_path / "boat.yaml", ["effort=0.02"]).run(output_folder=run)
+    ended, task = open_finished_task(run, "evaluate")
+    task.evaluate_on_logs(ended, [folder], tmp_path / "other")
     for place in (run, tmp_path / "other"):
         rows = json.loads((place / "metrics.json").read_text())["rows"]
         assert rows

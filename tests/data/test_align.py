@@ -9,7 +9,7 @@ import pytest
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
-from residnet.data.align import GridConfig, align
+from residnet.data.align import GridConfig, align_to_grid
 
 NAN = np.nan
 
@@ -19,14 +19,14 @@ def gridded(
 ) -> Log:
     channels = {name: np.asarray(values, dtype=float) for name, values in u.items()}
     log = Log("a", np.asarray(t, dtype=float), channels)
-    return align(log, GridConfig(step=step, held=held, longest_gap=gap))
+    return align_to_grid(log, GridConfig(step=step, held=held, longest_gap=gap))
 
 
 def test_a_log_on_the_grid_keeps_its_times_and_samples_exactly() -> None:
     rng = np.random.default_rng(0)
     t: np.ndarray = 1176.1 + 0.1 * np.arange(500) + rng.uniform(-4e-5, 4e-5, 500)
     log = Log("a", t, {"u": rng.normal(size=500)}, masks={"frozen": rng.random(500) < 0.1})
-    out = align(log, GridConfig(step=0.1))
+    out = align_to_grid(log, GridConfig(step=0.1))
     assert (out.t is log.t, out["u"] is log["u"], out.masks == log.masks) == (True, True, True)
     # a stamp beyond a thousandth of a step is interpolated
     t = 0.1 * np.arange(100)
@@ -99,7 +99,11 @@ def test_points_in_gaps_and_beside_missing_samples_are_masked(
 def test_masks_cover_every_point_that_a_masked_sample_enters() -> None:
     mask = np.arange(7) == 3
     log = Log("a", 0.2 * np.arange(7), {"u": np.arange(7.0)}, masks={"frozen": mask})
-    assert np.flatnonzero(align(log, GridConfig(step=0.1)).masks["frozen"]).tolist() == [5, 6, 7]
+    assert np.flatnonzero(align_to_grid(log, GridConfig(step=0.1)).masks["frozen"]).tolist() == [
+        5,
+        6,
+        7,
+    ]
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import pytest
 from residnet.api.data import read_logs
 from residnet.core.errors import DataError, ResidnetError
 from residnet.core.log import Log
-from residnet.data.doctor import inspect
+from residnet.data.doctor import inspect_log
 from residnet.data.readers.base import CanonicalConfig
 
 STRANGE: list[Any] = [None, 3, -1.5, True, "", "x", [], [1, None], {}, {"a": []}, [[{}]], 1e400]
@@ -71,7 +71,7 @@ def test_a_changed_file_is_a_log_or_one_line(seed: int, tmp_path: Path) -> None:
         table = pa.table(columns)
         pq.write_table(table.replace_schema_metadata({"residnet": text}), path)
         try:
-            inspect(CanonicalConfig().build().read(path), None)
+            inspect_log(CanonicalConfig().build().read(path), None)
         except ResidnetError as error:
             refused.append(str(error))
     assert 10 < len(refused) < 60

@@ -14,7 +14,7 @@ import pytest
 import written_logs
 import written_recorders
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.readers import ReaderConfig
@@ -54,7 +54,7 @@ def test_damage(
     tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    reader = validate({"kind": kind}, ReaderConfig, "test").build()
+    reader = validate_config({"kind": kind}, ReaderConfig, "test").build()
     path = write(written_logs.trial(3.0), tmp_path)
     files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
     whole = {file: file.read_bytes() for file in files}
@@ -85,7 +85,7 @@ def test_a_dataset_that_claims_more_than_its_file_holds_is_one_line(tmp_path: Pa
     with h5py.File(path, "w") as file:
         file.create_dataset("t", shape=(10**13,), dtype="f8", chunks=(10**6,))
         file.create_dataset("u", data=np.zeros(100))
-    reader = validate({"kind": "hdf5"}, ReaderConfig, "test").build()
+    reader = validate_config({"kind": "hdf5"}, ReaderConfig, "test").build()
     with pytest.raises(DataError, match=r"huge.h5: /t claims 8e\+04 GB in a file of") as caught:
         reader.read(path)
     assert "\n" not in str(caught.value)

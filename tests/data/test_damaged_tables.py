@@ -18,10 +18,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mutations import BYTE_DAMAGES
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ResidnetError
 from residnet.core.log import Log
-from residnet.data.doctor import inspect
+from residnet.data.doctor import inspect_log
 from residnet.data.readers import ReaderConfig
 
 _MAP = {
@@ -34,7 +34,7 @@ _MAP = {
     },
 }
 READERS = {
-    kind: validate({"kind": kind, **_MAP}, ReaderConfig, "test").build()
+    kind: validate_config({"kind": kind, **_MAP}, ReaderConfig, "test").build()
     for kind in ("csv", "parquet")
 }
 
@@ -168,6 +168,6 @@ def test_a_file_that_ends_within_its_last_line_loses_that_line(folder: Path, cut
     assert len(log) == ROWS - 1
     assert foreign(log) == []
     assert log.meta["rows_dropped"] == 1
-    assert [finding.code for finding in inspect(log).findings if "left out" in finding.text] == [
-        "cut_line"
-    ]
+    assert [
+        finding.code for finding in inspect_log(log).findings if "left out" in finding.text
+    ] == ["cut_line"]

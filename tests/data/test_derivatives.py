@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.signal import savgol_filter
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError
 from residnet.data.derivatives import (
-    Derivative,
     DerivativeConfig,
+    DerivativeRule,
     ForwardDifference,
     SavitzkyGolay,
 )
@@ -21,7 +21,7 @@ STEP = 0.1
 T = STEP * np.arange(200)
 NOISE = np.random.default_rng(0).normal(size=(200, 3))
 ONE = np.zeros(200, dtype=int)
-RULES: list[tuple[Derivative, int, np.ndarray, np.ndarray, list[int]]] = [
+RULES: list[tuple[DerivativeRule, int, np.ndarray, np.ndarray, list[int]]] = [
     (
         SavitzkyGolay(window=1.5, order=3),
         15,
@@ -35,7 +35,7 @@ RULES: list[tuple[Derivative, int, np.ndarray, np.ndarray, list[int]]] = [
 
 @pytest.mark.parametrize(("rule", "shortest", "smooth", "rate", "invalid"), RULES)
 def test_values_rates_and_pieces(
-    rule: Derivative, shortest: int, smooth: np.ndarray, rate: np.ndarray, invalid: list[int]
+    rule: DerivativeRule, shortest: int, smooth: np.ndarray, rate: np.ndarray, invalid: list[int]
 ) -> None:
     found = rule.derive(NOISE, STEP, ONE)
     assert np.flatnonzero(~found[2]).tolist() == invalid
@@ -70,7 +70,7 @@ def test_savitzky_golay_is_exact_for_polynomials_up_to_the_edges() -> None:
     slope = np.stack([2.0 - 0.6 * T, 2.0 * T], axis=1)
     np.testing.assert_allclose(rate[valid], slope[valid], atol=1e-8)
     for window, samples in ((1.5, 15), (1.4, 15), (2.05, 21), (0.3, 3)):
-        assert SavitzkyGolay(window=window, order=1).samples(STEP) == samples
+        assert SavitzkyGolay(window=window, order=1).n_window_samples(STEP) == samples
 
 
 @pytest.mark.parametrize(
@@ -83,5 +83,5 @@ def test_savitzky_golay_is_exact_for_polynomials_up_to_the_edges() -> None:
 )
 def test_faulty_rules(config: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
-        validate(config, DerivativeConfig, "test").derive(NOISE, STEP, ONE)
+        validate_config(config, DerivativeConfig, "test").derive(NOISE, STEP, ONE)
     assert SavitzkyGolay(window=0.5, order=3).derive(NOISE, STEP, ONE)[2].all()

@@ -13,7 +13,7 @@ from planted import FAULTS, KINDS, SHIPS, Fault, Ship, Undecidable, clean
 from random_vessels import random_logs, ship_of
 
 from residnet.core.log import Log
-from residnet.data.doctor import Finding, inspect, inspect_together
+from residnet.data.doctor import Finding, inspect_log, inspect_log_set
 
 HOSTS = ("boat", "wam_v", "ferry")
 
@@ -28,8 +28,8 @@ def host(name: str) -> tuple[Ship, tuple[Log, ...]]:
 
 
 def told(logs: list[Log], alone: int) -> list[Finding]:
-    found = [finding for log in logs[:alone] for finding in inspect(log).findings]
-    return [*found, *inspect_together(logs).findings]
+    found = [finding for log in logs[:alone] for finding in inspect_log(log).findings]
+    return [*found, *inspect_log_set(logs).findings]
 
 
 @pytest.mark.parametrize("name", HOSTS)

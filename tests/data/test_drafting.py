@@ -19,12 +19,17 @@ from fleets import drawn
 from foreign_tables import CHANNELS, NAMES, Style
 
 import residnet
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.data.drafting.questions import Marks, Question
+from residnet.data.drafting.questions import DraftNotes, Question
 from residnet.data.drafting.tables import draft_tables
-from residnet.data.drafting.words import input_channel, state_channel, words_of, written_unit
+from residnet.data.drafting.words import (
+    match_input_channel,
+    match_state_channel,
+    parse_header_unit,
+    parse_name,
+)
 from residnet.data.readers import ReaderConfig
 from residnet.tasks.inspection import inspect_logs
 
@@ -63,14 +68,14 @@ def logs(ship_logs: list[Log]) -> list[Log]:
 
 @pytest.mark.parametrize("style", STYLES.values(), ids=STYLES.keys())
 def test_a_table_is_read_as_it_was(style: Style, logs: list[Log], tmp_path: Path) -> None:
-    files, marks = foreign_tables.write(logs, tmp_path, style), Marks()
+    files, marks = foreign_tables.write(logs, tmp_path, style), DraftNotes()
     content, _ = draft_tables(files, marks)
-    reader = validate(content, ReaderConfig, "here").build()
+    reader = validate_config(content, ReaderConfig, "here").build()
     for file, log in zip(files, logs, strict=True):
         for name in set(CHANNELS) & set(log.channels):
             size = float(np.abs(log[name]).max()) + 1e-3
             assert_read(reader.read(file), {name: log[name]}, 1e-6 * size)
-    told = {".".join(key) for key, _ in marks.guesses}
+    told = {".".join(key) for key, _ in marks.guessed_values}
     if not style.told:
         assert {f"data.reader.channels.{name}" for name in ("psi", "u", "r", "delta")} <= told
 
@@ -83,15 +88,18 @@ def test_a_heading_that_is_not_wrapped_may_be_large_in_radians(
     assert float(np.ptp(turning["psi"])) > 7.0
     columns = {"t": turning.t, **{name: turning[name] for name in ("x", "y", "psi", "u", "v", "r")}}
     pd.DataFrame(columns).to_csv(tmp_path / "turn.csv", index=False)
-    channels = draft_tables([tmp_path / "turn.csv"], Marks())[0]["channels"]
+    channels = draft_tables([tmp_path / "turn.csv"], DraftNotes())[0]["channels"]
     assert (channels["psi"]["unit"], channels["r"]["unit"]) == ("rad", "rad/s")
 
 
 @pytest.mark.parametrize("language", NAMES)
 def test_words_of_a_language(language: str) -> None:
     time, *columns = NAMES[language]
-    assert words_of(time).has("time")
-    found = [state_channel(words_of(name)) or input_channel(words_of(name)) for name in columns]
+    assert parse_name(time).has_all("time")
+    found = [
+        match_state_channel(parse_name(name)) or match_input_channel(parse_name(name))
+        for name in columns
+    ]
     assert found == list(CHANNELS)
 
 
@@ -132,8 +140,8 @@ CALLED: dict[str | None, str] = {
 
 @pytest.mark.parametrize("channel", CALLED)
 def test_what_a_name_is_about(channel: str | None) -> None:
-    about = {name: words_of(name) for name in CALLED[channel].split("|")}
-    found = {name: state_channel(w) or input_channel(w) for name, w in about.items()}
+    about = {name: parse_name(name) for name in CALLED[channel].split("|")}
+    found = {name: match_state_channel(w) or match_input_channel(w) for name, w in about.items()}
     assert found == dict.fromkeys(about, channel)
 
 
@@ -167,7 +175,7 @@ def test_what_a_name_is_about(channel: str | None) -> None:
     ],
 )
 def test_the_unit_in_a_header(column: str, expected: str, unit: str | None) -> None:
-    assert written_unit(column, expected) == unit
+    assert parse_header_unit(column, expected) == unit
 
 
 def test_axes_that_are_called_by_letters(logs: list[Log], tmp_path: Path) -> None:
@@ -183,11 +191,11 @@ def test_axes_that_are_called_by_letters(logs: list[Log], tmp_path: Path) -> Non
         for old, letter in names.items():
             head = head.replace(old, letter)
         file.write_text(f"{head}\n{rest}")
-    marks = Marks()
+    marks = DraftNotes()
     channels = draft_tables(files, marks)[0]["channels"]
     # the mirror image fits as well, and is marked
     assert (channels["x"]["column"], "frame" in channels["psi"]) == ("x [m]", False)
-    assert "data.reader.channels.x" in {".".join(key) for key, _ in marks.guesses}
+    assert "data.reader.channels.x" in {".".join(key) for key, _ in marks.guessed_values}
 
 
 def test_a_header_that_is_wrong_is_asked_about(logs: list[Log], tmp_path: Path) -> None:
@@ -200,12 +208,12 @@ def test_a_header_that_is_wrong_is_asked_about(logs: list[Log], tmp_path: Path) 
         asked.append(question)
         return question.default
 
-    content = draft_tables(files, Marks(answer))[0]
+    content = draft_tables(files, DraftNotes(answer))[0]
     assert content["channels"]["r"]["unit"] == "deg/min"
     assert [question.options for question in asked] == [("deg/min", "deg/s")]
-    marks = Marks()
+    marks = DraftNotes()
     draft_tables(files, marks)
-    assert any("the header says deg/s" in text for _, text in marks.guesses)
+    assert any("the header says deg/s" in text for _, text in marks.guessed_values)
 
 
 def _told(work: Callable[..., object], files: Sequence[Path]) -> dict[str, Any]:
@@ -221,7 +229,7 @@ def _told(work: Callable[..., object], files: Sequence[Path]) -> dict[str, Any]:
 def _doors(files: Sequence[Path]) -> dict[str, dict[str, Any]]:
     shown = inspect_logs(files, None).text.partition("paste into a config:\n")[2]
     return {
-        "new": residnet.draft(files).config["data"]["reader"],
+        "new": residnet.draft_config(files).config["data"]["reader"],
         "inspect": yaml.safe_load(shown)["data"]["reader"],
         "read_logs": _told(lambda f, hear: residnet.read_logs(f, progress=hear), files),
         "fit": _told(lambda f, hear: residnet.prepare(f, ["delta", "n"], progress=hear), files),
@@ -276,7 +284,7 @@ def test_volts_are_no_sway_and_per_cents_neither_force_nor_revolutions(
         thrusters[1]: np.linspace(100.0, 0.0, len(log)),
     }
     pd.DataFrame(columns).to_csv(file, index=False)
-    channels = draft_tables([file], Marks())[0]["channels"]
+    channels = draft_tables([file], DraftNotes())[0]["channels"]
     assert channels.keys() == {"x", "y", "psi", "throttle_port", "throttle_stbd"}
     assert channels["throttle_port"] == {"column": thrusters[0], "unit": "%"}
 
@@ -289,7 +297,7 @@ def test_sides_of_thrusters_tell_a_frame_from_its_mirror_image(tmp_path: Path) -
         camera = {"t": log.t, "x [m]": log["x"], "y [m]": -log["y"], "yaw [rad]": -log["psi"]}
         thrust = {"left [1/s]": log["n_port"], "right [1/s]": log["n_stbd"]}
         pd.DataFrame({**camera, **thrust}).to_csv(file, index=False)
-    channels = draft_tables(files, Marks())[0]["channels"]
+    channels = draft_tables(files, DraftNotes())[0]["channels"]
     assert {name: channels[name]["column"] for name in ("x", "y")} == {"x": "y [m]", "y": "x [m]"}
     assert channels["psi"]["frame"] == "enu"
 
@@ -301,5 +309,5 @@ def test_the_unit_of_a_gyro_is_told_where_some_logs_have_it_upside_down(tmp_path
         pose = {"t": 20.0 * log.t, "x [m]": log["x"], "y [m]": log["y"], "psi [rad]": log["psi"]}
         rate = {"gyro_z": way * np.degrees(log["r"]) / 20.0, "rudder": np.zeros(len(log))}
         pd.DataFrame({**pose, **rate}).to_csv(tmp_path / f"{log.name}.csv", index=False)
-    channels = draft_tables(sorted(tmp_path.glob("*.csv")), Marks())[0]["channels"]
+    channels = draft_tables(sorted(tmp_path.glob("*.csv")), DraftNotes())[0]["channels"]
     assert channels["r"] == {"column": "gyro_z", "unit": "deg/s"}

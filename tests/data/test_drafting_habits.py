@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 import residnet
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.questions import DraftNotes
 from residnet.data.drafting.reading import read_drafted
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.motion import MotionConfig, complete_motion
@@ -239,11 +239,11 @@ def test_a_habit_is_read_as_it_was_meant(name: str, seen: pd.DataFrame, tmp_path
     pd.DataFrame(written).to_csv(file := tmp_path / "22605.csv", index=False)
     log, _, marks = drafted(file)
     assert_read(log, {channel: seen[channel] for channel in habit.read.split()}, habit.atol)
-    guessed = {key[-1] for key, _ in marks.guesses}
+    guessed = {key[-1] for key, _ in marks.guessed_values}
     assert {*habit.guessed.split()} <= guessed
     assert not {*habit.sure.split()} & guessed
     assert not {*habit.absent.split()} & {*log.channels}
-    said = " ".join(text for _, text in [*marks.guesses, *marks.notes])
+    said = " ".join(text for _, text in [*marks.guessed_values, *marks.notes])
     assert habit.told in said
     assert not habit.never or habit.never not in said
 
@@ -256,7 +256,7 @@ def test_a_speed_is_that_forward_where_no_heading_is_known(tmp_path: Path) -> No
     frame.to_csv(file := tmp_path / "log.csv", index=False)
     log, _, marks = drafted(file)
     assert_read(log, {"u": speed})
-    assert "u" in {key[-1] for key, _ in marks.guesses}
+    assert "u" in {key[-1] for key, _ in marks.guessed_values}
     frame.assign(**{"course over ground [deg]": 0.0}).to_csv(file, index=False)
     assert "u" not in drafted(file)[0].channels
 
@@ -309,7 +309,7 @@ def test_documents_of_json(seen: pd.DataFrame, tmp_path: Path) -> None:
     tables = {"motors": motors, "gnss": fixes.to_dict("records"), "notes": [{"crew": "Ada"}] * 2}
     file.write_text(json.dumps(tables))
     with pytest.raises(DataError, match=r"several tables, motors \(\d+ rows\), gnss \(\d+ rows\);"):
-        draft_tables([file], Marks())
+        draft_tables([file], DraftNotes())
 
 
 @pytest.mark.parametrize("pose", [True, False], ids=["heading", "yaw rate alone"])
@@ -327,7 +327,7 @@ def test_a_wind_from_the_bow_by_cosine_and_sine_becomes_the_true_wind(
     begin = 0.0 if pose else s.psi[0]
     assert_read(log, {"wind_speed": s.wind_speed})
     assert_read(log, {"wind_dir": s.wind_dir - begin}, 0.02)
-    assert "wind_angle_cos" in {key[-1] for key, _ in marks.guesses}
+    assert "wind_angle_cos" in {key[-1] for key, _ in marks.guessed_values}
 
 
 def test_the_wind_that_is_felt_is_made_true_by_velocities_that_a_smoother_finds(
@@ -401,7 +401,7 @@ def test_thrusters_that_no_number_tells_apart_are_one_each(
     assert len(inputs) == len(called)
     for force in forces.values():
         assert any(np.allclose(values, force, atol=1e-12) for values in inputs)
-    assert "cmd_thrust_port_1" in {key[-1] for key, _ in marks.guesses}
+    assert "cmd_thrust_port_1" in {key[-1] for key, _ in marks.guessed_values}
 
 
 def test_logs_with_other_columns_beside_each_other_are_no_messages(
@@ -437,7 +437,7 @@ def test_planes_are_told_by_the_pitch_that_they_hold(tmp_path: Path, side: float
         }
     )
     frame.to_csv(file := tmp_path / "dive.csv", index=False)
-    log: Log = read_drafted([file], Marks()).logs[file]
+    log: Log = read_drafted([file], DraftNotes()).logs[file]
     assert {"u", "w", "q", "theta", "z", "delta_s", "n"} <= log.channels.keys()
     assert "v" not in log.channels
     assert_read(log, {"delta_s": planes}, 1e-6)

@@ -12,7 +12,7 @@ import pytest
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.readers.tables import CsvConfig
-from residnet.data.readers.written import degrees_of
+from residnet.data.readers.written import parse_degrees
 
 pytest.importorskip("pyproj")
 T = np.arange(0.0, 60.0, 0.2)
@@ -65,10 +65,12 @@ def test_what_holds_no_fixes(text: str, said: str, tmp_path: Path) -> None:
 )  # fmt: skip
 def test_ways_to_write_a_latitude(cell: str) -> None:
     form: Literal["number", "ddmm"] = "ddmm" if "5954" in cell else "number"
-    np.testing.assert_allclose(degrees_of(pd.Series([cell, None]), "latitude", form)[0], 59.90535)
+    np.testing.assert_allclose(
+        parse_degrees(pd.Series([cell, None]), "latitude", form)[0], 59.90535
+    )
     if cell.startswith("N") or cell[-1] in "Nn":
         south = cell.replace("N", "S") if "N" in cell else f"{cell[:-1]}s"
-        np.testing.assert_allclose(degrees_of(pd.Series([south]), "latitude", form), -59.90535)
+        np.testing.assert_allclose(parse_degrees(pd.Series([south]), "latitude", form), -59.90535)
 
 
 @pytest.mark.parametrize(
@@ -85,4 +87,4 @@ def test_ways_to_write_a_latitude(cell: str) -> None:
 )
 def test_what_is_no_latitude(cell: str, said: str) -> None:
     with pytest.raises(DataError, match=said):
-        degrees_of(pd.Series(["59N", cell]), "latitude")
+        parse_degrees(pd.Series(["59N", cell]), "latitude")

@@ -15,12 +15,12 @@ import written_recorders
 from scipy.io import savemat
 from written_logs import COMMANDS, EPOCH, reader_for, recording_for, trial
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.detect import format_of
+from residnet.data.readers.detect import detect_recording_format
 
 Writer = Callable[[Log, Path], Path]
 TREES: list[Writer] = [written_logs.mat5, written_logs.mat73, written_logs.hdf5]
@@ -31,7 +31,7 @@ BAGS: list[Writer] = [
 
 
 def read(path: Path, **config: Any) -> Log:
-    return validate(config, ReaderConfig, "test").build().read(path)
+    return validate_config(config, ReaderConfig, "test").build().read(path)
 
 
 def assert_same(read: Log, expected: Log) -> None:
@@ -102,7 +102,7 @@ def test_channel_maps_of_topics(write: Writer, kind: str, tmp_path: Path) -> Non
 def test_everything_that_a_bag_holds(tmp_path: Path) -> None:
     recording = recording_for(written_logs.bag2(trial(2.0), tmp_path))
     assert sorted(recording.series) == ["/cmd_port", "/cmd_stbd", "/odometry"]
-    assert recording["odometry"].kind == "nav_msgs/msg/Odometry"
+    assert recording["odometry"].message_type == "nav_msgs/msg/Odometry"
     assert recording["odometry"].sender is not None
     assert len(recording["cmd_port"]) == 21
 
@@ -171,10 +171,10 @@ def test_a_missing_package_is_named_with_its_extra(
     ],
 )
 def test_formats_by_content(write: Writer, name: str, tmp_path: Path) -> None:
-    found = format_of(write(trial(2.0), tmp_path).rename(tmp_path / "recording"))
+    found = detect_recording_format(write(trial(2.0), tmp_path).rename(tmp_path / "recording"))
     assert found is not None
     assert found.name == name
     (table := tmp_path / "table.csv").write_text("a,b\n1,2\n")
-    assert format_of(table) is None
+    assert detect_recording_format(table) is None
     with pytest.raises(UsageError, match="give a channel map"):
         reader_for(table).read(table)

@@ -10,13 +10,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
-from residnet.data.drafting.reading import read_each
+from residnet.data.drafting.reading import read_mixed_formats
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.base import digest
-from residnet.data.readers.joined import clock_shift, partners
+from residnet.data.readers.base import hash_files
+from residnet.data.readers.joined import estimate_clock_offset, group_trip_files
 
 LATE = {0: 12.3, 1: -31.7, 2: 5.05}
 """What the clock of the motors shows less than that of the receiver, in s."""
@@ -35,28 +35,28 @@ def commands(log: Log) -> Log:
 def test_the_shift_of_a_clock_is_found(number: int, ship_logs: list[Log]) -> None:
     log = ship_logs[number]
     other = commands(log).replace(t=log.t - LATE[number])
-    found = clock_shift(motion(log), other)
+    found = estimate_clock_offset(motion(log), other)
     assert found.seconds == pytest.approx(LATE[number], abs=0.2)
-    assert 1.0 - found.other > 1.5 * (1.0 - found.explained)
+    assert 1.0 - found.runner_up_share > 1.5 * (1.0 - found.explained_share)
     strange = commands(ship_logs[1 - number // 2])
-    assert clock_shift(motion(log), strange).explained < found.explained
+    assert estimate_clock_offset(motion(log), strange).explained_share < found.explained_share
 
 
 def test_trips_are_found_by_the_names_of_their_files(tmp_path: Path) -> None:
     def files(*names: str) -> dict[Path, tuple[str, ...]]:
         return {tmp_path / name: (name.partition("_")[0],) for name in names}
 
-    both = partners(files("gps_1.csv", "gps_2.csv", "motor_1.csv", "motor_2.csv"))
+    both = group_trip_files(files("gps_1.csv", "gps_2.csv", "motor_1.csv", "motor_2.csv"))
     assert {word: [path.name for path in group] for word, group in both.items()} == {
         "gps": ["gps_1.csv", "gps_2.csv"],
         "motor": ["motor_1.csv", "motor_2.csv"],
     }
-    whole = partners(files("gps_1.csv", "gps_2.csv", "motor_1.csv", "motor_3.csv"))
+    whole = group_trip_files(files("gps_1.csv", "gps_2.csv", "motor_1.csv", "motor_3.csv"))
     assert [path.name for group in whole.values() for path in group] == ["gps_1.csv", "motor_1.csv"]
-    assert partners(files("gps_1.csv", "gps_2.csv", "motor_3.csv", "motor_4.csv")) == {}
-    assert partners(files("a_1.csv", "a_2.csv")) == {}
+    assert group_trip_files(files("gps_1.csv", "gps_2.csv", "motor_3.csv", "motor_4.csv")) == {}
+    assert group_trip_files(files("a_1.csv", "a_2.csv")) == {}
     apart = {tmp_path / run / f"{word}.csv": (word,) for run in "12" for word in ("imu", "cmd")}
-    assert set(partners(apart)) == {"imu", "cmd"}
+    assert set(group_trip_files(apart)) == {"imu", "cmd"}
 
 
 def tables(log: Log, late: float = 7.0) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -72,11 +72,11 @@ def found(folder: Path, **files: pd.DataFrame) -> tuple[set[str], list[str], dic
     folder.mkdir()
     for name, table in files.items():
         table.to_csv(folder / f"{name}.csv", index=False)
-    read = read_each(sorted(folder.iterdir()))
+    read = read_mixed_formats(sorted(folder.iterdir()))
     logs = {log.name: log for one in read for log in one.logs.values()}
     said = [f for log in logs.values() for f in log.meta.get("findings", ())]
     told = [f"{f['level']}: {f['text']}" for f in said if f["code"] == "joined"]
-    lost = {path.stem: str(why) for one in read for path, why in one.left_out.items()}
+    lost = {path.stem: str(why) for one in read for path, why in one.errors.items()}
     return set(logs), told, lost
 
 
@@ -146,19 +146,19 @@ def test_a_shift_that_is_given_and_what_is_wrong(tmp_path: Path) -> None:
     t = np.arange(20.0)
     pd.DataFrame({"t": t, "x": t, "y": -t}).to_csv(tmp_path / "pos1.csv", index=False)
     pd.DataFrame({"t": t + 7.0, "k": t**2}).to_csv(tmp_path / "cmd1.csv", index=False)
-    reader = validate(reader_of(shift={"cmd": -7.0}), ReaderConfig, "here").build()
+    reader = validate_config(reader_of(shift={"cmd": -7.0}), ReaderConfig, "here").build()
     read, both = reader.read(tmp_path / "pos1.csv"), [tmp_path / "pos1.csv", tmp_path / "cmd1.csv"]
     np.testing.assert_array_equal(read["k"], t**2)
     assert reader.files(both[0]) == both
-    assert read.meta["parts"] == {"pos": digest(both[:1]), "cmd": digest(both[1:])}
-    assert reader.logs_among(sorted(tmp_path.iterdir())) == [tmp_path / "pos1.csv"]
+    assert read.meta["parts"] == {"pos": hash_files(both[:1]), "cmd": hash_files(both[1:])}
+    assert reader.select_logs(sorted(tmp_path.iterdir())) == [tmp_path / "pos1.csv"]
     with pytest.raises(DataError, match="its name holds no 'pos'"):
         reader.read(tmp_path / "cmd1.csv")
-    far = validate(reader_of(shift={"cmd": 100.0}), ReaderConfig, "here").build()
+    far = validate_config(reader_of(shift={"cmd": 100.0}), ReaderConfig, "here").build()
     with pytest.raises(DataError, match=r"from 0\.0 to 19\.0 s, that of cmd from 107\.0"):
         far.read(tmp_path / "pos1.csv")
     with pytest.raises(ConfigError, match="'pos' is no part whose clock can be moved"):
-        validate(reader_of(shift={"pos": 1.0}), ReaderConfig, "here")
+        validate_config(reader_of(shift={"pos": 1.0}), ReaderConfig, "here")
     (tmp_path / "cmd1.csv").unlink()
     with pytest.raises(DataError, match=r"cmd1\.csv is not beside it"):
         reader.read(tmp_path / "pos1.csv")
@@ -173,7 +173,7 @@ def test_dates_join_by_themselves(tmp_path: Path) -> None:
         stamps = pd.Timestamp(start) + pd.to_timedelta(t, "s")
         table = pd.DataFrame({"t": stamps.astype(str), **columns})
         table.to_csv(tmp_path / f"{name}.csv", index=False)
-    reader = validate(reader_of(time={"unit": "date"}), ReaderConfig, "here").build()
+    reader = validate_config(reader_of(time={"unit": "date"}), ReaderConfig, "here").build()
     found = reader.read(tmp_path / "pos.csv")["k"]
     np.testing.assert_array_equal(found[:15], t[5:])
     assert np.isnan(found[15:]).all()

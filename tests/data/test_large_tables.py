@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.readers import ReaderConfig, texts
@@ -17,7 +17,7 @@ from residnet.data.readers.base import LogReader
 
 def reader(kind: str = "csv") -> LogReader:
     channels = {"psi": {"column": "h", "unit": "deg"}, "u": {"column": "u", "unit": "kn"}}
-    return validate(
+    return validate_config(
         {"kind": kind, "time": {"column": "t"}, "channels": channels}, ReaderConfig, "test"
     ).build()
 

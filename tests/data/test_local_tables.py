@@ -9,12 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
-from residnet.core.units import known_unit, to_si
+from residnet.core.units import canonical_unit, to_si
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.written import date_order, looks_dated, parse_texts
+from residnet.data.readers.written import detect_date_order, is_date_column, parse_texts
 
 SPELT = {
     "deg/min": "deg/min|° / MIN|度/分",
@@ -35,20 +35,20 @@ SPELT = {
 @pytest.mark.parametrize("unit", SPELT)
 def test_spelling_of_a_unit(unit: str) -> None:
     written = SPELT[unit].split("|")
-    assert [known_unit(one) for one in written] == [unit] * len(written)
+    assert [canonical_unit(one) for one in written] == [unit] * len(written)
 
 
 def test_case_alone_is_settled_by_the_dimension() -> None:
     assert to_si("KN", "m/s") == pytest.approx(1852 / 3600)
     assert to_si("KN", "N") == 1000.0
     with pytest.raises(UsageError, match="may be kn or kN"):
-        known_unit("KN")
+        canonical_unit("KN")
 
 
 @pytest.mark.parametrize("written", ["deg/m", "deg/h", "kn/s", "mrad", "rad/mm", "deg/ms"])
 def test_no_suggestion_differs_by_a_factor(written: str) -> None:
     with pytest.raises(UsageError) as caught:
-        known_unit(written)
+        canonical_unit(written)
     assert "did you mean" not in str(caught.value)
 
 
@@ -67,28 +67,28 @@ def test_no_suggestion_differs_by_a_factor(written: str) -> None:
 )
 def test_forms_of_dates(cells: list[str], order: str | None, seconds: float) -> None:
     column = pd.Series(cells)
-    assert looks_dated(column)
-    assert date_order(column) == order
-    ns = parse_texts(column, dates=True).ns
+    assert is_date_column(column)
+    assert detect_date_order(column) == order
+    ns = parse_texts(column, has_only_dates=True).ns
     assert ns[-1] - ns[0] == round(1e9 * seconds)
 
 
 def test_the_hour_that_comes_twice() -> None:
     local = ["27.10.2024 02:59:59", "27.10.2024 02:00:01", "27.10.2024 02:00:02"]
-    ns = parse_texts(pd.Series(local), zone="Europe/Berlin", dates=True).ns
+    ns = parse_texts(pd.Series(local), zone="Europe/Berlin", has_only_dates=True).ns
     assert (ns - pd.Timestamp("2024-10-27 00:59:59").value).tolist() == [0, 2 * 10**9, 3 * 10**9]
 
 
 def test_cells_that_are_no_dates() -> None:
-    assert not looks_dated(pd.Series(["1.5", "2.5"]))
+    assert not is_date_column(pd.Series(["1.5", "2.5"]))
     with pytest.raises(DataError, match="'soon' in row 2 is no date"):
-        parse_texts(pd.Series(["03.05.2024 10:00:00", "soon"]), dates=True)
+        parse_texts(pd.Series(["03.05.2024 10:00:00", "soon"]), has_only_dates=True)
     with pytest.raises(DataError, match=r"'31\.31\.2024 10:00' in row 1 is no date with dmy"):
-        parse_texts(pd.Series(["31.31.2024 10:00"]), dates=True)
+        parse_texts(pd.Series(["31.31.2024 10:00"]), has_only_dates=True)
 
 
 def _read(path: Path, settings: dict[str, Any]) -> Log:
-    return validate(settings, ReaderConfig, "here").build().read(path)
+    return validate_config(settings, ReaderConfig, "here").build().read(path)
 
 
 CHANNELS = {
@@ -140,4 +140,4 @@ def test_an_excel_sheet(tmp_path: Path) -> None:
 )
 def test_times_that_cannot_be(time: dict[str, str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        validate({"kind": "csv", "time": time, "channels": CHANNELS}, ReaderConfig, "here")
+        validate_config({"kind": "csv", "time": time, "channels": CHANNELS}, ReaderConfig, "here")

@@ -8,24 +8,24 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.log import Log
 from residnet.data.masks import (
-    Frozen,
-    Gap,
-    Hampel,
-    InputJump,
-    Jump,
-    Mask,
+    FrozenMask,
+    GapMask,
+    HampelMask,
+    InputJumpMask,
+    JumpMask,
     MaskConfig,
-    Missing,
-    Outlier,
-    Spike,
+    MaskRule,
+    MissingValues,
+    OutlierMask,
+    SpikeMask,
     apply_masks,
-    hard_mask,
-    scored,
-    segments,
+    find_scored_samples,
+    make_hard_mask,
+    number_log_segments,
 )
 
 
@@ -59,42 +59,42 @@ HALF_STEP = np.where(np.arange(300) == 40, 0.5, np.repeat([0.0, 1.0], 150))
 @pytest.mark.parametrize(
     ("rule", "log", "marked"),
     [
-        (Frozen(samples=3, after=0.0), log_of(x=REST, y=REST), [2, 3, 4, 5]),
-        (Frozen(samples=3), log_of(x=REST, y=REST), [*range(2, 10)]),
-        (Frozen(), log_of(LATER, x=HELD, y=HELD), [*range(10, 36)]),
-        (Frozen(samples=4), log_of(x=REST, y=REST), []),
-        (Frozen(samples=3), log_of(x=REST, y=np.arange(10)), []),
-        (Frozen(), log_of(x=SLOW, y=SLOW), []),
-        (Frozen(after=0.0), log_of(x=SLOW_FROZEN, y=SLOW_FROZEN), [*range(300, 370)]),
-        (Gap(longest=0.2), log_of(TIMES, u=np.ones(6)), [3]),
-        (Gap(longest=0.3), log_of(np.array([1.1, 1.2, 1.5]), u=np.ones(3)), []),
-        (Missing(), log_of(u=[0, np.nan, 0], v=[0, 0, np.nan]), [1, 2]),
-        (Missing(channels=("v",)), log_of(u=[0, np.nan, 0], v=[0, 0, np.nan]), [2]),
-        (Jump(channel="u", limit=1.0, before=2, after=3), log_of(u=STEP * 10), [*range(28, 33)]),
-        (Jump(channel="u", limit=5.0), log_of(u=STEP * 10), []),
-        (Jump(channel="psi", limit=0.5), log_of(psi=[3.1, 3.14, -3.1, -3.0]), []),
-        (InputJump(**AROUND, limit=0.1), log_of(d=STEP), [*range(25, 41)]),
-        (InputJump(**AROUND, limit=0.6), log_of(d=STEP), []),
-        (Outlier(channels=("u", "v")), log_of(u=np.linspace(0, 7, 300), v=HALF_STEP), [40]),
-        (Outlier(channels=("u",)), log_of(u=LONE), [50]),
-        (Outlier(channels=("u",)), log_of(u=np.arange(5)), []),
+        (FrozenMask(samples=3, after=0.0), log_of(x=REST, y=REST), [2, 3, 4, 5]),
+        (FrozenMask(samples=3), log_of(x=REST, y=REST), [*range(2, 10)]),
+        (FrozenMask(), log_of(LATER, x=HELD, y=HELD), [*range(10, 36)]),
+        (FrozenMask(samples=4), log_of(x=REST, y=REST), []),
+        (FrozenMask(samples=3), log_of(x=REST, y=np.arange(10)), []),
+        (FrozenMask(), log_of(x=SLOW, y=SLOW), []),
+        (FrozenMask(after=0.0), log_of(x=SLOW_FROZEN, y=SLOW_FROZEN), [*range(300, 370)]),
+        (GapMask(longest=0.2), log_of(TIMES, u=np.ones(6)), [3]),
+        (GapMask(longest=0.3), log_of(np.array([1.1, 1.2, 1.5]), u=np.ones(3)), []),
+        (MissingValues(), log_of(u=[0, np.nan, 0], v=[0, 0, np.nan]), [1, 2]),
+        (MissingValues(channels=("v",)), log_of(u=[0, np.nan, 0], v=[0, 0, np.nan]), [2]),
+        (JumpMask(channel="u", limit=1.0, before=2, after=3), log_of(u=STEP * 10), [*range(28, 33)]),
+        (JumpMask(channel="u", limit=5.0), log_of(u=STEP * 10), []),
+        (JumpMask(channel="psi", limit=0.5), log_of(psi=[3.1, 3.14, -3.1, -3.0]), []),
+        (InputJumpMask(**AROUND, limit=0.1), log_of(d=STEP), [*range(25, 41)]),
+        (InputJumpMask(**AROUND, limit=0.6), log_of(d=STEP), []),
+        (OutlierMask(channels=("u", "v")), log_of(u=np.linspace(0, 7, 300), v=HALF_STEP), [40]),
+        (OutlierMask(channels=("u",)), log_of(u=LONE), [50]),
+        (OutlierMask(channels=("u",)), log_of(u=np.arange(5)), []),
         # in a window of 10 that holds the sample itself the largest possible distance is 9 /
         # sqrt(10) standard deviations: document 002's rule taken literally never fires
-        (Outlier(channels=("u",)), log_of(u=np.where(np.arange(20) == 5, 1e6, 0.0)), [5]),
-        (Hampel(channels=("u",)), log_of(u=SEEN), []),
-        (Hampel(channels=("u",)), log_of(u=MOTION), []),
-        (Hampel(channels=("u",)), log_of(u=SPIKED), BAD),
-        (Hampel(channels=("psi",)), log_of(psi=np.angle(np.exp(0.4j * T))), []),
-        (Spike(), log_of(u=np.where(np.arange(4000) == 1000, 90.0, SEEN / 100)), [1000]),
+        (OutlierMask(channels=("u",)), log_of(u=np.where(np.arange(20) == 5, 1e6, 0.0)), [5]),
+        (HampelMask(channels=("u",)), log_of(u=SEEN), []),
+        (HampelMask(channels=("u",)), log_of(u=MOTION), []),
+        (HampelMask(channels=("u",)), log_of(u=SPIKED), BAD),
+        (HampelMask(channels=("psi",)), log_of(psi=np.angle(np.exp(0.4j * T))), []),
+        (SpikeMask(), log_of(u=np.where(np.arange(4000) == 1000, 90.0, SEEN / 100)), [1000]),
     ],
 )  # fmt: skip
-def test_rules_mark_these_samples(rule: Mask, log: Log, marked: list[int]) -> None:
+def test_rules_mark_these_samples(rule: MaskRule, log: Log, marked: list[int]) -> None:
     assert np.flatnonzero(rule.apply(log)).tolist() == marked
 
 
 def test_normal_noise_is_hardly_an_outlier_and_grouped_ones_hide_from_the_moving_rule() -> None:
-    assert Outlier(channels=("u",)).apply(log_of(u=NOISE)).mean() < 0.004
-    assert not Outlier(channels=("u",)).apply(log_of(u=SPIKED))[BAD].all()
+    assert OutlierMask(channels=("u",)).apply(log_of(u=NOISE)).mean() < 0.004
+    assert not OutlierMask(channels=("u",)).apply(log_of(u=SPIKED))[BAD].all()
 
 
 def hampel_by_loop(values: np.ndarray, sigmas: float, samples: int) -> np.ndarray:
@@ -123,35 +123,37 @@ def test_hampel_equals_an_independent_loop_on_random_logs() -> None:
         for _ in range(10):
             u = np.cumsum(rng.normal(size=120)) + rng.normal(size=120)
             u[rng.choice(120, 4)] += rng.normal(0.0, 20.0, 4)
-            found = Hampel(channels=("u",), sigmas=4.0, samples=samples).apply(log_of(u=u))
+            found = HampelMask(channels=("u",), sigmas=4.0, samples=samples).apply(log_of(u=u))
             np.testing.assert_array_equal(found, hampel_by_loop(u, 4.0, samples))
 
 
 def test_reasons_tell_hard_soft_and_rate_masks_apart() -> None:
-    input_jump = InputJump(channels=("u",), limit=1.0, before=0.0, after=0.2)
-    rules = [Jump(channel="u", limit=1.0), Missing(), input_jump]
+    input_jump = InputJumpMask(channels=("u",), limit=1.0, before=0.0, after=0.2)
+    rules = [JumpMask(channel="u", limit=1.0), MissingValues(), input_jump]
     log = apply_masks(log_of(u=LEVELS), rules)
     assert set(log.masks) == {"jump", "hard:nan", "rate:input_jump"}
-    assert [rule.hard for rule in rules] == [False, True, False]
-    assert np.flatnonzero(hard_mask(log)).tolist() == [7]
-    assert np.flatnonzero(~scored(log)).tolist() == [2, 3, 7]
+    assert [rule.is_hard for rule in rules] == [False, True, False]
+    assert np.flatnonzero(make_hard_mask(log)).tolist() == [7]
+    assert np.flatnonzero(~find_scored_samples(log)).tolist() == [2, 3, 7]
     assert np.flatnonzero(~log.usable).tolist() == [2, 3, 4, 5, 7]
-    assert segments(log).tolist() == [0, 0, 0, 0, 0, 0, 0, -1, 1, 1]
-    assert segments(log_of(u=np.ones(3))).tolist() == [0, 0, 0]
+    assert number_log_segments(log).tolist() == [0, 0, 0, 0, 0, 0, 0, -1, 1, 1]
+    assert number_log_segments(log_of(u=np.ones(3))).tolist() == [0, 0, 0]
 
 
 def test_rules_of_one_kind_share_a_mask_and_older_masks_stay() -> None:
     before = {"jump": np.array([True, False, False, False]), "mine": np.ones(4, dtype=bool)}
     log = log_of(u=[0, 9, 9, 9], v=[0, 0, 0, 9]).replace(masks=before)
-    log = apply_masks(log, [Jump(channel=name, limit=1.0, before=0) for name in "uv"])
+    log = apply_masks(log, [JumpMask(channel=name, limit=1.0, before=0) for name in "uv"])
     assert log.masks["jump"].tolist() == [True, True, False, True]
     assert log.masks["mine"].all()
     with pytest.raises(UsageError, match="no channel 'w'"):
-        apply_masks(log, [Jump(channel="w", limit=1.0)])
+        apply_masks(log, [JumpMask(channel="w", limit=1.0)])
 
 
 def test_configs_read_quantities_and_refuse_nonsense() -> None:
-    assert validate({"kind": "frozen", "after": "500 ms"}, MaskConfig, "test") == Frozen(after=0.5)
+    assert validate_config({"kind": "frozen", "after": "500 ms"}, MaskConfig, "test") == FrozenMask(
+        after=0.5
+    )
     kinds = {"frozen", "gap", "nan", "jump", "outlier", "hampel", "spike", "input_jump"}
     assert kinds == set(TypeAdapter(MaskConfig).json_schema()["discriminator"]["mapping"])
     for faulty in (
@@ -161,4 +163,4 @@ def test_configs_read_quantities_and_refuse_nonsense() -> None:
         {"kind": "outlier", "channels": []},
     ):
         with pytest.raises(ConfigError):
-            validate(faulty, MaskConfig, "test")
+            validate_config(faulty, MaskConfig, "test")

@@ -11,12 +11,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import DataError
-from residnet.core.files import config_folder
+from residnet.core.files import find_config_folder
 from residnet.core.log import Log
-from residnet.data.align import GridConfig, align
-from residnet.data.doctor import inspect
+from residnet.data.align import GridConfig, align_to_grid
+from residnet.data.doctor import inspect_log
 from residnet.data.readers import ReaderConfig
 from residnet.data.split import SplitConfig, check_leaks
 from residnet.tasks.import_logs import ImportConfig
@@ -40,7 +40,7 @@ def needs(folder: str) -> pytest.MarkDecorator:
 def read(path: Path, columns: dict[str, str], time: str) -> Log:
     channels = {name: {"column": one, "unit": UNITS[name]} for name, one in columns.items()}
     config = {"kind": "csv", "time": {"column": time}, "channels": channels, "manoeuvre": "folder"}
-    return validate(config, ReaderConfig, "test").build().read(path)
+    return validate_config(config, ReaderConfig, "test").build().read(path)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def logs() -> dict[str, list[Log]]:
     if not (DATA / "esso_osaka").is_dir():
         pytest.skip(f"no esso_osaka in {DATA}")
     file = {"file": str(DATA / "esso_osaka" / "split.yaml")}
-    files = validate(file, SplitConfig, "test").resolve()
+    files = validate_config(file, SplitConfig, "test").resolve_paths()
     return {split: [read(path, ESSO, "t [s]") for path in paths] for split, paths in files.items()}
 
 
@@ -56,7 +56,7 @@ def test_logs_are_on_the_grid_and_stay_as_published(logs: dict[str, list[Log]]) 
     assert [len(logs[split]) for split in ("train", "validation", "test")] == [21, 5, 6]
     for log in logs["test"]:
         table = pd.read_csv(log.meta["source"])
-        out = align(log, GridConfig(step=0.1, held=("n", "delta")))
+        out = align_to_grid(log, GridConfig(step=0.1, held=("n", "delta")))
         np.testing.assert_array_equal(out.t, table["t [s]"])
         for name in ("x", "u", "n", "delta"):
             np.testing.assert_array_equal(out[name], table[ESSO[name]])
@@ -78,16 +78,16 @@ def test_the_copied_file_is_caught_and_the_published_split_passes(
 def test_the_doctor_finds_the_known_illnesses(logs: dict[str, list[Log]]) -> None:
     lags, gyro, freezes = [], {}, []
     for log in [log for part in logs.values() for log in part]:
-        report = inspect(log)
-        assert not any(finding.level == "fatal" for finding in report.findings), report.lines()
-        (frames,) = report.find("frames")
+        report = inspect_log(log)
+        assert not any(finding.level == "fatal" for finding in report.findings), report.to_lines()
+        (frames,) = report.find_by_code("frames")
         assert (frames.level, frames.figures["coherence"] > 0.97) == ("note", True)
-        following = [finding for name in "uv" for finding in report.find(f"follows_{name}")]
+        following = [finding for name in "uv" for finding in report.find_by_code(f"follows_{name}")]
         trailing = [finding for finding in following if "trails" in finding.text]
         assert trailing or log.manoeuvre == "berthing"
         lags += [finding.figures["lag"] for finding in following]
-        gyro[log.name] = np.degrees(report.find("yaw_drift")[0].figures["end"])
-        frozen = [one for one in report.find("frozen") if one.text.startswith("position")]
+        gyro[log.name] = np.degrees(report.find_by_code("yaw_drift")[0].figures["end"])
+        frozen = [one for one in report.find_by_code("frozen") if one.text.startswith("position")]
         freezes += [finding.figures["share"] for finding in frozen]
     assert np.median(lags) == pytest.approx(0.62, abs=0.05)
     assert gyro.pop("random_31-Jul-2020_12_48_39") == pytest.approx(29.3, abs=0.2)
@@ -102,22 +102,22 @@ def test_tank_data_are_consistent_and_their_mistakes_would_be_seen() -> None:
     columns = {**dict(zip(MOTION, MOTION, strict=True)), "delta": "delta", "n": "rev"}
     for path in sorted((DATA / "kvlcc2").glob("*.csv")):
         raw = read(path, columns, "t")
-        loud = {finding.code for finding in inspect(raw).findings if finding.level != "note"}
+        loud = {finding.code for finding in inspect_log(raw).findings if finding.level != "note"}
         # published with the trailing edge to port positive
         assert "rudder_sign" in loud
         log = raw.replace(channels={**raw.channels, "delta": -raw["delta"]})
-        report = inspect(log)
+        report = inspect_log(log)
         said = [finding.code for finding in report.findings if finding.level != "note"]
-        assert "rudder_sign" not in said, report.lines()
-        assert report.find("frames")[0].figures["coherence"] > 0.9999
-        assert abs(report.find("follows_r")[0].figures["lag"]) < 0.1
+        assert "rudder_sign" not in said, report.to_lines()
+        assert report.find_by_code("frames")[0].figures["coherence"] > 0.9999
+        assert abs(report.find_by_code("follows_r")[0].figures["lag"]) < 0.1
         exchanged = log.replace(channels={**log.channels, "x": log["y"], "y": log["x"]})
-        assert inspect(exchanged).misled
+        assert inspect_log(exchanged).has_problems
 
 
 @needs("milliampere/raw_nlp1")
 def test_the_ferrys_raw_topics_become_the_table_made_by_hand() -> None:
-    task = load_task(config_folder() / "milliampere_raw.yaml", [])
+    task = load_task(find_config_folder() / "milliampere_raw.yaml", [])
     assert isinstance(task, ImportConfig)
     log = task.reader.build().read(DATA / "milliampere" / "raw_nlp1")
     table = pd.read_csv(DATA / "milliampere" / "nlp1.csv")

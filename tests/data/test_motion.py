@@ -7,14 +7,14 @@ import pytest
 from known_logs import wavy
 from scipy.spatial.transform import Rotation
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import DataError, UsageError
-from residnet.core.layout import Live
+from residnet.core.layout import DegreesOfFreedom
 from residnet.core.log import Log
-from residnet.core.names import STATE
+from residnet.core.names import STATE_NAMES
 from residnet.data.align import GridConfig
-from residnet.data.motion import MotionConfig, complete_motion, fill_sparse, smooth_motion
-from residnet.data.prepare import PrepareConfig, prepare
+from residnet.data.motion import MotionConfig, complete_motion, fill_sparse, smooth_measured_motion
+from residnet.data.prepare import PrepareConfig, prepare_log
 from residnet.data.readers.quantities import Antenna
 
 TRUTH = wavy(seconds=120.0)
@@ -66,8 +66,8 @@ def error(log: Log, name: str) -> float:
 )
 def test_velocities_from_position_and_heading(log: Log, config: MotionConfig, most: float) -> None:
     out = complete_motion(log, config)
-    assert {name: error(out, name) for name in STATE} == {
-        name: pytest.approx(0.0, abs=most) for name in STATE
+    assert {name: error(out, name) for name in STATE_NAMES} == {
+        name: pytest.approx(0.0, abs=most) for name in STATE_NAMES
     }
     assert set(out.meta["smoothed"]) >= {"u", "v", "r"}
 
@@ -82,21 +82,21 @@ def test_what_is_measured_at_every_sample_stays() -> None:
     # an antenna that is not told is seen in the velocities
     off = measured(antenna=(3.0, -1.0), delay=0.4)
     assert error(complete_motion(off, MotionConfig()), "v") > 0.2
-    config = validate({"antenna": {"x": "30 cm"}, "delay": "400 ms"}, MotionConfig, "here")
+    config = validate_config({"antenna": {"x": "30 cm"}, "delay": "400 ms"}, MotionConfig, "here")
     assert (config.antenna, config.delay) == (Antenna(x=0.3), 0.4)
 
 
 def test_nine_measured_quantities_become_one_motion() -> None:
     rates = [np.gradient(TRUTH[name], TRUTH.t) for name in "uvr"]
-    truth = np.stack([*(TRUTH[name] for name in STATE), *rates], axis=1)
+    truth = np.stack([*(TRUTH[name] for name in STATE_NAMES), *rates], axis=1)
     noise = np.array([0.05, 0.05, 0.01, 0.03, 0.03, 0.005, 0.05, 0.05, 0.01])
     seen = truth + noise * np.random.default_rng(0).standard_normal(truth.shape)
     for known in (noise, np.where(np.arange(9) > 5, np.inf, noise)):
-        off = (smooth_motion(seen, known.tolist(), 0.1) - truth)[100:-100]
+        off = (smooth_measured_motion(seen, known.tolist(), 0.1) - truth)[100:-100]
         assert (np.sqrt(np.mean(off**2, axis=0)) < 0.25 * noise).all()
     seen[3, 4] = np.nan
     with pytest.raises(DataError, match="column 4 is not finite at sample 3"):
-        smooth_motion(seen, noise.tolist(), 0.1)
+        smooth_measured_motion(seen, noise.tolist(), 0.1)
 
 
 @pytest.mark.parametrize("every", [2, 10])
@@ -126,7 +126,7 @@ def test_a_fit_is_prepared_from_position_and_heading() -> None:
     delta = np.where(np.arange(len(log)) % 2 == 0, log["delta"], np.nan)
     log = log.replace(channels={**log.channels, "delta": delta})
     config = PrepareConfig(grid=GridConfig(step=0.1))
-    prepared = prepare(log, "train", ("delta",), config)
+    prepared = prepare_log(log, "train", ("delta",), config)
     assert prepared.usable.mean() > 0.9
     assert float(np.abs(prepared.w[50:-50, 0] - TRUTH["delta"][50:-50]).max()) < 2e-3
 
@@ -178,8 +178,8 @@ def test_what_was_not_measured_under_water_follows_from_attitude_and_depth(
     channels = attitude | dict(zip("xyz", place.T, strict=True)) | truth
     kept = {name: values for name, values in channels.items() if name not in lost}
     log = Log("dive", t, kept)
-    live = Live.told(log.channels)
-    assert live.spatial
+    live = DegreesOfFreedom.from_channels(log.channels)
+    assert live.is_six_dof
     whole = complete_motion(log, MotionConfig(), live)
     for name in lost:
         inside = slice(40, -40)
@@ -191,7 +191,7 @@ def test_sparse_commands_hold_and_sparse_states_are_interpolated_up_to_three_int
     t = np.arange(40.0)
     values = np.where((t % 4 == 2) & ~((t > 15) & (t < 33)), t, np.nan)
     log = Log("log", t, {"u": values, "delta": values})
-    filled = fill_sparse(log, ("u", "delta"), held=("delta",))
+    filled = fill_sparse(log, ("u", "delta"), held_channels=("delta",))
     between = (t >= 2) & (t <= 14) | (t >= 34) & (t <= 38)
     np.testing.assert_allclose(filled["u"][between], t[between])
     np.testing.assert_array_equal(filled["delta"][between], (2 + (t - 2) // 4 * 4)[between])

@@ -10,9 +10,9 @@ import pytest
 from fleets import CONTRADICTIONS, Fleet, drawn
 
 from residnet.core.log import Log
-from residnet.data.doctor import Finding, inspect_together
+from residnet.data.doctor import Finding, inspect_log_set
 from residnet.data.doctor.others import dead_commands
-from residnet.data.doctor.statistics import Record
+from residnet.data.doctor.statistics import LogStatistics
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.registry import load_task
 
@@ -26,7 +26,7 @@ def fleets(request: pytest.FixtureRequest) -> list[Fleet]:
 
 
 def found(logs: list[Log], fleet: Fleet) -> list[Finding]:
-    findings = inspect_together(logs, fleet.inputs).findings
+    findings = inspect_log_set(logs, fleet.inputs).findings
     return [one for one in findings if one.code.startswith("contradicts")]
 
 
@@ -72,7 +72,7 @@ def test_no_log_of_the_quickstart_is_accused() -> None:
     """Its constant inputs reach farther than most of its logs, which agree best without them."""
     task = load_task(Path("quickstart"))
     assert isinstance(task, FitConfig)
-    logs = [log for members in task.logs().values() for log in members]
+    logs = [log for members in task.load_logs().values() for log in members]
     assert found(logs, Fleet("quickstart", logs, [], ("n_port", "n_stbd"), "")) == []
 
 
@@ -129,15 +129,15 @@ def _hand_on_the_wheel(fleet: Fleet) -> tuple[list[Log], slice]:
 
 def test_motion_without_a_command_is_found_where_it_is(fleets: list[Fleet]) -> None:
     fleet = fleets[0]
-    records = [Record(log, fleet.inputs) for log in fleet.logs]
+    records = [LogStatistics(log, fleet.inputs) for log in fleet.logs]
     assert dead_commands(records, [], fleet.inputs) == {}
     logs, rows = _hand_on_the_wheel(fleet)
-    records = [Record(log, fleet.inputs) for log in logs]
+    records = [LogStatistics(log, fleet.inputs) for log in logs]
     for learned, further in ((records, []), (records[1:], records[:1])):
         ((start, stop),) = dead_commands(learned, further, fleet.inputs)[logs[0].name]
         assert abs(start - rows.start) <= 1
         assert abs(stop - rows.stop) <= 1
-    (told,) = inspect_together(logs, fleet.inputs).find("dead_commands")
+    (told,) = inspect_log_set(logs, fleet.inputs).find_by_code("dead_commands")
     assert told.text.startswith(logs[0].name)
 
 
@@ -177,7 +177,7 @@ def test_twin_rudders_have_one_fault() -> None:
         )
         units = {**log.units, "delta_stbd": "rad"}
         logs.append(log.replace(channels={**log.channels, **rudders}, units=units))
-    (one,) = inspect_together(logs, (*fleet.inputs, "delta_stbd")).find("contradicts_sign")
+    (one,) = inspect_log_set(logs, (*fleet.inputs, "delta_stbd")).find_by_code("contradicts_sign")
     assert one.text.startswith(logs[2].name)
     assert "delta and delta_stbd would have to have the opposite sign" in one.text
 
@@ -203,8 +203,8 @@ def test_what_no_other_log_has_run_accuses_none(name: str) -> None:
         logs.append(Log(f"run_{number}", t, {"u": u, "v": v, "r": r, "n": n, name: angle}))
     fleet = Fleet("ferry", logs, [], ("n", name), name)
     assert [one.text for one in found(logs, fleet)] == []
-    beyond = inspect_together(logs, fleet.inputs)
-    assert [one.level for one in beyond.find("beyond_others")] == ["note"]
+    beyond = inspect_log_set(logs, fleet.inputs)
+    assert [one.level for one in beyond.find_by_code("beyond_others")] == ["note"]
 
 
 def test_gusts_on_straight_runs_are_no_dead_rudder(fleets: list[Fleet]) -> None:
@@ -235,5 +235,5 @@ def test_short_logs_and_vessels_at_rest_are_passed_over(size: int, speed: float)
         pose = {"x": speed * t, "y": 0.0 * t, "psi": 0.0 * t}
         return Log(name, t, {**pose, "delta": random.normal(0.0, 0.2, size)})
 
-    codes = [one.code for one in inspect_together([log("a"), log("b"), log("c")]).findings]
+    codes = [one.code for one in inspect_log_set([log("a"), log("b"), log("c")]).findings]
     assert not any(code.startswith("contradicts") for code in codes)

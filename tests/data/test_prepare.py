@@ -4,20 +4,20 @@ import numpy as np
 import pytest
 
 from residnet.core.log import Log
-from residnet.core.names import STATE
-from residnet.data.prepare import PrepareConfig, Prepared, prepare, samples
+from residnet.core.names import STATE_NAMES
+from residnet.data.prepare import PrepareConfig, PreparedLog, make_samples, prepare_log
 from residnet.data.windows import WindowStore
-from residnet.judge.freerun import Errors, Prediction
-from residnet.judge.protocol import Windows
+from residnet.judge.freerun import FreeRunErrors, Prediction
+from residnet.judge.protocol import WindowProtocol
 from residnet.physics.signals import SignalsConfig
 
 STEP = 0.1
 
 
-def made(hold: str, *, broken: bool = False) -> Prepared:
+def made(hold: str, *, broken: bool = False) -> PreparedLog:
     """Six seconds of a steady vessel whose input is t^2, with a break at sample 30 where asked."""
     t = STEP * np.arange(60)
-    channels = {name: np.zeros(60) for name in STATE} | {"n": t**2}
+    channels = {name: np.zeros(60) for name in STATE_NAMES} | {"n": t**2}
     if broken:
         channels["u"][28:31] = np.nan
     config = PrepareConfig.model_validate(
@@ -27,12 +27,12 @@ def made(hold: str, *, broken: bool = False) -> Prepared:
             "hold": hold,
         }
     )
-    return prepare(Log("made", t, channels, manoeuvre="made"), "train", ("n",), config)
+    return prepare_log(Log("made", t, channels, manoeuvre="made"), "train", ("n",), config)
 
 
 def test_an_input_is_held_from_the_sample_unless_told_otherwise() -> None:
     log = made("start")
-    assert np.array_equal(log.w, log.recorded)
+    assert np.array_equal(log.w, log.rate_inputs)
     assert np.allclose(log.w[:, 0], (STEP * np.arange(60)) ** 2)
 
 
@@ -40,10 +40,12 @@ def test_an_input_is_held_from_the_sample_unless_told_otherwise() -> None:
 def test_a_mean_over_the_step_ends_with_the_piece(broken: bool) -> None:
     log = made("mean", broken=broken)
     for k in range(60):
-        if log.piece[k] < 0:
+        if log.segment[k] < 0:
             continue
-        goes_on = k + 1 < 60 and log.piece[k + 1] == log.piece[k]
-        expected = (log.recorded[k] + log.recorded[k + 1]) / 2 if goes_on else log.recorded[k]
+        goes_on = k + 1 < 60 and log.segment[k + 1] == log.segment[k]
+        expected = (
+            (log.rate_inputs[k] + log.rate_inputs[k + 1]) / 2 if goes_on else log.rate_inputs[k]
+        )
         assert log.w[k] == pytest.approx(expected)
 
 
@@ -52,7 +54,7 @@ def test_a_mean_over_the_step_ends_with_the_piece(broken: bool) -> None:
 def test_a_channel_that_nothing_uses_changes_nothing(kind: str, step: float) -> None:
     random = np.random.default_rng(1)
     t = 0.1 * np.arange(400)
-    channels = {name: 0.1 * np.sin(t + k) for k, name in enumerate((*STATE, "n"))}
+    channels = {name: 0.1 * np.sin(t + k) for k, name in enumerate((*STATE_NAMES, "n"))}
     other = random.normal(size=t.size)
     spoiled = {
         "gaps": random.random(t.size) < 0.3,
@@ -71,10 +73,10 @@ def test_a_channel_that_nothing_uses_changes_nothing(kind: str, step: float) -> 
         }
     )
     alone, beside = (
-        prepare(Log("made", t, content, manoeuvre="made"), "train", ("n",), config)
+        prepare_log(Log("made", t, content, manoeuvre="made"), "train", ("n",), config)
         for content in (channels, {**channels, "voltage": other})
     )
-    assert alone.good.sum() > 100
+    assert alone.trainable.sum() > 100
     for name in ("y", "smooth", "nu_dot", "w", "piece", "usable", "good"):
         np.testing.assert_array_equal(getattr(alone, name), getattr(beside, name))
 
@@ -87,7 +89,7 @@ def test_masked_outliers_reach_neither_fits_nor_scores_nor_the_start_of_a_window
     bad = np.array([0, 57, 200, 311]) if kind == "outlier" else np.array([57, 200, 311])
     spiked = u.copy()
     spiked[bad] += 0.5
-    zeros = {name: np.zeros(400) for name in STATE}
+    zeros = {name: np.zeros(400) for name in STATE_NAMES}
     log = Log("spiked", t, {**zeros, "u": spiked, "n": np.ones(400)}, manoeuvre="made")
     derivative = {"kind": "savitzky_golay", "window": 0.5, "order": 2}
     config = PrepareConfig.model_validate(
@@ -97,21 +99,21 @@ def test_masked_outliers_reach_neither_fits_nor_scores_nor_the_start_of_a_window
             "masks": [{"kind": kind, "channels": ["u"]}],
         }
     )
-    found = prepare(log, "train", ("n",), config)
+    found = prepare_log(log, "train", ("n",), config)
     assert np.isin(bad, np.flatnonzero(~found.usable)).all()
     assert (~found.usable).sum() <= bad.size + 4
-    assert not found.good[bad].any()
+    assert not found.trainable[bad].any()
     signals = SignalsConfig(inputs=("n",)).build()
-    learned = samples([found], signals)
+    learned = make_samples([found], signals)
     # pieces end at an outlier, so that no derivative holds it
-    assert float((learned.column("u") - 2.0).abs().max()) < 0.35
+    assert float((learned.channel("u") - 2.0).abs().max()) < 0.35
     assert float(learned.target[:, 0].abs().max()) < 0.2
-    store = WindowStore.gather([found])
+    store = WindowStore.from_logs([found])
     assert not store.usable[bad].any()
-    windows = Windows(length=10.0, first=5.7).windows(found, 0, STEP)
+    windows = WindowProtocol(length=10.0, first=5.7).make_windows(found, 0, STEP)
     assert windows[0].start == 58
     true = np.zeros((400, 6))
     true[:, 3] = u
     perfect = [Prediction(true[w.start : w.stop], False) for w in windows]
-    errors = Errors.of(windows, perfect, [found])
+    errors = FreeRunErrors.from_predictions(windows, perfect, [found])
     np.testing.assert_allclose(errors.rmse, 0.0, atol=1e-12)

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.readers import ReaderConfig
@@ -21,7 +21,7 @@ def build(
     channels: dict[str, Any], kind: str = "csv", time: dict[str, str] | None = None, **options: Any
 ) -> LogReader:
     config = {"kind": kind, "time": time or {"column": "t"}, "channels": channels, **options}
-    return validate(config, ReaderConfig, "test").build()
+    return validate_config(config, ReaderConfig, "test").build()
 
 
 SIMPLE = {"u": {"column": "u", "unit": "m/s"}, "v": {"column": "v", "unit": "m/s"}}
@@ -204,7 +204,7 @@ def test_canonical_round_trip_keeps_masks_and_origin(tmp_path: Path) -> None:
     log = read(tmp_path, ROWS).replace(masks={"hard:gap": np.array([False, True])})
     log.save(tmp_path / "other.parquet")
     again = (
-        validate({"kind": "canonical"}, ReaderConfig, "test")
+        validate_config({"kind": "canonical"}, ReaderConfig, "test")
         .build()
         .read(tmp_path / "other.parquet")
     )
@@ -240,4 +240,6 @@ def test_faulty_canonical_logs(
 ) -> None:
     log.save(tmp_path / "a.parquet")
     with pytest.raises(error, match=words):
-        validate({"kind": "canonical"}, ReaderConfig, "test").build().read(tmp_path / "a.parquet")
+        validate_config({"kind": "canonical"}, ReaderConfig, "test").build().read(
+            tmp_path / "a.parquet"
+        )

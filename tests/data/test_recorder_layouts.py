@@ -12,19 +12,19 @@ from drafted_logs import assert_read, drafted
 from scipy.spatial.transform import Rotation
 
 import residnet
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import DataError
-from residnet.core.layout import SIX, Live
+from residnet.core.layout import SIX_DOF_LAYOUT, DegreesOfFreedom
 from residnet.core.log import Log
-from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.questions import DraftNotes
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.detect import AutoConfig, format_of
+from residnet.data.readers.detect import AutoConfig, detect_recording_format
 from residnet.data.readers.formats.topic_folder import TopicFolderConfig
-from residnet.data.readers.recording import EVERYTHING
-from residnet.data.readers.texts import encoding_of
-from residnet.data.split import stretch_of
-from residnet.tasks.drafting import driving
+from residnet.data.readers.recording import ALL_FIELDS
+from residnet.data.readers.texts import detect_encoding
+from residnet.data.split import extract_segment
+from residnet.tasks.drafting import choose_inputs
 
 T = np.arange(0.0, 60.0, 0.2)
 PSI = 0.4 * np.sin(0.2 * T)
@@ -113,7 +113,7 @@ def test_a_table_is_read_however_it_is_written(name: str, tmp_path: Path) -> Non
     assert content["time"]["unit"] == "s"
     # the sign of degrees is another letter in encodings that nobody can tell apart
     unsigned = name.endswith(("cp850", "mac_roman"))
-    assert any("no unit" in text for _, text in marks.guesses) == unsigned
+    assert any("no unit" in text for _, text in marks.guessed_values) == unsigned
 
 
 @pytest.mark.parametrize("lost", [1, 2, 7])
@@ -129,7 +129,7 @@ def test_the_encoding_may_be_told_and_is_checked(tmp_path: Path) -> None:
         drafted(path, encoding="utf-8")
     # the first megabyte may be plain ASCII
     path.write_bytes(b"t,note\n" + b"1.0,calm\n" * 130_000 + "2.0,Böe\n".encode("cp1252"))
-    assert encoding_of(path) == "cp1252"
+    assert detect_encoding(path) == "cp1252"
 
 
 def test_recordings_that_a_shell_of_windows_wrote(tmp_path: Path) -> None:
@@ -137,10 +137,10 @@ def test_recordings_that_a_shell_of_windows_wrote(tmp_path: Path) -> None:
     sums = [np.bitwise_xor.reduce([*body.encode()]) for body in bodies]
     lines = "".join(f"${body}*{total:02X}\r\n" for body, total in zip(bodies, sums, strict=True))
     (path := tmp_path / "log.txt").write_bytes(lines.encode("utf-16"))
-    found = format_of(path)
+    found = detect_recording_format(path)
     assert found is not None
     assert found.name == "NMEA 0183"
-    latitude = AutoConfig().load(path, EVERYTHING).series["RMC"].fields["latitude"]
+    latitude = AutoConfig().load(path, ALL_FIELDS).series["RMC"].fields["latitude"]
     np.testing.assert_allclose(latitude, [59 + (54.320 + 0.001 * i) / 60 for i in range(5)])
     (topics := tmp_path / "topics").mkdir()
     for name in ("pose", "speed"):
@@ -162,7 +162,7 @@ def test_a_line_is_called_by_its_number_in_the_file(tmp_path: Path) -> None:
         lines[30] = ";".join(wrong)
         path.write_text("\n".join([*lines, ""]))
         with pytest.raises(DataError, match=said):
-            validate(content, ReaderConfig, "here").build().read(path)
+            validate_config(content, ReaderConfig, "here").build().read(path)
 
 
 def test_a_sheet_with_a_title_and_units(tmp_path: Path) -> None:
@@ -194,7 +194,7 @@ def test_commands_that_are_no_angles_and_no_revolutions(
     (path := tmp_path / "log.csv").write_text("\n".join([*text(columns), ""]))
     log, _, marks = drafted(path)
     assert_read(log, {channel: read}, 1e-6)
-    told = " ".join(text for key, text in marks.guesses if key[-1] == "delta")
+    told = " ".join(text for key, text in marks.guessed_values if key[-1] == "delta")
     assert ("35 deg" in told) == (name == "Ruder")
 
 
@@ -212,8 +212,8 @@ def test_times_that_are_days_whole_seconds_or_beside_a_counter(tmp_path: Path) -
     assert "coarse_stamps" in [found["code"] for found in log.meta["findings"]]
     # times of Unix keep their digits where a log is cut
     log = Log("log", 1.75e9 + T, {"x": NORTH}, {"x": "m"})
-    first = stretch_of(log, -np.inf, 1.75e9 + 20.0)
-    second = stretch_of(log, 1.75e9 + 20.0, np.inf)
+    first = extract_segment(log, -np.inf, 1.75e9 + 20.0)
+    second = extract_segment(log, 1.75e9 + 20.0, np.inf)
     assert first.name != second.name
     assert len(first) + len(second) == len(log)
 
@@ -234,7 +234,7 @@ def test_times_that_are_days_whole_seconds_or_beside_a_counter(tmp_path: Path) -
 def test_what_is_no_table_is_refused_in_one_line(content: bytes, said: str, tmp_path: Path) -> None:
     (path := tmp_path / "log.csv").write_bytes(content)
     with pytest.raises(DataError, match=said) as refused:
-        draft_tables([path], Marks())
+        draft_tables([path], DraftNotes())
     assert "\n" not in str(refused.value)
 
 
@@ -243,10 +243,10 @@ def test_a_second_compass_is_no_input() -> None:
     names = ("x", "y", "psi", "u", "v", "r", "delta", "backup_compass_heading", "bucket")
     units = dict.fromkeys(names, "-") | {"delta": "rad"}
     channels = {name: np.sin((1.0 + i) * t) for i, name in enumerate(names)}
-    marks = Marks()
-    assert driving([Log("log", t, channels, units)], marks) == ("delta", "bucket")
+    marks = DraftNotes()
+    assert choose_inputs([Log("log", t, channels, units)], marks) == ("delta", "bucket")
     assert any("backup_compass" in text for _, text in marks.notes)
-    assert any(text.startswith("bucket is taken") for _, text in marks.guesses)
+    assert any(text.startswith("bucket is taken") for _, text in marks.guessed_values)
 
 
 def test_a_name_that_stands_twice(tmp_path: Path) -> None:
@@ -254,11 +254,13 @@ def test_a_name_that_stands_twice(tmp_path: Path) -> None:
     path, lines = tmp_path / "log.csv", text(COLUMNS)
     path.write_text("\n".join([lines[0].replace("Ost", "Kurs"), *lines[1:]]))
     _, content, marks = drafted(path)
-    assert any("more than once" in said for _, said in marks.guesses)
+    assert any("more than once" in said for _, said in marks.guessed_values)
     entry = content["channels"]["psi"]
     assert entry["column"] == "Kurs.0"
     entry |= {"column": "Kurs.1", "unit": "deg"}
-    assert_read(validate(content, ReaderConfig, "here").build().read(path), {"psi": PSI}, 1e-5)
+    assert_read(
+        validate_config(content, ReaderConfig, "here").build().read(path), {"psi": PSI}, 1e-5
+    )
 
 
 def test_odometry_of_ros_under_water(tmp_path: Path) -> None:
@@ -276,11 +278,11 @@ def test_odometry_of_ros_under_water(tmp_path: Path) -> None:
             columns[f"twist.twist.{kind}.{axis}"] = sign * log[name]
     (folder := tmp_path / "dive").mkdir()
     pd.DataFrame(columns).to_csv(folder / "odom.csv", index=False)
-    for name in {*log.channels} - {*SIX.names, "t"}:
+    for name in {*log.channels} - {*SIX_DOF_LAYOUT.state_names, "t"}:
         table = pd.DataFrame({"time": log.t, "data": log[name]})
         table.to_csv(folder / f"{name}.csv", index=False)
     (read,) = residnet.read_logs(folder)
-    assert Live.told(read.channels).spatial
+    assert DegreesOfFreedom.from_channels(read.channels).is_six_dof
     for name in ("z", "phi", "theta", "u", "v", "w", "p", "q", "r"):
         at = np.interp(read.t, log.t - log.t[0], log[name])
         np.testing.assert_allclose(read[name], at, atol=1e-3, err_msg=name)

@@ -15,15 +15,15 @@ from written_logs import EPOCH, reader_for, trial
 from written_recorders import ORIGIN
 
 import residnet
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.detect import format_of
+from residnet.data.readers.detect import detect_recording_format
 
 
 def read(path: Path, **config: Any) -> Log:
-    return validate(config, ReaderConfig, "test").build().read(path)
+    return validate_config(config, ReaderConfig, "test").build().read(path)
 
 
 def codes(log: Log) -> set[str]:
@@ -75,7 +75,7 @@ def test_no_other_frame_is_tried_where_the_format_fixes_it(
     (got,) = residnet.read_logs([path])
     for name in ("psi", "u", "v", "r"):
         np.testing.assert_allclose(got[name], log[name], atol=1e-5, err_msg=name)
-    assert "standard_messages" not in residnet.draft(path).config["data"]["reader"]
+    assert "standard_messages" not in residnet.draft_config(path).config["data"]["reader"]
 
 
 def test_past_midnight(tmp_path: Path) -> None:
@@ -166,7 +166,7 @@ def test_ardupilot_as_text(tmp_path: Path) -> None:
         lines.append(f"RCOU, {at}, {pulses[0]}, 0, {pulses[1]}")
     path = tmp_path / "00000042.log"
     path.write_text("\n".join(lines) + "\n")
-    found = format_of(path)
+    found = detect_recording_format(path)
     assert found is not None
     assert found.name == "ArduPilot log"
     (read,) = residnet.read_logs(path)

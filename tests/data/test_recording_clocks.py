@@ -10,7 +10,7 @@ from printed_times import EPOCH, printed
 
 from residnet.core.errors import DataError, UsageError
 from residnet.data.readers.recording import Recording, Series
-from residnet.data.readers.topics import align_clocks, traffic
+from residnet.data.readers.topics import align_clocks, topic_statistics
 from residnet.data.readers.written import parse_numbers, parse_texts
 
 RNG = np.random.default_rng(7)
@@ -51,13 +51,13 @@ def test_zones_unix_times_and_plain_seconds() -> None:
     for scale in (1, 10**3, 10**6, 10**9):
         whole = parse_numbers(np.array([EPOCH, EPOCH + 2], dtype=np.int64) * scale)
         np.testing.assert_array_equal(whole.ns, np.array([EPOCH, EPOCH + 2]) * 10**9)
-        assert whole.absolute
+        assert whole.is_absolute
     plain = parse_texts(np.array(["-0.5", "0.25", "1e1"], dtype=object))
     np.testing.assert_array_equal(plain.ns, [-5 * 10**8, 25 * 10**7, 10**10])
     np.testing.assert_array_equal(
         parse_texts(np.array(["-0.5", "12.25"], dtype=object)).ns, [-5 * 10**8, 1225 * 10**7]
     )
-    assert not plain.absolute
+    assert not plain.is_absolute
     with pytest.raises(DataError, match="row 2 is no date or time"):
         parse_texts(np.array(["2025-04-11 09:15:45", "soon"], dtype=object))
     with pytest.raises(DataError, match="is no date"):
@@ -79,10 +79,10 @@ def test_dates_whose_seconds_repeat_over_rows(form: str, ahead: int) -> None:
     texts = np.array([form.format(f"{n // 10:02d}", n % 10) for n in tenths], dtype=object)
     start = np.datetime64("2025-04-11T09:15:00", "ns").astype(np.int64)
     expected = start - ahead * 3600 * 10**9 + tenths * 10**8
-    np.testing.assert_array_equal(parse_texts(texts, dates=True).ns, expected)
+    np.testing.assert_array_equal(parse_texts(texts, has_only_dates=True).ns, expected)
     for end in (".5", " :20"):
         with pytest.raises(DataError, match="row 3 is no date or time"):
-            parse_texts(np.array([*texts[:2], texts[0] + end], dtype=object), dates=True)
+            parse_texts(np.array([*texts[:2], texts[0] + end], dtype=object), has_only_dates=True)
 
 
 # clocks
@@ -167,7 +167,7 @@ def test_order_of_rows() -> None:
 
 
 def seen(one: Series) -> set[str]:
-    return {entry["code"] for entry in traffic(one) if entry["level"] != "note"}
+    return {entry["code"] for entry in topic_statistics(one) if entry["level"] != "note"}
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -202,12 +202,14 @@ def test_several_publishers_are_told_from_noise_and_rounding(seed: int) -> None:
 def test_senders_tell_publishers_apart() -> None:
     t = 0.1 * np.arange(100)
     sender = np.array(["bow", "stern"] * 50, dtype=object)
-    assert [entry["code"] for entry in traffic(topic("none", np.zeros(0)))] == ["empty_topic"]
+    assert [entry["code"] for entry in topic_statistics(topic("none", np.zeros(0)))] == [
+        "empty_topic"
+    ]
     one = Series("heading", "", {"a": np.where(sender == "bow", 1.0, 2.0)}, t, None, sender)
     assert seen(one) == {"several_publishers"}
-    assert (one.of_sender("bow")["a"] == 1.0).all()
+    assert (one.rows_of_sender("bow")["a"] == 1.0).all()
     with pytest.raises(UsageError, match="no rows of sender 'midship'"):
-        one.of_sender("midship")
+        one.rows_of_sender("midship")
 
 
 def test_what_a_recording_holds_is_told_where_no_channel_is_found() -> None:
@@ -217,7 +219,7 @@ def test_what_a_recording_holds_is_told_where_no_channel_is_found() -> None:
         Series("tank", "", {"level": t, "volts": t}, t),
     ]
     whole = Recording(Path("run"), {one.name: one for one in series})
-    assert whole.contents == "/chatter (String), tank (level, volts)"
+    assert whole.describe_contents == "/chatter (String), tank (level, volts)"
     many = Recording(Path("run"), {f"s{i}": series[0] for i in range(23)})
-    assert many.contents.endswith("s19 (String), and 3 more")
-    assert Recording(Path("run"), {}).contents == "nothing"
+    assert many.describe_contents.endswith("s19 (String), and 3 more")
+    assert Recording(Path("run"), {}).describe_contents == "nothing"

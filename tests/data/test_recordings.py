@@ -10,10 +10,10 @@ import pandas as pd
 import pytest
 from printed_times import EPOCH, printed
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
-from residnet.core.progress import Progress, listen
+from residnet.core.progress import Progress, on_progress
 from residnet.data.readers import ReaderConfig
 
 
@@ -27,7 +27,7 @@ def folder(tmp_path: Path, **topics: dict[str, Any]) -> Path:
 
 def read(path: Path, **config: Any) -> Log:
     settings = {"kind": "csv_topics", "standard_messages": False, **config}
-    return validate(settings, ReaderConfig, "test").build().read(path)
+    return validate_config(settings, ReaderConfig, "test").build().read(path)
 
 
 def field(name: str, unit: str = "-", **more: Any) -> dict[str, Any]:
@@ -270,11 +270,11 @@ def test_reading_a_large_recording_reports_its_progress(
     place = folder(tmp_path, gyro={"time": t, "data": t}, log={"time": t, "data": t})
     reports: list[Progress] = []
     channels = {"r": field("gyro", "rad/s"), "u": field("log", "m/s")}
-    with listen(reports.append):
+    with on_progress(reports.append):
         read(place, channels=channels)
     assert not reports
-    monkeypatch.setattr("residnet.data.readers.base._LARGE", 1)
-    with listen(reports.append):
+    monkeypatch.setattr("residnet.data.readers.base._PROGRESS_MIN_BYTES", 1)
+    with on_progress(reports.append):
         read(place, channels=channels)
     assert {report.stage for report in reports} == {"reading run, per cent"}
     done = [report.done or 0.0 for report in reports]

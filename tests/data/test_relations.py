@@ -19,11 +19,11 @@ from hypothesis import strategies as st
 from random_vessels import KINDS, random_logs
 
 from residnet.baselines.regressors import RegressorsConfig
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.log import Log
 from residnet.core.samples import Samples
-from residnet.core.units import si_unit, to_si, units
-from residnet.data.prepare import PrepareConfig, prepare, samples
+from residnet.core.units import si_unit, to_si, unit_names
+from residnet.data.prepare import PrepareConfig, make_samples, prepare_log
 from residnet.data.readers import ReaderConfig
 from residnet.physics.signals import SignalsConfig
 
@@ -48,16 +48,18 @@ def prepared(logs: Sequence[Log], inputs: Sequence[str]) -> Samples:
     """Samples on the clock of the first log."""
     step = float(np.median(np.diff(logs[0].t)))
     derivative = {"kind": "savitzky_golay", "window": WINDOW * step, "order": 2}
-    config = validate({"grid": {"step": step}, "derivative": derivative}, PrepareConfig, "test")
+    config = validate_config(
+        {"grid": {"step": step}, "derivative": derivative}, PrepareConfig, "test"
+    )
     signals = SignalsConfig(inputs=tuple(inputs)).build()
-    return samples([prepare(log, "train", inputs, config) for log in logs], signals)
+    return make_samples([prepare_log(log, "train", inputs, config) for log in logs], signals)
 
 
 def fitted(data: Samples) -> np.ndarray:
     """The accelerations that a linear baseline, found from samples, gives for them [N, 3]."""
     config = RegressorsConfig()
     baseline = config.build(data.names)
-    config.fit(baseline, data)
+    config.fit_preferred(baseline, data)
     return np.asarray(baseline(data.z).numpy())
 
 
@@ -133,7 +135,7 @@ def test_a_log_in_two_parts_is_the_same_but_for_the_cut(
     log = logs_of(vessel)[1]
     inputs, at = inputs_of(log), round(share * len(log))
     whole = prepared([log], inputs)
-    parts = prepared([log.rows(slice(0, at)), log.rows(slice(at, None))], inputs)
+    parts = prepared([log.select_rows(slice(0, at)), log.select_rows(slice(at, None))], inputs)
     assert len(parts.z) == len(whole.z) == len(log)
     away = np.abs(np.arange(len(log)) - at + 0.5) > WINDOW / 2
     assert away.sum() == len(log) - WINDOW
@@ -147,7 +149,7 @@ def test_columns_in_any_unit_and_order(vessel: tuple[str, int], data: st.DataObj
     log = logs_of(vessel)[2]
     table, channels = {"t": log.t - log.t[0]}, {}
     for name in data.draw(st.permutations([*log.channels])):
-        alike = [unit for unit in units() if si_unit(unit) == log.units[name]]
+        alike = [unit for unit in unit_names() if si_unit(unit) == log.units[name]]
         unit = data.draw(st.sampled_from(alike))
         table[f"the {name}"] = log[name] / to_si(unit, log.units[name])
         channels[name] = {"column": f"the {name}", "unit": unit}
@@ -156,7 +158,7 @@ def test_columns_in_any_unit_and_order(vessel: tuple[str, int], data: st.DataObj
     with TemporaryDirectory() as folder:
         path = Path(folder) / "log.csv"
         pd.DataFrame(table)[columns].to_csv(path, index=False)
-        read = validate(settings, ReaderConfig, "test").build().read(path)
+        read = validate_config(settings, ReaderConfig, "test").build().read(path)
     for name in log.channels:
         apart = read[name] - log[name]
         apart -= 2.0 * np.pi * np.round(apart / (2.0 * np.pi)) * (name == "psi")
@@ -191,26 +193,26 @@ def test_a_long_log_tells_by_stretches_what_it_tells_whole(
     monkeypatch: pytest.MonkeyPatch, helm: float, gap: int
 ) -> None:
     from residnet.data import channels
-    from residnet.data.doctor import inspect, statistics
+    from residnet.data.doctor import inspect_log, statistics
 
     log = sailed(24_000 + gap, helm)
     # far from the stretches
-    log = log.rows(np.r_[0:8_500, 8_500 + gap : len(log)])
-    whole = inspect(log, ["delta"])
+    log = log.select_rows(np.r_[0:8_500, 8_500 + gap : len(log)])
+    whole = inspect_log(log, ["delta"])
     monkeypatch.setattr(statistics, "_LONG", 12_000)
     monkeypatch.setattr(channels, "_FEW", 6_000)
-    few = statistics.Record(log).few
+    few = statistics.Record(log).subsample
     assert len(few) == 12_000
     assert np.flatnonzero(np.isnan(few["r"])).tolist() == list(range(0, 12_000, 2_400))
-    told = inspect(log, ["delta"])
+    told = inspect_log(log, ["delta"])
     assert [(one.level, one.code) for one in told.findings] == [
         (one.level, one.code) for one in whole.findings
     ]
     assert {"lag", "position_jump", "spikes"} <= {one.code for one in told.findings}
     for one, other in zip(told.findings, whole.findings, strict=True):
-        assert (one.at is None) == (other.at is None)
-        if one.at is not None and other.at is not None:
-            assert np.mean(one.at != other.at) < 1e-3
+        assert (one.sample_mask is None) == (other.sample_mask is None)
+        if one.sample_mask is not None and other.sample_mask is not None:
+            assert np.mean(one.sample_mask != other.sample_mask) < 1e-3
         size = {name: one.figures[name] for name in {"size", "count"} & {*one.figures}}
         assert size == pytest.approx(
             {name: other.figures[name] for name in size}, rel=0.1, abs=0.02
@@ -221,7 +223,7 @@ def test_what_a_repair_of_a_long_log_does_is_measured_within_its_stretches(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     from residnet.data.doctor import Finding, statistics
-    from residnet.data.doctor.effects import Effects
+    from residnet.data.doctor.effects import FindingEffects
 
     log, off = sailed(24_000, 0.0), 0.3
     log = log.replace(channels={**log.channels, "psi": log["psi"] + off})
@@ -232,7 +234,7 @@ def test_what_a_repair_of_a_long_log_does_is_measured_within_its_stretches(
     finding, found = Finding("will mislead", "heading", "", repair=repair), []
     for longest in (12_000, 30_000):
         monkeypatch.setattr(statistics, "_LONG", longest)
-        effects = Effects(statistics.Record(log, ["delta"]))
-        found.append(effects.measured(finding).effect)
+        effects = FindingEffects(statistics.Record(log, ["delta"]))
+        found.append(effects.measure(finding).effect)
     assert found[0] == pytest.approx(found[1], rel=0.2)
     assert found[1] == pytest.approx(2.0 * np.sin(off / 2.0), rel=0.5)

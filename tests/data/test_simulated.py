@@ -13,20 +13,20 @@ import yaml
 from scipy.signal import lfilter
 from torch import Tensor
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.data.simulated import (
-    Craft,
-    Disturbance,
-    Sea,
-    SensorNoise,
+    DisturbanceConfig,
+    SensorsConfig,
     SimulatedTrials,
-    WindField,
-    fly,
-    gusty_wind,
-    ornstein_uhlenbeck,
-    simulate,
+    SimulatedVessel,
+    TrialEnvironment,
+    WindConfig,
+    sample_ornstein_uhlenbeck,
+    simulate_manoeuvres,
+    simulate_trial_logs,
+    simulate_wind,
 )
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.simulated import PlantDynamics
@@ -37,7 +37,7 @@ from residnet.physics.vessel import load_vessel, vessel_files
 
 STEP = 0.1
 CLEAN = {"u": 0.0, "v": 0.0, "r": 0.0}
-STILL = SensorNoise(u=0, v=0, r=0)
+STILL = SensorsConfig(u=0, v=0, r=0)
 TRIALS: dict[str, Any] = {
     **{"kind": "simulated", "vessel": "wam_v_cal", "duration": 20, "step": STEP, "substeps": 1},
     "trials": [
@@ -55,12 +55,12 @@ WIND = {
 
 
 def trials(**changes: Any) -> SimulatedTrials:
-    return validate(TRIALS | changes, SimulatedTrials, "here")
+    return validate_config(TRIALS | changes, SimulatedTrials, "here")
 
 
 def logs(noise: dict[str, Any] | None = None, **changes: Any) -> list[Log]:
     config = trials(noise=CLEAN if noise is None else noise, **changes)
-    return simulate(config.draw(), config)
+    return simulate_trial_logs(config.draw_manoeuvres(), config)
 
 
 @pytest.fixture
@@ -81,36 +81,38 @@ def test_random_forces_are_drawn_as_they_always_were(windy: str) -> None:
     wind = {"speed": 5, "direction": 1.0, "gust": 1.0}
     plant = load_vessel(windy).build()
     for more in ({}, {"wind": wind, "waves": WAVES}):
-        disturbance = validate(forces | current | more, Disturbance, "here")
-        found = disturbance.series(plant, 3, 50, STEP, 7, np.random.default_rng([7, 3]))
+        disturbance = validate_config(forces | current | more, DisturbanceConfig, "here")
+        found = disturbance.draw_plant_inputs(plant, 3, 50, STEP, 7, np.random.default_rng([7, 3]))
         keep = np.exp(-STEP / 4)
         drive = np.random.default_rng([7, 3]).standard_normal((3, 50, 3)) * np.sqrt(1 - keep**2)
         drive[:, 0] /= np.sqrt(1 - keep**2)
-        expected = np.zeros((3, 50, len(plant.inputs) - 2))
+        expected = np.zeros((3, 50, len(plant.input_names) - 2))
         expected[:, :, 2:5] = lfilter([1.0], [1.0, -keep], drive, axis=1) * [20, 10, 15]
         for name, value in (*current.items(),):
-            expected[:, :, plant.inputs.index(name)] = value
+            expected[:, :, plant.input_names.index(name)] = value
         np.testing.assert_array_equal(found[:, :, :-2], expected)
         assert (np.ptp(found[:, :, -2]) > 0.1) == bool(more)
 
 
 def test_currents_by_speed_and_direction_and_of_each_trial() -> None:
-    given = Disturbance(current_speed=2.0, current_direction=np.pi / 2)
-    assert given.current() == pytest.approx((0.0, 2.0))
+    given = DisturbanceConfig(current_speed=2.0, current_direction=np.pi / 2)
+    assert given.common_current() == pytest.approx((0.0, 2.0))
     each = {"current_north": 1.0, "current_each": ["0.1 m/s", 0.4]}
-    disturbance = validate(each, Disturbance, "here")
-    drawn = disturbance.currents(400, 3)
+    disturbance = validate_config(each, DisturbanceConfig, "here")
+    drawn = disturbance.draw_currents(400, 3)
     own = (drawn[:, 0] - 1.0) + 1j * drawn[:, 1]
     assert 0.1 <= abs(own).min() < 0.11 < 0.39 < abs(own).max() <= 0.4
     assert abs((own / abs(own)).mean()) < 0.15
     plant = load_vessel("wam_v_cal").build()
-    series = disturbance.series(plant, 400, 5, STEP, 3, np.random.default_rng(0))
+    series = disturbance.draw_plant_inputs(plant, 400, 5, STEP, 3, np.random.default_rng(0))
     np.testing.assert_array_equal(series[:, :, 5:7], np.repeat(drawn[:, None], 5, axis=1))
 
 
 def test_gusts_have_the_stated_spread_memory_and_spectrum() -> None:
     step, time, lag = 0.5, 6.0, 12
-    process = ornstein_uhlenbeck(np.random.default_rng(0), (200, 2048, 1), step, time)[:, :, 0]
+    process = sample_ornstein_uhlenbeck(np.random.default_rng(0), (200, 2048, 1), step, time)[
+        :, :, 0
+    ]
     assert process.var() == pytest.approx(1.0, rel=0.03)
     memory = np.mean(process[:, lag:] * process[:, :-lag])
     assert memory == pytest.approx(np.exp(-lag * step / time), abs=0.03)
@@ -121,8 +123,8 @@ def test_gusts_have_the_stated_spread_memory_and_spectrum() -> None:
     np.testing.assert_allclose(power[low], stated, rtol=0.35)
     assert power[low].mean() == pytest.approx(stated.mean(), rel=0.05)
     for gust in (0.0, 1.0):
-        wind = WindField(speed=7.0, direction=2.0, gust=gust, correlation=1.0)
-        speed, direction = gusty_wind(wind, 20, 3000, 0.5, 0).values()
+        wind = WindConfig(speed=7.0, direction=2.0, gust=gust, correlation=1.0)
+        speed, direction = simulate_wind(wind, 20, 3000, 0.5, 0).values()
         off = speed * np.exp(1j * (direction - 2.0)) - 7.0
         assert [off.real.std(), off.imag.std()] == pytest.approx([gust, gust], rel=0.03, abs=1e-9)
 
@@ -230,11 +232,13 @@ def test_what_cannot_be_is_one_line(
     assert "\n" not in str(caught.value)
 
 
-def ship(disturbance: Disturbance) -> tuple[Craft, Sea]:
+def ship(disturbance: DisturbanceConfig) -> tuple[SimulatedVessel, TrialEnvironment]:
     plant = load_vessel("wam_v_cal").build()
     dynamics, helm = PlantDynamics(plant, STEP, 1), Helm.from_plant(plant)
-    craft = Craft("wam_v_cal", dynamics, helm, plant.commands, plant.approach(1))
-    return craft, Sea(plant, disturbance, STILL, 0)
+    craft = SimulatedVessel(
+        "wam_v_cal", dynamics, helm, plant.n_commands, plant.make_initial_state(1)
+    )
+    return craft, TrialEnvironment(plant, disturbance, STILL, 0)
 
 
 class Runaway(Dynamics):
@@ -252,14 +256,16 @@ class Runaway(Dynamics):
         return out, s
 
 
-def runaway(start: float = 0.0) -> Craft:
+def runaway(start: float = 0.0) -> SimulatedVessel:
     names = ("x", "y", "psi", "u", "v", "r"), ("cmd_n", "wind_speed", "wind_dir")
     helm = Helm(lambda drive, steer: drive.unsqueeze(-1), *names)
-    return Craft("runaway", Runaway(), helm, 1, torch.full((1, 6), start, dtype=torch.float64))
+    return SimulatedVessel(
+        "runaway", Runaway(), helm, 1, torch.full((1, 6), start, dtype=torch.float64)
+    )
 
 
 def test_logs_end_where_the_manoeuvre_does() -> None:
-    craft, sea = ship(Disturbance())
+    craft, sea = ship(DisturbanceConfig())
     turn: dict[str, Any] = {"drive": 0.6, "steer": 0.6, "start": 3, "until": math.pi / 2}
     manoeuvres: list[Manoeuvre] = [
         TurningCircle(**turn),
@@ -267,42 +273,50 @@ def test_logs_end_where_the_manoeuvre_does() -> None:
         TurningCircle(**turn, duration=4),
         ConstantInput(drive=0.5, steer=0.1, name="last"),
     ]
-    flights = fly(craft, manoeuvres, sea, 20, STEP, {"vessel": "wam_v_cal"})
+    flights = simulate_manoeuvres(craft, manoeuvres, sea, 20, STEP, {"vessel": "wam_v_cal"})
     names = ["turning_circle_01", "constant_01", "turning_circle_02", "last"]
-    assert [f.log.name for f in flights] == names
-    psi = flights[0].motion["psi"]
+    assert [f.measured_log.name for f in flights] == names
+    psi = flights[0].true_log["psi"]
     assert psi[-1] >= math.pi / 2 > psi[-2]
-    assert [len(f.log) for f in flights[1:]] == [70, 40, 200]
+    assert [len(f.measured_log) for f in flights[1:]] == [70, 40, 200]
     timed_out = "timed out after 3.9 s before a heading change of 90 deg"
-    assert [f.fault for f in flights] == [None, None, timed_out, None]
-    assert flights[2].log.meta["timed_out"] is True
-    assert flights[1].log.meta["demand"]["steer"] == 0.1
-    assert flights[1].log.meta["vessel"] == "wam_v_cal"
-    np.testing.assert_array_equal(flights[1].motion["u"], flights[3].motion["u"][:70])
+    assert [f.fault_text for f in flights] == [None, None, timed_out, None]
+    assert flights[2].measured_log.meta["timed_out"] is True
+    assert flights[1].measured_log.meta["demand"]["steer"] == 0.1
+    assert flights[1].measured_log.meta["vessel"] == "wam_v_cal"
+    np.testing.assert_array_equal(flights[1].true_log["u"], flights[3].true_log["u"][:70])
 
 
 def test_a_motion_that_is_not_finite_ends_there() -> None:
     # u: 0, 0.9, 1.71, 3.82, 15.5, ...: beyond the largest number after 13 steps or so
     manoeuvres = [ConstantInput(drive=drive, steer=0) for drive in (0.9, 0.1)]
-    wind = Disturbance(wind=WindField(speed=4.0, direction=1.0))
-    wild, tame = fly(runaway(), manoeuvres, Sea(None, wind, STILL, 0), 5, STEP)
-    assert wild.log.meta["diverged"] is True
-    assert np.isfinite(wild.motion["u"]).all()
-    assert 5 < len(wild.motion) < 20
-    assert "no longer finite" in str(wild.fault)
-    assert (len(tame.motion), tame.fault) == (50, None)
+    wind = DisturbanceConfig(wind=WindConfig(speed=4.0, direction=1.0))
+    wild, tame = simulate_manoeuvres(
+        runaway(), manoeuvres, TrialEnvironment(None, wind, STILL, 0), 5, STEP
+    )
+    assert wild.measured_log.meta["diverged"] is True
+    assert np.isfinite(wild.true_log["u"]).all()
+    assert 5 < len(wild.true_log) < 20
+    assert "no longer finite" in str(wild.fault_text)
+    assert (len(tame.true_log), tame.fault_text) == (50, None)
     # wind reaches a model without a vessel, and its log
-    assert (tame.motion["v"][1:] == 4.0).all()
-    assert (tame.log["wind_speed"] == 4.0).all()
-    assert (tame.log["wind_dir"] == 1.0).all()
+    assert (tame.true_log["v"][1:] == 4.0).all()
+    assert (tame.measured_log["wind_speed"] == 4.0).all()
+    assert (tame.measured_log["wind_dir"] == 1.0).all()
     with pytest.raises(DataError, match="constant_01: the motion is not finite from its first"):
-        fly(runaway(math.nan), manoeuvres, Sea(None, Disturbance(), STILL, 0), 5, STEP)
+        simulate_manoeuvres(
+            runaway(math.nan),
+            manoeuvres,
+            TrialEnvironment(None, DisturbanceConfig(), STILL, 0),
+            5,
+            STEP,
+        )
 
 
 def test_a_manoeuvre_stops_in_waves_too() -> None:
-    craft, sea = ship(validate({"waves": WAVES}, Disturbance, "here"))
+    craft, sea = ship(validate_config({"waves": WAVES}, DisturbanceConfig, "here"))
     zigzag = Zigzag(drive=0.6, steer=0.5, heading=0.3, start=5, reversals=2)
-    (flight,) = fly(craft, [zigzag], sea, 40, STEP)
-    assert flight.fault is None
-    assert len(flight.motion) < 350
-    assert np.abs(flight.motion["v"][:50]).max() > 0, "the waves push before the first order"
+    (flight,) = simulate_manoeuvres(craft, [zigzag], sea, 40, STEP)
+    assert flight.fault_text is None
+    assert len(flight.true_log) < 350
+    assert np.abs(flight.true_log["v"][:50]).max() > 0, "the waves push before the first order"

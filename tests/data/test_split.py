@@ -9,12 +9,18 @@ import numpy as np
 import pytest
 from known_logs import wavy
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
-from residnet.data.doctor import inspect_together
-from residnet.data.sources import MeasuredLogs, read_logs
-from residnet.data.split import SplitConfig, check_leaks, divided, log_names, without_copies
+from residnet.data.doctor import inspect_log_set
+from residnet.data.sources import MeasuredLogs, read_split_logs
+from residnet.data.split import (
+    SplitConfig,
+    assign_log_names,
+    check_leaks,
+    remove_copies,
+    split_logs,
+)
 
 FILES = ("turning/a", "turning/b", "zigzag/c", "zigzag/d", "zigzag/deep/e", "odd [1]")
 
@@ -29,7 +35,7 @@ def root(tmp_path: Path) -> Path:
 
 
 def resolve(root: Path, **config: Any) -> dict[str, list[str]]:
-    found = validate({"root": str(root), **config}, SplitConfig, "test").resolve()
+    found = validate_config({"root": str(root), **config}, SplitConfig, "test").resolve_paths()
     return {
         split: [path.relative_to(root).as_posix() for path in paths]
         for split, paths in found.items()
@@ -61,7 +67,7 @@ def test_patterns_and_files_of_them(root: Path, tmp_path_factory: pytest.TempPat
     elsewhere = tmp_path_factory.mktemp("configs") / "split.yaml"
     for file, given in ((root / "split.yaml", {}), (elsewhere, {"root": str(root)})):
         file.write_text(text)
-        parts = validate({"file": str(file), **given}, SplitConfig, "test").resolve()
+        parts = validate_config({"file": str(file), **given}, SplitConfig, "test").resolve_paths()
         assert parts["test"] == [root / "turning/a.csv", root / "turning/b.csv"]
 
 
@@ -103,7 +109,7 @@ def test_faulty_splits(root: Path, config: dict[str, Any], words: str) -> None:
         (root / "split.yaml").write_text(config["file"])
         config = {"file": str(root / "split.yaml")}
     with pytest.raises(ConfigError, match=words) as caught:
-        validate({"root": str(root), **config}, SplitConfig, "test").files()
+        validate_config({"root": str(root), **config}, SplitConfig, "test").list_files()
     assert "\n" not in str(caught.value)
 
 
@@ -113,7 +119,7 @@ def test_logs_of_one_name_are_told_apart_by_their_folders(root: Path) -> None:
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_text("t\n")
     paths = sorted(root.rglob("*.*"))
-    names = log_names([*paths, paths[0]])
+    names = assign_log_names([*paths, paths[0]])
     assert len(set(names.values())) == len(names) == len(paths)
     told = {path.relative_to(root).as_posix(): name for path, name in names.items()}
     expected = {
@@ -137,7 +143,7 @@ def saved(folder: Path, *names: str) -> None:
 def splits(root: Path, **split: Any) -> dict[str, list[tuple[str, float, float]]]:
     """Name, first and last time of every log by split."""
     settings = {"reader": {"kind": "canonical"}, "split": {"root": str(root), **split}}
-    read = read_logs(validate(settings, MeasuredLogs, "here"))
+    read = read_split_logs(validate_config(settings, MeasuredLogs, "here"))
     return {
         name: [(log.name, float(log.t[0]), round(float(log.t[-1]), 6)) for log in logs]
         for name, logs in read.items()
@@ -179,7 +185,7 @@ def test_residnet_divides_many_logs_and_cuts_few(tmp_path: Path) -> None:
         "test": ["turn_2", "zigzag_1", "zigzag_4"],
     }
     log = wavy(seconds=100.0)
-    cut = divided([log.rows(slice(500)).replace(name="copy"), log])
+    cut = split_logs([log.select_rows(slice(500)).replace(name="copy"), log])
     assert {split: [one.name for one in logs] for split, logs in cut.items()} == {
         "train": ["wavy_0s_30s", "wavy_50s_79p9s"],
         "validation": ["wavy_30s_50s"],
@@ -190,7 +196,7 @@ def test_residnet_divides_many_logs_and_cuts_few(tmp_path: Path) -> None:
 
 
 def copied(log: Log, start: int, stop: int, turns: int = 0) -> Log:
-    part = log.rows(slice(start, stop))
+    part = log.select_rows(slice(start, stop))
     channels = {**part.channels, "psi": part["psi"] + 2.0 * np.pi * turns}
     return part.replace(name="copy", t=part.t - part.t[0], channels=channels)
 
@@ -211,8 +217,8 @@ def test_copies_across_splits_are_found(monkeypatch: pytest.MonkeyPatch) -> None
         monkeypatch.setattr("residnet.data.split.LARGE", most)
         with pytest.raises(DataError, match=words):
             check_leaks(logs)
-        assert inspect_together([log, copied(log, 700, 1200)]).find("copied_part")
-    check_leaks(logs, rows=500)
+        assert inspect_log_set([log, copied(log, 700, 1200)]).find_by_code("copied_part")
+    check_leaks(logs, max_shared_rows=500)
     check_leaks({"train": [log, copy, log], "test": [other(0)]})
     check_leaks({"train": [log, log]})
     check_leaks({})
@@ -236,11 +242,11 @@ def test_rows_between_two_fixes_are_no_copies() -> None:
             f"run{seed}", t, {"x": np.where(fixed, place, np.nan), "n": np.round(5 + t // 20)}
         )
 
-    check_leaks({"train": [sailed(1)], "test": [sailed(2)]}, rows=2)
+    check_leaks({"train": [sailed(1)], "test": [sailed(2)]}, max_shared_rows=2)
     copied = sailed(1).replace(name="again")
     with pytest.raises(DataError, match="share 200 identical rows"):
-        check_leaks({"train": [sailed(1)], "test": [copied]}, rows=2)
-    assert [log.name for log in without_copies([sailed(1), sailed(2), copied])] == ["run1", "run2"]
+        check_leaks({"train": [sailed(1)], "test": [copied]}, max_shared_rows=2)
+    assert [log.name for log in remove_copies([sailed(1), sailed(2), copied])] == ["run1", "run2"]
 
 
 def test_folders_called_after_the_splits_are_the_splits(tmp_path: Path) -> None:
@@ -250,14 +256,14 @@ def test_folders_called_after_the_splits_are_the_splits(tmp_path: Path) -> None:
         source = str(tmp_path / folder / f"{number}.csv")
         channels = {"u": np.random.default_rng(number).normal(size=t.size)}
         logs.append(Log(f"log{number}", t, channels, {"u": "m/s"}, meta={"source": source}))
-    found = {split: [log.name for log in part] for split, part in divided(logs).items()}
+    found = {split: [log.name for log in part] for split, part in split_logs(logs).items()}
     assert found == {"train": ["log0", "log1", "log2"], "validation": ["log4"], "test": ["log3"]}
     # without a folder for validation some of training are
-    found = {split: [log.name for log in part] for split, part in divided(logs[:4]).items()}
+    found = {split: [log.name for log in part] for split, part in split_logs(logs[:4]).items()}
     assert found == {"train": ["log0", "log1"], "validation": ["log2"], "test": ["log3"]}
     # `trials/test_3.csv` alone says nothing
     named = [log.replace(meta={"source": f"trials/test_{i}.csv"}) for i, log in enumerate(logs)]
-    assert [len(part) for part in divided(named).values()] == [3, 1, 1]
+    assert [len(part) for part in split_logs(named).values()] == [3, 1, 1]
 
 
 @pytest.mark.parametrize(
@@ -267,4 +273,4 @@ def test_a_verdict_has_its_test_logs_where_eight_can_be_divided(
     count: int, parts: list[int]
 ) -> None:
     logs = [Log(f"{k}", np.arange(3.0), {"u": np.arange(3.0) + k}) for k in range(count)]
-    assert [len(part) for part in divided(logs).values()] == parts
+    assert [len(part) for part in split_logs(logs).values()] == parts

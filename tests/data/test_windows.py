@@ -13,13 +13,13 @@ from made_logs import random_runs
 
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.core.names import STATE
-from residnet.data.module import RowsDataModule, Windows, WindowsDataModule
-from residnet.data.prepare import Prepared
-from residnet.data.windows import WindowBatches, WindowStage, WindowStore
+from residnet.core.names import STATE_NAMES
+from residnet.data.module import RowsDataModule, WindowBatch, WindowsDataModule
+from residnet.data.prepare import PreparedLog
+from residnet.data.windows import WindowSampler, WindowStage, WindowStore
 
 
-def broken_log(seed: int, count: int) -> Prepared:
+def broken_log(seed: int, count: int) -> PreparedLog:
     """Random numbers in stretches; the second stretch follows the first at once, so that only the
     label tells them apart.
     """
@@ -32,22 +32,22 @@ def broken_log(seed: int, count: int) -> Prepared:
     usable = random_runs(count, random, 12.0) & (piece >= 0)
     good = usable & (random.random(count) < 0.8)
     log = Log(
-        f"log_{seed}", 0.1 * np.arange(count), {name: y[:, i] for i, name in enumerate(STATE)}
+        f"log_{seed}", 0.1 * np.arange(count), {name: y[:, i] for i, name in enumerate(STATE_NAMES)}
     )
-    return Prepared(
+    return PreparedLog(
         log, "train", y, y + 0.5, random.normal(size=(count, 3)), w, w, piece, usable, good
     )
 
 
 LOGS = [broken_log(seed, count) for seed, count in enumerate((300, 1, 240, 400))]
-STORE = WindowStore.gather(LOGS, torch.float64)
+STORE = WindowStore.from_logs(LOGS, torch.float64)
 # (log, sample) of every row of the store
 ROWS = [(number, k) for number, log in enumerate(LOGS) for k in range(len(log))]
 
 
 def stretch(number: int, k: int) -> tuple[int, int]:
     """First sample of the stretch that holds sample k of a log, and one past its last."""
-    piece = LOGS[number].piece
+    piece = LOGS[number].segment
     first = last = k
     while first > 0 and piece[first - 1] == piece[k]:
         first -= 1
@@ -61,9 +61,9 @@ def expected_starts(length: int) -> list[int]:
     for row, (number, k) in enumerate(ROWS):
         log = LOGS[number]
         if (
-            log.piece[k] >= 0
+            log.segment[k] >= 0
             and k + length <= stretch(number, k)[1]
-            and log.good[k]
+            and log.trainable[k]
             and log.usable[k : k + length].sum() >= 0.5 * length
         ):
             out.append(row)
@@ -72,10 +72,10 @@ def expected_starts(length: int) -> list[int]:
 
 @pytest.mark.parametrize("length", [1, 2, 7, 20])
 def test_windows_start_where_the_loop_says_and_hold_the_logs_samples(length: int) -> None:
-    starts = STORE.starts(length)
+    starts = STORE.find_starts(length)
     assert starts.tolist() == expected_starts(length)
     names = ("y", "smooth", "nu_dot", "w", "usable", "good")
-    taken = {name: STORE.take(getattr(STORE, name), starts, length) for name in names}
+    taken = {name: STORE.take_windows(getattr(STORE, name), starts, length) for name in names}
     for i, row in enumerate(starts.tolist()):
         number, k = ROWS[row]
         for name, values in taken.items():
@@ -89,20 +89,20 @@ def test_windows_start_where_the_loop_says_and_hold_the_logs_samples(length: int
 def test_reach_depth_and_beginnings_are_those_of_the_stretch() -> None:
     for row, (number, k) in enumerate(ROWS):
         first, end = stretch(number, k)
-        if LOGS[number].piece[k] >= 0:
-            assert (int(STORE.depth[row]), int(STORE.reach[row])) == (k - first, end - k)
+        if LOGS[number].segment[k] >= 0:
+            assert (int(STORE.n_elapsed[row]), int(STORE.n_remaining[row])) == (k - first, end - k)
         else:
-            assert int(STORE.reach[row]) == 0
+            assert int(STORE.n_remaining[row]) == 0
     starts = expected_starts(5)
     for lead in (0, 1, 4):
         expected = [row for row in starts if ROWS[row][1] - stretch(*ROWS[row])[0] == lead]
-        assert STORE.beginnings(5, lead).tolist() == expected
+        assert STORE.find_segment_starts(5, lead).tolist() == expected
         assert expected
 
 
 def test_history_repeats_the_first_sample_of_a_stretch_that_is_too_short() -> None:
-    starts, length, padded = STORE.starts(3), 6, 0
-    y, w = STORE.history(starts, length)
+    starts, length, padded = STORE.find_starts(3), 6, 0
+    y, w = STORE.take_history(starts, length)
     for i, row in enumerate(starts.tolist()):
         number, k = ROWS[row]
         first, _ = stretch(number, k)
@@ -111,11 +111,11 @@ def test_history_repeats_the_first_sample_of_a_stretch_that_is_too_short() -> No
         np.testing.assert_array_equal(y[i, :, 2:].numpy(), LOGS[number].y[samples, 2:])
         np.testing.assert_array_equal(w[i].numpy(), LOGS[number].w[samples])
     assert 0 < padded < len(starts)
-    assert STORE.history(starts, 0)[0].shape == (len(starts), 0, 6)
+    assert STORE.take_history(starts, 0)[0].shape == (len(starts), 0, 6)
 
 
 def test_too_long_a_window_is_one_line_and_unknown_values_reach_no_tensor() -> None:
-    for wanted in (lambda: STORE.starts(500), lambda: STORE.beginnings(5, 300)):
+    for wanted in (lambda: STORE.find_starts(500), lambda: STORE.find_segment_starts(5, 300)):
         with pytest.raises(DataError, match="no training log holds a window of") as caught:
             wanted()
         assert "\n" not in str(caught.value)
@@ -125,20 +125,22 @@ def test_too_long_a_window_is_one_line_and_unknown_values_reach_no_tensor() -> N
 
 
 def test_batches_depend_on_seed_and_epoch_alone() -> None:
-    batches = WindowBatches(torch.arange(100, 190), batch=8, steps=5)
-    first = batches.epoch(3, 7)
+    batches = WindowSampler(torch.arange(100, 190), batch_size=8, n_batches=5)
+    first = batches.draw_epoch(3, 7)
     torch.manual_seed(123)
-    assert torch.equal(WindowBatches(torch.arange(100, 190), batch=8, steps=5).epoch(3, 7), first)
+    assert torch.equal(
+        WindowSampler(torch.arange(100, 190), batch_size=8, n_batches=5).draw_epoch(3, 7), first
+    )
     assert first.shape == (5, 8)
-    assert not torch.equal(batches.epoch(3, 8), first)
-    assert not torch.equal(batches.epoch(4, 7), first)
+    assert not torch.equal(batches.draw_epoch(3, 8), first)
+    assert not torch.equal(batches.draw_epoch(4, 7), first)
 
 
 def test_batches_draw_without_replacement_as_far_as_the_starts_last() -> None:
     starts = torch.arange(100, 190)
-    drawn = WindowBatches(starts, batch=9, steps=10).epoch(0, 0)
+    drawn = WindowSampler(starts, batch_size=9, n_batches=10).draw_epoch(0, 0)
     assert sorted(drawn.flatten().tolist()) == starts.tolist()
-    twice = WindowBatches(starts, batch=10, steps=20).epoch(0, 0).flatten()
+    twice = WindowSampler(starts, batch_size=10, n_batches=20).draw_epoch(0, 0).flatten()
     counts = torch.bincount(twice - 100)
     assert set(counts.tolist()) == {2, 3}
     assert len(set(twice[:90].tolist())) == len(set(twice[90:180].tolist())) == 90
@@ -147,9 +149,12 @@ def test_batches_draw_without_replacement_as_far_as_the_starts_last() -> None:
 def test_a_data_module_gives_whole_windows_stage_by_stage(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    stages = [WindowStage(3, 4), WindowStage(5, 6, history=2, begun=2, lead=3)]
-    data = WindowsDataModule(STORE, stages, 2, seed=9, stage=lambda epoch: min(epoch, 1))
-    seen: list[tuple[Windows, ...]] = []
+    stages = [
+        WindowStage(3, 4),
+        WindowStage(5, 6, n_history=2, n_segment_start_windows=2, n_lead=3),
+    ]
+    data = WindowsDataModule(STORE, stages, 2, seed=9, get_stage=lambda epoch: min(epoch, 1))
+    seen: list[tuple[WindowBatch, ...]] = []
     for epoch in range(3):
         trainer = SimpleNamespace(current_epoch=epoch, global_rank=0, world_size=1)
         monkeypatch.setattr(data, "trainer", trainer)
@@ -160,24 +165,24 @@ def test_a_data_module_gives_whole_windows_stage_by_stage(
     ]
     anywhere, begun = seen[-1]
     assert (anywhere.past_y.shape[1], begun.past_y.shape[1]) == (2, 3)
-    assert begun.depth.tolist() == [3, 3]
-    starts = WindowBatches(STORE.starts(5), 4, 2).epoch(9, 2)[1]
+    assert begun.n_elapsed.tolist() == [3, 3]
+    starts = WindowSampler(STORE.find_starts(5), 4, 2).draw_epoch(9, 2)[1]
     for row, start in enumerate(starts.tolist()):
         whole = slice(start, start + 5)
         for part in ("y", "smooth", "nu_dot", "w", "recorded", "usable", "good"):
             assert torch.equal(getattr(anywhere, part)[row], getattr(STORE, part)[whole])
-    past, w_past = STORE.history(starts, 2)
+    past, w_past = STORE.take_history(starts, 2)
     assert torch.equal(anywhere.past_y, past)
     assert torch.equal(anywhere.past_w, w_past)
 
 
 def test_every_epoch_goes_through_all_rows_in_an_order_of_its_own() -> None:
     data = RowsDataModule((torch.arange(10), -torch.arange(10)), 4, seed=3)
-    first, second = (list(data.batches(epoch)) for epoch in (0, 1))
+    first, second = (list(data.iterate_batches(epoch)) for epoch in (0, 1))
     assert [len(rows) for rows, _ in first] == [4, 4, 2]
-    assert len(list(data.train_dataloader())) == data.steps == 3
+    assert len(list(data.train_dataloader())) == data.n_batches == 3
     rows = [torch.cat([part for part, _ in batches]) for batches in (first, second)]
     assert all(torch.equal(-part, other) for part, other in first)
     assert torch.equal(rows[0].sort().values, torch.arange(10))
     assert not torch.equal(*rows)
-    assert torch.equal(rows[0], torch.cat([part for part, _ in data.batches(0)]))
+    assert torch.equal(rows[0], torch.cat([part for part, _ in data.iterate_batches(0)]))

@@ -26,7 +26,7 @@ from typer.main import get_command
 
 import residnet
 from residnet.cli import app
-from residnet.core.config import load_config, load_mapping, validate
+from residnet.core.config import load_config, load_mapping, validate_config
 from residnet.physics.vessel import VesselConfig
 from residnet.tasks.registry import TaskConfig
 
@@ -90,7 +90,7 @@ def test_yaml_is_read(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     if "task" in content:
         if content.get("data", {}).get("kind") == "measured":
             content["data"]["split"]["root"] = str(tmp_path)  # the logs are the reader's own
-        assert validate(content, TaskConfig, str(block)).task == content["task"]
+        assert validate_config(content, TaskConfig, str(block)).task == content["task"]
     elif block.text.startswith("# fragment: "):
         assert fragment(block.text).task == "fit"
     else:
@@ -116,7 +116,7 @@ def fragment(text: str) -> Any:
     else:
         whole |= part
         whole["signals"]["exogenous"] = ["wind_speed", "wind_dir"]
-    return validate(whole, TaskConfig, text)
+    return validate_config(whole, TaskConfig, text)
 
 
 @pytest.mark.parametrize("block", of_kind("sh"))

@@ -11,7 +11,7 @@ from read_page import plain
 from scipy.integrate import solve_ivp
 from tiny import Command, read_json, write_yaml
 
-from residnet.documents.halvorsen2019.breeding import TRUTH, NoiseConfig, RecordConfig
+from residnet.documents.halvorsen2019.breeding import TRUE_COEFFICIENTS, NoiseConfig, RecordConfig
 
 SMALL: dict[str, Any] = {
     "task": "breeding",
@@ -30,7 +30,7 @@ SMALL: dict[str, Any] = {
 
 def test_record_against_scipy() -> None:
     config = RecordConfig(length=20.0)
-    record = config.record(config.period)
+    record = config.simulate(config.period)
     t = 0.1 * np.arange(200)
 
     def rate(_: float, y: np.ndarray) -> list[float]:
@@ -42,7 +42,7 @@ def test_record_against_scipy() -> None:
     np.testing.assert_allclose(
         record["u_dot"], -1.3 * record["u"] + 0.1 * record["tau_x"] - 0.5 * record["x"], atol=1e-15
     )
-    assert pytest.approx({"tau_x": 0.1, "u": -1.3, "x": -0.5}) == TRUTH
+    assert pytest.approx({"tau_x": 0.1, "u": -1.3, "x": -0.5}) == TRUE_COEFFICIENTS
     assert set(record["tau_x"]) == {-1.0, 1.0}
 
 
@@ -51,8 +51,8 @@ def test_record_against_scipy() -> None:
     [("output", {"u_dot"}), ("inputs", {"x", "u", "tau_x"}), ("all", {"x", "u", "tau_x", "u_dot"})],
 )
 def test_noise_as_a_share_of_the_range(on: str, noisy: set[str]) -> None:
-    record = RecordConfig().record(18.0)
-    made = NoiseConfig.model_validate({"on": on, "factor": 0.2}).added(
+    record = RecordConfig().simulate(18.0)
+    made = NoiseConfig.model_validate({"on": on, "factor": 0.2}).add_noise(
         record, np.random.default_rng(0)
     )
     for name, values in record.items():
@@ -82,12 +82,12 @@ def test_a_grid_runs(tmp_path: Path, command: Command) -> None:
 def test_a_late_force_and_its_correction() -> None:
     """The force that acts and the one that the record tells move by themselves."""
     plain, late = RecordConfig(length=30.0), RecordConfig(length=30.0, delay=0.5)
-    told = RecordConfig(length=30.0, delay=0.5, corrected=0.5).record(10.0)
-    record = late.record(10.0)
-    np.testing.assert_array_equal(record["tau_x"], plain.record(10.0)["tau_x"])
+    told = RecordConfig(length=30.0, delay=0.5, corrected=0.5).simulate(10.0)
+    record = late.simulate(10.0)
+    np.testing.assert_array_equal(record["tau_x"], plain.simulate(10.0)["tau_x"])
     np.testing.assert_array_equal(told["tau_x"][5:], record["tau_x"][:-5])
     np.testing.assert_array_equal(told["u_dot"], record["u_dot"])
     explained = -1.3 * told["u"] + 0.1 * told["tau_x"] - 0.5 * told["x"]
     np.testing.assert_allclose(told["u_dot"], explained, atol=1e-15)
-    silent = NoiseConfig(on="none", factor=0.5).added(told, np.random.default_rng(0))
+    silent = NoiseConfig(on="none", factor=0.5).add_noise(told, np.random.default_rng(0))
     assert all((silent[name] == told[name]).all() for name in told)

@@ -18,7 +18,11 @@ import residnet
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, DataError, FitError, UsageError
 from residnet.documents.jervan2020.force_logs import compare_accelerations
-from residnet.documents.jervan2020.measured import ForceResidualConfig, better, force_study
+from residnet.documents.jervan2020.measured import (
+    ForceResidualConfig,
+    is_significantly_better,
+    run_force_study,
+)
 from residnet.physics.force_model import FERRY_TERMS
 
 CONFIG = Path(residnet.__file__).parents[2] / "configs" / "studies" / "jervan2020" / "measured.yaml"
@@ -51,10 +55,10 @@ def log(
     """A csv like the measured ones: tau = F_believed + missing (500 u_dot + 80 v|v| on surge and
     sway) + noise.
     """
-    hull = load_config(CONFIG, [f"data.root={folder}"], ForceResidualConfig).hull()
+    hull = load_config(CONFIG, [f"data.root={folder}"], ForceResidualConfig).believed_hull()
     t, nu, nu_dot = motion(seed, seconds)
     with torch.no_grad():
-        force = hull.required(torch.from_numpy(nu_dot), torch.from_numpy(nu)).numpy()
+        force = hull.required_force(torch.from_numpy(nu_dot), torch.from_numpy(nu)).numpy()
     random = np.random.default_rng(seed + 100)
     u, v, r = nu.T
     extra = np.stack((500 * nu_dot[:, 0], 300 * v * np.abs(v), 400 * nu_dot[:, 2]), axis=1)
@@ -82,25 +86,25 @@ def config(folder: Path, *overrides: str, **models: dict[str, Any]) -> ForceResi
 
 def studied(settings: ForceResidualConfig) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the rows by model, and all results."""
-    results, _ = force_study(settings)
+    results, _ = run_force_study(settings)
     return {row["model"]: row for row in results["rows"]}, results
 
 
 def test_what_the_hull_lacks_is_found_and_said(tmp_path: Path) -> None:
     log(tmp_path)
     settings = config(tmp_path, plsr={"fit": {"kind": "plsr"}}, ridge=RIDGE)
-    results, figures = force_study(settings)
+    results, figures = run_force_study(settings)
     rows = {row["model"]: row for row in results["rows"]}
     for name in ("ridge", "plsr"):
-        assert better(rows[name], "believed") == [True] * 4
-        assert better(rows[name], "zero")[3]
+        assert is_significantly_better(rows[name], "believed") == [True] * 4
+        assert is_significantly_better(rows[name], "zero")[3]
     # noise of 2 N is all that is left
     assert all(2.0 < value < 8.0 for value in rows["ridge"]["mse"])
     coefficients = dict(zip(FERRY_TERMS, results["models"]["ridge"]["coefficients"], strict=True))
     assert coefficients["u_dot"][0] == pytest.approx(500, rel=0.05)
     assert coefficients["r_dot"][2] == pytest.approx(400, rel=0.05)
-    assert "in the mean over the axes: plsr and ridge." in " ".join(settings.verdict(results))
-    titles = [section.title for section in settings.sections(results, tmp_path / "run")]
+    assert "in the mean over the axes: plsr and ridge." in " ".join(settings.summarize(results))
+    titles = [section.title for section in settings.build_sections(results, tmp_path / "run")]
     # the first picture has no title
     assert titles[:3] == ["", "Data and cross-validation", "Commanded and actual force"]
     assert "Residual of the actual force" in titles
@@ -112,9 +116,11 @@ def test_a_residual_of_noise_is_said_to_be_none(tmp_path: Path) -> None:
     settings = config(tmp_path, ols={"fit": {"kind": "ols"}}, surface={"fit": {"kind": "surface"}})
     rows, results = studied(settings)
     assert [*rows] == ["zero", "believed", "ols", "surface"]
-    assert not any(any(better(rows[name], "believed")) for name in ("ols", "surface"))
-    assert better(rows["believed"], "zero")[3]
-    said = settings.verdict(results)
+    assert not any(
+        any(is_significantly_better(rows[name], "believed")) for name in ("ols", "surface")
+    )
+    assert is_significantly_better(rows["believed"], "zero")[3]
+    said = settings.summarize(results)
     assert "None of the 2 regressions is better" in " ".join(said)
     assert "Recommended: the believed model alone in surge, sway and yaw." in said
 
@@ -129,10 +135,10 @@ def test_a_believed_model_that_is_worse_than_no_force_is_no_yardstick(tmp_path: 
     settings = config(tmp_path)
     rows, results = studied(settings)
     assert rows["ridge"]["reference"] == ["zero"] * 3
-    assert better(rows["ridge"], "believed") == [True] * 4
-    assert not any(better(rows["ridge"], "reference"))
+    assert is_significantly_better(rows["ridge"], "believed") == [True] * 4
+    assert not any(is_significantly_better(rows["ridge"], "reference"))
     assert rows["believed"]["minus_zero"]["ci95"][3][0] > 0
-    said = " ".join(settings.verdict(results))
+    said = " ".join(settings.summarize(results))
     for words in (
         "worse than no force in surge, sway and yaw",
         "None of the 1 regressions is better than the better of no force",
@@ -143,32 +149,32 @@ def test_a_believed_model_that_is_worse_than_no_force_is_no_yardstick(tmp_path: 
 
 def test_folds_are_stretches_of_one_log_with_a_gap_and_whole_logs_of_three(tmp_path: Path) -> None:
     log(tmp_path)
-    measured = config(tmp_path).measured()
+    measured = config(tmp_path).read_logs()
     # the sensor that is off is calibrated
-    surge, sway = (measured.acceleration[name] for name in ("surge", "sway"))
+    surge, sway = (measured.acceleration_comparison[name] for name in ("surge", "sway"))
     assert surge["offset"] == pytest.approx(OFFSET, abs=1e-4)
     assert surge["offset_ci95"][0] <= OFFSET <= surge["offset_ci95"][1] + 1e-6
     assert sway["offset"] == pytest.approx(0.0, abs=1e-4)
-    record, test = measured.split(2, 5.0)
-    assert measured.parts == "stretches"
+    record, test = measured.split_fold(2, 5.0)
+    assert measured.fold_unit == "stretches"
     near = torch.nn.functional.max_pool1d(test.double()[None, None], 101, 1, 50)[0, 0] > 0
-    assert not bool((near & record.train).any())
-    assert int((~near & ~record.train).sum()) == int((~measured.good & ~near).sum())
+    assert not bool((near & record.is_training).any())
+    assert int((~near & ~record.is_training).sum()) == int((~measured.usable & ~near).sum())
     for number, name in enumerate(("two", "three")):
         log(tmp_path, name, seed=number + 1, seconds=100.0)
-    measured = config(tmp_path).measured()
-    record, test = measured.split(0, 5.0)
-    assert (measured.names, measured.parts) == (("one", "three", "two"), "logs")
-    first = slice(record.runs[0])
+    measured = config(tmp_path).read_logs()
+    record, test = measured.split_fold(0, 5.0)
+    assert (measured.names, measured.fold_unit) == (("one", "three", "two"), "logs")
+    first = slice(record.run_lengths[0])
     assert bool(test[first].any())
-    assert not bool(test[record.runs[0] :].any())
-    assert not bool(record.train[first].any())
+    assert not bool(test[record.run_lengths[0] :].any())
+    assert not bool(record.is_training[first].any())
     # no segment reaches across logs
-    ends = torch.tensor(record.runs).cumsum(0)[:-1]
+    ends = torch.tensor(record.run_lengths).cumsum(0)[:-1]
     assert bool((record.fold[ends] != record.fold[ends - 1]).all())
     log(tmp_path, "copy")
     with pytest.raises(DataError, match="identical rows"):
-        config(tmp_path).measured()
+        config(tmp_path).read_logs()
 
 
 def test_outliers_and_gaps_are_left_out(tmp_path: Path) -> None:
@@ -176,10 +182,10 @@ def test_outliers_and_gaps_are_left_out(tmp_path: Path) -> None:
     u[700] += 3.0
     v[1500:1600] = np.nan
     log(tmp_path, u=u, v=v)
-    measured = config(tmp_path).measured()
-    assert not bool(measured.good[700])
-    assert not bool(measured.good[1500:1600].any())
-    assert measured.masked["one"]["outlier"] > 0
+    measured = config(tmp_path).read_logs()
+    assert not bool(measured.usable[700])
+    assert not bool(measured.usable[1500:1600].any())
+    assert measured.masked_shares["one"]["outlier"] > 0
     assert bool(torch.isfinite(measured.record.command).all())
     assert all(value < 8.0 for value in studied(config(tmp_path))[0]["ridge"]["mse"])
 
@@ -205,7 +211,7 @@ def test_a_model_that_is_not_determined_is_set_aside_and_said(tmp_path: Path) ->
     assert list(results["models"]) == ["ridge"]
     said = "model earth: a force constant in earth axes does not show"
     assert results["failed"]["earth"].startswith(said)
-    titles = [section.title for section in settings.sections(results, tmp_path / "run")]
+    titles = [section.title for section in settings.build_sections(results, tmp_path / "run")]
     assert "Not determined by these logs" in titles
 
 
@@ -224,7 +230,7 @@ def test_data_that_determine_nothing_are_clear_errors(
 ) -> None:
     log(tmp_path, **spoil)
     with pytest.raises((ConfigError, DataError, FitError, UsageError), match=said):
-        force_study(config(tmp_path, *overrides))
+        run_force_study(config(tmp_path, *overrides))
 
 
 def test_comparison_of_accelerations_without_segments_has_no_interval() -> None:

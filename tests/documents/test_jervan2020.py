@@ -14,28 +14,33 @@ from kinds import of_kind
 
 import residnet
 from residnet.baselines.given import BelievedConfig
-from residnet.control.motion import Derivatives, Lag, course, needed_force
+from residnet.control.motion import (
+    ActuatorLag,
+    PoseDerivatives,
+    required_force,
+    sample_filtered_course,
+)
 from residnet.core.config import load_config
 from residnet.core.errors import FitError
 from residnet.documents.jervan2020.ferry import (
     FerryModelConfig,
+    FerryStudy,
     FerryStudyConfig,
-    Flown,
-    identify,
-    objections,
-    record_of,
-    still_fits,
-    study,
-    written,
+    build_record,
+    compare_residuals,
+    identify_model,
+    list_feed_forward_objections,
+    run_ferry_study,
+    write_results,
 )
 from residnet.documents.jervan2020.residual import (
-    constant_force,
-    forward_equations,
+    derive_forward_equations,
+    estimate_earth_force,
     missing_coefficients,
 )
-from residnet.export import exporter
+from residnet.export import get_exporter
 from residnet.export.feed_forward import ExportedForce, RequiredForce
-from residnet.physics.force_model import FERRY_TERMS, Correction, ForceModel
+from residnet.physics.force_model import FERRY_TERMS, ForceCorrection, ForceModel
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
@@ -49,44 +54,48 @@ def config(name: str, *overrides: str) -> FerryStudyConfig:
 
 
 @pytest.fixture(scope="module")
-def short() -> Flown:
+def short() -> FerryStudy:
     torch.set_num_threads(1)
-    return study(config("operation", *SHORT, "~crossing", "models.plsr={fit: {kind: plsr}}"))
+    return run_ferry_study(
+        config("operation", *SHORT, "~crossing", "models.plsr={fit: {kind: plsr}}")
+    )
 
 
 def hull(name: str) -> Any:
     return of_kind(load_vessel(name).build(), HullPlant).hull
 
 
-def test_the_lag_and_the_missing_half_are_found_and_flown(short: Flown) -> None:
-    model, course = short.models["lag_ridge"], short.flights["course"]
-    before, after = course["believed"].tracking, course["lag_ridge"].tracking
+def test_the_lag_and_the_missing_half_are_found_and_flown(short: FerryStudy) -> None:
+    model, course = short.models["lag_ridge"], short.runs["course"]
+    before, after = course["believed"].tracking_metrics, course["lag_ridge"].tracking_metrics
     left = model.test_mse(short.record)
     assert model.lag is not None
     assert model.lag.frequency == pytest.approx(2.0, rel=0.01)
     assert model.lag.damping == pytest.approx(0.8, rel=0.01)
     # the command is held for 20 ms: 10 ms on average
     assert model.lag.delay == pytest.approx(0.01, abs=0.01)
-    assert all(own < 0.02 * raw for own, raw in zip(left, short.unmodelled, strict=True))
+    assert all(own < 0.02 * raw for own, raw in zip(left, short.unmodelled_mse, strict=True))
     assert after.position_mae < 0.05 * before.position_mae
     assert after.iaew[0] < 0.05 * before.iaew[0]
-    motion = short.first.nu_dot, short.first.nu
+    motion = short.believed_run.nu_dot, short.believed_run.nu
     missed = (model.force(*motion) - hull("milliampere_half").required(*motion)).std(0)
     # over both halves: of a shortened course the second goes beyond what identified
-    assert bool((missed < 0.06 * short.first.acting.std(0)).all())
+    assert bool((missed < 0.06 * short.believed_run.thruster_force.std(0)).all())
 
 
-def test_a_fitted_model_runs_forward_as_the_true_ferry(short: Flown) -> None:
-    equations = forward_equations("milliampere", short.models["lag_ridge"].force, "lag_ridge")
+def test_a_fitted_model_runs_forward_as_the_true_ferry(short: FerryStudy) -> None:
+    equations = derive_forward_equations(
+        "milliampere", short.models["lag_ridge"].force, "lag_ridge"
+    )
     names = ("u", "v", "r", "tau_x", "tau_y", "tau_n")
     model = BelievedConfig(vessel=equations).build(names)
     # along the half that identified: shortened segments leave the other half outside of what was
     # seen
-    half = slice(0, len(short.first.t) // 2)
-    nu, acting = short.first.nu[half], short.first.acting[half]
+    half = slice(0, len(short.believed_run.t) // 2)
+    nu, acting = short.believed_run.nu[half], short.believed_run.thruster_force[half]
     with torch.no_grad():
         nu_dot = model(torch.cat((nu, acting), dim=-1))
-    torch.testing.assert_close(nu_dot, short.first.nu_dot[half], rtol=0, atol=2e-3)
+    torch.testing.assert_close(nu_dot, short.believed_run.nu_dot[half], rtol=0, atol=2e-3)
 
 
 MISSING = {
@@ -114,66 +123,72 @@ def test_what_the_believed_hull_lacks_stands_beside_what_was_found() -> None:
 def test_azimuth_thrusters_get_the_controllers_force_and_push_late() -> None:
     near = "course.waypoints=[[0, 0, 0], [2, 0, 0], [2, -1, 0], [2, -1, 20 deg]]"
     flown = config("azimuth", near, "course.interval=5 s")
-    flight = flown.ferry(flown.true).fly(flown.course, [(ForceModel(hull("milliampere")), None)])[0]
+    flight = flown.build_loop(flown.true).simulate(
+        flown.course, [(ForceModel(hull("milliampere")), None)]
+    )[0]
     # the logged force is the controller's: feed-forward and feedback, not what the thrusters make
-    motion = course(flown.course, flown.loop.step)
-    needed = needed_force(ForceModel(hull("milliampere")), motion, None, flown.loop.step)
-    expected = needed[:: flown.loop.every, :3] + flight.feedback
+    motion = sample_filtered_course(flown.course, flown.loop.step)
+    needed = required_force(ForceModel(hull("milliampere")), motion, None, flown.loop.step)
+    expected = needed[:: flown.loop.steps_per_sample, :3] + flight.feedback
     torch.testing.assert_close(flight.command, expected, rtol=1e-9, atol=1e-6)
     # and what they make is what moves the hull
     moved = hull("milliampere_azimuth_half").required(flight.nu_dot, flight.nu)
-    torch.testing.assert_close(flight.acting, moved, rtol=1e-9, atol=1e-6)
-    late = (flight.acting[4:] - flight.command[:-4]).square().mean(0)
-    assert bool((late < (flight.acting - flight.command).square().mean(0)).all())
+    torch.testing.assert_close(flight.thruster_force, moved, rtol=1e-9, atol=1e-6)
+    late = (flight.thruster_force[4:] - flight.command[:-4]).square().mean(0)
+    assert bool((late < (flight.thruster_force - flight.command).square().mean(0)).all())
 
 
-def test_lag_and_no_residual_are_tried_with_every_order(short: Flown) -> None:
+def test_lag_and_no_residual_are_tried_with_every_order(short: FerryStudy) -> None:
     believed = ForceModel(hull("milliampere"))
     wanted = FerryModelConfig.model_validate({"fit": {"kind": "plsr"}})
-    late = identify(wanted, short.record, believed)
+    late = identify_model(wanted, short.record, believed)
     assert late.lag is not None
     assert late.fit.notes["left_out"] < 0.1
     # a command that the believed model explains but for noise
     record = short.record
     force = believed(record.nu_dot, record.nu)
     noise = 50.0 * torch.randn(force.shape, generator=torch.Generator().manual_seed(0)).double()
-    explained = replace(record, command=force + noise, averaged=force + noise)
-    nothing = identify(wanted, explained, believed)
+    explained = replace(record, command=force + noise, averaged_command=force + noise)
+    nothing = identify_model(wanted, explained, believed)
     assert (nothing.lag, nothing.fit.notes["order"]) == (None, 0)
     torch.testing.assert_close(nothing.force(record.nu_dot, record.nu), force)
 
 
-def test_motions_to_port_tell_of_those_to_starboard(short: Flown) -> None:
+def test_motions_to_port_tell_of_those_to_starboard(short: FerryStudy) -> None:
     believed, record = ForceModel(hull("milliampere")), short.record
     fit = {"fit": {"kind": "plsr"}}
     found = short.models["plsr"]
     assert found.fit.notes["mirror"]
-    motion = torch.cat((record.nu_dot, record.nu), dim=-1)[~record.train].split(3, dim=-1)
+    motion = torch.cat((record.nu_dot, record.nu), dim=-1)[~record.is_training].split(3, dim=-1)
     sides = torch.tensor([1.0, -1.0, -1.0]).double()
     there, back = (found.force(*(part * by for part in motion)) for by in (1.0, sides))
     torch.testing.assert_close(there, back * sides, rtol=1e-6, atol=1e-3)
-    alone = identify(FerryModelConfig.model_validate({**fit, "mirror": False}), record, believed)
+    alone = identify_model(
+        FerryModelConfig.model_validate({**fit, "mirror": False}), record, believed
+    )
     left, more = (sum(model.test_mse(record)) for model in (found, alone))
     assert left < 0.7 * more
-    for k, (low, high) in enumerate(record.ranges(mirror=True)):
+    for k, (low, high) in enumerate(record.motion_ranges(mirror=True)):
         # nu_dot and nu: surge, sway and yaw
         assert (low == -high) == (k % 3 > 0)
     # a hull that leans to port is not taken for one that does not
     pulled = record.command + torch.tensor([0.0, 200.0, 0.0]).double()
-    leaning = replace(record, command=pulled, averaged=pulled)
-    model = identify(FerryModelConfig.model_validate(fit), leaning, believed)
+    leaning = replace(record, command=pulled, averaged_command=pulled)
+    model = identify_model(FerryModelConfig.model_validate(fit), leaning, believed)
     assert "mirror" not in model.fit.notes
 
 
-def test_what_searches_its_settings_leaves_with_the_whole_course(short: Flown) -> None:
-    assert set(short.whole) == {"plsr"}
-    judged, leaves = short.models["plsr"], short.whole["plsr"]
+def test_what_searches_its_settings_leaves_with_the_whole_course(short: FerryStudy) -> None:
+    assert set(short.whole_course_models) == {"plsr"}
+    judged, leaves = short.models["plsr"], short.whole_course_models["plsr"]
     assert leaves.lag == judged.lag is not None
     assert [leaves.fit.notes[key] for key in ("order", "mirror")] == [
         judged.fit.notes[key] for key in ("order", "mirror")
     ]
     # the model that is reported has not seen what judges it
-    half, whole = (of["plsr"].test_mse(short.record) for of in (short.models, short.whole))
+    half, whole = (
+        of["plsr"].test_mse(short.record) for of in (short.models, short.whole_course_models)
+    )
     assert all(more < less for more, less in zip(whole, half, strict=True))
 
 
@@ -181,70 +196,74 @@ def test_a_feed_forward_worse_than_the_believed_one_is_objected_to() -> None:
     flown = {"believed": {"position_mae": 0.232}, "plsr": {"position_mae": 0.688}}
     results: dict[str, Any] = {"course": flown, "crossing": {}, "feed_forward_alone": {}}
     results["models"] = {"plsr": {"share_left": [1.47, 1.47, 1.28]}}
-    _, worse = objections("plsr", results)
+    _, worse = list_feed_forward_objections("plsr", results)
     assert "0.688 m, the believed model's 0.232 m" in worse
     results["models"]["plsr"]["share_left"] = [0.1, 0.2, 1.1]
     flown["plsr"]["position_mae"] = 0.1
-    assert objections("plsr", results) == []
+    assert list_feed_forward_objections("plsr", results) == []
 
 
 @pytest.mark.long
 def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) -> None:
     case = "models.case={fit: {kind: plsr, order: 1}, fly: true}"
     wanted = config("operation", *SHORT, "~crossing", "feed_forward_alone=true", case)
-    found = study(wanted)
-    alone = found.flights["feed_forward_alone"]
+    found = run_ferry_study(wanted)
+    alone = found.runs["feed_forward_alone"]
     assert list(alone) == ["believed", "lag_ridge", "case"]
     assert not any(bool(flight.feedback.any()) for flight in alone.values())
     # the thrusters give what is asked for, and half a ferry moves about twice as much
-    ridge, believed = (alone[name].tracking for name in ("lag_ridge", "believed"))
+    ridge, believed = (alone[name].tracking_metrics for name in ("lag_ridge", "believed"))
     assert ridge.motion_mse[0] < 0.02 * believed.motion_mse[0]
-    in_course = found.flights["course"]["believed"].tracking
+    in_course = found.runs["course"]["believed"].tracking_metrics
     assert believed.position_mae > 10 * in_course.position_mae
     upside_down = found.models["case"].force.corrections[0].coefficients
     assert isinstance(upside_down, torch.Tensor)
     upside_down[:3] -= 5000.0 * torch.eye(3)
     folder = RunFolder.create(tmp_path / "run", "", resume=False)
-    results, figures = written(wanted, found, folder)
+    results, figures = write_results(wanted, found, folder)
     assert results["models"]["case"]["not_forward"].startswith("model case: its mass matrix")
     told = "With lag_ridge as feed-forward, the mean position error in the course"
-    assert any(sentence.startswith(told) for sentence in wanted.verdict(results))
-    titles = {section.title for section in wanted.sections(results, folder.path)}
+    assert any(sentence.startswith(told) for sentence in wanted.summarize(results))
+    titles = {section.title for section in wanted.build_sections(results, folder.path)}
     assert titles >= {"Models that cannot run forward in time", "Feed-forward without feedback"}
     left = {path.name for path in (tmp_path / "run" / "models").glob("*.yaml")}
     assert left == {"lag_ridge_forward.yaml"}
     drawn = {"errors_course", "forces_course", "errors_feed_forward_alone"}
     assert {figure.name for figure in figures} >= drawn
     row = results["course"]["lag_ridge"]
-    assert row["power"][0] * float(found.first.t[-1]) == pytest.approx(row["energy"][0], rel=0.01)
+    assert row["power"][0] * float(found.believed_run.t[-1]) == pytest.approx(
+        row["energy"][0], rel=0.01
+    )
 
 
 def loaded(force: RequiredForce, low: torch.Tensor, high: torch.Tensor, folder: Path) -> Any:
     ranges = list(zip(low.tolist(), high.tolist(), strict=True))
-    exporter("torchscript").export(ExportedForce("ferry", force, ranges), folder / "f.pt")
+    get_exporter("torchscript").export(ExportedForce("ferry", force, ranges), folder / "f.pt")
     return torch.jit.load(str(folder / "f.pt"))
 
 
 @torch.no_grad()
 def test_feed_forward_outside_its_range_keeps_to_the_believed_model(
-    short: Flown, tmp_path: Path
+    short: FerryStudy, tmp_path: Path
 ) -> None:
     """Far from what identified it, a wild correction commands no more than 1.2 times the hull."""
     model, most = short.models["lag_ridge"].force, torch.tensor([5.0] * 3 + [9.0] * 3)
-    asked = loaded(RequiredForce(*model.parts(), mirrored=False), -most, most, tmp_path)
-    tau, outside = asked(short.first.nu_dot, short.first.nu)
-    torch.testing.assert_close(tau, model(short.first.nu_dot, short.first.nu))
+    asked = loaded(
+        RequiredForce(*model.split_corrections(), is_mirrored=False), -most, most, tmp_path
+    )
+    tau, outside = asked(short.believed_run.nu_dot, short.believed_run.nu)
+    torch.testing.assert_close(tau, model(short.believed_run.nu_dot, short.believed_run.nu))
     assert not outside.any()
-    record = record_of(short.first, 20.0, None)
+    record = build_record(short.believed_run, 20.0, None)
     believed, random = ForceModel(hull("milliampere")), torch.Generator().manual_seed(2)
-    wild = Correction(
+    wild = ForceCorrection(
         FERRY_TERMS,
         300.0 * torch.randn(30, 3, generator=random, dtype=torch.float64),
         torch.tensor([5.0, 20.0, 30.0], dtype=torch.float64),
     )
-    motion = torch.cat((record.nu_dot, record.nu), dim=-1)[record.train]
+    motion = torch.cat((record.nu_dot, record.nu), dim=-1)[record.is_training]
     low, high = motion.amin(0), motion.amax(0)
-    force = RequiredForce(*believed.extended(wild).parts(), mirrored=True)
+    force = RequiredForce(*believed.with_correction(wild).split_corrections(), is_mirrored=True)
     asked = loaded(force, low, high, tmp_path)
     random, width = torch.Generator().manual_seed(3), high - low
     seen = low + (2.0 * torch.rand(2000, 6, generator=random, dtype=torch.float64) - 0.5) * width
@@ -281,14 +300,14 @@ def test_a_model_is_identified_again_where_its_residual_has_grown_for_long() -> 
         return scale * torch.randn(600, 3, generator=random, dtype=torch.float64)
 
     then, now, force, fold = noise(20.0), noise(20.0, 1), noise(100.0, 9), torch.arange(600) // 100
-    same = still_fits(then, now, force, fold)
+    same = compare_residuals(then, now, force, fold)
     assert same["fits"]
     assert same["growth"] == pytest.approx([1.0] * 3, rel=0.3)
     # one percent of the force is a trifle, and one gust no reason
-    assert still_fits(noise(0.1), noise(1.0, 1), force, fold)["fits"]
+    assert compare_residuals(noise(0.1), noise(1.0, 1), force, fold)["fits"]
     gust = torch.cat((6.0 * now[:100], now[100:]))
-    assert still_fits(then, gust, force, fold)["fits"]
-    grown = still_fits(then, now * torch.tensor([1.0, 3.0, 1.0]).double(), force, fold)
+    assert compare_residuals(then, gust, force, fold)["fits"]
+    grown = compare_residuals(then, now * torch.tensor([1.0, 3.0, 1.0]).double(), force, fold)
     assert (grown["fits"], grown["segments"]) == (False, [0.0, 1.0, 0.0])
 
 
@@ -301,27 +320,27 @@ def test_constant_force_needs_a_vessel_that_turns() -> None:
     earthly = torch.stack([torch.stack(column, -1) for column in columns], -1)
     force = torch.tensor([200.0, 100.0], dtype=torch.float64)
     y = x @ torch.randn(4, 3, generator=random, dtype=torch.float64) + earthly @ force
-    torch.testing.assert_close(constant_force(x, y, earthly), force, rtol=1e-8, atol=1e-6)
+    torch.testing.assert_close(estimate_earth_force(x, y, earthly), force, rtol=1e-8, atol=1e-6)
     with pytest.raises(FitError, match="kept its heading"):
-        constant_force(x, y, earthly[:1].expand(500, 3, 2))
+        estimate_earth_force(x, y, earthly[:1].expand(500, 3, 2))
 
 
 def test_the_course_is_the_filters_own_and_its_derivatives_are_consistent() -> None:
     wanted = config("operation").course
-    motion, filtered = course(wanted, 0.02), wanted.build(0.02)
+    motion, filtered = sample_filtered_course(wanted, 0.02), wanted.build(0.02)
     s, x, rows = torch.zeros(1, 9, dtype=torch.float64), torch.zeros(1, 6, dtype=torch.float64), []
     for k in range(1100):
         reference, s = filtered(x, k, s)
         rows.append(reference[0])
-    _, nu, nu_dot = motion.later(0.0)
+    _, nu, nu_dot = motion.extrapolate(0.0)
     found = torch.cat((motion.pose, nu, nu_dot), -1)[:1100]
     torch.testing.assert_close(found, torch.stack(rows), rtol=1e-9, atol=1e-10)
-    ahead = Derivatives(*(part[500] for part in motion)).later(0.2)
+    ahead = PoseDerivatives(*(part[500] for part in motion)).extrapolate(0.2)
     torch.testing.assert_close(ahead[1], nu[510], rtol=1e-3, atol=1e-5)
     torch.testing.assert_close(ahead[2], nu_dot[510], rtol=1e-2, atol=1e-4)
     # the needed force and its derivatives
-    needed = needed_force(
-        ForceModel(hull("milliampere")), motion, Lag(frequency=2.0, damping=0.8), 0.0
+    needed = required_force(
+        ForceModel(hull("milliampere")), motion, ActuatorLag(frequency=2.0, damping=0.8), 0.0
     )
     slope = (needed[2:, :3] - needed[:-2, :3]) / 0.04
     inside = slice(200, 2800)

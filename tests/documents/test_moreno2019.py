@@ -12,8 +12,8 @@ import pytest
 from kinds import of_kind
 from made_run import stored
 
-from residnet.documents import study_sections
-from residnet.documents.moreno2019 import curves, errors_of_grid
+from residnet.documents import build_study_sections
+from residnet.documents.moreno2019 import grid_errors, grid_figures
 from residnet.report.blocks import Cell, Table, Text
 from residnet.report.figure import Figure
 
@@ -56,7 +56,7 @@ def made(run: Path, models: tuple[str, ...] = MODELS) -> Path:
 
 
 def test_tables_hold_the_errors_of_the_records(tmp_path: Path) -> None:
-    (section,) = study_sections("moreno2019", made(tmp_path))
+    (section,) = build_study_sections("moreno2019", made(tmp_path))
     errors, _, figure, _ = section.blocks
     content = json.loads((tmp_path / "study.json").read_text())
     found = {(row["model"], row["split"]) for row in content["rows"]}
@@ -75,7 +75,7 @@ def test_tables_hold_the_errors_of_the_records(tmp_path: Path) -> None:
     shown = cells["polynomial p = 2, together", "test"][1]
     assert shown == Cell("0.0700", "0.0700 to 0.0700; published 0.2249")
     assert isinstance(figure, Figure)
-    assert figure.stills[0].stat().st_size > 10_000
+    assert figure.static_images[0].stat().st_size > 10_000
 
 
 def test_the_curves_are_what_the_search_tried() -> None:
@@ -89,12 +89,12 @@ def test_the_curves_are_what_the_search_tried() -> None:
     choice = [entry | {"diverged": 0} for entry in (*tried, own_width, none)]
     errors = np.arange(1.0, 19.0).reshape(2, 3, 3)
     notes = {"free_run_choice": choice, "cross_validated_error": errors.tolist()}
-    grid, one_step = errors_of_grid(notes)
+    grid, one_step = grid_errors(notes)
     widths = {(one["penalty"][0], one["sigma"][0]): one["validation"] for one in tried}
     assert grid == widths
     assert one_step[0.01, 1.0] == 1.0
     assert one_step[0.1, 10.0] == pytest.approx(np.mean([13 / 1, 14 / 2, 15 / 3]))
-    over_penalty, over_width = curves(notes)
+    over_penalty, over_width = grid_figures(notes)
     x, y = over_penalty.cases[0].curves[0]["sigma = 10"]
     assert list(x) == [0.01, 0.1, 1.0]
     assert y == pytest.approx(10.0 + x)
@@ -102,6 +102,6 @@ def test_the_curves_are_what_the_search_tried() -> None:
 
 
 def test_a_run_without_the_optional_package_says_what_it_lacks(tmp_path: Path) -> None:
-    (section,) = study_sections("moreno2019", made(tmp_path, MODELS[:-1]))
+    (section,) = build_study_sections("moreno2019", made(tmp_path, MODELS[:-1]))
     said = of_kind(section.blocks[0], Text)
     assert "Not run: symbolic regression, GPTIPS settings" in str(said)

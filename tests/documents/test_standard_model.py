@@ -13,29 +13,29 @@ from tiny import read_json
 
 from residnet.core.errors import FitError
 from residnet.core.log import Log
-from residnet.documents import published
+from residnet.documents import load_published
 from residnet.documents.halvorsen2019.sea_trial import (
     CHANNELS,
     SET_NAMES,
     PreparationConfig,
-    odin,
-    prepared,
+    load_odin,
+    prepare_logs,
 )
 from residnet.documents.halvorsen2019.standard_model import (
-    HIGH,
-    LOW,
-    NAMES,
+    LOWER,
     SCALE,
+    STANDARD_PARAMETER_NAMES,
+    UPPER,
     StandardFitConfig,
-    accelerations,
-    fit,
-    truth,
+    fit_standard_model,
+    standard_accelerations,
+    true_parameters,
 )
 from residnet.tasks.registry import load_task
 
 CONFIG = Path(__file__).parents[2] / "configs" / "studies" / "halvorsen2019" / "standard_model.yaml"
 MASS = 4935.14
-START = published("halvorsen2019")["start"]
+START = load_published("halvorsen2019")["start"]
 
 
 def states(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -67,37 +67,42 @@ def matrices(p: dict[str, float], nu: np.ndarray, tau: np.ndarray) -> np.ndarray
 
 def some(**given: float) -> dict[str, float]:
     """Return parameters near the start, but for the given ones."""
-    near = np.array([START[name] for name in NAMES])
-    near = near + SCALE * np.random.default_rng(1).uniform(-0.5, 0.5, len(NAMES))
-    return dict(zip(NAMES, np.clip(near, LOW, HIGH).tolist(), strict=True)) | given
+    near = np.array([START[name] for name in STANDARD_PARAMETER_NAMES])
+    near = near + SCALE * np.random.default_rng(1).uniform(-0.5, 0.5, len(STANDARD_PARAMETER_NAMES))
+    return (
+        dict(zip(STANDARD_PARAMETER_NAMES, np.clip(near, LOWER, UPPER).tolist(), strict=True))
+        | given
+    )
 
 
 def test_accelerations_equal_the_matrices_and_the_truth_is_the_vessel() -> None:
     nu, tau = states(30)
     p = some(X_udot=-400.0, Y_vdot=-900.0, N_rdot=-3e3)
-    found = accelerations(np.array([p[n] for n in NAMES]), MASS, nu, tau)
+    found = standard_accelerations(
+        np.array([p[n] for n in STANDARD_PARAMETER_NAMES]), MASS, nu, tau
+    )
     np.testing.assert_allclose(found, matrices(p, nu, tau), rtol=1e-10, atol=1e-12)
-    vessel = odin("odin_steady")
-    known = vessel.hull()(torch.from_numpy(nu), torch.from_numpy(tau)).numpy()
+    vessel = load_odin("odin_steady")
+    known = vessel.build_hull()(torch.from_numpy(nu), torch.from_numpy(tau)).numpy()
     # the vessel's Coriolis terms are exactly v r and -u r, those of its 4935.8 kg differ by the
     # added mass of -0.7 kg
-    np.testing.assert_allclose(matrices(truth(vessel, MASS), nu, tau), known, atol=2e-3)
+    np.testing.assert_allclose(matrices(true_parameters(vessel, MASS), nu, tau), known, atol=2e-3)
 
 
 def test_a_fit_recovers_what_is_determined_and_names_what_is_not() -> None:
     nu, tau = states(3000)
     p = some(X_udot=-400.0, Y_vdot=-900.0, N_rdot=-3e3, Y_r=700.0, N_v=500.0, N_vdot=-800.0)
-    found = fit(nu, tau, matrices(p, nu, tau), StandardFitConfig(thin=1, starts=2))
+    found = fit_standard_model(nu, tau, matrices(p, nu, tau), StandardFitConfig(thin=1, starts=2))
     assert set(found["undetermined"]) == {"I_z", "N_rdot"}
     assert found["standard_errors"]["I_z"] is found["standard_errors"]["N_rdot"] is None
-    for name, scale in zip(NAMES, SCALE, strict=True):
+    for name, scale in zip(STANDARD_PARAMETER_NAMES, SCALE, strict=True):
         if name not in (*found["undetermined"], *found["at_bound"]):
             assert found["values"][name] == pytest.approx(p[name], abs=1e-4 * scale), name
     assert found["sums"]["I_z - N_rdot"][0] == pytest.approx(p["I_z"] - p["N_rdot"], rel=1e-6)
     assert found["sums"]["m - Y_vdot"][0] == pytest.approx(MASS - p["Y_vdot"], rel=1e-6)
 
     with pytest.raises(FitError, match="14 parameters"):
-        fit(nu[:4], tau[:4], nu[:4], StandardFitConfig(thin=1))
+        fit_standard_model(nu[:4], tau[:4], nu[:4], StandardFitConfig(thin=1))
 
 
 @pytest.mark.long
@@ -108,7 +113,7 @@ def test_standard_errors_are_those_of_repeated_noise() -> None:
     names = ("X_udot", "Y_vdot", "X_|u|u", "Y_|v|v", "N_v", "Y_r")
     for seed in range(30):
         noise = np.random.default_rng(seed).normal(size=clean.shape) * [0.05, 0.05, 0.02]
-        found = fit(nu, tau, clean + noise, StandardFitConfig(thin=1, starts=1))
+        found = fit_standard_model(nu, tau, clean + noise, StandardFitConfig(thin=1, starts=1))
         errors = found["standard_errors"]
         away.append([(found["values"][name] - p[name]) / errors[name] for name in names])
     spread = np.std(away, axis=0)
@@ -127,7 +132,7 @@ def test_preparation_is_the_documents() -> None:
     log = Log("made", t, channels, dict.fromkeys(channels, "-"), "zigzag")
     interval = (0.0499, 0.0499)
     config = PreparationConfig(interval=interval, margin=1.0, stretch=10.0, validate_every=3)
-    trial = prepared([log], odin("odin_planing"), config, 0)
+    trial = prepare_logs([log], load_odin("odin_planing"), config, 0)
     z = trial.samples.z.numpy()
     assert trial.samples.names == CHANNELS
     first = round(float(trial.samples.t[0]) / 0.05)
@@ -137,8 +142,10 @@ def test_preparation_is_the_documents() -> None:
     slope = np.diff(z[:, :3], axis=0) / 0.05
     np.testing.assert_allclose(trial.samples.target.numpy()[:-1], slope, atol=1e-9)
     third = (trial.samples.t.numpy() // 10).astype(int) % 3 == 2
-    np.testing.assert_array_equal(trial.validates, third)
-    assert all((np.diff(piece) == 1).all() for piece in trial.pieces(trial.validates))
+    np.testing.assert_array_equal(trial.is_validation, third)
+    assert all(
+        (np.diff(piece) == 1).all() for piece in trial.contiguous_indices(trial.is_validation)
+    )
 
 
 def test_a_short_trial_runs(tmp_path: Path) -> None:
@@ -146,7 +153,7 @@ def test_a_short_trial_runs(tmp_path: Path) -> None:
     over = [f"trials.calm.programme={programme}", "trials.calm.preparation.validate_every=2"]
     over += ["~trials.planing", "~trials.standard", "standard.starts=1", "~published"]
     run = tmp_path / "run"
-    load_task(CONFIG, over).run(source=CONFIG, overrides=over, out=run, resume=False)
+    load_task(CONFIG, over).run(source=CONFIG, overrides=over, output_folder=run, resume=False)
     found = read_json(run / "study.json")["trials"]["calm"]
     fitted = found["standard"]["displacement"]
     assert set(fitted["undetermined"]) == {"I_z", "N_rdot"}

@@ -12,7 +12,7 @@ import pytest
 from made_run import stored
 
 from residnet.core.errors import UsageError
-from residnet.documents import study_sections, woo2018
+from residnet.documents import build_study_sections, woo2018
 from residnet.report.blocks import Table
 from residnet.report.figure import Figure
 from residnet.report.run_reader import RunFiles
@@ -86,9 +86,12 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_seven_figures_and_two_tables(study: Path) -> None:
-    (section,) = study_sections("woo2018", study)
+    (section,) = build_study_sections("woo2018", study)
     stills = [
-        path for block in section.blocks if isinstance(block, Figure) for path in block.stills
+        path
+        for block in section.blocks
+        if isinstance(block, Figure)
+        for path in block.static_images
     ]
     numbers = (9, *range(13, 19))
     assert stills == [study / "figures" / "woo2018" / f"{number}.png" for number in numbers]
@@ -106,7 +109,7 @@ def test_seven_figures_and_two_tables(study: Path) -> None:
 
 
 def test_figures_show_the_stored_numbers_of_the_typical_run(study: Path) -> None:
-    figures = {figure.name: figure for figure in woo2018.drawings(RunFiles(study))}
+    figures = {figure.name: figure for figure in woo2018.build_figures(RunFiles(study))}
     stored = pd.read_parquet(study / "rollouts" / "test" / "zigzag_03.parquet")
     # Figure 13: sway and yaw rate in the zigzag of the median error, errors below each
     panels, shown = figures["13"].panels, figures["13"].cases[0].curves
@@ -128,4 +131,4 @@ def test_figures_show_the_stored_numbers_of_the_typical_run(study: Path) -> None
 
 def test_a_missing_manoeuvre_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=f"needs a test manoeuvre of kind {KINDS[0]}"):
-        study_sections("woo2018", made_study(tmp_path / "run", kinds=KINDS[1:]))
+        build_study_sections("woo2018", made_study(tmp_path / "run", kinds=KINDS[1:]))

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from residnet.baselines.given import StillConfig
+from residnet.baselines.given import ZeroBaselineConfig
 from residnet.core.errors import ConfigError
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, PlantActuators
 from residnet.dynamics.hybrid import HybridDynamics
@@ -25,7 +25,7 @@ DEG = math.pi / 180
 
 def still(columns: tuple[str, ...], dt: float = 0.1) -> HybridDynamics:
     signals = SignalsConfig(inputs=columns).build()
-    return HybridDynamics(signals, StillConfig().build(signals.names), ZeroHead(), dt)
+    return HybridDynamics(signals, ZeroBaselineConfig().build(signals.names), ZeroHead(), dt)
 
 
 @pytest.mark.parametrize(
@@ -39,18 +39,21 @@ def test_the_gear_is_the_plants_whatever_its_kind(vessel: str) -> None:
     random = np.random.default_rng(0)
     demands = torch.from_numpy(random.uniform(-1, 1, (2, 2, 12))).repeat_interleave(5, dim=-1)
     commands = gear.demand(demands[0], demands[1])
-    w = torch.zeros(2, 60, len(plant.inputs), dtype=torch.float64)
-    w[:, :, : plant.commands] = commands
-    start = plant.approach(2)
+    w = torch.zeros(2, 60, len(plant.input_names), dtype=torch.float64)
+    w[:, :, : plant.n_commands] = commands
+    start = plant.make_initial_state(2)
     with torch.no_grad():
         truth, _, _ = Rollout(PlantDynamics(plant, step, substeps))(start, w, start[:, :0])
         model = ActuatedDynamics(still(gear.inputs[:1], step), gear.inputs[:1], "start", gear)
         mine, _, _ = Rollout(model)(model.approach(2), w, start[:, :0])
     hull = ("x", "y", "phi", "psi", "u", "v", "p", "r")
-    assert len(gear.state) == len([name for name in plant.state if name not in hull])
+    assert len(gear.state) == len([name for name in plant.state_names if name not in hull])
     for name in gear.state:
         if name != "_yaw_lag":
-            found, wanted = mine[..., model.state.index(name)], truth[..., plant.state.index(name)]
+            found, wanted = (
+                mine[..., model.state.index(name)],
+                truth[..., plant.state_names.index(name)],
+            )
             torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9)
     assert float((truth[:, -1, 0] - truth[:, 0, 0]).abs().max()) > 0.01
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ExportError
-from residnet.core.processes import spread
+from residnet.core.processes import worker_limit
 from residnet.dynamics import c_code, compiled
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.compiled import CompiledRollout, _held
@@ -136,7 +136,7 @@ def test_the_number_of_threads_changes_nothing() -> None:
     alone = CompiledRollout(rollout, *given)
     weights = list(rollout.parameters())
     one = torch.autograd.grad(alone(*given)[0].sum(), weights)
-    with spread(4):
+    with worker_limit(4):
         several = torch.autograd.grad(alone(*given)[0].sum(), weights)
     assert all(map(torch.equal, one, several))
 

@@ -21,7 +21,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.heads.base import ResidualHead, ZeroHead
 from residnet.heads.lstm import LstmConfig
-from residnet.heads.recurrent import RecurrentConfig
+from residnet.heads.recurrent import GRUEnsembleConfig
 from residnet.physics.signals import SignalsConfig
 
 A = np.array([[-0.5, 0.0, 0.0], [0.0, -0.6, -0.4], [0.0, 0.2, -0.9]])
@@ -145,7 +145,7 @@ def test_heading_and_velocities_do_not_hang_on_positions(
     names = [*TERMS[terms], "wind_u", "wind_v"] if wind else TERMS[terms]
     baseline = RegressorBaseline([names] * 3, signals.names)
     baseline.theta.data.copy_(0.3 * torch.randn(3, len(names)) - 0.6 * torch.eye(3, len(names)))
-    kind = RecurrentConfig(members=1, hidden_size=6, step=STEP) if told else LstmConfig()
+    kind = GRUEnsembleConfig(members=1, hidden_size=6, step=STEP) if told else LstmConfig()
     head = kind.build(signals.names)
     model = HybridDynamics(signals, baseline, head, STEP, integrator).double().eval()
     assert (model.missed is not None) == told

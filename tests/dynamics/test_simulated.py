@@ -55,8 +55,10 @@ class Smooth(Stepped):
         t = x[:, 6]
         n = torch.stack((25 + 5 * torch.sin(t), 18 + 4 * torch.cos(1.3 * t)), dim=-1)
         full = torch.cat((x[:, :6], n), dim=-1)
-        still = torch.zeros(len(x), len(self.plant.inputs), dtype=x.dtype)
-        return torch.cat((self.plant.rate(full, still)[:, :6], torch.ones_like(t)[:, None]), dim=-1)
+        still = torch.zeros(len(x), len(self.plant.input_names), dtype=x.dtype)
+        return torch.cat(
+            (self.plant.derivative(full, still)[:, :6], torch.ones_like(t)[:, None]), dim=-1
+        )
 
 
 class Spring(Stepped):
@@ -114,8 +116,8 @@ def test_semi_implicit_euler_keeps_an_undamped_oscillation_bounded() -> None:
 
 def test_substeps_are_steps_under_one_command() -> None:
     plant, random = load_vessel("wam_v_cal").build(), torch.Generator().manual_seed(0)
-    w = torch.rand(2, 10, len(plant.inputs), generator=random, dtype=torch.float64)
-    x0 = plant.approach(2)
+    w = torch.rand(2, 10, len(plant.input_names), generator=random, dtype=torch.float64)
+    x0 = plant.make_initial_state(2)
     states = run(PlantDynamics(plant, 0.1, substeps=5), x0, w)
     fine = run(PlantDynamics(plant, 0.02), x0, w.repeat_interleave(5, dim=1))
     torch.testing.assert_close(states, fine[:, ::5], rtol=1e-13, atol=1e-13)
@@ -128,8 +130,8 @@ def test_a_plant_that_cannot_be_recorded_is_stepped_as_it_is(
         raise ExportError("a step that Python decides by values")
 
     plant = load_vessel("wam_v_vrx").build()
-    x = plant.approach(2)
-    w, s = torch.ones(2, len(plant.inputs), dtype=torch.float64), x[:, :0]
+    x = plant.make_initial_state(2)
+    w, s = torch.ones(2, len(plant.input_names), dtype=torch.float64), x[:, :0]
     wanted = PlantDynamics(plant, 0.1, 5).step(x, w, s)[0]
     recorded = RecordedPlantDynamics(plant, 0.1, 5)
     assert torch.allclose(recorded.step(x, w, s)[0], wanted, rtol=1e-13, atol=1e-15)
@@ -143,25 +145,31 @@ def test_in_an_ambient_current_it_moves_over_ground_as_a_hull_in_the_current() -
     axis, of the roll angle's second order.
     """
     calm, felt = (
-        SteeredPlant(load_vessel("patrol_p06").build(), calm=still) for still in (True, False)
+        SteeredPlant(load_vessel("patrol_p06").build(), in_calm_water=still)
+        for still in (True, False)
     )
     current = torch.tensor([[0.7, -0.4], [0.0, 1.0]], dtype=torch.float64)
     nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(2, -1)
     steps, one = 600, torch.ones(2, dtype=torch.float64)
-    x, w = calm.start(one)
+    x, w = calm.straight_course(one)
     w[:, 0] = 0.01
     held = w.unsqueeze(1).expand(-1, steps, -1)
     model = InAmbientCurrent(calm.model(0.1), calm.state)
     water = run(model, x, held, torch.cat((current, nominal), dim=1))
-    y, w = felt.start(one)
+    y, w = felt.straight_course(one)
     w[:, 0] = 0.01
     w[:, [felt.inputs.index(f"current_{name}") for name in ("north", "east")]] = current
     # over ground it begins with the current's speed on top
-    carried = torch.stack(to_body(current[:, 0], current[:, 1], y[:, felt.column("psi")]), dim=1)
-    y[:, [felt.column("u"), felt.column("v")]] += carried
+    carried = torch.stack(
+        to_body(current[:, 0], current[:, 1], y[:, felt.state_column("psi")]), dim=1
+    )
+    y[:, [felt.state_column("u"), felt.state_column("v")]] += carried
     ground = run(felt.model(0.1), y, w.unsqueeze(1).expand(-1, steps, -1), nominal)
     for name in ("x", "y", "psi", "r", "p"):
-        found, wanted = water[:, -1, calm.column(name)], ground[:, -1, felt.column(name)]
+        found, wanted = (
+            water[:, -1, calm.state_column(name)],
+            ground[:, -1, felt.state_column(name)],
+        )
         torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-6)
     assert float((water[:, -1, 0] - x[:, 0]).abs().min()) > 50.0
 
@@ -171,11 +179,13 @@ def test_effect_and_time_of_a_varied_plant_are_gain_and_time_constant() -> None:
     variation = torch.tensor([[0.8, 1.2, 0.02], [1.2, 0.8, -0.01]], dtype=torch.float64)
     delta, steps, dt = 0.05, 200, 0.02
     w = torch.full((2, steps, 1), delta, dtype=torch.float64)
-    states = run(VariedPlant(plant, dt), plant.approach(2), w, variation)
+    states = run(VariedPlant(plant, dt), plant.make_initial_state(2), w, variation)
     for row, (effect, time, bias) in enumerate(variation.tolist()):
         steady, constant = 3.47 * (effect * delta + bias), 3.94 * time
         wanted = steady * (1 - math.exp(-steps * dt / constant))
-        assert float(states[row, -1, plant.state.index("r")]) == pytest.approx(wanted, rel=1e-8)
+        assert float(states[row, -1, plant.state_names.index("r")]) == pytest.approx(
+            wanted, rel=1e-8
+        )
     with pytest.raises(ConfigError, match="cmd_delta"):
         VariedPlant(load_vessel("wam_v_cal").build(), 0.1)
 
@@ -183,21 +193,21 @@ def test_effect_and_time_of_a_varied_plant_are_gain_and_time_constant() -> None:
 @pytest.mark.parametrize("name", ["nomoto_oceanos", "patrol_p06_linear"])
 def test_no_variation_is_the_plant(name: str) -> None:
     plant = load_vessel(name).build()
-    w = torch.zeros(1, 60, len(plant.inputs), dtype=torch.float64)
+    w = torch.zeros(1, 60, len(plant.input_names), dtype=torch.float64)
     demand = torch.tensor([[1.0], [0.2]], dtype=torch.float64)
-    w[:, :, : plant.commands] = plant.demand(*demand).unsqueeze(1)
-    x, nominal = plant.approach(1), torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
+    w[:, :, : plant.n_commands] = plant.commands_for_demand(*demand).unsqueeze(1)
+    x, nominal = plant.make_initial_state(1), torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
     mine = run(VariedPlant(plant, 0.1), x, w, nominal)
     torch.testing.assert_close(mine, run(PlantDynamics(plant, 0.1), x, w), rtol=0, atol=1e-12)
-    assert mine[0, -1, plant.state.index("psi")] > 0.05
+    assert mine[0, -1, plant.state_names.index("psi")] > 0.05
 
 
 def test_a_rudder_with_a_lag_moves_within_the_step_and_its_effect_is_varied() -> None:
     """Half of the effect at twice the angle turns the hull alike, while the gear moves on."""
     plant = load_vessel("mariner").build()
-    model, column = VariedPlant(plant, 0.5), plant.state.index("delta")
-    x, w = plant.approach(2), torch.zeros(2, len(plant.inputs), dtype=torch.float64)
-    w[:, : plant.commands] = plant.demand(torch.ones(2), torch.zeros(2)).double()
+    model, column = VariedPlant(plant, 0.5), plant.state_names.index("delta")
+    x, w = plant.make_initial_state(2), torch.zeros(2, len(plant.input_names), dtype=torch.float64)
+    w[:, : plant.n_commands] = plant.commands_for_demand(torch.ones(2), torch.zeros(2)).double()
     x[:, column] = torch.tensor([0.1, 0.2], dtype=torch.float64)
     w[:, 0] = x[:, column]
     s = torch.tensor([[1.0, 1.0, 0.0], [0.5, 1.0, 0.0]], dtype=torch.float64)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from residnet.baselines.given import StillConfig
+from residnet.baselines.given import ZeroBaselineConfig
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.errors import ConfigError, UsageError
 from residnet.dynamics.store import ModelSpec, load_model, model_names, rebuilt, save_model
@@ -26,7 +26,9 @@ def spec(**changes: object) -> ModelSpec:
         "name": "baseline",
         "role": "baseline",
         "signals": (
-            SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").resolved().model_dump()
+            SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal")
+            .with_thrusters()
+            .model_dump()
         ),
         "baseline": RegressorsConfig(terms=("u", "tau_x", "1")).model_dump(),
         "head": None,
@@ -89,7 +91,7 @@ def test_a_rebuilt_model_is_the_loaded_one_bit_for_bit(tmp_path: Path) -> None:
 
 
 def test_zero_has_no_numbers(tmp_path: Path) -> None:
-    saved(tmp_path / "zero", name="zero", role="zero", baseline=StillConfig().model_dump())
+    saved(tmp_path / "zero", name="zero", role="zero", baseline=ZeroBaselineConfig().model_dump())
     _, model = load_model(tmp_path / "zero")
     x = torch.tensor([[0.0, 0.0, 0.0, 1.0, 0.2, 0.0]])
     after, _ = model.step(x, torch.ones(1, 2), x[:, :0])

@@ -12,7 +12,7 @@ import torch
 from exported_policies import observed
 
 from residnet.dynamics.store import save_model
-from residnet.export import exporter
+from residnet.export import get_exporter
 from residnet.export.policy import ExportedHeading
 
 SOURCE = Path(__file__).parents[2] / "examples" / "autopilot_cpp"
@@ -49,8 +49,8 @@ def test_an_observed_policy_steers_alike_with_delay_and_noise(
     save_model(tmp_path / "models" / "p", spec, own)
     file = tmp_path / "exports" / "p.pt"
     file.parent.mkdir()
-    exported = ExportedHeading("p", own, safe="amidships", about={}, metrics=[])
-    exporter("torchscript").export(exported, file)
+    exported = ExportedHeading("p", own, fallback="amidships", description={}, metrics=[])
+    get_exporter("torchscript").export(exported, file)
     words = [sys.executable, str(SOURCE / "compare.py"), str(file), str(program), "--seconds", "8"]
     said = subprocess.run(words, capture_output=True, text=True, check=True).stdout
     differences = [float(line.split()[-1]) for line in said.splitlines() if "difference" in line]

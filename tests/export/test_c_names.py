@@ -16,12 +16,12 @@ import torch
 from exported_models import built
 
 from residnet.core.errors import UsageError
-from residnet.core.progress import Progress, listen
+from residnet.core.progress import Progress, on_progress
 from residnet.core.version import __version__
 from residnet.dynamics import c_code
 from residnet.dynamics.c_code import compiler
-from residnet.export import c, exporter
-from residnet.export.c import STRICT, footprint, identifier
+from residnet.export import c, get_exporter
+from residnet.export.c import STRICT_FLAGS, measure_footprint, to_c_identifier
 from residnet.export.vessel import ExportedVessel
 from residnet.judge.assessment import Assessment
 
@@ -65,19 +65,19 @@ LINKS = {
 @pytest.mark.parametrize("way", LINKS)
 def test_two_exports_of_one_model_name_serve_one_program(way: str, tmp_path: Path) -> None:
     models = {"steer.c": vessel(), "my-boat 2.c": vessel(0.5)}
-    cards = {name: exporter("c").export(made, tmp_path / name) for name, made in models.items()}
+    cards = {name: get_exporter("c").export(made, tmp_path / name) for name, made in models.items()}
     (tmp_path / "main.c").write_text(MAIN)
     parts = ("steer.c", "my-boat 2.c", "main.c")
     (tmp_path / "all.c").write_text("".join(f'#include "{part}"\n' for part in parts))
     for command in LINKS[way]:
         call = [word.format(cc=compiler()) for word in command]
-        flags = STRICT if command[0] == "{cc}" else ()
+        flags = STRICT_FLAGS if command[0] == "{cc}" else ()
         subprocess.run([*call, *flags], cwd=tmp_path, check=True)
     printed = subprocess.run([tmp_path / "main"], capture_output=True, text=True).stdout.split()
     x, w = torch.tensor([[0.0, 0, 0, 1, 0, 0]]), torch.tensor([[9.0, 9, 3, 1]])
     for found, made in zip(printed[:2], models.values(), strict=True):
         with torch.no_grad():
-            after, _ = made.at(torch.float32).step(x, w, x[:, :0])
+            after, _ = made.to_precision(torch.float32).step(x, w, x[:, :0])
         assert float(found) == pytest.approx(float(after[0, 3]), rel=1e-6)
     assert printed[0] != printed[1]
     assert printed[2:] == [card["build"]["identity"] for card in cards.values()]
@@ -90,17 +90,17 @@ def defined_symbols(library: Path) -> set[str]:
 
 
 def test_every_name_begins_with_that_of_the_file(tmp_path: Path) -> None:
-    exporter("c").export(vessel(), tmp_path / "2nd Öl.c")
+    get_exporter("c").export(vessel(), tmp_path / "2nd Öl.c")
     subprocess.run([compiler(), "-c", "2nd Öl.c", "-o", "boat.o"], cwd=tmp_path, check=True)
     symbols = defined_symbols(tmp_path / "boat.o")
-    assert f"{identifier('2nd Öl')}_step" in symbols
+    assert f"{to_c_identifier('2nd Öl')}_step" in symbols
     assert all(name.startswith("m_2nd__l_") for name in symbols)
     header = (tmp_path / "2nd Öl.h").read_text()
     assert "#ifndef M_2ND__L_H\n#define M_2ND__L_H\n" in header
     macros = re.findall(r"^#define (\w+)", header, re.M)
     assert all(name.startswith("M_2ND__L_") for name in macros)
     with pytest.raises(UsageError, match=r"math\.c: its header math\.h would hide"):
-        exporter("c").export(vessel(), tmp_path / "math.c")
+        get_exporter("c").export(vessel(), tmp_path / "math.c")
     assert not (tmp_path / "math.c").exists()
 
 
@@ -110,7 +110,7 @@ def test_the_build_identity_is_of_the_model_and_the_version(tmp_path: Path) -> N
     assert first["model_sha256"] != second["model_sha256"]
     assert first["identity"] == f"{__version__}+{first['model_sha256'][:16]}"
     for name, made in (("a", vessel()), ("b", vessel(0.5))):
-        card = exporter("c").export(made, tmp_path / f"{name}.c")
+        card = get_exporter("c").export(made, tmp_path / f"{name}.c")
         held = json.loads((tmp_path / f"{name}.card.json").read_text())
         assert held["build"] == card["build"] == made.build()
         for end in ("c", "h"):
@@ -131,8 +131,8 @@ def listened(file: Path, made: ExportedVessel) -> list[tuple[str, bool]]:
     def hear(progress: Progress) -> None:
         heard.append((progress.message, file.exists()))
 
-    with listen(hear):
-        exporter("c").export(made, file)
+    with on_progress(hear):
+        get_exporter("c").export(made, file)
     return heard
 
 
@@ -161,8 +161,8 @@ def test_stack_and_size_are_reported_before_the_file_is_written(
 
 def test_the_stack_of_a_call_holds_that_of_the_functions_that_it_calls(tmp_path: Path) -> None:
     spec, model = built("lstm")
-    exporter("c").export(ExportedVessel(spec, model), tmp_path / "boat.c")
-    size = footprint(tmp_path / "boat.c")
+    get_exporter("c").export(ExportedVessel(spec, model), tmp_path / "boat.c")
+    size = measure_footprint(tmp_path / "boat.c")
     own = size["stack_bytes"]
     called = max(own["boat_step"], own["boat_measured"])
     assert size["largest_stack_bytes"] == own["boat_warmup"] + called
@@ -189,14 +189,14 @@ def test_what_the_tools_do_not_measure_is_estimated_and_said_so(
     known: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spec, model = built("lstm")
-    exporter("c").export(ExportedVessel(spec, model), tmp_path / "boat.c")
-    measured = footprint(tmp_path / "boat.c")
+    get_exporter("c").export(ExportedVessel(spec, model), tmp_path / "boat.c")
+    measured = measure_footprint(tmp_path / "boat.c")
     path = tools(tmp_path / "bin", known)
     found = {name: f"{path}/{name}" for name in known}
     monkeypatch.delenv("CC", raising=False)
     for module in (c, c_code):
         monkeypatch.setattr(module.shutil, "which", found.get)
-    size = footprint(tmp_path / "boat.c")
+    size = measure_footprint(tmp_path / "boat.c")
     assert size["stack_from"] == "estimate"
     assert (size["code_from"] == "estimate") == ("size" not in known)
     assert size["stack_bytes"].keys() == measured["stack_bytes"].keys()
@@ -220,7 +220,7 @@ KNOWN = Assessment(
 def test_every_card_holds_verdict_findings_and_split(name: str, tmp_path: Path) -> None:
     made = vessel()
     made.assessment = KNOWN
-    card = exporter(name).export(made, tmp_path / f"boat{exporter(name).suffix}")
+    card = get_exporter(name).export(made, tmp_path / f"boat{get_exporter(name).suffix}")
     assert (card["level"], card["verdict"]) == ("limited", list(KNOWN.verdict))
     assert card["findings"] == [dict(row) for row in KNOWN.findings or ()]
     assert card["split"] == {
@@ -229,5 +229,5 @@ def test_every_card_holds_verdict_findings_and_split(name: str, tmp_path: Path) 
         "test": ["turn_2"],
     }
     made.assessment = None
-    assert (made.card()["level"], made.card()["verdict"]) == (None, [])
-    assert (made.card()["findings"], made.card()["split"]) == (None, None)
+    assert (made.build_card()["level"], made.build_card()["verdict"]) == (None, [])
+    assert (made.build_card()["findings"], made.build_card()["split"]) == (None, None)

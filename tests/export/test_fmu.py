@@ -21,7 +21,7 @@ from fmpy.validation import validate_fmu
 
 from residnet.dynamics.c_code import compiler
 from residnet.dynamics.rollout import Rollout
-from residnet.export import exporter, fmu
+from residnet.export import fmu, get_exporter
 from residnet.export.vessel import ExportedVessel
 
 pytestmark = [pytest.mark.exporters, pytest.mark.usefixtures("short_parity")]
@@ -32,7 +32,7 @@ INPUTS = {"n_port": 20.0, "n_stbd": 25.0, "wind_speed": 3.0, "wind_dir": 1.0}
 def test_a_unit_is_imported_and_stepped(name: str, tmp_path: Path) -> None:
     spec, model = built("lstm_mirror")
     file = str(tmp_path / "boat.fmu")
-    exporter(name).export(ExportedVessel(spec, model), Path(file))
+    get_exporter(name).export(ExportedVessel(spec, model), Path(file))
     assert validate_fmu(file) == []
     model = model.double()
     x0 = torch.tensor([[0.0, 0, 0, 1, 0, 0]], dtype=torch.float64)
@@ -74,7 +74,7 @@ class Unit:
         self.version = 2 if name == "fmu2" else 3
         file = folder / f"{name}.fmu"
         if not file.is_file():
-            exporter(name).export(ExportedVessel(*built("plsr")), file)
+            get_exporter(name).export(ExportedVessel(*built("plsr")), file)
         description = fmpy.read_model_description(str(file))
         self.references = {v.name: v.valueReference for v in description.modelVariables}
         self.messages: list[str] = []
@@ -195,7 +195,7 @@ def test_compilers_for_other_machines_are_used(
         ("fmu2", {"linux64/model.so", "win64/model.dll"}),
     ):
         file = tmp_path / f"{name}.fmu"
-        card = exporter(name).export(ExportedVessel(spec, model), file)
+        card = get_exporter(name).export(ExportedVessel(spec, model), file)
         found = {one for one in zipfile.ZipFile(file).namelist() if one.startswith("binaries/")}
         assert found == {f"binaries/{one}" for one in wanted}
         assert set(card["binaries"]) == {one.split("/")[0] for one in wanted}

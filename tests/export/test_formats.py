@@ -29,24 +29,31 @@ from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.lowering import lowered
 from residnet.dynamics.store import BandTable, ModelSpec
-from residnet.export import FORMATS as REGISTERED
-from residnet.export import base, exporter, torchscript, vessel
-from residnet.export.base import Loaded, RoundingError, released
-from residnet.export.c import STRICT, CasadiModel, CFunction, CompiledModel, c_files, compile_shared
-from residnet.export.onnx_file import OnnxModel, _arctangent
+from residnet.export import EXPORT_FORMATS as REGISTERED
+from residnet.export import base, get_exporter, torchscript, vessel
+from residnet.export.base import LoadedExport, RoundingError, require_releasable
+from residnet.export.c import (
+    STRICT_FLAGS,
+    CasadiModel,
+    CFunction,
+    CompiledModel,
+    compile_shared_library,
+    render_c_files,
+)
+from residnet.export.onnx_file import OnnxModel, _translate_arctangent
 from residnet.export.torchscript import AotiModel, ScriptedModel
-from residnet.export.vessel import ExportedModel, ExportedVessel
+from residnet.export.vessel import ExportedVessel, GuardedVesselModule
 from residnet.heads.symbolic import DelayConfig, SymbolicConfig, SymbolicHead
 from residnet.physics.signals import SignalsConfig
 from residnet.testing import check_bad_inputs
 from residnet.testing.checks import (
-    ROLLING,
-    SIGNALS,
-    SUBMERGED,
-    example_model,
-    example_models,
-    example_samples,
-    example_spec,
+    EXAMPLE_SIGNALS,
+    ROLLING_SIGNALS,
+    SUBMERGED_SIGNALS,
+    make_example_model,
+    make_example_models,
+    make_example_samples,
+    make_example_spec,
 )
 
 pytestmark = pytest.mark.usefixtures("short_parity")
@@ -57,12 +64,12 @@ def exported(variant: str) -> ExportedVessel:
     return ExportedVessel(*built(variant), [ROW])
 
 
-def compiled(file: Path, made: ExportedVessel) -> Loaded:
-    library = compile_shared([file], file.with_suffix(".so"))
+def compiled(file: Path, made: ExportedVessel) -> LoadedExport:
+    library = compile_shared_library([file], file.with_suffix(".so"))
     return CompiledModel(library, made, torch.float32, file.stem)
 
 
-LOADED: dict[str, Callable[[Path, ExportedVessel], Loaded]] = {
+LOADED: dict[str, Callable[[Path, ExportedVessel], LoadedExport]] = {
     "c": compiled,
     "onnx": lambda file, made: OnnxModel(file, made),
     "casadi": lambda file, made: CasadiModel(file),
@@ -84,8 +91,8 @@ QUICK = {("c", "plsr"), ("casadi", "plsr")}
 )
 def test_a_file_keeps_the_contract(name: str, variant: str, tmp_path: Path) -> None:
     made = exported(variant)
-    file = tmp_path / "deep" / f"boat{exporter(name).suffix}"
-    card = exporter(name).export(made, file)
+    file = tmp_path / "deep" / f"boat{get_exporter(name).suffix}"
+    card = get_exporter(name).export(made, file)
     parities = card["parity"].values() if name == "c" else [card["parity"]]
     for parity in parities:
         assert parity["steps"] == 60
@@ -111,14 +118,14 @@ def test_torchscript_is_the_model(variant: str, tmp_path: Path) -> None:
     """With all its methods, in single precision; the model itself is left alone."""
     made = exported(variant)
     before = copy.deepcopy(made.model.state_dict())
-    card = exporter("torchscript").export(made, tmp_path / "boat.pt")
+    card = get_exporter("torchscript").export(made, tmp_path / "boat.pt")
     extra = {"card.json": ""}
     module: Any = torch.jit.load(str(tmp_path / "boat.pt"), _extra_files=extra)
     assert json.loads(extra["card.json"]) == json.loads(json.dumps(card))
     for name, value in made.model.state_dict().items():
         torch.testing.assert_close(value, before[name], rtol=0, atol=0, equal_nan=True)
-    check_bad_inputs(module, made.spec, made.at(torch.float32), cases=100)
-    random, model = np.random.default_rng(1), made.at(torch.float32)
+    check_bad_inputs(module, made.spec, made.to_precision(torch.float32), cases=100)
+    random, model = np.random.default_rng(1), made.to_precision(torch.float32)
     x = random.normal(size=(3, 6)) * [50, 50, 3, 0.5, 0.1, 0.1] + [0, 0, 0, 1, 0, 0]
     inputs = random.uniform(LOW[3:], HIGH[3:], size=(3, 30, 4))
     x0, w = (torch.from_numpy(part).float() for part in (x, inputs))
@@ -137,14 +144,16 @@ def test_torchscript_is_the_model(variant: str, tmp_path: Path) -> None:
 def test_what_is_worse_than_nothing_is_withheld_or_marked() -> None:
     made = exported("lstm")
     with pytest.raises(WithheldError, match=r"model mine is withheld: it drifts; .* --anyway"):
-        released(made, ["it drifts"], anyway=False)
-    assert released(made, ["it drifts"], anyway=True).card()["objections"] == ["it drifts"]
-    assert released(made, [], anyway=False).card()["objections"] == []
+        require_releasable(made, ["it drifts"], allows_objections=False)
+    assert require_releasable(made, ["it drifts"], allows_objections=True).build_card()[
+        "objections"
+    ] == ["it drifts"]
+    assert require_releasable(made, [], allows_objections=False).build_card()["objections"] == []
 
 
 def test_the_card_says_what_a_controller_needs() -> None:
     made = exported("lstm")
-    card = made.card()
+    card = made.build_card()
     units = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
     assert card["schema"] == "residnet.card/1"
     assert card["states"] == [{"name": name, "unit": unit} for name, unit in units.items()]
@@ -161,14 +170,14 @@ def test_the_card_says_what_a_controller_needs() -> None:
     assert card["metrics"] == [ROW]
     assert (card["memory"], card["members"], card["band"]) == (made.model.n_state, [], None)
     assert (card["head"]["kind"], card["baseline"]["kind"]) == ("lstm", "regressors")
-    mean = ExportedVessel(*built("mean")).card()
+    mean = ExportedVessel(*built("mean")).build_card()
     told = [(member["name"], member["head"]["kind"]) for member in mean["members"]]
     assert told[:2] == [("member_0", "plsr"), ("member_1", "lstm")]
 
 
 def test_outside_flags_each_channel_beyond_its_range() -> None:
     made = exported("lstm")
-    module: Any = made.module(torch.float32)
+    module: Any = made.build_module(torch.float32)
     low, high = torch.tensor(LOW), torch.tensor(HIGH)
     middle = 0.5 * (low + high)
     # rows: the middle, both corners, then each channel just below and just above its range
@@ -187,7 +196,7 @@ def test_outside_flags_each_channel_beyond_its_range() -> None:
 def test_a_compiled_package_takes_rows_of_a_transposed_array(tmp_path: Path) -> None:
     """The package reads memory without strides, so that a view of a row must be copied first."""
     made = exported("plsr")
-    exporter("aoti").export(made, tmp_path / "boat.pt2")
+    get_exporter("aoti").export(made, tmp_path / "boat.pt2")
     loaded = AotiModel(tmp_path / "boat.pt2")
     rows = np.asfortranarray([[9.0, 12, 3, 1], [4.0, 2, 1, 0.5]], dtype=np.float32)
     x, s = np.array([0, 0, 0, 1.0, 0, 0], np.float32), np.zeros(0, np.float32)
@@ -197,9 +206,9 @@ def test_a_compiled_package_takes_rows_of_a_transposed_array(tmp_path: Path) -> 
 
 def test_casadi_has_exact_derivatives(tmp_path: Path) -> None:
     made = exported("lstm")
-    card = exporter("casadi").export(made, tmp_path / "boat.casadi")
+    card = get_exporter("casadi").export(made, tmp_path / "boat.casadi")
     assert max(card["parity"]["share_of_range"].values()) <= 1e-12
-    model = made.at(torch.float64)
+    model = made.to_precision(torch.float64)
     x = torch.tensor([[1.0, 2, 0.3, 1.1, 0.05, 0.02]], dtype=torch.float64)
     w = torch.tensor([[9.0, 12, 3, 1]], dtype=torch.float64)
     s = model.initial_state(1).double()
@@ -213,7 +222,7 @@ def test_casadi_has_exact_derivatives(tmp_path: Path) -> None:
 
 def test_c_compiles_without_warnings_and_keeps_nothing(tmp_path: Path) -> None:
     made = exported("lstm")
-    size = exporter("c").export(made, tmp_path / "boat.c")["size"]
+    size = get_exporter("c").export(made, tmp_path / "boat.c")["size"]
     assert 0 < size["stack_bytes"]["boat_step"] < size["code_bytes"]
     text = (tmp_path / "boat.c").read_text()
     assert "malloc" not in text
@@ -226,12 +235,12 @@ def test_c_compiles_without_warnings_and_keeps_nothing(tmp_path: Path) -> None:
         "boat_initial_state(s); outside = boat_step(x, w, s, x, s);"
         ' printf("%d %.9g", outside, x[3]); return 0; }\n'
     )
-    model = made.at(torch.float32)
+    model = made.to_precision(torch.float32)
     x, w = torch.tensor([[0.0, 0, 0, 1, 0, 0]]), torch.tensor([[9.0, 9, 3, 1]])
     with torch.no_grad():
         after, _ = model.step(x, w, model.initial_state(1))
     for flags in [(), ("-O3", "-Wconversion")]:
-        call = [compiler(), *STRICT, *flags, "boat.c", "main.c", "-o", "main", "-lm"]
+        call = [compiler(), *STRICT_FLAGS, *flags, "boat.c", "main.c", "-o", "main", "-lm"]
         subprocess.run(call, cwd=tmp_path, check=True)
         printed = subprocess.run([tmp_path / "main"], capture_output=True, text=True).stdout.split()
         assert printed[0] == "0"
@@ -244,7 +253,7 @@ def test_coefficients_of_zero_are_left_out(left: int, tmp_path: Path) -> None:
     spec, model = built("plsr")
     with torch.no_grad():
         model.head.coefficients[left:] = 0.0  # type: ignore[index, operator]
-    card = exporter("c").export(ExportedVessel(spec, model), tmp_path / "boat.c")
+    card = get_exporter("c").export(ExportedVessel(spec, model), tmp_path / "boat.c")
     assert max(card["parity"]["double"]["share_of_range"].values()) <= 1e-12
 
 
@@ -256,17 +265,17 @@ def test_what_single_precision_does_not_determine_is_written_in_double(
     monkeypatch.setattr(base, "SINGLE", -1.0)
     made, file = exported("plsr"), tmp_path / f"boat.{name}"
     allowed = {torch.float32: -1.0, torch.float64: 1e-7}
-    monkeypatch.setattr("residnet.export.onnx_file._TOLERANCE", allowed)
-    card = exporter(name).export(made, file)
+    monkeypatch.setattr("residnet.export.onnx_file._TOLERANCES", allowed)
+    card = get_exporter(name).export(made, file)
     assert card["dtype"] == "float64"
     loaded = (
         OnnxModel(file, made)
         if name == "onnx"
         else CompiledModel(
-            compile_shared([file], tmp_path / "boat.so"), made, torch.float64, file.stem
+            compile_shared_library([file], tmp_path / "boat.so"), made, torch.float64, file.stem
         )
     )
-    assert max(made.require_parity(loaded, "the file", torch.float64, 1e-7).values()) < 1e-7
+    assert max(made.check_long_run(loaded, "the file", torch.float64, 1e-7).values()) < 1e-7
 
 
 class Angle(torch.nn.Module):
@@ -286,7 +295,7 @@ def test_onnx_has_the_angles_of_doubles(tmp_path: Path) -> None:
         optimize=False,
         verbose=False,
         input_names=["y", "x"],
-        custom_translation_table={torch.ops.aten.atan2.default: _arctangent},
+        custom_translation_table={torch.ops.aten.atan2.default: _translate_arctangent},
     )
     given = dict(zip(("y", "x"), points.T.contiguous().numpy(), strict=True))
     (found,) = onnxruntime.InferenceSession(str(file)).run(None, given)
@@ -320,11 +329,11 @@ def test_operations_are_those_of_torch_in_casadi_and_in_c(name: str, tmp_path: P
     wanted = OPERATIONS[name](given).reshape(-1).numpy()
     function = lowered(OPERATIONS[name], [("x", 4)], ["y"], "a step")
     np.testing.assert_allclose(function(given[0].numpy()).full().ravel(), wanted, rtol=1e-12)
-    source, header = c_files("f", [CFunction("step", "", function)], [], {}, "", "f.h")
+    source, header = render_c_files("f", [CFunction("step", "", function)], [], {}, "", "f.h")
     (tmp_path / "f.c").write_text(source)
     (tmp_path / "f.h").write_text(header)
     library = ctypes.CDLL(
-        str(compile_shared([tmp_path / "f.c"], tmp_path / "f.so", ["-DF_DOUBLE"]))
+        str(compile_shared_library([tmp_path / "f.c"], tmp_path / "f.so", ["-DF_DOUBLE"]))
     )
     out, x = np.zeros(len(wanted)), given[0].numpy()
     library.f_step(ctypes.c_void_p(x.ctypes.data), ctypes.c_void_p(out.ctypes.data))
@@ -333,14 +342,14 @@ def test_operations_are_those_of_torch_in_casadi_and_in_c(name: str, tmp_path: P
 
 def test_a_changed_weight_and_a_wrong_rollout_are_found() -> None:
     made = exported("lstm")
-    module = made.module(torch.float32)
-    made.check(ScriptedModel(module, torch.float32), "the module", torch.float32)
+    module = made.build_module(torch.float32)
+    made.check_parity(ScriptedModel(module, torch.float32), "the module", torch.float32)
     other = exported("lstm")
     with torch.no_grad():
         other.model.head.networks[0].readout[0].bias[2] += 1e-3  # type: ignore[union-attr, index]
     told = r"model mine: the module differs .* allowed 1e-05"
     with pytest.raises(ExportError, match=told) as said:
-        other.check(ScriptedModel(module, torch.float32), "the module", torch.float32)
+        other.check_parity(ScriptedModel(module, torch.float32), "the module", torch.float32)
     assert "\n" not in str(said.value)
 
     class NotFinite(ScriptedModel):
@@ -350,20 +359,20 @@ def test_a_changed_weight_and_a_wrong_rollout_are_found() -> None:
             return out
 
     with pytest.raises(ExportError, match="differs from the model"):
-        made.check(NotFinite(module, torch.float32), "the module", torch.float32)
+        made.check_parity(NotFinite(module, torch.float32), "the module", torch.float32)
 
 
 def test_a_file_that_differs_from_its_model_does_not_stand(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is written is read back and compared before it takes its place."""
-    wrong = torch.jit.script(exported("mlp_mirror").module(torch.float32))
+    wrong = torch.jit.script(exported("mlp_mirror").build_module(torch.float32))
     save = torch.jit.save
     monkeypatch.setattr(
         torchscript.torch.jit, "save", lambda _, *to, **extra: save(wrong, *to, **extra)
     )
     with pytest.raises(ExportError, match="model mine"):
-        exporter("torchscript").export(exported("mlp"), tmp_path / "mine.pt")
+        get_exporter("torchscript").export(exported("mlp"), tmp_path / "mine.pt")
     assert not (tmp_path / "mine.pt").exists()
 
 
@@ -371,24 +380,24 @@ def test_tracks_whose_inputs_jump_find_rounding_that_grows() -> None:
     """What rounds states to four decimals is refused; the model itself is not."""
     made = exported("plsr")
 
-    class Exact(Loaded):
-        step_of = made.graph(torch.float32)
+    class Exact(LoadedExport):
+        step_of = made.build_step_module(torch.float32)
 
         def step(self, *given: Any) -> tuple[Any, ...]:
             raise NotImplementedError
 
-        def rows(self, *given: Any) -> tuple[Any, ...]:
+        def step_rows(self, *given: Any) -> tuple[Any, ...]:
             with torch.no_grad():
                 return tuple(part.numpy() for part in self.step_of(*map(torch.from_numpy, given)))
 
     class Rounding(Exact):
-        def rows(self, *given: Any) -> tuple[Any, ...]:
-            after, *rest = super().rows(*given)
+        def step_rows(self, *given: Any) -> tuple[Any, ...]:
+            after, *rest = super().step_rows(*given)
             return (after.round(4), *rest)
 
-    made.require_tracks(Exact(), "the file", torch.float32, 1e-5)
+    made.check_tracks(Exact(), "the file", torch.float32, 1e-5)
     with pytest.raises(RoundingError, match="the file differs from the model"):
-        made.require_tracks(Rounding(), "the file", torch.float32, 1e-5)
+        made.check_tracks(Rounding(), "the file", torch.float32, 1e-5)
 
 
 TABLE = BandTable(
@@ -408,18 +417,24 @@ DEEP = {"w": (0.1, 0.2, 0.3), "q": (0.01, 0.02, 0.03), "z": (0.1, 0.3, 0.9), "th
 
 @pytest.mark.parametrize(
     ("table", "signals"),
-    [(TABLE, SIGNALS), (ROLLS.model_copy(update=DEEP), SUBMERGED), (None, ROLLING)],
+    [
+        (TABLE, EXAMPLE_SIGNALS),
+        (ROLLS.model_copy(update=DEEP), SUBMERGED_SIGNALS),
+        (None, ROLLING_SIGNALS),
+    ],
 )
 def test_half_widths_are_those_of_the_table_in_torchscript_and_in_c(
     tmp_path: Path, table: BandTable | None, signals: SignalsConfig
 ) -> None:
-    spec = example_spec(None, signals).model_copy(update={"band": table})
-    exported, file = ExportedVessel(spec, example_model(spec)), tmp_path / "boat.c"
-    card = exporter("torchscript").export(exported, tmp_path / "model.pt")
+    spec = make_example_spec(None, signals).model_copy(update={"band": table})
+    exported, file = ExportedVessel(spec, make_example_model(spec)), tmp_path / "boat.c"
+    card = get_exporter("torchscript").export(exported, tmp_path / "model.pt")
     loaded = torch.jit.load(str(tmp_path / "model.pt"))
-    exporter("c").export(exported, file)
-    library = ctypes.CDLL(str(compile_shared([file], tmp_path / "boat.so", ["-DBOAT_DOUBLE"])))
-    half = np.zeros(len(signals.live.layout.banded))
+    get_exporter("c").export(exported, file)
+    library = ctypes.CDLL(
+        str(compile_shared_library([file], tmp_path / "boat.so", ["-DBOAT_DOUBLE"]))
+    )
+    half = np.zeros(len(signals.dof.layout.band_channels))
     for k in (-3, 0, 1, 7, 10, 20, 29, 30, 60):
         library.boat_band(k, half.ctypes.data_as(ctypes.c_void_p))
         assert half.tolist() == pytest.approx(loaded.band(k).tolist(), rel=1e-6)
@@ -434,7 +449,7 @@ def test_half_widths_are_those_of_the_table_in_torchscript_and_in_c(
         torch.testing.assert_close(loaded.band(k), row)
     assert card["band"]["horizon"] == pytest.approx(30 * spec.dt)
     assert card["band"]["cautions"] == ["It is a test."]
-    assert ("phi" in card["band"]) == signals.live.rolls
+    assert ("phi" in card["band"]) == signals.dof.has_roll
     with pytest.raises(ValueError, match="one half width for each of steps"):
         BandTable.model_validate(TABLE.model_dump() | {"u": (0.1,)})
 
@@ -447,15 +462,15 @@ RATIO = SymbolicConfig(
 def scripted(spec: ModelSpec, model: HybridDynamics) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return torch.jit.script(ExportedModel(model.float().eval(), spec).eval())
+        return torch.jit.script(GuardedVesselModule(model.float().eval(), spec).eval())
 
 
 @functools.cache
 def delayed() -> tuple[ModelSpec, HybridDynamics]:
     """A term that divides by revolutions of some steps ago."""
-    spec, known = example_spec(RATIO), example_samples()
+    spec, known = make_example_spec(RATIO), make_example_samples()
     model = spec.build().eval()
-    spec.baseline.fit(model.baseline, known)
+    spec.baseline.fit_preferred(model.baseline, known)
     turning = known.z[known.z[:, 3] > 1.0]
     head = model.head
     assert isinstance(head, SymbolicHead)
@@ -467,7 +482,7 @@ def delayed() -> tuple[ModelSpec, HybridDynamics]:
 
 
 def ensemble() -> tuple[ModelSpec, HybridDynamics]:
-    pairs = [*example_models()[1:], delayed()]
+    pairs = [*make_example_models()[1:], delayed()]
     spec = pairs[0][0].model_copy(
         update={"role": "ensemble", "head": None, "members": tuple(spec for spec, _ in pairs)}
     )
@@ -497,7 +512,7 @@ def test_a_delay_line_begins_with_its_first_sample() -> None:
     """A ratio of zeros would be no number."""
     _, model = delayed()
     head = model.head.double()
-    z = example_samples().z[200:206][None]
+    z = make_example_samples().z[200:206][None]
     z[..., 3] = torch.linspace(5.0, 6.0, 6)
     first, memory = head(z[:, 0], torch.zeros(1, head.n_state, dtype=torch.float64))
     settled = head.warmup(z[:, :1].expand(-1, 9, -1))
@@ -505,13 +520,15 @@ def test_a_delay_line_begins_with_its_first_sample() -> None:
     torch.testing.assert_close(memory, settled)
     again, memory = head(z[:, 1], memory)
     torch.testing.assert_close(memory, head.warmup(z[:, :2]))
-    torch.testing.assert_close(torch.stack((first, again), dim=1), head.sequence(z[:, :2]))
+    torch.testing.assert_close(
+        torch.stack((first, again), dim=1), head.teacher_forced_residuals(z[:, :2])
+    )
     for _ in range(5):
         _, memory = head(z[:, 5], memory)
     torch.testing.assert_close(memory, head.warmup(z[:, 5:]))
 
 
-FORMATS = REGISTERED.names()
+FORMATS = REGISTERED.kind_names()
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -519,9 +536,9 @@ def test_a_number_that_is_not_finite_is_refused(name: str, tmp_path: Path) -> No
     spec, model = built("plsr")
     with torch.no_grad():
         model.baseline.theta[0, 1] = torch.nan  # type: ignore[index, operator]
-    file = tmp_path / f"boat{exporter(name).suffix}"
+    file = tmp_path / f"boat{get_exporter(name).suffix}"
     with pytest.raises(ResidnetError) as caught:
-        exporter(name).export(ExportedVessel(spec, model), file)
+        get_exporter(name).export(ExportedVessel(spec, model), file)
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 
@@ -532,9 +549,9 @@ def test_a_number_that_is_not_finite_is_refused(name: str, tmp_path: Path) -> No
 def test_a_format_writes_a_model_or_says_why_not(name: str, variant: str, tmp_path: Path) -> None:
     spec = spec_of(None)
     spec, model = (spec, spec.build()) if variant == "none" else built(variant)
-    file, said = tmp_path / f"boat{exporter(name).suffix}", ""
+    file, said = tmp_path / f"boat{get_exporter(name).suffix}", ""
     try:
-        exporter(name).export(ExportedVessel(spec, model), file)
+        get_exporter(name).export(ExportedVessel(spec, model), file)
     except ResidnetError as error:
         said = str(error).splitlines()[-1]
         assert spec.name in said
@@ -550,8 +567,8 @@ def a_sine(short_parity: None, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def swept(spec: ModelSpec, model: HybridDynamics) -> float:
     """Return the share of the training range that the inputs of the free run sweep at most."""
-    _, w, _ = ExportedVessel(spec, model).free_run(torch.float64)
-    n = spec.signals.live.size
+    _, w, _ = ExportedVessel(spec, model).run_reference(torch.float64)
+    n = spec.signals.dof.n_dynamic
     low, high = torch.tensor(spec.low[n:]), torch.tensor(spec.high[n:])
     return float(((w[0].amax(dim=0) - w[0].amin(dim=0)) / (high - low)).max())
 
@@ -561,7 +578,7 @@ def test_inputs_that_ask_for_too_much_together_sweep_less() -> None:
     """Inputs were logged one at a time; together they leave the states that logs hold."""
     spec, model = built("plsr")
     assert swept(spec, model) == pytest.approx(0.8, abs=0.01)
-    n = spec.signals.live.size
+    n = spec.signals.dof.n_dynamic
     low, high = ((*b[:n], *(3.0 * value for value in b[n:])) for b in (spec.low, spec.high))
     wide = spec.model_copy(update={"low": low, "high": high})
     assert swept(wide, model) in (pytest.approx(0.4, abs=0.01), pytest.approx(0.2, abs=0.01))

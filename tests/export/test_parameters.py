@@ -16,7 +16,7 @@ from exported_models import built
 from residnet.core.errors import UsageError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.export import exporter
+from residnet.export import get_exporter
 from residnet.export.vessel import ExportedVessel
 
 FORCES = ("tau_x", "tau_y", "tau_n")
@@ -24,7 +24,7 @@ FORCES = ("tau_x", "tau_y", "tau_n")
 
 def put(folder: Path, spec: ModelSpec, model: HybridDynamics) -> Any:
     file = folder / "hull.parameters.json"
-    return exporter("parameters").export(ExportedVessel(spec, model), file)
+    return get_exporter("parameters").export(ExportedVessel(spec, model), file)
 
 
 def believed() -> tuple[ModelSpec, HybridDynamics]:

@@ -19,15 +19,20 @@ from torch import Tensor
 from residnet.control.courses.course_plan import Course
 from residnet.control.guidance import CourseGuidance, DriftEstimate
 from residnet.control.heading.controllers import DepthPolicySpec, NetworkPolicySpec
-from residnet.control.heading.policies import FIXED
+from residnet.control.heading.policies import OBSERVER_MEMORY
 from residnet.core.errors import UsageError
 from residnet.dynamics.rollout import Rollout
-from residnet.export import exporter, policy
-from residnet.export.base import Exported
-from residnet.export.c import compile_shared
-from residnet.export.policy import COURSE, ExportedController, ExportedCoursePolicy, ExportedHeading
+from residnet.export import get_exporter, policy
+from residnet.export.base import Exportable
+from residnet.export.c import compile_shared_library
+from residnet.export.policy import (
+    COURSE_MEASUREMENTS,
+    ExportedController,
+    ExportedCoursePolicy,
+    ExportedHeading,
+)
 from residnet.export.vessel import ExportedVessel
-from residnet.testing.checks import damage, require, require_finite
+from residnet.testing.checks import assert_finite, assert_true, replace_entries
 
 SIMSTRUCT = Path(__file__).parents[1] / "support" / "simstruct"
 
@@ -35,11 +40,11 @@ SIMSTRUCT = Path(__file__).parents[1] / "support" / "simstruct"
 class SFunction:
     """An exported S-function under a harness that does what Simulink documents."""
 
-    def __init__(self, exported: Exported, folder: Path) -> None:
-        card = exporter("simulink").export(exported, folder / "Boat 2_sfun.c")
+    def __init__(self, exported: Exportable, folder: Path) -> None:
+        card = get_exporter("simulink").export(exported, folder / "Boat 2_sfun.c")
         assert card["format"] == "simulink"
         sources = [folder / "boat_2_sfun.c", folder / "boat_2_sfun_model.c"]
-        library = compile_shared(sources, folder / "boat.so", [f"-I{SIMSTRUCT}"])
+        library = compile_shared_library(sources, folder / "boat.so", [f"-I{SIMSTRUCT}"])
         self.library = ctypes.CDLL(str(library))
         self.library.fly.restype = ctypes.c_double
 
@@ -56,14 +61,14 @@ FAR = 12_000.0
 
 
 def heading(rate: float | None = 10 * DEG) -> ExportedHeading:
-    return ExportedHeading("pilot", observed(rate)[1], safe="hold", about={}, metrics=[])
+    return ExportedHeading("pilot", observed(rate)[1], fallback="hold", description={}, metrics=[])
 
 
 def network() -> ExportedHeading:
     torch.manual_seed(0)
     made = NetworkPolicySpec(rate=10 * DEG, **SETTINGS).build().requires_grad_(False)
     made.network.out.weight.normal_(std=0.5)
-    return ExportedHeading("pilot", made, safe="amidships", about={}, metrics=[])
+    return ExportedHeading("pilot", made, fallback="amidships", description={}, metrics=[])
 
 
 def depth() -> ExportedHeading:
@@ -73,17 +78,25 @@ def depth() -> ExportedHeading:
     made = DepthPolicySpec(law=law, steepest=0.5, sight=sight).build().requires_grad_(False)
     inner: Any = made.law
     inner.network.out.weight.normal_(std=0.02)
-    return ExportedHeading("pilot", made, safe="amidships", about={}, metrics=[])
+    return ExportedHeading("pilot", made, fallback="amidships", description={}, metrics=[])
 
 
 def along() -> ExportedCoursePolicy:
     angle = np.linspace(0.0, 2.0, 1001)
     track = FAR + 45.0 * np.stack((np.sin(angle), 1.0 - np.cos(angle)), axis=-1)
     course = Course(0.09, track, angle, angle, np.full(len(angle), 0.02), 88.0)
-    guidance = CourseGuidance(course, 10.0, tuple(COURSE), DriftEstimate(10.0, 0.8, DT))
+    guidance = CourseGuidance(
+        course, 10.0, tuple(COURSE_MEASUREMENTS), DriftEstimate(10.0, 0.8, DT)
+    )
     about = {"vessel": "x"}
     return ExportedCoursePolicy(
-        "along", observed(10 * DEG)[1], guidance, course, safe="hold", about=about, metrics=[]
+        "along",
+        observed(10 * DEG)[1],
+        guidance,
+        course,
+        fallback="hold",
+        description=about,
+        metrics=[],
     )
 
 
@@ -106,28 +119,30 @@ def check_bad_measurements(
     def between(a: Tensor, b: Tensor) -> Tensor:
         return a + torch.rand(cases, a.numel(), generator=random) * (b - a)
 
-    s = initial_state(damage(between(low, high), high, 0.2, random))
-    require_finite(s, "the memory at a bad measurement is not finite")
+    s = initial_state(replace_entries(between(low, high), high, 0.2, random))
+    assert_finite(s, "the memory at a bad measurement is not finite")
     for k in range(30):
         y, given = between(low, high), s
         if k % 5 == 1:
-            y = damage(y, high, 0.3, random)
+            y = replace_entries(y, high, 0.3, random)
         if k % 5 == 3:
-            given = damage(s, most, 0.2, random)
+            given = replace_entries(s, most, 0.2, random)
         if k == 20:
             given = between(least, most)
         command, s, fault = step(y, given)
         who = f"exported controller, step {k}"
-        require_finite(command, f"{who}: a command is not finite")
-        require_finite(s, f"{who}: a memory is not finite")
-        require(bool((command.abs() <= 1.001 * limit).all()), f"{who}: a command exceeds its limit")
+        assert_finite(command, f"{who}: a command is not finite")
+        assert_finite(s, f"{who}: a memory is not finite")
+        assert_true(
+            bool((command.abs() <= 1.001 * limit).all()), f"{who}: a command exceeds its limit"
+        )
         good = ((y >= low) & (y <= high)).all(dim=-1)
         good &= ((given >= least) & (given <= most)).all(dim=-1)
-        require(bool((fault | good).all()), f"{who}: a bad sample raises no flag")
+        assert_true(bool((fault | good).all()), f"{who}: a bad sample raises no flag")
         if k < 20:
-            require(not bool((fault & good).any()), f"{who}: a good sample raises a flag")
+            assert_true(not bool((fault & good).any()), f"{who}: a good sample raises a flag")
         kept = ((s >= least) & (s <= most)).all()
-        require(bool(kept), f"{who}: leaves a memory that it would not accept")
+        assert_true(bool(kept), f"{who}: leaves a memory that it would not accept")
 
 
 KINDS = [heading, depth, network, along]
@@ -140,14 +155,14 @@ def test_torchscript_answers_as_the_policy_and_is_safe(
     make: Callable[[], ExportedController], tmp_path: Path
 ) -> None:
     exported = make()
-    card = exporter("torchscript").export(exported, tmp_path / "p.pt")
+    card = get_exporter("torchscript").export(exported, tmp_path / "p.pt")
     extra = {"card.json": ""}
     module: Any = torch.jit.load(str(tmp_path / "p.pt"), _extra_files=extra)
     assert json.loads(extra["card.json"]) == json.loads(json.dumps(card))
     assert card["parity"]["share_of_limit"] <= 1e-4
     assert len(card["memory"]) == exported.arguments[-1][1]
-    eager: Any = exported.controller(exported.precisions[0])
-    count = len(exported.measured)
+    eager: Any = exported.build_controller(exported.precisions[0])
+    count = len(exported.measured_units)
     given = exported.arguments[1][1] if len(exported.arguments) > 2 else 0
 
     def step(y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -170,7 +185,7 @@ def test_torchscript_answers_as_the_policy_and_is_safe(
 
 
 def test_a_wrong_measurement_holds_the_command_and_the_memory() -> None:
-    module = along().controller(torch.float64)
+    module = along().build_controller(torch.float64)
     y = torch.tensor([[FAR, FAR, 0.05, SPEED, 0.01, 0.02]], dtype=torch.float64)
     command, s, _, arrived = module.step(y, module.initial_state(y))
     assert not bool(arrived)
@@ -193,7 +208,7 @@ def test_an_s_function_answers_as_the_policy(tmp_path: Path) -> None:
     rows[100, 0] = np.nan
     dt, out = made.fly(rows, 2)
     assert dt == DT
-    policy: Any = exported.controller(torch.float64)
+    policy: Any = exported.build_controller(torch.float64)
     given = torch.from_numpy(rows)
     s = policy.initial_state(given[:1, :3])
     for k in range(200):
@@ -210,9 +225,9 @@ def test_an_s_function_answers_as_the_policy(tmp_path: Path) -> None:
 def test_every_format_serves_every_policy(
     name: str, make: Callable[[], ExportedController], tmp_path: Path
 ) -> None:
-    file = tmp_path / f"p{exporter(name).suffix}"
+    file = tmp_path / f"p{get_exporter(name).suffix}"
     made = make()
-    card = exporter(name).export(made, file)
+    card = get_exporter(name).export(made, file)
     assert file.is_file()
     parity = card["parity"]
     parities = [parity] if "share_of_limit" in parity else parity.values()
@@ -225,18 +240,18 @@ def test_every_format_serves_every_policy(
 @pytest.mark.parametrize("name", ["fmu", "parameters", "feed_forward"])
 def test_what_is_made_of_vessels_alone_refuses_policies(name: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="policy pilot: "):
-        exporter(name).export(heading(), tmp_path / "p")
+        get_exporter(name).export(heading(), tmp_path / "p")
     assert not list(tmp_path.iterdir())
 
 
 def test_a_lost_estimate_begins_anew_and_keeps_the_push() -> None:
     made = observed(None)[1].double()
     s = made.initial_state(torch.tensor([[0.0, SPEED, 0.0]], dtype=torch.float64))
-    s[:, FIXED.index("push")] = 0.01
+    s[:, OBSERVER_MEMORY.index("push")] = 0.01
     turned = torch.tensor([[2.0, SPEED, 0.1]], dtype=torch.float64)
     _, after = made(turned, torch.full((1, 1), 2.0, dtype=torch.float64), s)
-    assert float(after[0, FIXED.index("push")]) == pytest.approx(0.01)
-    assert float(after[0, FIXED.index("heading")]) == pytest.approx(2.0, abs=0.01)
+    assert float(after[0, OBSERVER_MEMORY.index("push")]) == pytest.approx(0.01)
+    assert float(after[0, OBSERVER_MEMORY.index("heading")]) == pytest.approx(2.0, abs=0.01)
 
 
 @pytest.mark.usefixtures("short_parity")
@@ -270,14 +285,14 @@ STEPS, ASKED, LAST, AGAIN = 400, 60, 199, 301
 @pytest.mark.parametrize("safe", ["amidships", "hold"])
 def test_the_node_answers_as_the_policy(safe: Any, tmp_path: Path) -> None:
     own = observed(math.radians(10))[1]
-    exported = ExportedHeading("pilot", own, safe=safe, about={}, metrics=[])
-    exporter("c").export(exported, tmp_path / "pilot.c")
+    exported = ExportedHeading("pilot", own, fallback=safe, description={}, metrics=[])
+    get_exporter("c").export(exported, tmp_path / "pilot.c")
     flags = [
         f"-I{HARNESS}", f"-I{tmp_path}", "-Dmain=node_main", "-DMODEL=pilot",
         "-DMODEL_UPPER=PILOT", '-DMODEL_HEADER="pilot.h"', "-DPILOT_DOUBLE",
     ]  # fmt: skip
     sources = [NODE, HARNESS / "harness.c", tmp_path / "pilot.c"]
-    library = ctypes.CDLL(str(compile_shared(sources, tmp_path / "node.so", flags)))
+    library = ctypes.CDLL(str(compile_shared_library(sources, tmp_path / "node.so", flags)))
     library.drive.restype = ctypes.c_double
 
     random = np.random.default_rng(0)
@@ -299,7 +314,7 @@ def test_the_node_answers_as_the_policy(safe: Any, tmp_path: Path) -> None:
     at = [ctypes.c_void_p(part.ctypes.data) for part in (rows, out)]
     assert library.drive(at[0], STEPS, at[1]) == pytest.approx(DT)
 
-    module: Any = exported.controller(torch.float64)
+    module: Any = exported.build_controller(torch.float64)
     within = policy.PARITY_TOLERANCE * LIMIT
     s, seen, age, asked = None, torch.zeros(1, 3).double(), 0.0, math.nan
     for k in range(STEPS):

@@ -18,7 +18,7 @@ from sklearn.linear_model import Ridge
 from sklearn.metrics.pairwise import rbf_kernel
 from sklearn.pipeline import make_pipeline
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, ExportError, FitError
 from residnet.core.samples import Samples
 from residnet.export.vessel import ExportedVessel
@@ -27,9 +27,9 @@ from residnet.heads.base import Features
 from residnet.heads.kernel import KernelConfig
 from residnet.heads.linear import PlsrConfig, RidgeConfig
 from residnet.heads.scikit import SklearnConfig
-from residnet.regression.kernel import Polynomial, Rbf, spread_out
+from residnet.regression.kernel import PolynomialConfig, RbfConfig, kmeans_plus_plus_indices
 from residnet.regression.shrinkage import pls_path
-from residnet.testing.checks import example_model, example_spec
+from residnet.testing.checks import make_example_model, make_example_spec
 
 SAMPLES = made(300)
 NEW = torch.from_numpy(channels(200, seed=9))
@@ -59,10 +59,10 @@ def test_guard_holds_features_at_the_widened_range() -> None:
     low, high = samples.z.amin(0)[[2, 0]], samples.z.amax(0)[[2, 0]]
     reach = 0.25 * (high - low)
     inside = samples.z[:5]
-    assert torch.equal(features.guarded(inside), inside[:, [2, 0]])
+    assert torch.equal(features.select_clamped(inside), inside[:, [2, 0]])
     far = torch.full((1, 5), 1e9, dtype=torch.float64)
-    torch.testing.assert_close(features.guarded(far)[0], high + reach)
-    torch.testing.assert_close(features.guarded(-far)[0], low - reach)
+    torch.testing.assert_close(features.select_clamped(far)[0], high + reach)
+    torch.testing.assert_close(features.select_clamped(-far)[0], low - reach)
     out = features(samples.z)
     torch.testing.assert_close(out.mean(0), torch.zeros(2, dtype=torch.float64), rtol=0, atol=1e-12)
     torch.testing.assert_close(out.std(0, correction=0), torch.ones(2, dtype=torch.float64))
@@ -122,7 +122,7 @@ def test_free_runs_are_offered_every_order_and_none() -> None:
     """
     config = PlsrConfig()
     head = calibrated(config)
-    found = head.solutions(SAMPLES)
+    found = head.fit_solutions(SAMPLES)
     orders = [solution.choice["order"] for solution in found]
     assert orders[0] == int(np.argmin(found[0].notes["cross_validated_share"])) + 1
     assert orders[1:9] == [1, 2, 3, 4, 5, 6, 7, 8]
@@ -136,14 +136,14 @@ def test_free_runs_are_offered_every_order_and_none() -> None:
     assert not answer(head).any()
     assert calibrated(PlsrConfig(order=100)).solve(SAMPLES)["order"] == 23
     for single in (PlsrConfig(order=3), PlsrConfig(choose="one_step")):
-        assert len(calibrated(single).solutions(SAMPLES)) == 1
+        assert len(calibrated(single).fit_solutions(SAMPLES)) == 1
 
 
 def test_free_runs_are_offered_one_penalty_for_all_axes_and_none() -> None:
     penalties = (1e-6, 1e-2, 1.0)
     config = RidgeConfig(penalties=penalties)
     head = calibrated(config)
-    found = head.solutions(SAMPLES)
+    found = head.fit_solutions(SAMPLES)
     offered = [solution.choice["penalty"] for solution in found[1:]]
     assert offered == [*([penalty] * 3 for penalty in penalties), []]
     x, y = head.basis(SAMPLES.z).numpy(), SAMPLES.target.numpy()
@@ -151,13 +151,15 @@ def test_free_runs_are_offered_one_penalty_for_all_axes_and_none() -> None:
         head.load_state_dict(solution.state, strict=False)
         truth = refitted(config, penalty, x, y, len(x))(x)
         np.testing.assert_allclose(answer(head), truth, atol=1e-10)
-    (single,) = calibrated(RidgeConfig(penalties=penalties, choose="one_step")).solutions(SAMPLES)
+    (single,) = calibrated(RidgeConfig(penalties=penalties, choose="one_step")).fit_solutions(
+        SAMPLES
+    )
     assert single.choice == found[0].choice
 
 
 @pytest.mark.parametrize("kind", [PlsrConfig, RidgeConfig, KernelConfig])
 def test_few_manoeuvres_make_fewer_folds_unless_they_are_named(kind: Any) -> None:
-    few = SAMPLES.where(SAMPLES.group < 3)
+    few = SAMPLES.select(SAMPLES.group < 3)
     usual, three, five = (
         calibrated(config, few) for config in (kind(), kind(folds=3), kind(folds=5))
     )
@@ -221,12 +223,12 @@ def test_columns_that_say_nothing_get_nothing(kind: Any) -> None:
     with pytest.raises(FitError, match="channel 'u' is not finite at sample 7"):
         solved(("v", "u"), replace(of, z=spoiled))
     with pytest.raises(FitError, match="10 samples do not determine 23 basis functions"):
-        solved((), of.where(torch.arange(400) % 40 == 0))
+        solved((), of.select(torch.arange(400) % 40 == 0))
     with pytest.raises(FitError, match="one run or segment only"):
         solved(("u",), sampled(z, target, NAMES))
 
 
-def kernel(form: Rbf | Polynomial, *penalties: float, **settings: Any) -> Any:
+def kernel(form: RbfConfig | PolynomialConfig, *penalties: float, **settings: Any) -> Any:
     fixed: dict[str, Any] = {"choose": "one_step", "margin": 1.0}
     return KernelConfig(kernel=form, penalties=penalties, **(fixed | settings))
 
@@ -241,19 +243,21 @@ def standardised(z: torch.Tensor, own: torch.Tensor = SAMPLES.z) -> np.ndarray:
 @pytest.mark.parametrize(
     ("form", "penalty"),
     [
-        (Rbf(sigma=(1.0,)), 1e-3),
-        (Rbf(sigma=(10.0,)), 1e-5),
-        (Rbf(sigma=(100.0,)), 1e-1),
-        (Polynomial(degree=1, slope=1.0, constant=1.0), 1e-1),
-        (Polynomial(degree=3, slope=0.5, constant=2.0), 1e-3),
-        (Polynomial(degree=2, slope=0.3, constant=0.0), 1e-5),
+        (RbfConfig(sigma=(1.0,)), 1e-3),
+        (RbfConfig(sigma=(10.0,)), 1e-5),
+        (RbfConfig(sigma=(100.0,)), 1e-1),
+        (PolynomialConfig(degree=1, slope=1.0, constant=1.0), 1e-1),
+        (PolynomialConfig(degree=3, slope=0.5, constant=2.0), 1e-3),
+        (PolynomialConfig(degree=2, slope=0.3, constant=0.0), 1e-5),
     ],
 )
-def test_kernel_ridge_equals_scikit_learn(form: Rbf | Polynomial, penalty: float) -> None:
+def test_kernel_ridge_equals_scikit_learn(
+    form: RbfConfig | PolynomialConfig, penalty: float
+) -> None:
     head = calibrated(kernel(form, penalty))
     notes = head.solve(SAMPLES)
     alpha, x = penalty * len(SAMPLES), standardised(SAMPLES.z)
-    if isinstance(form, Rbf):
+    if isinstance(form, RbfConfig):
         gamma = 1 / (2 * form.sigma[0])
         truth = KernelRidge(kernel="rbf", gamma=gamma, alpha=alpha).fit(x, SAMPLES.target.numpy())
         size = np.abs(truth.dual_coef_).max()
@@ -269,7 +273,7 @@ def test_kernel_ridge_equals_scikit_learn(form: Rbf | Polynomial, penalty: float
 
 
 def test_terms_are_features_too() -> None:
-    head = calibrated(kernel(Polynomial(), 1e-3, terms=("u|u|", "u v")))
+    head = calibrated(kernel(PolynomialConfig(), 1e-3, terms=("u|u|", "u v")))
     head.solve(SAMPLES)
     low, high = SAMPLES.z.numpy().min(0), SAMPLES.z.numpy().max(0)
 
@@ -290,12 +294,18 @@ def test_terms_are_features_too() -> None:
 
 @pytest.mark.parametrize(
     "form",
-    [Rbf(sigma=(3.0, 30.0)), Rbf(sigma=(3.0, 30.0), exact=100, landmarks=80), Polynomial(degree=2)],
+    [
+        RbfConfig(sigma=(3.0, 30.0)),
+        RbfConfig(sigma=(3.0, 30.0), exact=100, landmarks=80),
+        PolynomialConfig(degree=2),
+    ],
 )
-def test_cross_validation_of_kernels_equals_explicit_refits(form: Rbf | Polynomial) -> None:
+def test_cross_validation_of_kernels_equals_explicit_refits(
+    form: RbfConfig | PolynomialConfig,
+) -> None:
     penalties = (1e-6, 1e-3, 10.0)
     head = calibrated(kernel(form, *penalties, folds=4), MIXED)
-    (only,) = head.solutions(MIXED)
+    (only,) = head.fit_solutions(MIXED)
     notes = head.solve(MIXED)
     x, y = standardised(MIXED.z), MIXED.target.numpy()
     errors = np.array(notes["cross_validated_error"])
@@ -311,14 +321,14 @@ def test_cross_validation_of_kernels_equals_explicit_refits(form: Rbf | Polynomi
     best = [np.unravel_index(errors[..., axis].argmin(), errors.shape[:2]) for axis in range(3)]
     assert only.choice["penalty"] == [penalties[j] for _, j in best]
     assert only.choice["penalty"][1] == 10.0 > only.choice["penalty"][0]
-    if isinstance(form, Rbf):
+    if isinstance(form, RbfConfig):
         assert only.choice["sigma"] == [form.sigma[i] for i, _ in best]
 
 
 def kernel_refitted(
     head: Any, form: Any, setting: int, x: np.ndarray, y: np.ndarray, alpha: float
 ) -> Callable[[np.ndarray], np.ndarray]:
-    if isinstance(form, Polynomial):
+    if isinstance(form, PolynomialConfig):
         poly = KernelRidge(kernel="poly", degree=form.degree, gamma=1, coef0=1, alpha=alpha)
         return poly.fit(x, y).predict  # type: ignore[no-any-return]
     gamma = 1 / (2 * form.sigma[setting])
@@ -337,9 +347,9 @@ def kernel_refitted(
 
 def test_landmarks_that_are_all_samples_give_the_exact_fit() -> None:
     forms = (
-        Rbf(sigma=(10.0,)),
-        Rbf(sigma=(10.0,), exact=1, landmarks=300),
-        Rbf(sigma=(10.0,), exact=1, landmarks=80),
+        RbfConfig(sigma=(10.0,)),
+        RbfConfig(sigma=(10.0,), exact=1, landmarks=300),
+        RbfConfig(sigma=(10.0,), exact=1, landmarks=80),
     )
     exact, all_of_them, few = (calibrated(kernel(form, 1e-4)) for form in forms)
     for head in (exact, all_of_them, few):
@@ -350,15 +360,15 @@ def test_landmarks_that_are_all_samples_give_the_exact_fit() -> None:
     assert np.sqrt(np.mean(apart**2)) < 0.05 * answer(exact, NEW).std()
     # they lie apart and are repeatable: three different values and no more
     x = torch.cat((torch.zeros(500, 2), torch.eye(2) * 3)).double()
-    chosen = spread_out(x, 10, seed=4)
-    assert torch.equal(chosen, spread_out(x, 10, seed=4))
+    chosen = kmeans_plus_plus_indices(x, 10, seed=4)
+    assert torch.equal(chosen, kmeans_plus_plus_indices(x, 10, seed=4))
     assert len(torch.unique(x[chosen], dim=0)) == len(chosen) == 3
 
 
 def test_free_runs_are_offered_joint_settings_then_single_steps_around_the_best() -> None:
     penalties = (1e-6, 1e-4, 1e-2)
-    head = calibrated(KernelConfig(kernel=Rbf(sigma=(3.0, 30.0)), penalties=penalties))
-    found = head.solutions(SAMPLES)
+    head = calibrated(KernelConfig(kernel=RbfConfig(sigma=(3.0, 30.0)), penalties=penalties))
+    found = head.fit_solutions(SAMPLES)
     joint = [([s] * 3, [p] * 3) for s in (3.0, 30.0) for p in penalties]
     assert [(s.choice["sigma"], s.choice["penalty"]) for s in found[1:-1]] == joint
     head.load_state_dict(found[-1].state, strict=False)
@@ -392,7 +402,7 @@ def test_recursion_is_a_free_run_of_one_velocity() -> None:
     known = sampled(z, rates, names, groups=2, t=t)
     sigmas, penalties = (2.0, 20.0), (1e-3, 1.0)
     settings = {"choose": "recursion", "folds": 2, "margin": 100.0}
-    head = calibrated(kernel(Rbf(sigma=sigmas), *penalties, **settings), known)
+    head = calibrated(kernel(RbfConfig(sigma=sigmas), *penalties, **settings), known)
     notes = head.solve(known)
     mean, std = z.mean(0), z.std(0)
     error = np.zeros((2, 2, 3))
@@ -429,10 +439,10 @@ PROCESS: dict[str, Any] = {
     ],
 )
 def test_the_answers_of_a_pipeline_are_those_of_scikit_learn(pipeline: list[Any]) -> None:
-    config = validate({"pipeline": pipeline, "samples": 100}, SklearnConfig, "here")
+    config = validate_config({"pipeline": pipeline, "samples": 100}, SklearnConfig, "here")
     head = calibrated(config)
     head.solve(SAMPLES)
-    x, spread = head.features(SAMPLES.z).numpy(), head.residual_std().numpy()
+    x, spread = head.features(SAMPLES.z).numpy(), head.residual_scale().numpy()
     rows = torch.linspace(0, len(x) - 1, 100).long()
     for axis in range(3):
         own = make_pipeline(*map(scikit.make_estimator, pipeline))
@@ -442,9 +452,9 @@ def test_the_answers_of_a_pipeline_are_those_of_scikit_learn(pipeline: list[Any]
 
 
 def test_no_format_exports_it() -> None:
-    spec = example_spec(SklearnConfig(samples=100))
+    spec = make_example_spec(SklearnConfig(samples=100))
     with pytest.raises(ExportError, match=r"example: scikit-learn predicts in Python.*export ano"):
-        ExportedVessel(spec, example_model(spec))
+        ExportedVessel(spec, make_example_model(spec))
 
 
 @pytest.mark.parametrize(
@@ -463,4 +473,4 @@ def test_no_format_exports_it() -> None:
 )
 def test_what_is_no_pipeline(pipeline: list[Any], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
-        validate({"pipeline": pipeline}, SklearnConfig, "here")
+        validate_config({"pipeline": pipeline}, SklearnConfig, "here")

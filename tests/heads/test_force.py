@@ -60,7 +60,7 @@ def built(head: Any) -> Any:
     content = {
         "schema": "residnet.model/1", "name": "force", "role": "head", "dt": 0.1,
         "integrator": "rk4", "signals": SIGNALS.model_dump(), "head": head.model_dump(),
-        "baseline": BELIEVED.resolved().model_dump(),
+        "baseline": BELIEVED.without_file_references().model_dump(),
         "low": [-2.0, -1.0, -0.5, -500.0, -500.0, -500.0],
         "high": [2.0, 1.0, 0.5, 500.0, 500.0, 500.0],
     }  # fmt: skip
@@ -70,10 +70,10 @@ def built(head: Any) -> Any:
 def fitted(head: Any, of: Samples) -> Any:
     model = built(head)
     with torch.no_grad():
-        residual = model.head.residual_target(of, model.baseline(of.z))
+        residual = model.head.residual_samples(of, model.baseline(of.z))
     assert isinstance(model.head, ForceHead)
     model.head.calibrate(residual)
-    model.head.solve(residual)
+    model.head.fit_preferred(residual)
     return model.eval()
 
 
@@ -123,7 +123,7 @@ def test_a_free_run_is_the_true_ferrys(model: Any) -> None:
 def test_the_feed_forward_undoes_the_motion(model: Any) -> None:
     of = samples(count=50)
     believed = BelievedForce(model.baseline, model.head.mass)
-    force = RequiredForce(believed, ResidualForce(model.head), mirrored=False).eval()
+    force = RequiredForce(believed, ResidualForce(model.head), is_mirrored=False).eval()
     with torch.no_grad():
         torch.testing.assert_close(force(of.target, of.z[:, :3]), of.z[:, 3:], rtol=0, atol=1e-2)
         # and exactly the model's own inverse
@@ -163,9 +163,9 @@ def test_only_the_solutions_that_run_forward_are_offered() -> None:
         samples(mass_sign=-1.0),
     )
     with torch.no_grad():
-        residual = model.head.residual_target(of, model.baseline(of.z))
+        residual = model.head.residual_samples(of, model.baseline(of.z))
     model.head.calibrate(residual)
-    offered = [solution.choice["penalty"] for solution in model.head.solutions(residual)]
+    offered = [solution.choice["penalty"] for solution in model.head.fit_solutions(residual)]
     assert offered == [[100.0] * 3, []]
 
 
@@ -185,7 +185,7 @@ ALONE, ONLY = "names accelerations only by themselves", "only a residual in forc
         (lambda: force(terms=("u_ddot",)), "u_ddot"),
         (lambda: MlpConfig(features=("u_dot", "v")).build(NAMES), ONLY),
         (lambda: SymbolicConfig(features=("u_dot",)).build(NAMES), ONLY),
-        (lambda: force().set_mass(OTHER.build(NAMES).mass()), "kind to 'believed'"),
+        (lambda: force().set_inertia(OTHER.build(NAMES).inertia_matrix()), "kind to 'believed'"),
     ],
 )
 def test_refused(build: Any, said: str) -> None:
@@ -194,6 +194,6 @@ def test_refused(build: Any, said: str) -> None:
 
 
 def test_believed_mass_is_the_hulls_times_its_factor() -> None:
-    mass = BelievedConfig(vessel="milliampere", scale=0.5).build(NAMES).mass()
+    mass = BelievedConfig(vessel="milliampere", scale=0.5).build(NAMES).inertia_matrix()
     assert mass is not None
     torch.testing.assert_close(mass, 0.5 * hull("milliampere").mass, rtol=1e-10, atol=1e-8)

@@ -13,7 +13,7 @@ from made_equations import CHANNELS, draw_ship
 from made_odin import FORCE_TRUTH, force_logs
 from made_samples import sampled
 
-from residnet.core.names import ACCELERATION
+from residnet.core.names import ACCELERATION_NAMES
 from residnet.core.samples import Samples
 from residnet.dynamics.store import load_model, save_model
 from residnet.heads.genetic import GeneticConfig
@@ -21,15 +21,15 @@ from residnet.physics.terms import TermLibrary, parse_term
 from residnet.regression.expressions import (
     Algebra,
     ExpressionLibrary,
-    Limits,
+    ExpressionLimits,
     Sum,
-    equation,
-    symbolic_sum,
-    tables,
-    term,
+    build_library_state,
+    format_equation,
+    format_product,
+    products_to_sympy,
 )
-from residnet.testing import example_samples
-from residnet.testing.checks import example_model, example_spec
+from residnet.testing import make_example_samples
+from residnet.testing.checks import make_example_model, make_example_spec
 
 FORCES = ("u", "v", "r", "tau_x", "tau_y", "tau_n")
 
@@ -40,7 +40,9 @@ def _deap() -> None:
 
 
 def samples(log: dict[str, np.ndarray]) -> Samples:
-    z, target = (np.stack([log[n] for n in names], axis=1) for names in (FORCES, ACCELERATION))
+    z, target = (
+        np.stack([log[n] for n in names], axis=1) for names in (FORCES, ACCELERATION_NAMES)
+    )
     return sampled(z, target, FORCES, t=log["t"])
 
 
@@ -49,15 +51,15 @@ def test_force_equations_of_odin() -> None:
     head = GeneticConfig.model_validate({"evolution": {"population": 1000}}).build(FORCES)
     data = samples({name: values[::10] for name, values in force_logs(1)[0].items()})
     head.calibrate(data)
-    notes = head.solve(data)
+    notes = head.fit_preferred(data)
     for axis, truth in FORCE_TRUTH.items():
         found = {c["term"]: c["value"] for c in notes["coefficients"] if c["axis"] == axis}
         assert found == pytest.approx(truth, rel=1e-9)
         assert notes["equations"][axis]["reached_goal"]
         assert notes["equations"][axis]["error_share"] < 1e-10
-    assert set(head.names()) == {term for truth in FORCE_TRUTH.values() for term in truth}
-    parts = head.contributions(data.z, 0)
-    assert list(parts) == [name for name in head.names() if name in FORCE_TRUTH["u_dot"]]
+    assert set(head.format_terms()) == {term for truth in FORCE_TRUTH.values() for term in truth}
+    parts = head.term_contributions(data.z, 0)
+    assert list(parts) == [name for name in head.format_terms() if name in FORCE_TRUTH["u_dot"]]
     np.testing.assert_allclose(sum(parts.values()), data.target[:, 0], rtol=1e-9, atol=1e-12)
 
 
@@ -69,8 +71,8 @@ def test_noise_hides_no_equation_that_a_sparse_search_finds(final: bool) -> None
     )
     head = config.build(CHANNELS)
     head.calibrate(design.samples)
-    notes = head.solve(design.samples)
-    for axis, truth in zip(ACCELERATION, design.truth, strict=True):
+    notes = head.fit_preferred(design.samples)
+    for axis, truth in zip(ACCELERATION_NAMES, design.truth, strict=True):
         assert bool(notes["equations"][axis]["by_sparse_search"]) == final
         if final:
             found = {
@@ -87,11 +89,11 @@ def test_saved_and_loaded_with_functions_of_sums(tmp_path: Path) -> None:
     config = GeneticConfig.model_validate(
         {"evolution": evolution | {"operators": ["+", "*", "abs", "sin", "/", "sqrt"]}}
     )
-    spec = example_spec(config)
-    model: Any = example_model(spec)
+    spec = make_example_spec(config)
+    model: Any = make_example_model(spec)
     save_model(tmp_path / "m", spec, model)
     again: Any = load_model(tmp_path / "m")[1]
-    z = example_samples().z[:50]
+    z = make_example_samples().z[:50]
     with torch.no_grad():
         assert torch.equal(again.head.sequence(z), model.head.sequence(z))
     assert again.head.names() == model.head.names()
@@ -99,14 +101,14 @@ def test_saved_and_loaded_with_functions_of_sums(tmp_path: Path) -> None:
 
 def expression(algebra: Algebra) -> Sum:
     """-2 u |v + 3 sin(u r)| + sqrt(v) / (1 + cos(r)^2), not multiplied out, and a constant."""
-    u, v, r = (algebra.channel(name) for name in ("u", "v", "r"))
-    inside = algebra.add(v, algebra.apply("sin", algebra.multiply(u, r)), 3.0)
+    u, v, r = (algebra.make_channel(name) for name in ("u", "v", "r"))
+    inside = algebra.add(v, algebra.apply_function("sin", algebra.multiply(u, r)), 3.0)
     one: Sum = {(): 1.0}
-    cosine = algebra.apply("cos", r)
-    below = algebra.apply("inv", algebra.add(one, algebra.multiply(cosine, cosine)))
-    first = algebra.multiply(algebra.multiply(u, {(): -2.0}), algebra.apply("abs", inside))
+    cosine = algebra.apply_function("cos", r)
+    below = algebra.apply_function("inv", algebra.add(one, algebra.multiply(cosine, cosine)))
+    first = algebra.multiply(algebra.multiply(u, {(): -2.0}), algebra.apply_function("abs", inside))
     return algebra.add(
-        algebra.add(first, algebra.multiply(algebra.apply("sqrt", v), below)), {(): 0.25}
+        algebra.add(first, algebra.multiply(algebra.apply_function("sqrt", v), below)), {(): 0.25}
     )
 
 
@@ -117,21 +119,21 @@ def truth(u: np.ndarray, v: np.ndarray, r: np.ndarray) -> np.ndarray:
 
 
 def test_tables_and_writing_say_the_same() -> None:
-    algebra = Algebra(("u", "v", "r"), Limits(nesting=3))
+    algebra = Algebra(("u", "v", "r"), ExpressionLimits(nesting=3))
     meant = expression(algebra)
     products, weights = list(meant), list(meant.values())
     library = ExpressionLibrary(3)
-    library.load_state_dict(tables(algebra, products, 3))
+    library.load_state_dict(build_library_state(algebra, products, 3))
     z = np.random.default_rng(0).normal(size=(30, 3))
     wanted = truth(*z.T)
     for module in (library, torch.jit.script(library)):
         with torch.no_grad():
             found = module(torch.from_numpy(z)).numpy() @ weights
         np.testing.assert_allclose(found, wanted, rtol=1e-12)
-    read, same = library.read(algebra.channels)
-    assert [term(read, p) for p in same] == [term(algebra, p) for p in products]
-    value = symbolic_sum(algebra, list(zip(products, weights, strict=True)))
-    written = equation("total", "", value, algebra.channels)
+    read, same = library.decode_terms(algebra.channels)
+    assert [format_product(read, p) for p in same] == [format_product(algebra, p) for p in products]
+    value = products_to_sympy(algebra, list(zip(products, weights, strict=True)))
+    written = format_equation("total", "", value, algebra.channels)
     called = sympy.lambdify(sympy.symbols("u v r"), sympy.sympify(written["sympy"]), "numpy")
     np.testing.assert_allclose(called(*z.T), wanted, rtol=1e-12)
     assert r"\sqrt{\left|{v}\right|}" in written["latex"]
@@ -139,8 +141,8 @@ def test_tables_and_writing_say_the_same() -> None:
 
 def test_terms_are_written_as_the_term_language_reads_them() -> None:
     algebra = Algebra(("u", "rpm", "nozzle"))
-    u, rpm, nozzle = (algebra.channel(name) for name in algebra.channels)
-    multiply, apply = algebra.multiply, algebra.apply
+    u, rpm, nozzle = (algebra.make_channel(name) for name in algebra.channels)
+    multiply, apply = algebra.multiply, algebra.apply_function
     made: list[Sum] = [
         multiply(u, apply("abs", u)),
         multiply(multiply(rpm, rpm), apply("cos", nozzle)),
@@ -150,6 +152,8 @@ def test_terms_are_written_as_the_term_language_reads_them() -> None:
     ]
     products = [next(iter(a)) for a in made]
     z = np.random.default_rng(0).normal(size=(20, 3))
-    library = TermLibrary([term(algebra, product) for product in products], algebra.channels)
-    own = algebra.values(products, dict(zip(algebra.channels, z.T, strict=True)))
+    library = TermLibrary(
+        [format_product(algebra, product) for product in products], algebra.channels
+    )
+    own = algebra.evaluate_products(products, dict(zip(algebra.channels, z.T, strict=True)))
     np.testing.assert_allclose(library(torch.from_numpy(z)).numpy(), own.T, rtol=1e-12)

@@ -13,8 +13,8 @@ import torch
 from made_samples import NAMES, channels, made, sampled
 from torch import Tensor, nn
 
-from residnet.baselines.given import StillConfig
-from residnet.core.config import validate
+from residnet.baselines.given import ZeroBaselineConfig
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError
 from residnet.core.samples import Samples
 from residnet.data.windows import WindowStore
@@ -22,10 +22,10 @@ from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, record_step
 from residnet.heads.base import ResidualHead
-from residnet.heads.lstm import LstmConfig, LstmCore, LstmHead
-from residnet.heads.mirror import Tanh, quick_tanh
+from residnet.heads.lstm import LSTMCell, LstmConfig, LstmHead
+from residnet.heads.mirror import Tanh, fast_tanh
 from residnet.heads.mlp import MlpConfig
-from residnet.heads.recurrent import RecurrentConfig, RecurrentHead
+from residnet.heads.recurrent import GRUEnsembleConfig, GRUEnsembleHead
 from residnet.physics.signals import SignalsConfig
 
 
@@ -51,17 +51,20 @@ def stepped(head: Any, z: Tensor) -> Tensor:
 
 
 def test_an_lstm_equals_that_of_torch() -> None:
-    core, z = LstmCore(4, 10, softsign=False).double(), torch.randn(5, 30, 4, dtype=torch.float64)
+    core, z = (
+        LSTMCell(4, 10, uses_softsign=False).double(),
+        torch.randn(5, 30, 4, dtype=torch.float64),
+    )
     other = nn.LSTM(4, 10, batch_first=True).double()
     with torch.no_grad():
         core.bias.uniform_(-0.5, 0.5)
         weights = dict(other.named_parameters())
-        weights["weight_ih_l0"].copy_(core.w_input)
-        weights["weight_hh_l0"].copy_(core.w_hidden)
+        weights["weight_ih_l0"].copy_(core.input_weight)
+        weights["weight_hh_l0"].copy_(core.hidden_weight)
         weights["bias_ih_l0"].copy_(core.bias)
         weights["bias_hh_l0"].zero_()
         out, (h, c) = other(z)
-        mine, s = core.sequence(z)
+        mine, s = core.run_sequence(z)
     torch.testing.assert_close(mine, out, rtol=0, atol=1e-12)
     torch.testing.assert_close(s, torch.cat((h[0], c[0]), dim=1), rtol=0, atol=1e-12)
 
@@ -76,8 +79,10 @@ def logistic(x: np.ndarray) -> np.ndarray:
 
 def test_a_softsign_cell_equals_numpy() -> None:
     """Document 003 eq. (17): softsign in place of tanh, the gates stay logistic."""
-    core, z = LstmCore(3, 6, softsign=True).double(), torch.randn(2, 8, 3, dtype=torch.float64)
-    wi, wh, b = (part.detach().numpy() for part in (core.w_input, core.w_hidden, core.bias))
+    core, z = LSTMCell(3, 6, uses_softsign=True).double(), torch.randn(2, 8, 3, dtype=torch.float64)
+    wi, wh, b = (
+        part.detach().numpy() for part in (core.input_weight, core.hidden_weight, core.bias)
+    )
     h, c = np.zeros((2, 6)), np.zeros((2, 6))
     outputs = []
     for k in range(8):
@@ -86,7 +91,7 @@ def test_a_softsign_cell_equals_numpy() -> None:
         h = logistic(o) * softsign(c)
         outputs.append(h)
     with torch.no_grad():
-        out, s = core.sequence(z)
+        out, s = core.run_sequence(z)
     np.testing.assert_allclose(out, np.stack(outputs, axis=1), atol=1e-13)
     np.testing.assert_allclose(s, np.concatenate((h, c), axis=1), atol=1e-13)
 
@@ -102,7 +107,7 @@ def test_the_documents_network_has_axes_of_their_own() -> None:
     own, z = built(per_axis=True, axis_features=seen), windows()
     changed = z.clone()
     changed[..., 3] += 50.0
-    before, after = own.sequence(z), own.sequence(changed)
+    before, after = own.teacher_forced_residuals(z), own.teacher_forced_residuals(changed)
     assert bool((before[..., 0] != after[..., 0]).any())
     assert torch.equal(before[..., 1:], after[..., 1:])
 
@@ -113,7 +118,7 @@ def test_gradients_of_the_sequence_are_those_of_the_steps(activation: str) -> No
     weights = list(head.parameters())
     found, wanted = (
         torch.autograd.grad(out.square().sum(), weights)
-        for out in (head.sequence(z), stepped(head, z))
+        for out in (head.teacher_forced_residuals(z), stepped(head, z))
     )
     for a, b in zip(found, wanted, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-12)
@@ -124,7 +129,7 @@ def test_a_memory_of_chosen_features_ignores_the_others() -> None:
     other = z.clone()
     other[:, :, : len(NAMES) - 1] += 0.1
     assert torch.equal(head.warmup(z), head.warmup(other))
-    assert not torch.equal(head.sequence(z), head.sequence(other))
+    assert not torch.equal(head.teacher_forced_residuals(z), head.teacher_forced_residuals(other))
 
 
 @pytest.mark.parametrize(
@@ -137,22 +142,22 @@ def test_a_memory_of_chosen_features_ignores_the_others() -> None:
 )
 def test_wrong_configs(config: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        validate({"kind": "lstm", **config}, LstmConfig, "here")
+        validate_config({"kind": "lstm", **config}, LstmConfig, "here")
 
 
 RUDDER = ("u", "v", "r", "n", "delta")
 
 
-def networks(**config: object) -> RecurrentHead:
+def networks(**config: object) -> GRUEnsembleHead:
     torch.manual_seed(0)
-    head = RecurrentConfig.model_validate({"hidden_size": 5, "step": 0.5, **config}).build(RUDDER)
-    assert isinstance(head, RecurrentHead)
+    head = GRUEnsembleConfig.model_validate({"hidden_size": 5, "step": 0.5, **config}).build(RUDDER)
+    assert isinstance(head, GRUEnsembleHead)
     return head.double()
 
 
 def mean_of(**config: object) -> MeanOfTrajectories:
     signals = SignalsConfig(inputs=("n", "delta")).build()
-    baseline = StillConfig().build(signals.names)
+    baseline = ZeroBaselineConfig().build(signals.names)
     model = HybridDynamics(signals, baseline, networks(**config), 0.1, "semi_implicit_euler")
     return MeanOfTrajectories([model], (-1.0,) * 3, (1.0,) * 3).double()
 
@@ -168,12 +173,12 @@ def test_a_step_is_that_of_pytorch_and_no_network_sees_another() -> None:
     for k in range(3):
         cell, rows = nn.GRUCell(8, 5, dtype=torch.float64), slice(2 * k, 2 * k + 2)
         with torch.no_grad():
-            cell.weight_ih.copy_(head.w_input[k].T[order])
-            cell.weight_hh.copy_(head.w_hidden[k].T[order])
+            cell.weight_ih.copy_(head.input_weight[k].T[order])
+            cell.weight_hh.copy_(head.hidden_weight[k].T[order])
             cell.bias_ih.copy_(head.bias[k, 0][order])
             cell.bias_hh.copy_(torch.cat((torch.zeros(10), head.bias_hidden[k, 0])))
             h = cell(seen[rows], s[rows])
-            rho = h @ head.w_out[k] + seen[rows] @ head.w_skip[k] + head.bias_out[k]
+            rho = h @ head.output_weight[k] + seen[rows] @ head.skip_weight[k] + head.bias_out[k]
         torch.testing.assert_close(after[rows], h)
         torch.testing.assert_close(found[rows], rho)
 
@@ -183,7 +188,7 @@ def test_short_steps_keep_what_a_long_one_does() -> None:
     head = networks()
     with torch.no_grad():
         # gates and new memory that depend on nothing but the biases
-        for weight in (head.w_input, head.w_hidden):
+        for weight in (head.input_weight, head.hidden_weight):
             weight.zero_()
     z, s = torch.randn(1, 5, dtype=torch.float64), torch.rand(1, 5, dtype=torch.float64)
     long = head(z, s)[1]
@@ -236,14 +241,14 @@ def test_a_coarse_store_holds_all_samples_and_the_means_of_inputs() -> None:
         rows.repeat(1, 6), rows.repeat(1, 6), rows.repeat(1, 3), w, w, yes, yes, left, stretch,
         (label >= 12).long(),
     )  # fmt: skip
-    coarse = store.coarse(steps, [1])
+    coarse = store.coarsen(steps, [1])
     assert sorted(coarse.y[:, 0].tolist()) == label.tolist()
-    starts = coarse.starts(3)
-    taken = coarse.take(coarse.y, starts, 3)[..., 0]
+    starts = coarse.find_starts(3)
+    taken = coarse.take_windows(coarse.y, starts, 3)[..., 0]
     torch.testing.assert_close(taken.diff(dim=1), torch.full((len(starts), 2), 4.0).double())
     # a window of three long steps keeps to its stretch
     assert all((row < 12).all() or (row >= 12).all() for row in taken)
-    means = coarse.take(coarse.w, starts, 2)
+    means = coarse.take_windows(coarse.w, starts, 2)
     torch.testing.assert_close(means[..., 0], taken[:, :2] + 1.5)
     expected = 0.3 * (taken[:, :2] + 1.5)
     torch.testing.assert_close(means[..., 1].cos(), expected.cos())
@@ -320,7 +325,7 @@ def test_the_residual_in_the_mirror_is_the_mirror_of_the_residual(kind: str, sce
     z = torch.from_numpy(2.0 * np.random.default_rng(3).normal(size=(3, 20, len(names))))
     other = z[..., index] * torch.tensor(sign, dtype=z.dtype)
     with torch.no_grad():
-        here, there = head.sequence(z), head.sequence(other)
+        here, there = head.teacher_forced_residuals(z), head.teacher_forced_residuals(other)
         torch.testing.assert_close(there, here * TURNED, rtol=0, atol=1e-15)
         step_here, step_there = stepped(head, z), stepped(head, other)
         torch.testing.assert_close(step_there, step_here * TURNED, rtol=0, atol=1e-15)
@@ -338,7 +343,7 @@ def test_scales_are_those_of_both_sides() -> None:
     torch.testing.assert_close(inner.std, both.std(0, correction=0))
     torch.testing.assert_close(inner.low[[1, 2, 4]], -inner.high[[1, 2, 4]])
     target = torch.cat((known.target, known.target * TURNED))
-    torch.testing.assert_close(head.residual_std(), target.std(0, correction=0))
+    torch.testing.assert_close(head.residual_scale(), target.std(0, correction=0))
 
 
 @pytest.mark.parametrize("kind", ["mlp", "lstm"])
@@ -353,16 +358,16 @@ def test_the_quick_hyperbolic_tangent_agrees_with_torch(dtype: torch.dtype, with
     x = torch.linspace(-30.0, 30.0, 10_001, dtype=dtype).reshape(73, 137)
     ends = torch.tensor([torch.inf, -torch.inf, torch.nan], dtype=dtype)[:, None].expand(3, 8_192)
     with torch.no_grad():
-        quick = quick_tanh(x)
+        quick = fast_tanh(x)
         torch.testing.assert_close(quick, torch.tanh(x), rtol=0.0, atol=within)
         # few numbers and traces take torch's own
-        assert torch.equal(quick_tanh(x[:2]), torch.tanh(x[:2]))
+        assert torch.equal(fast_tanh(x[:2]), torch.tanh(x[:2]))
         assert not torch.equal(quick, torch.tanh(x))
         assert torch.equal(torch.jit.script(Tanh())(x), quick)
         traced = torch.export.export(Tanh(), (x,))
         assert torch.equal(traced.module()(x), torch.tanh(x))
-        found = quick_tanh(ends.contiguous())
+        found = fast_tanh(ends.contiguous())
         torch.testing.assert_close(found, torch.tanh(ends), rtol=0, atol=0, equal_nan=True)
     x.requires_grad_()
-    slopes = [torch.autograd.grad(f(x).sum(), x)[0] for f in (quick_tanh, torch.tanh)]
+    slopes = [torch.autograd.grad(f(x).sum(), x)[0] for f in (fast_tanh, torch.tanh)]
     torch.testing.assert_close(*slopes, rtol=0.0, atol=2.0 * within)

@@ -12,13 +12,13 @@ import pytest
 import torch
 from safetensors.numpy import load, save
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.trust import trusting
 from residnet.dynamics.store import load_model, restored, save_model
 from residnet.heads import scikit, scikit_state
 from residnet.heads.scikit import SklearnConfig, SklearnHead
-from residnet.testing.checks import example_model, example_spec
+from residnet.testing.checks import make_example_model, make_example_spec
 
 STEPS: dict[str, Any] = {
     "sklearn.linear_model.QuantileRegressor": {"alpha": 0.01},
@@ -51,7 +51,7 @@ def _pipeline(name: str) -> list[Any]:
 
 
 def _config(pipeline: list[Any]) -> SklearnConfig:
-    return validate({"pipeline": pipeline, "samples": 150}, SklearnConfig, "here")
+    return validate_config({"pipeline": pipeline, "samples": 150}, SklearnConfig, "here")
 
 
 @pytest.fixture
@@ -74,8 +74,8 @@ def no_fit(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
 def test_a_stored_pipeline_predicts_the_same_without_a_fit(
     pipeline: list[Any], tmp_path: Path, no_fit: Callable[[], None]
 ) -> None:
-    spec = example_spec(_config(pipeline))
-    model = example_model(spec)
+    spec = make_example_spec(_config(pipeline))
+    model = make_example_model(spec)
     save_model(tmp_path / "model", spec, model)
     no_fit()
     stored = load_model(tmp_path / "model")[1]
@@ -83,7 +83,7 @@ def test_a_stored_pipeline_predicts_the_same_without_a_fit(
     before = model.head.asked(torch.from_numpy(x))
     assert before.std() > 0
     assert torch.equal(stored.head.asked(torch.from_numpy(x)), before)
-    assert stored.head.parameter_count() == model.head.parameter_count()
+    assert stored.head.parameter_counts() == model.head.parameter_counts()
     assert b"pickle" not in (tmp_path / "model" / "model.safetensors").read_bytes()
 
 
@@ -111,8 +111,8 @@ HOSTILE: list[tuple[str, str, Any, str]] = [
 @pytest.mark.parametrize(("name", "key", "value", "message"), HOSTILE)
 def test_a_forged_state_is_refused(name: str, key: str, value: Any, message: str) -> None:
     """Compiled code of scikit-learn would read beyond arrays, or walk in a circle."""
-    spec = example_spec(_config(_pipeline(name)))
-    model = example_model(spec)
+    spec = make_example_spec(_config(_pipeline(name)))
+    model = make_example_model(spec)
     state = model.state_dict()
     stored = state["head._extra_state"].numpy()
     arrays = load(stored[5:].tobytes())
@@ -134,8 +134,8 @@ def test_a_forged_state_is_refused(name: str, key: str, value: Any, message: str
 
 @pytest.mark.parametrize("length", [0, 3, 5, 40, 400])
 def test_a_cut_state_is_refused(length: int) -> None:
-    spec = example_spec(_config(["sklearn.linear_model.Ridge"]))
-    state = example_model(spec).state_dict()
+    spec = make_example_spec(_config(["sklearn.linear_model.Ridge"]))
+    state = make_example_model(spec).state_dict()
     state["head._extra_state"] = state["head._extra_state"][:length]
     if length == 0:
         # the state of a head that is not fitted yet
@@ -147,8 +147,8 @@ def test_a_cut_state_is_refused(length: int) -> None:
 
 def test_samples_to_fit_on_again_are_refused() -> None:
     """Earlier versions stored these; a forged state cannot make a load fit anything."""
-    spec = example_spec(_config(["sklearn.linear_model.Ridge"]))
-    state = example_model(spec).state_dict()
+    spec = make_example_spec(_config(["sklearn.linear_model.Ridge"]))
+    state = make_example_model(spec).state_dict()
     forged = state["head._extra_state"].clone()
     forged[0] = 2
     with pytest.raises(UsageError, match="give --trust"):
@@ -172,8 +172,10 @@ def test_a_store_of_pickles_is_refused_with_and_without_trust() -> None:
 
 def test_other_classes_need_trust_at_the_fit_and_at_the_load(tmp_path: Path) -> None:
     with trusting():
-        spec = example_spec(_config([{"sklearn.ensemble.BaggingRegressor": {"n_estimators": 2}}]))
-        model = example_model(spec)
+        spec = make_example_spec(
+            _config([{"sklearn.ensemble.BaggingRegressor": {"n_estimators": 2}}])
+        )
+        model = make_example_model(spec)
         save_model(tmp_path / "model", spec, model)
         stored = load_model(tmp_path / "model")[1]
     x = torch.randn(9, model.head.features.count)

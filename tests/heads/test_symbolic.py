@@ -19,11 +19,11 @@ from made_odin import FORCE_TRUTH, JET_TRUTH, MSD_TRUTH, force_logs, jet_logs, m
 from made_samples import sampled
 
 from residnet.core.errors import FitError
-from residnet.core.names import ACCELERATION
+from residnet.core.names import ACCELERATION_NAMES
 from residnet.core.samples import Samples
 from residnet.data.derivatives import SavitzkyGolay
-from residnet.heads.symbolic import Past, SymbolicConfig, SymbolicHead, best_delay
-from residnet.physics.symmetry import term_parity
+from residnet.heads.symbolic import SegmentedSamples, SymbolicConfig, SymbolicHead, find_best_delay
+from residnet.physics.symmetry import compute_term_parity
 
 FORCES, JETS = ("u", "v", "r", "tau_x", "tau_y", "tau_n"), ("u", "v", "r", "rpm", "nozzle")
 FORCE: dict[str, Any] = {"candidates": {"input_degree": 2, "coupling": ["u", "v", "r"]}}
@@ -43,14 +43,14 @@ Log = dict[str, np.ndarray]
 def samples(log: Log, names: tuple[str, ...], target: np.ndarray | None = None) -> Samples:
     """Samples of one log, with its exact accelerations unless others are given."""
     z = np.stack([log[name] for name in names], axis=1)
-    y = np.stack([log[name] for name in ACCELERATION], axis=1) if target is None else target
+    y = np.stack([log[name] for name in ACCELERATION_NAMES], axis=1) if target is None else target
     return sampled(z, y, names, t=log["t"])
 
 
 def fitted(config: dict[str, Any], data: Samples) -> tuple[SymbolicHead, dict[str, Any]]:
     head = SymbolicConfig.model_validate(config).build(data.names)
     head.calibrate(data)
-    return head, head.solve(data)
+    return head, head.fit_preferred(data)
 
 
 def found(notes: dict[str, Any], axis: str) -> dict[str, float]:
@@ -88,7 +88,7 @@ def test_structure_of_random_equations_with_products_magnitudes_and_ratios(seed:
     """A tenth of a standard deviation of noise."""
     drawn = draw(seed)
     _, notes = fitted({"candidates": SPACE.model_dump()}, drawn.samples)
-    for axis, terms in zip(ACCELERATION, drawn.truth, strict=True):
+    for axis, terms in zip(ACCELERATION_NAMES, drawn.truth, strict=True):
         assert set(found(notes, axis)) == set(terms)
 
 
@@ -96,7 +96,7 @@ def test_structure_of_random_equations_with_products_magnitudes_and_ratios(seed:
 def test_ships_are_known_without_settings(ratios: bool) -> None:
     drawn = draw_ship(1, ratios=ratios)
     _, notes = fitted({}, drawn.samples)
-    for axis, terms in zip(ACCELERATION, drawn.truth, strict=True):
+    for axis, terms in zip(ACCELERATION_NAMES, drawn.truth, strict=True):
         assert found(notes, axis) == pytest.approx(terms, rel=1e-6)
 
 
@@ -185,7 +185,7 @@ def test_a_delay_is_found_inside_the_regression_and_remembered() -> None:
             rho, s = head(data.z[k : k + 1], s)
             assert torch.equal(same, rho)
             torch.testing.assert_close(rho[0], data.target[k], rtol=0, atol=1e-12)
-        late = head.sequence(data.z[None])[0]
+        late = head.teacher_forced_residuals(data.z[None])[0]
     torch.testing.assert_close(late[12:], data.target[12:], rtol=0, atol=1e-12)
     for seed in range(4):
         random = np.random.default_rng(seed)
@@ -205,8 +205,8 @@ def test_errors_by_delay_are_those_of_refits_across_gaps(shift: int) -> None:
     stretch = np.repeat([0, 1, 2], [150, 50, 200])
     # one term twice does no harm
     terms, index = ("u", "tau", "u^2 tau |tau|", "tau"), np.array([1])
-    past = Past(np.stack((u, tau), axis=1), y[:, None], stretch, 0.1)
-    found, profile = best_delay(past, [terms], ("u", "tau"), index, 10)
+    past = SegmentedSamples(np.stack((u, tau), axis=1), y[:, None], stretch, 0.1)
+    found, profile = find_best_delay(past, [terms], ("u", "tau"), index, 10)
     now = np.array([i for i in range(10, count) if stretch[i] == stretch[i - 10]])
     for steps in range(11):
         then = tau[now - steps]
@@ -215,7 +215,7 @@ def test_errors_by_delay_are_those_of_refits_across_gaps(shift: int) -> None:
         assert profile[steps] == pytest.approx(np.log(left @ left), abs=1e-9)
     assert found == shift
     with pytest.raises(FitError, match="delay: 0 samples have a past of 300"):
-        best_delay(past, [terms], ("u", "tau"), index, 300)
+        find_best_delay(past, [terms], ("u", "tau"), index, 300)
 
 
 def test_a_symmetric_vessel_has_no_terms_that_a_mirror_forbids() -> None:
@@ -223,13 +223,16 @@ def test_a_symmetric_vessel_has_no_terms_that_a_mirror_forbids() -> None:
     noise and a bias would put them in.
     """
     log = force_logs(1)[0]
-    y = np.stack([log[name] for name in ACCELERATION], axis=1) + 0.02 * np.abs(log["v"])[:, None]
+    y = (
+        np.stack([log[name] for name in ACCELERATION_NAMES], axis=1)
+        + 0.02 * np.abs(log["v"])[:, None]
+    )
     _, free = fitted(FORCE, samples(log, FORCES, y))
     _, held = fitted({**FORCE, "symmetric": True}, samples(log, FORCES, y))
     assert "|v|" in found(free, "v_dot")
     assert "|v|" in found(held, "u_dot")
     for axis in ("v_dot", "r_dot"):
-        assert not any(term_parity(term, FORCES) == 1 for term in found(held, axis))
+        assert not any(compute_term_parity(term, FORCES) == 1 for term in found(held, axis))
     _, exact = fitted({**FORCE, "symmetric": True}, samples(log, FORCES))
     assert found(exact, "r_dot") == pytest.approx(FORCE_TRUTH["r_dot"], rel=1e-9)
     assert exact["equations"]["r_dot"]["candidates"] < held["terms"]
@@ -237,14 +240,14 @@ def test_a_symmetric_vessel_has_no_terms_that_a_mirror_forbids() -> None:
 
 def test_free_runs_may_choose_shorter_equations_or_none() -> None:
     log = force_logs(1)[0]
-    y = np.stack([log[name] for name in ACCELERATION], axis=1)
+    y = np.stack([log[name] for name in ACCELERATION_NAMES], axis=1)
     data = samples(
         log, FORCES, y + 0.3 * y.std(axis=0) * np.random.default_rng(0).normal(size=y.shape)
     )
     head = SymbolicConfig.model_validate({**FORCE, "choose": "free_run"}).build(FORCES)
     head.calibrate(data)
-    solutions = head.solutions(data)
-    assert solutions[-1].choice == {"kept": [0, 0, 0]}
+    solutions = head.fit_solutions(data)
+    assert solutions[-1].hyperparameters == {"kept": [0, 0, 0]}
     assert float(solutions[-1].state["coefficients"].abs().max()) == 0
     states = [solution.state["coefficients"] for solution in solutions]
     assert all(not torch.equal(a, b) for i, a in enumerate(states) for b in states[:i])
@@ -285,7 +288,7 @@ def test_c_code_and_sympy_text_equal_the_head(tmp_path: Path) -> None:
     with torch.no_grad():
         rho = head(z, z[:, :0])[0]
     symbols = sympy.symbols("u v r tau_x", real=True)
-    for axis, name in enumerate(ACCELERATION):
+    for axis, name in enumerate(ACCELERATION_NAMES):
         function = getattr(library, name)
         function.restype, function.argtypes = ctypes.c_double, [ctypes.c_double] * 4
         np.testing.assert_allclose(
@@ -308,10 +311,10 @@ def test_text_latex_and_parts_that_add_up_to_the_residual() -> None:
         assert part in latex
     assert r"4.78 \cdot 10^{-5} \tau_{n}" in written["r_dot"]["latex"]
     with torch.no_grad():
-        rho = head.sequence(data.z)
+        rho = head.teacher_forced_residuals(data.z)
     torch.testing.assert_close(rho, data.target, rtol=0, atol=1e-9)
-    for axis, name in enumerate(ACCELERATION):
-        parts = head.contributions(data.z, axis)
+    for axis, name in enumerate(ACCELERATION_NAMES):
+        parts = head.term_contributions(data.z, axis)
         assert found(notes, name) == pytest.approx(FORCE_TRUTH[name], rel=1e-6)
         assert set(parts) == set(FORCE_TRUTH[name])
         assert notes["equations"][name]["exact"]

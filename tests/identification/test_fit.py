@@ -16,25 +16,25 @@ from tiny_fit import logs_of, settings_of
 
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.errors import DataError, FitError
-from residnet.core.processes import free_cores, spread
-from residnet.core.progress import Progress, listen
-from residnet.data.prepare import channels, samples
+from residnet.core.processes import available_cores, worker_limit
+from residnet.core.progress import Progress, on_progress
+from residnet.data.prepare import compute_channels, make_samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.base import ZeroHead
 from residnet.identification import fit as parts
-from residnet.identification.bands import FoldModels
-from residnet.identification.fit import fit
+from residnet.identification.bands import LeaveFoldOutModels
+from residnet.identification.fit import fit_models
 from residnet.identification.fitter import (
     FitStore,
     FittedModel,
     Fitter,
-    choose_solution,
-    references,
+    find_reference_names,
+    select_by_free_run,
 )
 from residnet.identification.identified import (
-    Identified,
-    teacher_forced,
+    IdentifiedModels,
+    run_teacher_forced,
 )
 from residnet.identification.prepared import PreparedSplits
 from residnet.identification.settings import FitSettings
@@ -53,14 +53,14 @@ def test_models_stand_in_order(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     heard: list[Progress] = []
-    with listen(heard.append):
-        found = fit(logs, settings_of("heads", "ensembles", "training", bands=None))
+    with on_progress(heard.append):
+        found = fit_models(logs, settings_of("heads", "ensembles", "training", bands=None))
     assert not list(tmp_path.iterdir())
     assert list(found) == ["zero", "baseline", "ridge", "lstm", "mean"]
     roles = [entry.spec.role for entry in found.values()]
     assert roles == ["zero", "baseline", "head", "head", "ensemble"]
-    assert found.limit.shape == (3,)
-    assert np.all(found.limit > 0)
+    assert found.velocity_limits.shape == (3,)
+    assert np.all(found.velocity_limits > 0)
     epochs = [event.done for event in heard if event.stage == "training lstm"]
     assert epochs == list(range(1, 8))
 
@@ -71,8 +71,8 @@ def test_an_optional_head_is_left_out_where_its_package_is_absent(
     monkeypatch.setitem(sys.modules, "deap", None)
     bred = {"kind": "genetic", "evolution": {"population": 10, "generations": 1}, "optional": True}
     said: list[str] = []
-    with listen(lambda event: said.append(str(event))):
-        assert list(fit(logs, settings_of(heads={"bred": bred}))) == ["zero", "baseline"]
+    with on_progress(lambda event: said.append(str(event))):
+        assert list(fit_models(logs, settings_of(heads={"bred": bred}))) == ["zero", "baseline"]
     assert "bred is left out" in " ".join(said)
 
 
@@ -82,8 +82,8 @@ def test_a_band_says_why_its_model_could_not_be_fitted_without_some_logs(
     def refuse(*_: FittedModel) -> list[HybridDynamics]:
         raise FitError("the data do not excite it")
 
-    monkeypatch.setattr(FoldModels, "_baseline", refuse)
-    bands = fit(logs, settings_of(bands={"folds": 2}))["baseline"].bands
+    monkeypatch.setattr(LeaveFoldOutModels, "_baseline", refuse)
+    bands = fit_models(logs, settings_of(bands={"folds": 2}))["baseline"].bands
     assert bands
     for band in bands.values():
         assert "(the data do not excite it)" in band.cautions[0]
@@ -112,10 +112,10 @@ def test_side_by_side_gives_the_same_models(
 ) -> None:
     monkeypatch.setattr(parts, "_LONG_TRAINING", 1)
     settings = beside()
-    alone = fit(logs, settings)
+    alone = fit_models(logs, settings)
     heard: list[Progress] = []
-    with spread(2), listen(heard.append):
-        found = fit(logs, settings)
+    with worker_limit(2), on_progress(heard.append):
+        found = fit_models(logs, settings)
     assert list(found) == list(alone) == ["zero", "baseline", "wide", "narrow", "ridge"]
     for name, model in alone.items():
         other = found[name].model.state_dict()
@@ -126,8 +126,8 @@ def test_side_by_side_gives_the_same_models(
     # what the processes report reaches who listens to this one, and so does why one fails
     assert {"training wide", "training narrow"} <= {event.stage for event in heard}
     failing = beside(multi_step=[{"horizon": 500.0, "epochs": 1, "batch": 16}])
-    with spread(2), pytest.raises(DataError, match="no training log holds a window of 500"):
-        fit(logs, failing)
+    with worker_limit(2), pytest.raises(DataError, match="no training log holds a window of 500"):
+        fit_models(logs, failing)
 
 
 def test_what_ends_soon_stays_in_this_process(
@@ -135,16 +135,16 @@ def test_what_ends_soon_stays_in_this_process(
 ) -> None:
     settings = beside()
     fitter = Fitter(logs, settings, FitStore())
-    with spread(8):
-        assert parts.side_by_side(fitter) == 1
+    with worker_limit(8):
+        assert parts.count_parallel_heads(fitter) == 1
         monkeypatch.setattr(parts, "_LONG_TRAINING", 1)
-        assert parts.side_by_side(fitter) == 2
+        assert parts.count_parallel_heads(fitter) == 2
     # a program of the user's own need not be made for processes
-    assert free_cores() == 1
-    assert parts.side_by_side(fitter) == 1
-    with spread(8):
+    assert available_cores() == 1
+    assert parts.count_parallel_heads(fitter) == 1
+    with worker_limit(8):
         gpu = beside(device="cuda")
-        assert parts.side_by_side(Fitter(logs, gpu, FitStore())) == 1
+        assert parts.count_parallel_heads(Fitter(logs, gpu, FitStore())) == 1
 
 
 ROLES = {"zero": "zero", **dict.fromkeys(("baseline", "physics", "hull"), "baseline")}
@@ -187,7 +187,7 @@ def test_who_is_compared_with_whom(
         SimpleNamespace(name=name, spec=SimpleNamespace(role=role), notes=notes.get(name, {}))
         for name, role in roles.items()
     ]
-    assert references(cast(list[FittedModel], found)) == expected
+    assert find_reference_names(cast(list[FittedModel], found)) == expected
 
 
 def model() -> HybridDynamics:
@@ -219,9 +219,9 @@ def chosen(
         assert candidate is own
         return bench(float(theta[0, 0]))
 
-    best, notes = choose_solution(own, own.baseline, solutions, score)
-    assert theta.flatten().tolist() == [best.choice["value"]] * 3
-    return best.choice["value"], notes.get("free_run_choice", [])
+    best, notes = select_by_free_run(own, own.baseline, solutions, score)
+    assert theta.flatten().tolist() == [best.hyperparameters["value"]] * 3
+    return best.hyperparameters["value"], notes.get("free_run_choice", [])
 
 
 def test_a_single_solution_is_taken_without_a_free_run() -> None:
@@ -274,39 +274,44 @@ def forced_logs() -> PreparedSplits:
 
 
 @pytest.fixture(scope="module")
-def identified(forced_logs: PreparedSplits) -> Identified:
-    return fit(forced_logs, SETTINGS)
+def identified(forced_logs: PreparedSplits) -> IdentifiedModels:
+    return fit_models(forced_logs, SETTINGS)
 
 
 def test_accelerations_are_those_of_the_models_rate_at_the_sample(
-    forced_logs: PreparedSplits, identified: Identified
+    forced_logs: PreparedSplits, identified: IdentifiedModels
 ) -> None:
     log, model = forced_logs["test"][0], identified["ridge"].model.double()
     # inputs move on within a step: else one rule could not be told from the other
-    assert np.abs(log.w - log.recorded).max() > 1.0
-    at = int(np.flatnonzero(log.good)[50])
-    x, w = torch.from_numpy(log.smooth[at : at + 1]), torch.from_numpy(log.recorded[at : at + 1])
-    z = channels(log, model.signals)[at : at + 1]
+    assert np.abs(log.w - log.rate_inputs).max() > 1.0
+    at = int(np.flatnonzero(log.trainable)[50])
+    x, w = (
+        torch.from_numpy(log.smoothed[at : at + 1]),
+        torch.from_numpy(log.rate_inputs[at : at + 1]),
+    )
+    z = compute_channels(log, model.signals)[at : at + 1]
     torch.testing.assert_close(z, model.channels(x, w), rtol=1e-12, atol=1e-12)
     rate = model.rate(x, model.signals.prepare(w), model.head(z, model.initial_state(1))[0])
-    predicted = teacher_forced(model, log).predicted[at]
+    predicted = run_teacher_forced(model, log).predicted_accelerations[at]
     np.testing.assert_allclose(predicted, rate[0, 3:].detach().numpy(), rtol=1e-9)
 
 
 def test_training_sees_the_channels_of_the_closed_forms(
-    forced_logs: PreparedSplits, identified: Identified
+    forced_logs: PreparedSplits, identified: IdentifiedModels
 ) -> None:
     """Where the fit saw other inputs, its residual would correlate with the regressors."""
     signals = SETTINGS.signals.build()
-    known = samples(forced_logs["train"], signals)
-    store = WindowStore.gather(forced_logs["train"], torch.float64)
-    z = signals(store.smooth, signals.prepare(store.recorded))[store.good]
+    known = make_samples(forced_logs["train"], signals)
+    store = WindowStore.from_logs(forced_logs["train"], torch.float64)
+    z = signals(store.smoothed, signals.prepare(store.rate_inputs))[store.trainable]
     torch.testing.assert_close(z, known.z, rtol=1e-12, atol=1e-12)
     runs = [
-        (log, teacher_forced(identified["baseline"].model, log)) for log in forced_logs["train"]
+        (log, run_teacher_forced(identified["baseline"].model, log)) for log in forced_logs["train"]
     ]
-    assert torch.equal(torch.cat([run.z[log.good] for log, run in runs]), known.z)
-    left = np.concatenate([(log.nu_dot - run.predicted)[log.good] for log, run in runs])
+    assert torch.equal(torch.cat([run.channels[log.trainable] for log, run in runs]), known.z)
+    left = np.concatenate(
+        [(log.nu_dot - run.predicted_accelerations)[log.trainable] for log, run in runs]
+    )
     columns = known.z[:, [known.names.index(name) for name in TERMS]].numpy()
     size = np.linalg.norm(columns, axis=0)[:, None] * np.linalg.norm(left, axis=0)
     assert (np.abs(columns.T @ left) < 1e-6 * size).all()

@@ -15,11 +15,15 @@ from tiny_fit import DATA, settings_of
 
 from residnet.core.arrays import paged
 from residnet.core.log import Log
-from residnet.data.sources import read_logs
+from residnet.data.sources import read_split_logs
 from residnet.data.windows import WindowStore
-from residnet.identification.fit import fit
-from residnet.identification.prepared import prepare_logs, shortened, through_currents
-from residnet.regression.estimator import Estimator, Pieces
+from residnet.identification.fit import fit_models
+from residnet.identification.prepared import (
+    convert_to_motion_through_water,
+    prepare_splits,
+    split_long_log,
+)
+from residnet.regression.estimator import ChunkedRegressors, Estimator
 from residnet.regression.least_squares import LeastSquares
 from residnet.regression.shrinkage import PLSR, Ridge
 
@@ -34,23 +38,23 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.long
 def test_a_fit_from_disk_is_the_fit_from_memory(few: None, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = settings_of(heads={"plsr": {"kind": "plsr"}, "ridge": {"kind": "ridge"}})
-    read = read_logs(DATA)
-    on_disk = {split: [log.on_disk() for log in logs] for split, logs in read.items()}
-    prepared = prepare_logs(on_disk, settings)
-    assert all(paged.lies_on_disk(log.y) for logs in prepared.values() for log in logs)
-    small = fit(prepared, settings)
-    store = WindowStore.gather(prepared["train"])
+    read = read_split_logs(DATA)
+    on_disk = {split: [log.move_to_disk() for log in logs] for split, logs in read.items()}
+    prepared = prepare_splits(on_disk, settings)
+    assert all(paged.is_memory_mapped(log.y) for logs in prepared.values() for log in logs)
+    small = fit_models(prepared, settings)
+    store = WindowStore.from_logs(prepared["train"])
     monkeypatch.undo()
-    held = prepare_logs(read, settings)
-    assert not any(paged.lies_on_disk(log.y) for logs in held.values() for log in logs)
-    for each in (held, through_currents(held, settings)[0]):
-        assert all(isinstance(members, paged.OneByOne) for members in each.values())
-    for name, entry in fit(held, settings).items():
+    held = prepare_splits(read, settings)
+    assert not any(paged.is_memory_mapped(log.y) for logs in held.values() for log in logs)
+    for each in (held, convert_to_motion_through_water(held, settings)[0]):
+        assert all(isinstance(members, paged.PageReleasingList) for members in each.values())
+    for name, entry in fit_models(held, settings).items():
         for key, value in entry.model.state_dict().items():
             torch.testing.assert_close(
                 small[name].model.state_dict()[key], value, rtol=1e-7, atol=1e-10
             )
-    other = WindowStore.gather(held["train"])
+    other = WindowStore.from_logs(held["train"])
     for part in dataclasses.fields(store):
         one, another = getattr(store, part.name), getattr(other, part.name)
         assert one is another is None or torch.equal(one, another)
@@ -69,34 +73,34 @@ def test_pieces_give_what_the_whole_does(few: None, estimator: Estimator) -> Non
     columns = [5, 0, 1, 2, 4]
     y = basis(z)[:, [0, 4]] + 0.1 * torch.randn(900, 2, generator=generator, dtype=torch.float64)
     groups = torch.arange(900) // 150
-    in_pieces = estimator.fit(Pieces(basis, z, columns), y, groups)
+    in_pieces = estimator.fit(ChunkedRegressors(basis, z, columns), y, groups)
     at_once = estimator.fit(basis(z)[:, columns], y, groups)
     assert len(in_pieces) == len(at_once)
     for found, wanted in zip(in_pieces, at_once, strict=True):
-        assert found.choice == wanted.choice
+        assert found.hyperparameters == wanted.hyperparameters
         for name, value in wanted.state.items():
             torch.testing.assert_close(found.state[name], value, rtol=1e-9, atol=1e-12)
-        assert [c.error for c in found.table] == pytest.approx(
-            [c.error for c in wanted.table], rel=1e-9
+        assert [c.standard_error for c in found.table] == pytest.approx(
+            [c.standard_error for c in wanted.table], rel=1e-9
         )
 
 
 def test_a_very_long_log_is_prepared_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("residnet.identification.prepared._LONGEST", 400)
+    monkeypatch.setattr("residnet.identification.prepared._MAX_SAMPLES", 400)
     log = Log("trip", np.arange(1000.0), {"u": np.arange(1000.0)})
-    parts = shortened(log)
+    parts = split_long_log(log)
     assert [part.name for part in parts] == ["trip_1_of_3", "trip_2_of_3", "trip_3_of_3"]
     np.testing.assert_array_equal(np.concatenate([part["u"] for part in parts]), log["u"])
-    assert shortened(parts[0]) == [parts[0]]
+    assert split_long_log(parts[0]) == [parts[0]]
 
 
 def test_arrays_on_disk_keep_their_values_when_memory_is_given_back() -> None:
     values = np.random.default_rng(0).normal(size=(1000, 3))
-    kept = paged.on_disk(values)
-    paged.forget()
+    kept = paged.copy_to_disk(values)
+    paged.release_pages()
     np.testing.assert_array_equal(kept, values)
-    assert paged.lies_on_disk(kept[5:, 0])
-    assert not paged.lies_on_disk(values)
+    assert paged.is_memory_mapped(kept[5:, 0])
+    assert not paged.is_memory_mapped(values)
 
 
 LINUX = pytest.mark.skipif(
@@ -112,7 +116,7 @@ def pages() -> int:
 def test_pages_are_given_back_while_others_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(paged, "_RESIDENT", 1 << 24)
     before = pages()
-    values = paged.empty((1 << 23,))
+    values = paged.allocate_on_disk((1 << 23,))
     values[...] = np.arange(values.size)
     until = time.monotonic() + 20.0
     while pages() - before > 1 << 25 and time.monotonic() < until:
@@ -122,20 +126,20 @@ def test_pages_are_given_back_while_others_work(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_chosen_rows_of_many_lie_in_a_file(few: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    placed = Mock(wraps=paged.empty)
+    placed = Mock(wraps=paged.allocate_on_disk)
     monkeypatch.setattr(paged, "empty", placed)
     values = torch.arange(3000.0, dtype=torch.float64).reshape(1000, 3)
     many, some = torch.arange(1000) % 4 > 0, torch.arange(1000) < 100
-    assert torch.equal(paged.taken(values, many), values[many])
-    assert torch.equal(paged.taken(values[:, 0], many), values[many][:, 0])
-    assert torch.equal(paged.taken(values, some), values[some])
+    assert torch.equal(paged.take_rows(values, many), values[many])
+    assert torch.equal(paged.take_rows(values[:, 0], many), values[many][:, 0])
+    assert torch.equal(paged.take_rows(values, some), values[some])
     assert [call.args[0] for call in placed.call_args_list] == [(750, 3), (750,)]
 
 
 @LINUX
 def test_a_look_at_each_item_holds_the_pages_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
     def most(items: list[np.ndarray]) -> int:
-        paged.forget()
+        paged.release_pages()
         before, found = pages(), []
         for item in items:
             assert item[::512].sum() == 0.0
@@ -145,8 +149,8 @@ def test_a_look_at_each_item_holds_the_pages_of_one(monkeypatch: pytest.MonkeyPa
     # nobody else gives them back here
     monkeypatch.setattr(paged, "_RESIDENT", 1 << 40)
     size = 1 << 23
-    items = [paged.empty((size // 8,)) for _ in range(8)]
+    items = [paged.allocate_on_disk((size // 8,)) for _ in range(8)]
     for item in items:
         item[...] = 0.0
     assert most(items) >= 6 * size
-    assert most(paged.OneByOne(items)) < 2.5 * size
+    assert most(paged.PageReleasingList(items)) < 2.5 * size

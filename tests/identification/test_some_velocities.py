@@ -9,13 +9,13 @@ import pytest
 
 import residnet
 from residnet.core.errors import ConfigError, UsageError
-from residnet.core.layout import Live
+from residnet.core.layout import DegreesOfFreedom
 from residnet.core.log import Log
 from residnet.data.motion import MotionConfig, complete_motion
-from residnet.identification.planning import TrialLimits, candidates, shares_of
+from residnet.identification.planning import TrialLimits, infer_input_shares, propose_manoeuvres
 from residnet.identification.settings import FitSettings
 from residnet.physics.signals import SignalsConfig
-from residnet.testing.checks import example_spec
+from residnet.testing.checks import make_example_spec
 
 STEP = 0.2
 
@@ -45,25 +45,28 @@ def test_a_fit_is_of_what_the_logs_tell(
     assert data.signals.velocities == velocities
     models = residnet.fit(data, "regressors", ["ridge"] if len(velocities) > 1 else ())
     table = residnet.metrics(models, split="test")
-    live = Live(velocities)
+    live = DegreesOfFreedom(velocities)
     assert {name for name in map(str, table) if name.startswith("rmse_")} == {
         f"rmse_{v}" for v in velocities
     }
-    assert ("position_error_end" in table) == live.moves
-    assert ("heading_error_end" in table) == live.turns
+    assert ("position_error_end" in table) == live.has_position
+    assert ("heading_error_end" in table) == live.has_heading
     error = table.groupby("model")["nrmse_mean"].mean()
     assert error["baseline"] < 0.2 < error["zero"]
     x = np.array([0.0, 0.0, 0.3, 0.5, 0.7, 0.1])
     after, _ = models["baseline"].step(x, np.full(len(data.signals.inputs), 0.5))
     # a velocity that was not recorded is zero, whatever it is given as
-    assert np.flatnonzero(after[3:]).tolist() == live.axes
+    assert np.flatnonzero(after[3:]).tolist() == live.active_indices
     runs = models.runs["test"]
-    assert len(runs.plot_history().axes) == len(velocities) + live.turns
-    if not (live.moves and live.turns):
+    assert len(runs.plot_history().axes) == len(velocities) + live.has_heading
+    if not (live.has_position and live.has_heading):
         with pytest.raises(UsageError, match="has no track"):
             runs.plot_track()
     words = " ".join(models.verdict)
-    assert (" m " in words or " m;" in words, " deg" in words) == (live.moves, live.turns)
+    assert (" m " in words or " m;" in words, " deg" in words) == (
+        live.has_position,
+        live.has_heading,
+    )
 
 
 def dive(number: int, *channels: str) -> Log:
@@ -154,7 +157,7 @@ def test_a_vehicle_that_only_dives(made: Callable[..., Log], channels: tuple[str
     velocities = data.signals.velocities
     models = residnet.fit(data, {"kind": "regressors", "sets": ["fossen"], "ridge": 1e-6})
     table = residnet.metrics(models, split="test")
-    live = Live(velocities)
+    live = DegreesOfFreedom(velocities)
     assert {name for name in map(str, table) if name.startswith("rmse_")} == {
         f"rmse_{one}" for one in (*velocities, "z", *["theta"] * ("q" in velocities))
     }
@@ -162,17 +165,17 @@ def test_a_vehicle_that_only_dives(made: Callable[..., Log], channels: tuple[str
     assert [f"{name}_error_end" in table for name in ends] == [*ends.values()]
     error = table.groupby("model")["nrmse_mean"].mean()
     assert error["baseline"] < error["zero"] * (1.0 if velocities == ("w", "q") else 0.3)
-    x = np.full(len(live.states), 0.1)
+    x = np.full(len(live.state_names), 0.1)
     after, _ = models["baseline"].step(x, np.full(len(data.signals.inputs), 0.1))
-    assert not after[[live.states.index(name) for name in live.dead]].any()
-    assert after[live.states.index("z")] != x[live.states.index("z")]
+    assert not after[[live.state_names.index(name) for name in live.fixed_states]].any()
+    assert after[live.state_names.index("z")] != x[live.state_names.index("z")]
 
 
 def test_the_pose_is_what_the_live_velocities_lead_to() -> None:
-    straight = complete_motion(trial(0, "u", "x", "y"), MotionConfig(), Live(("u",)))
+    straight = complete_motion(trial(0, "u", "x", "y"), MotionConfig(), DegreesOfFreedom(("u",)))
     assert not straight["psi"].any()
     assert straight["x"][-1] == pytest.approx(np.trapezoid(straight["u"], straight.t), rel=1e-2)
-    turning = complete_motion(trial(0, "psi", "delta"), MotionConfig(), Live(("r",)))
+    turning = complete_motion(trial(0, "psi", "delta"), MotionConfig(), DegreesOfFreedom(("r",)))
     assert not any(turning[name].any() for name in ("x", "y", "u", "v"))
     assert np.abs(turning["r"] - trial(0, "r")["r"]).mean() < 0.01
     assert turning.meta["integrated"] == ["x", "y"]
@@ -191,7 +194,11 @@ def test_scales_are_of_the_velocities_of_the_model() -> None:
             "scales": {"u": 0.3},
         },
     }
-    assert FitSettings.model_validate(content).evaluation.scales.array().tolist() == [0.3, 1.0, 1.0]
+    assert FitSettings.model_validate(content).evaluation.scales.to_array().tolist() == [
+        0.3,
+        1.0,
+        1.0,
+    ]
     for part, key, value, told in (
         ("evaluation", "scales", {"u": 0.3, "v": 0.1, "r": 0.1}, "give one of each"),
         ("signals", "velocities", ["r", "u"], "in the order u, v, r"),
@@ -204,14 +211,14 @@ def test_scales_are_of_the_velocities_of_the_model() -> None:
 
 def test_trials_are_those_that_a_vessel_can_run() -> None:
     def kinds(*velocities: str) -> set[str]:
-        return {one.kind for one in candidates(TrialLimits(), Live(velocities))}
+        return {one.kind for one in propose_manoeuvres(TrialLimits(), DegreesOfFreedom(velocities))}
 
     both = {"three_two_one_one", "multi_sine"}
     assert kinds("u") == both | {"acceleration_deceleration"}
     assert kinds("r") == both | {"zigzag", "turning_circle"}
     assert kinds("u", "v", "r") == kinds("u") | kinds("r")
     named = {"inputs": ("n",), "velocities": ("u",)}
-    spec = example_spec(None, SignalsConfig(inputs=("n_port", "n_stbd"), velocities=("u",)))
+    spec = make_example_spec(None, SignalsConfig(inputs=("n_port", "n_stbd"), velocities=("u",)))
     one = spec.model_copy(
         update={
             "signals": SignalsConfig.model_validate(named),
@@ -219,4 +226,4 @@ def test_trials_are_those_that_a_vessel_can_run() -> None:
             "high": spec.high[:4],
         }
     )
-    assert shares_of(one)["n"].drive == pytest.approx(max(abs(one.low[3]), one.high[3]))
+    assert infer_input_shares(one)["n"].drive == pytest.approx(max(abs(one.low[3]), one.high[3]))

@@ -13,20 +13,25 @@ import torch
 from random_vessels import small_boat_logs
 
 from residnet.baselines.regressors import RegressorsConfig
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, FitError
-from residnet.core.layout import ALIVE
+from residnet.core.layout import SURGE_SWAY_YAW
 from residnet.core.log import Log
 from residnet.core.samples import Samples
-from residnet.data.prepare import samples
+from residnet.data.prepare import make_samples
 from residnet.dynamics.hybrid import Missed
-from residnet.identification.fit import Identified, fit
-from residnet.identification.fitter import FitStore, Fitter, burden
-from residnet.identification.prepared import PreparedSplits, prepare_logs
-from residnet.identification.recipe import PARTS, Facts, Preparation, portfolio
+from residnet.identification.fit import Identified, fit_models
+from residnet.identification.fitter import FitStore, Fitter, find_harmful_member
+from residnet.identification.prepared import PreparedSplits, prepare_splits
+from residnet.identification.recipe import (
+    PART_KEYS,
+    PreparationPlan,
+    TrainingDataSummary,
+    make_portfolio,
+)
 from residnet.identification.settings import FitSettings
 from residnet.physics.signals import SignalsConfig
-from residnet.physics.symmetry import dissipates
+from residnet.physics.symmetry import acts_along_own_velocity
 
 NAMES = ("hull", "hull_network", "mean")
 
@@ -52,7 +57,7 @@ def content(**changes: Any) -> dict[str, Any]:
 
 
 def settings(**changes: Any) -> FitSettings:
-    found: FitSettings = validate(content(**changes), FitSettings, "here")
+    found: FitSettings = validate_config(content(**changes), FitSettings, "here")
     return found
 
 
@@ -67,17 +72,17 @@ def renamed(log: Log) -> Log:
 def logs() -> PreparedSplits:
     flown = [renamed(log) for log in small_boat_logs("twin", 4, 4, 40.0)]
     splits = {"train": flown[:2], "validation": flown[2:3], "test": flown[3:]}
-    return prepare_logs(splits, settings())
+    return prepare_splits(splits, settings())
 
 
 @pytest.fixture(scope="module")
 def known(logs: PreparedSplits) -> Samples:
-    return samples(logs["train"], settings().signals.build())
+    return make_samples(logs["train"], settings().signals.build())
 
 
 @pytest.fixture(scope="module")
 def identified(logs: PreparedSplits) -> Identified:
-    return fit(logs, settings())
+    return fit_models(logs, settings())
 
 
 @pytest.mark.long
@@ -89,29 +94,29 @@ def test_the_mean_is_reported_first_and_a_hull_that_does_not_run_away_beside_it(
     assert {identified[name].notes["prior"] for name in ("baseline", "hull")} == {1.0}
     assert all(np.isfinite(model.notes.get("validation", 0.0)) for model in identified.values())
     judged = identified.evaluate({split: logs[split] for split in ("train", "validation")})
-    chosen = identified.select(judged)
-    families = {entry.name: entry.family for entry in chosen.contenders}
-    assert chosen.predictor == chosen.selected_ensemble == "mean"
+    chosen = identified.select_models(judged)
+    families = {entry.name: entry.family for entry in chosen.candidates}
+    assert chosen.default_model == chosen.selected_ensemble == "mean"
     assert (chosen.selected, families["hull"]) == ("hull", "refitted baseline")
     assert families["hull_network"] == families["mean"] == "ensemble"
     assert identified["mean"].notes["members"] == ["hull", "hull_network"]
-    found = judged["validation"].runs[0].predictions
-    found["hull"] = [replace(one, diverged=True) for one in found["hull"]]
-    assert identified.select(judged).selected == "baseline"
+    found = judged["validation"].free_runs[0].predictions
+    found["hull"] = [replace(one, has_diverged=True) for one in found["hull"]]
+    assert identified.select_models(judged).selected == "baseline"
 
 
 @pytest.mark.long
 def test_bands_of_short_logs_come_from_fits_without_some_of_them(
     logs: PreparedSplits,
 ) -> None:
-    found = fit(logs, settings(effort=0.01))
+    found = fit_models(logs, settings(effort=0.01))
     banded = {name: entry.bands["T8"] for name, entry in found.items() if entry.bands}
     assert list(banded) == ["zero", "baseline", "hull", "mean"]
     hull, mean = banded["hull"], banded["mean"]
-    assert hull.logs == len(logs["train"]) + len(logs["validation"])
-    np.testing.assert_array_equal(mean.width, hull.width)
+    assert hull.n_logs == len(logs["train"]) + len(logs["validation"])
+    np.testing.assert_array_equal(mean.half_width, hull.half_width)
     assert "hull" in mean.cautions[0]
-    assert hull.usual is not None
+    assert hull.typical_spread is not None
 
 
 @pytest.mark.long
@@ -121,15 +126,18 @@ def test_members_that_run_away_or_harm_the_mean_are_left_out(
     fitter = Fitter(logs, settings(), FitStore())
     zero, hull, network = (identified[name] for name in ("zero", "hull", "hull_network"))
     lost = replace(identified["baseline"], notes={"validation_diverged": 1})
-    assert fitter.mean("mean", [hull, network, lost]).notes["members"] == ["hull", "hull_network"]
-    zero = replace(zero, notes={"validation": fitter.validate(zero.model).error})
-    found = fitter.mean("mean", [hull, network, zero])
+    assert fitter.build_trajectory_ensemble("mean", [hull, network, lost]).notes["members"] == [
+        "hull",
+        "hull_network",
+    ]
+    zero = replace(zero, notes={"validation": fitter.score_on_validation(zero.model).error})
+    found = fitter.build_trajectory_ensemble("mean", [hull, network, zero])
     assert (found.notes["members"], found.notes["left_out"]) == (["hull", "hull_network"], ["zero"])
     for one in (lost, zero):
         with pytest.raises(FitError, match="no mean errs less"):
-            fitter.mean("mean", [hull, one])
-    fitter.seen = True
-    assert fitter.mean("mean", [hull, zero]).notes["left_out"] == []
+            fitter.build_trajectory_ensemble("mean", [hull, one])
+    fitter.validation_in_training = True
+    assert fitter.build_trajectory_ensemble("mean", [hull, zero]).notes["left_out"] == []
 
 
 def test_what_harms_a_mean_of_independent_errors() -> None:
@@ -142,15 +150,15 @@ def test_what_harms_a_mean_of_independent_errors() -> None:
         others = np.delete(sizes, sizes.argmax())
         without = (others**2).sum() / len(others) ** 2
         expected = members[sizes.argmax()] if without < variance else None
-        assert burden(members) is expected
+        assert find_harmful_member(members) is expected
 
 
 def test_settings_say_the_recipe_and_nothing_of_its_parts() -> None:
     own = settings()
     written = own.model_dump(mode="json", by_alias=True)
     assert written["recipe"] == "standard"
-    assert not set(PARTS) & set(written)
-    assert validate(written, FitSettings, "again") == own
+    assert not set(PART_KEYS) & set(written)
+    assert validate_config(written, FitSettings, "again") == own
     assert own.model_names == ("baseline", "hull", "hull_network", "network", "mean")
 
 
@@ -171,10 +179,10 @@ def test_what_does_not_go_with_the_recipe(changes: dict[str, Any], said: str) ->
 
 def test_terms_follow_from_what_moves() -> None:
     names = ("u", "v", "r", "n", "delta", "wind_u", "wind_v", "wind_mag")
-    whole = Facts.supposed(names)
+    whole = TrainingDataSummary.from_channel_names(names)
 
     def hull(**change: Any) -> list[str]:
-        return list(portfolio(replace(whole, **change))["baselines"]["hull"]["terms"])
+        return list(make_portfolio(replace(whole, **change))["baselines"]["hull"]["terms"])
 
     wanted = {"u|u|", "n|n|", "|n| u", "n|n| delta", "wind_u wind_mag"}
     assert wanted | {"u^2 v", "n r", "wind_mag r", "n|n| delta|delta|"} <= set(hull())
@@ -193,26 +201,26 @@ NAMES_OF_A_BOAT = ("u", "v", "r", "n", "delta")
 
 def short(names: tuple[str, ...]) -> dict[str, Any]:
     """The parts for what is supposed of nine minutes of logs."""
-    return portfolio(replace(Facts.supposed(names), samples=5_400))
+    return make_portfolio(replace(TrainingDataSummary.from_channel_names(names), n_samples=5_400))
 
 
 def test_a_yaw_rate_of_noise_alone_tells_no_memory() -> None:
     random, t = np.random.default_rng(1), np.arange(0.0, 200.0, 0.1)
     straight = Log("straight", t, {"u": np.sin(0.1 * t), "r": random.normal(size=t.size)})
-    assert Preparation.of([straight], []).memory > 5.0
+    assert PreparationPlan.from_logs([straight], []).correlation_time > 5.0
 
 
 def test_networks_stand_alone_and_horizons_are_long_where_logs_are() -> None:
-    facts = Facts.supposed(NAMES_OF_A_BOAT)
+    facts = TrainingDataSummary.from_channel_names(NAMES_OF_A_BOAT)
     assert short(NAMES_OF_A_BOAT)["means"] == {"mean": ("hull", "hull_network")}
-    whole = portfolio(facts)
+    whole = make_portfolio(facts)
     assert whole["means"] == {"mean": ("hull", "hull_network", "network")}
     assert whole["base_of"] == {"hull_network": "hull", "network": "zero"}
     # no model can run away
     for part in (whole["baseline"], *whole["baselines"].values()):
         assert part["bounded"]
         assert part["dissipative"]
-    plan = portfolio(replace(facts, length=100.0, stretch=30.0))
+    plan = make_portfolio(replace(facts, free_run_length=100.0, median_segment_duration=30.0))
     horizons = [s["horizon"] for t in plan["training"].values() for s in t["multi_step"]]
     assert max(*horizons, plan["refit"]["hull"]["horizon"]) <= 18.0
 
@@ -235,7 +243,7 @@ def test_a_mirror_symmetric_model_has_no_asymmetry(known: Samples) -> None:
         [[0.1, -0.5, 0.0, 2.0, 2.0], [0.0, 0.0, 0.3, 0.1, -0.1], [0.0, 0.0, -1.0, 0.4, -0.4]]
     ).double()
     baseline.theta.data.copy_(theta)
-    pull, flat = baseline.asymmetry(known), theta.flatten()
+    pull, flat = baseline.symmetry_precision(known), theta.flatten()
     assert float(flat @ pull @ flat) == pytest.approx(0.0, abs=1e-9)
     flat[-1] = 0.4
     assert float(flat @ pull @ flat) > 0.0
@@ -244,7 +252,7 @@ def test_a_mirror_symmetric_model_has_no_asymmetry(known: Samples) -> None:
 def test_what_was_predicted_wrong_of_the_past_is_told_and_fades() -> None:
     """A constant acceleration that no prediction knows; then a free run, where none is missed."""
     force = torch.tensor([[0.05, -0.02, 0.02]], dtype=torch.float64)
-    missed = Missed(5.0, 0.1, ALIVE)
+    missed = Missed(5.0, 0.1, SURGE_SWAY_YAW)
     x, s = torch.zeros(1, 6, dtype=torch.float64), torch.zeros(1, 7, dtype=torch.float64)
     told = force
     for k in range(2000):
@@ -260,7 +268,7 @@ TERMS = ("1", "u", "u|u|", "v", "r", "v|v|", "left", "left|left|")
 def test_a_bounded_model_comes_back_from_anywhere(known: Samples) -> None:
     config = RegressorsConfig(terms=TERMS, bounded=True)
     baseline = config.build(known.names)
-    config.fit(baseline, known)
+    config.fit_preferred(baseline, known)
     low, high = known.z.amin(0), known.z.amax(0)
     far = known.z[:1].clone()
     far[:, :3] = (high + 20.0 * (high - low))[:3]
@@ -289,14 +297,16 @@ def test_terms_that_would_feed_energy_are_left_out(known: Samples) -> None:
     for dissipative in (False, True):
         config = RegressorsConfig(terms=terms, dissipative=dissipative)
         baseline = config.build(known.names)
-        table = {(c.axis, c.term) for c in config.fit(baseline, known.with_target(target))}
+        table = {
+            (c.axis, c.term) for c in config.fit_preferred(baseline, known.with_target(target))
+        }
         assert {("r_dot", "u r") in table, ("u_dot", "u") in table} == {not dissipative}
         assert {("v_dot", "u r"), ("v_dot", "v")} <= table
         z = known.z[::20].clone().requires_grad_()
         slope = torch.autograd.grad(baseline(z)[:, 2].sum(), z)[0][:, 2]
         assert (slope.median() > 0.0) != dissipative
-    assert not baseline.undamped(known)
-    assert not baseline.feeding()
+    assert not baseline.undamped_terms(known)
+    assert not baseline.destabilising_terms()
     for term, axis, sure in (("u|u|", 0, 1), ("v|r|", 1, 1), ("|n| r", 2, 1), ("u v", 1, 0)):
-        assert dissipates(term, axis, ("u", "v", "r", "n")) == bool(sure)
-    assert not dissipates("u", 1, ("u", "v", "r", "n"))
+        assert acts_along_own_velocity(term, axis, ("u", "v", "r", "n")) == bool(sure)
+    assert not acts_along_own_velocity("u", 1, ("u", "v", "r", "n"))

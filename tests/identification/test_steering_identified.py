@@ -42,7 +42,7 @@ def test_gain_time_constant_delay_and_bias_are_found() -> None:
     found, speed, noise, *_ = identify_steering(logs, longest_delay=5.0)
     assert noise[1] == pytest.approx(2e-4, rel=0.1)
     assert found.rate is None
-    assert found.spread[0] < 0.01 * found.gain
+    assert found.standard_errors[0] < 0.01 * found.gain
     assert found.gain == pytest.approx(0.12, rel=0.02)
     assert found.time == pytest.approx(18.0, rel=0.03)
     assert found.delay == pytest.approx(1.5, abs=0.3)

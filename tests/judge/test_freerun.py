@@ -12,7 +12,7 @@ from made_logs import made, prepared, random_runs, random_states
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.data.prepare import Prepared
+from residnet.data.prepare import PreparedLog
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
@@ -20,8 +20,8 @@ from residnet.dynamics.simulated import PlantDynamics
 from residnet.heads.base import ResidualHead, ZeroHead
 from residnet.heads.lstm import LstmConfig
 from residnet.judge import freerun
-from residnet.judge.freerun import Candidate, Prediction, free_run, integrate
-from residnet.judge.protocol import WholeManoeuvre, Window, Windows, all_windows
+from residnet.judge.freerun import Candidate, Prediction, integrate_pose, run_free_runs
+from residnet.judge.protocol import ManoeuvreProtocol, Window, WindowProtocol, make_windows
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
@@ -39,7 +39,7 @@ def test_windows_are_the_first_that_fit_back_to_back() -> None:
         piece = np.where(hole, -1, breaks + 1000 * np.cumsum(np.diff(hole, prepend=False)))
         usable = ~(random_runs(count, rng, mean=15.0) & (rng.random(count) < 0.7))
         log = made(random_states(count, rng), STEP, usable=usable, piece=piece)
-        windows = Windows(length=2.0, first=0.5, history=1.0).windows(log, 7, STEP)
+        windows = WindowProtocol(length=2.0, first=0.5, history=1.0).make_windows(log, 7, STEP)
         expected, start = [], 5
         while start + 20 < count:
             inside = piece[start : start + 21]
@@ -49,8 +49,8 @@ def test_windows_are_the_first_that_fit_back_to_back() -> None:
             start += 1
         assert [w.start for w in windows] == expected
         for w in windows:
-            assert (w.log, w.stop) == (7, w.start + 21)
-            np.testing.assert_array_equal(w.nu, log.y[w.start, 3:])
+            assert (w.log_index, w.stop) == (7, w.start + 21)
+            np.testing.assert_array_equal(w.initial_velocities, log.y[w.start, 3:])
         found += len(windows)
     assert found > 200
 
@@ -59,11 +59,11 @@ def test_history_does_not_reach_across_a_break() -> None:
     """What warms up a memory must be an uninterrupted past."""
     piece = np.repeat([0, -1, 1], 100)
     log = made(np.zeros((300, 6)), STEP, piece=piece)
-    windows = Windows(length=4.0, first=5.0, history=6.0).windows(log, 0, STEP)
-    assert [(w.past, w.start) for w in windows] == [(0, 50), (200, 200), (200, 240)]
+    windows = WindowProtocol(length=4.0, first=5.0, history=6.0).make_windows(log, 0, STEP)
+    assert [(w.history_start, w.start) for w in windows] == [(0, 50), (200, 200), (200, 240)]
     touching = made(np.zeros((200, 6)), STEP, piece=np.repeat([0, 1], 100))
-    windows = Windows(length=4.0, first=9.0, history=6.0).windows(touching, 0, STEP)
-    assert [(w.past, w.start) for w in windows] == [(100, 100), (100, 140)]
+    windows = WindowProtocol(length=4.0, first=9.0, history=6.0).make_windows(touching, 0, STEP)
+    assert [(w.history_start, w.start) for w in windows] == [(100, 100), (100, 140)]
 
 
 def test_whole_manoeuvres() -> None:
@@ -81,17 +81,19 @@ def test_whole_manoeuvres() -> None:
             assert (np.diff(rows) == 1).all()
             if len(rows) > 30:
                 expected.append((int(rows[0]) + 4, int(rows[-1]) + 1, int(rows[0])))
-        windows = WholeManoeuvre(initial=0.4, shortest=3.0).windows(log, 3, STEP)
-        assert [(w.start, w.stop, w.past) for w in windows] == expected
+        windows = ManoeuvreProtocol(initial=0.4, shortest=3.0).make_windows(log, 3, STEP)
+        assert [(w.start, w.stop, w.history_start) for w in windows] == expected
         for w in windows:
-            np.testing.assert_allclose(w.nu, log.y[w.past : w.start, 3:].mean(0))
+            np.testing.assert_allclose(
+                w.initial_velocities, log.y[w.history_start : w.start, 3:].mean(0)
+            )
 
 
 def test_a_stretch_without_a_sample_to_score_is_no_window() -> None:
     """Its error would be the mean of nothing, and metrics.json holds no NaN."""
     usable, piece = np.ones(200, dtype=bool), np.repeat([0, 1], 100)
     usable[4:100] = False
-    windows = WholeManoeuvre(initial=0.4, shortest=3.0).windows(
+    windows = ManoeuvreProtocol(initial=0.4, shortest=3.0).make_windows(
         made(np.zeros((200, 6)), STEP, usable=usable, piece=piece), 0, STEP
     )
     assert [w.start for w in windows] == [104]
@@ -101,9 +103,9 @@ def test_no_window_at_all_says_how_long_the_logs_are() -> None:
     logs = [made(np.zeros((n, 6)), STEP, name=f"of {n}") for n in (50, 80)]
     told = r"protocol T30: none of 2 'test' logs.*of 80, lasts 8\.0 s"
     with pytest.raises(DataError, match=told):
-        all_windows(Windows(length=30.0), logs, STEP, "T30")
-    found = all_windows(Windows(length=2.0, first=0.0), logs, STEP, "T2")
-    assert [w.log for w in found] == [0, 0, 1, 1, 1]
+        make_windows(WindowProtocol(length=30.0), logs, STEP, "T30")
+    found = make_windows(WindowProtocol(length=2.0, first=0.0), logs, STEP, "T2")
+    assert [w.log_index for w in found] == [0, 0, 1, 1, 1]
 
 
 SIGNALS = SignalsConfig(inputs=("tau_x", "tau_n"))
@@ -126,12 +128,12 @@ def hybrid(theta: np.ndarray, head: ResidualHead | None = None) -> HybridDynamic
 def ran(
     model: Dynamics,
     windows: list[Window],
-    logs: list[Prepared],
+    logs: list[PreparedLog],
     limit: float = 1e6,
     dtype: torch.dtype = torch.float64,
 ) -> list[Prediction]:
     limits = np.full(3, limit)
-    return free_run([Candidate("m", "head", model)], windows, logs, STEP, limits, dtype)["m"]
+    return run_free_runs([Candidate("m", "head", model)], windows, logs, STEP, limits, dtype)["m"]
 
 
 def test_integrate_gives_a_circle() -> None:
@@ -140,7 +142,7 @@ def test_integrate_gives_a_circle() -> None:
     """
     count, u, v, rate = 400, 2.0, 0.3, -0.2
     nu = np.tile([u, v, rate], (count, 1))
-    pose = integrate(np.array([5.0, -3.0, 0.4]), nu, STEP)
+    pose = integrate_pose(np.array([5.0, -3.0, 0.4]), nu, STEP)
     t = STEP * np.arange(count)
     psi = 0.4 + rate * t
     north = 5 + (u * (np.sin(psi) - np.sin(0.4)) + v * (np.cos(psi) - np.cos(0.4))) / rate
@@ -149,7 +151,7 @@ def test_integrate_gives_a_circle() -> None:
     allowed = (rate * STEP) ** 2 / 12 * np.hypot(u, v) * t[-1] + 1e-12
     assert np.hypot(pose[:, 0] - north, pose[:, 1] - east).max() <= allowed
     # rates between samples are their means
-    faster = integrate(np.zeros(3), np.stack((0.5 * t, 0 * t, 0 * t), axis=1), STEP)
+    faster = integrate_pose(np.zeros(3), np.stack((0.5 * t, 0 * t, 0 * t), axis=1), STEP)
     np.testing.assert_allclose(faster[:, 0], 0.25 * t**2, atol=1e-9)
 
 
@@ -168,12 +170,16 @@ def test_free_run_of_a_linear_model_in_closed_form(dtype: torch.dtype, near: flo
     ]
     for w, p in zip(windows, ran(hybrid(theta), windows, logs, dtype=dtype), strict=True):
         t = STEP * np.arange(w.stop - w.start)
-        assert not p.diverged
-        np.testing.assert_allclose(p.states[:, 3], 2 + (w.nu[0] - 2) * np.exp(-t), atol=near)
-        np.testing.assert_allclose(p.states[:, 4:], np.tile(w.nu[1:], (len(t), 1)), atol=near)
-        np.testing.assert_array_equal(p.states[0, :3], logs[w.log].y[w.start, :3])
+        assert not p.has_diverged
         np.testing.assert_allclose(
-            p.states[:, :3], integrate(logs[w.log].y[w.start, :3], p.states[:, 3:], STEP)
+            p.states[:, 3], 2 + (w.initial_velocities[0] - 2) * np.exp(-t), atol=near
+        )
+        np.testing.assert_allclose(
+            p.states[:, 4:], np.tile(w.initial_velocities[1:], (len(t), 1)), atol=near
+        )
+        np.testing.assert_array_equal(p.states[0, :3], logs[w.log_index].y[w.start, :3])
+        np.testing.assert_allclose(
+            p.states[:, :3], integrate_pose(logs[w.log_index].y[w.start, :3], p.states[:, 3:], STEP)
         )
 
 
@@ -184,8 +190,8 @@ def test_a_diverged_window_holds_the_prediction_of_zero(growth: float, limit: fl
     logs = [made(random_states(80, np.random.default_rng(3)), STEP)]
     windows = [window(0, 0, 80, nu=(1.0, 0.2, -0.05)), window(0, 10, 40, nu=(0.0, 0.3, 0.1))]
     runs, zero = (ran(hybrid(one), windows, logs, limit) for one in (theta, 0.0 * theta))
-    assert [p.diverged for p in runs] == [True, False]
-    assert [p.diverged for p in zero] == [False, False]
+    assert [p.has_diverged for p in runs] == [True, False]
+    assert [p.has_diverged for p in zero] == [False, False]
     for p, z in zip(runs, zero, strict=True):
         # the second starts at rest, where growth has nothing to work on: it equals zero without
         # diverging
@@ -203,8 +209,8 @@ def test_a_mean_is_that_of_the_trajectories_of_its_members() -> None:
     windows = [window(0, 0, 40, nu=(5.0, 0.2, 0.1)), window(0, 10, 20, nu=(1.0, 0.3, 0.1))]
     candidates = [Candidate(name, "head", model) for name, model in zip("ab", models, strict=True)]
     candidates.append(Candidate("mean", "ensemble", mean, members=("a", "b")))
-    found = free_run(candidates, windows, logs, STEP, np.full(3, 100.0))
-    assert [[p.diverged for p in found[name]] for name in ("a", "b", "mean")] == [
+    found = run_free_runs(candidates, windows, logs, STEP, np.full(3, 100.0))
+    assert [[p.has_diverged for p in found[name]] for name in ("a", "b", "mean")] == [
         [False, False],
         [True, False],
         [False, False],
@@ -224,7 +230,7 @@ def test_a_window_beyond_short_training_logs_is_no_divergence() -> None:
     theta = np.zeros((3, 6))
     windows = [window(0, 0, 80, nu=(fast, 0.0, 0.0)), window(0, 0, 80, nu=(2.1 * fast, 0.0, 0.0))]
     found = ran(hybrid(theta), windows, [log], 0.1 * fast)
-    assert [p.diverged for p in found] == [False, True]
+    assert [p.has_diverged for p in found] == [False, True]
 
 
 def test_divergence_is_judged_within_the_window_only() -> None:
@@ -235,7 +241,7 @@ def test_divergence_is_judged_within_the_window_only() -> None:
     theta[0, 0] = 1.0
     log = made(random_states(80, np.random.default_rng(4)), STEP)
     short, long = ran(hybrid(theta), [window(0, 0, 20), window(0, 0, 80)], [log], 10.0)
-    assert (short.diverged, long.diverged) == (False, True)
+    assert (short.has_diverged, long.has_diverged) == (False, True)
     assert short.states[-1, 3] == pytest.approx(np.exp(1.9), rel=1e-5)
 
 
@@ -248,10 +254,10 @@ def test_a_memory_is_warmed_up_by_the_measured_past() -> None:
     windows = [window(0, 20, 40, past=5), window(0, 30, 50, past=15)]
     for w, p in zip(windows, ran(model, windows, [log]), strict=True):
         s = model.warmup(
-            torch.from_numpy(log.y[None, w.past : w.start]),
-            torch.from_numpy(log.w[None, w.past : w.start]),
+            torch.from_numpy(log.y[None, w.history_start : w.start]),
+            torch.from_numpy(log.w[None, w.history_start : w.start]),
         )
-        x = torch.from_numpy(np.concatenate((log.y[w.start, :3], w.nu)))[None]
+        x = torch.from_numpy(np.concatenate((log.y[w.start, :3], w.initial_velocities)))[None]
         with torch.no_grad():
             for k in range(w.start, w.stop):
                 np.testing.assert_allclose(
@@ -266,22 +272,29 @@ def test_the_plant_itself_predicts_its_own_noise_free_trial() -> None:
     """
     plant, count = load_vessel("patrol_p06").build(), 200
     model = PlantDynamics(plant, STEP, 2)
-    w = torch.zeros(1, count, len(plant.inputs), dtype=torch.float64)
+    w = torch.zeros(1, count, len(plant.input_names), dtype=torch.float64)
     w[0, :, 0] = 0.1 * torch.sign(torch.sin(torch.arange(count) * 0.1))
     w[0, :, 1] = 1e5
-    x, states = plant.approach(1), []
+    x, states = plant.make_initial_state(1), []
     with torch.no_grad():
         for k in range(count):
             states.append(x[0])
             x, _ = model.step(x, w[:, k], x[:, :0])
-    channels = dict(zip(plant.state, torch.stack(states).numpy().T, strict=True))
-    channels |= {name: w[0, :, i].numpy() for i, name in enumerate(plant.inputs[:2])}
+    channels = dict(zip(plant.state_names, torch.stack(states).numpy().T, strict=True))
+    channels |= {name: w[0, :, i].numpy() for i, name in enumerate(plant.input_names[:2])}
     log = Log("trial", STEP * np.arange(count), channels)
     motion, whole = log.stack(("x", "y", "psi", "u", "v", "r")), np.ones(count, dtype=bool)
     trial = prepared(log, motion, np.zeros((count, 2)), whole, np.zeros(count, dtype=int))
-    truth = Candidate("truth", "truth", model, plant.state, plant.inputs[:2], len(plant.inputs) - 2)
+    truth = Candidate(
+        "truth",
+        "truth",
+        model,
+        plant.state_names,
+        plant.input_names[:2],
+        len(plant.input_names) - 2,
+    )
     windows = [window(0, s, s + 60, nu=motion[s, 3:]) for s in (0, 70, 130)]
-    found = free_run([truth], windows, [trial], STEP, np.full(3, 1e6))["truth"]
+    found = run_free_runs([truth], windows, [trial], STEP, np.full(3, 1e6))["truth"]
     for one, p in zip(windows, found, strict=True):
         seen = motion[one.start : one.stop]
         np.testing.assert_allclose(p.states[:, 3:], seen[:, 3:], atol=1e-12)

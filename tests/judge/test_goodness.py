@@ -11,23 +11,23 @@ from made_series import autoregressive
 from scipy import stats
 from sklearn.metrics import r2_score
 
-from residnet.data.prepare import Prepared
+from residnet.data.prepare import PreparedLog
 from residnet.judge.goodness import (
-    OneStep,
-    autocovariance,
-    block_interval,
+    OneStepResiduals,
+    assess_repeatability,
+    block_bootstrap_interval,
+    build_goodness_table,
+    compute_autocovariance,
+    estimate_noise_variance,
+    estimate_serial_dependence,
     find_pairs,
-    independent_interval,
-    ljung_box,
-    measures,
-    memory,
+    goodness_of_fit_measures,
+    independent_confidence_interval,
+    ljung_box_test,
     mismatch,
-    noise_variance,
-    paired,
-    repeatability,
-    table,
+    paired_mae_difference,
 )
-from residnet.judge.protocol import Windows
+from residnet.judge.protocol import WindowProtocol
 
 
 def test_measures_are_the_corrected_equations() -> None:
@@ -35,10 +35,10 @@ def test_measures_are_the_corrected_equations() -> None:
     target = random.normal(size=50) + 3
     residual = 0.3 * random.normal(size=50)
     rss, m, d = float((residual**2).sum()), 50, 4
-    variance = noise_variance(residual, d)
+    variance = estimate_noise_variance(residual, d)
     assert variance == pytest.approx(rss / 45)
     r2 = r2_score(target, target - residual)
-    assert measures(residual, target, d, variance) == pytest.approx(
+    assert goodness_of_fit_measures(residual, target, d, variance) == pytest.approx(
         {
             "rmse": math.sqrt(rss / m),
             "r2": r2,
@@ -51,34 +51,38 @@ def test_measures_are_the_corrected_equations() -> None:
 
 
 def test_without_enough_samples_or_noise_there_is_no_measure() -> None:
-    short = measures(np.ones(5), np.arange(5.0), 5, noise_variance(np.ones(5), 2))
+    short = goodness_of_fit_measures(
+        np.ones(5), np.arange(5.0), 5, estimate_noise_variance(np.ones(5), 2)
+    )
     assert short["r2_adjusted"] is None
-    assert noise_variance(np.ones(5), 5) == math.inf
-    exact = measures(np.zeros(5), np.ones(5), 1, 0.0)
+    assert estimate_noise_variance(np.ones(5), 5) == math.inf
+    exact = goodness_of_fit_measures(np.zeros(5), np.ones(5), 1, 0.0)
     assert (exact["r2"], exact["aic"], exact["bic"]) == (None, None, None)
 
 
 def test_pairs_tell_correlated_models_apart_that_their_own_intervals_do_not() -> None:
     shared = autoregressive(0.9, 1, 3000, seed=7)[0]
     better, worse = 0.97 * shared, shared
-    found = paired([better], [worse], "worse")
+    found = paired_mae_difference([better], [worse], "worse")
     assert found["mae"] == pytest.approx(-0.03 * np.abs(shared).mean())
     assert found["ratio"] == pytest.approx(0.97)
     assert found["excludes_zero"]
     models = [
-        OneStep(name, "head", [size] * 3, [np.repeat(one[:, None], 3, axis=1)], "worse")
+        OneStepResiduals(name, "head", [size] * 3, [np.repeat(one[:, None], 3, axis=1)], "worse")
         for name, one, size in (("better", better, 0), ("worse", worse, 9))
     ]
-    rows = table(models, [shared[:, None].repeat(3, 1)], 0.1)
+    rows = build_goodness_table(models, [shared[:, None].repeat(3, 1)], 0.1)
     low, high = rows[0]["mae_ci95"]
     assert low < rows[1]["mae"] < high
     assert low < rows[0]["mae_ci95_independent"][0]
     assert rows[0]["effective"] < 0.2 * rows[0]["samples"]
     assert rows[0]["white_p"] < 1e-3
     # the noise is that of the model which leaves the least
-    aic = measures(worse, shared, 9, noise_variance(better, 0))["aic"]
+    aic = goodness_of_fit_measures(worse, shared, 9, estimate_noise_variance(better, 0))["aic"]
     assert rows[1]["aic"] == pytest.approx(aic)
-    same = paired([shared], [np.roll(autoregressive(0.9, 1, 3000, seed=8)[0], 1)], "other")
+    same = paired_mae_difference(
+        [shared], [np.roll(autoregressive(0.9, 1, 3000, seed=8)[0], 1)], "other"
+    )
     assert not same["excludes_zero"]
 
 
@@ -89,7 +93,7 @@ def test_autocovariance_is_its_definition_and_does_not_cross_pieces() -> None:
         sum(float((p[k:] - mean) @ (p[: len(p) - k] - mean)) for p in pieces if len(p) > k) / 6
         for k in range(4)
     ]
-    np.testing.assert_allclose(autocovariance(pieces, 3), expected, atol=1e-12)
+    np.testing.assert_allclose(compute_autocovariance(pieces, 3), expected, atol=1e-12)
 
 
 def test_ljung_box_is_its_definition() -> None:
@@ -97,7 +101,7 @@ def test_ljung_box_is_its_definition() -> None:
     centred = x - x.mean()
     rho = [float(centred[k:] @ centred[:-k]) / float(centred @ centred) for k in range(1, 6)]
     expected = 200 * 202 * sum(value**2 / (200 - k) for k, value in enumerate(rho, start=1))
-    statistic, chance = ljung_box([x], 5)
+    statistic, chance = ljung_box_test([x], 5)
     assert statistic == pytest.approx(expected)
     assert chance == pytest.approx(stats.chi2.sf(expected, 5))
 
@@ -107,18 +111,20 @@ def test_block_length_and_effective_size_come_near_those_of_the_process() -> Non
     phi^2))^2 n)^(1/3).
     """
     n, phi = 5000, 0.8
-    found = [memory([row]) for row in autoregressive(phi, 60, n, seed=4)]
+    found = [estimate_serial_dependence([row]) for row in autoregressive(phi, 60, n, seed=4)]
     optimal = (1.5 * (2 * phi / (1 - phi**2)) ** 2 * n) ** (1 / 3)
     ratio = (1 + phi) / (1 - phi)
-    assert np.median([m.block for m in found]) == pytest.approx(optimal, rel=0.15)
+    assert np.median([m.block_length for m in found]) == pytest.approx(optimal, rel=0.15)
     assert np.median([m.variance for m in found]) == pytest.approx(ratio, rel=0.1)
-    assert np.median([m.effective for m in found]) == pytest.approx(n / ratio, rel=0.1)
+    assert np.median([m.effective_size for m in found]) == pytest.approx(n / ratio, rel=0.1)
 
 
 def test_blocks_hold_the_mean_of_correlated_samples_and_single_samples_do_not() -> None:
     rows = np.abs(autoregressive(0.8, 120, 1000, seed=11))
-    spans = [(found.low, found.high) for found in (block_interval([row]) for row in rows)]
-    both = np.array([spans, [independent_interval(row) for row in rows]])
+    spans = [
+        (found.lower, found.upper) for found in (block_bootstrap_interval([row]) for row in rows)
+    ]
+    both = np.array([spans, [independent_confidence_interval(row) for row in rows]])
     truth = math.sqrt(2 / math.pi)
     in_blocks, alone = ((both[..., 0] <= truth) & (truth <= both[..., 1])).mean(axis=1)
     assert in_blocks >= 0.90
@@ -127,37 +133,37 @@ def test_blocks_hold_the_mean_of_correlated_samples_and_single_samples_do_not() 
 
 def test_pieces_count_like_one_series_and_are_not_crossed() -> None:
     rows = autoregressive(0.8, 20, 200, seed=5)
-    pieces, joined = block_interval(list(rows)), block_interval([rows.ravel()])
+    pieces, joined = block_bootstrap_interval(list(rows)), block_bootstrap_interval([rows.ravel()])
     assert pieces.mean == pytest.approx(joined.mean)
-    assert pieces.high - pieces.low == pytest.approx(joined.high - joined.low, rel=0.25)
+    assert pieces.upper - pieces.lower == pytest.approx(joined.upper - joined.lower, rel=0.25)
     # constant pieces at different levels: a block that crossed would make values between
-    low = block_interval([np.full(50, -1.0), np.full(50, 1.0)])
-    assert low.low < 0 < low.high
+    low = block_bootstrap_interval([np.full(50, -1.0), np.full(50, 1.0)])
+    assert low.lower < 0 < low.upper
 
 
 def test_many_blocks_are_not_drawn_but_give_the_textbook_interval() -> None:
     x = autoregressive(0.0, 1, 20_000, seed=6)[0]
-    found, (low, high) = block_interval([x]), independent_interval(x)
+    found, (low, high) = block_bootstrap_interval([x]), independent_confidence_interval(x)
     expected = stats.t.interval(0.95, len(x) - 1, loc=x.mean(), scale=stats.sem(x))
     assert (low, high) == pytest.approx(expected)
-    assert found.high - found.low == pytest.approx(high - low, rel=0.08)
+    assert found.upper - found.lower == pytest.approx(high - low, rel=0.08)
     assert found.mean == pytest.approx(x.mean())
 
 
 def test_a_series_too_short_has_no_bounds_and_a_constant_one_no_width() -> None:
-    assert block_interval([np.array([1.0])]).high == math.inf
-    constant = block_interval([np.full(100, 2.0)])
-    assert (constant.low, constant.mean, constant.high) == (2.0, 2.0, 2.0)
+    assert block_bootstrap_interval([np.array([1.0])]).upper == math.inf
+    constant = block_bootstrap_interval([np.full(100, 2.0)])
+    assert (constant.lower, constant.mean, constant.upper) == (2.0, 2.0, 2.0)
 
 
 STEP = 0.1
-PROTOCOL = Windows(length=10.0, first=5.0)
+PROTOCOL = WindowProtocol(length=10.0, first=5.0)
 SCALES = {"u": 0.1, "v": 0.05, "r": 0.02}
 
 
-def pairs_of(*logs: Prepared) -> int:
+def pairs_of(*logs: PreparedLog) -> int:
     """How many stretches repeat a window under two commanded inputs."""
-    found: int = repeatability(PROTOCOL, logs, 2, SCALES, STEP)["pairs"]
+    found: int = assess_repeatability(PROTOCOL, logs, 2, SCALES, STEP)["pairs"]
     return found
 
 
@@ -194,9 +200,14 @@ def test_a_repeated_run_is_found_and_its_difference_measured() -> None:
     (pair,) = find_pairs(PROTOCOL, logs, 2, np.array([0.1, 0.05, 0.02]), STEP)
     # without commands nothing says that two runs were to be the same
     assert not list(find_pairs(PROTOCOL, logs, 0, np.array([0.1, 0.05, 0.02]), STEP))
-    assert (pair.first.log, pair.first.start, pair.log, pair.start) == (0, 50, 1, 90)
+    assert (pair.window.log_index, pair.window.start, pair.repeat_log, pair.repeat_start) == (
+        0,
+        50,
+        1,
+        90,
+    )
     assert pair.mismatch == pytest.approx(0, abs=1e-6)
-    found = repeatability(PROTOCOL, logs, 2, SCALES, STEP)
+    found = assess_repeatability(PROTOCOL, logs, 2, SCALES, STEP)
     share = np.sqrt(51 / 101)
     assert (found["pairs"], found["logs"]) == (1, 2)
     assert [found[name] for name in "uvr"] == pytest.approx(
@@ -225,7 +236,7 @@ def test_other_commands_another_start_or_a_break_are_no_repeat() -> None:
     calm, windy = (np.c_[w, np.full(160, wind)] for wind in (0.0, 50.0))
     assert pairs_of(made(states(160), STEP, w=calm), made(states(160), STEP, w=windy)) == 1
     broken = made(states(160), STEP, w=w, piece=np.repeat([0, 1], [100, 60]))
-    found = repeatability(PROTOCOL, [first, broken], 2, SCALES, STEP)
+    found = assess_repeatability(PROTOCOL, [first, broken], 2, SCALES, STEP)
     assert found["pairs"] == found["logs"] == 0
     assert "u" not in found
 
@@ -234,4 +245,4 @@ def test_a_log_repeats_itself_only_after_the_window() -> None:
     once = commands(3, 160)
     log = made(np.tile(states(1), (320, 1)), STEP, w=np.concatenate((once, once)))
     pairs = find_pairs(PROTOCOL, [log], 2, np.array([0.1, 0.05, 0.02]), STEP)
-    assert [pair.start for pair in pairs if pair.first.start == 50] == [210]
+    assert [pair.repeat_start for pair in pairs if pair.window.start == 50] == [210]

@@ -10,25 +10,25 @@ import pytest
 from made_logs import made, random_states
 from scipy import stats
 
-from residnet.baselines.given import StillConfig
-from residnet.core.layout import Live
-from residnet.data.prepare import Prepared
+from residnet.baselines.given import ZeroBaselineConfig
+from residnet.core.layout import DegreesOfFreedom
+from residnet.data.prepare import PreparedLog
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.base import ZeroHead
-from residnet.judge.freerun import Candidate, Errors, FreeRun, Prediction
+from residnet.judge.freerun import Candidate, FreeRun, FreeRunErrors, Prediction
 from residnet.judge.metrics import (
-    Judged,
-    blocks,
-    difference,
-    find,
-    intervals,
-    metrics_content,
-    metrics_table,
-    new_trials,
-    tail,
+    ProtocolEvaluation,
+    bootstrap_intervals,
+    bootstrap_tail_probability,
+    build_metrics_content,
+    build_metrics_table,
+    find_row,
+    make_resampling_blocks,
+    paired_difference,
+    prediction_intervals,
 )
-from residnet.judge.protocol import Window, Windows
-from residnet.judge.selection import blocks_of, shares
+from residnet.judge.protocol import Window, WindowProtocol
+from residnet.judge.selection import block_error_shares, make_selection_blocks
 from residnet.physics.signals import SignalsConfig
 
 SIGNALS = SignalsConfig(inputs=("delta",)).build()
@@ -41,8 +41,8 @@ def window(log: int, start: int, stop: int) -> Window:
 
 
 def candidate(name: str, reference: str | None = None, kind: str = "head") -> Candidate:
-    model = HybridDynamics(SIGNALS, StillConfig().build(()), ZeroHead(), 0.1, "euler")
-    return Candidate(name, kind, model, reference=reference, ranges=RANGES)
+    model = HybridDynamics(SIGNALS, ZeroBaselineConfig().build(()), ZeroHead(), 0.1, "euler")
+    return Candidate(name, kind, model, reference=reference, training_ranges=RANGES)
 
 
 def made_run(seed: int = 0) -> tuple[FreeRun, list]:
@@ -62,7 +62,7 @@ def made_run(seed: int = 0) -> tuple[FreeRun, list]:
 
 def test_rows_equal_a_loop_over_windows() -> None:
     run, logs = made_run()
-    table = Judged(run, [candidate("a"), candidate("b")], logs, SCALES).rows(
+    table = ProtocolEvaluation(run, [candidate("a"), candidate("b")], logs, SCALES).build_rows(
         {"manoeuvring": ["zigzag", "turning"], "absent": ["3211"]}
     )
     shown = {"all", "zigzag", "constant", "turning", "manoeuvring"}
@@ -70,12 +70,12 @@ def test_rows_equal_a_loop_over_windows() -> None:
     members = {"all": {"zigzag", "constant", "turning"}, "manoeuvring": {"zigzag", "turning"}}
     for row in table:
         wanted = members.get(row["manoeuvre"], {row["manoeuvre"]})
-        chosen = [i for i, w in enumerate(run.windows) if logs[w.log].log.manoeuvre in wanted]
+        chosen = [i for i, w in enumerate(run.windows) if logs[w.log_index].log.manoeuvre in wanted]
         rmse, mae, position, heading, count = [], [], [], [], 0
         for i in chosen:
             w, p = run.windows[i], run.predictions[row["model"]][i]
-            error = p.states - logs[w.log].y[w.start : w.stop]
-            good = logs[w.log].usable[w.start : w.stop]
+            error = p.states - logs[w.log_index].y[w.start : w.stop]
+            good = logs[w.log_index].usable[w.start : w.stop]
             parts = (error[good, 3], error[good, 4], error[:, 5])
             rmse.append([np.sqrt((part**2).mean()) for part in parts])
             mae.append([np.abs(part).mean() for part in parts])
@@ -90,19 +90,23 @@ def test_rows_equal_a_loop_over_windows() -> None:
         assert row["position_error_end"] == pytest.approx(np.mean(position))
         assert row["heading_error_end"] == pytest.approx(np.mean(heading))
         assert (row["windows"], row["n"]) == (len(chosen), count)
-        assert row["diverged"] == sum(run.predictions[row["model"]][i].diverged for i in chosen)
+        assert row["diverged"] == sum(run.predictions[row["model"]][i].has_diverged for i in chosen)
 
 
 def test_intervals_hold_the_mean_and_say_what_was_drawn() -> None:
     run, logs = made_run()
-    row = find(Judged(run, [candidate("a")], logs, SCALES).rows({}), model="a")
+    row = find_row(
+        ProtocolEvaluation(run, [candidate("a")], logs, SCALES).build_rows({}), model="a"
+    )
     # four logs of three windows: whole logs are too few, runs of two and one make eight
     assert row["ci95_blocks"] == {"of": "windows", "count": 8}
     spans = [(row["rmse_ci95"][c], row["rmse"][c]) for c in "uvr"]
     for (low, high), mean in (*spans, (row["nrmse_mean_ci95"], row["nrmse"]["mean"])):
         assert low < mean < high
     alone = FreeRun("T3", "test", run.windows[:1], {"a": run.predictions["a"][:1]})
-    single = find(Judged(alone, [candidate("a")], logs, SCALES).rows({}), model="a")
+    single = find_row(
+        ProtocolEvaluation(alone, [candidate("a")], logs, SCALES).build_rows({}), model="a"
+    )
     assert single["rmse_ci95"] == {"u": None, "v": None, "r": None}
     assert single["nrmse_mean_ci95"] is single["ci95_blocks"] is None
 
@@ -110,12 +114,15 @@ def test_intervals_hold_the_mean_and_say_what_was_drawn() -> None:
 def test_differences_are_paired_by_window_and_kind() -> None:
     run, logs = made_run()
     errors = {
-        name: (Errors.of(run.windows, run.predictions[name], logs).rmse / [0.5, 0.25, 0.1]).mean(1)
+        name: (
+            FreeRunErrors.from_predictions(run.windows, run.predictions[name], logs).rmse
+            / [0.5, 0.25, 0.1]
+        ).mean(1)
         for name in "ab"
     }
     compared = candidate("a", "b")
-    for row in Judged(run, [compared, candidate("b")], logs, SCALES).rows({}):
-        chosen = [row["manoeuvre"] in ("all", logs[w.log].log.manoeuvre) for w in run.windows]
+    for row in ProtocolEvaluation(run, [compared, candidate("b")], logs, SCALES).build_rows({}):
+        chosen = [row["manoeuvre"] in ("all", logs[w.log_index].log.manoeuvre) for w in run.windows]
         if row["model"] == "b":
             assert row["difference"] is None
             continue
@@ -125,28 +132,32 @@ def test_differences_are_paired_by_window_and_kind() -> None:
         assert found["ratio"] == pytest.approx(one.mean() / other.mean())
         # only all kinds together make blocks enough
         assert (found["ci95"] is None) == (row["manoeuvre"] != "all")
-    lost = Judged(run, [replace(compared, reference="absent")], logs, SCALES).rows({})
+    lost = ProtocolEvaluation(
+        run, [replace(compared, reference="absent")], logs, SCALES
+    ).build_rows({})
     assert {row["difference"] for row in lost} == {None}
 
 
 def test_a_table_has_one_column_per_number_and_the_file_marks_the_selected_model() -> None:
     run, logs = made_run()
-    rows = Judged(run, [candidate("a"), candidate("b")], logs, SCALES).rows({})
-    table = metrics_table(rows)
+    rows = ProtocolEvaluation(run, [candidate("a"), candidate("b")], logs, SCALES).build_rows({})
+    table = build_metrics_table(rows)
     assert table["model"].tolist() == [row["model"] for row in rows]
     assert table["rmse_r"].tolist() == [row["rmse"]["r"] for row in rows]
     assert table["nrmse_mean"].tolist() == [row["nrmse"]["mean"] for row in rows]
     assert table["note"][0] == f"{rows[0]['diverged']}/12 diverged"
     assert "selected" not in table
     assert table.notna().to_numpy().all()
-    assert find(rows, model="b", split="test", protocol="T3", manoeuvre="zigzag")["windows"] == 6
+    assert (
+        find_row(rows, model="b", split="test", protocol="T3", manoeuvre="zigzag")["windows"] == 6
+    )
     for wanted, told in (({"model": "c"}, "0 rows"), ({"split": "test"}, "2 rows")):
         with pytest.raises(KeyError, match=told):
-            find(rows, **wanted)
-    content = metrics_content("run", {"u": "m/s"}, {"u": 1.0}, "b", "c", "c", rows)
+            find_row(rows, **wanted)
+    content = build_metrics_content("run", {"u": "m/s"}, {"u": 1.0}, "b", "c", "c", rows)
     assert content["schema"] == "residnet.metrics/1"
     assert (content["selected"], content["selected_ensemble"]) == ("b", "c")
-    marked = metrics_table(content["rows"])["selected"].tolist()
+    marked = build_metrics_table(content["rows"])["selected"].tolist()
     assert marked == [row["model"] == "b" for row in rows]
     assert "selected" not in rows[0]
 
@@ -164,7 +175,9 @@ def straight(
 def test_consistency_by_hand() -> None:
     logs = [made(straight(1.0, drift=0.3, turned=0.02), 0.1), made(straight(2.0, drift=0.4), 0.1)]
     windows = [window(0, 0, 21), window(1, 0, 21)]
-    found = Judged(FreeRun("T2", "test", windows), [], logs, SCALES).kinematics(0.1)
+    found = ProtocolEvaluation(
+        FreeRun("T2", "test", windows), [], logs, SCALES
+    ).evaluate_kinematics(0.1)
     # after 2 s the position is off by 0.6 m and 0.8 m, the heading by 0.02 rad and nothing
     assert found["windows"] == 2
     assert found["position_mean"] == pytest.approx(0.7)
@@ -173,7 +186,7 @@ def test_consistency_by_hand() -> None:
     assert found["heading_rms"] == pytest.approx(0.02 / np.sqrt(2))
 
 
-def nine(wind: list[float] | None = None) -> tuple[FreeRun, list[Prepared]]:
+def nine(wind: list[float] | None = None) -> tuple[FreeRun, list[PreparedLog]]:
     """Nine logs of one window each at speeds 1 .. 9 m/s; `a` is off by 0.01, 0.02, .. m/s in u, `b`
     by twice that.
     """
@@ -193,7 +206,9 @@ def nine(wind: list[float] | None = None) -> tuple[FreeRun, list[Prepared]]:
 
 def test_bands_are_thirds_of_the_windows() -> None:
     run, logs = nine(wind=[3.0, 1.0, 2.0] * 3)
-    found = Judged(run, [candidate("a", "b"), candidate("b")], logs, SCALES).bands()
+    found = ProtocolEvaluation(
+        run, [candidate("a", "b"), candidate("b")], logs, SCALES
+    ).evaluate_by_class()
     speeds, winds = ((1, 3), (4, 6), (7, 9)), ((1, 1), (2, 2), (3, 3))
     assert [(band["by"], band["low"], band["high"], band["windows"]) for band in found] == [
         (by, low, high, 3)
@@ -218,16 +233,16 @@ def test_bands_without_windows_enough_or_without_wind_are_left_out() -> None:
     run, logs = nine()
     few = FreeRun("T2", "test", run.windows[:8], {"a": run.predictions["a"][:8]})
     # 8 windows: thirds of 3, 2 and 3
-    found = Judged(few, [candidate("a")], logs, SCALES).bands()
+    found = ProtocolEvaluation(few, [candidate("a")], logs, SCALES).evaluate_by_class()
     assert [(band["by"], band["low"]) for band in found] == [("speed", 1.0), ("speed", 6.0)]
     # one speed: no breakdown at all
     still = [made(straight(1.0), 0.1) for _ in range(9)]
-    assert Judged(run, [candidate("a")], still, SCALES).bands() == []
+    assert ProtocolEvaluation(run, [candidate("a")], still, SCALES).evaluate_by_class() == []
 
 
 def test_worst_windows_are_named() -> None:
     run, logs = nine()
-    found = Judged(run, [candidate("a")], logs, SCALES).limits(0.1)["worst"]["a"]
+    found = ProtocolEvaluation(run, [candidate("a")], logs, SCALES).build_limits(0.1)["worst"]["a"]
     assert [entry["log"] for entry in found] == ["log8", "log7", "log6"]
     # u alone is off, by 0.09, 0.08 and 0.07 m/s
     worst = [0.01 * k / 0.5 / 3 for k in (9, 8, 7)]
@@ -246,7 +261,7 @@ CANDIDATES = [
 
 
 @pytest.fixture(scope="module")
-def logs() -> list[Prepared]:
+def logs() -> list[PreparedLog]:
     """Logs of 41 s, each at a speed of its own."""
     speeds = [0.6 + 0.3 * number for number in range(6)]
     return [
@@ -256,31 +271,33 @@ def logs() -> list[Prepared]:
 
 
 @pytest.fixture
-def run(logs: list[Prepared]) -> FreeRun:
+def run(logs: list[PreparedLog]) -> FreeRun:
     """The error of zero is 0.1 throughout; the model's grows with time and passes it at 12 s."""
-    protocol = Windows(length=20.0, first=0.0, history=0.0)
-    windows = [w for i, prepared in enumerate(logs) for w in protocol.windows(prepared, i, STEP)]
+    protocol = WindowProtocol(length=20.0, first=0.0, history=0.0)
+    windows = [
+        w for i, prepared in enumerate(logs) for w in protocol.make_windows(prepared, i, STEP)
+    ]
     out = FreeRun("T20", "test", windows)
     for name in ("zero", "baseline", "mlp"):
         out.predictions[name] = []
         for window in windows:
-            states = logs[window.log].y[window.start : window.stop].copy()
+            states = logs[window.log_index].y[window.start : window.stop].copy()
             age = STEP * np.arange(len(states))
             error = {"zero": 0.1 + 0 * age, "baseline": 0.09 + 0 * age, "mlp": 0.1 * age / 12.0}
             # a little of its own for each log, so that there is a spread
-            states[:, 3] += (1.0 + 0.01 * window.log) * error[name]
+            states[:, 3] += (1.0 + 0.01 * window.log_index) * error[name]
             out.predictions[name].append(Prediction(states, False))
     return out
 
 
 def test_errors_of_the_pose_are_told_after_the_times_that_matter(
-    run: FreeRun, logs: list[Prepared]
+    run: FreeRun, logs: list[PreparedLog]
 ) -> None:
     """Windows of 20 s; the model's position is put 3 m and its heading 200 deg off after 10 s."""
     for prediction in run.predictions["mlp"]:
         prediction.states[20, :2] += np.array([3.0, 4.0])
         prediction.states[20, 2] += np.radians(200.0)
-    entries = Judged(run, CANDIDATES, logs, SCALES).horizons(STEP)
+    entries = ProtocolEvaluation(run, CANDIDATES, logs, SCALES).evaluate_horizons(STEP)
     assert [entry["seconds"] for entry in entries] == [10.0, 20.0]
     first = entries[0]
     assert (first["windows"], first["logs"]) == (12, 6)
@@ -297,71 +314,74 @@ def test_errors_of_the_pose_are_told_after_the_times_that_matter(
     assert first["models"]["zero"]["position"] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_no_interval_of_a_heading_passes_half_a_turn(run: FreeRun, logs: list[Prepared]) -> None:
+def test_no_interval_of_a_heading_passes_half_a_turn(run: FreeRun, logs: list[PreparedLog]) -> None:
     for window, prediction in zip(run.windows, run.predictions["mlp"], strict=True):
-        prediction.states[20, 2] += 0.5 * (window.log + 1)
-    entries = Judged(run, CANDIDATES, logs, SCALES).horizons(STEP)
+        prediction.states[20, 2] += 0.5 * (window.log_index + 1)
+    entries = ProtocolEvaluation(run, CANDIDATES, logs, SCALES).evaluate_horizons(STEP)
     assert entries[0]["models"]["mlp"]["intervals"]["heading"][1] == pytest.approx(np.pi)
 
 
 def test_every_model_is_compared_with_zero_and_the_first_baseline(
-    run: FreeRun, logs: list[Prepared]
+    run: FreeRun, logs: list[PreparedLog]
 ) -> None:
-    judged = Judged(run, CANDIDATES, logs, SCALES)
-    found = judged.compared()
+    judged = ProtocolEvaluation(run, CANDIDATES, logs, SCALES)
+    found = judged.compare_with_references()
     assert set(found["mlp"]) == {"zero", "baseline"}
     assert set(found["baseline"]) == {"zero"}
     apart = found["baseline"]["zero"]["nrmse_mean"]
     # u alone is off, by 0.09 and 0.1 m/s, and the more the later the log
-    expected = np.array([(1.0 + 0.01 * w.log) * -0.01 / 0.5 / 3 for w in run.windows])
-    assert judged.nrmse["zero"][0] == pytest.approx(0.1 / 0.5 / 3)
+    expected = np.array([(1.0 + 0.01 * w.log_index) * -0.01 / 0.5 / 3 for w in run.windows])
+    assert judged.nrmse_by_window["zero"][0] == pytest.approx(0.1 / 0.5 / 3)
     assert apart == pytest.approx(expected.mean())
 
 
 def test_samples_outside_the_training_range_are_counted(
-    run: FreeRun, logs: list[Prepared], monkeypatch: pytest.MonkeyPatch
+    run: FreeRun, logs: list[PreparedLog], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # one of six logs is faster than 2 m/s
-    found = Judged(run, CANDIDATES, logs, SCALES).outside()
+    found = ProtocolEvaluation(run, CANDIDATES, logs, SCALES).share_outside_training_range()
     assert found["share"] == pytest.approx(1 / 6)
     assert found["channels"] == {"u": pytest.approx(1 / 6)}
     # nor does a channel that drives nothing, as the depth
-    monkeypatch.setattr(Live, "hidden", property(lambda _: ("u",)))
-    assert Judged(run, CANDIDATES, logs, SCALES).outside() == {"share": 0.0, "channels": {}}
+    monkeypatch.setattr(DegreesOfFreedom, "hidden", property(lambda _: ("u",)))
+    assert ProtocolEvaluation(run, CANDIDATES, logs, SCALES).share_outside_training_range() == {
+        "share": 0.0,
+        "channels": {},
+    }
 
 
 @pytest.mark.parametrize(("count", "of", "blocks"), [(6, "logs", 6), (2, "stretches", 8)])
 def test_shares_of_blocks_sum_to_the_mean_error(
-    run: FreeRun, logs: list[Prepared], count: int, of: str, blocks: int
+    run: FreeRun, logs: list[PreparedLog], count: int, of: str, blocks: int
 ) -> None:
-    few = [i for i, window in enumerate(run.windows) if window.log < count]
+    few = [i for i, window in enumerate(run.windows) if window.log_index < count]
     part = FreeRun("T20", "test", [run.windows[i] for i in few])
     part.predictions["mlp"] = [run.predictions["mlp"][i] for i in few]
-    found, labels = blocks_of(part)
-    assert (found.of, len(found.weights)) == (of, blocks)
+    found, labels = make_selection_blocks(part)
+    assert (found.block_kind, len(found.weights)) == (of, blocks)
     assert found.weights.sum() == pytest.approx(1.0)
-    own = shares(part, "mlp", logs, SCALES, labels, blocks)
-    expected = Judged(part, [CANDIDATES[2]], logs, SCALES).nrmse["mlp"].mean()
+    own = block_error_shares(part, "mlp", logs, SCALES, labels, blocks)
+    expected = ProtocolEvaluation(part, [CANDIDATES[2]], logs, SCALES).nrmse_by_window["mlp"].mean()
     assert own.sum() == pytest.approx(expected)
 
 
 def test_a_block_is_a_log_from_five_logs_on() -> None:
     numbers = np.array([7, 7, 2, 3, 3, 3, 9, 4])
-    found = blocks(numbers)
+    found = make_resampling_blocks(numbers)
     assert found is not None
-    assert (found.of, found.count) == ("logs", 5)
-    same = found.labels[:, None] == found.labels[None, :]
+    assert (found.block_kind, found.n_blocks) == ("logs", 5)
+    same = found.block_indices[:, None] == found.block_indices[None, :]
     assert (same == (numbers[:, None] == numbers[None, :])).all()
 
 
 def test_few_logs_are_cut_into_runs_that_stay_within_a_log() -> None:
     # 12 + 5 + 1 windows: runs of 3 make 4 + 2 + 1 = 7 blocks, runs of 2 make 6 + 3 + 1 = 10
     logs = [0] * 12 + [1] * 5 + [2]
-    found = blocks(logs)
+    found = make_resampling_blocks(logs)
     assert found is not None
-    assert (found.of, found.count) == ("windows", 10)
-    for block in range(found.count):
-        members = np.flatnonzero(found.labels == block)
+    assert (found.block_kind, found.n_blocks) == ("windows", 10)
+    for block in range(found.n_blocks):
+        members = np.flatnonzero(found.block_indices == block)
         assert len({logs[i] for i in members}) == 1
         assert (np.diff(members) == 1).all()
         assert 1 <= len(members) <= 2
@@ -369,9 +389,9 @@ def test_few_logs_are_cut_into_runs_that_stay_within_a_log() -> None:
 
 @pytest.mark.parametrize("logs", [[0] * 40, [0, 0, 0, 1, 1, 1, 1, 1, 1], [0, 1, 2, 3]])
 def test_too_little_gives_no_interval(logs: list[int]) -> None:
-    assert blocks(logs) is None
-    assert intervals(np.ones((len(logs), 2)), None) == [None, None]
-    found = difference(np.arange(len(logs)) + 2.0, np.ones(len(logs)), "base", None)
+    assert make_resampling_blocks(logs) is None
+    assert bootstrap_intervals(np.ones((len(logs), 2)), None) == [None, None]
+    found = paired_difference(np.arange(len(logs)) + 2.0, np.ones(len(logs)), "base", None)
     assert found["ci95"] is None
     assert found["excludes_zero"] is False
     assert found["nrmse_mean"] == pytest.approx(np.mean(np.arange(len(logs)) + 1.0))
@@ -384,44 +404,50 @@ def test_equals_the_enumeration_of_all_resamples() -> None:
     sizes = np.array([logs.count(k) for k in range(6)])
     picks = np.array(list(itertools.product(range(6), repeat=6)))
     means = sums[picks].sum(1) / sizes[picks].sum(1)
-    (interval,) = intervals(values[:, None], blocks(logs))
+    (interval,) = bootstrap_intervals(values[:, None], make_resampling_blocks(logs))
     assert interval is not None
-    expected = np.quantile(means, [tail(6), 1 - tail(6)])
+    expected = np.quantile(
+        means, [bootstrap_tail_probability(6), 1 - bootstrap_tail_probability(6)]
+    )
     assert interval == pytest.approx(expected.tolist(), abs=0.06 * (expected[1] - expected[0]))
 
 
 def test_levels_widen_as_student_s_t() -> None:
-    assert tail(10**6) == pytest.approx(0.025, rel=1e-4)
+    assert bootstrap_tail_probability(10**6) == pytest.approx(0.025, rel=1e-4)
     # t of 4 and 7 degrees of freedom from tables
     for count, t in ((5, 2.7764), (8, 2.3646)):
-        assert tail(count) == pytest.approx(stats.norm.sf(t * np.sqrt(count / (count - 1))), 1e-3)
+        assert bootstrap_tail_probability(count) == pytest.approx(
+            stats.norm.sf(t * np.sqrt(count / (count - 1))), 1e-3
+        )
 
 
 def test_pairing_finds_what_the_errors_of_each_model_hide() -> None:
     # windows differ a hundred times more than models do
     hard = np.random.default_rng(5).uniform(0.1, 1.0, 24)
-    drawn = blocks(np.arange(24) // 3)
-    found, other = (difference(*two, "base", drawn) for two in ((hard - 0.01, hard), (hard, hard)))
+    drawn = make_resampling_blocks(np.arange(24) // 3)
+    found, other = (
+        paired_difference(*two, "base", drawn) for two in ((hard - 0.01, hard), (hard, hard))
+    )
     assert found["excludes_zero"] is True
     assert found["ci95"] == pytest.approx([-0.01, -0.01])
     assert found["ratio"] == pytest.approx(1.0 - 0.01 / hard.mean())
-    first, second = intervals(np.stack((hard - 0.01, hard), axis=1), drawn)
+    first, second = bootstrap_intervals(np.stack((hard - 0.01, hard), axis=1), drawn)
     assert first is not None
     assert second is not None
     assert first[1] > second[0]
     itself = {"ci95": [0.0, 0.0], "excludes_zero": False, "ratio": 1.0, "worse": False}
     assert other == {"to": "base", "nrmse_mean": 0.0} | itself
-    above = difference(hard + 0.01, hard, "base", drawn)
+    above = paired_difference(hard + 0.01, hard, "base", drawn)
     assert above["excludes_zero"] is True
 
 
 @pytest.mark.parametrize(("factor", "worse"), [(1.04, False), (1.06, True), (0.5, False)])
 def test_worse_is_more_than_five_percent(factor: float, worse: bool) -> None:
     base = np.array([0.1, 0.2, 0.4])
-    found = difference(factor * base, base, "base", None)
+    found = paired_difference(factor * base, base, "base", None)
     assert found["ratio"] == pytest.approx(factor)
     assert found["worse"] is worse
-    assert difference(base, 0 * base, "base", None)["ratio"] is None
+    assert paired_difference(base, 0 * base, "base", None)["ratio"] is None
 
 
 @pytest.mark.parametrize("logs", [3, 6])
@@ -434,7 +460,7 @@ def test_intervals_hold_for_new_logs_of_the_column_that_looks_surest(logs: int) 
         seen, new = np.exp(
             sizes.repeat(windows, axis=1) + 0.1 * random.normal(size=(2, 3 * logs, 6))
         )
-        spans = np.array(new_trials(seen, numbers))
+        spans = np.array(prediction_intervals(seen, numbers))
         surest = int(np.log(seen.reshape(logs, windows, 6).mean(1)).std(0).argmin())
         low, high = spans[surest]
         held.append(low <= new.mean(0)[surest] <= high)
@@ -445,12 +471,12 @@ def test_intervals_hold_for_new_logs_of_the_column_that_looks_surest(logs: int) 
 def test_what_ran_away_or_is_exact_leaves_the_intervals_of_others() -> None:
     values = np.exp(np.random.default_rng(4).normal(size=(12, 4)))
     numbers = np.repeat(np.arange(4), 3)
-    plain = new_trials(values[:, :2], numbers)
+    plain = prediction_intervals(values[:, :2], numbers)
     values[:, 2], values[5, 3] = 0.0, np.inf
-    spans = new_trials(values, numbers)
+    spans = prediction_intervals(values, numbers)
     assert spans[:2] == plain
     assert spans[2] == [0.0, 0.0]
-    assert new_trials(values[:6], numbers[:6]) == [None] * 4
+    assert prediction_intervals(values[:6], numbers[:6]) == [None] * 4
 
 
 def test_a_log_without_an_error_widens_no_interval() -> None:
@@ -458,7 +484,7 @@ def test_a_log_without_an_error_widens_no_interval() -> None:
     for _ in range(400):
         # one log in six goes straight, and nothing goes wrong in it
         seen, new = np.abs(random.normal(size=(2, 12, 2))) * (random.random((2, 12, 1)) > 1 / 6)
-        low, high = np.array(new_trials(seen, np.arange(12))).T
+        low, high = np.array(prediction_intervals(seen, np.arange(12))).T
         held.append((low <= new.mean(0)) & (new.mean(0) <= high))
         factors.append(high[0] / seen.mean(0)[0])
     assert 0.92 <= np.mean(held) <= 0.98

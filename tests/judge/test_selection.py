@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from residnet.judge.selection import (
-    Blocks,
-    Contender,
     Selection,
-    choose,
-    difference,
-    log_errors,
+    SelectionBlocks,
+    SelectionCandidate,
+    block_log_errors,
+    log_error_ratio,
+    select_models,
 )
 
-EVEN = Blocks(np.full(5, 0.2), "logs")
+EVEN = SelectionBlocks(np.full(5, 0.2), "logs")
 JITTER = np.array([1.0, -1.0, 2.0, -2.0, 0.0])
 
 
@@ -29,28 +29,30 @@ def contender(
     spread: float = 0.0,
     diverged: int = 0,
     faults: tuple[str, ...] = (),
-) -> Contender:
+) -> SelectionCandidate:
     """A model whose log error differs from log to log by `spread` times (1, -1, 2, -2, 0)."""
     told = (f"{diverged} of its 7 validation windows diverged (T30)",) if diverged else ()
     scores = (math.log(error) + spread * JITTER) / 5
-    return Contender(name, family, parameters, error, scores, diverged, (*told, *faults))
+    return SelectionCandidate(name, family, parameters, error, scores, diverged, (*told, *faults))
 
 
 ZERO = contender("zero", "zero", 1.0, parameters=0)
 
 
-def chosen(*models: Contender) -> Selection:
-    return choose((ZERO, *models), EVEN)
+def chosen(*models: SelectionCandidate) -> Selection:
+    return select_models((ZERO, *models), EVEN)
 
 
 def test_the_standard_error_is_that_of_paired_differences() -> None:
     one, other = contender("a", "baseline", 0.5, spread=0.1), contender("b", "baseline", 0.4)
     expected = (0.1 * JITTER).std(ddof=1) / np.sqrt(5)
-    assert EVEN.standard_error(one.scores, other.scores) == pytest.approx(expected)
-    assert difference(one, other, EVEN) == pytest.approx((math.log(0.5 / 0.4), expected))
+    assert EVEN.standard_error(one.block_scores, other.block_scores) == pytest.approx(expected)
+    assert log_error_ratio(one, other, EVEN) == pytest.approx((math.log(0.5 / 0.4), expected))
     # what both have in common is no spread of the difference
     common = contender("c", "baseline", 0.4, spread=0.1)
-    assert EVEN.standard_error(one.scores, common.scores) == pytest.approx(0.0, abs=1e-12)
+    assert EVEN.standard_error(one.block_scores, common.block_scores) == pytest.approx(
+        0.0, abs=1e-12
+    )
 
 
 LOST = "passed over: lstm (7 of its 7 validation windows diverged (T30))"
@@ -58,7 +60,7 @@ FAULT = ("its damping has the wrong sign",)
 WITHIN = "baseline is the simplest sound model within one standard error (7.1 %) of the best one"
 
 
-def baseline(error: float, spread: float = 0.0) -> Contender:
+def baseline(error: float, spread: float = 0.0) -> SelectionCandidate:
     return contender("baseline", "baseline", error, spread=spread)
 
 
@@ -91,7 +93,7 @@ LINE = contender("line", "baseline", 0.4, faults=FAULT)
         ([contender("mlp", "network", 0.1, diverged=1)], "zero", ""),
     ],
 )
-def test_the_choice(models: list[Contender], expected: str, said: str) -> None:
+def test_the_choice(models: list[SelectionCandidate], expected: str, said: str) -> None:
     found = chosen(*models)
     assert found.selected == expected
     assert said in found.reason
@@ -127,7 +129,7 @@ def test_ensembles_are_compared_among_themselves() -> None:
 
 def test_the_file_says_of_each_model_what_decided() -> None:
     lead = baseline(0.5, 0.1)
-    content = chosen(lead, contender("mlp", "network", 0.7, diverged=2)).content()
+    content = chosen(lead, contender("mlp", "network", 0.7, diverged=2)).to_json()
     assert (content["schema"], content["selected"]) == ("residnet.selection/2", "baseline")
     assert content["blocks"] == {"of": "logs", "count": 5}
     rows = {row["model"]: row for row in content["models"]}
@@ -140,7 +142,7 @@ def test_the_file_says_of_each_model_what_decided() -> None:
 
 def test_of_stretches_half_a_standard_error_is_taken() -> None:
     models = (ZERO, baseline(0.5, 0.1), contender("mlp", "network", 0.5 * math.exp(-0.05)))
-    found = choose(models, Blocks(EVEN.weights, "stretches"))
+    found = select_models(models, SelectionBlocks(EVEN.weights, "stretches"))
     assert found.selected == "mlp"
     assert "no simpler one comes within half a standard error" in found.reason
 
@@ -149,8 +151,8 @@ def test_a_tenth_of_the_least_error_is_added_to_that_of_each_block() -> None:
     """No block counts much where all models are nearly right, nor does one bad stretch."""
     weights = np.array([0.5, 0.25, 0.25])
     errors = {"one": np.array([0.4, 0.4, 1e-9]), "other": np.array([0.3, 0.6, 1e-4])}
-    scores = log_errors({name: weights * error for name, error in errors.items()}, weights)
+    scores = block_log_errors({name: weights * error for name, error in errors.items()}, weights)
     least = min(float(weights @ error) for error in errors.values())
     for name, error in errors.items():
         np.testing.assert_allclose(scores[name], weights * np.log(error + 0.1 * least))
-    assert np.isfinite(log_errors({"none": np.zeros(3)}, weights)["none"]).all()
+    assert np.isfinite(block_log_errors({"none": np.zeros(3)}, weights)["none"]).all()

@@ -18,29 +18,29 @@ from torch import Tensor
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.data.prepare import PrepareConfig, Prepared, prepare
+from residnet.data.prepare import PrepareConfig, PreparedLog, prepare_log
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.heads.base import ResidualHead
 from residnet.heads.lstm import LstmHead
 from residnet.judge.soundness import (
-    BOUNDED,
+    BOUNDEDNESS,
     CHECKS,
     DAMPING,
     STABILITY,
     SYMMETRY,
-    Finding,
-    Recorded,
-    acceleration,
+    SanityFinding,
+    TrainingPoints,
+    build_sanity_content,
     check_model,
-    contradiction,
-    growth_rate,
-    mirrored_inputs,
-    operating_points,
-    read_findings,
-    sanity_content,
-    steady_runs,
+    compute_growth_rate,
+    find_contradicting_steady_run,
+    find_operating_points,
+    find_steady_runs,
+    mirror_inputs,
+    read_sanity_findings,
+    settled_acceleration,
 )
 from residnet.physics.signals import SignalsConfig
 
@@ -93,15 +93,15 @@ def made(
     return spec, model
 
 
-def recorded(spec: ModelSpec, count: int = 300) -> Recorded:
+def recorded(spec: ModelSpec, count: int = 300) -> TrainingPoints:
     """Points drawn in the training ranges."""
     random = np.random.default_rng(0)
     drawn = random.uniform(spec.low, spec.high, size=(count, len(spec.low)))
     x = np.concatenate((np.zeros((count, 3)), drawn[:, :3]), axis=1)
-    return Recorded(torch.from_numpy(x), torch.from_numpy(drawn[:, 3:]), 100.0, ())
+    return TrainingPoints(torch.from_numpy(x), torch.from_numpy(drawn[:, 3:]), 100.0, ())
 
 
-def findings(spec: ModelSpec, model: HybridDynamics) -> dict[str, Finding]:
+def findings(spec: ModelSpec, model: HybridDynamics) -> dict[str, SanityFinding]:
     return {finding.check: finding for finding in check_model(spec, model, recorded(spec))}
 
 
@@ -120,8 +120,8 @@ def test_a_vessel_that_behaves_passes(vessel: tuple[ModelSpec, HybridDynamics]) 
     # one without inputs is checked from rest
     coasting = {name: row for name, row in RUDDER.items() if name in "uvr"}
     found = findings(*made(coasting, (), low=(0.0, -0.4, -0.2), high=(2.0, 0.4, 0.2)))
-    assert found[BOUNDED].ok
-    assert "1 from rest" in found[BOUNDED].text
+    assert found[BOUNDEDNESS].ok
+    assert "1 from rest" in found[BOUNDEDNESS].text
 
 
 @pytest.mark.parametrize(
@@ -137,8 +137,8 @@ def test_damping_of_the_wrong_sign_and_running_away(change: Terms, said: str) ->
     assert found[DAMPING].ok is False
     assert said in found[DAMPING].fault
     assert found[DAMPING].text.startswith("unsound: its damping")
-    assert "runs away within" in found[BOUNDED].fault
-    assert "recorded inputs (n " in found[BOUNDED].fault
+    assert "runs away within" in found[BOUNDEDNESS].fault
+    assert "recorded inputs (n " in found[BOUNDEDNESS].fault
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_running_away_at_inputs_that_no_log_holds_is_no_fault() -> None:
     spec, model = made({**RUDDER, "u n": (0.02, 0, 0)})
     seen = recorded(spec)
     seen.w[:, 0] *= 0.2
-    found = check_model(spec, model, seen)[CHECKS.index(BOUNDED)]
+    found = check_model(spec, model, seen)[CHECKS.index(BOUNDEDNESS)]
     assert found.ok is False
     assert found.fault == ""
     assert "held from rest" in found.text
@@ -182,8 +182,8 @@ def test_instability_is_flagged_with_its_doubling_time_and_where_it_is() -> None
 def test_growth_rate_with_a_memory_is_that_of_the_whole_step() -> None:
     spec, model = made(RUDDER, head={"kind": "lstm", "hidden_size": 3})
     model = model.double().eval()
-    of_kind(model.head, LstmHead).scale.spread.fill_(0.3)
-    point = operating_points(spec, model)[2]
+    of_kind(model.head, LstmHead).scale.std.fill_(0.3)
+    point = find_operating_points(spec, model)[2]
     s = model.warmup(point.x.expand(1, 20, 6), point.w.expand(1, 20, 2))[0]
 
     def step(z: torch.Tensor) -> torch.Tensor:
@@ -192,18 +192,18 @@ def test_growth_rate_with_a_memory_is_that_of_the_whole_step() -> None:
 
     jacobian = torch.autograd.functional.jacobian(step, torch.cat((point.x[4:], s)))
     expected = math.log(float(torch.linalg.eigvals(jacobian).abs().max())) / STEP
-    assert growth_rate(model, point.x, point.w) == pytest.approx(expected, rel=1e-9)
+    assert compute_growth_rate(model, point.x, point.w) == pytest.approx(expected, rel=1e-9)
 
 
 def test_cruise_holds_its_speed_with_the_rudder_amidships() -> None:
     spec, model = made(RUDDER)
-    points = {point.label: point for point in operating_points(spec, model.double())}
+    points = {point.label: point for point in find_operating_points(spec, model.double())}
     cruise = points["cruise"]
     assert cruise.speed == pytest.approx(0.67 * 2.0)
     assert float(cruise.w[1]) == 0.0
     # u_dot = 0.02 n - 0.1 u vanishes at n = 6.7; the drives tried are 0.25 apart
     assert float(cruise.w[0]) == pytest.approx(6.7, abs=0.13)
-    assert cruise.inside
+    assert cruise.is_inside_training_range
 
 
 @pytest.mark.parametrize(
@@ -238,21 +238,24 @@ def test_wind_from_the_other_side_is_the_mirror_of_wind() -> None:
     spec, model = made({**RUDDER, **wind}, exogenous=names, low=low, high=high)
     assert findings(spec, model)[SYMMETRY].ok is True
     seen = recorded(spec)
-    other = mirrored_inputs(spec.signals.columns, seen.w)
+    other = mirror_inputs(spec.signals.input_columns, seen.w)
     assert other is not None
     turned = seen.x * torch.tensor([1.0, -1, -1, 1, -1, -1], dtype=torch.float64)
     model = model.double()
-    one, two = acceleration(model, seen.x, seen.w), acceleration(model, turned, other)
+    one, two = (
+        settled_acceleration(model, seen.x, seen.w),
+        settled_acceleration(model, turned, other),
+    )
     torch.testing.assert_close(two, one * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-    assert mirrored_inputs(("n_port", "delta"), seen.w[:, :2]) is None
+    assert mirror_inputs(("n_port", "delta"), seen.w[:, :2]) is None
 
 
 def test_a_network_on_top_is_checked_with_its_memory_settled() -> None:
     spec, model = made(RUDDER, head={"kind": "lstm", "hidden_size": 4})
-    of_kind(model.head, LstmHead).scale.spread.fill_(1e-6)
+    of_kind(model.head, LstmHead).scale.std.fill_(1e-6)
     # the memory of an untrained network may be unstable by itself
     assert all(found.ok for found in findings(spec, model).values() if found.check != STABILITY)
-    of_kind(model.head, LstmHead).scale.spread.fill_(0.5)
+    of_kind(model.head, LstmHead).scale.std.fill_(0.5)
     assert findings(spec, model)[SYMMETRY].ok is False
     assert next(model.head.parameters()).dtype == torch.float32, "the model stays as it is"
 
@@ -262,10 +265,10 @@ class Carried(ResidualHead):
 
     def __init__(self) -> None:
         super().__init__()
-        self.settle = 2.0
+        self.innovation_time_constant = 2.0
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        return 2.0 * z[:, -self.dof :], s
+        return 2.0 * z[:, -self.n_dof :], s
 
 
 def test_what_looks_for_an_unknown_force_is_asked_without_a_past() -> None:
@@ -286,7 +289,7 @@ def test_what_looks_for_an_unknown_force_is_asked_without_a_past() -> None:
         assert findings(spec, one)[DAMPING].fault
 
 
-def log(seconds: float = 200.0, *, settles: bool = True) -> Prepared:
+def log(seconds: float = 200.0, *, settles: bool = True) -> PreparedLog:
     """A log at constant drive: its rudder is put over once and it turns steadily, or it is held and
     it turns ever faster.
     """
@@ -309,17 +312,17 @@ def log(seconds: float = 200.0, *, settles: bool = True) -> Prepared:
     }
     derivative = {"kind": "savitzky_golay", "window": 5 * STEP, "order": 2}
     config = PrepareConfig.model_validate({"grid": {"step": STEP}, "derivative": derivative})
-    return prepare(Log("made", t, channels), "train", ("n", "delta"), config)
+    return prepare_log(Log("made", t, channels), "train", ("n", "delta"), config)
 
 
 def test_points_of_several_logs_are_recorded_ones_with_the_extreme_inputs() -> None:
     logs = [replace(log(), usable=np.arange(400) % 3 > 0), log(150.0, settles=False), log(300.0)]
     logs[2].w[77, 1], logs[0].w[1, 0] = -0.9, 55.0
-    points = Recorded.of(logs, STEP)
+    points = TrainingPoints.from_logs(logs, STEP)
     recorded = {
         (*state[3:], *inputs)
         for one in logs
-        for state, inputs in zip(one.smooth[one.usable], one.w[one.usable], strict=True)
+        for state, inputs in zip(one.smoothed[one.usable], one.w[one.usable], strict=True)
     }
     found = list(map(tuple, np.hstack((points.x[:, 3:], points.w)).tolist()))
     assert set(found) <= recorded
@@ -328,26 +331,26 @@ def test_points_of_several_logs_are_recorded_ones_with_the_extreme_inputs() -> N
     assert points.w[:, 0].max() == 55.0
     speeds = [np.hypot(state[0], state[1]) for state in recorded]
     assert np.hypot(*points.x[:, 3:5].numpy().T).max() == max(speeds)
-    assert points.longest == 299.5
+    assert points.longest_duration == 299.5
 
 
 def test_an_unstable_model_is_contradicted_by_a_vessel_that_turns_steadily_only() -> None:
     # the faster mode of sway and yaw grows by about 0.1 1/s
     _, model = made({**RUDDER, "v": (0, -0.3, -0.6), "r": (0, -0.4, -0.3)})
-    steady = steady_runs([log()], STEP)
+    steady = find_steady_runs([log()], STEP)
     # the stretches of held inputs, without what settles
-    assert [round(run.seconds) for run in steady] == [30, 120]
-    assert steady[1].w.tolist() == pytest.approx([8.0, 0.5])
-    assert steady[1].x[5] == pytest.approx(0.1, abs=0.002)
+    assert [round(run.duration) for run in steady] == [30, 120]
+    assert steady[1].mean_inputs.tolist() == pytest.approx([8.0, 0.5])
+    assert steady[1].mean_state[5] == pytest.approx(0.1, abs=0.002)
     assert steady[1].growth < 2.0
     assert steady[0].decay < 3.0 < steady[1].decay
-    assert "unstable where the logs are not" in contradiction(model, steady)
-    assert contradiction(model, steady_runs([log(settles=False)], STEP)) == ""
+    assert "unstable where the logs are not" in find_contradicting_steady_run(model, steady)
+    assert find_contradicting_steady_run(model, find_steady_runs([log(settles=False)], STEP)) == ""
     # a straight run that nothing disturbs proves nothing
-    assert contradiction(model, steady[:1]) == ""
+    assert find_contradicting_steady_run(model, steady[:1]) == ""
     # one that grows too slowly for the logs to tell
     _, slow = made({**RUDDER, "v": (0, -0.3, -0.38), "r": (0, -0.4, -0.5)})
-    assert contradiction(slow, steady) == ""
+    assert find_contradicting_steady_run(slow, steady) == ""
 
 
 def test_a_small_swing_in_a_turn_is_no_fault_where_the_vessel_swings_as_much() -> None:
@@ -357,20 +360,20 @@ def test_a_small_swing_in_a_turn_is_no_fault_where_the_vessel_swings_as_much() -
     change = {"v": (0, -0.3, -0.6), "r": (0, -0.4, -0.3)}
     _, runs_off = made({**RUDDER, **change})
     _, swings = made({**RUDDER, **change, "v^3": (0, -30.0, 0)})
-    steady = steady_runs([log()], STEP)
+    steady = find_steady_runs([log()], STEP)
     blown = [replace(run, scatter=np.array([0.2, 0.2])) for run in steady]
-    assert "unstable where the logs are not" in contradiction(runs_off, blown)
-    assert "unstable where the logs are not" in contradiction(swings, steady)
-    assert contradiction(swings, blown) == ""
+    assert "unstable where the logs are not" in find_contradicting_steady_run(runs_off, blown)
+    assert "unstable where the logs are not" in find_contradicting_steady_run(swings, steady)
+    assert find_contradicting_steady_run(swings, blown) == ""
 
 
 def test_findings_go_through_the_file_of_a_run(tmp_path: Path) -> None:
     spec, model = made({**RUDDER, "u": (0.02, 0, 0)})
     found = check_model(spec, model, recorded(spec))
-    assert read_findings(tmp_path) == []
-    content = sanity_content({"made": found})
+    assert read_sanity_findings(tmp_path) == []
+    content = build_sanity_content({"made": found})
     (tmp_path / "sanity.json").write_text(json.dumps(content), encoding="utf-8")
-    assert read_findings(tmp_path) == found
+    assert read_sanity_findings(tmp_path) == found
     (tmp_path / "sanity.json").write_text("{", encoding="utf-8")
     with pytest.raises(DataError, match=r"sanity.json: not readable .*delete the file"):
-        read_findings(tmp_path)
+        read_sanity_findings(tmp_path)

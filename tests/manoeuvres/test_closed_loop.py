@@ -13,20 +13,26 @@ from torch import Tensor
 from residnet.control.motion import MotionPIDConfig
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
-from residnet.data.simulated import Craft, Disturbance, Sea, SensorNoise, fly
+from residnet.data.simulated import (
+    DisturbanceConfig,
+    SensorsConfig,
+    SimulatedVessel,
+    TrialEnvironment,
+    simulate_manoeuvres,
+)
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import RecordedPlantDynamics
-from residnet.manoeuvres.base import Helm, StackedSource, Watched
+from residnet.manoeuvres.base import Helm, StackedSource, StopRecorder
 from residnet.manoeuvres.closed_loop import (
     Spiral,
     SteadyConfig,
     TurningCircle,
     Zigzag,
+    initial_steadiness,
     is_steady,
-    restarted,
-    steadied,
-    steady_at,
+    restart_wait,
+    update_steadiness,
 )
 from residnet.manoeuvres.courses import SEGMENTS, FourCorner
 from residnet.manoeuvres.open_loop import MultiSine, RandomSteps
@@ -74,14 +80,14 @@ def flown(
     source: Source, rows: int, steps: int, model: Nomoto | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Nomoto]:
     model = model or Nomoto()
-    watched = Watched(source, rows)
+    watched = StopRecorder(source, rows)
     x0 = torch.zeros(rows, 6, dtype=torch.float64)
     x0[:, 3] = 1.0
     with torch.no_grad():
         x, w, _ = Rollout(model, watched)(
             x0, torch.zeros(rows, steps, 2, dtype=torch.float64), x0[:, :0]
         )
-    return x, w, watched.stopped, model
+    return x, w, watched.stop_step, model
 
 
 def times(steps: int, dt: float = 0.1) -> Tensor:
@@ -96,7 +102,8 @@ def test_each_row_stops_on_its_own_and_the_loop_when_all_have() -> None:
     zigzags = [Zigzag(drive=1, steer=0.5, heading=10 * DEG, start=1, reversals=3)]
     t = times(2000)
     source = StackedSource(
-        [TurningCircle.source(circles, HELM, t), Zigzag.source(zigzags, HELM, t)], [2, 1]
+        [TurningCircle.build_source(circles, HELM, t), Zigzag.build_source(zigzags, HELM, t)],
+        [2, 1],
     )
     x, w, stopped, model = flown(source, 3, 2000)
     assert x.shape == (3, 2001, 6)
@@ -126,7 +133,7 @@ def test_pull_out_ends_when_the_yaw_rate_is_steady() -> None:
         steady=SteadyConfig(window=2.0, tolerance=0.01),
     )
     t = times(1500)
-    x, w, stopped, _ = flown(TurningCircle.source([circle], HELM, t), 1, 1500)
+    x, w, stopped, _ = flown(TurningCircle.build_source([circle], HELM, t), 1, 1500)
     k = int(stopped)
     turned = int(np.argmax(x[0, :, 2].numpy() >= math.pi))
     assert float(w[0, turned - 1, 0]) == pytest.approx(30 * DEG)
@@ -138,16 +145,16 @@ def test_pull_out_ends_when_the_yaw_rate_is_steady() -> None:
 def test_steady_by_hand() -> None:
     given = {"window": 1.0, "tolerance": 0.1, "dt": 0.5}
     numbers = {name: torch.tensor([value]) for name, value in given.items()}
-    memory = steady_at(torch.tensor([0.0]))
+    memory = initial_steadiness(torch.tensor([0.0]))
     seen = []
     for _ in range(6):
-        memory = steadied(torch.tensor([1.0]), numbers, memory)
+        memory = update_steadiness(torch.tensor([1.0]), numbers, memory)
         seen.append((round(float(memory[0, 0]), 4), bool(is_steady(numbers, memory))))
     # the mean halves its distance each step: within 0.1 from the third on, for a window of two
     # steps
     assert [mean for mean, _ in seen] == [0.5, 0.75, 0.875, 0.9375, 0.9688, 0.9844]
     assert [steady for _, steady in seen] == [False] * 4 + [True] * 2
-    assert not bool(is_steady(numbers, restarted(memory, torch.tensor([True]))))
+    assert not bool(is_steady(numbers, restart_wait(memory, torch.tensor([True]))))
 
 
 def test_spiral_of_a_linear_vessel_has_no_loop() -> None:
@@ -159,12 +166,14 @@ def test_spiral_of_a_linear_vessel_has_no_loop() -> None:
         steady=SteadyConfig(window=5, tolerance=0.002),
     )
     t = times(4000)
-    x, w, stopped, _ = flown(Spiral.source([spiral], HELM, t), 1, 4000, Nomoto(offset=2 * DEG))
+    x, w, stopped, _ = flown(
+        Spiral.build_source([spiral], HELM, t), 1, 4000, Nomoto(offset=2 * DEG)
+    )
     assert int(stopped) > 0
     end = int(stopped) + 1
     channels = {name: x[0, :end, i].numpy() for i, name in enumerate(STATE)}
     channels |= {name: w[0, :end, i].numpy() for i, name in enumerate(HELM.inputs)}
-    found = spiral.indices(Log("made", t[:end].numpy(), channels))
+    found = spiral.compute_indices(Log("made", t[:end].numpy(), channels))
     assert found["yaw_rates"] == pytest.approx(
         [0.4 * (a - 2) * DEG for a in (20, 5, 0, -5, -20, -5, 0, 5)], abs=0.01 * 0.4 * 22 * DEG
     )
@@ -177,7 +186,7 @@ def test_excitation_keeps_to_its_band_and_amplitude(kind: Any) -> None:
     wave = kind(
         drive=0.5, drive_amplitude=0.2, steer_amplitude=0.6, band=(0.02, 0.2), seed=3, start=10.0
     )
-    drive, steer = (demand.numpy() for demand in wave.demands(t))
+    drive, steer = (demand.numpy() for demand in wave.demands_at(t))
     assert (drive[t < 9.99] == 0.5).all()
     assert (steer[t < 9.99] == 0).all()
     assert 0.18 < np.abs(drive - 0.5).max() <= 0.2 + 1e-12
@@ -189,10 +198,10 @@ def test_excitation_keeps_to_its_band_and_amplitude(kind: Any) -> None:
         # steps have harmonics and a level of their own besides
         assert inside > (0.99 if kind is MultiSine else 0.5)
     assert abs(np.corrcoef(drive[200:], steer[200:])[0, 1]) < 0.1
-    other, _ = wave.model_copy(update={"seed": 4}).demands(t)
+    other, _ = wave.model_copy(update={"seed": 4}).demands_at(t)
     assert not np.array_equal(other.numpy(), drive)
     # a demand does not depend on how long it is asked for
-    for short, long in zip(wave.demands(t[:300]), (drive, steer), strict=True):
+    for short, long in zip(wave.demands_at(t[:300]), (drive, steer), strict=True):
         np.testing.assert_array_equal(short, long[:300])
     if kind is RandomSteps:
         # held for half periods of the band
@@ -203,14 +212,14 @@ def test_excitation_keeps_to_its_band_and_amplitude(kind: Any) -> None:
 
 def test_rudder_angles_and_vessels_that_cannot() -> None:
     circle = TurningCircle(drive=1, rudder=-15 * DEG)
-    assert circle.share(HELM) == pytest.approx(-0.5)
+    assert circle.steer_share(HELM) == pytest.approx(-0.5)
     assert circle.side == -1
     with pytest.raises(UsageError, match="goes to 30 deg"):
-        TurningCircle(drive=1, rudder=31 * DEG).share(HELM)
+        TurningCircle(drive=1, rudder=31 * DEG).steer_share(HELM)
     gains = (1.0, 1.0, 1.0)
     control = MotionPIDConfig(proportional=gains, integral=gains, derivative=gains)
     with pytest.raises(UsageError, match="all three"):
-        FourCorner.source([FourCorner(control=control)], HELM, times(2))
+        FourCorner.build_source([FourCorner(control=control)], HELM, times(2))
 
 
 @pytest.mark.long
@@ -226,13 +235,15 @@ def test_four_corner_course_of_the_ferry(vessel: str) -> None:
     )
     control = MotionPIDConfig(proportional=proportional, integral=integral, derivative=derivative)
     course = FourCorner(control=control)
-    assert course.lasts(10.0) == 720.0
+    assert course.duration_within(10.0) == 720.0
     model, helm = RecordedPlantDynamics(plant, 0.2, 2), Helm.from_plant(plant)
-    craft = Craft(vessel, model, helm, plant.commands, plant.approach(1))
-    (flight,) = fly(craft, [course], Sea(plant, Disturbance(), SensorNoise(), 0), 10.0, 0.2)
-    motion = flight.motion
+    craft = SimulatedVessel(vessel, model, helm, plant.commands, plant.approach(1))
+    (flight,) = simulate_manoeuvres(
+        craft, [course], TrialEnvironment(plant, DisturbanceConfig(), SensorsConfig(), 0), 10.0, 0.2
+    )
+    motion = flight.true_log
     assert len(motion) == 3600
-    found = course.indices(motion)
+    found = course.compute_indices(motion)
     assert found["mean_position_error"] < 1.0
     assert found["mean_heading_error"] < 5 * DEG
     # each segment ends near its pose, the ninth's turn goes the long way round as it is written

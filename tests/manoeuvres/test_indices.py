@@ -18,13 +18,13 @@ from residnet.manoeuvres import indices
 from residnet.manoeuvres.base import Helm
 from residnet.manoeuvres.closed_loop import Spiral, Stopping, TurningCircle, Zigzag
 from residnet.manoeuvres.indices import (
-    IN_LENGTHS,
-    UNITS,
-    Track,
+    INDEX_UNITS,
+    LENGTH_INDICES,
+    SmoothTrack,
     first_crossing,
-    steered_zigzag,
+    identify_zigzag,
     turning,
-    zigzag,
+    zigzag_indices,
 )
 
 DEG, HALF = math.pi / 180, math.pi / 2
@@ -93,7 +93,7 @@ def test_sinusoidal_heading(side: float) -> None:
     psi, r = psi0 + side * a * np.sin(w * t), side * a * w * np.cos(w * t)
     # a whole cycle comes before it is steered
     log = thinned(motion(t, psi, r, np.full_like(t, 3.0)), 700)
-    found = zigzag(log, cycle, side, bound, 10.0)
+    found = zigzag_indices(log, cycle, side, bound, 10.0)
     first = math.asin(bound / a) / w
     assert found["initial_turning_time"] == pytest.approx(first, abs=1e-4)
     assert found["initial_turning_distance"] == pytest.approx(3 * first, rel=1e-3)
@@ -107,7 +107,7 @@ def test_sinusoidal_heading(side: float) -> None:
     outside = np.linspace(first, math.pi / w, 4000)
     outward = np.trapezoid(3 * np.sin(a * np.sin(w * outside)), outside)
     assert found["overshoot_width"] == pytest.approx(outward, rel=1e-3)
-    assert set(found) <= set(UNITS) | {f"{name}_lengths" for name in IN_LENGTHS}
+    assert set(found) <= set(INDEX_UNITS) | {f"{name}_lengths" for name in LENGTH_INDICES}
 
 
 def test_crossings_lie_between_samples() -> None:
@@ -123,7 +123,7 @@ def test_stopping_with_constant_deceleration() -> None:
     t = np.arange(0.0, 40.0, 0.1)
     u = np.where(t < 6, 4.0, 4.0 - 0.25 * (t - 6))
     log = motion(t, np.full_like(t, 0.7), np.zeros_like(t), u)
-    found = Stopping(drive=1.0, start=6.0).indices(log, 8.0)
+    found = Stopping(drive=1.0, start=6.0).compute_indices(log, 8.0)
     assert found["stopping_time"] == pytest.approx(16.0, abs=1e-3)
     assert found["track_reach"] == pytest.approx(32.0, abs=1e-3)
     assert found["head_reach"] == pytest.approx(32.0, abs=1e-3)
@@ -136,7 +136,7 @@ def test_spiral_takes_the_rate_before_each_change() -> None:
     held = np.select([t < 5, t < 15, t < 25, t < 35], [0.0, 0.4, 0.0, -0.4], 0.0)
     r = 0.01 * np.floor(t / 5)
     channels = {"x": t, "y": t, "psi": 0 * t, "u": 0 * t + 1, "v": 0 * t, "r": r, "cmd_delta": held}
-    found = Spiral(drive=0.5, steers=(0.4, 0.0, -0.4, 0.0), start=5.0).indices(
+    found = Spiral(drive=0.5, steers=(0.4, 0.0, -0.4, 0.0), start=5.0).compute_indices(
         Log("made", t, channels)
     )
     assert found["yaw_rates"] == pytest.approx([0.02, 0.04, 0.06, 0.09])
@@ -166,10 +166,10 @@ def test_which_manoeuvres_imo_limits() -> None:
         Helm(partial(_helm, size), ("psi", "r", "u"), inputs)
         for size, inputs in ((35 * DEG, ("cmd_delta", "cmd_n")), (1.0, ("cmd_port", "cmd_stbd")))
     )
-    assert rudder.hard_over == pytest.approx(35 * DEG)
-    assert twin.hard_over is None
+    assert rudder.max_rudder == pytest.approx(35 * DEG)
+    assert twin.max_rudder is None
     ten = Zigzag(drive=1, rudder=10 * DEG, heading=10 * DEG)
-    assert ten.share(rudder) == pytest.approx(10 / 35)
+    assert ten.steer_share(rudder) == pytest.approx(10 / 35)
     tens, twenties = (indices.zigzag_limits(angle, 100, 8) for angle in (10.0, 20.0))
     over = {"advance": 450, "tactical_diameter": 500}
     for manoeuvre, limits in (
@@ -181,9 +181,9 @@ def test_which_manoeuvres_imo_limits() -> None:
         (Stopping(drive=1), {"track_reach": 1500}),
         (Stopping(drive=1, astern=-0.5), {}),
     ):
-        assert manoeuvre.limits(rudder, 100, 8) == limits
+        assert manoeuvre.imo_limits(rudder, 100, 8) == limits
     alone = Zigzag(drive=1, steer=0.5, heading=20 * DEG)
-    assert alone.limits(twin, 100, 8) == twenties, "without a rudder the heading tells"
+    assert alone.imo_limits(twin, 100, 8) == twenties, "without a rudder the heading tells"
 
 
 def test_empty_samples_are_left_out() -> None:
@@ -192,10 +192,13 @@ def test_empty_samples_are_left_out() -> None:
     holes = log.replace(
         channels=log.channels | {"x": np.where(np.arange(t.size) % 5 == 0, log["x"], np.nan)}
     )
-    whole, few = zigzag(log, 0.0, 1.0, 0.2, None), zigzag(holes, 0.0, 1.0, 0.2, None)
+    whole, few = (
+        zigzag_indices(log, 0.0, 1.0, 0.2, None),
+        zigzag_indices(holes, 0.0, 1.0, 0.2, None),
+    )
     assert few["period"] == pytest.approx(whole["period"], abs=1e-4)
     with pytest.raises(DataError, match="indices need"):
-        Track(log.replace(channels=log.channels | {"r": np.full(t.size, np.nan)}))
+        SmoothTrack(log.replace(channels=log.channels | {"r": np.full(t.size, np.nan)}))
 
 
 def steered(angle: float, heading: float, side: float, offset: float = 0.0) -> Log:
@@ -228,8 +231,8 @@ def test_what_was_steered_is_read_off(
     # noise on the rudder does not make orders
     noise = 0.01 * DEG * np.random.default_rng(0).standard_normal(len(log))
     for one in (log, log.replace(channels=log.channels | {"delta": log["delta"] + noise})):
-        found = steered_zigzag(one, "delta")
-        assert found.side == side
+        found = identify_zigzag(one, "delta")
+        assert found.first_sign == side
         assert found.angle / DEG == pytest.approx(angle, abs=0.02)
         assert found.start == pytest.approx(4.0, abs=0.15)
         # the order falls on the first sample beyond the heading
@@ -246,19 +249,19 @@ def test_where_the_rudder_left_does_not_hang_on_the_grid(every: int) -> None:
     left = np.isclose(size[:-1], 20 * DEG) & (np.diff(size) < -1e-6)
     turns = np.flatnonzero(left & (np.arange(len(log) - 1) >= 60))
     assert len(turns) > 2
-    found = steered_zigzag(thinned(log, every), "delta")
-    assert found.leaves / DEG == pytest.approx(np.abs(psi[turns]).mean() / DEG, abs=0.03)
+    found = identify_zigzag(thinned(log, every), "delta")
+    assert found.departure_heading / DEG == pytest.approx(np.abs(psi[turns]).mean() / DEG, abs=0.03)
     rates = np.abs(np.gradient(psi, log.t))[turns]
-    assert found.turning == pytest.approx(rates.mean(), rel=0.02)
-    assert every > 1 or found.leaves > found.heading
+    assert found.departure_rate == pytest.approx(rates.mean(), rel=0.02)
+    assert every > 1 or found.departure_heading > found.heading
 
 
 def test_other_manoeuvres_are_refused() -> None:
     t = np.arange(0, 60, 0.1)
     turn = Log("turn", t, {"psi": 0.05 * t, "delta": np.where(t < 5, 0.0, 0.3)})
     with pytest.raises(DataError, match="turn: the rudder is reversed"):
-        steered_zigzag(turn, "delta")
+        identify_zigzag(turn, "delta")
     log = steered(20, 20, 1.0)
     against = log.replace(channels={"psi": -log["psi"], "delta": log["delta"]})
     with pytest.raises(DataError, match="sign of delta"):
-        steered_zigzag(against, "delta")
+        identify_zigzag(against, "delta")

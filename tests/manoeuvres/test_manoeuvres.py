@@ -12,17 +12,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.log import Log
-from residnet.core.registry import kinds
+from residnet.core.registry import load_kinds
 from residnet.data.simulated import SimulatedTrials
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.manoeuvres import FamilyConfig, ManoeuvreConfig
 from residnet.manoeuvres.base import Helm, Manoeuvre, ScheduleSource, StackedSource
 from residnet.manoeuvres.closed_loop import Zigzag
-from residnet.manoeuvres.indices import UNITS
+from residnet.manoeuvres.indices import INDEX_UNITS
 from residnet.manoeuvres.open_loop import (
     AccelerationDeceleration,
     ConstantInput,
@@ -32,7 +32,7 @@ from residnet.manoeuvres.open_loop import (
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 
-FAMILIES, MANOEUVRES = kinds(FamilyConfig), kinds(ManoeuvreConfig)
+FAMILIES, MANOEUVRES = load_kinds(FamilyConfig), load_kinds(ManoeuvreConfig)
 DURATION, DT = 15.0, 0.1
 # what a family cannot do without; one whose fields have defaults beyond these needs no line here
 NEEDS: dict[str, Any] = {
@@ -98,7 +98,7 @@ def fly(
     """States [B, T+1, 8] and inputs [B, T, m], whose third is a disturbance."""
     x0 = torch.zeros(len(psi), 8, dtype=torch.float64)
     x0[:, 2] = psi
-    w = torch.zeros(len(psi), steps, len(model.plant.inputs), dtype=torch.float64)
+    w = torch.zeros(len(psi), steps, len(model.plant.input_names), dtype=torch.float64)
     w[:, :, 2] = 5.0
     with torch.no_grad():
         states, inputs, _ = Rollout(model, source)(x0, w, x0[:, :0])
@@ -122,7 +122,7 @@ def test_kinds_side_by_side_equal_each_alone_within_bounds_and_with_indices(
     """Every kind reads its indices off its own flight: finite numbers with a unit."""
     groups = [pair(kind, tmp_path) for kind in FLOWN]
     t, helm, model = times(), Helm.from_plant(plant), RecordedPlantDynamics(plant, DT)
-    source = StackedSource([type(g[0]).source(g, helm, t) for g in groups], [2] * len(groups))
+    source = StackedSource([type(g[0]).build_source(g, helm, t) for g in groups], [2] * len(groups))
     zero = torch.zeros(2 * len(groups), dtype=torch.float64)
     states, inputs = fly(model, source, len(t), zero)
     assert bool((inputs[:, :, 2] == 5.0).all()), "disturbances pass through a manoeuvre"
@@ -134,13 +134,13 @@ def test_kinds_side_by_side_equal_each_alone_within_bounds_and_with_indices(
         assert float(states[rows, :, 6:].abs().max()) <= n_max
         before = t < getattr(group[0], "start", 0.0)
         assert torch.equal(inputs[2 * i, before, 0], inputs[2 * i, before, 1]), "the helm waits"
-        alone, own = fly(model, type(group[1]).source(group[1:], helm, t), len(t), zero[:1])
+        alone, own = fly(model, type(group[1]).build_source(group[1:], helm, t), len(t), zero[:1])
         torch.testing.assert_close(alone[0], states[2 * i + 1], rtol=1e-10, atol=1e-12)
         torch.testing.assert_close(own[0], inputs[2 * i + 1], rtol=1e-10, atol=1e-12)
-        channels = dict(zip(plant.state, states[2 * i, :-1].T.numpy(), strict=True))
+        channels = dict(zip(plant.state_names, states[2 * i, :-1].T.numpy(), strict=True))
         channels |= dict(zip(("cmd_port", "cmd_stbd"), inputs[2 * i].T.numpy(), strict=False))
-        indices = group[0].indices(Log(kind, t.numpy(), channels), length=5.0)
-        assert {name.removesuffix("_lengths") for name in indices} <= set(UNITS)
+        indices = group[0].compute_indices(Log(kind, t.numpy(), channels), length=5.0)
+        assert {name.removesuffix("_lengths") for name in indices} <= set(INDEX_UNITS)
         assert all(np.isfinite(value).all() for value in indices.values())
         assert bool(indices) == (kind in WITH_INDICES)
 
@@ -153,7 +153,7 @@ def test_zigzag_switches_at_its_bound(plant: Plant) -> None:
         Zigzag(drive=0.5, steer=0.4, start=4.0, heading=bound, first=first) for first, _ in cases
     ]
     time, begun = times(40.0), torch.tensor([psi for _, psi in cases], dtype=torch.float64)
-    source = Zigzag.source(zigzags, Helm.from_plant(plant), time)
+    source = Zigzag.build_source(zigzags, Helm.from_plant(plant), time)
     states, commands = fly(RecordedPlantDynamics(plant, DT), source, len(time), begun)
     t = time.numpy()
     for row, (first, psi) in enumerate(cases):
@@ -182,19 +182,22 @@ def test_edges_fall_on_the_grid_point_they_name(
 ) -> None:
     """Rounding must not move an edge by a step, wherever it lies."""
     t = times(30.0, dt)
-    _, steer = ThreeTwoOneOne(drive=0.0, steer=1.0, start=start, unit=unit).demands(t)
+    _, steer = ThreeTwoOneOne(drive=0.0, steer=1.0, start=start, unit=unit).demands_at(t)
     edges = np.flatnonzero(np.diff(steer.numpy()) != 0) + 1
     units = np.cumsum([0, 3, 2, 1] + [1, 3, 2, 1] * 200)
     expected = np.rint((start + unit * units) / dt).astype(int)
     np.testing.assert_array_equal(edges, expected[expected < len(t)])
     moments = tuple(start + unit * k for k in range(5))
     levels = AccelerationDeceleration(times=moments, levels=(1.0, 0.5, 0.2, 0.8, 0.1))
-    drive, _ = levels.demands(t)
+    drive, _ = levels.demands_at(t)
     edges = np.flatnonzero(np.diff(drive.numpy()) != 0) + 1
     np.testing.assert_array_equal(edges, np.rint(np.array(moments) / dt).astype(int))
     zigzag = Zigzag(drive=0.5, steer=0.4, start=start, heading=0.3)
-    source, x = Zigzag.source([zigzag], Helm.from_plant(plant), t), plant.approach(1)
-    memory, first, w = source.initial(x), round(start / dt), torch.zeros(1, len(plant.inputs))
+    source, x = (
+        Zigzag.build_source([zigzag], Helm.from_plant(plant), t),
+        plant.make_initial_state(1),
+    )
+    memory, first, w = source.initial(x), round(start / dt), torch.zeros(1, len(plant.input_names))
     for k in range(first + 1):
         command, memory = source(x, w.double(), k, memory)
         assert bool(command[0, 0] != command[0, 1]) == (k == first)
@@ -202,14 +205,14 @@ def test_edges_fall_on_the_grid_point_they_name(
 
 def test_open_loop_patterns() -> None:
     m = ThreeTwoOneOne(drive=0.4, steer=0.7, start=5.0, unit=2.0)
-    drive, steer = m.demands(times(40.0, 1.0))
+    drive, steer = m.demands_at(times(40.0, 1.0))
     once = [0.7] * 6 + [-0.7] * 4 + [0.7] * 2 + [-0.7] * 2
     assert drive.tolist() == [0.4] * 40
     assert steer.tolist() == ([0.0] * 5 + once * 3)[:40]
-    _, single = m.model_copy(update={"repeat": False}).demands(times(40.0, 1.0))
+    _, single = m.model_copy(update={"repeat": False}).demands_at(times(40.0, 1.0))
     assert single.tolist() == [0.0] * 5 + once + [0.0] * 21
     levels = AccelerationDeceleration(times=(1.0, 3.0, 4.0), levels=(0.8, 0.2, 0.5))
-    drive, steer = levels.demands(times(6.0, 0.5))
+    drive, steer = levels.demands_at(times(6.0, 0.5))
     assert drive.tolist() == [0, 0, 0.8, 0.8, 0.8, 0.8, 0.2, 0.2, 0.5, 0.5, 0.5, 0.5]
     assert steer.abs().max() == 0
     for draw in drawn("acceleration_deceleration"):
@@ -237,7 +240,7 @@ def test_open_loop_patterns() -> None:
 )
 def test_wrong_manoeuvres(config: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
-        validate(config, ManoeuvreConfig, "here")
+        validate_config(config, ManoeuvreConfig, "here")
     assert "\n" not in str(caught.value)
 
 
@@ -253,13 +256,13 @@ def test_simulated_trials_are_split_whole() -> None:
         "validation": {"zigzag": 1},
     }
     config = SimulatedTrials.model_validate(content)
-    splits = config.splits(config.draw())
+    splits = config.assign_splits(config.draw_manoeuvres())
     assert sorted(splits) == ["test", "train", "train", "train", "validation"]
     assert splits[-1] == "train", "kinds that are not named are for identification"
-    assert splits == config.splits(config.draw())
+    assert splits == config.assign_splits(config.draw_manoeuvres())
     config = SimulatedTrials.model_validate(content | {"identification": {"zigzag": 4}})
     with pytest.raises(ValueError, match="leaves a split empty"):
-        config.splits(config.draw())
+        config.assign_splits(config.draw_manoeuvres())
 
 
 def test_multi_sines_excite_the_sway_force_where_commands_are_forces() -> None:
@@ -268,11 +271,11 @@ def test_multi_sines_excite_the_sway_force_where_commands_are_forces() -> None:
     wave = MultiSine(
         drive=0.2, steer_amplitude=0.1, sway_amplitude=0.3, band=(0.02, 0.1), start=5.0
     )
-    source = MultiSine.source([wave], Helm.from_plant(load_vessel("odin_forces").build()), t)
+    source = MultiSine.build_source([wave], Helm.from_plant(load_vessel("odin_forces").build()), t)
     assert isinstance(source, ScheduleSource)
     sway, moment = source.commands[0, :, 1], source.commands[0, :, 2]
     assert float(sway[:50].abs().max()) == 0.0
     assert 0.15 * 25e3 < float(sway.abs().max()) <= 0.3 * 25e3
     assert abs(float(torch.corrcoef(torch.stack((sway, moment)))[0, 1])) < 0.2
     with pytest.raises(UsageError, match="no forces; leave it out"):
-        MultiSine.source([wave], Helm.from_plant(load_vessel("wam_v_cal").build()), t)
+        MultiSine.build_source([wave], Helm.from_plant(load_vessel("wam_v_cal").build()), t)

@@ -10,7 +10,7 @@ import torch
 from kinds import of_kind
 from torch import Tensor
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError
 from residnet.physics.actuators import RudderPropellerConfig, Thrusters, ThrustersConfig
 from residnet.physics.actuators.base import Servo, SteeredActuators, SteeringGearConfig
@@ -27,7 +27,7 @@ def test_the_catamarans_curve_is_the_printed_one(twin: Thrusters) -> None:
     opposes the revolutions (correction W5).
     """
     rpm = np.linspace(-2380, 2380, 20_001)
-    thrust = twin.forces.thrust(torch.from_numpy(rpm / 60)[:, None])[:, 0].numpy()
+    thrust = twin.thruster_forces.thrust_at(torch.from_numpy(rpm / 60)[:, None])[:, 0].numpy()
     ahead, astern, dead = rpm >= 45, rpm <= -61, (rpm > -60) & (rpm < 44)
     forward, reverse = [3.54e-5, 0.084, -3.798], [-1.189e-5, 0.0707, 4.331]
     np.testing.assert_allclose(thrust[ahead], np.polyval(forward, rpm[ahead]), rtol=1e-4)
@@ -44,7 +44,7 @@ def test_revolutions_keep_to_their_rate(twin: Thrusters) -> None:
         command = sign * torch.tensor([[full, -full]], dtype=torch.float64)
         steps = 0
         while not torch.equal(n, command):
-            before, n = n, twin.advance(n, command, 0.01)
+            before, n = n, twin.advance_step(n, command, 0.01)
             assert bool(((n - before).abs() <= 0.25 + 1e-12).all())
             steps += 1
         assert steps - least in (0, int(sign < 0))
@@ -53,18 +53,18 @@ def test_revolutions_keep_to_their_rate(twin: Thrusters) -> None:
 def thrusters(*units: dict[str, Any]) -> Thrusters:
     curve = {"n_max": 10.0, "forward": [0.0, 0.0, 2.0], "reverse": [0.0, 0.0, -1.0]}
     content = {"kind": "thrusters", "source": "made", "thrusters": [curve | unit for unit in units]}
-    config: ThrustersConfig = validate(content, ThrustersConfig, "here")
+    config: ThrustersConfig = validate_config(content, ThrustersConfig, "here")
     return config.build()
 
 
 def test_fixed_thrusters_push_where_they_stand() -> None:
     sides = ({"name": "port", "x": -2.0, "y": -1.0}, {"name": "stbd", "x": -2.0, "y": 1.0})
     unit = thrusters(*sides, {"name": "bow", "x": 2.5, "angle": "90 deg"})
-    assert unit.commands == ("cmd_port", "cmd_stbd", "cmd_bow")
+    assert unit.command_names == ("cmd_port", "cmd_stbd", "cmd_bow")
     n = torch.cat((4.0 * torch.eye(3), torch.tensor([[0.0, 0.0, -4.0]]))).double()
     expected = [[32, 0, 32], [32, 0, -32], [0, 32, 80], [0, -16, -40]]
     np.testing.assert_allclose(unit.force(n[:, :0], n, torch.zeros(4, 3)), expected, atol=1e-12)
-    command = unit.demand(torch.tensor(0.5).double(), torch.tensor(0.2).double())
+    command = unit.commands_for_demand(torch.tensor(0.5).double(), torch.tensor(0.2).double())
     np.testing.assert_allclose(command, [7.0, 3.0, 2.0], atol=1e-12)
 
 
@@ -78,8 +78,8 @@ def test_two_of_them_are_the_differential_thrusters(twin: Thrusters) -> None:
     drive, steer = 2 * torch.rand(2, 50, generator=random, dtype=torch.float64) - 1
     for one, other in (
         (unit.force(a, command, a), twin.force(a, command, a)),
-        (unit.advance(a, command, 0.1), twin.advance(a, command, 0.1)),
-        (unit.demand(drive, steer), twin.demand(drive, steer)),
+        (unit.advance_step(a, command, 0.1), twin.advance_step(a, command, 0.1)),
+        (unit.commands_for_demand(drive, steer), twin.commands_for_demand(drive, steer)),
     ):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-9)
 
@@ -91,7 +91,7 @@ def rudder(**changes: dict[str, Any]) -> SteeredActuators:
     }
     content = {key: part | changes.get(key, {}) for key, part in base.items()}
     content |= {"kind": "rudder_propeller", "source": "made", "density": 1000.0}
-    config: RudderPropellerConfig = validate(content, RudderPropellerConfig, "here")
+    config: RudderPropellerConfig = validate_config(content, RudderPropellerConfig, "here")
     return config.build()
 
 
@@ -134,32 +134,34 @@ def test_thrust_falls_with_speed_and_commands_saturate() -> None:
     limit = force(unit, 0.6, 20.0, (1.0, 0, 0))
     np.testing.assert_array_equal(force(unit, 3.0, 1000.0, (1.0, 0, 0)), limit)
     asked = torch.tensor([[0.5, -2.0], [1.5, -0.5]], dtype=torch.float64)
-    np.testing.assert_allclose(unit.demand(*asked), [[0.6, 10.0], [-0.3, -20.0]])
+    np.testing.assert_allclose(unit.commands_for_demand(*asked), [[0.6, 10.0], [-0.3, -20.0]])
 
 
 def servo(**content: Any) -> Servo:
-    config: SteeringGearConfig = validate({"limit": 0.6} | content, SteeringGearConfig, "here")
-    return config.servo("delta")
+    config: SteeringGearConfig = validate_config(
+        {"limit": 0.6} | content, SteeringGearConfig, "here"
+    )
+    return config.build_servo("delta")
 
 
 def follow(unit: Servo, command: np.ndarray, dt: float = 0.01) -> np.ndarray:
     """Positions [T + 1] under commands [T] held over steps, as a plant moves it: RK4, then what
     moves once per step.
     """
-    a = torch.zeros(1, len(unit.state), dtype=torch.float64)
+    a = torch.zeros(1, len(unit.state_names), dtype=torch.float64)
     out = []
     for value in [*command, command[-1]]:
         c = torch.tensor([[value]], dtype=torch.float64)
-        out.append(float(unit.value(a, c)))
+        out.append(float(unit.position(a, c)))
 
         def rate(state: Tensor, c: Tensor = c) -> Tensor:
-            return unit.rate(state, c)
+            return unit.derivative(state, c)
 
         k1 = rate(a)
         k2 = rate(a + 0.5 * dt * k1)
         k3 = rate(a + 0.5 * dt * k2)
         k4 = rate(a + dt * k3)
-        a = unit.advance(a + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4), c, dt)
+        a = unit.advance_step(a + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4), c, dt)
     return np.array(out)
 
 
@@ -202,9 +204,9 @@ def test_an_answer_is_the_closed_form_and_dead_time_shifts_it(
 
 def test_limits_of_a_servo() -> None:
     unit = servo()
-    assert unit.state == ()
+    assert unit.state_names == ()
     assert follow(unit, np.array([0.2, 5.0, -5.0])).tolist() == [0.2, 0.6, -0.6, -0.6]
-    assert servo(**SWING).state == ("delta", "_delta_rate")
+    assert servo(**SWING).state_names == ("delta", "_delta_rate")
     response = {"kind": "second_order", "frequency": 6.0, "damping": 0.8}
     found = follow(servo(response=response, rate=0.3), np.full(300, 0.5))
     # without wind-up

@@ -11,12 +11,12 @@ import pytest
 import torch
 from scipy.integrate import quad
 
-from residnet.core.config import load_config, validate
+from residnet.core.config import load_config, validate_config
 from residnet.core.errors import ConfigError
 from residnet.physics.environment import (
     GRAVITY,
-    JonswapSpectrum,
-    Waves,
+    IrregularWaves,
+    JonswapSpectrumConfig,
     WavesConfig,
     WindLoadConfig,
     WindLoadsConfig,
@@ -32,14 +32,16 @@ SEA: dict[str, Any] = {
 }
 
 
-def sea(rows: int = 1, seed: int = 0, **changes: Any) -> Waves:
-    return validate(SEA | changes, WavesConfig, "here").build(rows, np.random.default_rng(seed))
+def sea(rows: int = 1, seed: int = 0, **changes: Any) -> IrregularWaves:
+    return validate_config(SEA | changes, WavesConfig, "here").build(
+        rows, np.random.default_rng(seed)
+    )
 
 
-def elevations(waves: Waves, t: np.ndarray) -> np.ndarray:
+def elevations(waves: IrregularWaves, t: np.ndarray) -> np.ndarray:
     """[B, T] at the origin."""
     zero = torch.zeros(waves.omega.shape[0], dtype=torch.float64)
-    phases = [waves.phases(zero, zero, float(time)) for time in t]
+    phases = [waves.component_phases(zero, zero, float(time)) for time in t]
     return torch.stack([(waves.amplitude * p.cos()).sum(-1) for p in phases], dim=1).numpy()
 
 
@@ -49,12 +51,16 @@ def test_forms_of_the_spectrum() -> None:
     """
     height, period = 2.0, 7.0
     omega = np.linspace(0.05, 8, 20_000)
-    form = JonswapSpectrum(gamma=1.0)
-    plain, raised = (one.density(omega, height, period) for one in (form, JonswapSpectrum()))
+    form = JonswapSpectrumConfig(gamma=1.0)
+    plain, raised = (
+        one.spectral_density(omega, height, period) for one in (form, JonswapSpectrumConfig())
+    )
     for density in (plain, raised):
         assert 2 * np.pi / omega[density.argmax()] == pytest.approx(period, rel=2e-3)
     assert raised.max() == pytest.approx(3.3 * plain.max(), rel=2e-3)
-    area, _ = quad(lambda o: float(form.density(np.array(o), height, period)), 0.05, 60, limit=500)
+    area, _ = quad(
+        lambda o: float(form.spectral_density(np.array(o), height, period)), 0.05, 60, limit=500
+    )
     assert area == pytest.approx(height**2 / 16, rel=1e-5)
     t1 = 0.7718 * period
     table = 173 * height**2 / t1**4 * omega**-5 * np.exp(-691 / t1**4 * omega**-4)
@@ -91,7 +97,7 @@ def test_the_response_is_the_pressure_on_the_hull(angle: float) -> None:
     """
     waves = sea(direction=float(np.radians(angle)), frequencies=10)
     psi = torch.zeros(1, dtype=torch.float64)
-    quadrature, yaw = waves.response(psi)
+    quadrature, yaw = waves.force_response(psi)
     length, breadth, draught = 20.0, 5.0, 1.5
     rho_g = 1025.0 * GRAVITY
     nodes, weights = np.polynomial.legendre.leggauss(60)
@@ -100,7 +106,7 @@ def test_the_response_is_the_pressure_on_the_hull(angle: float) -> None:
         (low + 0.5 * span * (nodes + 1), 0.5 * span * weights)
         for span, low in ((length, -length / 2), (breadth, -breadth / 2), (draught, 0.0))
     )
-    for i, number in enumerate(waves.number[0].tolist()):
+    for i, number in enumerate(waves.wave_number[0].tolist()):
         for theta in (0.3, 2.0):
 
             def pressure(x: Any, y: Any, z: Any, k: float = number, theta: float = theta) -> Any:
@@ -119,7 +125,7 @@ def test_the_response_is_the_pressure_on_the_hull(angle: float) -> None:
             total += [0, 0, (y * lift).sum(), 0]
             found = [*(quadrature[0, i] * np.sin(theta)).tolist(), float(yaw[0, i] * np.cos(theta))]
             np.testing.assert_allclose(found, total, rtol=1e-9, atol=1e-8 * rho_g)
-    phase = waves.phases(psi + 3.0, psi - 2.0, 1.5)[0]
+    phase = waves.component_phases(psi + 3.0, psi - 2.0, 1.5)[0]
     parts = torch.cat((quadrature[0] * phase.sin()[:, None], (yaw[0] * phase.cos())[:, None]), 1)
     wanted = (waves.amplitude[0][:, None] * parts).sum(0)
     torch.testing.assert_close(waves(psi + 3.0, psi - 2.0, psi, 1.5)[0], wanted)
@@ -132,7 +138,7 @@ def test_a_moving_vessel_meets_waves_at_the_encounter_frequency() -> None:
     north, east = (torch.tensor([speed * t * f(course)]).double() for f in (np.cos, np.sin))
     chi = np.radians(40) - course
     encounter = waves.omega - waves.omega**2 * speed / GRAVITY * np.cos(chi)
-    torch.testing.assert_close(waves.phases(north, east, t), encounter * t + waves.phase)
+    torch.testing.assert_close(waves.component_phases(north, east, t), encounter * t + waves.phase)
 
 
 AREAS: dict[str, Any] = {
@@ -155,7 +161,7 @@ TABLE = AREAS | {
 
 
 def loads(content: dict[str, Any]) -> WindLoadConfig:
-    config: WindLoadConfig = validate(content, WindLoadsConfig, "here")
+    config: WindLoadConfig = validate_config(content, WindLoadsConfig, "here")
     return config
 
 
@@ -180,7 +186,7 @@ def test_wind_of_10_metres_a_second_from_an_angle_off_the_bow(
 ) -> None:
     angle = torch.tensor(np.radians(degrees), dtype=torch.float64)
     for speed in (10.0, 20.0):
-        found = loads(content).loads(-speed * torch.cos(angle), -speed * torch.sin(angle))
+        found = loads(content).wind_forces(-speed * torch.cos(angle), -speed * torch.sin(angle))
         np.testing.assert_allclose(found, np.array(expected) * (speed / 10) ** 2, atol=1e-9)
 
 
@@ -188,11 +194,11 @@ def test_a_fine_table_of_the_symmetric_form_is_it_and_calm_air_is_smooth() -> No
     air = torch.from_numpy(np.random.default_rng(0).normal(size=(2, 300)) * 8)
     # linear between degrees: the error of a chord
     chord = 2e-4 * 0.5 * 1.225 * 600 * 30
-    one, other = (loads(content).loads(*air) for content in (TABLE, SYMMETRIC))
+    one, other = (loads(content).wind_forces(*air) for content in (TABLE, SYMMETRIC))
     torch.testing.assert_close(one, other, rtol=0, atol=chord)
     for content in (TABLE, SYMMETRIC):
         calm = torch.zeros(2, dtype=torch.float64, requires_grad=True)
-        out = loads(content).loads(calm, calm)
+        out = loads(content).wind_forces(calm, calm)
         assert float(out.detach().abs().max()) < 1e-5
         (slope,) = torch.autograd.grad(out.sum(), calm)
         assert bool(torch.isfinite(slope).all())
@@ -205,16 +211,18 @@ def test_a_plant_feels_the_wind_relative_to_itself() -> None:
         " c_n: 0.1, source: made}"
     )
     plant = load_config(vessel_files()["wam_v_cal"], [section], FossenConfig).build()
-    assert plant.inputs[-2:] == ("wind_speed", "wind_dir")
+    assert plant.input_names[-2:] == ("wind_speed", "wind_dir")
     still = load_vessel("wam_v_cal").build()
-    assert "wind_speed" not in still.inputs
+    assert "wind_speed" not in still.input_names
     x = torch.zeros(1, 8, dtype=torch.float64)
     x[:, 2], x[:, 3] = 0.6, 2.0
-    w = torch.zeros(1, len(plant.inputs), dtype=torch.float64)
+    w = torch.zeros(1, len(plant.input_names), dtype=torch.float64)
     w[:, -2], w[:, -1] = 2.0, 0.6 + np.pi
-    torch.testing.assert_close(plant.rate(x, w), still.rate(x, w[:, :-2]), rtol=0, atol=1e-8)
+    torch.testing.assert_close(
+        plant.derivative(x, w), still.derivative(x, w[:, :-2]), rtol=0, atol=1e-8
+    )
     w[:, -1] = 0.6
-    force = (plant.rate(x, w) - still.rate(x, w[:, :-2]))[0, 3:6] @ plant.hull.mass.T
+    force = (plant.derivative(x, w) - still.derivative(x, w[:, :-2]))[0, 3:6] @ plant.hull.mass.T
     np.testing.assert_allclose(force, [-0.16 * HEAD, 0, 0], atol=1e-8)
 
 
@@ -236,5 +244,5 @@ def test_a_plant_feels_the_wind_relative_to_itself() -> None:
 )
 def test_what_is_wrong_is_one_line(content: dict[str, Any], kind: Any, message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
-        validate(content, kind, "here")
+        validate_config(content, kind, "here")
     assert "\n" not in str(caught.value)

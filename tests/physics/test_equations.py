@@ -19,7 +19,7 @@ from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.physics.abkowitz import AbkowitzConfig
-from residnet.physics.hull import PHASES, froude_number, phase_of
+from residnet.physics.hull import SPEED_REGIMES, classify_speed_regime, compute_froude_number
 from residnet.physics.vessel import VesselConfig, load_vessel
 from residnet.physics.vessel_file import vessel_files
 
@@ -114,15 +114,15 @@ def test_froude_phases() -> None:
     vessel = load_vessel("odin_forces")
     u = torch.tensor([0.0, 4.0, 4.1, 10.1, 10.2, 3.0], dtype=torch.float64)
     v = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, -4.0], dtype=torch.float64)
-    froude = froude_number(u, v, vessel.length.value)
+    froude = compute_froude_number(u, v, vessel.length.value)
     assert float(froude[3]) == pytest.approx(1.0, abs=0.005)
-    assert [PHASES[i] for i in phase_of(froude).tolist()] == [
+    assert [SPEED_REGIMES[i] for i in classify_speed_regime(froude).tolist()] == [
         "displacement", "displacement", "semi_displacement", "semi_displacement", "planing",
         "semi_displacement",
     ]  # fmt: skip
-    assert phase_of(torch.tensor([0.4, 1.0, 1.1])).tolist() == [1, 2, 2]
+    assert classify_speed_regime(torch.tensor([0.4, 1.0, 1.1])).tolist() == [1, 2, 2]
     with pytest.raises(ValueError, match="length"):
-        froude_number(u, v, 0.0)
+        compute_froude_number(u, v, 0.0)
 
 
 def test_azimuth_thrusters_written_out() -> None:
@@ -160,7 +160,7 @@ def test_a_foil_beyond_stall_lifts_no_more() -> None:
     rudders = load_vessel("patrol_p06").actuators.build()
     delta = torch.linspace(-0.6, 0.6, 241, dtype=torch.float64)
     u, v, thrust = (torch.full_like(delta, value) for value in (7.0, 0.5, THRUST))
-    lift, drag = rudders.config.foil(delta, u, v, thrust)
+    lift, drag = rudders.config.lift_and_drag(delta, u, v, thrust)
     torch.testing.assert_close(lift, -lift.flip(0), rtol=1e-12, atol=1e-9)
     torch.testing.assert_close(drag, drag.flip(0), rtol=1e-12, atol=1e-9)
     stalled = delta > np.radians(23)
@@ -217,11 +217,11 @@ def test_the_mariner_written_out() -> None:
         nu = np.array([7.0, 0.0, 0.0]) + rng.normal(size=3) * [1.0, 0.8, 0.01]
         delta = rng.uniform(-0.6, 0.6)
         x = torch.tensor([[0.0, 0.0, 0.0, *nu, delta]], dtype=torch.float64)
-        w = torch.zeros(1, len(plant.inputs), dtype=torch.float64)
+        w = torch.zeros(1, len(plant.input_names), dtype=torch.float64)
         w[0, 0] = delta
         u, v, r = nu
         np.testing.assert_allclose(
-            plant.rate(x, w)[0, 3:6], mariner(u, v, r, -delta), rtol=1e-10, atol=1e-14
+            plant.derivative(x, w)[0, 3:6], mariner(u, v, r, -delta), rtol=1e-10, atol=1e-14
         )
 
 
@@ -260,9 +260,9 @@ def test_prime_and_si_are_the_same_vessel() -> None:
     x = torch.tensor(
         [[0.0, 0.0, 0.3, np.sqrt(SERVICE**2 - v**2), v, 0.008, -0.2]], dtype=torch.float64
     )
-    w = torch.zeros(1, len(a.inputs), dtype=torch.float64)
+    w = torch.zeros(1, len(a.input_names), dtype=torch.float64)
     w[0, 1:4] = torch.tensor([2e5, -1e5, 3e7])
-    torch.testing.assert_close(a.rate(x, w), b.rate(x, w), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(a.derivative(x, w), b.derivative(x, w), rtol=1e-9, atol=1e-12)
 
 
 def test_coriolis_of_the_rigid_body_may_stand_outside_the_series() -> None:
@@ -286,8 +286,8 @@ def test_coriolis_of_the_rigid_body_may_stand_outside_the_series() -> None:
     x = torch.tensor(
         [[0.0, 0.0, 0.3, np.sqrt(SERVICE**2 - 0.25), 0.5, 0.008, -0.2]], dtype=torch.float64
     )
-    w = torch.zeros(1, len(a.inputs), dtype=torch.float64)
-    torch.testing.assert_close(a.rate(x, w), b.rate(x, w), rtol=1e-9, atol=1e-14)
+    w = torch.zeros(1, len(a.input_names), dtype=torch.float64)
+    torch.testing.assert_close(a.derivative(x, w), b.rate(x, w), rtol=1e-9, atol=1e-14)
 
 
 def test_revolutions_enter_where_the_series_knows_them() -> None:
@@ -314,7 +314,7 @@ def commands(steps: int, dt: float) -> np.ndarray:
 
 
 def flown(model: NomotoDynamics | PlantDynamics, rudder: np.ndarray) -> np.ndarray:
-    x0 = model.plant.approach(1)
+    x0 = model.plant.make_initial_state(1)
     return rolled(model, x0, torch.from_numpy(rudder)[None, :, None])[0].numpy()
 
 

@@ -8,11 +8,11 @@ import torch
 from residnet.core.errors import ConfigError, FitError
 from residnet.physics.force_model import (
     FERRY_TERMS,
-    Correction,
+    ForceCorrection,
     ForceModel,
-    augmented,
-    column_scale,
-    order_of,
+    augment_mass,
+    term_order,
+    weighted_column_std,
 )
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
@@ -57,39 +57,43 @@ def truth() -> torch.Tensor:
 
 def test_half_the_ferry_is_the_believed_one_and_table_4_11() -> None:
     assert len(set(FERRY_TERMS)) == len(FERRY_TERMS) == 30
-    orders = [order_of(term) for term in ("u_dot", "|u|", "u|u|", "v^2", "r^3", "|u||r|")]
+    orders = [term_order(term) for term in ("u_dot", "|u|", "u|u|", "v^2", "r^3", "|u||r|")]
     assert orders == [1, 1, 2, 2, 3, 2]
     nu_dot, nu = motion()
-    correction = Correction(FERRY_TERMS, truth(), torch.zeros(3))
+    correction = ForceCorrection(FERRY_TERMS, truth(), torch.zeros(3))
     model = ForceModel(hull("milliampere").hull, [correction])
-    wanted = hull("milliampere_half").hull.required(nu_dot, nu)
+    wanted = hull("milliampere_half").hull.required_force(nu_dot, nu)
     torch.testing.assert_close(model(nu_dot, nu), wanted, rtol=1e-4, atol=1e-2)
     # forward in time it is the true ferry
     believed = hull("milliampere").hull
-    total, rest = augmented(believed.mass, FERRY_TERMS, truth(), "model")
+    total, rest = augment_mass(believed.mass, FERRY_TERMS, truth(), "model")
     torch.testing.assert_close(total, 0.5 * believed.mass, rtol=1e-6, atol=1e-2)
     assert [FERRY_TERMS[j] for j in rest[:2]] == ["u", "v"]
 
 
 def test_a_chain_adds_up_and_leaves_what_its_corrections_do_not_explain() -> None:
     nu_dot, nu = motion()
-    first = Correction(("u_dot",), torch.tensor([[3.0, 0.0, 0.0]]), torch.tensor([1.0, 0.0, 0.0]))
-    second = Correction(
+    first = ForceCorrection(
+        ("u_dot",), torch.tensor([[3.0, 0.0, 0.0]]), torch.tensor([1.0, 0.0, 0.0])
+    )
+    second = ForceCorrection(
         ("u|u|", "v"), torch.tensor([[0.0, 2.0, 0.0], [0.0, 0.0, 5.0]]), torch.zeros(3)
     )
     base = ForceModel(hull("milliampere").hull)
-    chain = base.extended(first).extended(second, torch.tensor([200.0, 100.0], dtype=torch.float64))
+    chain = base.with_correction(first).with_correction(
+        second, torch.tensor([200.0, 100.0], dtype=torch.float64)
+    )
     extra = torch.stack((3 * nu_dot[:, 0] + 1, 2 * nu[:, 0] * nu[:, 0].abs(), 5 * nu[:, 1]), dim=-1)
     torch.testing.assert_close(chain(nu_dot, nu) - base(nu_dot, nu), extra)
     psi = torch.full((len(nu),), torch.pi / 2, dtype=torch.float64)
     # heading east: a force to the north pushes to port, one to the east pushes forward; the
     # thrusters hold against both
-    against = chain.at_heading(nu_dot, nu, psi) - chain(nu_dot, nu)
+    against = chain.thruster_force(nu_dot, nu, psi) - chain(nu_dot, nu)
     torch.testing.assert_close(
         against, torch.tensor([-100.0, 200.0, 0.0], dtype=torch.float64).expand(len(nu), 3)
     )
     torch.testing.assert_close(
-        chain.residual(against + chain(nu_dot, nu), nu_dot, nu, psi),
+        chain.force_residual(against + chain(nu_dot, nu), nu_dot, nu, psi),
         torch.zeros(len(nu), 3, dtype=torch.float64),
     )
 
@@ -109,14 +113,14 @@ def test_what_cannot_run_forward_is_refused(
 ) -> None:
     coefficients = torch.tensor([[value, 0.0, 0.0]], dtype=torch.float64)
     with pytest.raises(error, match=message):
-        augmented(hull("milliampere").hull.mass, (term,), coefficients, "model plsr")
+        augment_mass(hull("milliampere").hull.mass, (term,), coefficients, "model plsr")
 
 
 def test_constant_columns_are_named() -> None:
     x = torch.stack((torch.linspace(0, 1, 20), torch.full((20,), 3.0)), dim=1).double()
     with pytest.raises(FitError, match=r"'v' is constant"):
-        column_scale(("u", "v"), x)
+        weighted_column_std(("u", "v"), x)
     torch.testing.assert_close(
-        column_scale(("u^2", "v"), x + torch.rand(20, 2)) / (x.std(0) + 1) > 0,
+        weighted_column_std(("u^2", "v"), x + torch.rand(20, 2)) / (x.std(0) + 1) > 0,
         torch.tensor([True, True]),
     )

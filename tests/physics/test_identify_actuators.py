@@ -10,7 +10,12 @@ import pytest
 import torch
 
 from residnet.core.errors import FitError
-from residnet.physics.actuators.identify import Estimate, fit_step, fit_throttle, fit_thrust
+from residnet.physics.actuators.identify import (
+    IntervalEstimate,
+    fit_step_response,
+    fit_throttle_map,
+    fit_thrust_curves,
+)
 from residnet.physics.vessel import load_vessel
 
 CONFIG: Any = load_vessel("wam_v_cal").actuators
@@ -21,10 +26,10 @@ Trial = Any
 
 def thrusts(test: Trial) -> Any:
     """Fit two propellers to revolutions and forces."""
-    return fit_thrust(test[0], test[1], 2)
+    return fit_thrust_curves(test[0], test[1], 2)
 
 
-def inside(estimate: Estimate, truth: float) -> bool:
+def inside(estimate: IntervalEstimate, truth: float) -> bool:
     return estimate.low <= truth <= estimate.high
 
 
@@ -40,14 +45,14 @@ def test_throttle_map_with_its_bound_and_without() -> None:
     """
     held = 0
     for seed in SEEDS:
-        fit = fit_throttle(*throttle_test(seed))
+        fit = fit_throttle_map(*throttle_test(seed))
         assert fit.saturated
         assert fit.slope.value * 60 == pytest.approx(2800, rel=0.01)
         assert fit.n_max.value * 60 == pytest.approx(2380, rel=0.01)
         held += inside(fit.slope, 2800 / 60) + inside(fit.n_max, 2380 / 60)
         held += inside(fit.offset, 30 / 60)
     assert held >= 0.8 * 60
-    fit = fit_throttle(*throttle_test(top=1e6))
+    fit = fit_throttle_map(*throttle_test(top=1e6))
     assert not fit.saturated
     assert fit.slope.value * 60 == pytest.approx(2800, rel=0.01)
     assert fit.n_max.value * 60 == pytest.approx(2830, rel=0.03)
@@ -70,7 +75,10 @@ def step_test(level: float, seed: int = 0, count: int = 300) -> Trial:
 
 def test_rate_limit_and_dead_time() -> None:
     """At 50 Hz: 1500 rpm/s to 1 %, 0.14 s to one sample."""
-    fits = [fit_step([step_test(level, seed) for level in (2380.0, -1800.0)]) for seed in range(6)]
+    fits = [
+        fit_step_response([step_test(level, seed) for level in (2380.0, -1800.0)])
+        for seed in range(6)
+    ]
     for fit in fits:
         assert fit.rate.value * 60 == pytest.approx(1500, rel=0.01)
         assert fit.dead_time.value == pytest.approx(0.14, abs=0.02)
@@ -112,13 +120,13 @@ def ahead(test: Trial) -> Any:
     [
         (lambda: thrusts(ahead(bollard_test())), "bollard pull astern: 0 points"),
         (lambda: thrusts([part[::8] for part in bollard_test()]), "needs 5 at 4 revolut"),
-        (lambda: fit_thrust(bollard_test()[0], -bollard_test()[1], 2), "wrong sign"),
-        (lambda: fit_throttle(*(part[20:] for part in throttle_test())), "only one direction"),
-        (lambda: fit_throttle(*(part[:3] for part in throttle_test())), "3 points"),
-        (lambda: fit_throttle(throttle_test()[0], -throttle_test()[1]), "do not rise"),
-        (lambda: fit_step([step_test(2380.0, count=10)]), "10 samples"),
-        (lambda: fit_step([step_test(2380.0, count=60)]), "never changes"),
-        (lambda: fit_step([step_test(2380.0, count=75)]), "hardly follow"),
+        (lambda: fit_thrust_curves(bollard_test()[0], -bollard_test()[1], 2), "wrong sign"),
+        (lambda: fit_throttle_map(*(part[20:] for part in throttle_test())), "only one direction"),
+        (lambda: fit_throttle_map(*(part[:3] for part in throttle_test())), "3 points"),
+        (lambda: fit_throttle_map(throttle_test()[0], -throttle_test()[1]), "do not rise"),
+        (lambda: fit_step_response([step_test(2380.0, count=10)]), "10 samples"),
+        (lambda: fit_step_response([step_test(2380.0, count=60)]), "never changes"),
+        (lambda: fit_step_response([step_test(2380.0, count=75)]), "hardly follow"),
     ],
 )
 def test_tests_that_say_too_little(call: Callable[[], object], message: str) -> None:

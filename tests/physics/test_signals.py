@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError
 from residnet.physics.signals import Signals, SignalsConfig
 from residnet.physics.vessel import load_vessel
@@ -56,11 +56,11 @@ def test_names_and_forces_are_the_vessels() -> None:
     assert both.names == (*plain, *forces, "wind_u", "wind_v", "wind_mag")
     w = torch.tensor([[20.0, -10.0]], dtype=torch.float64)
     z = signals(torch.zeros(1, 6, dtype=torch.float64), signals.prepare(w))
-    assert torch.equal(z[:, 5:], load_vessel("wam_v_cal").actuators.build().forces(w))
+    assert torch.equal(z[:, 5:], load_vessel("wam_v_cal").actuators.build().thruster_forces(w))
 
 
 def test_inputs_of_ones_own_have_the_unit_that_their_name_says() -> None:
-    units = SignalsConfig(inputs=("cmd_azimuth", "thrust_port", "servo_1")).units()
+    units = SignalsConfig(inputs=("cmd_azimuth", "thrust_port", "servo_1")).channel_units()
     assert [*units.values()][-3:] == ["rad", "N", "-"]
 
 
@@ -80,18 +80,18 @@ def test_batched_shapes_equal_sample_by_sample(
     x = torch.randn(*shape, 6, dtype=torch.float64)
     w = torch.randn(*shape, 2 + len(exogenous), dtype=torch.float64) * 20
     z = signals(x, signals.prepare(w))
-    assert z.shape == (*shape, signals.count)
+    assert z.shape == (*shape, signals.n_channels)
     pairs = zip(x.reshape(-1, 6), w.reshape(-1, w.shape[-1]), strict=True)
     rows = [signals(a[None], signals.prepare(b[None])) for a, b in pairs]
-    found = z.reshape(-1, signals.count)
+    found = z.reshape(-1, signals.n_channels)
     torch.testing.assert_close(found, torch.cat(rows or [found]), rtol=1e-13, atol=1e-13)
 
 
 def test_a_resolved_config_needs_no_vessel_file() -> None:
     config = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal")
-    resolved = config.resolved()
+    resolved = config.with_thrusters()
     assert resolved.forces == load_vessel("wam_v_cal").actuators
-    assert resolved.resolved() is resolved
+    assert resolved.with_thrusters() is resolved
     again = SignalsConfig.model_validate(resolved.model_dump())
     assert again.build().names == config.build().names
 
@@ -113,5 +113,5 @@ def test_a_resolved_config_needs_no_vessel_file() -> None:
 )
 def test_wrong_combinations(changes: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
-        validate({"inputs": ["n_port", "n_stbd"], **changes}, SignalsConfig, "here")
+        validate_config({"inputs": ["n_port", "n_stbd"], **changes}, SignalsConfig, "here")
     assert "\n" not in str(caught.value)

@@ -12,7 +12,12 @@ import torch
 from torch import Tensor
 
 from residnet.physics.signals import SignalsConfig
-from residnet.physics.symmetry import channel_parity, mirrored_channels, term_parity, wrong_parity
+from residnet.physics.symmetry import (
+    compute_term_parity,
+    get_channel_parity,
+    mirror_channels,
+    violates_symmetry,
+)
 from residnet.physics.terms import TermLibrary
 
 NAMES = ("u", "v", "r", "delta", "n", "tau_x", "tau_y", "tau_n", "wind_u", "wind_v", "wind_mag")
@@ -28,9 +33,9 @@ def values(terms: list[str]) -> tuple[Tensor, Tensor]:
 
 
 def test_parity_of_channels_and_terms_is_the_sign_that_the_mirror_gives_their_values() -> None:
-    assert [channel_parity(name) for name in NAMES] == SIGNS.tolist()
+    assert [get_channel_parity(name) for name in NAMES] == SIGNS.tolist()
     unknown = ("n_port", "cmd_stbd", "psi", "anything")
-    assert [channel_parity(name) for name in unknown] == [None] * 4
+    assert [get_channel_parity(name) for name in unknown] == [None] * 4
     powers = ("{}", "|{}|", "{}^2", "|{}|^3", "{}^-1", "|{}|^-1", "{}^-2")
     functions = ("sin({})", "cos({})", "sqrt({})", "ssqrt({})", "inv({})", "sin({})^2")
     factors = [form.format(name) for name in NAMES for form in powers]
@@ -38,7 +43,9 @@ def test_parity_of_channels_and_terms_is_the_sign_that_the_mirror_gives_their_va
     pairs = [f"{a} {b}" for a, b in combinations_with_replacement(factors, 2)]
     terms = ["1", *factors, *pairs, "v |v| r", "|u| v |v|", "n^2 delta", "v r delta^3 u"]
     here, there = values(terms)
-    parity = torch.tensor([term_parity(term, NAMES) or 0 for term in terms], dtype=here.dtype)
+    parity = torch.tensor(
+        [compute_term_parity(term, NAMES) or 0 for term in terms], dtype=here.dtype
+    )
     torch.testing.assert_close(there, here * parity, rtol=1e-12, atol=0)
     assert set(parity.tolist()) == {-1.0, 1.0}
 
@@ -50,7 +57,7 @@ def test_a_term_is_wrong_where_it_breaks_the_symmetry_of_its_axis(axis: int, tur
     terms += [f"{a} {b}" for a, b in combinations_with_replacement(NAMES, 2)]
     here, there = values(terms)
     broken = (there - turned * here).abs().amax(0) > 1e-9
-    assert [wrong_parity(term, axis, NAMES) for term in terms] == broken.tolist()
+    assert [violates_symmetry(term, axis, NAMES) for term in terms] == broken.tolist()
 
 
 def test_a_lone_propeller_heels_and_what_nobody_said_is_not_called_wrong() -> None:
@@ -58,15 +65,20 @@ def test_a_lone_propeller_heels_and_what_nobody_said_is_not_called_wrong() -> No
         return SignalsConfig(inputs=inputs, velocities=("u", "v", "r", "p")).build().names
 
     lone = names("delta", "n")
-    assert mirrored_channels(lone) is None
-    assert mirrored_channels(names("delta", "n_port", "n_stbd")) is not None
+    assert mirror_channels(lone) is None
+    assert mirror_channels(names("delta", "n_port", "n_stbd")) is not None
     # its torque acts about the roll, and no thrust to a side
-    assert [wrong_parity("|n| u", axis, lone) for axis in range(4)] == [False, True, True, False]
-    assert wrong_parity("u|u|", 3, lone)
+    assert [violates_symmetry("|n| u", axis, lone) for axis in range(4)] == [
+        False,
+        True,
+        True,
+        False,
+    ]
+    assert violates_symmetry("u|u|", 3, lone)
     unsaid = ("u", "v", "trim")
-    parities = [term_parity(term, unsaid) for term in ("u trim", "|trim|", "u |v|")]
+    parities = [compute_term_parity(term, unsaid) for term in ("u trim", "|trim|", "u |v|")]
     assert parities == [None, None, 1]
-    assert not any(wrong_parity("trim", axis, unsaid) for axis in range(3))
+    assert not any(violates_symmetry("trim", axis, unsaid) for axis in range(3))
 
 
 def test_channels_are_those_of_the_scene_in_the_mirror() -> None:
@@ -82,7 +94,7 @@ def test_channels_are_those_of_the_scene_in_the_mirror() -> None:
     x_there = x * torch.tensor([1, -1, -1, 1, -1, -1.0], dtype=x.dtype)
     w_there = w[:, [1, 0, 2, 3]] * torch.tensor([1, 1, 1, -1.0], dtype=x.dtype)
     z, z_there = signals(x, signals.prepare(w)), signals(x_there, signals.prepare(w_there))
-    found = mirrored_channels(signals.names)
+    found = mirror_channels(signals.names)
     assert found is not None
     mirrored = z[:, found[0]] * torch.tensor(found[1], dtype=z.dtype)
     torch.testing.assert_close(mirrored, z_there, rtol=1e-12, atol=1e-9)
@@ -102,4 +114,4 @@ def test_channels_are_those_of_the_scene_in_the_mirror() -> None:
 def test_pairs_change_places_and_no_mirror_is_without_a_partner(
     names: str, expected: tuple[list[int], list[float]] | None
 ) -> None:
-    assert mirrored_channels(tuple(names.split())) == expected
+    assert mirror_channels(tuple(names.split())) == expected

@@ -14,9 +14,9 @@ from residnet.physics.terms import (
     CandidatesConfig,
     Factor,
     TermLibrary,
+    make_polynomial_terms,
     parse_term,
-    polynomial_terms,
-    rated,
+    rank_candidates,
 )
 
 NAMES = ("u", "v", "r", "n_port", "delta2")
@@ -102,7 +102,7 @@ def test_a_library_equals_numpy_with_its_derivatives(name: str) -> None:
     terms, truth = LIBRARIES[name]
     z, wanted = torch.from_numpy(np.stack((U, V, R, N, D), axis=-1)), np.stack(truth, axis=-1)
     library = TermLibrary(terms, NAMES)
-    assert library.count == len(terms)
+    assert library.n_terms == len(terms)
     for module in (library, torch.jit.script(library)):
         np.testing.assert_allclose(module(z), wanted, rtol=1e-13)
     single = library(z.float())
@@ -136,7 +136,7 @@ def test_division_and_roots_leave_gradients_finite_at_zero(
 
 def test_polynomials_are_all_products_once() -> None:
     names = ("u", "v", "r")
-    terms = polynomial_terms(names, 3, magnitudes=("u", "r"))
+    terms = make_polynomial_terms(names, 3, magnitudes=("u", "r"))
     # binomial(3 + 3, 3) - 1 products, then the magnitudes
     assert len(terms) == len(set(terms)) == 19 + 2
     assert terms[-2:] == ("u|u|", "r|r|")
@@ -152,7 +152,7 @@ SHIP = ("u", "v", "r", "n", "delta")
 
 
 def terms_of(names: Sequence[str], **config: Any) -> set[str]:
-    return {c.term for c in CandidatesConfig(**config).candidates(tuple(names))}
+    return {c.term for c in CandidatesConfig(**config).generate_candidates(tuple(names))}
 
 
 def test_motions_with_magnitudes() -> None:
@@ -163,7 +163,7 @@ def test_motions_with_magnitudes() -> None:
 
 
 def test_jets_have_every_term_of_the_document_by_degree_then_by_effort() -> None:
-    found = JETS.candidates(JET_NAMES)
+    found = JETS.generate_candidates(JET_NAMES)
     place = {c.term: i for i, c in enumerate(found)}
     assert len(found) == len(place) == 49
     # (6.21)-(6.23): nine products with the cosine, nine with the sine, and the hull
@@ -197,11 +197,11 @@ def test_candidates_know_propellers_and_rudders_unless_told_otherwise() -> None:
 def test_nothing_divides_by_what_comes_near_zero() -> None:
     names = ("u", "n", "delta")
     config = CandidatesConfig(extra=("u inv(delta)",))
-    terms = [c.term for c in config.candidates(names)]
+    terms = [c.term for c in config.generate_candidates(names)]
     z = torch.tensor([[1.0, 4.0, 0.3], [-1.0, 20.0, -0.3], [0.5, 9.0, 0.1]]).double()
 
     def kept(z: torch.Tensor) -> set[str]:
-        clear = config.clear(terms, names, z)
+        clear = config.find_nonsingular_terms(terms, names, z)
         return {t for t, good in zip(terms, clear.tolist(), strict=True) if good and "inv" in t}
 
     # what is named by hand stays
@@ -213,6 +213,6 @@ def test_nothing_divides_by_what_comes_near_zero() -> None:
 
 def test_unknown_channels_are_named() -> None:
     with pytest.raises(ConfigError, match=r"'nozle' is not a channel.*did you mean 'nozzle'"):
-        CandidatesConfig(angles=("nozle",)).candidates(JET_NAMES)
+        CandidatesConfig(angles=("nozle",)).generate_candidates(JET_NAMES)
     with pytest.raises(ConfigError, match="no channel 'w'"):
-        rated(["u w"], JET_NAMES)
+        rank_candidates(["u w"], JET_NAMES)

@@ -17,9 +17,9 @@ from sklearn.linear_model import LinearRegression
 from sklearn.linear_model import Ridge as ReferenceRidge
 
 from residnet.core.errors import FitError
-from residnet.regression.estimator import Estimator, Solution, fold_numbers
+from residnet.regression.estimator import Estimator, Solution, assign_group_folds
 from residnet.regression.genetic import EquationSearchConfig, EvolutionConfig, GeneticEquations
-from residnet.regression.kernel import KernelRidge, Polynomial, Rbf
+from residnet.regression.kernel import KernelRidge, PolynomialConfig, RbfConfig
 from residnet.regression.least_squares import CentredLeastSquares, ElasticNet, LeastSquares
 from residnet.regression.shrinkage import PLSR, Ridge
 from residnet.regression.sparse import SparseRegression
@@ -31,14 +31,14 @@ LINEAR: dict[str, Make] = {
     "ridge penalties": lambda j, n: LeastSquares((1e-8, 1e-2)),
     "centred": lambda j, n: CentredLeastSquares(),
     "plsr": lambda j, n: PLSR(folds=2),
-    "ridge": lambda j, n: Ridge((1e-10, 1e-3), folds=2, alternatives=True),
+    "ridge": lambda j, n: Ridge((1e-10, 1e-3), folds=2, has_alternatives=True),
     "elastic net": lambda j, n: ElasticNet(0.5, folds=2),
     "surface": lambda j, n: SurfacePLSR("least"),
     "sparse": lambda j, n: SparseRegression(gammas=(0.0, 1.0)),
 }
 OTHERS: dict[str, Make] = {
-    "rbf": lambda j, n: KernelRidge(Rbf(sigma=(3.0,)).build(j, n), (1e-6, 1e-2), folds=2),
-    "polynomial": lambda j, n: KernelRidge(Polynomial().build(j, n), (1e-6, 1e-2), folds=2),
+    "rbf": lambda j, n: KernelRidge(RbfConfig(sigma=(3.0,)).build(j, n), (1e-6, 1e-2), folds=2),
+    "polynomial": lambda j, n: KernelRidge(PolynomialConfig().build(j, n), (1e-6, 1e-2), folds=2),
     "genetic": lambda j, n: GeneticEquations(
         EquationSearchConfig(evolution=EvolutionConfig(population=10, generations=1))
     ),
@@ -145,7 +145,7 @@ def test_the_chosen_elastic_net_is_scikit_learns_at_its_penalty(seed: int) -> No
     x = (x - x.mean(0)) / x.std(0)
     groups = torch.arange(80) // 20
     found = ElasticNet(0.5).fit(torch.from_numpy(x), torch.from_numpy(y), groups)[0]
-    for output, alpha in enumerate(found.choice["alpha"]):
+    for output, alpha in enumerate(found.hyperparameters["alpha"]):
         model = ReferenceElasticNet(alpha=alpha, l1_ratio=0.5, tol=1e-4, max_iter=3000)
         model.fit(x, y[:, output])
         np.testing.assert_allclose(found.coefficients[:, output], model.coef_, atol=1e-3)
@@ -178,10 +178,10 @@ def test_settings_stay_as_they_were() -> None:
 
 def test_a_group_is_never_split_between_folds() -> None:
     groups = torch.tensor([3, 3, 5, 5, 5, 7, 8, 8, 11])
-    assert fold_numbers(groups, 2).tolist() == [0, 0, 1, 1, 1, 0, 1, 1, 0]
-    assert fold_numbers(groups, None).tolist() == [0, 0, 1, 1, 1, 2, 3, 3, 4]
+    assert assign_group_folds(groups, 2).tolist() == [0, 0, 1, 1, 1, 0, 1, 1, 0]
+    assert assign_group_folds(groups, None).tolist() == [0, 0, 1, 1, 1, 2, 3, 3, 4]
     with pytest.raises(FitError, match="3 folds need as many manoeuvres, the training data have 2"):
-        fold_numbers(torch.tensor([0, 0, 1]), 3)
+        assign_group_folds(torch.tensor([0, 0, 1]), 3)
 
 
 def least_squares(x: np.ndarray, y: np.ndarray, groups: int = 1, ridge: float = 0.0) -> Solution:
@@ -224,7 +224,9 @@ def test_coefficients_and_errors_in_closed_form(groups: int) -> None:
         scores = (x * e[:, None]).reshape(groups, -1, 3).sum(1)
         meat = scores.T @ scores * groups / max(groups - 1, 1)
         covariance = bread @ meat @ bread if groups > 1 else e @ e / 207 * bread
-        np.testing.assert_allclose(fit.errors[:, k], np.sqrt(np.diag(covariance)), rtol=1e-9)
+        np.testing.assert_allclose(
+            fit.standard_errors[:, k], np.sqrt(np.diag(covariance)), rtol=1e-9
+        )
 
 
 NOISE = np.random.default_rng(5).normal(size=(60, 3))

@@ -13,21 +13,21 @@ import sympy
 
 from residnet.core.errors import FitError, UsageError
 from residnet.regression.expressions import (
+    CONSTANT_PRODUCT,
     FUNCTIONS,
-    ONE,
     Algebra,
-    Limits,
+    ExpressionLimits,
     Product,
     Sum,
     TooLargeError,
-    values_of,
+    apply_function,
 )
 from residnet.regression.genetic import (
     EvolutionConfig,
-    Fitness,
-    Found,
+    EvolutionResult,
+    FitnessEvaluator,
     evolve,
-    limits_of,
+    expression_limits,
 )
 
 NAMES = ("a", "b", "c")
@@ -39,7 +39,7 @@ NOISY = 2 * DATA["a"] - DATA["b"] * DATA["c"] + 0.1 * np.random.default_rng(9).n
 def value(algebra: Algebra, meant: Sum) -> np.ndarray:
     if not meant:
         return np.zeros(200)
-    return np.array(list(meant.values())) @ algebra.values(list(meant), DATA)
+    return np.array(list(meant.values())) @ algebra.evaluate_products(list(meant), DATA)
 
 
 def grown(algebra: Algebra, seed: random.Random, depth: int) -> tuple[Sum, np.ndarray]:
@@ -48,14 +48,14 @@ def grown(algebra: Algebra, seed: random.Random, depth: int) -> tuple[Sum, np.nd
     kind = seed.choice(more if depth else ("channel", "number"))
     if kind == "channel":
         name = seed.choice(NAMES)
-        return algebra.channel(name), DATA[name]
+        return algebra.make_channel(name), DATA[name]
     if kind == "number":
         number = seed.choice((-1.5, 1.0, 2.0))
-        return {ONE: number}, np.full(200, number)
+        return {CONSTANT_PRODUCT: number}, np.full(200, number)
     a, x = grown(algebra, seed, depth - 1)
     if kind == "function":
         function = seed.choice([f for f in FUNCTIONS if f != "sum"])
-        return algebra.apply(function, a), values_of(function, x)
+        return algebra.apply_function(function, a), apply_function(function, x)
     b, y = grown(algebra, seed, depth - 1)
     if kind == "multiply":
         return algebra.multiply(a, b), x * y
@@ -65,7 +65,7 @@ def grown(algebra: Algebra, seed: random.Random, depth: int) -> tuple[Sum, np.nd
 
 @pytest.mark.parametrize("expand", [True, False])
 def test_normal_form_keeps_the_values(expand: bool) -> None:
-    limits = Limits(terms=200, degree=16, nesting=5, expand=expand)
+    limits = ExpressionLimits(terms=200, degree=16, nesting=5, expand=expand)
     algebra, seed, tried = Algebra(NAMES, limits), random.Random(1), 0
     while tried < 100:
         try:
@@ -81,7 +81,7 @@ def test_normal_form_keeps_the_values(expand: bool) -> None:
 
 def test_products_are_multiplied_out_as_sympy_does() -> None:
     algebra = Algebra(NAMES)
-    a, b, c = (algebra.channel(name) for name in NAMES)
+    a, b, c = (algebra.make_channel(name) for name in NAMES)
     second = algebra.multiply(algebra.add(a, c, -2.0), algebra.add(b, algebra.multiply(c, c)))
     made = algebra.multiply(algebra.add(a, b), second)
     x, y, z = sympy.symbols(NAMES)
@@ -89,17 +89,17 @@ def test_products_are_multiplied_out_as_sympy_does() -> None:
     powers = {tuple(product.count(i) for i in range(3)): made[product] for product in made}
     assert powers == {k: float(v) for k, v in truth.items()}
     # unless brackets are to stay
-    closed = Algebra(NAMES, Limits(expand=False))
+    closed = Algebra(NAMES, ExpressionLimits(expand=False))
     assert len(closed.add(closed.multiply(closed.add(a, b), closed.add(b, c)), a)) == 2
 
 
 def test_equal_expressions_are_one() -> None:
     algebra = Algebra(NAMES)
-    a, b = algebra.channel("a"), algebra.channel("b")
+    a, b = algebra.make_channel("a"), algebra.make_channel("b")
     minus = algebra.add({}, a, -1.0)
     both = algebra.add(a, b)
     turned = algebra.add({}, both, -1.0)
-    apply, times = algebra.apply, algebra.multiply
+    apply, times = algebra.apply_function, algebra.multiply
     assert apply("abs", times(minus, b)) == times(apply("abs", a), apply("abs", b))
     assert times(apply("abs", a), apply("abs", a)) == times(a, a)
     assert apply("abs", times(a, a)) == times(a, a)
@@ -111,65 +111,65 @@ def test_equal_expressions_are_one() -> None:
 
 
 def test_limits_hold() -> None:
-    algebra = Algebra(NAMES, Limits(terms=3, degree=2, nesting=1))
-    a, b, c = (algebra.channel(name) for name in NAMES)
+    algebra = Algebra(NAMES, ExpressionLimits(terms=3, degree=2, nesting=1))
+    a, b, c = (algebra.make_channel(name) for name in NAMES)
     with pytest.raises(TooLargeError):
         algebra.multiply(algebra.multiply(a, b), c)
     with pytest.raises(TooLargeError):
-        algebra.apply("sin", algebra.apply("cos", a))
+        algebra.apply_function("sin", algebra.apply_function("cos", a))
     with pytest.raises(TooLargeError):
         algebra.multiply(algebra.add(a, b), algebra.add(b, c))
     # overflow is told by values that are not finite
-    algebra = Algebra(("a",), Limits(degree=8))
-    column = algebra.values([(0,) * 8], {"a": np.array([1e60, 1.0])})
+    algebra = Algebra(("a",), ExpressionLimits(degree=8))
+    column = algebra.evaluate_products([(0,) * 8], {"a": np.array([1e60, 1.0])})
     assert column[0].tolist() == [np.inf, 1.0]
 
 
-def breed(target: np.ndarray, seed: int = 0, **config: Any) -> tuple[Algebra, Found]:
+def breed(target: np.ndarray, seed: int = 0, **config: Any) -> tuple[Algebra, EvolutionResult]:
     pytest.importorskip("deap", reason="genetic programming needs the extra gp")
     made = EvolutionConfig.model_validate({"population": 200, "generations": 10} | config)
-    algebra = Algebra(NAMES, limits_of(made))
+    algebra = Algebra(NAMES, expression_limits(made))
     return algebra, evolve(algebra, DATA, target, TRAIN, made, seed)
 
 
 def test_fitness_equals_least_squares() -> None:
     algebra = Algebra(NAMES)
-    magnitude = next(iter(algebra.apply("abs", algebra.channel("a"))))
+    magnitude = next(iter(algebra.apply_function("abs", algebra.make_channel("a"))))
     sets: list[tuple[Product, ...]] = [
         ((0,), (1, 2)),
         ((0, 1), (2,), magnitude),
         (magnitude,),
         ((0,), (1,)),
     ]
-    fitness = Fitness(algebra, DATA, NOISY, TRAIN)
-    for terms, (train, validation, left) in zip(sets, fitness.of(sets), strict=True):
-        x = algebra.values(terms, DATA).T
+    fitness = FitnessEvaluator(algebra, DATA, NOISY, TRAIN)
+    for terms, (train, validation, left) in zip(sets, fitness.evaluate(sets), strict=True):
+        x = algebra.evaluate_products(terms, DATA).T
         best = np.linalg.lstsq(x[TRAIN], NOISY[TRAIN], rcond=None)[0]
         for part, error in ((TRAIN, train), (~TRAIN, validation)):
             share = np.square(NOISY[part] - x[part] @ best).sum() / np.square(NOISY[part]).sum()
             assert error == pytest.approx(share, rel=1e-10)
         assert left == terms
-    assert fitness.fitted == 4
-    fitness.of(sets)
-    assert fitness.fitted == 4, "a set of terms is fitted once"
+    assert fitness.n_fitted == 4
+    fitness.evaluate(sets)
+    assert fitness.n_fitted == 4, "a set of terms is fitted once"
 
 
 def test_terms_that_are_not_independent_or_not_finite_take_no_part() -> None:
-    algebra = Algebra(("a", "b"), Limits(degree=8))
+    algebra = Algebra(("a", "b"), ExpressionLimits(degree=8))
     data = {"a": DATA["a"], "b": 3 * DATA["a"]}
-    fitness = Fitness(algebra, data, NOISY, TRAIN)
-    one, both, nothing = fitness.of([((0,),), ((0,), (1,)), None])
+    fitness = FitnessEvaluator(algebra, data, NOISY, TRAIN)
+    one, both, nothing = fitness.evaluate([((0,),), ((0,), (1,)), None])
     assert np.isfinite(one[0])
     assert both[0] == nothing[0] == np.inf
-    huge = Fitness(algebra, {"a": DATA["a"] * 1e60, "b": DATA["b"]}, NOISY, TRAIN)
-    assert huge.of([((0,) * 8, (1,))])[0][0] == np.inf
+    huge = FitnessEvaluator(algebra, {"a": DATA["a"] * 1e60, "b": DATA["b"]}, NOISY, TRAIN)
+    assert huge.evaluate([((0,) * 8, (1,))])[0][0] == np.inf
 
 
 @pytest.mark.parametrize("split", ["sum", "expand"])
 def test_finds_a_sum_of_products(split: str) -> None:
     target = 2 * DATA["a"] - DATA["b"] * DATA["c"] + 0.5 * DATA["c"] * np.abs(DATA["c"])
     _, found = breed(target, split=split, population=500)
-    assert found.reached
+    assert found.is_goal_reached
     assert max(found.train, found.validation) < 1e-12
     assert found.history[-1].train == found.train
 
@@ -184,7 +184,7 @@ def test_genes_get_a_coefficient_each() -> None:
         "patience": 40,
     }
     algebra, found = breed(target, split="gene", population=600, **settings)
-    assert found.reached
+    assert found.is_goal_reached
     assert 2 <= len(found.terms) <= 3
     assert all(len(product) >= 1 for product in found.terms)
     assert algebra.limits.expand is False
@@ -193,16 +193,16 @@ def test_genes_get_a_coefficient_each() -> None:
 def test_functions_and_protected_division() -> None:
     target = np.sin(DATA["a"]) / DATA["b"] - DATA["c"]
     _, found = breed(target, operators=("+", "*", "/", "sin"), population=500, generations=25)
-    assert found.reached
+    assert found.is_goal_reached
 
 
 def test_trees_with_a_term_twice_take_no_part_where_asked() -> None:
     settings = {"generations": 0, "population": 60, "operators": ("+", "-")}
     # a full tree of depth 2 is a sum of four of three channels
-    assert breed(NOISY, 1, **settings, first_depth=(2, 2))[1].fitted > 0
+    assert breed(NOISY, 1, **settings, first_depth=(2, 2))[1].n_fitted > 0
     with pytest.raises(FitError, match="no individual"):
         breed(NOISY, 1, **settings, first_depth=(2, 2), equal_terms="reject")
-    assert breed(NOISY, 1, **settings, first_depth=(0, 2), equal_terms="reject")[1].fitted > 0
+    assert breed(NOISY, 1, **settings, first_depth=(0, 2), equal_terms="reject")[1].n_fitted > 0
 
 
 def test_same_seed_same_result_and_pythons_generator_is_left_alone() -> None:

@@ -12,13 +12,13 @@ from scipy.signal import lfilter
 
 from residnet.core.errors import FitError
 from residnet.regression.sparse import (
-    Equation,
-    Search,
-    SearchConfig,
-    added_one,
-    coarser,
-    find,
-    reduce,
+    ForwardSearch,
+    SparseEquation,
+    SparseSearchConfig,
+    find_equation,
+    merge_similar_columns,
+    reduce_problem,
+    rss_with_one_added,
 )
 
 
@@ -26,9 +26,11 @@ def named(count: int) -> list[str]:
     return [f"c{i}" for i in range(count)]
 
 
-def solve(x: np.ndarray, y: np.ndarray, **config: Any) -> Equation:
-    return find(
-        reduce(x, y[:, None], named(x.shape[1]), [1] * x.shape[1]), 0, SearchConfig(**config)
+def solve(x: np.ndarray, y: np.ndarray, **config: Any) -> SparseEquation:
+    return find_equation(
+        reduce_problem(x, y[:, None], named(x.shape[1]), [1] * x.shape[1]),
+        0,
+        SparseSearchConfig(**config),
     )[0]
 
 
@@ -50,7 +52,7 @@ def planted(
 def test_a_planted_equation_is_found_exactly(seed: int) -> None:
     x, y, truth = planted(seed)
     equation = solve(x, y)
-    assert equation.exact
+    assert equation.is_exact
     assert dict(zip(equation.terms, equation.values, strict=True)) == pytest.approx(truth, rel=1e-9)
     assert not equation.alternatives
     assert not equation.undecided
@@ -61,15 +63,17 @@ def test_a_planted_equation_is_found_in_noise_with_honest_errors(seed: int) -> N
     x, y, truth = planted(seed, rows=2000, noise=0.2)
     equation = solve(x, y)
     assert set(equation.terms) == set(truth)
-    assert equation.share == pytest.approx(0.2 / np.sqrt(1.04), rel=0.1)
+    assert equation.relative_error == pytest.approx(0.2 / np.sqrt(1.04), rel=0.1)
     found = dict(zip(equation.terms, equation.values, strict=True))
-    off = np.array([found[term] - truth[term] for term in equation.terms]) / equation.errors
+    off = (
+        np.array([found[term] - truth[term] for term in equation.terms]) / equation.standard_errors
+    )
     assert np.abs(off).max() < 4.0
     # the textbook formula on the columns that were found
     own = x[:, [int(term[1:]) for term in equation.terms]]
     left = y - own @ equation.values
     textbook = np.sqrt(np.diag(np.linalg.inv(own.T @ own)) * (left @ left) / (len(y) - 4))
-    np.testing.assert_allclose(equation.errors, textbook, rtol=0.1)
+    np.testing.assert_allclose(equation.standard_errors, textbook, rtol=0.1)
 
 
 def test_standard_errors_grow_with_the_correlation_of_the_noise() -> None:
@@ -80,7 +84,9 @@ def test_standard_errors_grow_with_the_correlation_of_the_noise() -> None:
     white = solve(x, x[:, 0] + random.normal(size=4000) * noise.std())
     coloured = solve(x, x[:, 0] + noise)
     # (1 + phi) / (1 - phi) = 19 samples say what one does
-    assert coloured.errors[0] / white.errors[0] == pytest.approx(np.sqrt(19), rel=0.3)
+    assert coloured.standard_errors[0] / white.standard_errors[0] == pytest.approx(
+        np.sqrt(19), rel=0.3
+    )
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -89,20 +95,22 @@ def test_the_search_finds_the_best_of_all_subsets(seed: int) -> None:
     x = random.normal(size=(60, 9)) @ (np.eye(9) + random.normal(size=(9, 9)))
     x /= np.linalg.norm(x, axis=0)
     y = x[:, :3] @ [1.0, -1.0, 1.0] + 0.05 * random.normal(size=60)
-    search = Search(x, y, 60.0, SearchConfig(gamma=0.5))
+    search = ForwardSearch(x, y, 60.0, SparseSearchConfig(gamma=0.5))
     everything = [list(chosen) for k in range(10) for chosen in combinations(range(9), k)]
-    best = min(everything, key=search.value)
-    value, chosen = search.best()
-    assert value == search.value(chosen) == pytest.approx(search.value(best), abs=1e-6)
+    best = min(everything, key=search.criterion_of)
+    value, chosen = search.beam_search()
+    assert (
+        value == search.criterion_of(chosen) == pytest.approx(search.criterion_of(best), abs=1e-6)
+    )
 
 
 def test_criterion_is_the_formula_and_columns_added_leave_what_refits_do() -> None:
-    search = Search(np.zeros((2, 20)), np.full(2, 5.0), 100.0, SearchConfig(gamma=0.5))
+    search = ForwardSearch(np.zeros((2, 20)), np.full(2, 5.0), 100.0, SparseSearchConfig(gamma=0.5))
     wanted = 100 * log(2.0 / 50.0) + 3 * log(100) + log(comb(20, 3))
     assert float(search.criterion(2.0, 3)) == pytest.approx(wanted)
     x, y, _ = planted(3, columns=7, noise=0.5)
     unit = x / np.linalg.norm(x, axis=0)
-    table = added_one(unit, y, np.array([[4, 5], [1, 5], [1, 4]]))
+    table = rss_with_one_added(unit, y, np.array([[4, 5], [1, 5], [1, 4]]))
     for row, gone in enumerate((1, 4, 5)):
         for j in (0, 2, 3, 6, gone):
             own = unit[:, [c for c in (1, 4, 5) if c != gone] + [j]]
@@ -118,12 +126,12 @@ def test_columns_that_simpler_ones_make_up_are_set_aside_and_told() -> None:
         (a * np.abs(a), a**2, b, np.ones(100), levels, levels**2, np.zeros(100), c), axis=1
     )
     names = ["a|a|", "a^2", "b", "1", "n", "n^2", "v", "c"]
-    reduced = reduce(
+    reduced = reduce_problem(
         x,
         (2 * a**2 + levels**2 - b)[:, None],
         names,
         [2, 2, 1, 0, 1, 2, 1, 1],
-        effort=[1.5, 1.0, 1, 0, 1, 1, 1, 1],
+        complexity=[1.5, 1.0, 1, 0, 1, 1, 1, 1],
     )
     assert reduced.names == ("1", "b", "n", "c", "a^2")
     assert reduced.unexcited == ("v",)
@@ -131,7 +139,7 @@ def test_columns_that_simpler_ones_make_up_are_set_aside_and_told() -> None:
         "a|a|": pytest.approx({"a^2": 1.0}),
         "n^2": pytest.approx({"1": -3.0, "n": 4.0}),
     }
-    equation = find(reduced, 0, SearchConfig())[0]
+    equation = find_equation(reduced, 0, SparseSearchConfig())[0]
     assert dict(zip(equation.terms, equation.values, strict=True)) == pytest.approx(
         {"1": -3.0, "n": 4.0, "b": -1.0, "a^2": 2.0}
     )
@@ -146,14 +154,18 @@ def test_noise_does_not_set_columns_apart() -> None:
     w = random.normal(size=1000)
     y = -u * np.abs(u) + w + 0.05 * random.normal(size=1000)
     x = np.stack((u, np.abs(u), u**2, u * np.abs(u), w), axis=1)
-    reduced = reduce(
-        x, y[:, None], ["u", "|u|", "u^2", "u|u|", "w"], [1, 1, 2, 2, 1], effort=[1, 1.5, 1, 1.5, 1]
+    reduced = reduce_problem(
+        x,
+        y[:, None],
+        ["u", "|u|", "u^2", "u|u|", "w"],
+        [1, 1, 2, 2, 1],
+        complexity=[1, 1.5, 1, 1.5, 1],
     )
     assert reduced.rank == 5
-    equation, within = find(reduced, 0, SearchConfig())
+    equation, within = find_equation(reduced, 0, SparseSearchConfig())
     assert equation.terms == ("w", "u^2")
     assert set(within.dependent) == {"|u|", "u|u|"}
-    assert coarser(reduced, 0.0).rank == 5
+    assert merge_similar_columns(reduced, 0.0).rank == 5
 
 
 def test_a_term_close_to_simpler_ones_is_taken_where_the_criterion_prefers_it() -> None:
@@ -167,9 +179,9 @@ def test_a_term_close_to_simpler_ones_is_taken_where_the_criterion_prefers_it() 
     )
     y = u**2 * n**2 / 100.0 + w
     y += 0.05 * y.std() * random.normal(size=2000)
-    reduced = reduce(x, y[:, None], names, [0, 1, 1, 1, 2, 2, 2, 3, 3, 4])
-    assert "u^2 n^2" not in coarser(reduced, 1e-2).names
-    assert set(find(reduced, 0, SearchConfig())[0].terms) == {"w", "u^2 n^2"}
+    reduced = reduce_problem(x, y[:, None], names, [0, 1, 1, 1, 2, 2, 2, 3, 3, 4])
+    assert "u^2 n^2" not in merge_similar_columns(reduced, 1e-2).names
+    assert set(find_equation(reduced, 0, SparseSearchConfig())[0].terms) == {"w", "u^2 n^2"}
 
 
 def test_terms_that_the_data_cannot_tell_apart_are_named() -> None:
@@ -202,7 +214,7 @@ def test_pure_noise_and_a_target_of_zero_have_no_terms() -> None:
     assert sum(found) <= 1
     equation = solve(noise(0, 50, 5), np.zeros(50))
     assert equation.terms == ()
-    assert equation.exact
+    assert equation.is_exact
 
 
 @pytest.mark.parametrize(
@@ -216,5 +228,5 @@ def test_pure_noise_and_a_target_of_zero_have_no_terms() -> None:
 )
 def test_errors_are_one_line(x: np.ndarray, y: np.ndarray, message: str) -> None:
     with pytest.raises(FitError, match=message) as caught:
-        reduce(x, y, named(x.shape[1]), [1] * x.shape[1])
+        reduce_problem(x, y, named(x.shape[1]), [1] * x.shape[1])
     assert "\n" not in str(caught.value)

@@ -9,7 +9,7 @@ from sklearn.cross_decomposition import PLSRegression
 
 from residnet.core.errors import FitError
 from residnet.regression.shrinkage import FoldMoments
-from residnet.regression.surface import surface
+from residnet.regression.surface import compute_error_surface
 
 
 def data(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -46,7 +46,7 @@ def by_hand(
 
 
 def moments(x: np.ndarray, y: np.ndarray, fold: np.ndarray) -> FoldMoments:
-    return FoldMoments.gather(
+    return FoldMoments.from_samples(
         torch.from_numpy(x), torch.from_numpy(y), torch.from_numpy(fold), int(fold.max()) + 1
     )
 
@@ -56,11 +56,11 @@ def test_equals_scikit_learn(judged: str) -> None:
     x, y, fold = data()
     rows = np.arange(len(x))
     if judged == "folds":
-        found = surface(moments(x, y, fold))
+        found = compute_error_surface(moments(x, y, fold))
         fit, judge = ([rows[(fold == f) == own] for f in range(4)] for own in (False, True))
         whole = rows
     else:
-        found = surface(moments(x, y, fold), test=(2, 3))
+        found = compute_error_surface(moments(x, y, fold), test_folds=(2, 3))
         fit, judge, whole = [rows[fold < 2]], [rows[fold >= 2]], rows[fold < 2]
     for k in range(3):
         expected = by_hand(x, y[:, k], fit, judge, whole)
@@ -68,7 +68,7 @@ def test_equals_scikit_learn(judged: str) -> None:
         own = {(a + 1, j): float(found.error[k, a, j]) for a, j in places}
         assert own.keys() == expected.keys()
         assert own == pytest.approx(expected, rel=1e-8)
-        order, count = found.least(k)
+        order, count = found.minimum_error_model(k)
         assert found.error[k, order - 1, count] == min(own.values())
 
 
@@ -77,16 +77,16 @@ def test_what_explains_nothing_goes_first() -> None:
     x = random.normal(size=(400, 5))
     y = np.stack((x[:, 0] + 2 * x[:, 3], x[:, 1], x[:, 3] - x[:, 4]), axis=1)
     y += 0.01 * random.normal(size=(400, 3))
-    found = surface(moments(x, y, np.arange(400) % 4))
-    assert found.kept(0, 2, 2) == [0, 3]
-    assert found.kept(2, 2, 2) == [3, 4]
+    found = compute_error_surface(moments(x, y, np.arange(400) % 4))
+    assert found.retained_columns(0, 2, 2) == [0, 3]
+    assert found.retained_columns(2, 2, 2) == [3, 4]
 
 
 def test_simplest_is_no_worse_than_one_standard_error_and_no_more_complex() -> None:
     x, y, fold = data(seed=3)
-    found = surface(moments(x, y, fold))
+    found = compute_error_surface(moments(x, y, fold))
     for k in range(3):
-        (a, j), (low, many) = found.least(k), found.simplest(k)
+        (a, j), (low, many) = found.minimum_error_model(k), found.one_standard_error_model(k)
         assert low <= a
         limit = found.error[k, a - 1, j] + found.standard_error[k, a - 1, j]
         assert found.error[k, low - 1, many] <= limit
@@ -96,6 +96,6 @@ def test_constant_and_single_columns_are_refused() -> None:
     x, y, fold = data()
     x[:, 4] = 2.5
     with pytest.raises(FitError, match="number 4 is constant"):
-        surface(moments(x, y, fold))
+        compute_error_surface(moments(x, y, fold))
     with pytest.raises(FitError, match="at least two"):
-        surface(moments(x[:, :1], y, fold))
+        compute_error_surface(moments(x[:, :1], y, fold))

@@ -16,36 +16,36 @@ from PIL import Image
 from read_page import Page
 
 from residnet.core.errors import UsageError
-from residnet.core.ownership import recorded_folder
+from residnet.core.ownership import record_folder
 from residnet.report.blocks import Section
-from residnet.report.browser import draw
+from residnet.report.browser import render_bokeh
 from residnet.report.figure import (
     BLUE,
-    MASKED,
-    MEASURED,
-    START,
+    MASKED_STYLE,
+    MEASURED_STYLE,
+    START_STYLE,
     Case,
     Figure,
-    Look,
+    GlyphStyle,
     Panel,
-    band,
-    bars,
-    family,
-    joined,
-    names_of,
-    parts,
-    steps,
-    thinned,
-    whiskers,
+    band_outline,
+    bar_outlines,
+    error_bars,
+    join_with_gaps,
+    split_at_gaps,
+    step_curve,
+    style_family,
+    subsample_indices,
+    tick_labels,
 )
-from residnet.report.figure_files import read_figures, unpacked, write_figures
+from residnet.report.figure_files import read_figures, unpack_column, write_figures
 from residnet.report.fit import write_fit_figures
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections import runs
-from residnet.report.sections.models import breeding
+from residnet.report.sections.models import evolution_figures
 from residnet.report.sections.sweep import parallel_coordinates
-from residnet.report.still import still
+from residnet.report.still import render_matplotlib
 
 T = np.linspace(0.0, 10.0, 900)
 needs_browser = pytest.mark.skipif(browser() is None, reason="no browser is installed")
@@ -61,30 +61,33 @@ def every_kind() -> Figure:
             "a": (T, np.sin(T)),
             "measured": (T, gap),
             "masked": (np.array([3.0]), np.array([4.0])),
-            "band": band(T, gap - 0.1, gap + 0.1),
+            "band": band_outline(T, gap - 0.1, gap + 0.1),
             "level": (np.zeros(2), np.array([-1.0, 1.0])),
         },
         {"b": (T, np.exp(-T)), "now": (np.array([5.0]), np.zeros(1))},
-        {"bars": bars([0, 1], [2.0, 3.0]), "spread": whiskers([0, 1], [1.0, 2.5], [2.5, 3.5])},
+        {
+            "bars": bar_outlines([0, 1], [2.0, 3.0]),
+            "spread": error_bars([0, 1], [1.0, 2.5], [2.5, 3.5]),
+        },
     ]
     return Figure(
         "every_kind",
         "Every kind",
         "Look at it.",
-        {"measured": MEASURED, "masked": MASKED, **family(("a", "b"))}
+        {"measured": MEASURED_STYLE, "masked": MASKED_STYLE, **style_family(("a", "b"))}
         | {
-            "band": Look("band of a", BLUE, kind="fill", alpha=0.2),
-            "level": Look("limits", kind="across", dash="dotted"),
-            "now": Look("now", kind="upright"),
-            "bars": Look("</script>", BLUE, kind="fill"),
-            "spread": Look("interval", shown=False),
-            "start": START,
+            "band": GlyphStyle("band of a", BLUE, kind="fill", alpha=0.2),
+            "level": GlyphStyle("limits", kind="across", dash="dotted"),
+            "now": GlyphStyle("now", kind="upright"),
+            "bars": GlyphStyle("</script>", BLUE, kind="fill"),
+            "spread": GlyphStyle("interval", is_visible=False),
+            "start": START_STYLE,
         },
         [
             Panel("north [m]", "east [m]", kind="map"),
             Panel("heading\n[deg]", y_limits=(-2.0, 2.0)),
             Panel("error", "time [s]", "first", y_log=True),
-            Panel("u", group="names", x_names=names_of(["u", "v"])),
+            Panel("u", group="names", x_names=tick_labels(["u", "v"])),
         ],
         [
             Case("one", first, "A note.", texts=[(1, 5.0, np.nan, "stage")]),
@@ -96,22 +99,22 @@ def every_kind() -> Figure:
 
 def test_a_figure_is_written_and_read_back(tmp_path: Path) -> None:
     given = every_kind()
-    with recorded_folder(tmp_path):
+    with record_folder(tmp_path):
         (written,) = write_figures(tmp_path, [given])
     (read,) = read_figures(tmp_path)
-    assert [path.name for path in read.stills] == ["01_every_kind.png"]
-    assert read.stills == written.stills
-    assert (read.looks, read.chooser) == (given.looks, "Run")
+    assert [path.name for path in read.static_images] == ["01_every_kind.png"]
+    assert read.static_images == written.static_images
+    assert (read.styles, read.chooser) == (given.styles, "Run")
     words = ["north [m]", "heading [deg]", "first: error", "u"]
-    assert [panel.words for panel in read.panels] == words
+    assert [panel.heading for panel in read.panels] == words
     assert (read.panels[1].y_limits, read.panels[2].y_log) == ([-2.0, 2.0], True)
     assert [case.note for case in read.cases] == ["A note.", "Other."]
     x, y = read.cases[0].curves[1]["a"]
     assert len(x) == 600, "no more samples than a screen shows"
     np.testing.assert_allclose(y, np.sin(x), atol=1e-3)
     assert (x[0], x[-1]) == pytest.approx((0.0, 10.0), abs=1e-3)
-    assert len(parts(*read.cases[0].curves[1]["measured"])) == 2, "a gap stays one"
-    with Image.open(read.stills[0]) as picture:
+    assert len(split_at_gaps(*read.cases[0].curves[1]["measured"])) == 2, "a gap stays one"
+    with Image.open(read.static_images[0]) as picture:
         assert picture.info["Title"] == "Every kind"
         assert picture.info["Description"] == "Look at it."
     (tmp_path / "damaged.json").write_text('{"name": 1')
@@ -124,7 +127,7 @@ def test_a_figure_is_written_and_read_back(tmp_path: Path) -> None:
 
 
 def test_still_pictures_show_what_is_switched_on() -> None:
-    canvas = still(every_kind())
+    canvas = render_matplotlib(every_kind())
     track, heading, error, names = canvas.axes
     assert track.get_aspect() in ("equal", 1.0)
     assert heading.get_ylim() == (-2.0, 2.0)
@@ -135,32 +138,32 @@ def test_still_pictures_show_what_is_switched_on() -> None:
     assert labels >= {"a", "b", "measured", "masked", "band of a", "limits", "now", "start"}
     assert "interval" not in labels
     assert [text.get_text() for text in heading.texts] == ["stage"]
-    assert len(still(every_kind(), only=[1, 2]).axes) == 2
+    assert len(render_matplotlib(every_kind(), panel_numbers=[1, 2]).axes) == 2
 
 
 def test_outlines_and_steps() -> None:
-    x, y = bars([0, 2], [1.0, 3.0], 0.5)
+    x, y = bar_outlines([0, 2], [1.0, 3.0], 0.5)
     assert x[:4].tolist() == [-0.25, -0.25, 0.25, 0.25]
     assert y[5:].tolist() == [0.0, 3.0, 3.0, 0.0]
     assert np.isnan(x[4])
-    x, y = steps([0, 1, 2], [3.0, 1.0, 2.0])
+    x, y = step_curve([0, 1, 2], [3.0, 1.0, 2.0])
     assert (x.tolist(), y.tolist()) == ([0, 1, 1, 2, 2], [3, 3, 1, 1, 2])
-    rows = thinned(10_001, 500)
+    rows = subsample_indices(10_001, 500)
     assert (rows[0], rows[-1], len(rows)) == (0, 10_000, 500)
-    assert joined([])[0].size == 0
+    assert join_with_gaps([])[0].size == 0
 
 
 def test_cases_on_a_page_hold_their_curves_to_a_part_in_sixty_thousand() -> None:
     figure = every_kind()
-    drawn = draw([figure])
+    drawn = render_bokeh([figure])
     assert drawn is not None
     cases = json.loads(drawn.figures["figure-every-kind"])["cases"]
     one, two = (case["panels"] for case in cases)
     curve = figure.cases[0].curves[1]["measured"][1]
-    np.testing.assert_allclose(unpacked(one[1], "measured")[: len(T)], curve, atol=2 / 60_000)
-    np.testing.assert_allclose(unpacked(one[1], "x of a")[: len(T)], T, atol=10 / 60_000)
-    assert np.isnan(unpacked(two[1], "a")).all(), "a case without a curve draws none"
-    assert draw([]) is None
+    np.testing.assert_allclose(unpack_column(one[1], "measured")[: len(T)], curve, atol=2 / 60_000)
+    np.testing.assert_allclose(unpack_column(one[1], "x of a")[: len(T)], T, atol=10 / 60_000)
+    assert np.isnan(unpack_column(two[1], "a")).all(), "a case without a curve draws none"
+    assert render_bokeh([]) is None
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +178,7 @@ def test_every_figure_of_a_fit_is_a_light_picture_that_shows_something(run: Path
     figures = read_figures(run / "figures")
     names = ["track", "free_runs", "horizon", "residuals", "learning"]
     assert [figure.name for figure in figures] == names
-    for path in (path for figure in figures for path in figure.stills):
+    for path in (path for figure in figures for path in figure.static_images):
         assert path.stat().st_size < 200_000
         with Image.open(path) as picture:
             width, height = picture.size
@@ -210,16 +213,16 @@ def test_the_page_of_a_fit_stands_alone_and_loads_nothing(run: Path) -> None:
 
 def test_runs_to_choose_from_are_the_median_worst_and_best_of_each_kind(run: Path) -> None:
     files = RunFiles(run)
-    figure = runs.free_runs(files, files.windows("test"))
+    figure = runs.free_run_figure(files, files.read_split_windows("test"))
     assert figure is not None
     cases = {case.title: case for case in figure.cases}
     # errors grow with the number of the log: of zigzags 01, 02, 03 the second is the median
     median = cases["zigzag, whole: median error (zigzag_02)"]
-    pictured = [case.title.split(":")[0] for case in figure.pictured]
+    pictured = [case.title.split(":")[0] for case in figure.static_cases]
     assert pictured == ["zigzag, whole", "turning, whole"]
-    looks = figure.looks
-    assert all(looks[name].shown for name in ("measured", "plsr", "baseline", "truth"))
-    assert not looks["zero"].shown
+    looks = figure.styles
+    assert all(looks[name].is_visible for name in ("measured", "plsr", "baseline", "truth"))
+    assert not looks["zero"].is_visible
     assert (looks["plsr"].color, looks["baseline"].dash) == (BLUE, "dashed")
     track, surge = median.curves[:2]
     assert np.isnan(track["measured"][0]).sum() == 10, "masked samples are a gap"
@@ -228,9 +231,11 @@ def test_runs_to_choose_from_are_the_median_worst_and_best_of_each_kind(run: Pat
 
 
 def test_masked_samples_do_not_count(run: Path) -> None:
-    window = next(window for window in RunFiles(run).windows("test") if window.log == "zigzag_02")
-    np.testing.assert_allclose(window.rmse("plsr"), LEVEL["plsr"], rtol=1e-12)
-    error = runs.growth([window], "plsr")
+    window = next(
+        window for window in RunFiles(run).read_split_windows("test") if window.log == "zigzag_02"
+    )
+    np.testing.assert_allclose(window.rmse_by_channel("plsr"), LEVEL["plsr"], rtol=1e-12)
+    error = runs.error_growth([window], "plsr")
     time = error.index.to_numpy()
     assert time[0] == pytest.approx(0.1)
     seen = np.isfinite(error["u"])
@@ -242,7 +247,7 @@ def test_masked_samples_do_not_count(run: Path) -> None:
     # a whole turn more is no error of the heading
     turned = window.predicted["plsr"] + np.where(np.arange(6) == 3, 2 * np.pi, 0.0)
     window = replace(window, predicted={"plsr": turned})
-    assert runs.growth([window], "plsr")["psi"].max() < 0.1
+    assert runs.error_growth([window], "plsr")["psi"].max() < 0.1
 
 
 def test_metrics_alone_give_no_figure_and_many_heads_distinct_looks(tmp_path: Path) -> None:
@@ -254,7 +259,7 @@ def test_metrics_alone_give_no_figure_and_many_heads_distinct_looks(tmp_path: Pa
     first = content["rows"][0] | {"selected": False}
     content |= {"selected": None, "rows": [first | {"model": f"head{i}"} for i in range(12)]}
     write_json(tmp_path / "metrics.json", content)
-    looks = runs.model_looks(RunFiles(tmp_path)).values()
+    looks = runs.model_styles(RunFiles(tmp_path)).values()
     assert len({(look.color, look.dash) for look in looks}) == 12
 
 
@@ -264,7 +269,7 @@ def test_a_bred_equation_shows_its_generations(tmp_path: Path) -> None:
     history = [{"train": 1 / k, "validation": 1.2 / k, "terms": k} for k in range(1, 6)]
     row = {"history": history, "generation": 4}
     write_json(folder / "models" / model / "fit.json", {"equations": {"u_dot": row, "r_dot": row}})
-    (figure,) = breeding(RunFiles(folder))
+    (figure,) = evolution_figures(RunFiles(folder))
     assert [panel.title for panel in figure.panels] == ["surge", "yaw"]
     curves = figure.cases[0].curves[0]
     np.testing.assert_allclose(curves["validation"][1], [1.2 / k for k in range(1, 6)])
@@ -283,7 +288,7 @@ def test_trials_of_a_sweep_over_their_keys() -> None:
     assert figure.panels[0].x_names == {str(place): name for place, name in enumerate(names)}
     curves = figure.cases[0].curves[0]
     assert [values.tolist() for values in curves["best"]] == [[0, 1, 2], [1.0, 1.0, 1.0]]
-    counts = {name: len(parts(*curve)) for name, curve in curves.items()}
+    counts = {name: len(split_at_gaps(*curve)) for name, curve in curves.items()}
     assert counts["best tenth"] + counts["better half"] + counts["worse half"] == len(trials)
 
 

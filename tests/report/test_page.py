@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from read_page import Page
 
-from residnet.core.format import number
+from residnet.core.format import format_number
 from residnet.report.blocks import (
     Bullets,
     Cell,
@@ -21,19 +21,19 @@ from residnet.report.blocks import (
     Section,
     Table,
     Text,
-    bad_where,
-    table_of,
+    build_table,
+    flag_cell,
 )
-from residnet.report.figure import Case, Figure, Look, Panel
+from residnet.report.figure import Case, Figure, GlyphStyle, Panel
 from residnet.report.page import write_page
 
 
 def table() -> Table:
     out = Table(["controller", "settling [s]", "remark"], "Changes of 10 deg.")
     remark = Cell("tuned at the corners", mark="text")
-    out.add("proportional_and_derivative", [Cell("12.5", "best of 5"), remark])
+    out.add_row("proportional_and_derivative", [Cell("12.5", "best of 5"), remark])
     cells = [Cell("10.1", mark="best"), Cell("learned", mark="text")]
-    out.add("net", cells, selected=True)
+    out.add_row("net", cells, is_selected=True)
     return out
 
 
@@ -42,19 +42,19 @@ def every_block(folder: Path) -> list[Section]:
     picture.parent.mkdir(parents=True, exist_ok=True)
     Image.new("RGB", (900, 300), "white").save(picture)
     case = Case("", [{"a": (np.arange(3.0), np.arange(3.0))}])
-    look, panel = {"a": Look("a")}, [Panel("u [m/s]")]
-    figure = Figure("track", "Track", "Look out.", look, panel, [case], stills=[picture])
+    look, panel = {"a": GlyphStyle("a")}, [Panel("u [m/s]")]
+    figure = Figure("track", "Track", "Look out.", look, panel, [case], static_images=[picture])
     return [
         Section("Results of <all>", [Text(["First.", "", "Second."]), table()]),
         Section("Pictures", [figure, None]),
         Section(
             "Details",
             [
-                Bullets(["mind the gap"], warning=True),
+                Bullets(["mind the gap"], is_warning=True),
                 Facts([("damping", "is wrong"), ("gain", "is right")], failed=["damping"]),
-                Section("Inside", [Code("a: 1\nb: 2")], folded=True),
+                Section("Inside", [Code("a: 1\nb: 2")], is_folded=True),
             ],
-            folded=True,
+            is_folded=True,
         ),
     ]
 
@@ -103,15 +103,15 @@ def test_provenance_and_configuration_come_last_and_folded(tmp_path: Path) -> No
 
 
 def test_a_table_for_the_terminal_has_its_columns_below_each_other() -> None:
-    assert table().text().splitlines() == [
+    assert table().to_text().splitlines() == [
         "Changes of 10 deg.",
         "controller                       settling [s]  remark",
         "proportional_and_derivative  12.5 (best of 5)  tuned at the corners",
         "net                                      10.1  learned",
     ]
     grouped = Table(["model", "train", "test"], groups=[("surge u [m/s]", 2)])
-    grouped.add("plsr", ["1", Cell("2", mark="bad")])
-    assert grouped.text().splitlines() == [
+    grouped.add_row("plsr", ["1", Cell("2", mark="bad")])
+    assert grouped.to_text().splitlines() == [
         "       surge u [m/s]",
         "model    train  test",
         "plsr         1   2 !",
@@ -124,39 +124,39 @@ def test_a_table_is_columns_of_what_rows_hold() -> None:
         {"model": "pd", "time": {}, "rms": None, "kind": "law"},
         {"model": "lqr", "time": {"mean": 2.0}, "rms": 1.0, "kind": "law"},
     ]
-    made = table_of(
+    made = build_table(
         rows,
         [
             ("controller", "model"),
             ("kind", "kind"),
             ("time [s]", "time.mean", 2),
-            ("rms [deg]", "rms", number, 10.0),
-            ("twice", lambda row: bad_where(row["model"] * 2, row["model"] == "pd")),
+            ("rms [deg]", "rms", format_number, 10.0),
+            ("twice", lambda row: flag_cell(row["model"] * 2, row["model"] == "pd")),
         ],
-        selected=lambda row: row["kind"] == "policy",
-        rule=lambda row: row["kind"],
+        is_selected=lambda row: row["kind"] == "policy",
+        group_key=lambda row: row["kind"],
     )
     assert [[row.label, *(cell.text for cell in row.cells)] for row in made.rows] == [
         ["net", "policy", "1.25", "5.00", "netnet"],
         ["pd", "law", "–", "–", "pdpd"],
         ["lqr", "law", "2.00", "10.0", "lqrlqr"],
     ]
-    marks = [(row.rule, row.selected) for row in made.rows]
+    marks = [(row.has_rule, row.is_selected) for row in made.rows]
     assert marks == [(True, True), (True, False), (False, False)]
-    assert made.aligned_left == [True, True, False, False, False]
+    assert made.text_columns == [True, True, False, False, False]
     assert made.rows[1].cells[-1].mark == "bad"
 
 
 def test_a_wide_table_stands_in_pieces_that_fit_a_sheet() -> None:
     wide = Table(["model", *"abcdef"], "Told.", [(f"group {k}", 2) for k in range(3)])
-    wide.add("net", ["1234567890" * 2] * 6)
-    pieces = wide.pieces
+    wide.add_row("net", ["1234567890" * 2] * 6)
+    pieces = wide.split_to_width
     assert [piece.columns for piece in pieces] == [["model", *"abcd"], ["model", *"ef"]]
     groups = [[("group 0", 2), ("group 1", 2)], [("group 2", 2)]]
     assert [piece.groups for piece in pieces] == groups
     assert [piece.caption for piece in pieces] == ["Told.", ""]
     with pytest.raises(ValueError, match="row 'net': 1 cells for 6 columns"):
-        wide.add("net", ["1"])
+        wide.add_row("net", ["1"])
 
 
 def test_words_of_the_field_are_linked_once_a_section_to_what_they_mean(tmp_path: Path) -> None:

@@ -18,16 +18,16 @@ from made_series import autoregressive
 from read_page import Page, plain
 
 from residnet.core.errors import DataError, UsageError
-from residnet.core.format import interval, number
+from residnet.core.format import format_interval, format_number
 from residnet.core.log import Log
-from residnet.data.doctor import inspect, inspect_together, inspection
-from residnet.judge.goodness import OneStep, content, table
-from residnet.judge.soundness import CHECKS, Finding, sanity_content
-from residnet.judge.verdict import LEVELS
+from residnet.data.doctor import build_inspection, inspect_log, inspect_log_set
+from residnet.judge.goodness import OneStepResiduals, build_goodness_content, build_goodness_table
+from residnet.judge.soundness import CHECKS, SanityFinding, build_sanity_content
+from residnet.judge.verdict import LEVEL_TEXTS
 from residnet.report.blocks import Section, Table, Text
 from residnet.report.fit import write_fit_figures
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections.models import goodness, term_unit
+from residnet.report.sections.models import goodness_section, term_unit
 
 REFITTED = "values and standard errors are those after the refit through rollouts"
 
@@ -61,7 +61,7 @@ def test_free_run_numbers_are_those_of_metrics(page: str) -> None:
     assert plsr[:3] == ["0.0320|−60 %", "0.0400|−60 %", "0.0240|−40 %"]
     assert plsr[3:6] == ["0.0300|−40 %", "0.458|−50 %", "0.573|−50 %"]
     assert row("plsr", "test", "whole")["nrmse"]["mean"] == pytest.approx(0.08)
-    turned = number(DEG * LEVEL["plsr"][2], 2)
+    turned = format_number(DEG * LEVEL["plsr"][2], 2)
     assert plsr[7:14:2] == ["0.0800|0.0720–0.0880", "0.40", turned, "0/6"]
     assert cells["mlp"][3] == "0.0510|+2 %"
     assert cells["baseline"][1] == "0.100"
@@ -77,7 +77,7 @@ def test_the_first_screen_answers_how_far_off_and_which_model(page: str) -> None
     # what is selected, then what it is to be better than, then the others, the nearest first
     labels = [line[0] for line in table[2:]]
     assert labels == ["plsr (selected)", "baseline", "zero", "truth (plant)", "mlp"]
-    assert table[2][1:3] == ["0.40", number(DEG * LEVEL["plsr"][2], 2)]
+    assert table[2][1:3] == ["0.40", format_number(DEG * LEVEL["plsr"][2], 2)]
     assert "Mean of 6 free runs on test data (T30, which start elsewhere than those of" in first
     # the run holds no errors after single times, so that nothing is known to be good
     text = html.unescape(page)
@@ -151,10 +151,10 @@ def five_answers(seen: str, level: str) -> bool:
     """How far off after 30 s, better than doing nothing, which model, is it of use, which data."""
     rows = ("error after 30 s", "plsr (selected) | 0.40 | 0.57", "zero | 12 | 12")
     doctor = "1 of 2 logs hold something that would mislead a fit: gaps (1)."
-    return all(words in seen for words in (*rows, LEVELS[level], doctor))
+    return all(words in seen for words in (*rows, LEVEL_TEXTS[level], doctor))
 
 
-@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("level", LEVEL_TEXTS)
 def test_five_questions_are_answered_before_the_first_section(level: str, tmp_path: Path) -> None:
     text = html.unescape(shown(judged(tmp_path / "run", level)))
     opening = text.partition("<main")[2].partition('id="at-a-glance"')
@@ -170,7 +170,7 @@ def test_free_runs_of_logs_that_turn_to_one_side_make_no_good_model(tmp_path: Pa
     for known, found in (("good", "note"), ("limited", "will mislead")):
         write_json(run / "doctor.json", doctor | {"together": [{**said, "level": found}]})
         text = html.unescape(shown(run)).partition('id="at-a-glance"')[0]
-        assert LEVELS[known] in text
+        assert LEVEL_TEXTS[known] in text
         assert (said["text"] in text) == (known == "limited")
 
 
@@ -280,10 +280,12 @@ def test_what_doctor_sanity_refit_and_currents_found_is_shown(run: Path) -> None
     clock = logs[1].t.copy()
     clock[500:] += 7.0
     logs[1] = logs[1].replace(t=clock)
-    reports = [inspect(log) for log in logs]
-    write_json(run / "doctor.json", inspection(reports, inspect_together(logs)))
-    checks = [Finding("plsr", check, check != "damping", f"words on {check}") for check in CHECKS]
-    write_json(run / "sanity.json", sanity_content({"plsr": checks}))
+    reports = [inspect_log(log) for log in logs]
+    write_json(run / "doctor.json", build_inspection(reports, inspect_log_set(logs)))
+    checks = [
+        SanityFinding("plsr", check, check != "damping", f"words on {check}") for check in CHECKS
+    ]
+    write_json(run / "sanity.json", build_sanity_content({"plsr": checks}))
     fit = run / "models" / "baseline" / "fit.json"
     write_json(fit, json.loads(fit.read_text()) | {"refit": {"iterations": 3}})
     current = {"current_north": 0.31, "current_east": -0.1, "standard_error": [0.02, 0.015]}
@@ -309,28 +311,30 @@ def test_goodness_of_fit_is_as_the_file_says(run: Path) -> None:
     target = autoregressive(0.9, 3, 800, seed=0).T
     noise = 0.01 * np.random.default_rng(0).normal(size=target.shape)
     models = [
-        OneStep("baseline", "baseline", [4, 4, 4], [0.5 * target]),
-        OneStep("plsr", "head", [9, 9, 9], [0.4 * target + noise], "baseline"),
+        OneStepResiduals("baseline", "baseline", [4, 4, 4], [0.5 * target]),
+        OneStepResiduals("plsr", "head", [9, 9, 9], [0.4 * target + noise], "baseline"),
     ]
-    rows = table(models, [target], 0.1)
-    write_json(run / "goodness.json", content("made", {"train": rows, "test": rows}, 0.1))
-    found = goodness(RunFiles(run))
+    rows = build_goodness_table(models, [target], 0.1)
+    write_json(
+        run / "goodness.json", build_goodness_content("made", {"train": rows, "test": rows}, 0.1)
+    )
+    found = goodness_section(RunFiles(run))
     assert found is not None
-    parts = [one for one in found.shown if isinstance(one, Section)]
+    parts = [one for one in found.present_blocks if isinstance(one, Section)]
     units = {"surge u′": "m/s²", "sway v′": "m/s²", "yaw r′": "deg/s²"}
     assert [one.title for one in parts] == [f"{k} [{u}], test data" for k, u in units.items()]
-    fits, residuals, sentences = parts[2].shown
+    fits, residuals, sentences = parts[2].present_blocks
     assert isinstance(fits, Table)
     assert isinstance(residuals, Table)
     assert isinstance(sentences, Text)
     yaw = {line.label: line.cells for line in residuals.rows}
     line = next(line for line in rows if (line["model"], line["axis"]) == ("plsr", "r_dot"))
     texts = [cell.text for cell in fits.rows[1].cells]
-    assert texts[:3] == ["9.00", number(DEG * line["rmse"]), number(line["r2"])]
-    assert yaw["plsr"][1].text == interval(line["mae_ci95"], DEG)
+    assert texts[:3] == ["9.00", format_number(DEG * line["rmse"]), format_number(line["r2"])]
+    assert yaw["plsr"][1].text == format_interval(line["mae_ci95"], DEG)
     assert (yaw["plsr"][-1].note, yaw["plsr"][-1].mark) == ("to baseline", "best")
     assert yaw["baseline"][-1].text == "–"
-    assert "times too narrow" in sentences.lines[0]
+    assert "times too narrow" in sentences.nonempty_paragraphs[0]
     assert 'id="goodness-of-fit"' in shown(run)
 
 
@@ -379,7 +383,7 @@ def test_metrics_alone_make_a_report_and_folders_without_are_refused(tmp_path: P
     ],
 )
 def test_numbers_have_three_digits(value: float | None, text: str) -> None:
-    assert number(value) == text
+    assert format_number(value) == text
 
 
 @pytest.mark.parametrize(

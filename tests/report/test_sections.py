@@ -19,7 +19,7 @@ from tiny import write_yaml
 
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.judge.metrics import blocks, intervals
+from residnet.judge.metrics import bootstrap_intervals, make_resampling_blocks
 from residnet.report.blocks import Section
 from residnet.report.fit import fit_sections
 from residnet.report.page import write_page
@@ -358,30 +358,32 @@ def variants(seeds: int) -> tuple[pd.DataFrame, dict[str, np.ndarray]]:
 
 def test_rows_of_a_study_are_means_over_windows_and_seeds() -> None:
     table, arrays = variants(3)
-    recipe, other = study.variant_rows(table, "recipe")
+    recipe, other = study.compare_variants(table, "recipe")
     errors = arrays["other"]
     assert other["nrmse_mean"] == pytest.approx(errors.mean())
     assert other["nrmse_sd"] == pytest.approx(errors.mean(1).std(ddof=1))
     assert other["nrmse_range"] == pytest.approx([errors.mean(1).min(), errors.mean(1).max()])
     apart = errors.mean(0) - arrays["recipe"].mean(0)
     assert other["difference"] == pytest.approx(apart.mean())
-    (expected,) = intervals(apart[:, None], blocks([i // 3 for i in range(18)]))
+    (expected,) = bootstrap_intervals(
+        apart[:, None], make_resampling_blocks([i // 3 for i in range(18)])
+    )
     assert other["difference_ci95"] == pytest.approx(expected)
     assert (recipe["difference"], recipe["difference_ci95"]) == (0.0, None)
     assert (other["windows"], other["seeds"], other["diverged"]) == (18, 3, 1)
 
 
 def test_one_seed_has_no_spread_and_the_reference_no_difference(tmp_path: Path) -> None:
-    found = study.variant_rows(variants(1)[0], "recipe")
+    found = study.compare_variants(variants(1)[0], "recipe")
     rows = [row | {"overrides": [], "seconds": 10.0} for row in found]
     assert rows[1]["nrmse_sd"] is None
-    recipe, other = study.variants_table(rows, "recipe").rows
+    recipe, other = study.tabulate_variants(rows, "recipe").rows
     assert [cell.text for cell in recipe.cells[:4]] == [f"{rows[0]['nrmse_mean']:.4f}", "–", "", ""]
     low, high = rows[1]["difference_ci95"]
     assert (other.cells[3].text, other.cells[3].mark) == (f"+{low:.4f} to +{high:.4f}", "best")
-    figure = study.differences(rows, "recipe")
+    figure = study.plot_differences(rows, "recipe")
     assert figure.cases[0].curves[0]["difference"][0].tolist() == [rows[1]["difference"]]
     run = made_run(tmp_path / "made")
     for model, split, said in (("gru", "test", "no model 'gru'"), ("selected", "train", "'train'")):
         with pytest.raises(DataError, match=said):
-            study.window_nrmse(run, model, split)
+            study.compute_window_errors(run, model, split)

@@ -22,8 +22,14 @@ from residnet.core.files import sha256
 from residnet.core.run_loader import accept_run
 from residnet.core.version import __version__
 from residnet.runs import folder as folders
-from residnet.runs.folder import Provenance, RunFolder, git_revision, require_sealed, seal
-from residnet.runs.model_store import FolderStore
+from residnet.runs.folder import (
+    Provenance,
+    RunFolder,
+    read_git_revision,
+    verify_checksums,
+    write_checksums,
+)
+from residnet.runs.model_store import RunModelStore
 
 
 def refused(wanted: str, path: Path, resolved: str = "a: 1\n", *, resume: bool = False) -> None:
@@ -38,28 +44,28 @@ def test_a_folder_is_taken_up_only_by_its_own_configuration(tmp_path: Path) -> N
     (tmp_path / "empty").mkdir()
     for path, resume in ((tmp_path / "deep" / "run", False), (tmp_path / "empty", True)):
         folder = RunFolder.create(path, "a: 1\n", resume=resume)
-        assert (folder.path, folder.resolved.read_text()) == (path, "a: 1\n")
+        assert (folder.path, folder.resolved_config.read_text()) == (path, "a: 1\n")
     (path / "kept.txt").write_text("mine")
-    folder.write_summary("fit", [], {}, finished=True)
+    folder.write_summary("fit", [], {}, is_finished=True)
     refused("exists already; give another --out", path)
     refused("was made with another configuration", path, "a: 2\n", resume=True)
-    assert RunFolder(path).finished
+    assert RunFolder(path).is_finished
     assert RunFolder.create(path, "a: 1\n", resume=True).path == path
     assert (path / "kept.txt").read_text() == "mine"
     assert (path / "resolved.yaml").read_text() == "a: 1\n"
-    assert not RunFolder(path).finished, "a run that is taken up does not look finished"
+    assert not RunFolder(path).is_finished, "a run that is taken up does not look finished"
 
 
 def test_a_folder_is_used_again_without_results_or_where_that_is_asked_for(tmp_path: Path) -> None:
     path = tmp_path / "run"
     folder = RunFolder.create(path, "a: 1\n")
     folder.write_json(folder.provenance, {})
-    assert RunFolder.create(path, "a: 2\n").resolved.read_text() == "a: 2\n"
+    assert RunFolder.create(path, "a: 2\n").resolved_config.read_text() == "a: 2\n"
     folder.write_json(folder.models / "zero" / "fit.json", {})
     refused("exists already", path, "a: 2\n")
     folder = RunFolder.create(path, "a: 3\n", overwrite=True)
     assert {entry.name for entry in path.iterdir()} == {"resolved.yaml", "checksums.jsonl"}
-    assert folder.resolved.read_text() == "a: 3\n"
+    assert folder.resolved_config.read_text() == "a: 3\n"
     with pytest.raises(UsageError, match="not both"):
         RunFolder.create(path, "a: 2\n", overwrite=True, resume=True)
 
@@ -89,9 +95,9 @@ def test_only_a_finished_run_whose_files_are_whole_is_opened(tmp_path: Path) -> 
     folder = RunFolder.create(path, "a: 1\n", resume=False)
     closed(r"is not finished .* --resume")
     given = ("fit", ["Good."], {"error": {"value": 1.0, "unit": "m"}})
-    folder.write_summary(*given, finished=False)
+    folder.write_summary(*given, is_finished=False)
     closed("is not finished")
-    folder.write_summary(*given, finished=True)
+    folder.write_summary(*given, is_finished=True)
     with pytest.raises(UsageError, match="no such file"):
         folder.read_metrics()
     folder.write_json(folder.metrics, {"rows": [{"a": 1}]})
@@ -135,16 +141,16 @@ def test_two_processes_do_not_write_into_one_folder(
 ) -> None:
     monkeypatch.setattr(folders, "_PATIENCE", 1)
     run = tmp_path / "run"
-    with RunFolder(run).held():
+    with RunFolder(run).lock():
         for overwrite in (False, True):
             folder = RunFolder.create(run, "a: 1\n", overwrite=overwrite)
             with (
                 pytest.raises(UsageError, match="another run is being written here"),
-                RunFolder(run).held(),
+                RunFolder(run).lock(),
             ):
                 pass
             folder.write_json(folder.metrics, {})
-    with RunFolder(run).held():
+    with RunFolder(run).lock():
         assert (run / "resolved.yaml").read_text() == "a: 1\n"
 
 
@@ -175,12 +181,12 @@ def test_provenance_names_every_input_by_its_hash(
 def test_the_revision_is_that_of_git(monkeypatch: pytest.MonkeyPatch) -> None:
     words, here = ["git", "rev-parse", "HEAD"], Path(folders.__file__).parent
     told = subprocess.run(words, cwd=here, capture_output=True, text=True, check=False)
-    found = git_revision()
+    found = read_git_revision()
     expected = told.stdout.strip() if told.returncode == 0 else None
     assert (found.removesuffix("+changes") if found else None) == expected
     # outside a checkout, or without git, nobody can say
     monkeypatch.setenv("PATH", "")
-    assert git_revision() is None
+    assert read_git_revision() is None
 
 
 SEALED = ("resolved.yaml", "metrics.json", "models/mlp/model.safetensors")
@@ -191,7 +197,7 @@ def sealed(run: Path) -> Path:
     for name in (*SEALED, *others):
         (run / name).parent.mkdir(parents=True, exist_ok=True)
         (run / name).write_text(f"contents of {name}")
-    seal(run)
+    write_checksums(run)
     return run
 
 
@@ -200,12 +206,12 @@ def test_results_alone_are_sealed(tmp_path: Path) -> None:
     assert set(json.loads((run / "checksums.json").read_text())["files"]) == set(SEALED)
     for name in ("figures/a.png", "external-1/metrics.json"):
         (run / name).write_text("made anew")
-    require_sealed(run)
+    verify_checksums(run)
     (run / "checksums.json").unlink()
     with pytest.raises(UsageError, match=r"has no checksums.json; .*: residnet trust"):
-        require_sealed(run)
+        verify_checksums(run)
     accept_run(run)
-    require_sealed(run)
+    verify_checksums(run)
 
 
 def as_folder(file: Path) -> None:
@@ -232,16 +238,16 @@ def test_damaged_results_and_checksums_are_one_line(
 ) -> None:
     damage(sealed(tmp_path) / name)
     with pytest.raises(UsageError, match=said) as caught:
-        require_sealed(tmp_path)
+        verify_checksums(tmp_path)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("file", ["fit.json", "model.json"])
 def test_a_resumed_run_takes_no_model_that_was_edited(file: str, tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
-    store = FolderStore(folder)
+    store = RunModelStore(folder)
     spec, model = nomoto_model(0.2, 5.0, 0.1)
-    store.keep_module("ridge", spec, model, {"validation": 0.2})
+    store.save_module("ridge", spec, model, {"validation": 0.2})
     assert store.load("ridge").notes == {"validation": 0.2}
     (folder.models / "ridge" / file).write_text("{}")
     with pytest.raises(UsageError, match=f"{file}: its SHA-256 is not the one"):

@@ -177,14 +177,14 @@ def _read_report(run: Path) -> None:
 
 
 def _list_runs(run: Path) -> None:
-    registry.runs_text(run.parent, registry.runs_below(run.parent))
+    registry.format_runs(run.parent, registry.list_runs(run.parent))
 
 
 def _read_task(run: Path) -> None:
     folder = RunFolder.open(run)
     with name_damaged_key(run):
-        registry.finished_task(run, registry.task_class(folder).verbs[0])
-        RunFiles(run).json("metrics.json")
+        registry.open_finished_task(run, registry.get_task_class(folder).supported_commands[0])
+        RunFiles(run).read_json("metrics.json")
 
 
 ENTRANCES = [_load_models, _read_report, _list_runs, _read_task]
@@ -333,9 +333,7 @@ def test_a_missing_manifest_is_refused_until_it_is_accepted(
     assert residnet.load(stranger, "ridge").name == "ridge"
 
 
-def test_an_unlisted_file_is_refused_until_it_is_accepted(
-    command: Command, stranger: Path
-) -> None:
+def test_an_unlisted_file_is_refused_until_it_is_accepted(command: Command, stranger: Path) -> None:
     shutil.copytree(stranger / "models" / "ridge", stranger / "models" / "planted")
     (stranger / "models" / "planted" / "checksums.json").unlink()
     ended = command("export", stranger, "--model", "planted")

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from residnet.core.errors import UsageError
-from residnet.simulators.ardupilot import ArduPilotBackEnd, servos
-from residnet.simulators.vehicle import Vehicle, vehicle
+from residnet.simulators.ardupilot import ArduPilotBackend, assign_servos
+from residnet.simulators.vehicle import Vehicle, load_vehicle
 
 RATE = 400
 
@@ -26,17 +26,17 @@ def packet(frame: int, *pulses: int, rate: int = RATE, count: int = 16) -> bytes
 
 @pytest.fixture(scope="module")
 def boat() -> Vehicle:
-    return vehicle("wam_v_cal", dt=1 / RATE)
+    return load_vehicle("wam_v_cal", dt=1 / RATE)
 
 
 @pytest.fixture
-def end(boat: Vehicle) -> Iterator[ArduPilotBackEnd]:
-    back = ArduPilotBackEnd(boat, servos(boat), port=0)
+def end(boat: Vehicle) -> Iterator[ArduPilotBackend]:
+    back = ArduPilotBackend(boat, assign_servos(boat), port=0)
     yield back
     back.close()
 
 
-def test_packets_are_answered_over_the_network(end: ArduPilotBackEnd) -> None:
+def test_packets_are_answered_over_the_network(end: ArduPilotBackend) -> None:
     server = threading.Thread(target=end.serve, args=(60, 5.0))
     server.start()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
@@ -54,26 +54,26 @@ def test_packets_are_answered_over_the_network(end: ArduPilotBackEnd) -> None:
             stamps.append(reply["timestamp"])
     server.join()
     np.testing.assert_allclose(np.diff(stamps), 1 / RATE, rtol=1e-9)
-    assert end.refused == 16
+    assert end.n_invalid_packets == 16
     assert set(reply) == {"timestamp", "imu", "position", "attitude", "velocity"}
     assert reply["imu"]["accel_body"][0] > 0
     assert reply["imu"]["accel_body"][2] == pytest.approx(-9.80665)
 
 
-def replies(end: ArduPilotBackEnd, frames: list[int], *pulses: int) -> list[dict[str, object]]:
+def replies(end: ArduPilotBackend, frames: list[int], *pulses: int) -> list[dict[str, object]]:
     out = []
     for frame in frames:
-        answer = end.answer(packet(frame, *pulses))
+        answer = end.reply_to(packet(frame, *pulses))
         assert answer is not None
         out.append(json.loads(answer))
     return out
 
 
-def test_losses_repeats_and_a_new_start(end: ArduPilotBackEnd) -> None:
+def test_losses_repeats_and_a_new_start(end: ArduPilotBackend) -> None:
     first, same, later = replies(end, [1, 1, 9], 1600, 0, 1600)
     assert first == same
     assert later["timestamp"] == pytest.approx(2 / RATE)
-    assert end.missed == 7
+    assert end.n_lost_frames == 7
     (anew,) = replies(end, [0], 1600, 0, 1600)
     assert anew["timestamp"] == pytest.approx(1 / RATE)
 
@@ -82,13 +82,13 @@ def test_losses_repeats_and_a_new_start(end: ArduPilotBackEnd) -> None:
     "data",
     [b"", packet(1, 1500)[:-1], packet(1, 9), packet(1, 1500, rate=0), b"\xff" * 40],
 )
-def test_what_is_no_packet_is_left_out(end: ArduPilotBackEnd, data: bytes) -> None:
-    before = end.refused
-    assert end.answer(data) is None
-    assert end.refused == before + 1
+def test_what_is_no_packet_is_left_out(end: ArduPilotBackend, data: bytes) -> None:
+    before = end.n_invalid_packets
+    assert end.reply_to(data) is None
+    assert end.n_invalid_packets == before + 1
 
 
-def test_the_motion_is_that_of_the_vehicle_and_consistent(end: ArduPilotBackEnd) -> None:
+def test_the_motion_is_that_of_the_vehicle_and_consistent(end: ArduPilotBackend) -> None:
     """The change of velocity over ground is what the accelerometers feel, turned to the earth."""
     seen = replies(end, list(range(1, 601)), 1800, 0, 1600)
     velocity = np.array([reply["velocity"] for reply in seen])
@@ -108,8 +108,8 @@ def test_the_motion_is_that_of_the_vehicle_and_consistent(end: ArduPilotBackEnd)
 
 
 def test_a_slower_vehicle_is_interpolated(boat: Vehicle) -> None:
-    slow = vehicle("wam_v_cal", dt=0.05)
-    ends = [ArduPilotBackEnd(it, servos(it), port=0) for it in (boat, slow)]
+    slow = load_vehicle("wam_v_cal", dt=0.05)
+    ends = [ArduPilotBackend(it, assign_servos(it), port=0) for it in (boat, slow)]
     fine, coarse = (replies(end, list(range(1, 801)), 1800, 0, 1600) for end in ends)
     for end in ends:
         end.close()
@@ -120,14 +120,14 @@ def test_a_slower_vehicle_is_interpolated(boat: Vehicle) -> None:
 
 def test_servos_are_read_and_refused(boat: Vehicle) -> None:
     first, second = boat.inputs[:2]
-    found = servos(boat, [f"{second}=4:-5:5"])
+    found = assign_servos(boat, [f"{second}=4:-5:5"])
     assert (found[0].channel, found[1].channel) == (1, 4)
-    assert found[1].command(2000) == 5.0
-    assert found[1].command(0) == 0.0
+    assert found[1].command_at(2000) == 5.0
+    assert found[1].command_at(0) == 0.0
     for text, message in (
         (f"{first}=1", "expected COMMAND=OUTPUT:LOW:HIGH"),
         (f"{first}=40:0:1", "numbered 1 to 32"),
         ("n_prot=1:0:1", "no command 'n_prot'"),
     ):
         with pytest.raises(UsageError, match=message):
-            servos(boat, [text])
+            assign_servos(boat, [text])

@@ -10,16 +10,16 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from residnet.core.errors import UsageError
-from residnet.simulators.gym import TASKS, Task, VesselEnv, VesselVectorEnv
-from residnet.simulators.vehicle import Vehicle, vehicle
+from residnet.simulators.gym import REFERENCE_TASKS, Task, VesselEnv, VesselVectorEnv
+from residnet.simulators.vehicle import Vehicle, load_vehicle
 
 
 @pytest.fixture(scope="module")
 def boat() -> Vehicle:
-    return vehicle("wam_v_cal", dt=0.5)
+    return load_vehicle("wam_v_cal", dt=0.5)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", REFERENCE_TASKS)
 def test_the_packages_own_checker_passes(boat: Vehicle, task: str) -> None:
     with warnings.catch_warnings():
         # it warns of bounds that are infinite, which those of velocities are
@@ -37,7 +37,7 @@ def test_a_batch_is_its_single_vessels(boat: Vehicle) -> None:
     single.reset(seed=0)
     single.episodes.x[:] = many.episodes.x[1]
     single.episodes.goal[:] = many.episodes.goal[1]
-    actions = np.random.default_rng(0).uniform(-1, 1, (9, 3, boat.commands))
+    actions = np.random.default_rng(0).uniform(-1, 1, (9, 3, boat.n_commands))
     for k, action in enumerate(actions[:8]):
         seen, reward, lost, truncated, _ = many.step(action)
         alone, gain, *_ = single.step(action[1])
@@ -48,15 +48,15 @@ def test_a_batch_is_its_single_vessels(boat: Vehicle) -> None:
     seen, reward, _, truncated, _ = many.step(actions[8])
     assert (reward == 0).all()
     assert not truncated.any()
-    assert (many.episodes.count == 0).all()
-    assert (seen[:, -boat.commands :] == 0).all()
+    assert (many.episodes.step_count == 0).all()
+    assert (seen[:, -boat.n_commands :] == 0).all()
 
 
 def test_an_action_that_is_no_number_or_too_large_is_held(boat: Vehicle) -> None:
     env = VesselEnv(boat, "heading")
     env.reset(seed=1)
     for value in (np.nan, np.inf, -1e30):
-        seen, reward, *_ = env.step(np.full(boat.commands, value))
+        seen, reward, *_ = env.step(np.full(boat.n_commands, value))
         assert np.isfinite(seen).all()
         assert np.isfinite(reward)
 
@@ -77,4 +77,4 @@ def test_faults_are_said_in_one_line(boat: Vehicle) -> None:
     with pytest.raises(UsageError, match="no task 'coarse'; did you mean 'course'"):
         VesselEnv(boat, cast(Task, "coarse"))
     with pytest.raises(UsageError, match="no vessel 'wam_w'"):
-        vehicle("wam_w")
+        load_vehicle("wam_w")

@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.log import Log
-from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.questions import DraftNotes
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.readers import ReaderConfig
 
 
-def drafted(path: Path, **settings: Any) -> tuple[Log, dict[str, Any], Marks]:
+def drafted(path: Path, **settings: Any) -> tuple[Log, dict[str, Any], DraftNotes]:
     """The log that the drafted reader reads, its settings, and what is marked."""
-    marks = Marks()
+    marks = DraftNotes()
     content = {**draft_tables([path], marks)[0], **settings}
-    return validate(content, ReaderConfig, "here").build().read(path), content, marks
+    return validate_config(content, ReaderConfig, "here").build().read(path), content, marks
 
 
 def assert_read(log: Log, truth: Mapping[str, Any], atol: float = 1e-9) -> None:

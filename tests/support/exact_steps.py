@@ -10,7 +10,7 @@ from torch import Tensor
 from residnet.core.columns import heading, surge
 from residnet.core.frames import to_earth
 from residnet.dynamics.base import Dynamics
-from residnet.physics.nomoto import SteeringVessel
+from residnet.physics.nomoto import NomotoVessel
 
 
 @final
@@ -23,10 +23,10 @@ class NomotoDynamics(Dynamics):
     is O(dt^4), that of heading and velocities is rounding at any dt.
     """
 
-    def __init__(self, plant: SteeringVessel, dt: float) -> None:
+    def __init__(self, plant: NomotoVessel, dt: float) -> None:
         super().__init__(dt, "rk4")
         self.plant = plant
-        size = plant.free + 2
+        size = plant.n_steering_states + 2
         # psi, then v, r and internal states, then the rudder angle, which is constant
         system = torch.zeros(size, size, dtype=torch.float64)
         system[0, 2] = 1.0
@@ -49,8 +49,8 @@ class NomotoDynamics(Dynamics):
         start = torch.cat(
             (
                 heading(x).unsqueeze(-1),
-                x[:, plant.turning_columns],
-                plant.delta(x, w).unsqueeze(-1),
+                x[:, plant.steering_columns],
+                plant.rudder_angle(x, w).unsqueeze(-1),
             ),
             dim=-1,
         )
@@ -63,4 +63,4 @@ class NomotoDynamics(Dynamics):
         after = torch.cat(
             (torch.stack((north, east, end[:, 0], speed), dim=-1), end[:, 1:], rudder), dim=-1
         )
-        return plant.end_step(after, w, self.dt), s
+        return plant.finish_step(after, w, self.dt), s

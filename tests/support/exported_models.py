@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
-from residnet.core.registry import kinds
+from residnet.core.registry import load_kinds
 from residnet.core.samples import Samples
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.export.base import Loaded
+from residnet.export.base import LoadedExport
 from residnet.export.vessel import ExportedVessel
 from residnet.heads import HeadConfig
 from residnet.heads.base import ClosedFormHead
@@ -22,11 +22,11 @@ from residnet.physics.signals import SignalsConfig
 
 SIGNALS = SignalsConfig(
     inputs=("n_port", "n_stbd"), exogenous=("wind_speed", "wind_dir"), forces="wam_v_cal"
-).resolved()
+).with_thrusters()
 NAMES = SIGNALS.build().names
 FEATURES = ("u", "v", "r", "tau_x", "tau_n", "wind_u", "wind_v", "wind_mag")
 LOW, HIGH = (-0.5, -0.6, -0.4, -10.0, -12.0, 0.0, -3.0), (3.0, 0.6, 0.4, 30.0, 32.0, 9.0, 3.0)
-KINDS: dict[str, type[Any]] = kinds(HeadConfig)
+KINDS: dict[str, type[Any]] = load_kinds(HeadConfig)
 # smaller than the defaults, for the sake of time
 SIZES: dict[str, dict[str, Any]] = {
     "mlp": {"hidden": (8,)},
@@ -89,7 +89,7 @@ def fill(model: HybridDynamics, seed: int = 0) -> None:
     samples = Samples(z, target, torch.arange(400) // 40, torch.zeros(400), ("zigzag",) * 10, NAMES)
     model.head.calibrate(samples)
     if isinstance(model.head, ClosedFormHead):
-        model.head.solve(samples)
+        model.head.fit_preferred(samples)
     with torch.no_grad():
         for parameter in model.head.parameters():
             parameter.add_(0.2 * torch.randn_like(parameter))
@@ -115,10 +115,10 @@ def built(variant: str) -> tuple[ModelSpec, HybridDynamics]:
 class AsTensors:
     """A loaded file of a vessel in any format as a module of batches, row by row."""
 
-    def __init__(self, loaded: Loaded, exported: ExportedVessel) -> None:
+    def __init__(self, loaded: LoadedExport, exported: ExportedVessel) -> None:
         self.loaded, self.exported = loaded, exported
         self.size = exported.model.n_state
-        self.guard = exported.guarded(torch.float32)
+        self.guard = exported.guard_model(torch.float32)
 
     def initial_state(self, batch: int) -> Tensor:
         return torch.zeros(batch, self.size)
@@ -134,11 +134,11 @@ class AsTensors:
     def warmup(self, y: Tensor, w: Tensor) -> Tensor:
         rows = zip(y.numpy(), w.numpy(), strict=True)
         return torch.from_numpy(
-            np.stack([self.exported.memory(self.loaded, *row) for row in rows])
+            np.stack([self.exported.warm_up_memory(self.loaded, *row) for row in rows])
         ).float()
 
     def rollout(self, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        states, flags, x = [self.guard.of_state.replaced(x0)], [], x0
+        states, flags, x = [self.guard.state_ranges.replace_unaccepted(x0)], [], x0
         for k in range(w.shape[1]):
             x, s, outside = self.step(x, w[:, k], s)
             states.append(x)

@@ -102,11 +102,13 @@ def source_of(runs: list[Run], plant: HullPlant, t: torch.Tensor) -> Source:
         drive = torch.tensor([run.drive for run in steps], dtype=torch.float64)
         sources.append(
             ScheduleSource(
-                plant.demand(drive[:, None].expand(-1, len(t)), steer[:, None] * (t >= START))
+                plant.commands_for_demand(
+                    drive[:, None].expand(-1, len(t)), steer[:, None] * (t >= START)
+                )
             )
         )
     if zigzags:
-        sources.append(Zigzag.source(zigzags, Helm.from_plant(plant), t))
+        sources.append(Zigzag.build_source(zigzags, Helm.from_plant(plant), t))
     return StackedSource(sources, [count for count in (len(steps), len(zigzags)) if count])
 
 
@@ -130,13 +132,13 @@ def trajectories(
     steps = round(min(longest, seconds) / DT) + 1
     t = torch.arange(steps, dtype=torch.float64) * DT
     runs = [case_of(path).run for path in files]
-    plant = plant_of(case_of(files[0])).in_calm_water()
-    x0 = torch.zeros(len(runs), len(plant.state), dtype=torch.float64)
-    x0[:, plant.state.index("u")] = torch.tensor([one.u for one in runs], dtype=torch.float64)
-    x0[:, plant.state.index("phi")] = torch.tensor(np.radians([one.phi for one in runs]))
-    w = torch.zeros(len(runs), steps, len(plant.inputs), dtype=torch.float64)
+    plant = plant_of(case_of(files[0])).without_environment()
+    x0 = torch.zeros(len(runs), len(plant.state_names), dtype=torch.float64)
+    x0[:, plant.state_names.index("u")] = torch.tensor([one.u for one in runs], dtype=torch.float64)
+    x0[:, plant.state_names.index("phi")] = torch.tensor(np.radians([one.phi for one in runs]))
+    w = torch.zeros(len(runs), steps, len(plant.input_names), dtype=torch.float64)
     states, inputs = run(RecordedPlantDynamics(plant, DT), x0, w, source_of(runs, plant, t))
-    assert plant.state == COLUMNS
+    assert plant.state_names == COLUMNS
     return {path.name: (states[i].numpy(), inputs[i, :, 0].numpy()) for i, path in enumerate(files)}
 
 

@@ -138,7 +138,7 @@ class StagedPlantDynamics(Dynamics):
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return x_dot [B, nx] of the plant under the inputs p [B, m] of one stage."""
-        return self.plant.rate(x, p)
+        return self.plant.derivative(x, p)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state after a step; the memory passes through."""
@@ -148,7 +148,9 @@ class StagedPlantDynamics(Dynamics):
         k3 = self.rate(x + 0.5 * self.dt * k2, middle, s)
         k4 = self.rate(x + self.dt * k3, end, s)
         return (
-            self.plant.end_step(x + self.dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4), end, self.dt),
+            self.plant.finish_step(
+                x + self.dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4), end, self.dt
+            ),
             s,
         )
 
@@ -157,7 +159,7 @@ class StagedPlantDynamics(Dynamics):
 def trajectories(folder: Path, vessel: str, seconds: float) -> dict[str, np.ndarray]:
     """States [T+1, 6] at the steps of every file of one vessel, flown side by side."""
     files, _ = beside(folder, lambda path: case_of(path)[0] == vessel)
-    plant = plant_of(files[0]).in_calm_water()
+    plant = plant_of(files[0]).without_environment()
     t = DT * np.arange(round(min(END, seconds) / DT))
     # the last stage sees the input just before the next step (golden/README.md)
     stages = (t, t + DT / 2, t + DT - 1e-12)

@@ -118,14 +118,14 @@ def flights(folder: Path, scale: float, disturbed: bool, seconds: float) -> dict
     steps = round(min(longest, seconds) / DT) + 1
     plant = vessel(scale)
     if not disturbed:
-        plant.in_calm_water()
+        plant.without_environment()
     believed = HullFeedForward(vessel(1.0).hull)
     guidance = Watched(ReferenceFilter([case.guidance for case in cases], DT), EVERY["closed"])
     controller = MotionPID([pid(case.feedback) for case in cases], DT, believed)
-    x0 = torch.zeros(len(cases), len(plant.state), dtype=torch.float64)
-    w = torch.zeros(len(cases), steps, len(plant.inputs), dtype=torch.float64)
+    x0 = torch.zeros(len(cases), len(plant.state_names), dtype=torch.float64)
+    w = torch.zeros(len(cases), steps, len(plant.input_names), dtype=torch.float64)
     for name, force in (("force_north", 200.0), ("force_east", 100.0)) if disturbed else ():
-        w[..., plant.inputs.index(name)] = force
+        w[..., plant.input_names.index(name)] = force
     loop = ClosedLoop(controller, guidance)
     states, inputs = run(RecordedPlantDynamics(plant, DT), x0, w, loop)
     every = range(0, steps, EVERY["closed"])
@@ -134,7 +134,7 @@ def flights(folder: Path, scale: float, disturbed: bool, seconds: float) -> dict
     for i, path in enumerate(files):
         x, command, desired = states[i, every], inputs[i, every, :3], reference[:, i]
         forward = believed(desired[:, 6:9], desired[:, 3:6])
-        rate = plant.rate(x, w[i, every])[:, 3:6]
+        rate = plant.derivative(x, w[i, every])[:, 3:6]
         columns = (x[:, :9], rate, command, forward, command - forward, desired, waypoint[:, i])
         out[path.name] = pd.DataFrame(torch.cat(columns, dim=-1).numpy(), columns=NAMES)
     return out
@@ -163,7 +163,7 @@ class Watched(Reference):
         desired, s = self.guidance(x, k, s)
         if k % self.every == 0:
             self.asked.append(desired)
-            self.waypoints.append(self.guidance.waypoint(k).expand(x.shape[0], -1))
+            self.waypoints.append(self.guidance.waypoint_at(k).expand(x.shape[0], -1))
         return desired, s
 
 
@@ -173,13 +173,13 @@ def simulated(path: Path, seconds: float) -> pd.DataFrame:
     if isinstance(case, Flight):
         return flights(path.parent, case.scale, case.disturbed, seconds)[path.name]
     plant = vessel(1.0)
-    x0 = torch.zeros(1, len(plant.state), dtype=torch.float64)
+    x0 = torch.zeros(1, len(plant.state_names), dtype=torch.float64)
     x0[0, 3:6] = torch.tensor(case.nu, dtype=torch.float64)
     # as body forces, which act at once; the thrusters rest
     steps = round(min(100.0, seconds + OPEN_DT) / OPEN_DT)
-    w = torch.zeros(1, steps, len(plant.inputs), dtype=torch.float64)
+    w = torch.zeros(1, steps, len(plant.input_names), dtype=torch.float64)
     w[..., 3:6] = torch.tensor(case.force, dtype=torch.float64)
-    assert plant.inputs[3:6] == ("force_x", "force_y", "force_n")
+    assert plant.input_names[3:6] == ("force_x", "force_y", "force_n")
     states, _ = run(RecordedPlantDynamics(plant, OPEN_DT), x0, w)
     return pd.DataFrame(states[0, :: EVERY["open"], :6].numpy(), columns=STATE[:6])
 
@@ -217,7 +217,7 @@ def by_row(path: Path, frame: pd.DataFrame) -> Iterator[Row]:
     water = believed.terms(nu_d).abs() @ believed.coefficients.abs()
     size = ((nu_dot_d @ believed.mass.T).abs() + water).numpy()
     forward = frame[["ff_u", "ff_v", "ff_r"]].to_numpy()
-    asked = believed.required(nu_dot_d, nu_d).numpy()
+    asked = believed.required_force(nu_dot_d, nu_d).numpy()
     allowed = 2.0 * rounding_bound(size, forward, float(size.max()))
     yield "feed-forward", asked, forward, allowed
 

@@ -81,10 +81,10 @@ def trajectories(vessel: str, folder: Path, seconds: float) -> dict[str, list[np
     plant = load_vessel(vessel).build()
     manoeuvres = [case_of(path).manoeuvre for path in files]
     source = StackedSource(
-        [type(m).source([m], Helm.from_plant(plant), t) for m in manoeuvres], [1] * len(files)
+        [type(m).build_source([m], Helm.from_plant(plant), t) for m in manoeuvres], [1] * len(files)
     )
-    x0 = torch.zeros(len(files), len(plant.state), dtype=torch.float64)
-    w = torch.zeros(len(files), steps, len(plant.inputs), dtype=torch.float64)
+    x0 = torch.zeros(len(files), len(plant.state_names), dtype=torch.float64)
+    w = torch.zeros(len(files), steps, len(plant.input_names), dtype=torch.float64)
     states, inputs = run(RecordedPlantDynamics(plant, DT), x0, w, source)
     return {
         path.name: [states[i].numpy(), inputs[i, :, :2].numpy()] for i, path in enumerate(files)
@@ -106,8 +106,11 @@ def by_row(path: Path, frame: pd.DataFrame) -> Iterator[Row]:
     if is_linear(path):
         return
     plant = of_kind(load_vessel(case_of(path).vessel).build(), HullPlant)
-    forces, n = of_kind(plant.actuators, Thrusters).forces, tensor(frame, "n_port", "n_stbd") / 60
-    thrust, truth = forces.thrust(n).numpy(), frame[["T_port", "T_stbd"]].to_numpy()
+    forces, n = (
+        of_kind(plant.actuators, Thrusters).thruster_forces,
+        tensor(frame, "n_port", "n_stbd") / 60,
+    )
+    thrust, truth = forces.thrust_at(n).numpy(), frame[["T_port", "T_stbd"]].to_numpy()
     # the printed polynomial cancels near zero thrust, where only its largest term bounds the
     # rounding
     yield "thrust", thrust, truth, 1e-12 * (np.abs(truth) + 3.8)

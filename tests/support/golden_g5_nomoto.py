@@ -24,15 +24,15 @@ from golden_tables import made_by, name_of, run, table
 from kinds import of_kind
 from torch import Tensor
 
-from residnet.control import BangBangHeading, ClosedLoop, GivenReference, HeadingPD, Policy
+from residnet.control import BangBangHeading, ClosedLoop, HeadingPD, Policy, RecordedReference
 from residnet.documents.gouletas2020.law import DocumentAutopilot, SimulatedPredictor
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Source
 from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.manoeuvres.base import Helm, ScheduleSource
 from residnet.manoeuvres.closed_loop import Zigzag
-from residnet.physics.hull import PatrolConfig
-from residnet.physics.nomoto import NomotoConfig, SteeringVessel
+from residnet.physics.hull import RollingHullConfig
+from residnet.physics.nomoto import NomotoConfig, NomotoVessel
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 
@@ -53,7 +53,7 @@ class Case:
     source: Callable[[Tensor], Source]
 
 
-def nomoto(rate: str | None = None) -> SteeringVessel:
+def nomoto(rate: str | None = None) -> NomotoVessel:
     """The vessel of document 004, with a steering gear of `rate` deg/s where there is one."""
     vessel = of_kind(load_vessel("nomoto_oceanos"), NomotoConfig)
     assert (vessel.K.value, vessel.T.value) == (GAIN, TIME)
@@ -65,14 +65,16 @@ def nomoto(rate: str | None = None) -> SteeringVessel:
 
 def patrol(parameters: str) -> Plant:
     """The patrol vessel with a rudder that stands at its command at once."""
-    vessel = of_kind(load_vessel(PATROL[parameters]), PatrolConfig)
+    vessel = of_kind(load_vessel(PATROL[parameters]), RollingHullConfig)
     immediate = vessel.actuators.model_copy(update={"rate": None})
-    return vessel.model_copy(update={"actuators": immediate}).build().in_calm_water()
+    return vessel.model_copy(update={"actuators": immediate}).build().without_environment()
 
 
 def follow(policy: Policy, heading: Heading, t: Tensor) -> Source:
     """The policy towards a heading in rad at times t [T]."""
-    return ClosedLoop(policy, GivenReference(torch.from_numpy(heading(t.numpy()))[None, :, None]))
+    return ClosedLoop(
+        policy, RecordedReference(torch.from_numpy(heading(t.numpy()))[None, :, None])
+    )
 
 
 def step_to(degrees: float) -> Heading:
@@ -84,7 +86,7 @@ def approach(tau: float) -> Heading:
     return (lambda t: np.radians(30.0) * (1.0 - np.exp(-t / tau))) if tau else step_to(30.0)
 
 
-def exactly(plant: SteeringVessel, source: Callable[[Tensor], Source]) -> Case:
+def exactly(plant: NomotoVessel, source: Callable[[Tensor], Source]) -> Case:
     return Case(plant, NomotoDynamics(plant, 0.01), source)
 
 
@@ -93,7 +95,9 @@ def rudder_step(angle: str) -> Case:
     steer = np.radians(float(angle)) / plant.delta_max
     return exactly(
         plant,
-        lambda t: ScheduleSource(plant.demand(torch.ones_like(t)[None], steer * (t >= 1.0)[None])),
+        lambda t: ScheduleSource(
+            plant.commands_for_demand(torch.ones_like(t)[None], steer * (t >= 1.0)[None])
+        ),
     )
 
 
@@ -102,27 +106,27 @@ def zigzag(angle: str, heading: str, rate: str | None) -> Case:
     turn = float(np.radians(float(heading)))
     steer = np.radians(float(angle)) / plant.delta_max
     manoeuvre = Zigzag(drive=1.0, steer=steer, start=0.0, heading=turn)
-    return exactly(plant, lambda t: Zigzag.source([manoeuvre], Helm.from_plant(plant), t))
+    return exactly(plant, lambda t: Zigzag.build_source([manoeuvre], Helm.from_plant(plant), t))
 
 
 def document(horizon: str, tau: str) -> Case:
     plant = nomoto()
-    predictor = SimulatedPredictor(NomotoDynamics(plant, float(horizon)), plant.state, 1)
+    predictor = SimulatedPredictor(NomotoDynamics(plant, float(horizon)), plant.state_names, 1)
     policy = DocumentAutopilot(predictor, limit=LIMIT)
     return exactly(plant, partial(follow, policy, approach(float(tau))))
 
 
 def tuned(heading: str | None = None) -> Case:
     plant = nomoto()
-    policy = HeadingPD.placed(
-        plant.state, gain=GAIN, time=TIME, frequency=2.0, damping=0.9, limit=LIMIT
+    policy = HeadingPD.from_pole_placement(
+        plant.state_names, gain=GAIN, time=TIME, frequency=2.0, damping=0.9, limit=LIMIT
     )
     return exactly(plant, partial(follow, policy, step_to(float(heading or 30))))
 
 
 def time_optimal(heading: str | None = None) -> Case:
     plant = nomoto()
-    policy = BangBangHeading(plant.state, gain=GAIN, time=TIME, limit=LIMIT)
+    policy = BangBangHeading(plant.state_names, gain=GAIN, time=TIME, limit=LIMIT)
     return exactly(plant, partial(follow, policy, step_to(float(heading or 30))))
 
 
@@ -133,14 +137,14 @@ def patrol_document(spacing: float, parameters: str, horizon: str, tau: str | No
     model = RecordedPlantDynamics(plant, dt)
     thrust = torch.tensor([THRUST], dtype=torch.float64)
     policy = DocumentAutopilot(
-        SimulatedPredictor(model, plant.state, round(h / dt), thrust), limit=LIMIT
+        SimulatedPredictor(model, plant.state_names, round(h / dt), thrust), limit=LIMIT
     )
     return Case(plant, model, partial(follow, policy, approach(float(tau or 0))))
 
 
 def patrol_pd(parameters: str, heading: str) -> Case:
     plant = patrol(parameters)
-    policy = HeadingPD(plant.state, kp=6.0, kd=6.0, limit=LIMIT)
+    policy = HeadingPD(plant.state_names, kp=6.0, kd=6.0, limit=LIMIT)
     model = RecordedPlantDynamics(plant, 0.05)
     return Case(plant, model, partial(follow, policy, step_to(float(heading))))
 
@@ -167,10 +171,10 @@ def case_of(path: Path, spacing: float = 0.25) -> Case:
 def fly(case: Case, steps: int) -> dict[str, np.ndarray]:
     """Channels [T] of a run, with the rudder angle and the command that act from each time on."""
     t = torch.arange(steps, dtype=torch.float64) * case.model.dt
-    w = torch.zeros(1, steps, len(case.plant.inputs), dtype=torch.float64)
+    w = torch.zeros(1, steps, len(case.plant.input_names), dtype=torch.float64)
     w[:, :, 1:] = THRUST
-    states, inputs = run(case.model, case.plant.approach(1), w, case.source(t))
-    out = dict(zip(case.plant.state, states[0, :-1].T.numpy(), strict=True))
+    states, inputs = run(case.model, case.plant.make_initial_state(1), w, case.source(t))
+    out = dict(zip(case.plant.state_names, states[0, :-1].T.numpy(), strict=True))
     out["delta_cmd"] = inputs[0, :, 0].numpy()
     return {"delta": out["delta_cmd"], **out}
 
@@ -192,7 +196,7 @@ UNKNOWN = ("turn_5",)
 def check_inputs() -> None:
     """Those of names that no file here has."""
     case = case_of(Path("zigzag_20_10_rate10.csv.gz"))
-    assert case.plant.state[-1] == "delta"
+    assert case.plant.state_names[-1] == "delta"
     run = fly(case, 300)
     assert abs(float(np.abs(np.diff(run["delta"])).max()) - np.radians(10.0) * 0.01) < 1e-12
     assert set(np.round(np.degrees(run["delta_cmd"]), 9)) == {20.0, -20.0}

@@ -66,9 +66,11 @@ Row = tuple[str, np.ndarray, np.ndarray, np.ndarray]
 def accelerations(hull: Hull, nu: Tensor, tau: Tensor, frame: pd.DataFrame) -> Row:
     """The right-hand side of a hull row by row: no more exact than its largest term."""
     forces = hull.terms(nu).abs() @ hull.coefficients.abs() + tau.abs()
-    parts = forces @ hull.inverse.abs().T
+    parts = forces @ hull.inverse_mass.abs().T
     truth = frame[["du", "dv", "dr"]].to_numpy()
-    allowed = rounding_bound(parts.numpy(), truth, forces.amax() * hull.inverse.abs().sum(dim=1))
+    allowed = rounding_bound(
+        parts.numpy(), truth, forces.amax() * hull.inverse_mass.abs().sum(dim=1)
+    )
     return "accelerations", hull(nu, tau).numpy(), truth, allowed
 
 

@@ -49,7 +49,7 @@ def draw(
     act `delay` samples late.
     """
     random = np.random.default_rng(seed)
-    terms = tuple(candidate.term for candidate in space.candidates(CHANNELS))
+    terms = tuple(candidate.term for candidate in space.generate_candidates(CHANNELS))
     z = record(random, count + delay, step)
     late = z[delay:].copy()
     late[:, 3:] = z[: len(z) - delay, 3:]

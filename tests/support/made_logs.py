@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from residnet.core.log import Log
-from residnet.core.names import STATE
-from residnet.data.prepare import Prepared
+from residnet.core.names import STATE_NAMES
+from residnet.data.prepare import PreparedLog
 
 
 def made(
@@ -17,32 +17,32 @@ def made(
     w: np.ndarray | None = None,
     name: str = "made",
     kind: str = "zigzag",
-) -> Prepared:
+) -> PreparedLog:
     """A prepared log from measured states [T, 6]; usable and in one piece where not said."""
     count = len(y)
     piece = np.zeros(count, dtype=int) if piece is None else piece
     usable = np.ones(count, dtype=bool) if usable is None else usable
     w = np.zeros((count, 2)) if w is None else w
     t = 3.0 + step * np.arange(count)
-    log = Log(name, t, {key: y[:, i] for i, key in enumerate(STATE)}, manoeuvre=kind)
+    log = Log(name, t, {key: y[:, i] for i, key in enumerate(STATE_NAMES)}, manoeuvre=kind)
     return prepared(log, y, w, usable & (piece >= 0), piece)
 
 
 def prepared(
     log: Log, y: np.ndarray, w: np.ndarray, usable: np.ndarray, piece: np.ndarray
-) -> Prepared:
+) -> PreparedLog:
     """Without smoothing; the accelerations are no part of an evaluation."""
-    return Prepared(
+    return PreparedLog(
         log=log,
         split="test",
         y=y,
-        smooth=y.copy(),
+        smoothed=y.copy(),
         nu_dot=np.zeros((len(y), 3)),
         w=w,
-        recorded=w,
-        piece=piece,
+        rate_inputs=w,
+        segment=piece,
         usable=usable,
-        good=usable,
+        trainable=usable,
     )
 
 

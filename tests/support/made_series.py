@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy.signal import lfilter
 
-from residnet.judge.goodness import block_interval, independent_interval
+from residnet.judge.goodness import block_bootstrap_interval, independent_confidence_interval
 
 
 def autoregressive(phi: float, count: int, length: int, seed: int) -> np.ndarray:
@@ -26,8 +26,8 @@ def coverage(phi: float, count: int, length: int, seed: int) -> dict[str, float]
     held = {"mae": 0, "mean": 0, "mae independent": 0, "mean independent": 0}
     for row in series:
         for name, values, level in (("mae", np.abs(row), truth), ("mean", row, 0.0)):
-            found = block_interval([values])
-            low, high = independent_interval(values)
-            held[name] += found.low <= level <= found.high
+            found = block_bootstrap_interval([values])
+            low, high = independent_confidence_interval(values)
+            held[name] += found.lower <= level <= found.upper
             held[f"{name} independent"] += low <= level <= high
     return {name: number / count for name, number in held.items()}

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.log import Log
-from residnet.core.names import STATE
-from residnet.data.prepare import PrepareConfig, Prepared, prepare
+from residnet.core.names import STATE_NAMES
+from residnet.data.prepare import PrepareConfig, PreparedLog, prepare_log
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.heads.base import ResidualHead, ZeroHead
@@ -73,7 +73,7 @@ def trials(
     noise: float = 0.01,
     seed: int = 0,
     window: float = 0.9,
-) -> tuple[Prepared, ...]:
+) -> tuple[PreparedLog, ...]:
     """Logs of the vessel from rest, velocities noisy, derivatives over `window` seconds (a long one
     biases them).
     """
@@ -91,15 +91,15 @@ def trials(
     )
     out = []
     for i in range(count):
-        channels = {name: states[i, :, j].copy() for j, name in enumerate(STATE)} | {
+        channels = {name: states[i, :, j].copy() for j, name in enumerate(STATE_NAMES)} | {
             "tau_x": w[i, :, 0].numpy(),
             "tau_n": w[i, :, 1].numpy(),
         }
         out.append(
-            prepare(
+            prepare_log(
                 Log(f"trial_{i}", STEP * np.arange(steps), channels, manoeuvre="made"),
                 "train",
-                SIGNALS.columns,
+                SIGNALS.input_columns,
                 config,
             )
         )

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from residnet.core.log import Log
-from residnet.data.doctor.actuators import neutral_angle
-from residnet.data.doctor.effects import OneStep
-from residnet.data.doctor.statistics import Record
-from residnet.data.simulated import SimulatedTrials, simulate
+from residnet.data.doctor.actuators import estimate_neutral_angle
+from residnet.data.doctor.effects import OneStepRegression
+from residnet.data.doctor.statistics import LogStatistics
+from residnet.data.simulated import SimulatedTrials, simulate_trial_logs
 
 Random = np.random.Generator
 Range = tuple[float, float]
@@ -72,7 +72,7 @@ def clean(ship: Ship, seed: int, kinds: Sequence[str] = KINDS[:3]) -> list[Log]:
             **{"noise": ship.noise, "trials": trials, "identification": {}, "validation": {}},
         }
     )
-    return simulate(config.draw(), config)
+    return simulate_trial_logs(config.draw_manoeuvres(), config)
 
 
 class Undecidable(Exception):
@@ -339,8 +339,8 @@ def _resting(ship: Ship, log: Log, random: Random) -> Log:
 
 @fault("rudder bias 3 deg", "rudder_bias", ships=(), hosts=_RUDDER)
 def _rudder_bias(ship: Ship, log: Log, random: Random) -> Log:
-    neutral = neutral_angle(Record(log))
-    if neutral is None or neutral.error > np.radians(0.5):
+    neutral = estimate_neutral_angle(LogStatistics(log))
+    if neutral is None or neutral.standard_error > np.radians(0.5):
         raise Undecidable
     bias = np.radians(random.uniform(3.0, 5.0)) * sign(random)
     return changed(log, delta=log["delta"] + bias)
@@ -423,8 +423,15 @@ def _inputs_late(name: str, inputs: Sequence[str], hosts: tuple[str, ...]) -> No
     @fault(name, "acausal", "contradicts_late", ships=(), hosts=hosts)
     def damage(ship: Ship, log: Log, random: Random) -> Log:
         out = late(log, ship.lag[0], *(n for n in inputs if n in log.channels))
-        before, after = (OneStep(Record(one, driving(one))) for one in (log, out))
-        if float((after.left(after.fit()) / before.left(before.fit())).max()) < 1.1:
+        before, after = (OneStepRegression(LogStatistics(one, driving(one))) for one in (log, out))
+        if (
+            float(
+                (
+                    after.residual_rms(after.fit_ridge()) / before.residual_rms(before.fit_ridge())
+                ).max()
+            )
+            < 1.1
+        ):
             raise Undecidable
         return out
 
@@ -435,7 +442,7 @@ _inputs_late("rudder late .7 s", ("delta",), _RUDDER)
 
 def _copied(ship: Ship, logs: list[Log], random: Random) -> list[Log]:
     start = len(logs[1]) // 3
-    part = logs[1].rows(slice(start, start + int(random.uniform(0.2, 0.5) * len(logs[1]))))
+    part = logs[1].select_rows(slice(start, start + int(random.uniform(0.2, 0.5) * len(logs[1]))))
     return [logs[0], logs[1], part.replace(name="cut", t=part.t - part.t[0])]
 
 

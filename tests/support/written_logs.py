@@ -19,7 +19,7 @@ from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.data.readers.base import CanonicalConfig, LogReader
 from residnet.data.readers.detect import AutoConfig
-from residnet.data.readers.recording import EVERYTHING, Recording
+from residnet.data.readers.recording import ALL_FIELDS, Recording
 from residnet.data.readers.topics import align_clocks
 
 EPOCH = 1_744_362_945
@@ -228,9 +228,9 @@ def _quaternion(log: Log) -> tuple[np.ndarray, ...]:
 
 def reader_for(path: Path) -> LogReader:
     """The reader of a file or folder that describes itself."""
-    return (CanonicalConfig() if Log.recognises(path) else AutoConfig()).build()
+    return (CanonicalConfig() if Log.is_canonical_log(path) else AutoConfig()).build()
 
 
 def recording_for(path: Path) -> Recording:
     """All that a file or folder holds, its clocks settled, before it becomes a log."""
-    return align_clocks(AutoConfig().load(path, EVERYTHING), {}, None)
+    return align_clocks(AutoConfig().load(path, ALL_FIELDS), {}, None)

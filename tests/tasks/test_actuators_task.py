@@ -13,7 +13,7 @@ import yaml
 from kinds import of_kind
 from tiny import Command, read_json, write_yaml
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.physics.actuators import DifferentialThrustConfig, Thrusters
 from residnet.physics.hull import FossenConfig
 from residnet.physics.vessel import load_vessel
@@ -63,7 +63,7 @@ def test_logs_become_lines_of_a_vessel_file(
     assert command("run", write_yaml(tmp_path / "a.yaml", config), "--out", run).code == 0
     lines = yaml.safe_load((run / "actuators.yaml").read_text()) | {"n_max": "2375 rpm"}
     lines |= {"kind": "differential_thrust", "spacing": 2.44}
-    found = validate(lines, DifferentialThrustConfig, "here")
+    found = validate_config(lines, DifferentialThrustConfig, "here")
     n = np.linspace(-2300, 2300, 50)
     known = pushed(of_kind(VESSEL.actuators.build(), Thrusters), n)
     np.testing.assert_allclose(pushed(found.build(), n), known, rtol=0, atol=0.01 * known.max())

@@ -13,10 +13,10 @@ from read_page import plain
 from tiny import call, read_json, write_yaml
 
 from residnet.core.config import load_config
-from residnet.judge.autopilots import cycling, objections
-from residnet.report.sections.autopilot import cost_verdict
+from residnet.judge.autopilots import describe_limit_cycles, list_policy_objections
+from residnet.report.sections.autopilot import cost_sentences
 from residnet.tasks.autopilot import AutopilotConfig
-from residnet.tasks.autopilot_run import stored_policy
+from residnet.tasks.autopilot_run import load_trained_policy
 
 pytestmark = pytest.mark.long
 
@@ -124,8 +124,8 @@ def test_policies_are_exported_with_their_cards_and_read_back(run: Path) -> None
     assert card["kind"] == "network"
     assert "constants" not in card
     config = load_config(run / "resolved.yaml", [], AutopilotConfig)
-    policy = stored_policy(config, run / "models", "network", 0.1)
-    policy.read_from(("psi", "u", "r"))
+    policy = load_trained_policy(config, run / "models", "network", 0.1)
+    policy.set_state_columns(("psi", "u", "r"))
     memory, s = policy.initial_state(measured.double()), module.initial_state(measured)
     for _ in range(5):
         command, s, _ = module.step(measured, torch.tensor([[0.5]]), s)
@@ -139,16 +139,18 @@ def test_the_verdict_begins_with_the_cheapest_policy() -> None:
         {"protocol": "conditions", "model": name, "kind": kind, "cost": {"mean": cost}}
         for name, (kind, cost) in costs.items()
     ]
-    first, second = cost_verdict(rows)
+    first, second = cost_sentences(rows)
     assert first.startswith("Under the stated conditions 'b' costs 6.100 s a change, 4.7 % below")
     assert "'a' costs 6.300 s" in second
-    assert objections("b", rows) == []
+    assert list_policy_objections("b", rows) == []
     rows += [{**row, "protocol": "beyond_waves", "cost": {"mean": 9.0}} for row in rows[1:]]
     rows[-1]["cost"]["mean"] = 8.0
     costly = "Do not use 'b' there: under 'waves' a flight costs 9 s, with law 8 s."
-    assert cost_verdict(rows)[1] == costly
+    assert cost_sentences(rows)[1] == costly
     rows[2]["cost"]["mean"] = 6.0
-    assert objections("b", rows) == ["under its conditions a flight costs 6.1 s, with law 6 s"]
+    assert list_policy_objections("b", rows) == [
+        "under its conditions a flight costs 6.1 s, with law 6 s"
+    ]
 
 
 def test_the_verdict_tells_a_policy_that_keeps_swinging() -> None:
@@ -162,8 +164,8 @@ def test_the_verdict_tells_a_policy_that_keeps_swinging() -> None:
         for row in rows
     ]
     said = "'a' keeps swinging in 1 of 100 flights without noise, its command by up to 40 deg; "
-    assert cost_verdict(rows)[1] == said + "not so pd."
-    assert cycling("lqr", rows)[0].endswith("not so pd.")
-    assert cycling("pd", rows) == []
+    assert cost_sentences(rows)[1] == said + "not so pd."
+    assert describe_limit_cycles("lqr", rows)[0].endswith("not so pd.")
+    assert describe_limit_cycles("pd", rows) == []
     rows[2]["cycling"] = 1
-    assert cycling("a", rows) == [said + "each tuned law does so too."]
+    assert describe_limit_cycles("a", rows) == [said + "each tuned law does so too."]

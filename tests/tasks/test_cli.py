@@ -18,13 +18,13 @@ from tiny import Command, read_json, write_yaml
 from tiny_tasks import measured
 
 from residnet.core.errors import DataError, UsageError
-from residnet.core.files import shipped_configs
-from residnet.core.progress import say
+from residnet.core.files import find_shipped_configs
+from residnet.core.progress import log_message
 from residnet.core.version import __version__
-from residnet.data.drafting.reading import log_files
+from residnet.data.drafting.reading import find_log_files
 from residnet.export import vessel
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import Outcome
+from residnet.runs.task import TaskOutcome
 from residnet.tasks.simulate import SimulateConfig
 
 CONSTANT = {"kind": "constant", "name": "turn", "drive": 0.5, "steer": 0.3}
@@ -58,7 +58,9 @@ def test_configs_are_found_by_file_or_name_and_folders_of_others_left_alone(
     assert [file.name for file in (tmp_path / "mine").iterdir()] == ["notes.txt"]
     valid = "quickstart: the config is valid (task fit, run quickstart)"
     assert valid in command("check", "quickstart").out
-    assert all(yaml.safe_load(f.read_text())["description"] for f in shipped_configs().values())
+    assert all(
+        yaml.safe_load(f.read_text())["description"] for f in find_shipped_configs().values()
+    )
 
 
 def test_a_finished_run_is_exported(
@@ -156,21 +158,21 @@ def test_folders_hold_tables_recordings_or_other_logs(tmp_path: Path) -> None:
     table = written_logs.csv(log, tables)
     # what lies beside tables is no log
     (tables / "README.txt").write_text("Trials of a boat.\n")
-    assert log_files([tables]) == [table]
+    assert find_log_files([tables]) == [table]
     # what Dataverse hands out
     tab = tabs / "trial.tab"
     tab.write_text(table.read_text().replace(",", "\t"))
-    assert log_files([tabs]) == [tab]
+    assert find_log_files([tabs]) == [tab]
     # a file that is named twice is one log
-    assert log_files([table, tables, tables / ".." / "tables" / table.name]) == [table]
+    assert find_log_files([table, tables, tables / ".." / "tables" / table.name]) == [table]
     bag_files = [written_logs.bag2(log, bags / name) for name in ("one", "two")]
-    assert log_files([bags]) == bag_files
-    assert log_files([bag_files[0]]) == bag_files[:1]
+    assert find_log_files([bags]) == bag_files
+    assert find_log_files([bag_files[0]]) == bag_files[:1]
     box = written_logs.mcap(log, boxes)
     shutil.rmtree(boxes / "whole")
-    assert log_files([boxes]) == [box]
+    assert find_log_files([boxes]) == [box]
     with pytest.raises(UsageError, match="holds no log of a format"):
-        log_files([tmp_path / "empty"])
+        find_log_files([tmp_path / "empty"])
 
 
 @pytest.mark.long
@@ -180,8 +182,8 @@ def test_the_log_of_a_run_that_ends_badly_goes_on(
 ) -> None:
     """Its lines and the traceback stay, and the next one goes on behind them."""
 
-    def broken(self: SimulateConfig, folder: RunFolder) -> Outcome:
-        say("the wind rises")
+    def broken(self: SimulateConfig, folder: RunFolder) -> TaskOutcome:
+        log_message("the wind rises")
         raise error
 
     monkeypatch.chdir(tmp_path)

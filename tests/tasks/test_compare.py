@@ -12,8 +12,8 @@ from tiny import read_json
 
 from residnet.core.errors import UsageError
 from residnet.core.run_loader import accept_run
-from residnet.tasks.compare import compare_runs, judged_runs, paired
-from residnet.tasks.registry import runs_below, runs_text
+from residnet.tasks.compare import compare_paired, compare_runs, open_fit_runs
+from residnet.tasks.registry import format_runs, list_runs
 
 
 def judged(folder: Path, size: float, more: str = "") -> Path:
@@ -46,7 +46,7 @@ def two(tmp_path: Path) -> list[Path]:
 
 def test_two_runs_side_by_side(two: list[Path], tmp_path: Path) -> None:
     text, page = compare_runs(two, tmp_path / "out")
-    entry = paired(judged_runs(two))["whole"]["second"]
+    entry = compare_paired(open_fit_runs(two))["whole"]["second"]
     assert (entry["mean"], entry["nrmse_mean"]) == pytest.approx((0.04, -0.04))
     assert entry["ci95"] == pytest.approx([-0.04, -0.04])
     assert "second (plsr) has the least error: -0.040 against first, beyond chance." in text
@@ -71,7 +71,7 @@ def test_runs_of_other_velocities_are_compared_by_what_both_move(
         row["rmse"] = {"u": row["rmse"]["u"]}
     write_json(two[1] / "metrics.json", metrics)
     accept_run(two[1])
-    entry = paired(judged_runs(two))["whole"]["second"]
+    entry = compare_paired(open_fit_runs(two))["whole"]["second"]
     # of u alone
     assert entry["nrmse_mean"] == pytest.approx(-0.04)
     assert "mean over u." in plain(compare_runs(two, tmp_path / "out")[1])
@@ -93,10 +93,10 @@ def test_the_list_of_runs_tells_how_each_ended(tmp_path: Path) -> None:
     judged(tmp_path / "good", 0.3)
     (judged(tmp_path / "deep" / "cut", 0.2) / "summary.json").write_text("{")
     (judged(tmp_path / "open", 0.1) / "summary.json").unlink()
-    entries = runs_below(tmp_path)
+    entries = list_runs(tmp_path)
     states = {Path(entry["run"]).name: entry["state"] for entry in entries}
     assert states == {"good": "finished", "cut": "damaged", "open": "unfinished"}
-    assert "nrmse 0.3" in runs_text(tmp_path, entries)
-    assert runs_text(tmp_path / "none", []).endswith("no runs")
+    assert "nrmse 0.3" in format_runs(tmp_path, entries)
+    assert format_runs(tmp_path / "none", []).endswith("no runs")
     with pytest.raises(UsageError, match="no such folder"):
-        runs_below(tmp_path / "nowhere")
+        list_runs(tmp_path / "nowhere")

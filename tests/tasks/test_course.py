@@ -160,12 +160,14 @@ def test_a_policy_flies_the_course_and_is_exported(
 def test_vessels_and_currents_fill_their_ranges_and_come_again_with_their_seed() -> None:
     settings: dict[str, Any] = {"effect": (0.8, 1.1), "time": (0.9, 1.3), "bias": 0.01}
     spread = CourseSpreadConfig(flights=2000, seed=3, current=0.4, **settings)
-    variation, current = spread.draw()
+    variation, current = spread.sample_vessels()
     assert variation.amin(0).tolist() == pytest.approx([0.8, 0.9, -0.01], abs=2e-3)
     assert variation.amax(0).tolist() == pytest.approx([1.1, 1.3, 0.01], abs=2e-3)
     assert current.norm(dim=1).tolist() == pytest.approx([0.4] * 2000)
     # from all directions alike: the mean of unit vectors has a standard deviation of 1/sqrt(2 N)
     # each way
     assert current.mean(0).abs().max() < 0.4 * 4 / math.sqrt(4000)
-    assert torch.equal(spread.draw().variation, variation)
-    assert not torch.equal(CourseSpreadConfig(flights=2000, seed=4).draw().current, current)
+    assert torch.equal(spread.sample_vessels().variation, variation)
+    assert not torch.equal(
+        CourseSpreadConfig(flights=2000, seed=4).sample_vessels().current, current
+    )

@@ -235,7 +235,7 @@ def test_evaluate_locks_its_folder(
 ) -> None:
     monkeypatch.setattr(folders, "_PATIENCE", 1)
     out = tmp_path / "out"
-    with RunFolder(out).held():
+    with RunFolder(out).lock():
         said = command("evaluate", tiny_run, flown / "logs", "--out", out, "--quiet")
     assert said.code == 2
     assert said.err.count("\n") == 1

@@ -18,10 +18,10 @@ import pytest
 import torch
 from tiny import TINY, Command, read_json, write_yaml
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.data.simulated import SimulatedTrials
 from residnet.dynamics.store import load_model
-from residnet.judge.verdict import LEVELS
+from residnet.judge.verdict import LEVEL_TEXTS
 
 ALONE: dict[str, Any] = {**TINY, "ensembles": {}, "training": {}, "export": {"models": []}}
 
@@ -51,7 +51,7 @@ def test_the_card_of_an_export_holds_what_the_run_says(tiny_run: Path) -> None:
     torch.jit.load(str(tiny_run / "exports" / "lstm.pt"), _extra_files=extra)
     card, doctor = json.loads(extra["card.json"]), read_json(tiny_run / "doctor.json")
     summary = read_json(tiny_run / "summary.json")
-    assert card["level"] in LEVELS
+    assert card["level"] in LEVEL_TEXTS
     assert all(sentence.strip() for sentence in card["verdict"])
     assert card["verdict"]
     if summary["level"] == card["level"]:
@@ -230,12 +230,12 @@ def test_currents_are_found_and_models_fitted_without_them(
     # 0.118 in calm water
     assert errors["with"] < 0.15 < 0.5 < errors["without"]
     assert not (tmp_path / "without" / "currents.json").exists()
-    data = validate(drifting, SimulatedTrials, "here")
-    kinds = [manoeuvre.kind for manoeuvre in data.draw()]
+    data = validate_config(drifting, SimulatedTrials, "here")
+    kinds = [manoeuvre.kind for manoeuvre in data.draw_manoeuvres()]
     names = [f"{kind}_{kinds[: i + 1].count(kind):02d}" for i, kind in enumerate(kinds)]
-    known = dict(zip(names, data.disturbance.currents(len(names), data.seed), strict=True))
+    known = dict(zip(names, data.disturbance.draw_currents(len(names), data.seed), strict=True))
     table = read_json(tmp_path / "with" / "currents.json")
-    splits = zip(names, data.splits(data.draw()), strict=True)
+    splits = zip(names, data.assign_splits(data.draw_manoeuvres()), strict=True)
     assert {row["log"]: row["fitted"] for row in table} == {n: s != "test" for n, s in splits}
     for row in table:
         found = [row["current_north"], row["current_east"]]

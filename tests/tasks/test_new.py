@@ -16,14 +16,14 @@ from foreign_tables import Style
 from kinds import of_kind
 
 import residnet
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.readers import ReaderConfig
-from residnet.data.sources import read_logs
-from residnet.identification.prepared import prepare_logs
-from residnet.identification.recipe import judging, window_length
-from residnet.tasks.drafting import new_config
+from residnet.data.sources import read_split_logs
+from residnet.identification.prepared import prepare_splits
+from residnet.identification.recipe import choose_window_length, make_evaluation_settings
+from residnet.tasks.drafting import write_new_config
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.registry import load_task
 
@@ -60,13 +60,15 @@ def test_free_runs_are_no_longer_than_most_logs() -> None:
         ([30.0], 20.0),
         ([], 0.5),
     ):
-        assert window_length(lengths, 20.0) == expected
+        assert choose_window_length(lengths, 20.0) == expected
 
 
 def test_the_length_of_the_test_logs_enters_no_choice() -> None:
     lengths = {"train": [180.0] * 3, "validation": [180.0]}
     splits = {name: [lasting(s) for s in each] for name, each in {**lengths, "test": []}.items()}
-    long, short = (judging(splits, {**lengths, "test": [s]}, 20.0) for s in (180.0, 15.0))
+    long, short = (
+        make_evaluation_settings(splits, {**lengths, "test": [s]}, 20.0) for s in (180.0, 15.0)
+    )
     assert long["selection"] == short["selection"] == "T100"
     assert long["scales"] == short["scales"]
     assert list(long["protocols"]) == list(short["protocols"])[:2] == ["T100", "T40"]
@@ -81,15 +83,15 @@ def test_free_runs_are_as_short_as_gaps_ask_for(tmp_path: Path, logs: list[Log])
     }
     log.replace(channels=holes).save(tmp_path / "holes.parquet")
     out = tmp_path / "holes.yaml"
-    new_config([tmp_path / "holes.parquet"], out, None, overwrite=False)
+    write_new_config([tmp_path / "holes.parquet"], out, None, overwrite=False)
     task = of_kind(load_task(out), FitConfig)
     # refuses a log that holds no window
-    assert all(prepare_logs(read_logs(task.data), task).values())
+    assert all(prepare_splits(read_split_logs(task.data), task).values())
 
 
 def test_a_config_from_logs_alone(folder: Path) -> None:
     out = folder / "boat.yaml"
-    lines = new_config([folder / "trials"], out, None, overwrite=False)
+    lines = write_new_config([folder / "trials"], out, None, overwrite=False)
     assert lines[-1] == f"next: residnet run {out}"
     load_task(out).check()
     text = out.read_text()
@@ -106,28 +108,28 @@ def test_a_config_from_logs_alone(folder: Path) -> None:
         above = text[: text.index(line)].rstrip().splitlines()[-1]
         assert above.strip().startswith("#"), line
     # the same from Python
-    draft = residnet.draft(folder / "trials", name="boat", folder=folder)
+    draft = residnet.draft_config(folder / "trials", name="boat", folder=folder)
     assert draft.config == content
     assert "data.split" in dict(draft.guesses)
     for file, said in (("boat.yaml", "exists; give --overwrite"), ("a.txt", r"name it .*a\.txt\.")):
         with pytest.raises(UsageError, match=said):
-            new_config([folder / "trials"], folder / file, None, overwrite=False)
+            write_new_config([folder / "trials"], folder / file, None, overwrite=False)
 
 
 def test_one_log_is_cut_in_time(folder: Path) -> None:
     only = sorted((folder / "trials").glob("*.csv"))[0]
-    draft = residnet.draft(only, folder=folder)
+    draft = residnet.draft_config(only, folder=folder)
     assert draft.config["data"]["split"]["test"] == [{"log": only.name, "from": "47.9 s"}]
     assert any("cut in time" in why for _, why in draft.guesses)
     out = folder / "Fähre Süd.yaml"
-    assert new_config([only], out, None, overwrite=False)[-1] == f"next: residnet run '{out}'"
+    assert write_new_config([only], out, None, overwrite=False)[-1] == f"next: residnet run '{out}'"
     assert yaml.safe_load(out.read_text())["name"] == "Fahre_Sud"
 
 
 def test_answers_are_taken(logs: list[Log], tmp_path: Path) -> None:
     for file in foreign_tables.write(logs, tmp_path, Style(units={"r": "°/min"})):
         file.write_text(file.read_text().replace("[°/min]", "[deg/s]"))
-    draft = residnet.draft(tmp_path, folder=tmp_path, answer=lambda asked: asked.options[-1])
+    draft = residnet.draft_config(tmp_path, folder=tmp_path, answer=lambda asked: asked.options[-1])
     assert draft.config["data"]["reader"]["channels"]["r"]["unit"] == "deg/s"
     assert "answered 'deg/s' in place of 'deg/min'" in draft.text
 
@@ -141,10 +143,10 @@ def test_what_cannot_be_drafted(logs: list[Log], tmp_path: Path) -> None:
         ("lost", "no channel psi"),
     ):
         with pytest.raises((UsageError, DataError), match=said):
-            residnet.draft(tmp_path / name)
+            residnet.draft_config(tmp_path / name)
     still = [log.replace(channels={**log.channels, "n": np.full(len(log), 3.0)}) for log in logs]
     foreign_tables.write(still, tmp_path / "still", Style(left_out=("delta",)))
-    draft = residnet.draft(tmp_path / "still", folder=tmp_path)
+    draft = residnet.draft_config(tmp_path / "still", folder=tmp_path)
     assert draft.config["signals"]["inputs"] == []
     assert "no channel of the logs is a rudder" in dict(draft.guesses)["signals.inputs"]
 
@@ -166,14 +168,14 @@ def test_logs_of_a_simulated_boat_as_recorders_write_them(write: str, tmp_path: 
         pytest.importorskip(needs[write])
     log = written_logs.trial(60.0)
     path = WRITERS[write](log, tmp_path)
-    draft = residnet.draft(path, folder=tmp_path)
+    draft = residnet.draft_config(path, folder=tmp_path)
     told = {"csv", "mat5", "mcap", "bag2"}
     assert set(draft.config["signals"]["inputs"]) == (
         {"cmd_port", "cmd_stbd"} if write in told else set()
     )
     guessed = " ".join(why for _, why in draft.guesses)
     assert ("can only predict how the vessel coasts" in guessed) == (write not in told)
-    read = validate(draft.config["data"]["reader"], ReaderConfig, "here").build().read(path)
+    read = validate_config(draft.config["data"]["reader"], ReaderConfig, "here").build().read(path)
     np.testing.assert_allclose(read["u"][5:-5], log["u"][5:-5], atol=2e-3)
 
 
@@ -189,11 +191,13 @@ def test_a_struct_is_read_by_the_names_of_its_fields(tmp_path: Path) -> None:
     for path, moves in zip(paths, (0.0, 1.0), strict=True):
         data = fields | {"cmd_stbd": 4.0 + moves * log["cmd_stbd"]}
         scipy.io.savemat(path, {"trial": data})
-    draft = residnet.draft(tmp_path, folder=tmp_path)
+    draft = residnet.draft_config(tmp_path, folder=tmp_path)
     channels = draft.config["data"]["reader"]["channels"]
     assert {name: channels[name]["unit"] for name in "uvr"} == {"u": "kn", "v": "m/s", "r": "deg/s"}
     assert draft.config["signals"]["inputs"] == ["cmd_port", "cmd_stbd"]
     assert "data.reader.channels.v" in dict(draft.guesses)
-    read = validate(draft.config["data"]["reader"], ReaderConfig, "here").build().read(paths[1])
+    read = (
+        validate_config(draft.config["data"]["reader"], ReaderConfig, "here").build().read(paths[1])
+    )
     np.testing.assert_allclose(read["u"][5:-5], log["u"][5:-5], atol=2e-3)
     np.testing.assert_allclose(read["r"][5:-5], log["r"][5:-5], atol=2e-3)

@@ -11,12 +11,12 @@ import pandas as pd
 import pytest
 from pydantic import ValidationError
 
-from residnet.control.heading.turning import Turning
+from residnet.control.heading.turning import NomotoModel
 from residnet.core.config import load_config, load_mapping
 from residnet.core.errors import UsageError
-from residnet.core.progress import listen
-from residnet.tasks.autopilot import AutopilotConfig, least_time
-from residnet.tasks.own_autopilot import draft_autopilot
+from residnet.core.progress import on_progress
+from residnet.tasks.autopilot import AutopilotConfig, minimum_turn_time
+from residnet.tasks.own_autopilot import draft_autopilot_config
 
 GAIN, TIME, GEAR, DELAY, NOISE, SPEED = 0.31, 7.4, 6.0, 0.3, 0.15, 2.5
 
@@ -47,7 +47,7 @@ def zigzag(file: Path, angle: float, seed: int) -> Path:
 
 def test_logs_give_the_vessel_and_the_conditions(tmp_path: Path) -> None:
     logs = [zigzag(tmp_path / f"zigzag{a}.csv", a, a) for a in (10, 20)]
-    file = draft_autopilot(logs, tmp_path / "mine.yaml")
+    file = draft_autopilot_config(logs, tmp_path / "mine.yaml")
     vessel = load_mapping(tmp_path / "mine_vessel.yaml")
     assert vessel["K"]["value"] == pytest.approx(GAIN, rel=0.03)
     assert vessel["T"]["value"] == pytest.approx(TIME, rel=0.05)
@@ -68,12 +68,14 @@ def test_logs_give_the_vessel_and_the_conditions(tmp_path: Path) -> None:
 
 def test_gain_and_time_are_enough(tmp_path: Path) -> None:
     told: list[str] = []
-    with listen(lambda progress: told.append(progress.message)):
-        file = draft_autopilot(["0.31, 7.4"], tmp_path / "kt.yaml", rate="6 deg/s", rudder="15 deg")
+    with on_progress(lambda progress: told.append(progress.message)):
+        file = draft_autopilot_config(
+            ["0.31, 7.4"], tmp_path / "kt.yaml", rate="6 deg/s", rudder="15 deg"
+        )
     assert any("give --speed" in line for line in told)
     config = load_config(file, [], AutopilotConfig)
-    assert math.degrees(config.steered.rate or 0.0) == pytest.approx(6.0)
-    turning = config.steered.turning(config.rudder, config.turning_time)
+    assert math.degrees(config.steered_vessel.rate or 0.0) == pytest.approx(6.0)
+    turning = config.steered_vessel.estimate_nomoto(config.rudder, config.turning_time)
     # the gear's way to its angle is no part of T
     assert turning.time == pytest.approx(7.4, rel=0.02)
     for given, out, rudder, said in (
@@ -83,7 +85,7 @@ def test_gain_and_time_are_enough(tmp_path: Path) -> None:
         ("0.31,7.4", "other", "15 kg", "rudder"),
     ):
         with pytest.raises(UsageError, match=said):
-            draft_autopilot([given], tmp_path / f"{out}.yaml", rudder=rudder)
+            draft_autopilot_config([given], tmp_path / f"{out}.yaml", rudder=rudder)
 
 
 CONFIG: dict[str, Any] = {
@@ -100,18 +102,20 @@ CONFIG: dict[str, Any] = {
 
 def test_the_least_time_is_that_of_two_pulses() -> None:
     # without damping: half the way at full acceleration, half at full braking
-    turning = Turning(1e4, 1e6, 1.0)
+    turning = NomotoModel(1e4, 1e6, 1.0)
     acceleration = turning.gain * 0.1 / turning.time
     two = 2.0 * math.sqrt(math.radians(30.0) / acceleration)
-    assert least_time(turning, 0.1, None) == pytest.approx(two, rel=1e-3)
+    assert minimum_turn_time(turning, 0.1, None) == pytest.approx(two, rel=1e-3)
     # at once at its speed: the angle over the yaw rate
-    quick = Turning(1.0, 1e-4, 1.0)
-    assert least_time(quick, 0.1, None) == pytest.approx(math.radians(30.0) / 0.1, rel=1e-3)
-    assert least_time(quick, 0.1, 0.05) == pytest.approx(math.radians(30.0) / 0.1 + 4.0, rel=1e-3)
+    quick = NomotoModel(1.0, 1e-4, 1.0)
+    assert minimum_turn_time(quick, 0.1, None) == pytest.approx(math.radians(30.0) / 0.1, rel=1e-3)
+    assert minimum_turn_time(quick, 0.1, 0.05) == pytest.approx(
+        math.radians(30.0) / 0.1 + 4.0, rel=1e-3
+    )
 
 
 def test_times_follow_the_pace_and_delays_do_not() -> None:
-    slow = AutopilotConfig.model_validate(CONFIG | {"pace": 8.0}).paced()
+    slow = AutopilotConfig.model_validate(CONFIG | {"pace": 8.0}).with_scaled_times()
     assert slow.conditions is not None
     assert (slow.test.duration, slow.test.dt) == (112.0, 0.16)
     for conditions in (slow.conditions.stated, slow.conditions.beyond["late"]):
@@ -119,13 +123,13 @@ def test_times_follow_the_pace_and_delays_do_not() -> None:
         assert conditions.overshoot_weight == 4.0
     assert slow.conditions.stated.delay == (0.0, 0.4)
     assert slow.policies["learned"].training.dt == 0.32
-    assert slow.paced() == slow
-    odd = AutopilotConfig.model_validate(CONFIG | {"pace": 2.9}).paced()
+    assert slow.with_scaled_times() == slow
+    odd = AutopilotConfig.model_validate(CONFIG | {"pace": 2.9}).with_scaled_times()
     assert odd.test.dt == 0.058
 
 
 def test_the_pace_of_a_vessel_is_measured_and_belongs_to_conditions() -> None:
-    slow = AutopilotConfig.model_validate(CONFIG | {"pace": "vessel"}).paced()
+    slow = AutopilotConfig.model_validate(CONFIG | {"pace": "vessel"}).with_scaled_times()
     assert slow.test.duration == pytest.approx(14.0 * 8.7, rel=0.05)
     without = CONFIG | {"pace": 2.0, "conditions": None, "policies": {}, "peers": {}}
     without |= {"predictive": {"document": {"horizon": 2.0}}}

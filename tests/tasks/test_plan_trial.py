@@ -12,7 +12,7 @@ from read_page import Page, plain
 
 from residnet.core.log import Log
 from residnet.manoeuvres.closed_loop import Zigzag
-from residnet.tasks.fit_service import PlannedTrials
+from residnet.tasks.fit_service import NextTrials
 
 
 def trial(name: str, volume: float) -> Any:
@@ -28,12 +28,12 @@ def trial(name: str, volume: float) -> Any:
 def test_what_to_run_stands_in_table_page_and_files(tmp_path: Path) -> None:
     trials: Any = [trial("zigzag_1", 3.0), trial("turn_1", 2.0)]
     plan: Any = SimpleNamespace(trials=trials, chosen=trials[:1], shrinks=0.4)
-    planned = PlannedTrials("hull", plan)
-    text = planned.text().splitlines()
+    planned = NextTrials("hull", plan)
+    text = planned.to_text().splitlines()
     assert text[0].startswith("Candidates for hull")
     assert text[2].split() == ["zigzag_1", "0.5", "12", "25.0", "3.00"]
     assert text[-1].startswith("Run zigzag_1: together they narrow the intervals")
-    files = planned.write(tmp_path)
+    files = planned.write_files(tmp_path)
     assert [file.name for file in files] == ["next_trials.yaml", "next_tracks.csv", "report.html"]
     assert yaml.safe_load(files[0].read_text())["manoeuvres"][0]["kind"] == "zigzag"
     page = plain(files[2])

@@ -9,9 +9,9 @@ import pytest
 from read_page import Page, plain
 from tiny import TINY, Command, call, read_json, write_yaml
 
-from residnet.core.config import validate
-from residnet.data.simulated import SimulatedTrials, simulate
-from residnet.runs.folder import require_sealed
+from residnet.core.config import validate_config
+from residnet.data.simulated import SimulatedTrials, simulate_trial_logs
+from residnet.runs.folder import verify_checksums
 
 pytestmark = pytest.mark.long
 
@@ -48,10 +48,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def new_logs(folder: Path, weaker: float) -> list[Any]:
     """Write logs of a vessel whose starboard propeller pushes by a share less."""
-    data = validate({**DATA, "seed": 7}, SimulatedTrials, "test")
+    data = validate_config({**DATA, "seed": 7}, SimulatedTrials, "test")
     folder.mkdir()
     words: list[Any] = []
-    for number, log in enumerate(simulate(data.draw(), data)[:4]):
+    for number, log in enumerate(simulate_trial_logs(data.draw_manoeuvres(), data)[:4]):
         # the log tells more revolutions than those that push, as the thrust grows with the square
         told = log.channels["n_stbd"] / (1.0 - weaker) ** 0.5
         log.replace(channels={**log.channels, "n_stbd": told}).save(folder / f"{number}.parquet")
@@ -72,7 +72,7 @@ def test_a_refit_leaves_the_old_run_alone_and_can_be_exported(
     assert alarms[-1][2] == "gain n_stbd"
     assert [line[1] for line in causes].count("gain n_stbd") == 4
     assert {file: file.read_bytes() for file in run.rglob("*") if file.is_file()} == before
-    require_sealed(run)
+    verify_checksums(run)
     found = read_json(tmp_path / "page" / "monitor.json")[-1]["refit"]
     (change,) = found["changes"]
     assert change["cause"] == "gain n_stbd"

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import short_configs
 
-from residnet.core.files import config_folder
+from residnet.core.files import find_config_folder
 from residnet.tasks.registry import load_task
 
 CONFIGS = sorted(
-    path.relative_to(config_folder()).with_suffix("").as_posix()
-    for path in config_folder().rglob("*.yaml")
+    path.relative_to(find_config_folder()).with_suffix("").as_posix()
+    for path in find_config_folder().rglob("*.yaml")
     if path.parent.name != "vessels"
 )
 
@@ -30,7 +30,7 @@ def test_the_overrides_of_a_row_are_valid(
     if row.after:
         (tmp_path / row.after).mkdir()
     given = [override.replace("{runs}", str(tmp_path)) for override in row.overrides]
-    assert load_task(config_folder() / f"{name}.yaml", given).name
+    assert load_task(find_config_folder() / f"{name}.yaml", given).name
 
 
 def test_what_cannot_run_is_skipped_and_what_fails_has_failed(

@@ -14,7 +14,7 @@ from tiny import TINY, Command, call, read_json, write_yaml
 
 from residnet.core.log import Log
 from residnet.data.readers.base import CanonicalConfig
-from residnet.data.simulated import SimulatedTrials, simulate
+from residnet.data.simulated import SimulatedTrials, simulate_trial_logs
 from residnet.tasks.registry import load_task
 
 STEP = 0.1
@@ -48,7 +48,7 @@ def logs_of(run: Path) -> dict[str, Log]:
 def flown(folder: Path, **content: Any) -> dict[str, Log]:
     """The logs of a run without a report."""
     file = of(folder, **content)
-    load_task(file).run(source=file, out=folder, report=False)
+    load_task(file).run(source=file, output_folder=folder, report=False)
     return logs_of(folder)
 
 
@@ -172,7 +172,11 @@ def test_trials_are_drawn_split_and_read_by_inspect(tmp_path: Path, command: Com
     settings = {**TINY["data"], "duration": 6, "trials": trials, **counts}
     logs = flown(tmp_path / "run", data=settings)
     data = SimulatedTrials.model_validate(settings)
-    found = zip(simulate(data.draw(), data), data.splits(data.draw()), strict=True)
+    found = zip(
+        simulate_trial_logs(data.draw_manoeuvres(), data),
+        data.assign_splits(data.draw_manoeuvres()),
+        strict=True,
+    )
     expected = {f"{split}/{log.name}": log for log, split in found}
     assert logs.keys() == expected.keys()
     for name, log in expected.items():

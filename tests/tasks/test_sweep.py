@@ -18,10 +18,10 @@ from read_page import plain
 from tiny import STUDY, SWEEP, TINY, Command, read_json, write_yaml
 
 from residnet.core.config import load_config
-from residnet.core.processes import ApartProcesses
+from residnet.core.processes import IsolatedProcessPool
 from residnet.core.progress import Progress
 from residnet.tasks import sweep as running
-from residnet.tasks.sweep import SweepConfig, Trials, open_study, watch
+from residnet.tasks.sweep import SweepConfig, TrialQueue, make_pruning_callback, open_optuna_study
 
 optuna = pytest.importorskip("optuna")
 
@@ -54,7 +54,7 @@ def test_a_grid_is_searched_whole_and_resumed(
     sweep: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
     out = tmp_path / "out"
-    real, begun = running.carry_out_trial, []
+    real, begun = running.run_sweep_trial, []
 
     def killed(*words: Any) -> Any:
         begun.append(words[3])
@@ -97,11 +97,11 @@ def test_values_of_a_random_search_hang_on_its_seed_alone(sweep: Path, tmp_path:
         drawn: list[Any] = []
         # what a resumed sweep draws goes on as the undisturbed one does
         for stop in (7, 20, 30):
-            trials = Trials(config, open_study(config, folder))
-            while len(drawn) < stop and (trial := trials.next()):
+            trials = TrialQueue(config, open_optuna_study(config, folder))
+            while len(drawn) < stop and (trial := trials.start_next()):
                 drawn.append(trial.params["heads.ridge.penalty"])
                 trials.study.tell(trial.number, 1.0)
-        assert trials.next() is None
+        assert trials.start_next() is None
         assert len(drawn) == 30
         assert all(1e-6 <= value <= 1.0 for value in drawn)
         # evenly in the logarithm
@@ -113,12 +113,12 @@ def test_values_of_a_random_search_hang_on_its_seed_alone(sweep: Path, tmp_path:
 def test_a_poor_trial_is_ended_early(sweep: Path, tmp_path: Path) -> None:
     words = ["pruning={startup: 3}", "search={kind: random, trials: 5}"]
     config = load_config(sweep, words, SweepConfig)
-    trials = Trials(config, open_study(config, tmp_path))
+    trials = TrialQueue(config, open_optuna_study(config, tmp_path))
 
     def heard(number: int) -> Any:
-        trial: Any = trials.next()
+        trial: Any = trials.start_next()
         assert trial.number == number
-        return watch(config, tmp_path, trial._trial_id)
+        return make_pruning_callback(config, tmp_path, trial._trial_id)
 
     for number, level in enumerate((1.0, 2.0, 3.0)):
         told = heard(number)
@@ -177,7 +177,7 @@ def test_a_lost_process_costs_its_own_trial_alone(
         begun.append(words[3])
         if words[3] == 1 or begun == [0]:
             raise BrokenProcessPool("a process ended")
-        return running.Ended(float(words[3]), False, "", 0.0)
+        return running.TrialResult(float(words[3]), False, "", 0.0)
 
     monkeypatch.setattr(running, "carry_out_trial", lost)
     space = {**SWEEP["space"], WINDOW: {"choices": [0.9, 1.1, 1.3]}}
@@ -190,7 +190,7 @@ def test_a_lost_process_costs_its_own_trial_alone(
 
 
 def test_a_process_that_is_killed_is_replaced() -> None:
-    with ApartProcesses(1) as pool:
+    with IsolatedProcessPool(1) as pool:
         with pytest.raises(BrokenProcessPool):
             pool.submit(os._exit, 1).result()
         assert pool.submit(abs, -2).result() == 2

@@ -7,7 +7,11 @@ import math
 import pytest
 import torch
 
-from residnet.control.heading.conditions import ConditionsConfig, Flights, SteadinessLimits
+from residnet.control.heading.conditions import (
+    ClosedLoopTrajectories,
+    ConditionsConfig,
+    SteadinessLimits,
+)
 from residnet.control.heading.controllers import ObservedPolicySpec, PtosConfig
 from residnet.control.heading.policies import ObservedPolicy
 from residnet.control.heading.vessels import SteeredPlant
@@ -45,7 +49,7 @@ def test_training_lowers_the_cost_of_flights_that_it_does_not_see() -> None:
         notes = train_policy("policy", made, VESSEL, settings, CONDITIONS, 3, None)
         found.append((notes["best_validation"], made.constants.tolist()))
     assert notes["best_validation"] < 0.97 * notes["start_validation"]
-    assert made.values()["steepness"] < 250.0
+    assert made.constant_values()["steepness"] < 250.0
     assert found[0] == found[1]
 
 
@@ -96,7 +100,7 @@ def test_epochs_that_swing_come_after_those_that_do_not() -> None:
 
 def test_swing_and_nominal_overshoot_cost_beyond_what_is_free() -> None:
     fit = fitted(PolicyTraining(dt=0.1, hold=0.0, validation=4, calm=0.5, exact=2.0))
-    changes = CONDITIONS.draw(16, 0.1, torch.Generator().manual_seed(0))
+    changes = CONDITIONS.sample_steps(16, 0.1, torch.Generator().manual_seed(0))
     time = 0.1 * torch.arange(changes.push.shape[1])
     wave = torch.sin(2.0 * math.pi * time)
     over = torch.full((16,), math.radians(0.1))
@@ -104,9 +108,9 @@ def test_swing_and_nominal_overshoot_cost_beyond_what_is_free() -> None:
     def cost(amplitude: float, swinging: int) -> float:
         command = torch.zeros(16, len(time))
         command[:swinging] = math.radians(amplitude) * wave
-        about = (changes.dt, ("psi",), HEADING, changes.start, changes.count)
+        about = (changes.dt, ("psi",), HEADING, changes.step_index, changes.n_counted)
         states = torch.zeros(16, len(time) + 1, 1)
-        flown = Flights(states, command, changes.heading, *about)
+        flown = ClosedLoopTrajectories(states, command, changes.target, *about)
         return float(fit._unsteady(flown, over, 8))
 
     # 0.2 s are the overshoot; half of what an epoch may swing is free; of eight quiet flights the

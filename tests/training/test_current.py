@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from residnet.baselines.regressors import RegressorsConfig
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import FitError
-from residnet.data.prepare import PrepareConfig, Prepared, prepare, samples
-from residnet.data.simulated import SimulatedTrials, simulate
+from residnet.data.prepare import PrepareConfig, PreparedLog, make_samples, prepare_log
+from residnet.data.simulated import SimulatedTrials, simulate_trial_logs
 from residnet.physics.signals import SignalsConfig
 from residnet.training import current as module
 from residnet.training.current import CurrentConfig, estimate_currents, through_water
@@ -47,16 +47,16 @@ TRIALS = {
 
 
 @cache
-def sailed(*, drifting: bool = False, exact: bool = False) -> tuple[list[Prepared], np.ndarray]:
+def sailed(*, drifting: bool = False, exact: bool = False) -> tuple[list[PreparedLog], np.ndarray]:
     """Logs of the simulated catamaran and the current of each."""
     change: dict[str, object] = {"seed": 0}
     change |= {"disturbance": {"current_each": [0.1, 0.5]}} if drifting else {}
     change |= {"noise": {"u": 0, "v": 0, "r": 0}} if exact else {}
-    config = validate({**TRIALS, **change}, SimulatedTrials, "here")
-    logs = simulate(config.draw(), config)
+    config = validate_config({**TRIALS, **change}, SimulatedTrials, "here")
+    logs = simulate_trial_logs(config.draw_manoeuvres(), config)
     return [
-        prepare(log, "train", SIGNALS.columns, PREPARE) for log in logs
-    ], config.disturbance.currents(len(logs), config.seed)
+        prepare_log(log, "train", SIGNALS.input_columns, PREPARE) for log in logs
+    ], config.disturbance.draw_currents(len(logs), config.seed)
 
 
 def test_a_drifting_frame_is_calm_water() -> None:
@@ -68,10 +68,10 @@ def test_a_drifting_frame_is_calm_water() -> None:
     calm, _ = sailed(exact=True)
     logs, currents = sailed(exact=True, drifting=True)
     model = fossen.build(signals.names)
-    fossen.fit(model, samples(calm, signals))
+    fossen.fit_preferred(model, make_samples(calm, signals))
 
-    def left(logs: list[Prepared]) -> np.ndarray:
-        known = samples(logs, signals)
+    def left(logs: list[PreparedLog]) -> np.ndarray:
+        known = make_samples(logs, signals)
         with torch.no_grad():
             return np.asarray((known.target - model(known.z)).square().mean(0).sqrt())
 
@@ -92,10 +92,10 @@ def test_wind_is_that_of_the_frame() -> None:
     signals = SignalsConfig(inputs=("n", "delta"), exogenous=("wind_speed", "wind_dir")).build()
     log = sailed()[0][0]
     windy = np.concatenate((log.w, np.tile([5.0, 0.7], (len(log), 1))), axis=1)
-    log = dataclasses.replace(log, w=windy, recorded=windy)
+    log = dataclasses.replace(log, w=windy, rate_inputs=windy)
     moved = through_water(log, np.array([0.8, -0.5]), signals)
     before, after = (
-        signals(torch.from_numpy(p.smooth), signals.prepare(torch.from_numpy(p.recorded)))
+        signals(torch.from_numpy(p.smoothed), signals.prepare(torch.from_numpy(p.rate_inputs)))
         for p in (log, moved)
     )
     # the air that the vessel feels is the same, whatever frame it is told in
@@ -142,7 +142,7 @@ LINEAR = RegressorsConfig(sets=("linear",))
 def test_a_log_without_samples_is_named() -> None:
     logs, _ = sailed()
     signals = SIGNALS.build()
-    empty = dataclasses.replace(logs[0], good=np.zeros(len(logs[0]), dtype=bool))
+    empty = dataclasses.replace(logs[0], trainable=np.zeros(len(logs[0]), dtype=bool))
     told = "log constant_01: has no sample to estimate its current from"
     with pytest.raises(FitError, match=told):
         estimate_currents(LINEAR.build(signals.names), signals, [empty, logs[1]], CurrentConfig())

@@ -18,11 +18,11 @@ from made_system import LINEAR, SCALES, STEP, free_run_error, inputs, model_of, 
 from torch import Tensor, nn
 
 from residnet.baselines.regressors import RegressorsConfig
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, DataError, FitError, UsageError
 from residnet.core.samples import Samples
-from residnet.data.module import Windows, WindowsDataModule
-from residnet.data.prepare import Prepared, samples
+from residnet.data.module import WindowBatch, WindowsDataModule
+from residnet.data.prepare import PreparedLog, make_samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
@@ -69,7 +69,7 @@ def test_stage_of_each_epoch(lengths: tuple[int, ...], expected: list[tuple[int,
 )
 def test_wrong_configs(content: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
-        validate(content, TrainingConfig, "training")
+        validate_config(content, TrainingConfig, "training")
     assert "\n" not in str(caught.value)
 
 
@@ -97,7 +97,7 @@ def with_mlp() -> HybridDynamics:
 
 def layers(model: HybridDynamics) -> tuple[nn.Linear, nn.Linear]:
     """The hidden and the last layer of the head."""
-    net = of_kind(model.head, MlpHead).net
+    net = of_kind(model.head, MlpHead).network
     return of_kind(net[0], nn.Linear), of_kind(net[2], nn.Linear)
 
 
@@ -193,23 +193,23 @@ HALF_SECOND = {"horizon": 0.5, "epochs": 2, "batch": 8}
 
 
 @pytest.fixture(scope="module")
-def logs() -> Sequence[Prepared]:
+def logs() -> Sequence[PreparedLog]:
     return trials()
 
 
 def prepared(
-    logs: Sequence[Prepared], head: Any = None
+    logs: Sequence[PreparedLog], head: Any = None
 ) -> tuple[HybridDynamics, Samples, WindowStore]:
     """A linear baseline of the quadratic vessel with a fresh head on it."""
     torch.manual_seed(1)
     model = model_of(
         LINEAR, head=(head or MlpConfig(hidden=(12,))).build(("u", "v", "r", "tau_x", "tau_n"))
     )
-    known = samples(logs, model.signals)
-    RegressorsConfig(terms=LINEAR).fit(model.baseline, known)
+    known = make_samples(logs, model.signals)
+    RegressorsConfig(terms=LINEAR).fit_preferred(model.baseline, known)
     with torch.no_grad():
         residual = known.with_target(known.target - model.baseline(known.z))
-    return model, residual, WindowStore.gather(logs)
+    return model, residual, WindowStore.from_logs(logs)
 
 
 def state_of(model: HybridDynamics) -> dict[str, Tensor]:
@@ -230,7 +230,7 @@ class Scripted:
 
 
 def trained(
-    logs: Sequence[Prepared],
+    logs: Sequence[PreparedLog],
     folder: Path,
     validate: Validate,
     **config: Any,
@@ -246,7 +246,7 @@ def same(one: dict[str, Tensor], two: dict[str, Tensor]) -> bool:
 
 
 def untrained(
-    logs: Sequence[Prepared], head: Any = None, **config: Any
+    logs: Sequence[PreparedLog], head: Any = None, **config: Any
 ) -> tuple[HeadTraining, WindowsDataModule]:
     """The module, float32, without a trainer, and its windows."""
     model, residual, store = prepared(logs, head)
@@ -295,7 +295,7 @@ def test_training_lowers_the_free_run_error(tmp_path: Path) -> None:
     ],
 )
 def test_the_weights_that_validated_best_are_kept(
-    logs: Sequence[Prepared], tmp_path: Path, scores: list[float], diverged: list[int], best: int
+    logs: Sequence[PreparedLog], tmp_path: Path, scores: list[float], diverged: list[int], best: int
 ) -> None:
     validate = Scripted(scores, diverged)
     model, notes = trained(logs, tmp_path, validate, multi_step=[HALF_SECOND])
@@ -317,7 +317,7 @@ def test_the_weights_that_validated_best_are_kept(
     ],
 )
 def test_stops_by_patience_in_the_last_stage(
-    logs: Sequence[Prepared], tmp_path: Path, stages: list[int], scores: list[float], epochs: int
+    logs: Sequence[PreparedLog], tmp_path: Path, stages: list[int], scores: list[float], epochs: int
 ) -> None:
     later = [{**HALF_SECOND, "epochs": length} for length in stages[1:]]
     one_step = {**ONE_STEP, "epochs": stages[0]}
@@ -327,7 +327,7 @@ def test_stops_by_patience_in_the_last_stage(
 
 
 def test_validates_so_often_and_after_the_last_epoch(
-    logs: Sequence[Prepared], tmp_path: Path
+    logs: Sequence[PreparedLog], tmp_path: Path
 ) -> None:
     validate = Scripted([1.0])
     one_step = {**ONE_STEP, "epochs": 5}
@@ -335,14 +335,14 @@ def test_validates_so_often_and_after_the_last_epoch(
     assert ["validation" in entry for entry in notes["curve"]] == [False, True, False, True, True]
 
 
-def test_no_finite_free_run_is_one_line(logs: Sequence[Prepared], tmp_path: Path) -> None:
+def test_no_finite_free_run_is_one_line(logs: Sequence[PreparedLog], tmp_path: Path) -> None:
     with pytest.raises(FitError, match="mlp: no epoch gave a finite free run") as caught:
         trained(logs, tmp_path, Scripted([math.nan]))
     assert "\n" not in str(caught.value)
 
 
 def test_learning_rates_fall_along_a_cosine_in_each_stage(
-    logs: Sequence[Prepared], monkeypatch: pytest.MonkeyPatch
+    logs: Sequence[PreparedLog], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stages = [
         {"horizon": 0.5, "epochs": 5, "learning_rate": 0.1, "final": 0.1},
@@ -365,7 +365,7 @@ def test_learning_rates_fall_along_a_cosine_in_each_stage(
     assert rates == pytest.approx([0.2, 0.2, 0.2, *falling, 0.05])
 
 
-def test_weight_decay_acts_on_matrices_of_the_head_only(logs: Sequence[Prepared]) -> None:
+def test_weight_decay_acts_on_matrices_of_the_head_only(logs: Sequence[PreparedLog]) -> None:
     module, _ = untrained(logs, weight_decay=0.3)
     decayed = {
         id(p): group["weight_decay"]
@@ -377,7 +377,7 @@ def test_weight_decay_acts_on_matrices_of_the_head_only(logs: Sequence[Prepared]
     assert id(module.model.baseline.theta) not in decayed
 
 
-def test_batches_hold_their_share_of_beginnings(logs: Sequence[Prepared]) -> None:
+def test_batches_hold_their_share_of_beginnings(logs: Sequence[PreparedLog]) -> None:
     module, data = untrained(
         logs, beginnings={"share": 0.25, "initial": 0.3}, multi_step=[HALF_SECOND]
     )
@@ -393,13 +393,13 @@ def test_batches_hold_their_share_of_beginnings(logs: Sequence[Prepared]) -> Non
         )
 
 
-def loss_of(module: HeadTraining, windows: Sequence[Windows]) -> float:
+def loss_of(module: HeadTraining, windows: Sequence[WindowBatch]) -> float:
     module.on_fit_start()
     module.history = [{}] * module.settings.one_step.epochs
     return float(module.training_step(tuple(windows), 0).detach())
 
 
-def test_rollouts_start_from_the_measured_past(logs: Sequence[Prepared]) -> None:
+def test_rollouts_start_from_the_measured_past(logs: Sequence[PreparedLog]) -> None:
     """The loss of one window, from the logs by hand: memory from the past, mean velocities at a
     beginning.
     """
@@ -409,7 +409,7 @@ def test_rollouts_start_from_the_measured_past(logs: Sequence[Prepared]) -> None
     beginnings = {"share": 0.5, "initial": 0.3}
     stages = [{**HALF_SECOND, "batch": 2}]
     begun, _ = untrained(logs, lstm, history=0.4, multi_step=stages, beginnings=beginnings)
-    y, w, smooth = (torch.from_numpy(part).float()[None] for part in (log.y, log.w, log.smooth))
+    y, w, smooth = (torch.from_numpy(part).float()[None] for part in (log.y, log.w, log.smoothed))
 
     @torch.no_grad()
     def by_hand(first: int, past: int, x: Tensor) -> float:
@@ -421,10 +421,10 @@ def test_rollouts_start_from_the_measured_past(logs: Sequence[Prepared]) -> None
         return total / 5
 
     here = by_hand(row, 4, smooth[:, row])
-    anywhere = data.windows(torch.tensor([len(logs[0]) + row]), 6, 4)
+    anywhere = data.make_window_batch(torch.tensor([len(logs[0]) + row]), 6, 4)
     assert loss_of(plain, [anywhere]) == pytest.approx(here, rel=1e-4)
     there = by_hand(3, 3, torch.cat((smooth[:, 3, :3], y[:, :3, 3:].mean(1)), dim=-1))
-    beginning = data.windows(torch.tensor([len(logs[0]) + 3]), 6, 3)
+    beginning = data.make_window_batch(torch.tensor([len(logs[0]) + 3]), 6, 3)
     assert loss_of(begun, [anywhere, beginning]) == pytest.approx((here + there) / 2, rel=1e-4)
 
 
@@ -440,7 +440,7 @@ def test_short_logs_need_no_room_for_a_stage_without_epochs(tmp_path: Path) -> N
 
 
 def test_tensorboard_shows_axes_rate_settings_and_a_free_run(
-    logs: Sequence[Prepared], tmp_path: Path
+    logs: Sequence[PreparedLog], tmp_path: Path
 ) -> None:
     """A validation that knows its axes and a free run leaves them, with the final score."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -492,7 +492,7 @@ def losses_of(
 ) -> list[float]:
     """Train; returns the loss of each epoch."""
     model, residual, _ = prepared(trials(), HEADS[head])
-    store = WindowStore.gather(trials(), dtype)
+    store = WindowStore.from_logs(trials(), dtype)
     precision = "64-true" if dtype == torch.float64 else "32-true"
     config = TrainingConfig.model_validate({**SETTINGS, "precision": precision, **settings})
     notes = train("net", model.to(dtype), residual, store, config, SCALES, validated, 0, folder)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from residnet.control.motion import Lag
+from residnet.control.motion import ActuatorLag
 from residnet.core.errors import FitError
 from residnet.training.lag import fit_lag, followed
 
@@ -33,7 +33,7 @@ def test_followed_is_the_differential_equation(delay: float) -> None:
         return [y[1], 9.0 * (np.interp(time, t, late) - y[0]) - 2 * 0.6 * 3.0 * y[1]]
 
     wanted = solve_ivp(rate, (0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-9, max_step=0.02)
-    lag = Lag(frequency=3.0, damping=0.6, delay=delay)
+    lag = ActuatorLag(frequency=3.0, damping=0.6, delay=delay)
     mine = followed(commands(200), lag, DT)[:, 1].numpy()
     # a delayed polygon has its corners between samples: exact only where the delay is a whole
     # number of them
@@ -41,9 +41,10 @@ def test_followed_is_the_differential_equation(delay: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "true", [Lag(frequency=2.0, damping=0.8), Lag(frequency=4.0, damping=0.5, delay=0.3)]
+    "true",
+    [ActuatorLag(frequency=2.0, damping=0.8), ActuatorLag(frequency=4.0, damping=0.5, delay=0.3)],
 )
-def test_lag_and_regression_together(true: Lag) -> None:
+def test_lag_and_regression_together(true: ActuatorLag) -> None:
     command = commands()
     acting = followed(command, true, DT)
     velocity = torch.cumsum(acting, 0) * DT / 1000.0

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from residnet.control.heading.controllers import Steering
+from residnet.control.heading.controllers import ControlTask
 from residnet.control.heading.vessels import SteeredPlant
-from residnet.documents.gouletas2020.autopilot import simulate_answers, train_predictor
+from residnet.documents.gouletas2020.autopilot import simulate_rudder_responses, train_predictor
 from residnet.documents.gouletas2020.law import (
     DocumentConfig,
     PredictiveConfig,
@@ -24,7 +24,7 @@ DEG = math.pi / 180
 LIMIT = 5 * DEG
 GAIN, TIME = 3.47, 3.94
 VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())
-STEERING = Steering(VESSEL, VESSEL.turning(LIMIT, 60.0), LIMIT, 0.1)
+STEERING = ControlTask(VESSEL, VESSEL.estimate_nomoto(LIMIT, 60.0), LIMIT, 0.1)
 SETTINGS = PredictorTraining(states=1000, epochs=40, batch=50)
 
 
@@ -34,8 +34,10 @@ def test_answers_are_nomotos_closed_form() -> None:
     """
     law, horizon = DocumentConfig(horizon=2.0), 2.0
     angles = torch.linspace(-LIMIT, LIMIT, 41, dtype=torch.float64)
-    x, change = simulate_answers(VESSEL, law.exact(STEERING), angles, SETTINGS, 50, 3)
-    start, steady = x[:, VESSEL.column("r"), None], GAIN * angles[None, :]
+    x, change = simulate_rudder_responses(
+        VESSEL, law.build_exact_predictor(STEERING), angles, SETTINGS, 50, 3
+    )
+    start, steady = x[:, VESSEL.state_column("r"), None], GAIN * angles[None, :]
     decay = 1 - math.exp(-horizon / TIME)
     torch.testing.assert_close(change[:, 1], (steady - start) * decay, rtol=1e-4, atol=1e-7)
     torch.testing.assert_close(
@@ -51,13 +53,13 @@ def test_a_linear_network_finds_nomotos_affine_map(tmp_path: Path) -> None:
     """
     config = PredictiveConfig(horizon=2.0, hidden=(20,), linear=True, training=SETTINGS)
     torch.manual_seed(0)
-    network = config.spec(STEERING).build()
+    network = config.predictor_spec(STEERING).build()
     notes = train_predictor("mlp", network, config, STEERING, 0, tmp_path)
     assert notes["rms_heading"] < 0.01 * DEG
     assert notes["rms_yaw_rate"] < 0.01 * DEG
     x = torch.zeros(2, len(VESSEL.state), dtype=torch.float64)
-    x[:, VESSEL.column("u")] = 3.2
-    x[1, VESSEL.column("r")] = 0.1
+    x[:, VESSEL.state_column("u")] = 3.2
+    x[1, VESSEL.state_column("r")] = 0.1
     heading = torch.tensor([0.5, 0.5], dtype=torch.float64)
     error, rate = network(x, heading, torch.zeros(41))
     decay = math.exp(-2.0 / TIME)
@@ -69,7 +71,7 @@ def test_a_linear_network_finds_nomotos_affine_map(tmp_path: Path) -> None:
 def test_the_document_s_law_turns_the_short_way() -> None:
     """From 170 deg to -170 deg the bow goes through south."""
     law = DocumentConfig(horizon=6.0).build(STEERING)
-    x, _ = VESSEL.start(torch.ones(1, dtype=torch.float64))
-    x[:, VESSEL.column("psi")] = 170 * DEG
+    x, _ = VESSEL.straight_course(torch.ones(1, dtype=torch.float64))
+    x[:, VESSEL.state_column("psi")] = 170 * DEG
     command, _ = law(x, torch.tensor([[-170 * DEG]], dtype=torch.float64), x[:, :0])
     assert float(command) > 0

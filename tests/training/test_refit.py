@@ -23,12 +23,12 @@ from made_system import (
 from torch import Tensor
 
 from residnet.baselines.base import ParametricBaseline
-from residnet.baselines.given import StillConfig
+from residnet.baselines.given import ZeroBaselineConfig
 from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
 from residnet.core.errors import DataError, FitError, ResidnetError
 from residnet.core.layout import HEADING
 from residnet.core.samples import Samples
-from residnet.data.prepare import Prepared, samples
+from residnet.data.prepare import PreparedLog, make_samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
@@ -41,13 +41,13 @@ from residnet.training.refit import Problem, RefitConfig, refit, sensitivities
 
 
 def fitted(
-    terms: Sequence[str], logs: Sequence[Prepared]
+    terms: Sequence[str], logs: Sequence[PreparedLog]
 ) -> tuple[HybridDynamics, Samples, WindowStore]:
     """Least squares on derivatives."""
     model = model_of(terms)
-    known = samples(logs, model.signals)
-    RegressorsConfig(terms=tuple(terms)).fit(model.baseline, known)
-    return model, known, WindowStore.gather(logs, torch.float64)
+    known = make_samples(logs, model.signals)
+    RegressorsConfig(terms=tuple(terms)).fit_preferred(model.baseline, known)
+    return model, known, WindowStore.from_logs(logs, torch.float64)
 
 
 def theta_of(model: HybridDynamics) -> Tensor:
@@ -56,7 +56,7 @@ def theta_of(model: HybridDynamics) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def smoothed() -> Sequence[Prepared]:
+def smoothed() -> Sequence[PreparedLog]:
     """Derivatives over 3 s of motions that take one: least squares finds the vessel too slow."""
     return trials(window=3.1)
 
@@ -77,7 +77,7 @@ def windy(
             "velocities": velocities,
         }
     ).build()
-    n = signals.dof
+    n = signals.n_dof
     rows = [
         ("1", "u", "u|u|", "tau_x", "wind_u"),
         ("v", "u r", "wind_v wind_mag"),
@@ -93,7 +93,7 @@ def windy(
         for axis, name in enumerate(velocities):
             baseline.theta[axis, baseline.library.terms.index(name)] = -0.7
     model = HybridDynamics(signals, baseline, ZeroHead(signals.names), STEP, integrator)
-    active = torch.nonzero(baseline.allowed.flatten() > 0).squeeze(1)
+    active = torch.nonzero(baseline.term_mask.flatten() > 0).squeeze(1)
     batch, steps, count = 5, 25, len(active)
     wind = torch.from_numpy(random.uniform([2, -3], [6, 3], size=(batch, 1, 2))).expand(
         -1, steps, -1
@@ -231,7 +231,7 @@ def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
         assert 2.0 * float(hessian[i, i]) == pytest.approx(curvature, rel=2e-3)
 
 
-def test_a_symmetric_vessel_loses_what_it_cannot_have(smoothed: Sequence[Prepared]) -> None:
+def test_a_symmetric_vessel_loses_what_it_cannot_have(smoothed: Sequence[PreparedLog]) -> None:
     free, known, store = fitted(LINEAR, smoothed)
     held = copy.deepcopy(free)
     config = {"horizon": 8.0, "every": 4.0, "prior": 1e-4}
@@ -259,12 +259,12 @@ def test_a_symmetric_vessel_loses_what_it_cannot_have(smoothed: Sequence[Prepare
     ids=str,
 )
 def test_what_cannot_be_refitted_is_one_line(
-    smoothed: Sequence[Prepared], change: Any, error: type[ResidnetError], told: str
+    smoothed: Sequence[PreparedLog], change: Any, error: type[ResidnetError], told: str
 ) -> None:
     model, known, store = fitted(LINEAR, smoothed)
     config = {"horizon": 8.0, "every": 4.0}
     if change == "still":
-        still = StillConfig().build(model.signals.names)
+        still = ZeroBaselineConfig().build(model.signals.names)
         model = HybridDynamics(model.signals, still, ZeroHead(), STEP)
     elif change == "growing":
         config["horizon"] = 30.0
@@ -272,14 +272,14 @@ def test_what_cannot_be_refitted_is_one_line(
     else:
         config |= change
     if "every" in change:
-        store = dataclasses.replace(store, good=store.good & (store.depth > 0))
+        store = dataclasses.replace(store, trainable=store.trainable & (store.n_elapsed > 0))
     with pytest.raises(error, match=told) as caught:
         refit(model, known, store, RefitConfig.model_validate(config), SCALES)
     assert "\n" not in str(caught.value)
 
 
 def test_a_start_that_diverges_is_brought_near_over_shorter_free_runs(
-    smoothed: Sequence[Prepared],
+    smoothed: Sequence[PreparedLog],
 ) -> None:
     model, known, store = fitted(LINEAR, smoothed)
     config = RefitConfig(horizon=4.0, every=4.0, prior=0.0)
@@ -295,7 +295,7 @@ def test_a_start_that_diverges_is_brought_near_over_shorter_free_runs(
     count = 0
     for log in smoothed:
         for k in range(0, len(log) - 40, 40):
-            count += bool(log.good[k]) and log.usable[k : k + 41].mean() >= 0.5
+            count += bool(log.trainable[k]) and log.usable[k : k + 41].mean() >= 0.5
     assert wanted["windows"] == count > 0
     # a strong prior holds least squares
     held, _, _ = fitted(LINEAR, smoothed)
@@ -308,8 +308,8 @@ def test_one_step_goes_where_a_refit_without_the_logs_goes() -> None:
     logs = trials()[:4]
     config = RefitConfig(horizon=4.0, every=4.0, iterations=4, prior=1e-4)
     model = model_of(LINEAR)
-    known, store = samples(logs, model.signals), WindowStore.gather(logs, torch.float64)
-    RegressorsConfig(terms=tuple(LINEAR)).fit(model.baseline, known)
+    known, store = make_samples(logs, model.signals), WindowStore.from_logs(logs, torch.float64)
+    RegressorsConfig(terms=tuple(LINEAR)).fit_preferred(model.baseline, known)
     assert isinstance(model.baseline, ParametricBaseline)
     first = model.baseline.theta.detach().clone()
     refit(model, known, store, config, SCALES)
@@ -329,8 +329,8 @@ def test_one_step_goes_where_a_refit_without_the_logs_goes() -> None:
             other.baseline.theta.copy_(first)
         refit(
             other,
-            samples(kept, model.signals),
-            WindowStore.gather(kept, torch.float64),
+            make_samples(kept, model.signals),
+            WindowStore.from_logs(kept, torch.float64),
             config,
             SCALES,
             begin=whole,

@@ -8,46 +8,54 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from residnet.api.values import PartGiven, PathGiven, described, hearing, part, path, plain
+from residnet.api.values import (
+    PartLike,
+    PathLikeArg,
+    describe_type,
+    forward_progress,
+    parse_part,
+    parse_path,
+    to_builtin,
+)
 from residnet.core.arrays import paged
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import DataError, UsageError
-from residnet.core.layout import Live
+from residnet.core.layout import DegreesOfFreedom
 from residnet.core.log import Log
-from residnet.core.names import nearest
-from residnet.core.progress import ProgressCallback, report, say
-from residnet.data.doctor import inspect as examine
-from residnet.data.doctor import inspect_together
-from residnet.data.drafting.questions import Marks, Question, commented
-from residnet.data.drafting.reading import log_files, read_each
+from residnet.core.names import suggest_name
+from residnet.core.progress import ProgressCallback, log_message, report_progress
+from residnet.data.doctor import inspect_log as examine
+from residnet.data.doctor import inspect_log_set
+from residnet.data.drafting.questions import DraftNotes, Question, dump_commented_yaml
+from residnet.data.drafting.reading import find_log_files, read_mixed_formats
 from residnet.data.motion import MotionConfig, complete_motion
-from residnet.data.prepare import PrepareConfig, Prepared
-from residnet.data.prepare import prepare as prepare_log
+from residnet.data.prepare import PrepareConfig, PreparedLog
+from residnet.data.prepare import prepare_log as prepare_log
 from residnet.data.readers import ReaderConfig
 from residnet.data.simulated import SimulatedTrials
 from residnet.data.sources import DataConfig, MeasuredLogs
-from residnet.data.sources import read_logs as read_splits
-from residnet.data.split import SPLITS, check_leaks, divided, log_names
-from residnet.identification.recipe import Preparation, judging
-from residnet.judge.protocol import EvaluationConfig, longest_stretch
+from residnet.data.sources import read_split_logs as read_splits
+from residnet.data.split import SPLITS, assign_log_names, check_leaks, split_logs
+from residnet.identification.recipe import PreparationPlan, make_evaluation_settings
+from residnet.judge.protocol import EvaluationConfig, longest_segment_length
 from residnet.physics.signals import SignalsConfig
-from residnet.tasks.drafting import Draft, drafted, driving
+from residnet.tasks.drafting import ConfigDraft, choose_inputs, draft_fit_config
 
 if TYPE_CHECKING:
     import pandas as pd
 
-LogsGiven = PathGiven | Log | Sequence[PathGiven] | Sequence[Log]
+LogsLike = PathLikeArg | Log | Sequence[PathLikeArg] | Sequence[Log]
 """Logs that were read, or where to read them."""
 """Recipes by name."""
 
 
 def read_logs(
-    source: LogsGiven,
+    source: LogsLike,
     *,
     channels: Mapping[str, Any] | None = None,
     time: str | tuple[str, str] | Mapping[str, str] = "t",
     manoeuvre: str | None = None,
-    reader: PartGiven | None = None,
+    reader: PartLike | None = None,
     progress: ProgressCallback | None = None,
 ) -> list[Log]:
     """Read logs from files, patterns or folders.
@@ -75,74 +83,87 @@ def read_logs(
     Example:
         logs = residnet.read_logs("trials/*.csv", channels={"u": ("speed", "kn"), ...})
     """
-    given: list[Any] = list(source) if isinstance(source, list | tuple) else [source]
-    if not given:
+    entries: list[Any] = list(source) if isinstance(source, list | tuple) else [source]
+    if not entries:
         raise UsageError("read_logs: no log is given; name files, a pattern or a folder")
-    read = [isinstance(entry, Log) for entry in given]
-    if all(read):
-        return given
-    if any(read):
+    are_logs = [isinstance(source_entry, Log) for source_entry in entries]
+    if all(are_logs):
+        return entries
+    if any(are_logs):
         raise UsageError("read_logs: give either paths or logs that were read, not both")
     if reader is not None and channels is not None:
         raise UsageError("read_logs: give channels or a reader, not both")
-    with hearing(progress):
-        files = log_files([file for entry in given for file in _matching(entry)])
+    with forward_progress(progress):
+        files = find_log_files(
+            [file for source_entry in entries for file in _expand_glob(source_entry)]
+        )
         logs = dict[Path, Log]()
-        settings: Any = None if reader is None else part(reader, "reader")
+        settings: Any = None if reader is None else parse_part(reader, "reader")
         if channels is not None:
             settings = {
                 "kind": "parquet" if files[0].suffix == ".parquet" else "csv",
-                "time": _column(time, "time", "s"),
-                "channels": {name: _column(entry, name) for name, entry in channels.items()},
+                "time": _parse_column(time, "time", "s"),
+                "channels": {
+                    name: _parse_column(source_entry, name)
+                    for name, source_entry in channels.items()
+                },
                 "manoeuvre": manoeuvre,
             }
         if settings is None:
-            for draft in read_each(files):
-                for error in draft.left_out.values():
+            for draft_result in read_mixed_formats(files):
+                for error in draft_result.errors.values():
                     raise error
-                if {"channels", "parts"} & set(draft.reader):
-                    say(f"{next(iter(draft.logs))}: channel map as guessed, to be checked")
-                    content = {"data": {"reader": draft.reader}}
-                    for line in commented(content, draft.marks.comments).splitlines():
-                        say(f"  {line}")
-                logs |= draft.logs
+                if {"channels", "parts"} & set(draft_result.reader):
+                    log_message(
+                        f"{next(iter(draft_result.logs))}: channel map as guessed, to be checked"
+                    )
+                    content = {"data": {"reader": draft_result.reader}}
+                    for line in dump_commented_yaml(
+                        content, draft_result.draft_notes.comments_at
+                    ).splitlines():
+                        log_message(f"  {line}")
+                logs |= draft_result.logs
         else:
-            chosen = validate(plain(settings), ReaderConfig, "read_logs").build()
-            for number, file in enumerate(chosen.logs_among(files)):
-                report("reading logs", number, len(files))
-                logs[file] = chosen.read(file)
-            report("reading logs", len(files), len(files))
-    names = log_names(logs)
+            configured_reader = validate_config(
+                to_builtin(settings), ReaderConfig, "read_logs"
+            ).build()
+            for number, file in enumerate(configured_reader.select_logs(files)):
+                report_progress("reading logs", number, len(files))
+                logs[file] = configured_reader.read(file)
+            report_progress("reading logs", len(files), len(files))
+    names = assign_log_names(logs)
     return [logs[file].replace(name=names[file]) for file in files if file in logs]
 
 
-def _matching(entry: Any) -> list[Path]:
-    file = path(entry, "read_logs")
+def _expand_glob(source_entry: Any) -> list[Path]:
+    file = parse_path(source_entry, "read_logs")
     if file.exists() or not glob.has_magic(str(file)):
         return [file]
-    found = sorted(Path(name) for name in glob.glob(str(file), recursive=True))  # noqa: PTH207
-    if not found:
+    matches = sorted(Path(name) for name in glob.glob(str(file), recursive=True))  # noqa: PTH207
+    if not matches:
         raise UsageError(f"read_logs: '{file}' matches no file")
-    return found
+    return matches
 
 
-def _column(given: Any, name: str, unit: str | None = None) -> Any:
-    if isinstance(given, tuple | list) and len(given) == 2:
-        return {"column": given[0], "unit": given[1]}
-    if isinstance(given, str) and unit is not None:
-        return {"column": given, "unit": unit}
-    if isinstance(given, str):
+def _parse_column(entry: Any, name: str, default_unit: str | None = None) -> Any:
+    if isinstance(entry, tuple | list) and len(entry) == 2:
+        return {"column": entry[0], "unit": entry[1]}
+    if isinstance(entry, str) and default_unit is not None:
+        return {"column": entry, "unit": default_unit}
+    if isinstance(entry, str):
         raise UsageError(
             f"read_logs: channels: {name}: give the column and its unit, for example"
-            f" ('{given}', 'm/s')"
+            f" ('{entry}', 'm/s')"
         )
-    if isinstance(given, Mapping):
-        return given
-    raise UsageError(f"read_logs: channels: {name}: expected (column, unit), {described(given)}")
+    if isinstance(entry, Mapping):
+        return entry
+    raise UsageError(
+        f"read_logs: channels: {name}: expected (column, unit), {describe_type(entry)}"
+    )
 
 
 def inspect(
-    logs: LogsGiven, *, inputs: Sequence[str] | None = None, masks: Sequence[Any] = ()
+    logs: LogsLike, *, inputs: Sequence[str] | None = None, masks: Sequence[Any] = ()
 ) -> pd.DataFrame:
     """Look at logs as a doctor would: clocks, gaps, jumps, frames, lags, copies, excitation.
 
@@ -166,27 +187,30 @@ def inspect(
     """
     import pandas as pd
 
-    members = read_logs(logs)
-    settings = {"grid": {"step": 1.0}, "masks": plain(masks)}
-    rules = validate(settings, PrepareConfig, "inspect").masks
-    reports = [*(examine(log, inputs, rules) for log in members), inspect_together(members, inputs)]
+    log_list = read_logs(logs)
+    settings = {"grid": {"step": 1.0}, "masks": to_builtin(masks)}
+    mask_rules = validate_config(settings, PrepareConfig, "inspect").masks
+    quality_reports = [
+        *(examine(log, inputs, mask_rules) for log in log_list),
+        inspect_log_set(log_list, inputs),
+    ]
     columns = ["level", "code", "text", "action"]
     rows = [
-        [doctor.name, *(getattr(finding, name) for name in columns)]
-        for doctor in reports
-        for finding in doctor.findings
+        [quality_report.name, *(getattr(finding, name) for name in columns)]
+        for quality_report in quality_reports
+        for finding in quality_report.findings
     ]
     return pd.DataFrame(rows, columns=["log", *columns])
 
 
-def draft(
-    logs: PathGiven | Sequence[PathGiven],
+def draft_config(
+    logs: PathLikeArg | Sequence[PathLikeArg],
     *,
     name: str = "my_boat",
-    folder: PathGiven = ".",
+    folder: PathLikeArg = ".",
     answer: Callable[[Question], str] | None = None,
     progress: ProgressCallback | None = None,
-) -> Draft:
+) -> ConfigDraft:
     """Draft a complete config of a fit from logs of any format.
 
     Channels, units, frames, inputs, splits, protocols and scales are proposed by names, headers,
@@ -212,16 +236,16 @@ def draft(
     Example:
         draft = residnet.draft("trials/"); draft.save("my_boat.yaml"); residnet.run("my_boat.yaml")
     """
-    given = list(logs) if isinstance(logs, list | tuple) else [logs]
-    if not given:
+    sources = list(logs) if isinstance(logs, list | tuple) else [logs]
+    if not sources:
         raise UsageError("draft: no log is given; name files, folders or bags")
-    with hearing(progress):
-        paths = [path(one, "draft") for one in given]
-        return drafted(paths, Path(folder), name, answer)
+    with forward_progress(progress):
+        paths = [parse_path(log_source, "draft") for log_source in sources]
+        return draft_fit_config(paths, Path(folder), name, answer)
 
 
 @dataclass(frozen=True)
-class Data:
+class Dataset:
     """Logs that are ready for a fit, with what models are judged by.
 
     Attributes:
@@ -232,7 +256,7 @@ class Data:
         source: the `data` section of a config that the logs came from; None for others.
     """
 
-    splits: Mapping[str, list[Prepared]]
+    splits: Mapping[str, list[PreparedLog]]
     signals: SignalsConfig
     prepare: PrepareConfig
     evaluation: EvaluationConfig
@@ -243,30 +267,30 @@ class Data:
         """One row for each log: log, split, manoeuvre, seconds, samples, usable, learned_from."""
         import pandas as pd
 
-        rows = [log.described(split) for split, logs in self.splits.items() for log in logs]
+        rows = [log.to_table_row(split) for split, logs in self.splits.items() for log in logs]
         return pd.DataFrame(rows)
 
-    def logs(self, split: str) -> list[Prepared]:
+    def logs(self, split: str) -> list[PreparedLog]:
         """Return the prepared logs of a split.
 
         Raises:
             UsageError: where there is no such split.
         """
         if split not in self.splits or not self.splits[split]:
-            raise UsageError(f"the data have no split '{split}'{nearest(split, self.splits)}")
+            raise UsageError(f"the data have no split '{split}'{suggest_name(split, self.splits)}")
         return self.splits[split]
 
 
 def prepare(
-    logs: LogsGiven | Mapping[str, Any],
+    logs: LogsLike | Mapping[str, Any],
     inputs: Sequence[str] | None = None,
     *,
     step: float | str | None = None,
-    held: Sequence[str] | None = None,
-    like: Data | None = None,
+    held_channels: Sequence[str] | None = None,
+    settings_from: Dataset | None = None,
     progress: ProgressCallback | None = None,
     **settings: Any,
-) -> Data:
+) -> Dataset:
     """Bring logs to a grid, smooth and differentiate them, and say what models are judged by.
 
     What is left out follows from the logs, as in a config that `draft` writes: inputs by names and
@@ -283,8 +307,8 @@ def prepare(
         inputs: command channels that drive the model, in order; an empty list for a model without
             any.
         step: of the grid in s.
-        held: channels whose last value holds until the next; others are interpolated.
-        like: data whose settings are taken over; all logs then form the split `external`.
+        held_channels: channels whose last value holds until the next; others are interpolated.
+        settings_from: data whose settings are taken over; all logs then form the split `external`.
         progress: is told how far the work is.
         settings: further keys of the sections `signals` (exogenous, forces, velocities),
             `prepare` (masks, derivative, motion, trim, hold, beside) and `evaluation` (protocols,
@@ -302,107 +326,139 @@ def prepare(
     Example:
         data = residnet.prepare(logs, ["n_port", "n_stbd"])
     """
-    with hearing(progress):
-        if like is not None:
+    with forward_progress(progress):
+        if settings_from is not None:
             external = read_logs(logs)  # type: ignore[arg-type]
-            prepared = _prepared({"external": external}, like.signals, like.prepare)
-            return Data(prepared, like.signals, like.prepare, like.evaluation)
-        splits, source = _splits(logs)
-        given = settings.get("velocities")
-        told = [Live.told(log.channels) for members in splits.values() for log in members]
-        live = Live.shared(told)
-        if given is not None:
-            live = validate(
-                {"inputs": [], "velocities": plain(given)}, SignalsConfig, "prepare"
-            ).live
-        whole = {
-            name: [complete_motion(log, MotionConfig(), live) for log in members]
+            prepared = _prepare_splits(
+                {"external": external}, settings_from.signals, settings_from.prepare
+            )
+            return Dataset(
+                prepared, settings_from.signals, settings_from.prepare, settings_from.evaluation
+            )
+        splits, source = _resolve_splits(logs)
+        velocities = settings.get("velocities")
+        dof_of_logs = [
+            DegreesOfFreedom.from_channels(log.channels)
+            for members in splits.values()
+            for log in members
+        ]
+        dof = DegreesOfFreedom.intersection(dof_of_logs)
+        if velocities is not None:
+            dof = validate_config(
+                {"inputs": [], "velocities": to_builtin(velocities)}, SignalsConfig, "prepare"
+            ).dof
+        complete_logs = {
+            name: [complete_motion(log, MotionConfig(), dof) for log in members]
             for name, members in splits.items()
         }
-        every = [log for members in whole.values() for log in members]
-        taken = driving(every, Marks()) if inputs is None else inputs
-        if inputs is None and not taken:
+        all_logs = [log for members in complete_logs.values() for log in members]
+        input_names = choose_inputs(all_logs, DraftNotes()) if inputs is None else inputs
+        if inputs is None and not input_names:
             raise UsageError(
                 "prepare: inputs: no channel of the logs is a rudder, a propeller or another"
                 " command; name those that drive the vessel; the first log has"
-                f" {', '.join(every[0].channels)} (an empty list makes a model without commands)"
+                f" {', '.join(all_logs[0].channels)} (an empty list makes a model without commands)"
             )
-        known = [name for name in taken if all(name in log.channels for log in every)]
-        chosen = Preparation.of(every, known, live)
-        if live.text:
-            say(f"velocities: {live.text}")
-        say(f"recipe: {chosen.reason}")
-        judged: dict[str, Any] = {}
-        content = chosen.content()
-        grid = {"step": step, "held": held}
-        content["grid"] |= {key: value for key, value in grid.items() if value is not None}
+        common_inputs = [
+            name for name in input_names if all(name in log.channels for log in all_logs)
+        ]
+        preparation_recipe = PreparationPlan.from_logs(all_logs, common_inputs, dof)
+        if dof.description:
+            log_message(f"velocities: {dof.description}")
+        log_message(f"recipe: {preparation_recipe.reason}")
+        evaluation_settings: dict[str, Any] = {}
+        preparation_settings = preparation_recipe.to_config()
+        grid = {"step": step, "held": held_channels}
+        preparation_settings["grid"] |= {
+            key: value for key, value in grid.items() if value is not None
+        }
         if settings.get("protocols") is not None:
             if not isinstance(settings["protocols"], Mapping):
-                given = described(settings["protocols"])
-                raise UsageError(f"prepare: protocols: expected a mapping by name, given {given}")
-            judged["selection"] = next(iter(settings["protocols"]), "")
+                velocities = describe_type(settings["protocols"])
+                raise UsageError(
+                    f"prepare: protocols: expected a mapping by name, given {velocities}"
+                )
+            evaluation_settings["selection"] = next(iter(settings["protocols"]), "")
         signals = {
-            "inputs": taken if isinstance(taken, str) else list(taken),
-            "exogenous": chosen.exogenous,
-            "velocities": live.velocities,
+            "inputs": input_names if isinstance(input_names, str) else list(input_names),
+            "exogenous": preparation_recipe.wind_channels,
+            "velocities": dof.velocities,
         }
         # what no section knows is refused as an unknown key of `prepare`
-        homes: Any = (
+        sections: Any = (
             (SignalsConfig, signals),
-            (EvaluationConfig, judged),
-            (PrepareConfig, content),
+            (EvaluationConfig, evaluation_settings),
+            (PrepareConfig, preparation_settings),
         )
         for key, value in settings.items():
-            home = next((c for kind, c in homes if key in kind.model_fields), content)
+            section = next(
+                (
+                    section_settings
+                    for config_class, section_settings in sections
+                    if key in config_class.model_fields
+                ),
+                preparation_settings,
+            )
             if value is not None:
-                home[key] = value
-        model = validate(plain(signals), SignalsConfig, "prepare")
-        preparation = validate(plain(content), PrepareConfig, "prepare")
-        prepared, step = _prepared(splits, model, preparation), preparation.grid.step
-        lasting = {
-            split: [longest_stretch(log) * step for log in members]
+                section[key] = value
+        signals_config = validate_config(to_builtin(signals), SignalsConfig, "prepare")
+        preparation = validate_config(to_builtin(preparation_settings), PrepareConfig, "prepare")
+        prepared, step = _prepare_splits(splits, signals_config, preparation), preparation.grid.step
+        durations = {
+            split: [longest_segment_length(log) * step for log in members]
             for split, members in prepared.items()
         }
-        judged = judging(whole, lasting, chosen.memory, live) | judged
-        evaluation = validate(plain(judged), EvaluationConfig, "prepare")
-        return Data(prepared, model, preparation, evaluation, source)
+        evaluation_settings = (
+            make_evaluation_settings(
+                complete_logs, durations, preparation_recipe.correlation_time, dof
+            )
+            | evaluation_settings
+        )
+        evaluation = validate_config(to_builtin(evaluation_settings), EvaluationConfig, "prepare")
+        return Dataset(prepared, signals_config, preparation, evaluation, source)
 
 
-def _prepared(
+def _prepare_splits(
     splits: Mapping[str, Sequence[Log]], signals: SignalsConfig, config: PrepareConfig
-) -> dict[str, list[Prepared]]:
-    done, total = 0, sum(map(len, splits.values()))
-    out: dict[str, list[Prepared]] = {}
+) -> dict[str, list[PreparedLog]]:
+    n_done, total = 0, sum(map(len, splits.values()))
+    prepared: dict[str, list[PreparedLog]] = {}
     for split, members in splits.items():
-        out[split] = paged.OneByOne()
+        prepared[split] = paged.PageReleasingList()
         for log in members:
-            report("preparing logs", done, total)
-            out[split].append(prepare_log(log, split, signals.columns, config, signals.live))
-            if not out[split][-1].good.any():
+            report_progress("preparing logs", n_done, total)
+            prepared[split].append(
+                prepare_log(log, split, signals.input_columns, config, signals.dof)
+            )
+            if not prepared[split][-1].trainable.any():
                 raise DataError(
                     f"log {log.name}: no stretch is as long as the derivative's window; leave the"
                     " log out or give a shorter derivative window"
                 )
-            done += 1
-    report("preparing logs", total, total)
-    return out
+            n_done += 1
+    report_progress("preparing logs", total, total)
+    return prepared
 
 
-def _splits(logs: Any) -> tuple[dict[str, list[Log]], MeasuredLogs | SimulatedTrials | None]:
+def _resolve_splits(
+    logs: Any,
+) -> tuple[dict[str, list[Log]], MeasuredLogs | SimulatedTrials | None]:
     if isinstance(logs, Mapping) and "kind" in logs:
-        source = validate(plain(logs), DataConfig, "prepare")
+        source = validate_config(to_builtin(logs), DataConfig, "prepare")
         return read_splits(source), source
     if isinstance(logs, Mapping):
         for name in logs:
             if name not in SPLITS:
-                raise UsageError(f"prepare: unknown split '{name}'{nearest(str(name), SPLITS)}")
-        if missing := [name for name in SPLITS if name not in logs]:
-            raise UsageError(f"prepare: no logs for {', '.join(missing)}")
+                raise UsageError(
+                    f"prepare: unknown split '{name}'{suggest_name(str(name), SPLITS)}"
+                )
+        if missing_splits := [name for name in SPLITS if name not in logs]:
+            raise UsageError(f"prepare: no logs for {', '.join(missing_splits)}")
         splits = {name: read_logs(logs[name]) for name in SPLITS}
     else:
-        splits = divided(read_logs(logs))
+        splits = split_logs(read_logs(logs))
     names = [log.name for members in splits.values() for log in members]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise UsageError(f"prepare: two logs are named '{twice[0]}'; rename one of them")
+    if duplicates := [name for name in names if names.count(name) > 1]:
+        raise UsageError(f"prepare: two logs are named '{duplicates[0]}'; rename one of them")
     check_leaks(splits)
     return splits, None

@@ -10,26 +10,42 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from residnet.api.data import Data, LogsGiven, prepare
-from residnet.api.models import Model, require
-from residnet.api.values import PartGiven, described, hearing, named_parts, part, plain
-from residnet.core.config import validate
+from residnet.api.data import Dataset, LogsLike, prepare
+from residnet.api.models import Model, require_instance
+from residnet.api.values import (
+    PartLike,
+    describe_type,
+    forward_progress,
+    parse_named_parts,
+    parse_part,
+    to_builtin,
+)
+from residnet.core.config import validate_config
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
-from residnet.core.names import nearest
-from residnet.core.processes import spread
+from residnet.core.names import suggest_name
+from residnet.core.processes import worker_limit
 from residnet.core.progress import ProgressCallback
 from residnet.core.trust import trusting
-from residnet.identification.fit import fit as identify
-from residnet.identification.identified import Evaluation, Identified, candidates, evaluate
-from residnet.identification.prepared import require_window, through_currents, velocity_limit
-from residnet.identification.recipe import integrator
-from residnet.identification.settings import FitSettings, Parts
-from residnet.judge.metrics import metrics_table, rollout_columns
+from residnet.identification.fit import fit_models as identify
+from residnet.identification.identified import (
+    IdentifiedModels,
+    SplitEvaluation,
+    evaluate_splits,
+    make_candidates,
+)
+from residnet.identification.prepared import (
+    check_window_fits,
+    compute_velocity_limits,
+    convert_to_motion_through_water,
+)
+from residnet.identification.recipe import choose_integrator
+from residnet.identification.settings import FitSettings, ModelPartsConfig
+from residnet.judge.metrics import build_metrics_table, iterate_rollout_columns
 from residnet.judge.selection import Selection
-from residnet.judge.verdict import Evidence, by_windows, verdict
-from residnet.report.run_reader import StoredWindow, windows_of
-from residnet.runs.task import computing
+from residnet.judge.verdict import VerdictEvidence, order_protocols, write_verdict
+from residnet.report.run_reader import StoredWindow, read_windows
+from residnet.runs.task import torch_threads
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,16 +65,16 @@ class FreeRuns:
         runs.plot_track("zigzag_01").savefig("track.png")
     """
 
-    def __init__(self, evaluation: Evaluation) -> None:
+    def __init__(self, evaluation: SplitEvaluation) -> None:
         self.evaluation = evaluation
         self.rows: list[dict[str, Any]] = evaluation.rows
         self.logs = [log.log.name for log in evaluation.logs]
-        self.protocols = [run.protocol for run in evaluation.runs]
+        self.protocols = [run.protocol for run in evaluation.free_runs]
 
     @property
     def metrics(self) -> pd.DataFrame:
         """Errors as a table, see `residnet.metrics`."""
-        return metrics_table(self.rows)
+        return build_metrics_table(self.rows)
 
     @cached_property
     def windows(self) -> list[StoredWindow]:
@@ -68,7 +84,7 @@ class FreeRuns:
         return [
             window
             for name, table in tables
-            for window in windows_of(table, str(name), kinds[str(name)], logs[0].live)
+            for window in read_windows(table, str(name), kinds[str(name)], logs[0].dof)
         ]
 
     @cached_property
@@ -80,79 +96,99 @@ class FreeRuns:
         """
         import pandas as pd
 
-        found = rollout_columns(self.evaluation.runs, self.evaluation.logs)
-        parts = [pd.DataFrame({"log": log.log.name, **columns}) for log, columns in found]
-        return pd.concat(parts, ignore_index=True)
+        columns_of_logs = iterate_rollout_columns(self.evaluation.free_runs, self.evaluation.logs)
+        tables = [
+            pd.DataFrame({"log": log.log.name, **columns}) for log, columns in columns_of_logs
+        ]
+        return pd.concat(tables, ignore_index=True)
 
-    def plot_track(self, log: str | None = None, **chosen: Any) -> Figure:
+    def plot_track(self, log: str | None = None, **selection: Any) -> Figure:
         """Draw the measured track and those of models; north up, equal scales.
 
         Args:
             log: name of the log; the first where None.
-            chosen: `models`, their names, all but `zero` where there are none; `protocol`,
+            selection: `models`, their names, all but `zero` where there are none; `protocol`,
                 `manoeuvre` where there is such a one, else the first; `window`, number of the
                 window in the log, the longest where None.
 
         Raises:
             UsageError: where there is no such log, model, protocol or window.
         """
-        return self._drawn(log, True, **chosen)
+        return self._plot(log, True, **selection)
 
-    def plot_history(self, log: str | None = None, **chosen: Any) -> Figure:
+    def plot_history(self, log: str | None = None, **selection: Any) -> Figure:
         """Draw velocities and heading against time, measured and predicted.
 
         Args:
             log: name of the log; the first where None.
-            chosen: as of `plot_track`.
+            selection: as of `plot_track`.
 
         Raises:
             UsageError: where there is no such log, model, protocol or window.
         """
-        return self._drawn(log, False, **chosen)
+        return self._plot(log, False, **selection)
 
-    def _drawn(
+    def _plot(
         self,
         log: str | None,
-        mapped: bool,
+        is_track: bool,
         models: str | Sequence[str] = (),
         protocol: str | None = None,
         window: int | None = None,
     ) -> Figure:
-        from residnet.report.sections.runs import window_figure
-        from residnet.report.still import still
+        from residnet.report.sections.runs import plot_window
+        from residnet.report.still import render_matplotlib
 
-        usual = "manoeuvre" if "manoeuvre" in self.protocols else self.protocols[0]
-        kind = _named(protocol or usual, self.protocols, "protocol")
-        found = [one for one in self.windows if one.protocol == kind]
-        name = _named(log or found[0].log, self.logs, "log")
-        found = [one for one in found if one.log == name]
-        if not found:
-            raise UsageError(f"log {name} has no window of the protocol {kind}")
-        if window is not None and not 0 <= window < len(found):
-            raise UsageError(f"log {name} has {len(found)} windows of {kind}, no number {window}")
-        one = max(found, key=lambda one: len(one.t)) if window is None else found[window]
-        given = [models] if isinstance(models, str) else models
-        shown = [_named(model, one.predicted, "model") for model in given]
-        shown = shown or [model for model in one.predicted if model != "zero"]
-        predicted = {model: one.predicted[model] for model in shown}
-        one = replace(one, predicted=predicted, diverged={})
-        drawn = window_figure(one, f"{name}, {kind}")
-        panels = [i for i, panel in enumerate(drawn.panels) if (panel.kind == "map") == mapped]
+        default_protocol = "manoeuvre" if "manoeuvre" in self.protocols else self.protocols[0]
+        protocol_name = _require_known(protocol or default_protocol, self.protocols, "protocol")
+        windows_of_log = [
+            stored_window
+            for stored_window in self.windows
+            if stored_window.protocol == protocol_name
+        ]
+        log_name = _require_known(log or windows_of_log[0].log, self.logs, "log")
+        windows_of_log = [
+            stored_window for stored_window in windows_of_log if stored_window.log == log_name
+        ]
+        if not windows_of_log:
+            raise UsageError(f"log {log_name} has no window of the protocol {protocol_name}")
+        if window is not None and not 0 <= window < len(windows_of_log):
+            raise UsageError(
+                f"log {log_name} has {len(windows_of_log)} windows of {protocol_name}, no number {window}"
+            )
+        stored_window = (
+            max(windows_of_log, key=lambda one: len(one.t))
+            if window is None
+            else windows_of_log[window]
+        )
+        requested_models = [models] if isinstance(models, str) else models
+        model_names = [
+            _require_known(model, stored_window.predicted, "model") for model in requested_models
+        ]
+        model_names = model_names or [model for model in stored_window.predicted if model != "zero"]
+        predicted = {model: stored_window.predicted[model] for model in model_names}
+        stored_window = replace(stored_window, predicted=predicted, diverged={})
+        window_plot = plot_window(stored_window, f"{log_name}, {protocol_name}")
+        panels = [
+            i for i, panel in enumerate(window_plot.panels) if (panel.kind == "map") == is_track
+        ]
         if not panels:
-            raise UsageError(f"log {name} has no track: {one.live.text}; draw its history")
-        figure: Figure = still(drawn, only=panels)
+            raise UsageError(
+                f"log {log_name} has no track: {stored_window.dof.description}; draw its history"
+            )
+        figure: Figure = render_matplotlib(window_plot, panel_numbers=panels)
         return figure
 
 
-def _named(name: Any, known: Any, what: str) -> str:
-    if name not in known:
-        raise UsageError(f"no {what} '{name}'{nearest(str(name), known)}")
+def _require_known(name: Any, valid_names: Any, description: str) -> str:
+    if name not in valid_names:
+        raise UsageError(f"no {description} '{name}'{suggest_name(str(name), valid_names)}")
     return str(name)
 
 
 def free_run(
     models: Model | Sequence[Model] | Mapping[str, Model],
-    data: Data,
+    data: Dataset,
     split: str | None = None,
     *,
     progress: ProgressCallback | None = None,
@@ -174,18 +210,18 @@ def free_run(
     Example:
         runs = residnet.free_run(models, data); runs.metrics
     """
-    require(data, Data, "free_run: expected data from residnet.prepare")
-    found: Any = [models] if isinstance(models, Model) else models
-    found = list(found.values()) if isinstance(found, Mapping) else found
-    if not isinstance(found, list | tuple) or not found:
-        raise UsageError(f"free_run: expected one or several models, given {described(models)}")
+    require_instance(data, Dataset, "free_run: expected data from residnet.prepare")
+    model_list: Any = [models] if isinstance(models, Model) else models
+    model_list = list(model_list.values()) if isinstance(model_list, Mapping) else model_list
+    if not isinstance(model_list, list | tuple) or not model_list:
+        raise UsageError(f"free_run: expected one or several models, given {describe_type(models)}")
     step = data.prepare.grid.step
-    for model in found:
-        require(model, Model, "free_run: expected a model")
-        if model.inputs != data.signals.columns:
+    for model in model_list:
+        require_instance(model, Model, "free_run: expected a model")
+        if model.inputs != data.signals.input_columns:
             raise UsageError(
                 f"free_run: model {model.name} has the inputs {', '.join(model.inputs)}, the data"
-                f" have {', '.join(data.signals.columns)}; prepare them with the model's inputs"
+                f" have {', '.join(data.signals.input_columns)}; prepare them with the model's inputs"
             )
         if abs(model.dt - step) > 1e-9:
             raise UsageError(
@@ -193,17 +229,19 @@ def free_run(
                 f" prepare them with step={model.dt:g}"
             )
     split = split or ("test" if "test" in data.splits else next(iter(data.splits)))
-    spec, divergence = found[0].spec, data.evaluation.divergence
-    limit = velocity_limit(np.array(spec.low), np.array(spec.high), divergence, spec.signals.live)
-    with hearing(progress):
-        judged = evaluate(
-            candidates([model.fitted for model in found], data.source),
+    spec, divergence = model_list[0].spec, data.evaluation.divergence
+    velocity_bounds = compute_velocity_limits(
+        np.array(spec.low), np.array(spec.high), divergence, spec.signals.live
+    )
+    with forward_progress(progress):
+        evaluations = evaluate_splits(
+            make_candidates([model.fitted for model in model_list], data.source),
             {split: data.logs(split)},
             data.evaluation,
             step,
-            limit,
+            velocity_bounds,
         )
-        return FreeRuns(judged[split])
+        return FreeRuns(evaluations[split])
 
 
 @final
@@ -219,8 +257,8 @@ class Models(dict[str, Model]):
         models["lstm"].step(x, w)
     """
 
-    def __init__(self, identified: Identified, data: Data) -> None:
-        super().__init__({name: Model(fitted) for name, fitted in identified.items()})
+    def __init__(self, identified: IdentifiedModels, data: Dataset) -> None:
+        super().__init__({name: Model(fitted_model) for name, fitted_model in identified.items()})
         self.identified, self.data = identified, data
         self.settings: FitSettings = identified.settings
 
@@ -233,44 +271,46 @@ class Models(dict[str, Model]):
     @cached_property
     def selection(self) -> Selection:
         """Which single model and which ensemble the validation logs choose, and why."""
-        return self.identified.select({name: runs.evaluation for name, runs in self.runs.items()})
+        return self.identified.select_models(
+            {name: runs.evaluation for name, runs in self.runs.items()}
+        )
 
     @property
-    def selected(self) -> str:
+    def selected_name(self) -> str:
         """Name of the single model: the recipe's hull, else the simplest that is alike the best."""
         return self.selection.selected
 
     @property
-    def predictor(self) -> str:
+    def predictor_name(self) -> str:
         """Name of the model that is reported first: the recipe's mean, else the selected one."""
-        return self.selection.predictor
+        return self.selection.default_model
 
     @property
     def verdict(self) -> list[str]:
         """The verdict on the predictor in whole sentences, the most important first."""
-        return verdict(self.evidence)
+        return write_verdict(self.evidence)
 
     @cached_property
-    def evidence(self) -> Evidence:
+    def evidence(self) -> VerdictEvidence:
         """What the verdict is passed on.
 
         It is of the test logs where they are judged, else of the validation logs.
         """
         split = "test" if "test" in self.runs else "validation"
-        judged = self.runs[split].evaluation
-        protocol = by_windows(judged.rows, split, self.settings.evaluation.selection)[0]
-        whole = {
+        evaluation = self.runs[split].evaluation
+        protocol = order_protocols(evaluation.rows, split, self.settings.evaluation.selection)[0]
+        rows_by_model = {
             row["model"]: row
-            for row in judged.rows
+            for row in evaluation.rows
             if (row["protocol"], row["manoeuvre"]) == (protocol, "all")
         }
-        return Evidence(
-            self.predictor,
+        return VerdictEvidence(
+            self.predictor_name,
             split,
-            whole,
+            rows_by_model,
             "baseline",
-            self.selection.content(),
-            judged.limits,
+            self.selection.to_json(),
+            evaluation.limits_by_protocol,
             protocol=protocol,
         )
 
@@ -280,21 +320,23 @@ class Models(dict[str, Model]):
         return self._table([row for runs in self.runs.values() for row in runs.rows])
 
     def _table(self, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-        return metrics_table([{**r, "selected": r["model"] == self.selected} for r in rows])
+        return build_metrics_table(
+            [{**r, "selected": r["model"] == self.selected_name} for r in rows]
+        )
 
     def __missing__(self, name: str) -> Model:
-        return self[_named(name, self, "model")]
+        return self[_require_known(name, self, "model")]
 
     def __repr__(self) -> str:
         return f"Models({', '.join(self)})"
 
 
 def fit(
-    data: Data | LogsGiven,
-    baseline: PartGiven | None = None,
-    heads: PartGiven | Sequence[str] | Mapping[str, PartGiven] = (),
+    data: Dataset | LogsLike,
+    baseline: PartLike | None = None,
+    heads: PartLike | Sequence[str] | Mapping[str, PartLike] = (),
     *,
-    baselines: Mapping[str, PartGiven] | None = None,
+    baselines: Mapping[str, PartLike] | None = None,
     threads: int = 1,
     workers: int = 1,
     trust: bool = False,
@@ -335,39 +377,44 @@ def fit(
         models = residnet.fit(logs); models.selected, models.metrics
     """
     with trusting(trust):
-        given = {
+        fit_settings = {
             key: value
             for key, value in settings.items()
-            if (value or key not in Parts.model_fields) and (key, value) != ("integrator", None)
+            if (value or key not in ModelPartsConfig.model_fields)
+            and (key, value) != ("integrator", None)
         }
-        given |= {"baselines": named_parts(baselines, "baseline")} if baselines else {}
+        fit_settings |= {"baselines": parse_named_parts(baselines, "baseline")} if baselines else {}
         if not (isinstance(heads, list | tuple | Mapping) and not heads):
-            given["heads"] = named_parts(heads, "head")
+            fit_settings["heads"] = parse_named_parts(heads, "head")
         if baseline is not None:
-            given["baseline"] = part(baseline, "baseline")
-        if given.get("recipe") is None and not set(given) & set(Parts.model_fields):
-            given["recipe"] = "standard"
-        if given.get("recipe") is None:
-            given.setdefault("baseline", part("regressors", "baseline"))
-        if not isinstance(data, Data):
+            fit_settings["baseline"] = parse_part(baseline, "baseline")
+        if fit_settings.get("recipe") is None and not set(fit_settings) & set(
+            ModelPartsConfig.model_fields
+        ):
+            fit_settings["recipe"] = "standard"
+        if fit_settings.get("recipe") is None:
+            fit_settings.setdefault("baseline", parse_part("regressors", "baseline"))
+        if not isinstance(data, Dataset):
             logs = (str, PathLike, Log, list, tuple, Mapping)
-            require(data, logs, "fit: expected logs, or data from residnet.prepare")
+            require_instance(data, logs, "fit: expected logs, or data from residnet.prepare")
             data = prepare(data)
-        if given.get("recipe") is not None:
-            given.setdefault("integrator", integrator(data.signals.live))
+        if fit_settings.get("recipe") is not None:
+            fit_settings.setdefault("integrator", choose_integrator(data.signals.dof))
         sections = {"prepare": data.prepare, "signals": data.signals, "evaluation": data.evaluation}
-        config: FitSettings = validate(plain({**sections, **given}), FitSettings, "fit")
-        with computing(threads), hearing(progress), spread(workers):
+        config: FitSettings = validate_config(
+            to_builtin({**sections, **fit_settings}), FitSettings, "fit"
+        )
+        with torch_threads(threads), forward_progress(progress), worker_limit(workers):
             for split in ("validation", "test"):
                 for log in data.logs(split):
-                    require_window(log, config)
-            splits, _ = through_currents(data.splits, config)
+                    check_window_fits(log, config)
+            splits, _ = convert_to_motion_through_water(data.splits, config)
             return Models(identify(splits, config), replace(data, splits=splits))
 
 
 def metrics(
     models: Models,
-    data: Data | None = None,
+    data: Dataset | None = None,
     *,
     split: str | None = None,
     manoeuvre: str | None = "all",
@@ -393,20 +440,20 @@ def metrics(
     Example:
         residnet.metrics(models, split="test")
     """
-    require(models, Models, "metrics: expected models from residnet.fit")
-    with hearing(progress):
+    require_instance(models, Models, "metrics: expected models from residnet.fit")
+    with forward_progress(progress):
         rows = None if data is None else free_run(models, data, split).rows
         table = models.metrics if rows is None else models._table(rows)
-    for column, wanted in (("split", split), ("manoeuvre", manoeuvre)):
-        if wanted is not None:
-            if wanted not in set(table[column]):
-                known = nearest(str(wanted), map(str, table[column].unique()))
-                raise UsageError(f"metrics: no {column} '{wanted}'{known}")
-            table = table[table[column] == wanted]
+    for column, required_value in (("split", split), ("manoeuvre", manoeuvre)):
+        if required_value is not None:
+            if required_value not in set(table[column]):
+                suggestion = suggest_name(str(required_value), map(str, table[column].unique()))
+                raise UsageError(f"metrics: no {column} '{required_value}'{suggestion}")
+            table = table[table[column] == required_value]
     return table.reset_index(drop=True)
 
 
-def select(models: Models) -> Model:
+def select_model(models: Models) -> Model:
     """Return the recipe's hull, else the simplest sound model that is alike the best.
 
     Free runs over the validation logs decide; `models.selection.reason` says why.
@@ -414,5 +461,5 @@ def select(models: Models) -> Model:
     Example:
         residnet.select(models).name
     """
-    require(models, Models, "select: expected models from residnet.fit")
-    return models[models.selected]
+    require_instance(models, Models, "select: expected models from residnet.fit")
+    return models[models.selected_name]

@@ -11,27 +11,36 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from residnet.api.data import Data
-from residnet.api.values import PathGiven, described, path
-from residnet.core.config import validate
+from residnet.api.data import Dataset
+from residnet.api.values import PathLikeArg, describe_type, parse_path
+from residnet.core.config import validate_config
 from residnet.core.errors import UsageError
-from residnet.core.files import read_json, staged_files
-from residnet.core.ownership import Manifest, recorded_folder
+from residnet.core.files import read_json, stage_files
+from residnet.core.ownership import Manifest, record_folder
 from residnet.core.run_loader import accept_run, name_damaged_key
 from residnet.core.trust import trusting
 from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec, chosen_model, load_model, save_model
-from residnet.export import exporter
-from residnet.export.base import released
+from residnet.export import get_exporter
+from residnet.export.base import require_releasable
 from residnet.export.vessel import ExportedVessel
 from residnet.identification.fitter import FittedModel
-from residnet.identification.monitoring import MonitorConfig, Verdict, Watch, Watcher
-from residnet.identification.recursive_refit import Refit, recursive_refit, refitted
+from residnet.identification.monitoring import (
+    ChangeDetector,
+    MonitorConfig,
+    MonitorVerdict,
+    OnlineChangeDetector,
+)
+from residnet.identification.recursive_refit import (
+    RecursiveRefit,
+    make_refitted_model,
+    refit_recursively,
+)
 from residnet.judge.band import read_bands
-from residnet.judge.verdict import UNSEEN, Evidence, objections
-from residnet.runs.folder import require_sealed
+from residnet.judge.verdict import UNSEEN_SPLITS, VerdictEvidence, list_model_objections
+from residnet.runs.folder import verify_checksums
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,9 +58,9 @@ class Model:
         x, s = model.step([0, 0, 0, 1.2, 0, 0], [20.0, 18.0])
 
     Attributes:
-        fitted: the model with the notes of its fit.
+        fitted_model: the model with the notes of its fit.
         name: of the model.
-        kind: what it is: zero, baseline, head or ensemble.
+        role: what it is: zero, baseline, head or ensemble.
         spec: everything that determines the model but its numbers.
         module: the PyTorch module itself.
         states: names of the columns of a state.
@@ -61,13 +70,20 @@ class Model:
         notes: what there is to say about the fit; empty for a model that was saved without a run.
     """
 
-    def __init__(self, fitted: FittedModel) -> None:
-        self.fitted, self.name, self.module = fitted, fitted.name, fitted.model
-        self.spec: ModelSpec = fitted.spec
-        self.kind, self.dt = str(self.spec.role), self.spec.dt
-        self.states, self.inputs = self.spec.signals.live.states, self.spec.signals.columns
-        self.units = self.spec.signals.units()
-        self.notes = dict(fitted.notes)
+    def __init__(self, fitted_model: FittedModel) -> None:
+        self.fitted_model, self.name, self.module = (
+            fitted_model,
+            fitted_model.name,
+            fitted_model.model,
+        )
+        self.spec: ModelSpec = fitted_model.spec
+        self.role, self.dt = str(self.spec.role), self.spec.dt
+        self.states, self.inputs = (
+            self.spec.signals.dof.state_names,
+            self.spec.signals.input_columns,
+        )
+        self.units = self.spec.signals.channel_units()
+        self.notes = dict(fitted_model.notes)
 
     @property
     def coefficients(self) -> pd.DataFrame:
@@ -94,11 +110,13 @@ class Model:
         Example:
             x, s = model.step(x, w, s)
         """
-        states, inputs = self._rows(("x", x, 1), ("w", w, 1))
+        states, inputs = self._parse_arrays(("x", x, 1), ("w", w, 1))
         with torch.no_grad():
-            found = self._double().step(states, inputs, self._memory(s, len(states)))
-        after, memory = (_back(part, np.ndim(x) == 1) for part in found)
-        return after, memory
+            step_result = self._double_precision_module().step(
+                states, inputs, self._parse_memory(s, len(states))
+            )
+        next_states, memory = (_to_numpy(array, np.ndim(x) == 1) for array in step_result)
+        return next_states, memory
 
     def rollout(self, x0: Any, w: Any, s: Any = None) -> np.ndarray:
         """Return the states of a free run from x0 on, [B, T+1, 6] or [T+1, 6].
@@ -114,11 +132,13 @@ class Model:
         Example:
             track = model.rollout(x0, w)[:, :2]
         """
-        states, inputs = self._rows(("x0", x0, 1), ("w", w, 2))
-        memory = self._memory(s, len(states))
+        states, inputs = self._parse_arrays(("x0", x0, 1), ("w", w, 2))
+        memory = self._parse_memory(s, len(states))
         with torch.no_grad():
-            found, _, _ = compiled(Rollout(self._double()), inputs.shape[1])(states, inputs, memory)
-        return _back(found, np.ndim(x0) == 1)
+            trajectory, _, _ = compiled(Rollout(self._double_precision_module()), inputs.shape[1])(
+                states, inputs, memory
+            )
+        return _to_numpy(trajectory, np.ndim(x0) == 1)
 
     def warmup(self, y_history: Any, w_history: Any) -> np.ndarray:
         """Return the memory that a measured past leaves, [B, n_state] or [n_state].
@@ -133,70 +153,76 @@ class Model:
         Example:
             s = model.warmup(log.y[:50], log.w[:50])
         """
-        states, inputs = self._rows(("y_history", y_history, 2), ("w_history", w_history, 2))
+        states, inputs = self._parse_arrays(
+            ("y_history", y_history, 2), ("w_history", w_history, 2)
+        )
         if states.shape[1] != inputs.shape[1]:
             raise UsageError(
                 f"model {self.name}: y_history has {states.shape[1]} samples, w_history"
                 f" {inputs.shape[1]}; give both at the same samples"
             )
         with torch.no_grad():
-            return _back(self._double().warmup(states, inputs), np.ndim(y_history) == 2)
+            return _to_numpy(
+                self._double_precision_module().warmup(states, inputs), np.ndim(y_history) == 2
+            )
 
     def __repr__(self) -> str:
         return (
-            f"Model({self.name!r}, {self.kind}, inputs {', '.join(self.inputs)}, dt {self.dt:g} s)"
+            f"Model({self.name!r}, {self.role}, inputs {', '.join(self.inputs)}, dt {self.dt:g} s)"
         )
 
-    def _double(self) -> HybridDynamics:
+    def _double_precision_module(self) -> HybridDynamics:
         # a copy: float64 arrays must not change the precision of the model itself
         return copy.deepcopy(self.module).to(torch.float64).eval()
 
-    def _rows(self, *given: tuple[str, Any, int]) -> tuple[Tensor, Tensor]:
+    def _parse_arrays(self, *named_arrays: tuple[str, Any, int]) -> tuple[Tensor, Tensor]:
         """Rows [B, (T,) width] of states and inputs, each by its name, value and axes; float64."""
-        out = []
-        for (name, value, axes), what in zip(given, ("states", "inputs"), strict=True):
-            columns = self.states if what == "states" else self.inputs
+        tensors = []
+        for (name, value, axes), array_kind in zip(named_arrays, ("states", "inputs"), strict=True):
+            columns = self.states if array_kind == "states" else self.inputs
             width = len(columns)
             try:
                 values = np.asarray(value, dtype=np.float64)
             except (TypeError, ValueError):
                 raise UsageError(
-                    f"model {self.name}: {name}: expected numbers, given {described(value)}"
+                    f"model {self.name}: {name}: expected numbers, given {describe_type(value)}"
                 ) from None
             if values.ndim not in (axes, axes + 1) or values.shape[-1] != width:
-                one = f"T, {width}" if axes == 2 else f"{width}"
+                expected_shape = f"T, {width}" if axes == 2 else f"{width}"
                 raise UsageError(
                     f"model {self.name}: {name} has the shape {list(values.shape)}, expected"
-                    f" [B, {one}] or [{one}] ({what} {', '.join(columns)})"
+                    f" [B, {expected_shape}] or [{expected_shape}] ({array_kind} {', '.join(columns)})"
                 )
             if not np.isfinite(values).all():
                 raise UsageError(f"model {self.name}: {name} holds a value that is not finite")
-            out.append(torch.from_numpy(values if values.ndim == axes + 1 else values[None].copy()))
-        states, inputs = out
+            tensors.append(
+                torch.from_numpy(values if values.ndim == axes + 1 else values[None].copy())
+            )
+        states, inputs = tensors
         if len(states) != len(inputs):
             raise UsageError(
                 f"model {self.name}: {len(states)} states, but inputs for {len(inputs)}"
             )
         return states, inputs
 
-    def _memory(self, given: Any, rows: int) -> Tensor:
+    def _parse_memory(self, value: Any, batch_size: int) -> Tensor:
         width = self.module.n_state
-        if given is None:
-            return torch.zeros(rows, width, dtype=torch.float64)
-        memory = np.atleast_2d(np.asarray(given, dtype=np.float64))
-        if memory.shape != (rows, width):
+        if value is None:
+            return torch.zeros(batch_size, width, dtype=torch.float64)
+        memory = np.atleast_2d(np.asarray(value, dtype=np.float64))
+        if memory.shape != (batch_size, width):
             raise UsageError(
-                f"model {self.name}: s has the shape {list(np.shape(given))}, expected"
-                f" [{rows}, {width}]"
+                f"model {self.name}: s has the shape {list(np.shape(value))}, expected"
+                f" [{batch_size}, {width}]"
             )
         return torch.from_numpy(memory)
 
 
-def _back(values: Tensor, single: bool) -> np.ndarray:
-    return (values[0] if single else values).numpy()
+def _to_numpy(values: Tensor, is_single: bool) -> np.ndarray:
+    return (values[0] if is_single else values).numpy()
 
 
-def save(model: Model, folder: PathGiven, *, overwrite: bool = False) -> Path:
+def save(model: Model, folder: PathLikeArg, *, overwrite: bool = False) -> Path:
     """Write a model to a folder and return it; nothing in it runs when it is loaded.
 
     Args:
@@ -210,21 +236,21 @@ def save(model: Model, folder: PathGiven, *, overwrite: bool = False) -> Path:
     Example:
         residnet.save(models["lstm"], "models/lstm")
     """
-    require(model, Model, "save: expected a model")
-    place = path(folder, "save")
-    if (place / "model.json").exists() and not overwrite:
-        raise UsageError(f"{place}: a model stands there already; give overwrite=True")
-    if place.exists() and not place.is_dir():
-        raise UsageError(f"{place}: is a file, expected a folder")
-    manifest = Manifest(place)
+    require_instance(model, Model, "save: expected a model")
+    model_folder = parse_path(folder, "save")
+    if (model_folder / "model.json").exists() and not overwrite:
+        raise UsageError(f"{model_folder}: a model stands there already; give overwrite=True")
+    if model_folder.exists() and not model_folder.is_dir():
+        raise UsageError(f"{model_folder}: is a file, expected a folder")
+    manifest = Manifest(model_folder)
     for name in ("model.json", "model.safetensors"):
-        manifest.require_replaceable(place / name)
-    with recorded_folder(place):
-        save_model(place, model.spec, model.module)
-    return place
+        manifest.require_replaceable(model_folder / name)
+    with record_folder(model_folder):
+        save_model(model_folder, model.spec, model.module)
+    return model_folder
 
 
-def load(folder: PathGiven, name: str | None = None, *, trust: bool = False) -> Model:
+def load(folder: PathLikeArg, name: str | None = None, *, trust: bool = False) -> Model:
     """Read a model from its folder, or by its name from the folder of a run.
 
     Args:
@@ -240,26 +266,28 @@ def load(folder: PathGiven, name: str | None = None, *, trust: bool = False) -> 
     Example:
         model = residnet.load("runs/quickstart", "selected")
     """
-    with trusting(trust), name_damaged_key(path(folder, "load")):
-        place = path(folder, "load")
-        is_model = (place / "model.json").is_file()
-        if name is not None or (not is_model and (place / "models").is_dir()):
-            place = place / "models" / chosen_model(place, name or "predictor")
-        require_sealed(place)
-        spec, module = load_model(place)
+    with trusting(trust), name_damaged_key(parse_path(folder, "load")):
+        model_folder = parse_path(folder, "load")
+        is_model = (model_folder / "model.json").is_file()
+        if name is not None or (not is_model and (model_folder / "models").is_dir()):
+            model_folder = model_folder / "models" / chosen_model(model_folder, name or "predictor")
+        verify_checksums(model_folder)
+        spec, module = load_model(model_folder)
         # outside of a run there are neither notes nor bands
-        notes, bands = place / "fit.json", place.parent.parent / "bands.json"
+        notes, bands = model_folder / "fit.json", model_folder.parent.parent / "bands.json"
         return Model(
             FittedModel(
                 spec,
                 module,
                 read_json(notes) if notes.is_file() else {},
-                bands=read_bands(read_json(bands)).get(place.name, {}) if bands.is_file() else {},
+                bands=read_bands(read_json(bands)).get(model_folder.name, {})
+                if bands.is_file()
+                else {},
             )
         )
 
 
-def trust(folder: PathGiven) -> list[str]:
+def trust(folder: PathLikeArg) -> list[str]:
     """Accept the folder of a run or model as it stands, as `residnet trust` does.
 
     Do this only if you trust where it comes from. Its manifest (`checksums.json`) is written anew.
@@ -276,16 +304,16 @@ def trust(folder: PathGiven) -> list[str]:
     Example:
         residnet.trust("runs/of_an_earlier_version")
     """
-    return accept_run(path(folder, "trust"))
+    return accept_run(parse_path(folder, "trust"))
 
 
 def export_model(
     model: Model,
-    file: PathGiven,
+    file: PathLikeArg,
     format: str = "torchscript",
     *,
     metrics: Sequence[Mapping[str, Any]] = (),
-    anyway: bool = False,
+    allows_objections: bool = False,
 ) -> Mapping[str, Any]:
     """Write a model for controllers, after a parity check, and return what its card says.
 
@@ -295,10 +323,10 @@ def export_model(
         format: one of `available("formats")`.
         metrics: rows of metrics.json. Those of this model stand in the card; those of `zero` and
             of a baseline under the same protocol show whether it is worse than they are.
-        anyway: whether a model is wanted that is worse, too; its card says so.
+        allows_objections: whether a model is wanted that is worse, too; its card says so.
 
     Raises:
-        WithheldError: where it is worse than `zero` or the baseline, but for `anyway`.
+        WithheldError: where it is worse than `zero` or the baseline, but for `allows_objections`.
         ConfigError: where there is no such format.
         UsageError: where the format cannot hold such a model.
         ExportError: where what was written does not reproduce the model.
@@ -306,38 +334,45 @@ def export_model(
     Example:
         card = residnet.export_model(models["lstm"], "lstm.pt")
     """
-    require(model, Model, "export_model: expected a model")
+    require_instance(model, Model, "export_model: expected a model")
     name = model.spec.name
-    chosen_format = exporter(format)
-    own = [row for row in metrics if row.get("model", name) == name]
-    exported = ExportedVessel(model.spec, model.module, own)
-    released(exported, _objections(name, metrics), anyway=anyway)
-    place = path(file, "export_model")
-    with staged_files(place, place.parent.glob("*.masses.yaml")) as staged:
+    chosen_format = get_exporter(format)
+    model_rows = [row for row in metrics if row.get("model", name) == name]
+    exported = ExportedVessel(model.spec, model.module, model_rows)
+    require_releasable(
+        exported, _find_objections(name, metrics), allows_objections=allows_objections
+    )
+    place = parse_path(file, "export_model")
+    with stage_files(place, place.parent.glob("*.masses.yaml")) as staged:
         return chosen_format.export(exported, staged)
 
 
-def _objections(name: str, metrics: Sequence[Mapping[str, Any]]) -> list[str]:
+def _find_objections(name: str, metrics: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return what rows of metrics.json say against a model, on the data that tell most."""
-    whole = [row for row in metrics if row.get("manoeuvre") == "all"]
-    splits = [row["split"] for row in whole if row["model"] == name]
+    all_manoeuvre_rows = [row for row in metrics if row.get("manoeuvre") == "all"]
+    splits = [row["split"] for row in all_manoeuvre_rows if row["model"] == name]
     if not splits:
         return []
-    split = next((one for one in UNSEEN if one in splits), splits[0])
-    judged = [row for row in whole if row["split"] == split]
-    rows = {row["model"]: row for row in judged if row["protocol"] == judged[0]["protocol"]}
-    baseline = next((row["model"] for row in judged if row["kind"] == "baseline"), "")
-    return objections(Evidence(name, split, rows, baseline))
+    split = next(
+        (candidate_split for candidate_split in UNSEEN_SPLITS if candidate_split in splits),
+        splits[0],
+    )
+    split_rows = [row for row in all_manoeuvre_rows if row["split"] == split]
+    rows = {row["model"]: row for row in split_rows if row["protocol"] == split_rows[0]["protocol"]}
+    baseline = next((row["model"] for row in split_rows if row["kind"] == "baseline"), "")
+    return list_model_objections(VerdictEvidence(name, split, rows, baseline))
 
 
-def require(given: Any, kind: type[Any] | tuple[type[Any], ...], expected: str) -> None:
+def require_instance(
+    value: Any, expected_type: type[Any] | tuple[type[Any], ...], expected: str
+) -> None:
     """Stop where an argument is of another kind.
 
     Raises:
         UsageError: with what it is instead.
     """
-    if not isinstance(given, kind):
-        raise UsageError(f"{expected}, given {described(given)}")
+    if not isinstance(value, expected_type):
+        raise UsageError(f"{expected}, given {describe_type(value)}")
 
 
 @final
@@ -350,7 +385,7 @@ class Monitor:
 
     Args:
         model: of the vessel as it was.
-        clean: data of the unchanged vessel, as they were fitted.
+        reference_data: data of the unchanged vessel, as they were fitted.
         settings: of `residnet.identification.monitoring.MonitorConfig`: `window`,
             `stretch`, `false_alarm`, `group` in s.
 
@@ -362,39 +397,43 @@ class Monitor:
         monitor = residnet.Monitor(models["baseline"], data); verdict = monitor.step(y, w)
     """
 
-    def __init__(self, model: Model, clean: Data, **settings: Any) -> None:
-        require(model, Model, "Monitor: expected a model")
-        require(clean, Data, "Monitor: expected data from residnet.prepare")
-        config = validate(settings, MonitorConfig, "Monitor")
-        logs = [log for split in ("train", "validation") for log in clean.splits.get(split, ())]
-        watch = Watch.of(model.spec, copy.deepcopy(model.module), logs, config)
-        self._model, self._watcher = model, Watcher(watch)
-        self.verdict: Verdict | None = None
+    def __init__(self, model: Model, reference_data: Dataset, **settings: Any) -> None:
+        require_instance(model, Model, "Monitor: expected a model")
+        require_instance(reference_data, Dataset, "Monitor: expected data from residnet.prepare")
+        config = validate_config(settings, MonitorConfig, "Monitor")
+        logs = [
+            log for split in ("train", "validation") for log in reference_data.splits.get(split, ())
+        ]
+        change_detector = ChangeDetector.from_logs(
+            model.spec, copy.deepcopy(model.module), logs, config
+        )
+        self._model, self._detector = model, OnlineChangeDetector(change_detector)
+        self.verdict: MonitorVerdict | None = None
 
     @property
     def threshold(self) -> float:
         """The score at which a cause raises an alarm."""
-        return self._watcher.watch.threshold
+        return self._detector.detector.threshold
 
-    def step(self, y: Sequence[float], w: Sequence[float]) -> Verdict | None:
+    def step(self, y: Sequence[float], w: Sequence[float]) -> MonitorVerdict | None:
         """Take one sample, and return the verdict where a window is complete, else None.
 
         Args:
             y: measured x, y, psi, u, v, r, then p and phi of a model that rolls; psi without jumps.
             w: inputs held over the step after it, in the model's order.
         """
-        found = self._watcher.step(np.asarray(y, dtype=float), np.asarray(w, dtype=float))
-        self.verdict = found or self.verdict
-        return found
+        new_verdict = self._detector.update(np.asarray(y, dtype=float), np.asarray(w, dtype=float))
+        self.verdict = new_verdict or self.verdict
+        return new_verdict
 
-    def refit(self, new: Data) -> tuple[Model, Refit]:
+    def refit(self, new_data: Dataset) -> tuple[Model, RecursiveRefit]:
         """Put the changes that the monitor names into a copy of the model, log by log.
 
         The old model stays as it is. Judge both on logs that were not given here, for example by
         `residnet.free_run`, before the new one goes into service.
 
         Args:
-            new: logs of the changed vessel in the order of time, as
+            new_data: logs of the changed vessel in the order of time, as
                 `residnet.prepare(logs, like=data)` gives them.
 
         Returns:
@@ -406,12 +445,18 @@ class Monitor:
             UsageError: where the data are of another kind, or the model has no parameters to move.
             DataError: where a log holds no window.
         """
-        require(new, Data, "Monitor.refit: expected data from residnet.prepare")
-        watch = self._watcher.watch
-        windows = [watch.windows(log) for members in new.splits.values() for log in members]
-        refit = recursive_refit(watch, windows)
-        return Model(refitted(self._model.fitted, refit)), refit
+        require_instance(new_data, Dataset, "Monitor.refit: expected data from residnet.prepare")
+        change_detector = self._detector.detector
+        windows = [
+            change_detector.make_windows(log)
+            for members in new_data.splits.values()
+            for log in members
+        ]
+        recursive_result = refit_recursively(change_detector, windows)
+        return Model(
+            make_refitted_model(self._model.fitted_model, recursive_result)
+        ), recursive_result
 
     def restart(self) -> None:
         """Say that the next sample does not follow the last one."""
-        self._watcher.restart()
+        self._detector.start_new_log()

@@ -11,44 +11,52 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, final, get_args
 
 from residnet.api.models import Model, load
-from residnet.api.values import PartGiven, PathGiven, described, hearing, part, path, plain
+from residnet.api.values import (
+    PartLike,
+    PathLikeArg,
+    describe_type,
+    forward_progress,
+    parse_part,
+    parse_path,
+    to_builtin,
+)
 from residnet.baselines import BaselineConfig
 from residnet.baselines.base import IdentifiedConfig
-from residnet.core.config import load_config, validate
+from residnet.core.config import load_config, validate_config
 from residnet.core.errors import UsageError
 from residnet.core.files import read_table
 from residnet.core.log import Log
-from residnet.core.names import nearest
-from residnet.core.ownership import read_regular, require_inside, resolve_name
+from residnet.core.names import suggest_name
+from residnet.core.ownership import read_regular_file, require_inside, resolve_name
 from residnet.core.progress import ProgressCallback
 from residnet.core.run_loader import SIZE_LIMITS
 from residnet.core.trust import trusting
-from residnet.data.simulated import Flight
+from residnet.data.simulated import ManoeuvreRun
 from residnet.heads import HeadConfig
 from residnet.heads.base import FeatureConfig
-from residnet.judge.booklet import index_rows
-from residnet.judge.metrics import metrics_table
+from residnet.judge.booklet import build_index_rows
+from residnet.judge.metrics import build_metrics_table
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.manoeuvres.base import Manoeuvre
 from residnet.physics.vessel import load_vessel
 from residnet.physics.vessel_file import VesselFile
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Task
-from residnet.tasks.own_autopilot import draft_autopilot
-from residnet.tasks.registry import TaskConfig, catalogue
+from residnet.tasks.own_autopilot import draft_autopilot_config
+from residnet.tasks.registry import TaskConfig, list_catalogue
 from residnet.tasks.simulate import Programme
 
 if TYPE_CHECKING:
     import pandas as pd
 
-What = Literal["vessels", "heads", "baselines", "manoeuvres", "readers", "tasks", "formats"]
+PartKind = Literal["vessels", "heads", "baselines", "manoeuvres", "readers", "tasks", "formats"]
 
 
-def available(what: What) -> pd.DataFrame:
+def list_available(part_kind: PartKind) -> pd.DataFrame:
     """Return what there is to choose from, parts of other packages included: name and about.
 
     Args:
-        what: vessels, heads, baselines, manoeuvres, readers, tasks or formats (of exports).
+        part_kind: vessels, heads, baselines, manoeuvres, readers, tasks or formats (of exports).
 
     Raises:
         UsageError: where it is none of these.
@@ -58,12 +66,14 @@ def available(what: What) -> pd.DataFrame:
     """
     import pandas as pd
 
-    if what not in get_args(What):
-        raise UsageError(f"available: there are no '{what}'{nearest(str(what), get_args(What))}")
-    return pd.DataFrame(catalogue(what), columns=["name", "about"])
+    if part_kind not in get_args(PartKind):
+        raise UsageError(
+            f"available: there are no '{part_kind}'{suggest_name(str(part_kind), get_args(PartKind))}"
+        )
+    return pd.DataFrame(list_catalogue(part_kind), columns=["name", "about"])
 
 
-def head(kind: PartGiven, *, trust: bool = False, **settings: Any) -> FeatureConfig:
+def head(kind: PartLike, *, trust: bool = False, **settings: Any) -> FeatureConfig:
     """Return the config of a residual head, for `fit`.
 
     Args:
@@ -79,11 +89,13 @@ def head(kind: PartGiven, *, trust: bool = False, **settings: Any) -> FeatureCon
         residnet.head("lstm", hidden_size=16)
     """
     with trusting(trust):
-        config: FeatureConfig = validate(part(kind, "head", **settings), HeadConfig, "head")
+        config: FeatureConfig = validate_config(
+            parse_part(kind, "head", **settings), HeadConfig, "head"
+        )
         return config
 
 
-def baseline(kind: PartGiven, **settings: Any) -> IdentifiedConfig:
+def baseline(kind: PartLike, **settings: Any) -> IdentifiedConfig:
     """Return the config of a baseline, for `fit`.
 
     Args:
@@ -96,12 +108,12 @@ def baseline(kind: PartGiven, **settings: Any) -> IdentifiedConfig:
     Example:
         residnet.baseline("regressors", sets=["fossen"])
     """
-    given = part(kind, "baseline", **settings)
-    config: IdentifiedConfig = validate(given, BaselineConfig, "baseline")
+    baseline_settings = parse_part(kind, "baseline", **settings)
+    config: IdentifiedConfig = validate_config(baseline_settings, BaselineConfig, "baseline")
     return config
 
 
-def manoeuvre(kind: PartGiven, **settings: Any) -> Manoeuvre:
+def manoeuvre(kind: PartLike, **settings: Any) -> Manoeuvre:
     """Return a manoeuvre by its kind and settings, for `simulate`.
 
     Args:
@@ -114,7 +126,9 @@ def manoeuvre(kind: PartGiven, **settings: Any) -> Manoeuvre:
     Example:
         residnet.manoeuvre("zigzag", drive=0.6, steer=0.4, heading="20 deg")
     """
-    config: Manoeuvre = validate(part(kind, "manoeuvre", **settings), ManoeuvreConfig, "manoeuvre")
+    config: Manoeuvre = validate_config(
+        parse_part(kind, "manoeuvre", **settings), ManoeuvreConfig, "manoeuvre"
+    )
     return config
 
 
@@ -131,12 +145,12 @@ def vessel(name: str) -> VesselFile:
         residnet.vessel("wam_v_cal").length.value
     """
     if not isinstance(name, str):
-        raise UsageError(f"vessel: expected a name or path, given {described(name)}")
+        raise UsageError(f"vessel: expected a name or path, given {describe_type(name)}")
     return load_vessel(name)
 
 
 @final
-class Trials:
+class SimulationResult:
     """Sea trials that were flown.
 
     Attributes:
@@ -150,9 +164,9 @@ class Trials:
         trials.indices[["log", "first_overshoot"]]
     """
 
-    def __init__(self, flights: Sequence[Flight], indices: pd.DataFrame) -> None:
-        self.logs: list[Log] = [flight.log for flight in flights]
-        self.motions: list[Log] = [flight.motion for flight in flights]
+    def __init__(self, flights: Sequence[ManoeuvreRun], indices: pd.DataFrame) -> None:
+        self.logs: list[Log] = [flight.measured_log for flight in flights]
+        self.motions: list[Log] = [flight.true_log for flight in flights]
         self.indices = indices
 
     def __repr__(self) -> str:
@@ -161,12 +175,12 @@ class Trials:
 
 def simulate(
     vessel: str | None = None,
-    manoeuvres: PartGiven | Sequence[PartGiven] = (),
+    manoeuvres: PartLike | Sequence[PartLike] = (),
     *,
-    families: PartGiven | Sequence[PartGiven] = (),
+    families: PartLike | Sequence[PartLike] = (),
     progress: ProgressCallback | None = None,
     **settings: Any,
-) -> Trials:
+) -> SimulationResult:
     """Fly manoeuvres with a vessel, a learned model, or both.
 
     The arguments are the keys of `programme` in a config of the task `simulate`, and give the same
@@ -190,26 +204,28 @@ def simulate(
     """
     import pandas as pd
 
-    given: dict[str, Any] = {"vessel": vessel, **settings}
-    asked: dict[str, Any] = {"manoeuvres": manoeuvres, "families": families}
-    for key, parts in asked.items():
-        several = parts if isinstance(parts, list | tuple) else [parts]
-        given[key] = [part(entry, key) for entry in several]
-    known = {name: value for name, value in given.items() if value is not None}
-    programme: Programme = validate(plain(known), Programme, "simulate")
+    programme_settings: dict[str, Any] = {"vessel": vessel, **settings}
+    manoeuvre_parts: dict[str, Any] = {"manoeuvres": manoeuvres, "families": families}
+    for key, entries in manoeuvre_parts.items():
+        entry_list = entries if isinstance(entries, list | tuple) else [entries]
+        programme_settings[key] = [parse_part(entry, key) for entry in entry_list]
+    settings_without_none = {
+        name: value for name, value in programme_settings.items() if value is not None
+    }
+    programme: Programme = validate_config(to_builtin(settings_without_none), Programme, "simulate")
     flights, rows = [], []
-    with hearing(progress):
-        for craft, sea in programme.crafts():
-            flown = programme.fly(craft, sea)
-            flights += flown
-            rows += index_rows(craft, flown, programme.hull_length)
-    names = ("log", "manoeuvre", "craft", "fault")
-    flat = [{name: row[name] for name in names} | row["indices"] for row in rows]
-    return Trials(flights, pd.DataFrame(flat))
+    with forward_progress(progress):
+        for craft, sea in programme.build_crafts():
+            craft_flights = programme.simulate_all(craft, sea)
+            flights += craft_flights
+            rows += build_index_rows(craft, craft_flights, programme.hull_length)
+    identity_columns = ("log", "manoeuvre", "craft", "fault")
+    flat_rows = [{name: row[name] for name in identity_columns} | row["indices"] for row in rows]
+    return SimulationResult(flights, pd.DataFrame(flat_rows))
 
 
 @final
-class Result:
+class RunResult:
     """What a run found, of whatever task.
 
     Where the run was given no folder, its files are kept as long as this object is.
@@ -218,8 +234,10 @@ class Result:
         folder: where everything stands.
     """
 
-    def __init__(self, folder: Path, kept: tempfile.TemporaryDirectory[str] | None) -> None:
-        self.folder, self._kept = folder, kept
+    def __init__(
+        self, folder: Path, temporary_folder: tempfile.TemporaryDirectory[str] | None
+    ) -> None:
+        self.folder, self._temporary_folder = folder, temporary_folder
 
     @cached_property
     def summary(self) -> dict[str, Any]:
@@ -242,19 +260,19 @@ class Result:
 
         rows = list(RunFolder(self.folder).read_metrics()["rows"])
         # a fit counts errors of velocities; other tasks have columns of their own
-        return metrics_table(rows) if "rmse" in rows[0] else pd.json_normalize(rows)
+        return build_metrics_table(rows) if "rmse" in rows[0] else pd.json_normalize(rows)
 
     @property
-    def files(self) -> list[str]:
+    def file_names(self) -> list[str]:
         """Names of all files of the run."""
-        every = sorted(self.folder.rglob("*"))
-        return [str(file.relative_to(self.folder)) for file in every if file.is_file()]
+        all_paths = sorted(self.folder.rglob("*"))
+        return [str(file.relative_to(self.folder)) for file in all_paths if file.is_file()]
 
-    def read(self, name: str) -> Any:
+    def read_file(self, name: str) -> Any:
         """Return the contents of a file: a table for Parquet, values for JSON, else text.
 
         Args:
-            name: of the file, as `files` has it.
+            name: of the file, as `file_names` has it.
 
         Raises:
             UsageError: where there is no such file, or it is no text, JSON or Parquet.
@@ -264,19 +282,21 @@ class Result:
         """
         file = resolve_name(self.folder, name)
         if not file.is_file():
-            raise UsageError(f"{self.folder}: no file '{name}'{nearest(str(name), self.files)}")
+            raise UsageError(
+                f"{self.folder}: no file '{name}'{suggest_name(str(name), self.file_names)}"
+            )
         if file.suffix == ".parquet":
             return read_table(file)
         try:
             require_inside(self.folder, file)
-            text = read_regular(file, SIZE_LIMITS[".json"]).decode("utf-8")
+            text = read_regular_file(file, SIZE_LIMITS[".json"]).decode("utf-8")
             return json.loads(text) if file.suffix == ".json" else text
         except (OSError, ValueError, RecursionError) as error:
             raise UsageError(
                 f"{file}: not readable ({error}); restore it or run it again"
             ) from error
 
-    def model(self, name: str = "predictor", *, trust: bool = False) -> Model:
+    def load_model(self, name: str = "predictor", *, trust: bool = False) -> Model:
         """Return a model of a fit, the one that is reported first where none is named.
 
         Args:
@@ -293,16 +313,16 @@ class Result:
 
 
 def run(
-    config: PathGiven | Mapping[str, Any] | Task,
+    config: PathLikeArg | Mapping[str, Any] | Task,
     *,
     overrides: Sequence[str] | Mapping[str, Any] = (),
-    folder: PathGiven | None = None,
+    folder: PathLikeArg | None = None,
     resume: bool = False,
     overwrite: bool = False,
     report: bool = True,
     trust: bool = False,
     progress: ProgressCallback | None = None,
-) -> Result:
+) -> RunResult:
     """Carry out any task, with the numbers of the command line.
 
     Args:
@@ -327,52 +347,60 @@ def run(
         result = residnet.run("quickstart.yaml", overrides={"seed": 3}); result.metrics
     """
     with trusting(trust):
-        changes, source, task = _overrides(overrides), None, config
-        if isinstance(config, Task | Mapping) and changes:
+        override_texts, source, task = _parse_overrides(overrides), None, config
+        if isinstance(config, Task | Mapping) and override_texts:
             raise UsageError("run: overrides are for a file; change the mapping itself")
         if isinstance(config, Mapping):
-            task = validate(plain(config), TaskConfig, "run", Path.cwd())
+            task = validate_config(to_builtin(config), TaskConfig, "run", Path.cwd())
         elif isinstance(config, str | Path):
-            source = path(config, "run")
-            task = load_config(source, changes, TaskConfig)
+            source = parse_path(config, "run")
+            task = load_config(source, override_texts, TaskConfig)
         if not isinstance(task, Task):
             raise UsageError(
                 "run: expected the path of a YAML file, a mapping or a task, given"
-                f" {described(config)}"
+                f" {describe_type(config)}"
             )
-        kept = None if folder is not None else tempfile.TemporaryDirectory(prefix="residnet-")
-        place = path(folder, "run: folder") if kept is None else Path(kept.name) / task.name
-        with hearing(progress):
+        temporary_folder = (
+            None if folder is not None else tempfile.TemporaryDirectory(prefix="residnet-")
+        )
+        folder_path = (
+            parse_path(folder, "run: folder")
+            if temporary_folder is None
+            else Path(temporary_folder.name) / task.name
+        )
+        with forward_progress(progress):
             task.run(
                 source=source,
-                overrides=changes,
-                out=place,
+                overrides=override_texts,
+                output_folder=folder_path,
                 resume=resume,
                 overwrite=overwrite,
                 report=report,
             )
-        return Result(place, kept)
+        return RunResult(folder_path, temporary_folder)
 
 
-def _overrides(given: Any) -> list[str]:
-    if isinstance(given, Mapping):
-        return [f"{key}={json.dumps(plain(value))}" for key, value in given.items()]
-    if isinstance(given, list | tuple) and all(isinstance(text, str) for text in given):
-        return list(given)
-    raise UsageError(f"run: overrides: expected a list or a mapping, given {described(given)}")
+def _parse_overrides(overrides: Any) -> list[str]:
+    if isinstance(overrides, Mapping):
+        return [f"{key}={json.dumps(to_builtin(value))}" for key, value in overrides.items()]
+    if isinstance(overrides, list | tuple) and all(isinstance(text, str) for text in overrides):
+        return list(overrides)
+    raise UsageError(
+        f"run: overrides: expected a list or a mapping, given {describe_type(overrides)}"
+    )
 
 
-def own_autopilot(
-    source: PathGiven | Sequence[PathGiven],
-    config: PathGiven = "my_autopilot.yaml",
+def design_autopilot(
+    source: PathLikeArg | Sequence[PathLikeArg],
+    config: PathLikeArg = "my_autopilot.yaml",
     *,
     rudder: str | None = None,
     rate: str | None = None,
     speed: str | None = None,
-    folder: PathGiven | None = None,
+    folder: PathLikeArg | None = None,
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
-) -> Result:
+) -> RunResult:
     """Train a heading autopilot for one's own vessel, as `residnet autopilot` does.
 
     Args:
@@ -392,11 +420,16 @@ def own_autopilot(
     Example:
         residnet.own_autopilot("0.31,7.4", rate="6 deg/s", folder="runs/own")
     """
-    given = [source] if isinstance(source, str | PathLike) else source
-    told = {"rudder": rudder, "rate": rate, "speed": speed}
-    place = path(config, "own_autopilot")
-    file = draft_autopilot([str(one) for one in given], place, overwrite=overwrite, **told)
-    return run(file, folder=folder, overwrite=overwrite, progress=progress)
+    sources = [source] if isinstance(source, str | PathLike) else source
+    steering_options = {"rudder": rudder, "rate": rate, "speed": speed}
+    config_path = parse_path(config, "own_autopilot")
+    config_file = draft_autopilot_config(
+        [str(source_entry) for source_entry in sources],
+        config_path,
+        overwrite=overwrite,
+        **steering_options,
+    )
+    return run(config_file, folder=folder, overwrite=overwrite, progress=progress)
 
 
 def autopilot(
@@ -404,11 +437,11 @@ def autopilot(
     rudder: float | str,
     *,
     peers: Mapping[str, Any] | None = None,
-    folder: PathGiven | None = None,
+    folder: PathLikeArg | None = None,
     name: str = "autopilot",
     progress: ProgressCallback | None = None,
     **settings: Any,
-) -> Result:
+) -> RunResult:
     """Train heading autopilots through a vessel and compare them with tuned classical controllers.
 
     The arguments are the keys of a config of the task `autopilot`, and give the same numbers.
@@ -430,9 +463,9 @@ def autopilot(
         residnet.autopilot("nomoto_oceanos", "5 deg", test={"duration": 12}, conditions={},
                            policies={"mine": {"start": None}})
     """
-    given = {
-        peer: {"kind": kind} if isinstance(kind, str) else kind
-        for peer, kind in (peers or {}).items()
+    peer_settings = {
+        peer: {"kind": controller_kind} if isinstance(controller_kind, str) else controller_kind
+        for peer, controller_kind in (peers or {}).items()
     }
     config = {"task": "autopilot", "name": name, "vessel": vessel, "rudder": rudder}
-    return run({**config, "peers": given, **settings}, folder=folder, progress=progress)
+    return run({**config, "peers": peer_settings, **settings}, folder=folder, progress=progress)

@@ -12,78 +12,80 @@ import numpy as np
 from pydantic import BaseModel
 
 from residnet.core.errors import UsageError
-from residnet.core.progress import ProgressCallback, listen
+from residnet.core.progress import ProgressCallback, on_progress
 
-PathGiven = str | PathLike[str]
+PathLikeArg = str | PathLike[str]
 """A path, as text or as an object."""
 
-PartGiven = str | Mapping[str, Any] | BaseModel
+PartLike = str | Mapping[str, Any] | BaseModel
 """A part by its kind, by a mapping as YAML has it, or by its config object."""
 
 
-def plain(value: Any) -> Any:
+def to_builtin(value: Any) -> Any:
     """Return a value as YAML would hold it: configs, tuples, paths and arrays become plain."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", by_alias=True)
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_builtin(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
+        return to_builtin(value.tolist())
     if isinstance(value, list | tuple | set | frozenset):
-        return [plain(item) for item in value]
+        return [to_builtin(item) for item in value]
     return str(value) if isinstance(value, PathLike) else value
 
 
-def part(given: PartGiven, what: str, **settings: Any) -> dict[str, Any]:
+def parse_part(value: PartLike, description: str, **settings: Any) -> dict[str, Any]:
     """Return the config of a part as a mapping with its kind.
 
     Args:
-        given: the kind alone, a mapping, or a config object.
-        what: the part, in words, for the error.
+        value: the kind alone, a mapping, or a config object.
+        description: the part, in words, for the error.
         settings: further keys.
 
     Raises:
         UsageError: where it is none of these.
     """
-    if isinstance(given, str):
-        return {"kind": given, **plain(settings)}
-    if isinstance(given, Mapping | BaseModel):
-        return {**plain(given), **plain(settings)}
+    if isinstance(value, str):
+        return {"kind": value, **to_builtin(settings)}
+    if isinstance(value, Mapping | BaseModel):
+        return {**to_builtin(value), **to_builtin(settings)}
     raise UsageError(
-        f"{what}: expected its kind, a mapping or a config object, given {described(given)}"
+        f"{description}: expected its kind, a mapping or a config object, given {describe_type(value)}"
     )
 
 
-def named_parts(given: Any, what: str) -> dict[str, Any]:
+def parse_named_parts(value: Any, description: str) -> dict[str, Any]:
     """Return parts by name, from a list of kinds or a mapping from names to parts.
 
     Raises:
         UsageError: where it is neither.
     """
-    if isinstance(given, str):
-        return {given: part(given, what)}
-    if isinstance(given, Mapping) and "kind" not in given:
-        return {str(name): part(entry, f"{what} '{name}'") for name, entry in given.items()}
-    if isinstance(given, list | tuple) and all(isinstance(kind, str) for kind in given):
-        return {kind: part(kind, what) for kind in given}
+    if isinstance(value, str):
+        return {value: parse_part(value, description)}
+    if isinstance(value, Mapping) and "kind" not in value:
+        return {
+            str(name): parse_part(entry, f"{description} '{name}'") for name, entry in value.items()
+        }
+    if isinstance(value, list | tuple) and all(isinstance(part_kind, str) for part_kind in value):
+        return {part_kind: parse_part(part_kind, description) for part_kind in value}
     raise UsageError(
-        f"{what}s: expected kinds such as ['plsr', 'lstm'], or a mapping from names to settings,"
-        f" given {described(given)}"
+        f"{description}s: expected kinds such as ['plsr', 'lstm'], or a mapping from names to settings,"
+        f" given {describe_type(value)}"
     )
 
 
-def path(given: Any, what: str) -> Path:
+def parse_path(value: Any, description: str) -> Path:
     """Return the given value as a path, ~ expanded.
 
     Raises:
         UsageError: where it is none.
     """
-    if isinstance(given, str | PathLike) and str(given):
-        return Path(given).expanduser()
-    raise UsageError(f"{what}: expected a path, given {described(given)}")
+    if isinstance(value, str | PathLike) and str(value):
+        return Path(value).expanduser()
+    raise UsageError(f"{description}: expected a path, given {describe_type(value)}")
 
 
-def described(value: Any) -> str:
+def describe_type(value: Any) -> str:
     """Return what a wrong argument is, in a few words."""
     if value is None or isinstance(value, str | int | float | bool):
         return repr(value)
@@ -93,7 +95,7 @@ def described(value: Any) -> str:
     return f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}"
 
 
-def hearing(progress: ProgressCallback | None) -> AbstractContextManager[None]:
+def forward_progress(progress: ProgressCallback | None) -> AbstractContextManager[None]:
     """Return a context that sends progress to a callback; without one, whoever listens goes on.
 
     Raises:
@@ -102,5 +104,5 @@ def hearing(progress: ProgressCallback | None) -> AbstractContextManager[None]:
     if progress is None:
         return nullcontext()
     if not callable(progress):
-        raise UsageError(f"progress: expected a function, given {described(progress)}")
-    return listen(progress)
+        raise UsageError(f"progress: expected a function, given {describe_type(progress)}")
+    return on_progress(progress)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any
 
-from residnet.core.registry import Kinds
+from residnet.core.registry import PluginUnion
 
 if TYPE_CHECKING:
     from residnet.baselines.base import IdentifiedConfig
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 else:
     BaselineConfig = Annotated[
         Any,
-        Kinds(
+        PluginUnion(
             "residnet.baselines",
             "residnet.baselines.base:IdentifiedConfig",
             {
@@ -21,10 +21,10 @@ else:
                 "equations": "residnet.baselines.given:EquationsConfig",
                 "linear_steady": "residnet.baselines.steering:LinearSteadyConfig",
                 "mmg": "residnet.baselines.mmg:MMGConfig",
-                "nomoto": "residnet.baselines.steering:NomotoConfig",
-                "nomoto_sideslip": "residnet.baselines.steering:NomotoSideslipConfig",
+                "nomoto": "residnet.baselines.steering:NomotoBaselineConfig",
+                "nomoto_sideslip": "residnet.baselines.steering:NomotoSideslipBaselineConfig",
                 "regressors": "residnet.baselines.regressors:RegressorsConfig",
-                "still": "residnet.baselines.given:StillConfig",
+                "still": "residnet.baselines.given:ZeroBaselineConfig",
             },
         ),
     ]

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
-from residnet.physics.symmetry import live_of
+from residnet.physics.symmetry import get_dof
 from residnet.regression.estimator import Coefficient, Solution
 
 
@@ -27,10 +27,10 @@ class Baseline(nn.Module, ABC):
         """Return nu_dot [..., n] at channels z [..., nz] (see `residnet.physics.signals`)."""
 
     @abstractmethod
-    def parameter_count(self) -> list[float]:
+    def parameter_counts(self) -> list[float]:
         """Return the number of fitted parameters of each axis."""
 
-    def mass(self) -> Tensor | None:
+    def inertia_matrix(self) -> Tensor | None:
         """Return the inertia [3, 3] between forces and accelerations, float64.
 
         None where a baseline knows no forces.
@@ -57,24 +57,24 @@ class ParametricBaseline(Baseline, ABC):
         """Return the places [P] in theta, flattened, of the parameters that may move."""
 
     @final
-    def free(self) -> Tensor:
+    def get_free(self) -> Tensor:
         """Return the free parameters [P] as they are."""
         return self.theta.detach().flatten()[self.free_indices()].clone()
 
     @final
-    def place(self, values: Tensor) -> None:
+    def set_free(self, values: Tensor) -> None:
         """Set the free parameters to values [P]."""
         with torch.no_grad():
-            flat = self.theta.detach().clone().flatten()
-            flat[self.free_indices()] = values.to(flat.dtype)
-            self.theta.copy_(flat.reshape(self.theta.shape))
+            flat_theta = self.theta.detach().clone().flatten()
+            flat_theta[self.free_indices()] = values.to(flat_theta.dtype)
+            self.theta.copy_(flat_theta.reshape(self.theta.shape))
 
     @abstractmethod
-    def free_names(self) -> list[tuple[str, str]]:
+    def free_parameter_names(self) -> list[tuple[str, str]]:
         """Return (axis, term) of each free parameter, as the table of coefficients has them [P]."""
 
     @final
-    def sensitivity(self, z: Tensor) -> Tensor:
+    def parameter_jacobian(self, z: Tensor) -> Tensor:
         """Return the derivatives [B, n, P] of nu_dot by the free parameters at channels z [B, nz].
 
         They are exact: each row is differentiated in reverse mode, all rows at once.
@@ -89,7 +89,7 @@ class ParametricBaseline(Baseline, ABC):
         return jacobian.flatten(2)[..., self.free_indices()]
 
     @abstractmethod
-    def information(self, samples: Samples) -> Tensor:
+    def mean_information(self, samples: Samples) -> Tensor:
         """Return the information [P, P] that a sample's accelerations hold, mean over samples.
 
         It is about the free parameters.
@@ -103,29 +103,31 @@ class ParametricBaseline(Baseline, ABC):
         """
 
     @abstractmethod
-    def asymmetry(self, samples: Samples) -> Tensor:
+    def symmetry_precision(self, samples: Samples) -> Tensor:
         """Return the information [P, P] about what a mirror-symmetric vessel cannot have.
 
         It is zero where nothing is known of the mirror. Terms of the wrong parity, and differences
         between a coefficient and that of the term's mirror image, cost by it.
         """
 
-    def feeding(self) -> list[int]:
+    def destabilising_terms(self) -> list[int]:
         """Return the free parameters, counted among these, whose sign feeds energy as they are.
 
         Empty for a baseline whose form does not allow it, or that is not asked to look.
         """
         return []
 
-    def undamped(self, samples: Samples) -> list[int]:
+    def undamped_terms(self, samples: Samples) -> list[int]:
         """Return the free parameters that feed an axis where most of the samples are not damped.
 
-        They are counted among the free ones, at most one of each axis; empty as for `feeding`.
+        They are counted among the free ones, at most one of each axis; empty as for `destabilising_terms`.
         """
         return []
 
     @abstractmethod
-    def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
+    def refresh_table(
+        self, table: Sequence[Coefficient], standard_errors: Tensor
+    ) -> list[Coefficient]:
         """Return the table of coefficients as theta is now.
 
         Standard errors [P] are those of the free parameters; errors of ratios stay as they were.
@@ -137,7 +139,7 @@ class IdentifiedConfig(Config, ABC):
 
     kind: str
 
-    def resolved(self) -> Self:
+    def without_file_references(self) -> Self:
         """Return the config without references to files, as it is kept with a model."""
         return self
 
@@ -149,7 +151,7 @@ class IdentifiedConfig(Config, ABC):
             ConfigError: where a channel that it needs is missing.
         """
 
-    def require_samples(self, samples: Samples) -> None:
+    def validate_samples(self, samples: Samples) -> None:
         """Check that samples hold the manoeuvres that this baseline is identified from.
 
         Raises:
@@ -157,7 +159,7 @@ class IdentifiedConfig(Config, ABC):
         """
 
     @abstractmethod
-    def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
+    def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
         """Identify from samples whose target is the measured acceleration.
 
         There are several solutions where free runs are to choose between them.
@@ -167,46 +169,46 @@ class IdentifiedConfig(Config, ABC):
         """
 
     @final
-    def fit(self, baseline: Baseline, samples: Samples) -> list[Coefficient]:
-        """Fill the baseline with the first of `solutions` and return its coefficients."""
-        first = self.solutions(baseline, samples)[0]
-        baseline.load_state_dict(first.state, strict=False)
-        return list(first.table)
+    def fit_preferred(self, baseline: Baseline, samples: Samples) -> list[Coefficient]:
+        """Fill the baseline with the first of `fit_solutions` and return its coefficients."""
+        preferred = self.fit_solutions(baseline, samples)[0]
+        baseline.load_state_dict(preferred.state, strict=False)
+        return list(preferred.table)
 
 
-def require(names: Sequence[str], wanted: Sequence[str], who: str) -> None:
+def require_channels(names: Sequence[str], required: Sequence[str], subject: str) -> None:
     """Check that channels exist, velocities live, and nothing rolls.
 
     Raises:
         ConfigError: naming the first that does not.
         UsageError: where the model rolls.
     """
-    live = live_of(names)
-    live.require_no_roll(who)
-    for name in wanted:
-        if name in live.dead:
+    dof = get_dof(names)
+    dof.require_no_roll(subject)
+    for name in required:
+        if name in dof.fixed_states:
             raise ConfigError(
-                f"{who} needs the velocity {name}, but signals.velocities are"
-                f" {', '.join(live.velocities)}; a baseline of kind 'regressors' or 'nomoto' needs"
+                f"{subject} needs the velocity {name}, but signals.velocities are"
+                f" {', '.join(dof.velocities)}; a baseline of kind 'regressors' or 'nomoto' needs"
                 " no other"
             )
         if name not in names:
             raise ConfigError(
-                f"{who} needs the channel '{name}', but the model has {', '.join(names)}; add it to"
+                f"{subject} needs the channel '{name}', but the model has {', '.join(names)}; add it to"
                 " signals"
             )
 
 
-def of_manoeuvres(samples: Samples, kinds: Sequence[str]) -> Samples:
+def select_manoeuvres(samples: Samples, kinds: Sequence[str]) -> Samples:
     """Return the samples of some kinds of manoeuvre, all where `kinds` is empty.
 
     Raises:
         FitError: where there are none.
     """
-    chosen = samples.of_kinds(kinds)
-    if len(chosen) == 0:
+    selected = samples.select_manoeuvres(kinds)
+    if len(selected) == 0:
         raise FitError(
             f"no sample is of the manoeuvres {list(kinds)} that the baseline is fitted on; kinds in"
             f" the data: {sorted(set(samples.kinds))}"
         )
-    return chosen
+    return selected

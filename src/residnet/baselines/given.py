@@ -10,79 +10,92 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from residnet.baselines.base import Baseline, IdentifiedConfig, require
+from residnet.baselines.base import Baseline, IdentifiedConfig, require_channels
 from residnet.core.columns import zero_acceleration
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError, UsageError
-from residnet.core.names import CHANNEL_UNITS, VELOCITY, to_si
+from residnet.core.names import CHANNEL_UNITS, VELOCITY_NAMES, to_si
 from residnet.core.samples import Samples
-from residnet.physics.hull import HullConfig, OdinConfig
+from residnet.physics.hull import AccelerationHullConfig, HullConfig
 from residnet.physics.signals import FORCE_CHANNELS
-from residnet.physics.symmetry import live_of
-from residnet.physics.terms import TermLibrary, parse_term, read_rows
+from residnet.physics.symmetry import get_dof
+from residnet.physics.terms import TermLibrary, parse_axis_terms, parse_term
 from residnet.physics.vessel import load_vessel
 from residnet.regression.estimator import Solution
 
-Row = dict[str, float]
+TermCoefficients = dict[str, float]
 
 
 @final
-class GivenBaseline(Baseline):
+class FixedBaseline(Baseline):
     """A baseline nu_dot = theta [n, J] phi(z) [..., J] whose numbers stay as they were given.
 
     Args:
-        rows: coefficients of u_dot, v_dot and r_dot by term; what else moves has none.
-        fitted: whether the numbers were fitted, if to other data (correction E9 of document 000).
+        coefficients_by_axis: coefficients of u_dot, v_dot and r_dot by term; what else moves has none.
+        is_fitted: whether the numbers were fitted, if to other data (correction E9 of document 000).
     """
 
-    def __init__(self, rows: Sequence[Row], names: Sequence[str], *, fitted: bool = False) -> None:
+    def __init__(
+        self,
+        coefficients_by_axis: Sequence[TermCoefficients],
+        names: Sequence[str],
+        *,
+        is_fitted: bool = False,
+    ) -> None:
         super().__init__()
-        terms = list(dict.fromkeys(term for row in rows for term in row))
+        terms = list(
+            dict.fromkeys(
+                term for axis_coefficients in coefficients_by_axis for term in axis_coefficients
+            )
+        )
         self.library = TermLibrary(terms, names)
-        self.dof = live_of(names).size
-        self.fitted = fitted
-        beside = [dict[str, float]()] * (self.dof - len(rows))
-        theta = [[row.get(term, 0.0) for term in terms] for row in (*rows, *beside)]
+        self.n_dof = get_dof(names).n_dynamic
+        self.is_fitted = is_fitted
+        empty_axes = [dict[str, float]()] * (self.n_dof - len(coefficients_by_axis))
+        theta = [
+            [axis_coefficients.get(term, 0.0) for term in terms]
+            for axis_coefficients in (*coefficients_by_axis, *empty_axes)
+        ]
         # a baseline without terms has nothing to store
         self.theta = nn.Buffer(
-            torch.tensor(theta, dtype=torch.float64).reshape(self.dof, len(terms)),
+            torch.tensor(theta, dtype=torch.float64).reshape(self.n_dof, len(terms)),
             persistent=len(terms) > 0,
         )
 
     def forward(self, z: Tensor) -> Tensor:
-        if self.library.count == 0:
-            return zero_acceleration(z, self.dof)
+        if self.library.n_terms == 0:
+            return zero_acceleration(z, self.n_dof)
         phi: Tensor = self.library(z)
         return phi @ self.theta.to(z.dtype).T
 
-    def parameter_count(self) -> list[float]:
+    def parameter_counts(self) -> list[float]:
         """Return the number of terms of each axis where they were fitted, else zeros."""
-        return [float(count) * self.fitted for count in (self.theta != 0).sum(1)]
+        return [float(n_terms) * self.is_fitted for n_terms in (self.theta != 0).sum(1)]
 
-    def mass(self) -> Tensor | None:
+    def inertia_matrix(self) -> Tensor | None:
         """Return the inertia [3, 3], the inverse of what forces do to accelerations.
 
         None where that has no inverse, or the vessel rolls.
         """
         terms = self.library.terms
         columns = [terms.index(name) for name in FORCE_CHANNELS if name in terms]
-        if len(columns) < len(FORCE_CHANNELS) or self.dof > len(FORCE_CHANNELS):
+        if len(columns) < len(FORCE_CHANNELS) or self.n_dof > len(FORCE_CHANNELS):
             return None
-        by_force = self.theta[:, columns].to(torch.float64)
-        apart = float(torch.linalg.cond(by_force / by_force.abs().amax(0))) < 1e6
-        return torch.linalg.inv(by_force) if apart else None
+        force_columns = self.theta[:, columns].to(torch.float64)
+        is_invertible = float(torch.linalg.cond(force_columns / force_columns.abs().amax(0))) < 1e6
+        return torch.linalg.inv(force_columns) if is_invertible else None
 
 
-class GivenConfig(IdentifiedConfig, ABC):
+class FixedBaselineConfig(IdentifiedConfig, ABC):
     """A known part of which nothing is identified."""
 
     @final
-    def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
+    def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
         """Return one solution without numbers: there is nothing to fit."""
         return [Solution({}, {})]
 
 
-class StillConfig(GivenConfig):
+class ZeroBaselineConfig(FixedBaselineConfig):
     """No known part, velocities held: the model `zero`, and a black box where a head is set on it.
 
     The head learns the whole acceleration.
@@ -90,11 +103,11 @@ class StillConfig(GivenConfig):
 
     kind: Literal["still"] = "still"
 
-    def build(self, names: Sequence[str]) -> GivenBaseline:
-        return GivenBaseline([], names)
+    def build(self, names: Sequence[str]) -> FixedBaseline:
+        return FixedBaseline([], names)
 
 
-class AxisRows(Config):
+class AxisCoefficients(Config):
     """Accelerations as sums of terms.
 
     Attributes:
@@ -103,16 +116,16 @@ class AxisRows(Config):
         r: coefficients of r_dot by term.
     """
 
-    u: Row = Field(default_factory=dict)
-    v: Row = Field(default_factory=dict)
-    r: Row = Field(default_factory=dict)
+    u: TermCoefficients = Field(default_factory=dict)
+    v: TermCoefficients = Field(default_factory=dict)
+    r: TermCoefficients = Field(default_factory=dict)
 
-    def rows(self) -> tuple[Row, Row, Row]:
+    def axis_coefficients(self) -> tuple[TermCoefficients, TermCoefficients, TermCoefficients]:
         """Return the coefficients of u_dot, v_dot and r_dot."""
         return self.u, self.v, self.r
 
 
-class EquationsConfig(AxisRows, GivenConfig):
+class EquationsConfig(AxisCoefficients, FixedBaselineConfig):
     """Published equations of the accelerations; nothing is identified.
 
     Examples are eqs. (6.24)-(6.32) and (7.2)-(7.7) of document 000.
@@ -128,8 +141,8 @@ class EquationsConfig(AxisRows, GivenConfig):
     source: str = ""
 
     @model_validator(mode="after")
-    def _any(self) -> EquationsConfig:
-        if not any(self.rows()):
+    def _validate_equations(self) -> EquationsConfig:
+        if not any(self.axis_coefficients()):
             raise ValueError("no axis has a term; give coefficients by term under u, v or r")
         for name, unit in self.units.items():
             try:
@@ -138,7 +151,7 @@ class EquationsConfig(AxisRows, GivenConfig):
                 raise ValueError(f"units.{name}: {error}") from None
         return self
 
-    def _in_si(self, axis: str, term: str, value: float, names: Sequence[str]) -> float:
+    def _coefficient_in_si(self, axis: str, term: str, value: float, names: Sequence[str]) -> float:
         for factor in parse_term(term, names):
             if factor.name not in self.units:
                 continue
@@ -150,28 +163,33 @@ class EquationsConfig(AxisRows, GivenConfig):
             value /= to_si(self.units[factor.name]) ** factor.power
         return value
 
-    def build(self, names: Sequence[str]) -> GivenBaseline:
-        require(names, (), "baseline 'equations'")
-        rows = [
-            {term: self._in_si(axis, term, value, names) for term, value in row.items()}
-            for axis, row in zip(VELOCITY, self.rows(), strict=True)
+    def build(self, names: Sequence[str]) -> FixedBaseline:
+        require_channels(names, (), "baseline 'equations'")
+        coefficients_by_axis = [
+            {
+                term: self._coefficient_in_si(axis, term, value, names)
+                for term, value in axis_coefficients.items()
+            }
+            for axis, axis_coefficients in zip(
+                VELOCITY_NAMES, self.axis_coefficients(), strict=True
+            )
         ]
-        return GivenBaseline(rows, names, fitted=True)
+        return FixedBaseline(coefficients_by_axis, names, is_fitted=True)
 
 
-class HullEquations(AxisRows):
+class HullEquations(AxisCoefficients):
     """The accelerations of a hull written out, in SI.
 
     The terms are products of u, v, r, tau_x, tau_y and tau_n.
     """
 
     @model_validator(mode="after")
-    def _terms(self) -> HullEquations:
-        read_rows(dict(self), VELOCITY + FORCE_CHANNELS)
+    def _validate_terms(self) -> HullEquations:
+        parse_axis_terms(dict(self), VELOCITY_NAMES + FORCE_CHANNELS)
         return self
 
 
-class BelievedConfig(GivenConfig):
+class BelievedConfig(FixedBaselineConfig):
     """The hull of a vessel file with its parameters as they are (document 002 section 4.1.1).
 
     A factor on its mass, Coriolis and damping matrices makes it wrong on purpose. Needs the
@@ -189,11 +207,11 @@ class BelievedConfig(GivenConfig):
     scale: Annotated[float, Field(gt=0)] = 1.0
 
     @model_validator(mode="after")
-    def _known(self) -> BelievedConfig:
-        self.equations()
+    def _validate_vessel(self) -> BelievedConfig:
+        self.hull_equations()
         return self
 
-    def equations(self) -> HullEquations:
+    def hull_equations(self) -> HullEquations:
         """Return the equations of the vessel, without the factor.
 
         Raises:
@@ -203,30 +221,36 @@ class BelievedConfig(GivenConfig):
             return self.vessel
         try:
             vessel = load_vessel(self.vessel)
-            if not isinstance(vessel, HullConfig | OdinConfig):
+            if not isinstance(vessel, HullConfig | AccelerationHullConfig):
                 raise ValueError(
                     f"vessel: '{self.vessel}' is of kind '{vessel.kind}'; a believed hull needs one"
                     " of kind fossen, mass_matrix or odin"
                 )
-            terms, coefficients = vessel.hull().equations()
+            terms, coefficients = vessel.build_hull().acceleration_equations()
         except ConfigError as error:
             raise ValueError(str(error)) from None
         u, v, r = (
-            {t: c for t, c in zip((*terms, *FORCE_CHANNELS), row, strict=True) if c != 0.0}
-            for row in coefficients
+            {
+                term: coefficient
+                for term, coefficient in zip(
+                    (*terms, *FORCE_CHANNELS), axis_coefficients, strict=True
+                )
+                if coefficient != 0.0
+            }
+            for axis_coefficients in coefficients
         )
         return HullEquations(u=u, v=v, r=r)
 
-    def resolved(self) -> Self:
+    def without_file_references(self) -> Self:
         """Return the config with the equations in place of the vessel's name."""
-        return self.model_copy(update={"vessel": self.equations()})
+        return self.model_copy(update={"vessel": self.hull_equations()})
 
-    def build(self, names: Sequence[str]) -> GivenBaseline:
-        require(names, (*VELOCITY, *FORCE_CHANNELS), "baseline 'believed'")
+    def build(self, names: Sequence[str]) -> FixedBaseline:
+        require_channels(names, (*VELOCITY_NAMES, *FORCE_CHANNELS), "baseline 'believed'")
         # M, C and D times one factor: only the forces act differently
-        scales = dict.fromkeys(FORCE_CHANNELS, self.scale)
-        rows = [
-            {term: value / scales.get(term, 1.0) for term, value in row.items()}
-            for row in self.equations().rows()
+        force_scales = dict.fromkeys(FORCE_CHANNELS, self.scale)
+        coefficients_by_axis = [
+            {term: value / force_scales.get(term, 1.0) for term, value in axis_coefficients.items()}
+            for axis_coefficients in self.hull_equations().axis_coefficients()
         ]
-        return GivenBaseline(rows, names)
+        return FixedBaseline(coefficients_by_axis, names)

@@ -22,21 +22,21 @@ from residnet.baselines.base import (
     Baseline,
     IdentifiedConfig,
     ParametricBaseline,
-    of_manoeuvres,
-    require,
+    require_channels,
+    select_manoeuvres,
 )
 from residnet.core.config import Config, Kilograms, Metres
 from residnet.core.errors import FitError
-from residnet.core.names import VELOCITY, nearest
+from residnet.core.names import VELOCITY_NAMES, suggest_name
 from residnet.core.samples import Samples
 from residnet.physics.parameters import Density, SquareMetres
 from residnet.regression.estimator import Coefficient, Solution
-from residnet.regression.least_squares import descend
+from residnet.regression.least_squares import minimize_levenberg_marquardt
 
 _WAKE_SLOPE = 2.0
 """C_1 of the wake in drift: that of the KVLCC2 in the source."""
 # keeps the drift angle defined for a ship at rest; (m/s)^2
-_STILL = 1e-6
+_MIN_SPEED_SQUARED = 1e-6
 
 
 class MMGHull(Config):
@@ -61,7 +61,7 @@ class MMGHull(Config):
     density: Density = Field(default=1000.0, gt=0)
 
     @property
-    def block(self) -> float:
+    def block_coefficient(self) -> float:
         """The block coefficient, dimensionless."""
         return self.mass / (self.density * self.length * self.beam * self.draught)
 
@@ -96,12 +96,12 @@ class MMGRudder(Config):
     race: float = Field(gt=0, le=1)
 
     @property
-    def lift(self) -> float:
+    def lift_slope(self) -> float:
         """The slope of the normal force by Fujii's formula, dimensionless."""
         return 6.13 * self.aspect / (2.25 + self.aspect)
 
 
-class Prior(NamedTuple):
+class ParameterPrior(NamedTuple):
     """What is believed of a parameter before any trial: mean, standard deviation and meaning."""
 
     mean: float
@@ -109,58 +109,68 @@ class Prior(NamedTuple):
     meaning: str
 
 
-def usual_priors(hull: MMGHull) -> dict[str, Prior]:
+def default_priors(hull: MMGHull) -> dict[str, ParameterPrior]:
     """Return the prior of every parameter, as one would expect of a merchant ship of this form.
 
     Linear hull derivatives by Kijima's formulas; those of higher order are thought to be near zero,
     so that the trials speak for themselves.
     """
-    k = 2.0 * hull.draught / hull.length
-    fullness = hull.block * hull.beam / hull.length
-    mass = 2.0 * hull.mass / (hull.density * hull.length**2 * hull.draught)
+    aspect_ratio = 2.0 * hull.draught / hull.length
+    beam_fullness = hull.block_coefficient * hull.beam / hull.length
+    mass_nondim = 2.0 * hull.mass / (hull.density * hull.length**2 * hull.draught)
     return {
-        "m_x": Prior(0.022, 0.01, "added mass in surge"),
-        "m_y": Prior(0.2, 0.06, "added mass in sway"),
-        "J_z": Prior(0.011, 0.004, "added moment of inertia in yaw"),
-        "R_0": Prior(0.02, 0.01, "resistance straight ahead"),
-        "X_vv": Prior(0.0, 0.1, "surge force of drift"),
-        "X_vr": Prior(0.0, 0.1, "surge force of drift in a turn, beyond the added mass's"),
-        "X_rr": Prior(0.0, 0.03, "surge force of turning"),
-        "X_vvvv": Prior(0.5, 0.5, "surge force of large drift"),
-        "Y_0": Prior(0.0, 0.005, "sway force of asymmetry"),
-        "Y_v": Prior(-(0.5 * math.pi * k + 1.4 * fullness), 0.15, "sway force of drift"),
-        "Y_r": Prior(mass + 0.022 - 1.5 * fullness, 0.06, "sway force of turning"),
-        "Y_vvv": Prior(-1.0, 1.0, "sway force of large drift"),
-        "Y_vvr": Prior(0.0, 0.8, "sway force of large drift and turning"),
-        "Y_vrr": Prior(0.0, 0.5, "sway force of drift and fast turning"),
-        "Y_rrr": Prior(0.0, 0.05, "sway force of fast turning"),
-        "N_0": Prior(0.0, 0.002, "yaw moment of asymmetry"),
-        "N_v": Prior(-k, 0.05, "yaw moment of drift"),
-        "N_r": Prior(-0.54 * k + k * k, 0.02, "yaw moment of turning"),
-        "N_vvv": Prior(0.0, 0.3, "yaw moment of large drift"),
-        "N_vvr": Prior(0.0, 0.3, "yaw moment of large drift and turning"),
-        "N_vrr": Prior(0.0, 0.1, "yaw moment of drift and fast turning"),
-        "N_rrr": Prior(0.0, 0.02, "yaw moment of fast turning"),
-        "t_P": Prior(0.22, 0.03, "thrust deduction"),
-        "w_P0": Prior(0.4, 0.06, "wake fraction straight ahead"),
-        "C_2p": Prior(
+        "m_x": ParameterPrior(0.022, 0.01, "added mass in surge"),
+        "m_y": ParameterPrior(0.2, 0.06, "added mass in sway"),
+        "J_z": ParameterPrior(0.011, 0.004, "added moment of inertia in yaw"),
+        "R_0": ParameterPrior(0.02, 0.01, "resistance straight ahead"),
+        "X_vv": ParameterPrior(0.0, 0.1, "surge force of drift"),
+        "X_vr": ParameterPrior(0.0, 0.1, "surge force of drift in a turn, beyond the added mass's"),
+        "X_rr": ParameterPrior(0.0, 0.03, "surge force of turning"),
+        "X_vvvv": ParameterPrior(0.5, 0.5, "surge force of large drift"),
+        "Y_0": ParameterPrior(0.0, 0.005, "sway force of asymmetry"),
+        "Y_v": ParameterPrior(
+            -(0.5 * math.pi * aspect_ratio + 1.4 * beam_fullness), 0.15, "sway force of drift"
+        ),
+        "Y_r": ParameterPrior(
+            mass_nondim + 0.022 - 1.5 * beam_fullness, 0.06, "sway force of turning"
+        ),
+        "Y_vvv": ParameterPrior(-1.0, 1.0, "sway force of large drift"),
+        "Y_vvr": ParameterPrior(0.0, 0.8, "sway force of large drift and turning"),
+        "Y_vrr": ParameterPrior(0.0, 0.5, "sway force of drift and fast turning"),
+        "Y_rrr": ParameterPrior(0.0, 0.05, "sway force of fast turning"),
+        "N_0": ParameterPrior(0.0, 0.002, "yaw moment of asymmetry"),
+        "N_v": ParameterPrior(-aspect_ratio, 0.05, "yaw moment of drift"),
+        "N_r": ParameterPrior(
+            -0.54 * aspect_ratio + aspect_ratio * aspect_ratio, 0.02, "yaw moment of turning"
+        ),
+        "N_vvv": ParameterPrior(0.0, 0.3, "yaw moment of large drift"),
+        "N_vvr": ParameterPrior(0.0, 0.3, "yaw moment of large drift and turning"),
+        "N_vrr": ParameterPrior(0.0, 0.1, "yaw moment of drift and fast turning"),
+        "N_rrr": ParameterPrior(0.0, 0.02, "yaw moment of fast turning"),
+        "t_P": ParameterPrior(0.22, 0.03, "thrust deduction"),
+        "w_P0": ParameterPrior(0.4, 0.06, "wake fraction straight ahead"),
+        "C_2p": ParameterPrior(
             1.3,
             0.25,
             "inflow far aside over inflow straight ahead, drift towards port or turn to starboard",
         ),
-        "C_2n": Prior(1.1, 0.25, "the same, drift towards starboard or turn to port"),
-        "t_R": Prior(0.35, 0.15, "steering resistance deduction"),
-        "a_H": Prior(0.3, 0.2, "sway force that the rudder raises on the hull, over its own"),
-        "x_H": Prior(-0.45, 0.1, "where that force acts, lengths ahead of midship"),
-        "gamma_p": Prior(0.5, 0.2, "flow straightening, inflow from port"),
-        "gamma_n": Prior(0.5, 0.2, "flow straightening, inflow from starboard"),
-        "l_R": Prior(-0.8, 0.3, "where the rudder feels the turning, lengths ahead of midship"),
-        "epsilon": Prior(1.05, 0.2, "wake at the propeller over wake at the rudder"),
-        "kappa": Prior(0.5, 0.1, "how much of the race's acceleration reaches the rudder"),
+        "C_2n": ParameterPrior(1.1, 0.25, "the same, drift towards starboard or turn to port"),
+        "t_R": ParameterPrior(0.35, 0.15, "steering resistance deduction"),
+        "a_H": ParameterPrior(
+            0.3, 0.2, "sway force that the rudder raises on the hull, over its own"
+        ),
+        "x_H": ParameterPrior(-0.45, 0.1, "where that force acts, lengths ahead of midship"),
+        "gamma_p": ParameterPrior(0.5, 0.2, "flow straightening, inflow from port"),
+        "gamma_n": ParameterPrior(0.5, 0.2, "flow straightening, inflow from starboard"),
+        "l_R": ParameterPrior(
+            -0.8, 0.3, "where the rudder feels the turning, lengths ahead of midship"
+        ),
+        "epsilon": ParameterPrior(1.05, 0.2, "wake at the propeller over wake at the rudder"),
+        "kappa": ParameterPrior(0.5, 0.1, "how much of the race's acceleration reaches the rudder"),
     }
 
 
-PARAMETERS = tuple(usual_priors(MMGHull(length=1.0, beam=0.2, draught=0.1, mass=10.0)))
+PARAMETER_NAMES = tuple(default_priors(MMGHull(length=1.0, beam=0.2, draught=0.1, mass=10.0)))
 """Names of the parameters, in the order of the columns of theta."""
 
 
@@ -180,175 +190,216 @@ class MMGForces(nn.Module):
     ) -> None:
         super().__init__()
         self.columns = list(columns)
-        self.wake_slope, self.still = _WAKE_SLOPE, _STILL
+        self.wake_slope, self.min_speed_squared = _WAKE_SLOPE, _MIN_SPEED_SQUARED
         self.length = float(hull.length)
-        self.pressed = 0.5 * hull.density * hull.length * hull.draught
+        self.pressure_factor = 0.5 * hull.density * hull.length * hull.draught
         self.mass, self.x_G = float(hull.mass), float(hull.x_G)
         self.inertia = hull.mass * ((hull.gyration * hull.length) ** 2 + hull.x_G**2)
         self.density, self.diameter = float(hull.density), float(propeller.diameter)
         self.k0, self.k1, self.k2 = propeller.thrust
-        self.lifting = 0.5 * hull.density * rudder.area * rudder.lift
-        self.x_P, self.x_R, self.race = propeller.x, rudder.x, rudder.race
+        self.lift_factor = 0.5 * hull.density * rudder.area * rudder.lift_slope
+        self.x_P, self.x_R, self.race_share = propeller.x, rudder.x, rudder.race
 
     def forward(self, z: Tensor, theta: Tensor) -> Tensor:
         """Return nu_dot [..., 3] at channels z [..., nz] with parameters theta [..., 34].
 
-        The order of the parameters is that of `PARAMETERS`.
+        The order of the parameters is that of `PARAMETER_NAMES`.
         """
         (
             m_x, m_y, J_z, R_0, X_vv, X_vr, X_rr, X_vvvv,
             Y_0, Y_v, Y_r, Y_vvv, Y_vvr, Y_vrr, Y_rrr, N_0, N_v, N_r, N_vvv, N_vvr, N_vrr, N_rrr,
             t_P, w_P0, C_2p, C_2n, t_R, a_H, x_H, gamma_p, gamma_n, l_R, epsilon, kappa,
         ) = theta.unbind(-1)  # fmt: skip
-        chosen = [z[..., c] for c in self.columns]
-        u, v, r, n, delta = chosen[0], chosen[1], chosen[2], chosen[3], chosen[4]
-        speed = torch.sqrt(u * u + v * v + self.still)
-        a, b = v / speed, r * self.length / speed
+        selected_channels = [z[..., column] for column in self.columns]
+        u, v, r, n, delta = (
+            selected_channels[0],
+            selected_channels[1],
+            selected_channels[2],
+            selected_channels[3],
+            selected_channels[4],
+        )
+        speed = torch.sqrt(u * u + v * v + self.min_speed_squared)
+        v_nondim, r_nondim = v / speed, r * self.length / speed
         # hull
-        pressure = self.pressed * speed * speed
+        pressure = self.pressure_factor * speed * speed
         x_hull = (
-            -R_0 * (u / speed) ** 2 + X_vv * a * a + X_vr * a * b + X_rr * b * b + X_vvvv * a**4
+            -R_0 * (u / speed) ** 2
+            + X_vv * v_nondim * v_nondim
+            + X_vr * v_nondim * r_nondim
+            + X_rr * r_nondim * r_nondim
+            + X_vvvv * v_nondim**4
         )
         y_hull = (
             Y_0
-            + Y_v * a
-            + Y_r * b
-            + Y_vvv * a**3
-            + Y_vvr * a * a * b
-            + Y_vrr * a * b * b
-            + Y_rrr * b**3
+            + Y_v * v_nondim
+            + Y_r * r_nondim
+            + Y_vvv * v_nondim**3
+            + Y_vvr * v_nondim * v_nondim * r_nondim
+            + Y_vrr * v_nondim * r_nondim * r_nondim
+            + Y_rrr * r_nondim**3
         )
         n_hull = (
             N_0
-            + N_v * a
-            + N_r * b
-            + N_vvv * a**3
-            + N_vvr * a * a * b
-            + N_vrr * a * b * b
-            + N_rrr * b**3
+            + N_v * v_nondim
+            + N_r * r_nondim
+            + N_vvv * v_nondim**3
+            + N_vvr * v_nondim * v_nondim * r_nondim
+            + N_vrr * v_nondim * r_nondim * r_nondim
+            + N_rrr * r_nondim**3
         )
         # propeller: the inflow changes with its drift angle, to both sides differently
-        aside = -a - self.x_P * b
-        side = torch.where(aside > 0, C_2p, C_2n)
-        inflow = u * (1 - w_P0) * (1 + (1 - torch.exp(-self.wake_slope * aside.abs())) * (side - 1))
-        nd = n * self.diameter
-        loading = self.k0 * nd * nd + self.k1 * nd * inflow + self.k2 * inflow * inflow
-        thrust = (1 - t_P) * self.density * self.diameter**2 * loading
-        # rudder, partly in the propeller's race
-        raced = torch.sqrt(torch.clamp(inflow * inflow + 8.0 / math.pi * loading, min=self.still))
-        squared = (
-            self.race * (inflow + kappa * (raced - inflow)) ** 2 + (1 - self.race) * inflow * inflow
+        propeller_drift = -v_nondim - self.x_P * r_nondim
+        wake_ratio = torch.where(propeller_drift > 0, C_2p, C_2n)
+        inflow = (
+            u
+            * (1 - w_P0)
+            * (1 + (1 - torch.exp(-self.wake_slope * propeller_drift.abs())) * (wake_ratio - 1))
         )
-        along = epsilon * torch.sqrt(squared + self.still)
-        cross = -a - l_R * b
-        across = speed * torch.where(cross > 0, gamma_p, gamma_n) * cross
-        angle = delta - torch.atan2(across, along)
-        normal = self.lifting * (along * along + across * across) * torch.sin(angle)
-        x_rudder = -(1 - t_R) * normal * torch.sin(delta)
-        side_force = -normal * torch.cos(delta)
+        revolutions_diameter = n * self.diameter
+        thrust_loading = (
+            self.k0 * revolutions_diameter * revolutions_diameter
+            + self.k1 * revolutions_diameter * inflow
+            + self.k2 * inflow * inflow
+        )
+        thrust = (1 - t_P) * self.density * self.diameter**2 * thrust_loading
+        # rudder, partly in the propeller's race
+        race_velocity = torch.sqrt(
+            torch.clamp(
+                inflow * inflow + 8.0 / math.pi * thrust_loading, min=self.min_speed_squared
+            )
+        )
+        rudder_inflow_squared = (
+            self.race_share * (inflow + kappa * (race_velocity - inflow)) ** 2
+            + (1 - self.race_share) * inflow * inflow
+        )
+        rudder_inflow_x = epsilon * torch.sqrt(rudder_inflow_squared + self.min_speed_squared)
+        rudder_drift = -v_nondim - l_R * r_nondim
+        rudder_inflow_y = speed * torch.where(rudder_drift > 0, gamma_p, gamma_n) * rudder_drift
+        attack_angle = delta - torch.atan2(rudder_inflow_y, rudder_inflow_x)
+        normal_force = (
+            self.lift_factor
+            * (rudder_inflow_x * rudder_inflow_x + rudder_inflow_y * rudder_inflow_y)
+            * torch.sin(attack_angle)
+        )
+        x_rudder = -(1 - t_R) * normal_force * torch.sin(delta)
+        side_force = -normal_force * torch.cos(delta)
         # rigid body and added mass
-        scale = self.pressed * self.length
-        mass_x, mass_y = self.mass + m_x * scale, self.mass + m_y * scale
-        inertia = self.inertia + J_z * scale * self.length**2
-        arm = self.x_G * self.mass
-        surge = pressure * x_hull + thrust + x_rudder + mass_y * v * r + arm * r * r
+        mass_scale = self.pressure_factor * self.length
+        mass_x, mass_y = self.mass + m_x * mass_scale, self.mass + m_y * mass_scale
+        inertia = self.inertia + J_z * mass_scale * self.length**2
+        mass_moment = self.x_G * self.mass
+        surge = pressure * x_hull + thrust + x_rudder + mass_y * v * r + mass_moment * r * r
         sway = pressure * y_hull + (1 + a_H) * side_force - mass_x * u * r
-        turning = (self.x_R + a_H * x_H) * self.length * side_force
-        yaw = pressure * self.length * n_hull + turning - arm * u * r
-        determinant = mass_y * inertia - arm * arm
+        rudder_moment = (self.x_R + a_H * x_H) * self.length * side_force
+        yaw = pressure * self.length * n_hull + rudder_moment - mass_moment * u * r
+        determinant = mass_y * inertia - mass_moment * mass_moment
         return torch.stack(
             (
                 surge / mass_x,
-                (inertia * sway - arm * yaw) / determinant,
-                (mass_y * yaw - arm * sway) / determinant,
+                (inertia * sway - mass_moment * yaw) / determinant,
+                (mass_y * yaw - mass_moment * sway) / determinant,
             ),
             dim=-1,
         )
 
 
-_MOST_SAMPLES = 4000
+_MAX_SAMPLES = 4000
 """Samples that accelerations are fitted to; more are thinned evenly."""
-_MOST_STEPS = 20
+_MAX_STEPS = 20
 """Most steps of the search."""
-_GAIN = 1e-9
+_MIN_RELATIVE_GAIN = 1e-9
 """Share of the logarithm of the likelihood that a step must gain for another one."""
 # what can only be seen in the accelerations of one axis is listed under it
-_AXIS = {"X": "u_dot", "R": "u_dot", "t": "u_dot", "Y": "v_dot", "N": "r_dot"}
+_AXIS_OF_PREFIX = {"X": "u_dot", "R": "u_dot", "t": "u_dot", "Y": "v_dot", "N": "r_dot"}
 
 
 @final
 class MMGBaseline(ParametricBaseline):
-    """The MMG model, nu_dot [..., 3], with parameters theta [34] as `PARAMETERS` names them."""
+    """The MMG model, nu_dot [..., 3], with parameters theta [34] as `PARAMETER_NAMES` names them."""
 
-    def __init__(self, forces: MMGForces, priors: Iterable[Prior]) -> None:
-        mean, sd, _ = zip(*priors, strict=True)
-        super().__init__(torch.tensor(mean, dtype=torch.float64))
-        self.forces, self.mean, self.sd = forces, list(mean), list(sd)
+    def __init__(self, force_model: MMGForces, priors: Iterable[ParameterPrior]) -> None:
+        prior_mean, prior_std, _ = zip(*priors, strict=True)
+        super().__init__(torch.tensor(prior_mean, dtype=torch.float64))
+        self.force_model, self.prior_mean, self.prior_std = (
+            force_model,
+            list(prior_mean),
+            list(prior_std),
+        )
 
     def forward(self, z: Tensor) -> Tensor:
-        nu_dot: Tensor = self.forces(z, self.theta.to(z.dtype))
+        nu_dot: Tensor = self.force_model(z, self.theta.to(z.dtype))
         return nu_dot
 
-    def parameter_count(self) -> list[float]:
+    def parameter_counts(self) -> list[float]:
         """Return the number of parameters that are not fixed, by the axis they are listed under.
 
         Those of propeller and rudder count in every axis.
         """
-        free = [PARAMETERS[i] for i in self.free_indices().tolist()]
+        free_parameters = [PARAMETER_NAMES[i] for i in self.free_indices().tolist()]
         return [
-            float(sum(axis_of(name) in (f"{axis}_dot", "") for name in free)) for axis in VELOCITY
+            float(sum(axis_of_parameter(name) in (f"{axis}_dot", "") for name in free_parameters))
+            for axis in VELOCITY_NAMES
         ]
 
     def free_indices(self) -> Tensor:
         """Return the places [P] of the parameters whose prior is not fixed."""
-        return torch.nonzero(torch.tensor(self.sd) > 0).squeeze(1)
+        return torch.nonzero(torch.tensor(self.prior_std) > 0).squeeze(1)
 
-    def free_names(self) -> list[tuple[str, str]]:
+    def free_parameter_names(self) -> list[tuple[str, str]]:
         """Return (axis, name) of each parameter whose prior is not fixed [P]."""
-        return [(axis_of(PARAMETERS[i]), PARAMETERS[i]) for i in self.free_indices().tolist()]
+        return [
+            (axis_of_parameter(PARAMETER_NAMES[i]), PARAMETER_NAMES[i])
+            for i in self.free_indices().tolist()
+        ]
 
-    def information(self, samples: Samples) -> Tensor:
+    def mean_information(self, samples: Samples) -> Tensor:
         """Return the mean information of a sample [P, P].
 
         Each axis weighs by the variance that the present parameters leave of it.
         """
-        part = _thinned(samples)
+        subsample = _subsample(samples)
         with torch.no_grad():
-            slopes, variance = (
-                self.sensitivity(part.z),
-                (part.target - self(part.z)).square().mean(0),
+            jacobian, variance = (
+                self.parameter_jacobian(subsample.z),
+                (subsample.target - self(subsample.z)).square().mean(0),
             )
-        return torch.einsum("bip,biq,i->pq", slopes, slopes, 1.0 / variance) / len(part)
+        return torch.einsum("bip,biq,i->pq", jacobian, jacobian, 1.0 / variance) / len(subsample)
 
     def prior(self) -> tuple[Tensor, Tensor]:
-        free = self.free_indices()
+        free_index = self.free_indices()
         return (
-            torch.tensor(self.mean, dtype=torch.float64)[free],
-            torch.tensor(self.sd, dtype=torch.float64)[free] ** -2,
+            torch.tensor(self.prior_mean, dtype=torch.float64)[free_index],
+            torch.tensor(self.prior_std, dtype=torch.float64)[free_index] ** -2,
         )
 
-    def asymmetry(self, samples: Samples) -> Tensor:
+    def symmetry_precision(self, samples: Samples) -> Tensor:
         """Return zeros [P, P]: what is asymmetric here has a prior of its own."""
-        count = self.free_indices().numel()
-        return torch.zeros(count, count, dtype=torch.float64)
+        n_free = self.free_indices().numel()
+        return torch.zeros(n_free, n_free, dtype=torch.float64)
 
-    def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
-        known = dict(zip(self.free_indices().tolist(), errors.tolist(), strict=True))
+    def refresh_table(
+        self, table: Sequence[Coefficient], standard_errors: Tensor
+    ) -> list[Coefficient]:
+        standard_error_of = dict(
+            zip(self.free_indices().tolist(), standard_errors.tolist(), strict=True)
+        )
         return [
-            Coefficient(axis_of(name), name, float(self.theta[i]), known.get(i, 0.0))
-            for i, name in enumerate(PARAMETERS)
+            Coefficient(
+                axis_of_parameter(name), name, float(self.theta[i]), standard_error_of.get(i, 0.0)
+            )
+            for i, name in enumerate(PARAMETER_NAMES)
         ]
 
 
-def axis_of(name: str) -> str:
+def axis_of_parameter(name: str) -> str:
     """Return the acceleration that a parameter is listed under, empty where it acts on several."""
-    return _AXIS.get(name.split("_")[0], "") if name != "t_R" else "u_dot"
+    return _AXIS_OF_PREFIX.get(name.split("_")[0], "") if name != "t_R" else "u_dot"
 
 
-def _thinned(samples: Samples) -> Samples:
-    keep = torch.zeros(len(samples), dtype=torch.bool)
-    keep[:: max(len(samples) // _MOST_SAMPLES, 1)] = True
-    return samples.where(keep)
+def _subsample(samples: Samples) -> Samples:
+    mask = torch.zeros(len(samples), dtype=torch.bool)
+    mask[:: max(len(samples) // _MAX_SAMPLES, 1)] = True
+    return samples.select(mask)
 
 
 class MMGConfig(IdentifiedConfig):
@@ -382,68 +433,80 @@ class MMGConfig(IdentifiedConfig):
     manoeuvres: tuple[str, ...] = ()
 
     @model_validator(mode="after")
-    def _known(self) -> MMGConfig:
+    def _validate_beliefs(self) -> MMGConfig:
         for name in self.beliefs:
-            if name not in PARAMETERS:
-                raise ValueError(f"beliefs: no parameter '{name}'{nearest(name, PARAMETERS)}")
+            if name not in PARAMETER_NAMES:
+                raise ValueError(
+                    f"beliefs: no parameter '{name}'{suggest_name(name, PARAMETER_NAMES)}"
+                )
         return self
 
     def build(self, names: Sequence[str]) -> MMGBaseline:
         """Return the module with every parameter at its prior mean, for channels `names`."""
-        wanted = (*VELOCITY, self.revolutions, self.angle)
-        require(names, wanted, "the baseline 'mmg'")
-        columns = [list(names).index(name) for name in wanted]
-        given = {name: Prior(*belief, "") for name, belief in self.beliefs.items()}
-        priors = (usual_priors(self.hull) | given).values()
+        required_channels = (*VELOCITY_NAMES, self.revolutions, self.angle)
+        require_channels(names, required_channels, "the baseline 'mmg'")
+        columns = [list(names).index(name) for name in required_channels]
+        configured_priors = {
+            name: ParameterPrior(*mean_and_std, "") for name, mean_and_std in self.beliefs.items()
+        }
+        priors = (default_priors(self.hull) | configured_priors).values()
         return MMGBaseline(MMGForces(self.hull, self.propeller, self.rudder, columns), priors)
 
-    def require_samples(self, samples: Samples) -> None:
-        of_manoeuvres(samples, self.manoeuvres)
+    def validate_samples(self, samples: Samples) -> None:
+        select_manoeuvres(samples, self.manoeuvres)
 
-    def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
+    def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
         """Return the most likely parameters given accelerations and priors, by Gauss-Newton.
 
         Raises:
             FitError: where the accelerations at the prior means are not finite.
         """
         assert isinstance(baseline, MMGBaseline)
-        picked = of_manoeuvres(samples, self.manoeuvres)
-        chosen, count = _thinned(picked), len(picked) / self.correlation
-        free, (mean, precision) = baseline.free_indices(), baseline.prior()
+        selected = select_manoeuvres(samples, self.manoeuvres)
+        subsample, independent_samples = _subsample(selected), len(selected) / self.correlation
+        free_index, (mean, precision) = baseline.free_indices(), baseline.prior()
 
-        def error(theta: Tensor) -> Tensor:
-            baseline.theta[free] = theta
-            known: Tensor = baseline(chosen.z)
-            return chosen.target - known
+        def acceleration_residual(theta: Tensor) -> Tensor:
+            baseline.theta[free_index] = theta
+            predicted: Tensor = baseline(subsample.z)
+            return subsample.target - predicted
 
-        def cost(theta: Tensor) -> float:
-            likelihood = 0.5 * count * error(theta).square().mean(0).log().sum()
+        def negative_log_posterior(theta: Tensor) -> float:
+            likelihood = (
+                0.5
+                * independent_samples
+                * acceleration_residual(theta).square().mean(0).log().sum()
+            )
             return float(likelihood + 0.5 * (precision * (theta - mean).square()).sum())
 
-        def equations(theta: Tensor) -> tuple[Tensor, Tensor]:
-            left = error(theta)
-            weight = count / len(chosen) / left.square().mean(0)
-            slopes = baseline.sensitivity(chosen.z)
-            hessian = torch.einsum("bip,biq,i->pq", slopes, slopes, weight) + torch.diag(precision)
-            gradient = torch.einsum("bip,bi,i->p", slopes, left, weight)
+        def normal_equations(theta: Tensor) -> tuple[Tensor, Tensor]:
+            residual = acceleration_residual(theta)
+            axis_weight = independent_samples / len(subsample) / residual.square().mean(0)
+            jacobian = baseline.parameter_jacobian(subsample.z)
+            hessian = torch.einsum("bip,biq,i->pq", jacobian, jacobian, axis_weight) + torch.diag(
+                precision
+            )
+            gradient = torch.einsum("bip,bi,i->p", jacobian, residual, axis_weight)
             return hessian, gradient + precision * (mean - theta)
 
-        def near(theta: Tensor) -> tuple[float, Callable[[float], tuple[float, Tensor]]]:
-            hessian, gradient = equations(theta)
+        def linearize(theta: Tensor) -> tuple[float, Callable[[float], tuple[float, Tensor]]]:
+            hessian, gradient = normal_equations(theta)
 
-            def trial(damping: float) -> tuple[float, Tensor]:
-                damped = hessian + damping * torch.diag(hessian.diagonal())
-                moved = theta + torch.linalg.solve(damped, gradient)
-                return cost(moved), moved
+            def try_step(damping: float) -> tuple[float, Tensor]:
+                damped_hessian = hessian + damping * torch.diag(hessian.diagonal())
+                next_theta = theta + torch.linalg.solve(damped_hessian, gradient)
+                return negative_log_posterior(next_theta), next_theta
 
-            return cost(theta), trial
+            return negative_log_posterior(theta), try_step
 
-        if not torch.isfinite(error(mean)).all():
+        if not torch.isfinite(acceleration_residual(mean)).all():
             raise FitError(
                 "the MMG model's accelerations are not finite along the training logs; check"
                 " hull, propeller and rudder, and units"
             )
-        found = descend(mean, near, _MOST_STEPS, gain=_GAIN, damping=0.0).point
-        errors = torch.linalg.inv(equations(found)[0]).diagonal().sqrt()
+        theta_map = minimize_levenberg_marquardt(
+            mean, linearize, _MAX_STEPS, min_relative_decrease=_MIN_RELATIVE_GAIN, damping=0.0
+        ).minimizer
+        standard_errors = torch.linalg.inv(normal_equations(theta_map)[0]).diagonal().sqrt()
         theta = baseline.theta.detach().clone()
-        return [Solution({}, {"theta": theta}, tuple(baseline.updated_table((), errors)))]
+        return [Solution({}, {"theta": theta}, tuple(baseline.refresh_table((), standard_errors)))]

@@ -14,18 +14,18 @@ from typing import Any, ClassVar, Literal, NamedTuple, final
 import torch
 from torch import Tensor
 
-from residnet.baselines.base import Baseline, IdentifiedConfig, of_manoeuvres, require
-from residnet.baselines.regressors import RegressorBaseline, living_rows
+from residnet.baselines.base import Baseline, IdentifiedConfig, require_channels, select_manoeuvres
+from residnet.baselines.regressors import RegressorBaseline, active_terms
 from residnet.core.config import Seconds
 from residnet.core.errors import FitError
-from residnet.core.names import ACCELERATION, VELOCITY
+from residnet.core.names import ACCELERATION_NAMES, VELOCITY_NAMES
 from residnet.core.samples import Samples
-from residnet.physics.symmetry import live_of
+from residnet.physics.symmetry import get_dof
 from residnet.regression.estimator import Coefficient, Ratio, Solution
 from residnet.regression.least_squares import LeastSquares
 
 
-class SteeredConfig(IdentifiedConfig, ABC):
+class SteeringBaselineConfig(IdentifiedConfig, ABC):
     """The part that all models of speed and steering share.
 
     Attributes:
@@ -33,7 +33,7 @@ class SteeredConfig(IdentifiedConfig, ABC):
         steer: channel that turns the vessel.
     """
 
-    needs: ClassVar[tuple[str, ...]] = VELOCITY
+    required_velocities: ClassVar[tuple[str, ...]] = VELOCITY_NAMES
     """Velocities that must live."""
 
     kind: str
@@ -41,26 +41,32 @@ class SteeredConfig(IdentifiedConfig, ABC):
     steer: str
 
     @abstractmethod
-    def rows(self) -> tuple[tuple[str, ...], ...]:
+    def axis_terms(self) -> tuple[tuple[str, ...], ...]:
         """Return the terms of each axis; sway of `("v",)` alone dies out as the yaw rate does."""
 
     @final
     def build(self, names: Sequence[str]) -> RegressorBaseline:
-        live = live_of(names).velocities
-        acting = [self.drive] if live == ("u",) else [self.steer] if "u" not in live else []
-        acting = acting or [self.drive, self.steer]
-        require(names, (*self.needs, *acting), f"baseline '{self.kind}'")
-        rows = living_rows(self.rows(), names)
-        return RegressorBaseline(rows, names, ((1, "v"),) if rows[1] == ("v",) else ())
+        velocities = get_dof(names).velocities
+        driving = (
+            [self.drive] if velocities == ("u",) else [self.steer] if "u" not in velocities else []
+        )
+        driving = driving or [self.drive, self.steer]
+        require_channels(names, (*self.required_velocities, *driving), f"baseline '{self.kind}'")
+        terms_by_axis = active_terms(self.axis_terms(), names)
+        return RegressorBaseline(
+            terms_by_axis, names, ((1, "v"),) if terms_by_axis[1] == ("v",) else ()
+        )
 
 
-def _decay(yaw: Sequence[Coefficient]) -> tuple[Coefficient, ...]:
+def _sway_decay(yaw_coefficients: Sequence[Coefficient]) -> tuple[Coefficient, ...]:
     """Return the table of a sway velocity that decays with yaw's time constant."""
-    own = next(entry for entry in yaw if entry.term == "r")
-    return (Coefficient("v_dot", "v", own.value, own.error),)
+    yaw_coefficient = next(
+        coefficient for coefficient in yaw_coefficients if coefficient.term == "r"
+    )
+    return (Coefficient("v_dot", "v", yaw_coefficient.value, yaw_coefficient.standard_error),)
 
 
-class _NomotoConfig(SteeredConfig, ABC):
+class _NomotoBaselineConfig(SteeringBaselineConfig, ABC):
     """The part that both Nomoto models share.
 
     T_u u_dot + u = K_u drive + b_u (eq. (12)) and T r_dot + r = K steer + b (eq. (13)).
@@ -69,22 +75,22 @@ class _NomotoConfig(SteeredConfig, ABC):
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
     """
 
-    sway: ClassVar[tuple[str, ...]] = ("v",)
+    sway_terms: ClassVar[tuple[str, ...]] = ("v",)
 
     drive: str = "n"
     steer: str = "delta"
     manoeuvres: tuple[str, ...] = ()
 
     @final
-    def rows(self) -> tuple[tuple[str, ...], ...]:
-        return ("u", self.drive, "1"), self.sway, ("r", self.steer, "1")
+    def axis_terms(self) -> tuple[tuple[str, ...], ...]:
+        return ("u", self.drive, "1"), self.sway_terms, ("r", self.steer, "1")
 
     @final
-    def require_samples(self, samples: Samples) -> None:
-        of_manoeuvres(samples, self.manoeuvres)
+    def validate_samples(self, samples: Samples) -> None:
+        select_manoeuvres(samples, self.manoeuvres)
 
     @final
-    def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
+    def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
         """Return the one solution.
 
         Its table holds the coefficients, then T, K and b of each lag.
@@ -94,25 +100,25 @@ class _NomotoConfig(SteeredConfig, ABC):
         """
         assert isinstance(baseline, RegressorBaseline)
         ratios = (
-            _lag_of("u", self.drive, "_u"),
+            _lag_ratios("u", self.drive, "_u"),
             {
                 "T_beta": Ratio(-1.0, None, "v"),
                 "K_beta": Ratio(1.0, "u r", "v"),
                 "b_beta": Ratio(-1.0, "u", "v"),
             },
-            _lag_of("r", self.steer, ""),
+            _lag_ratios("r", self.steer, ""),
         )
-        chosen, fits, further = of_manoeuvres(samples, self.manoeuvres), {}, []
-        for axis, terms in enumerate(living_rows(self.rows(), chosen.names)):
+        selected, axis_fits, parameters = select_manoeuvres(samples, self.manoeuvres), {}, []
+        for axis, terms in enumerate(active_terms(self.axis_terms(), selected.names)):
             if len(terms) > 1:
-                fits[axis] = self._lag(baseline, chosen, axis, terms)
-                further += _parameters(axis, terms, fits[axis], ratios[axis])
-        if 1 not in fits and "v" in live_of(chosen.names).velocities:
-            fits[1] = Solution({}, {}, _decay(fits[2].table))
-        found = baseline.solution(fits, {})
-        return [replace(found, table=(*found.table, *further))]
+                axis_fits[axis] = self._fit_lag(baseline, selected, axis, terms)
+                parameters += _ratio_parameters(axis, terms, axis_fits[axis], ratios[axis])
+        if 1 not in axis_fits and "v" in get_dof(selected.names).velocities:
+            axis_fits[1] = Solution({}, {}, _sway_decay(axis_fits[2].table))
+        solution = baseline.combine_axis_fits(axis_fits, {})
+        return [replace(solution, table=(*solution.table, *parameters))]
 
-    def _lag(
+    def _fit_lag(
         self, baseline: RegressorBaseline, samples: Samples, axis: int, terms: Sequence[str]
     ) -> Solution:
         """Fit one axis as a first-order lag by least squares.
@@ -120,81 +126,87 @@ class _NomotoConfig(SteeredConfig, ABC):
         Raises:
             FitError: where the data do not determine it, or it does not settle.
         """
-        columns = [baseline.library.terms.index(term) for term in terms]
+        term_columns = [baseline.library.terms.index(term) for term in terms]
         (fit,) = LeastSquares().fit(
-            baseline.library(samples.z)[:, columns],
+            baseline.library(samples.z)[:, term_columns],
             samples.target[:, [axis]],
             samples.group,
             names=terms,
-            outputs=(ACCELERATION[axis],),
+            outputs=(ACCELERATION_NAMES[axis],),
         )
-        slope, error, name = float(fit.coefficients[0, 0]), float(fit.errors[0, 0]), VELOCITY[axis]
+        slope, standard_error, name = (
+            float(fit.coefficients[0, 0]),
+            float(fit.standard_errors[0, 0]),
+            VELOCITY_NAMES[axis],
+        )
         if slope >= 0:
             raise FitError(
                 f"a Nomoto model needs {name} to settle, but {name}_dot rises with {name}"
-                f" ({slope:.2g} +- {error:.1g} 1/s): the vessel is unstable on course or hardly"
+                f" ({slope:.2g} +- {standard_error:.1g} 1/s): the vessel is unstable on course or hardly"
                 " excited; take a baseline of kind 'regressors' or fit on other `manoeuvres`"
             )
         return fit
 
 
-def _lag_of(state: str, drive: str, suffix: str) -> dict[str, Ratio]:
+def _lag_ratios(state: str, drive: str, suffix: str) -> dict[str, Ratio]:
     """Return T, K and b of T x_dot + x = K drive + b, from x_dot = a x + k drive + c."""
-    above = {"T": None, "K": drive, "b": "1"}
-    return {f"{name}{suffix}": Ratio(-1.0, term, state) for name, term in above.items()}
+    numerators = {"T": None, "K": drive, "b": "1"}
+    return {f"{name}{suffix}": Ratio(-1.0, term, state) for name, term in numerators.items()}
 
 
-def _parameters(
+def _ratio_parameters(
     axis: int, terms: Sequence[str], fit: Solution, ratios: Mapping[str, Ratio]
 ) -> list[Coefficient]:
     """Return parameters that are ratios of the coefficients of an axis, errors to first order."""
     theta = fit.coefficients[:, 0]
     assert fit.covariance is not None
-    out = []
+    parameters = []
     for name, ratio in ratios.items():
-        below = terms.index(ratio.denominator)
+        denominator_index = terms.index(ratio.denominator)
         gradient = torch.zeros_like(theta)
-        value = ratio.of(dict(zip(terms, theta.tolist(), strict=True)))
-        gradient[below] = -value / theta[below]
+        value = ratio.evaluate(dict(zip(terms, theta.tolist(), strict=True)))
+        gradient[denominator_index] = -value / theta[denominator_index]
         if ratio.numerator is not None:
-            gradient[terms.index(ratio.numerator)] += ratio.sign / theta[below]
-        error = (gradient @ fit.covariance[0] @ gradient).clamp(min=0).sqrt()
-        out.append(Coefficient(ACCELERATION[axis], name, value, float(error), ratio))
-    return out
+            gradient[terms.index(ratio.numerator)] += ratio.sign / theta[denominator_index]
+        standard_error = (gradient @ fit.covariance[0] @ gradient).clamp(min=0).sqrt()
+        parameters.append(
+            Coefficient(ACCELERATION_NAMES[axis], name, value, float(standard_error), ratio)
+        )
+    return parameters
 
 
-class NomotoConfig(_NomotoConfig):
+class NomotoBaselineConfig(_NomotoBaselineConfig):
     """Nomoto's model of first order, T r_dot + r = K steer + b.
 
     Surge is a first-order lag of the drive; sway, of which the model knows nothing, dies out with
     T. Where only surge or only yaw lives, only its lag is found.
     """
 
-    needs = ()
+    required_velocities = ()
 
     kind: Literal["nomoto"] = "nomoto"
 
 
-class NomotoSideslipConfig(_NomotoConfig):
+class NomotoSideslipBaselineConfig(_NomotoBaselineConfig):
     """Nomoto's model with side slip (document 003 eqs. (14), (15)).
 
     T_beta beta_dot + beta = -K_beta r + b_beta, written for v = u beta.
     """
 
-    sway = ("v", "u r", "u")
+    sway_terms = ("v", "u r", "u")
 
     kind: Literal["nomoto_sideslip"] = "nomoto_sideslip"
 
 
-class _Block(NamedTuple):
+class _SteadyStateBlock(NamedTuple):
     """States that one input drives, and the manoeuvres that identify how they settle."""
 
     states: tuple[str, ...]
     drive: str
-    kinds: tuple[str, ...]
+    manoeuvre_kinds: tuple[str, ...]
 
 
-class LinearSteadyConfig(SteeredConfig):
+class LinearSteadyConfig(SteeringBaselineConfig):
     """The models u_dot = a u + k tau + c and (v, r)_dot = A (v, r) + B tau + C (eqs. (12), (16)).
 
     First the steady states of constant-input manoeuvres give x_ss = Phi tau + Phi_bias by least
@@ -221,32 +233,35 @@ class LinearSteadyConfig(SteeredConfig):
     speed: tuple[str, ...] = ("acceleration_deceleration",)
     steering: tuple[str, ...] = ("zigzag", "three_two_one_one")
 
-    def rows(self) -> tuple[tuple[str, ...], ...]:
-        rows: dict[str, tuple[str, ...]] = {"v": ("v",)}
-        for block in self._blocks():
-            rows |= dict.fromkeys(block.states, (*block.states, block.drive, "1"))
-        return tuple(rows[axis] for axis in VELOCITY)
+    def axis_terms(self) -> tuple[tuple[str, ...], ...]:
+        terms_of_axis: dict[str, tuple[str, ...]] = {"v": ("v",)}
+        for block in self._steady_state_blocks():
+            terms_of_axis |= dict.fromkeys(block.states, (*block.states, block.drive, "1"))
+        return tuple(terms_of_axis[axis] for axis in VELOCITY_NAMES)
 
-    def _blocks(self) -> list[_Block]:
-        yaw = _Block(("r",), self.steer, self.steering)
-        steering = {
-            "linear": [_Block(("v", "r"), self.steer, self.steering)],
-            "nomoto": [yaw],
-            "nomoto_sideslip": [_Block(("v",), "r", self.steering), yaw],
+    def _steady_state_blocks(self) -> list[_SteadyStateBlock]:
+        yaw_block = _SteadyStateBlock(("r",), self.steer, self.steering)
+        steering_blocks = {
+            "linear": [_SteadyStateBlock(("v", "r"), self.steer, self.steering)],
+            "nomoto": [yaw_block],
+            "nomoto_sideslip": [_SteadyStateBlock(("v",), "r", self.steering), yaw_block],
         }
-        return [_Block(("u",), self.drive, self.speed), *steering[self.steering_model]]
+        return [
+            _SteadyStateBlock(("u",), self.drive, self.speed),
+            *steering_blocks[self.steering_model],
+        ]
 
-    def require_samples(self, samples: Samples) -> None:
+    def validate_samples(self, samples: Samples) -> None:
         """Check that there are constant manoeuvres, and those that identify speed and steering.
 
         Raises:
             FitError: where there are not.
         """
-        self._means(samples, ())
+        self._steady_means(samples, ())
         for kinds in (self.speed, self.steering):
-            of_manoeuvres(samples, kinds)
+            select_manoeuvres(samples, kinds)
 
-    def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
+    def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
         """Return the one solution; its notes hold the steady states and Phi (Table 1).
 
         Raises:
@@ -254,70 +269,86 @@ class LinearSteadyConfig(SteeredConfig):
         """
         assert isinstance(baseline, RegressorBaseline)
         tables: dict[str, tuple[Coefficient, ...]] = {}
-        phi: dict[str, dict[str, Any]] = {}
-        for block in self._blocks():
-            means = self._means(samples, (*block.states, block.drive))
-            slope = torch.stack((means[:, -1], torch.ones_like(means[:, -1])), dim=1)
-            (steady,) = LeastSquares().fit(
-                slope,
+        steady_constraints: dict[str, dict[str, Any]] = {}
+        for block in self._steady_state_blocks():
+            means = self._steady_means(samples, (*block.states, block.drive))
+            design_matrix = torch.stack((means[:, -1], torch.ones_like(means[:, -1])), dim=1)
+            (steady_fit,) = LeastSquares().fit(
+                design_matrix,
                 means[:, :-1],
                 torch.arange(len(means)),
                 names=(block.drive, "1"),
                 outputs=block.states,
             )
-            tables |= self._tables(samples, block, steady)
+            tables |= self._fit_dynamics(samples, block, steady_fit)
             for i, state in enumerate(block.states):
-                (value, bias), (error, bias_error) = (
-                    numbers[:, i].tolist() for numbers in (steady.coefficients, steady.errors)
+                (value, bias), (standard_error, bias_standard_error) = (
+                    values[:, i].tolist()
+                    for values in (steady_fit.coefficients, steady_fit.standard_errors)
                 )
-                phi[state] = {"of": block.drive, "phi": value, "phi_error": error}
-                phi[state] |= {"bias": bias, "bias_error": bias_error}
-        tables.setdefault("v", _decay(tables["r"]))
-        names = (*VELOCITY, self.drive, self.steer)
-        states = dict(zip(names, self._means(samples, names).T.tolist(), strict=True))
-        fits = {i: Solution({}, {}, tables[axis]) for i, axis in enumerate(VELOCITY)}
-        found = baseline.solution(fits, {})
-        return [replace(found, notes={"steady_states": states, "steady_constraints": phi})]
+                steady_constraints[state] = {
+                    "of": block.drive,
+                    "phi": value,
+                    "phi_error": standard_error,
+                }
+                steady_constraints[state] |= {"bias": bias, "bias_error": bias_standard_error}
+        tables.setdefault("v", _sway_decay(tables["r"]))
+        names = (*VELOCITY_NAMES, self.drive, self.steer)
+        steady_states = dict(zip(names, self._steady_means(samples, names).T.tolist(), strict=True))
+        axis_fits = {i: Solution({}, {}, tables[axis]) for i, axis in enumerate(VELOCITY_NAMES)}
+        solution = baseline.combine_axis_fits(axis_fits, {})
+        return [
+            replace(
+                solution,
+                notes={"steady_states": steady_states, "steady_constraints": steady_constraints},
+            )
+        ]
 
-    def _means(self, samples: Samples, names: Sequence[str]) -> Tensor:
+    def _steady_means(self, samples: Samples, names: Sequence[str]) -> Tensor:
         """Return the means [n, len(names)] of the settled part of every constant manoeuvre."""
-        settled = samples.of_kinds(self.steady)
-        settled = settled.where(settled.t >= self.settled)
-        present, index = torch.unique(settled.group, return_inverse=True)
-        if len(present) < 3:
+        steady_samples = samples.select_manoeuvres(self.steady)
+        steady_samples = steady_samples.select(steady_samples.t >= self.settled)
+        groups, group_index = torch.unique(steady_samples.group, return_inverse=True)
+        if len(groups) < 3:
             raise FitError(
                 "baseline 'linear_steady' needs at least 3 constant-input manoeuvres of kinds"
                 f" {list(self.steady)} longer than {self.settled:g} s, the data have"
-                f" {len(present)}; kinds in the data: {sorted(set(samples.kinds))}"
+                f" {len(groups)}; kinds in the data: {sorted(set(samples.kinds))}"
             )
-        columns = settled.z[:, [samples.names.index(name) for name in names]]
-        sums = columns.new_zeros(len(present), len(names)).index_add_(0, index, columns)
-        return sums / torch.bincount(index)[:, None]
+        selected_channels = steady_samples.z[:, [samples.names.index(name) for name in names]]
+        group_sums = selected_channels.new_zeros(len(groups), len(names)).index_add_(
+            0, group_index, selected_channels
+        )
+        return group_sums / torch.bincount(group_index)[:, None]
 
-    def _tables(
-        self, samples: Samples, block: _Block, steady: Solution
+    def _fit_dynamics(
+        self, samples: Samples, block: _SteadyStateBlock, steady_fit: Solution
     ) -> dict[str, tuple[Coefficient, ...]]:
         """Return the coefficients of each state of a block.
 
         First stands A, then B = -A Phi and -A Phi_bias, errors to first order as if those of A and
         Phi were independent.
         """
-        dynamic, states = of_manoeuvres(samples, block.kinds), block.states
-        phi, phi_error = steady.coefficients, steady.errors
-        x = torch.stack([dynamic.column(name) for name in states], dim=1)
+        dynamic_samples, states = select_manoeuvres(samples, block.manoeuvre_kinds), block.states
+        phi, phi_standard_error = steady_fit.coefficients, steady_fit.standard_errors
+        states_matrix = torch.stack([dynamic_samples.channel(name) for name in states], dim=1)
         (fit,) = LeastSquares().fit(
-            x - dynamic.column(block.drive)[:, None] * phi[0] - phi[1],
-            dynamic.target[:, [VELOCITY.index(name) for name in states]],
-            dynamic.group,
+            states_matrix - dynamic_samples.channel(block.drive)[:, None] * phi[0] - phi[1],
+            dynamic_samples.target[:, [VELOCITY_NAMES.index(name) for name in states]],
+            dynamic_samples.group,
             names=states,
         )
-        a, a_error = fit.coefficients, fit.errors
-        value = torch.cat((a, -phi @ a))
-        variance = phi_error.square() @ a.square() + phi.square() @ a_error.square()
-        error = torch.cat((a_error, variance.sqrt()))
+        a, a_standard_error = fit.coefficients, fit.standard_errors
+        coefficients = torch.cat((a, -phi @ a))
+        variance = (
+            phi_standard_error.square() @ a.square() + phi.square() @ a_standard_error.square()
+        )
+        standard_errors = torch.cat((a_standard_error, variance.sqrt()))
         return {
             state: tuple(
-                Coefficient(f"{state}_dot", term, float(value[j, i]), float(error[j, i]))
+                Coefficient(
+                    f"{state}_dot", term, float(coefficients[j, i]), float(standard_errors[j, i])
+                )
                 for j, term in enumerate((*states, block.drive, "1"))
             )
             for i, state in enumerate(states)

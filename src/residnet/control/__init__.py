@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from residnet.control.base import ClosedLoop, GivenReference, Policy, Reference
+from residnet.control.base import ClosedLoop, Policy, RecordedReference, Reference
 from residnet.control.heading.classical import BangBangHeading, HeadingPD
 from residnet.control.motion import (
-    Allocated,
+    AllocatedPolicy,
     FeedForward,
     HullFeedForward,
     MotionPID,
@@ -16,17 +16,17 @@ from residnet.control.motion import (
 )
 
 __all__ = [
-    "Allocated",
+    "AllocatedPolicy",
     "BangBangHeading",
     "ClosedLoop",
     "FeedForward",
-    "GivenReference",
     "HeadingPD",
     "HullFeedForward",
     "MotionPID",
     "MotionPIDConfig",
     "NoFeedForward",
     "Policy",
+    "RecordedReference",
     "Reference",
     "ReferenceFilter",
     "ReferenceFilterConfig",

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from residnet.dynamics.rollout import Source
 
 
-class Remembering(nn.Module, ABC):
+class StatefulModule(nn.Module, ABC):
     """What has a memory [B, n_state] that goes from step to step."""
 
     def __init__(self) -> None:
@@ -23,7 +23,7 @@ class Remembering(nn.Module, ABC):
         return torch.zeros(x.shape[0], self.n_state, dtype=x.dtype, device=x.device)
 
 
-class Policy(Remembering):
+class Policy(StatefulModule):
     """A controller: commands from the state and a reference, once per step.
 
     The same tensor code trains, flies and is exported.
@@ -39,7 +39,7 @@ class Policy(Remembering):
             s: memory [B, n_state].
         """
 
-    def told(self, s: Tensor, rudder: Tensor) -> Tensor:
+    def with_applied_rudder(self, s: Tensor, rudder: Tensor) -> Tensor:
         """Return the memory once the rudder angle [B, 1] is known that is really taken.
 
         A controller without an estimate of the vessel does not care.
@@ -47,7 +47,7 @@ class Policy(Remembering):
         return s
 
 
-class Reference(Remembering):
+class Reference(StatefulModule):
     """Guidance: what the controller shall follow."""
 
     def __init__(self) -> None:
@@ -69,7 +69,7 @@ class Reference(Remembering):
 
 
 @final
-class GivenReference(Reference):
+class RecordedReference(Reference):
     """A reference known in advance, [B, T, r]; its last value holds beyond T."""
 
     def __init__(self, values: Tensor) -> None:
@@ -100,10 +100,10 @@ class ClosedLoop(Source):
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the inputs [B, m]: the command, then what else was given."""
         n = self.reference.n_state
-        target, guided = self.reference(x, k, memory[:, :n])
+        target, reference_state = self.reference(x, k, memory[:, :n])
         command, s = self.policy(x, target, memory[:, n:])
         return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), torch.cat(
-            (guided, s), dim=-1
+            (reference_state, s), dim=-1
         )
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
@@ -112,7 +112,7 @@ class ClosedLoop(Source):
 
 
 @final
-class Followed(Source):
+class ReferenceInInputs(Source):
     """A controller whose reference stands behind the inputs of a rollout, w [B, m + r].
 
     What does not count steps can be compiled. Its commands take the first columns of the m.

@@ -17,19 +17,19 @@ from torch import Tensor, nn
 
 from residnet.control.base import Policy, Reference
 from residnet.control.courses.course_plan import Course
-from residnet.control.heading.turning import Turning
+from residnet.control.heading.turning import NomotoModel
 from residnet.control.motion import (
-    Derivatives,
-    Lag,
+    ActuatorLag,
+    PoseDerivatives,
     ReferenceFilterConfig,
-    derivatives,
-    needed_force,
-    reference_row,
+    filter_derivatives,
+    required_force,
+    stack_reference,
 )
-from residnet.core.columns import accelerations, heading, pose, position, velocities
+from residnet.core.columns import dynamic_states, heading, motion_accelerations, pose, position
 from residnet.core.config import Config, Metres, MetresPerSecond, RadiansPerSecond, Seconds
 from residnet.core.errors import ConfigError
-from residnet.core.frames import wrap
+from residnet.core.frames import wrap_angle
 from residnet.physics.force_model import ForceModel
 
 _ANGLES = 181
@@ -60,7 +60,7 @@ class WheelOver(nn.Module):
 
     def __init__(
         self,
-        turning: Turning,
+        nomoto: NomotoModel,
         limit: float,
         acceptance: float,
         *,
@@ -68,74 +68,88 @@ class WheelOver(nn.Module):
         rate: float | None = None,
     ) -> None:
         super().__init__()
-        angles, reach, tracks = _turns(turning, limit)
-        within = share * acceptance
-        radius = turning.speed / (turning.gain * limit)
+        angles, corner_distances, tracks = _switching_turns(nomoto, limit)
+        max_miss = share * acceptance
+        radius = nomoto.speed / (nomoto.gain * limit)
         # an arc without lag, then the lag
-        farthest = math.sqrt(within * (2.0 * radius + within)) + turning.speed * turning.time
-        distance = np.linspace(0.0, farthest, _DISTANCES)
-        missed = np.stack(
+        max_distance = math.sqrt(max_miss * (2.0 * radius + max_miss)) + nomoto.speed * nomoto.time
+        distance = np.linspace(0.0, max_distance, _DISTANCES)
+        miss_distance = np.stack(
             [np.hypot(distance[:, None] - track[:, 0], track[:, 1]).min(axis=1) for track in tracks]
         )
-        found = np.where((distance <= reach[:, None]) & (missed <= within), distance, 0.0).max(
-            axis=1
-        )
-        even = np.linspace(0.0, math.pi, _ANGLES)
-        moving = 0.0 if rate is None else 0.5 * turning.speed * limit / rate
+        best_distance = np.where(
+            (distance <= corner_distances[:, None]) & (miss_distance <= max_miss), distance, 0.0
+        ).max(axis=1)
+        course_changes = np.linspace(0.0, math.pi, _ANGLES)
+        rudder_distance = 0.0 if rate is None else 0.5 * nomoto.speed * limit / rate
         self.register_buffer(
-            "table", torch.from_numpy(np.interp(even, angles, found) + moving), persistent=False
+            "table",
+            torch.from_numpy(np.interp(course_changes, angles, best_distance) + rudder_distance),
+            persistent=False,
         )
         self.table: Tensor
 
     def forward(self, change: Tensor) -> Tensor:
         """Return the distance [B] in m for changes of course [B] in rad, within +-pi."""
         table = self.table.to(change.dtype)
-        along = change.abs() * (float(table.shape[0] - 1) / math.pi)
-        before = along.floor().clamp(max=float(table.shape[0] - 2))
-        number, share = before.long(), along - before
-        return (1.0 - share) * table[number] + share * table[number + 1]
+        table_position = change.abs() * (float(table.shape[0] - 1) / math.pi)
+        lower_index = table_position.floor().clamp(max=float(table.shape[0] - 2))
+        row, fraction = lower_index.long(), table_position - lower_index
+        return (1.0 - fraction) * table[row] + fraction * table[row + 1]
 
 
-def _turns(turning: Turning, limit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _switching_turns(
+    nomoto: NomotoModel, limit: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return heading changes [N], distances to the corner [N] and tracks [N, M, 2] of turns.
 
     The heading changes go from 0 to past pi in rad; a distance is from a turn's beginning to where
     the lines before and after it meet, in m; tracks are ahead and aside, in m.
     """
-    full, time = turning.gain * limit, turning.time
-    held = np.concatenate(
-        ([0.0], np.geomspace(1e-3 * time, math.pi / full + 2.0 * time, 4 * _ANGLES))
+    max_yaw_rate, time_constant = nomoto.gain * limit, nomoto.time
+    hold_times = np.concatenate(
+        (
+            [0.0],
+            np.geomspace(
+                1e-3 * time_constant, math.pi / max_yaw_rate + 2.0 * time_constant, 4 * _ANGLES
+            ),
+        )
     )[:, None]
-    first = full * (1.0 - np.exp(-held / time))
+    yaw_rate_at_reversal = max_yaw_rate * (1.0 - np.exp(-hold_times / time_constant))
     share = np.linspace(0.0, 1.0, _SAMPLES)[None, :]
     # over, then back until the yaw has stopped
-    over = held * share
-    back = time * np.log1p(first / full) * share[:, 1:]
-    turned = full * held - time * first
-    rate = (first + full) * np.exp(-back / time) - full
+    hold_phase = hold_times * share
+    reversal_phase = time_constant * np.log1p(yaw_rate_at_reversal / max_yaw_rate) * share[:, 1:]
+    heading_at_reversal = max_yaw_rate * hold_times - time_constant * yaw_rate_at_reversal
+    rate = (yaw_rate_at_reversal + max_yaw_rate) * np.exp(
+        -reversal_phase / time_constant
+    ) - max_yaw_rate
     heading = np.concatenate(
         (
-            full * (over - time * (1.0 - np.exp(-over / time))),
-            turned + time * (first - rate) - full * back,
+            max_yaw_rate
+            * (hold_phase - time_constant * (1.0 - np.exp(-hold_phase / time_constant))),
+            heading_at_reversal
+            + time_constant * (yaw_rate_at_reversal - rate)
+            - max_yaw_rate * reversal_phase,
         ),
         axis=1,
     )
-    moments = np.concatenate((over, held + back), axis=1)
-    step = turning.speed * np.diff(moments, axis=1)
-    middle = 0.5 * (heading[:, 1:] + heading[:, :-1])
-    parts = np.stack((step * np.cos(middle), step * np.sin(middle)), axis=-1)
-    track = np.concatenate((np.zeros((len(parts), 1, 2)), parts.cumsum(axis=1)), axis=1)
-    angle = heading[:, -1]
-    sine = np.sin(angle)
-    meet = np.where(
+    phase_times = np.concatenate((hold_phase, hold_times + reversal_phase), axis=1)
+    step = nomoto.speed * np.diff(phase_times, axis=1)
+    mean_heading = 0.5 * (heading[:, 1:] + heading[:, :-1])
+    increments = np.stack((step * np.cos(mean_heading), step * np.sin(mean_heading)), axis=-1)
+    track = np.concatenate((np.zeros((len(increments), 1, 2)), increments.cumsum(axis=1)), axis=1)
+    final_heading = heading[:, -1]
+    sine = np.sin(final_heading)
+    corner_distance = np.where(
         sine > 1e-9,
-        track[:, -1, 0] - track[:, -1, 1] * np.cos(angle) / np.maximum(sine, 1e-9),
+        track[:, -1, 0] - track[:, -1, 1] * np.cos(final_heading) / np.maximum(sine, 1e-9),
         math.inf,
     )
-    return angle, np.where(angle == 0.0, 0.0, meet), track
+    return final_heading, np.where(final_heading == 0.0, 0.0, corner_distance), track
 
 
-_ON_LEG = 0.4
+_MAX_LEG_OFFSET = 0.4
 """Share of the circle of acceptance that a vessel may be set off its leg by, at the wheel-over and
 on from there, for the turn to count on.
 """
@@ -164,7 +178,7 @@ class WaypointGuidance(Reference):
         self,
         points: Sequence[tuple[float, float]],
         acceptance: float,
-        sight: LineOfSight,
+        line_of_sight: LineOfSight,
         state: Sequence[str],
         wheel_over: WheelOver | None = None,
     ) -> None:
@@ -176,64 +190,78 @@ class WaypointGuidance(Reference):
             )
         self.register_buffer("points", torch.tensor(points, dtype=torch.float64), persistent=False)
         self.points: Tensor
-        self.acceptance, self.sight, self.wheel_over = acceptance, sight, wheel_over
-        self.on_leg = _ON_LEG * acceptance
+        self.acceptance, self.line_of_sight, self.wheel_over = acceptance, line_of_sight, wheel_over
+        self.max_leg_offset = _MAX_LEG_OFFSET * acceptance
         self.x, self.y, self.psi = state.index("x"), state.index("y"), state.index("psi")
-        self.n_state = 3 + sight.n_state
+        self.n_state = 3 + line_of_sight.n_state
         self.may_finish = True
 
     def initial_state(self, x: Tensor) -> Tensor:
         """Return the memory at the start of the first leg, which begins where the vessel is."""
-        rest = torch.zeros(x.shape[0], self.n_state - 3, dtype=x.dtype, device=x.device)
+        law_memory = torch.zeros(x.shape[0], self.n_state - 3, dtype=x.dtype, device=x.device)
         return torch.cat(
             (
                 torch.zeros_like(x[:, :1]),
                 x[:, self.x : self.x + 1],
                 x[:, self.y : self.y + 1],
-                rest,
+                law_memory,
             ),
             dim=-1,
         )
 
-    def leg(self, x: Tensor, number: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def leg_geometry(
+        self, x: Tensor, leg_number: Tensor, s: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return a leg's direction [B] in rad, distance left [B] and cross-track error [B] in m.
 
         The distance is along the leg; the cross-track error is positive to starboard of it.
         """
         points = self.points.to(x.dtype)
-        target = points[number.clamp(max=len(points) - 1)]
-        before = torch.where(
-            (number == 0).unsqueeze(-1), s[:, 1:3], points[(number - 1).clamp(0, len(points) - 1)]
+        target = points[leg_number.clamp(max=len(points) - 1)]
+        leg_start = torch.where(
+            (leg_number == 0).unsqueeze(-1),
+            s[:, 1:3],
+            points[(leg_number - 1).clamp(0, len(points) - 1)],
         )
-        along = target - before
-        direction = torch.atan2(along[:, 1], along[:, 0])
+        leg_vector = target - leg_start
+        direction = torch.atan2(leg_vector[:, 1], leg_vector[:, 0])
         north, east = target[:, 0] - x[:, self.x], target[:, 1] - x[:, self.y]
-        ahead = north * torch.cos(direction) + east * torch.sin(direction)
-        return direction, ahead, north * torch.sin(direction) - east * torch.cos(direction)
+        remaining_distance = north * torch.cos(direction) + east * torch.sin(direction)
+        return (
+            direction,
+            remaining_distance,
+            north * torch.sin(direction) - east * torch.cos(direction),
+        )
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        number = s[:, 0].long()
-        direction, ahead, error = self.leg(x, number, s)
-        reached = (ahead <= 0) | (ahead * ahead + error * error <= self.acceptance**2)
+        leg_number = s[:, 0].long()
+        direction, remaining_distance, error = self.leg_geometry(x, leg_number, s)
+        has_reached = (remaining_distance <= 0) | (
+            remaining_distance * remaining_distance + error * error <= self.acceptance**2
+        )
         if self.wheel_over is not None:
-            change = self.leg(x, number + 1, s)[0] - direction
-            before = self.wheel_over(wrap(change))
-            aside = error.abs() + before * torch.sin(x[:, self.psi] - direction).abs()
-            reached = reached | (
-                (ahead <= before) & (aside <= self.on_leg) & (number < len(self.points) - 1)
+            change = self.leg_geometry(x, leg_number + 1, s)[0] - direction
+            switch_distance = self.wheel_over(wrap_angle(change))
+            offset_at_corner = (
+                error.abs() + switch_distance * torch.sin(x[:, self.psi] - direction).abs()
             )
-        number = (number + reached.long()).clamp(max=self.points.shape[0])
-        direction, _, error = self.leg(x, number, s)
-        angle, memory = self.sight(error, direction, s[:, 3:])
-        heading = wrap(direction + angle).unsqueeze(-1)
-        return heading, torch.cat((number.to(x.dtype).unsqueeze(-1), s[:, 1:3], memory), dim=-1)
+            has_reached = has_reached | (
+                (remaining_distance <= switch_distance)
+                & (offset_at_corner <= self.max_leg_offset)
+                & (leg_number < len(self.points) - 1)
+            )
+        leg_number = (leg_number + has_reached.long()).clamp(max=self.points.shape[0])
+        direction, _, error = self.leg_geometry(x, leg_number, s)
+        angle, memory = self.line_of_sight(error, direction, s[:, 3:])
+        heading = wrap_angle(direction + angle).unsqueeze(-1)
+        return heading, torch.cat((leg_number.to(x.dtype).unsqueeze(-1), s[:, 1:3], memory), dim=-1)
 
     def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
         """Return the rows behind their last way-point."""
         return s[:, 0] >= self.points.shape[0]
 
 
-_MOST = 1.0
+_MAX_DRIFT_TANGENT = 1.0
 """Tangent of the largest crab angle."""
 
 
@@ -274,13 +302,13 @@ class DriftEstimate(nn.Module):
                 f" {distance:g} m, {gain:g} m/s, {dt:g} s"
             )
         self.distance, self.gain, self.dt = distance, gain, dt
-        self.most = _MOST
+        self.max_drift = _MAX_DRIFT_TANGENT
 
-    def across(self, direction: Tensor, s: Tensor) -> Tensor:
+    def cross_component(self, direction: Tensor, s: Tensor) -> Tensor:
         """Return the part [B] to starboard of a direction [B] in rad."""
         return torch.cos(direction) * s[:, 1] - torch.sin(direction) * s[:, 0]
 
-    def along(self, direction: Tensor, s: Tensor) -> Tensor:
+    def along_component(self, direction: Tensor, s: Tensor) -> Tensor:
         """Return the part [B] along a direction [B] in rad."""
         return torch.cos(direction) * s[:, 0] + torch.sin(direction) * s[:, 1]
 
@@ -292,12 +320,12 @@ class DriftEstimate(nn.Module):
             error: cross-track error [B] in m.
             direction: of the way [B] in rad.
         """
-        aim = error + self.distance * self.across(direction, s)
-        grown = self.dt * self.gain * error / (self.distance**2 + aim.square())
-        s = s + grown.unsqueeze(-1) * torch.stack(
+        steering_error = error + self.distance * self.cross_component(direction, s)
+        drift_increment = self.dt * self.gain * error / (self.distance**2 + steering_error.square())
+        s = s + drift_increment.unsqueeze(-1) * torch.stack(
             (-torch.sin(direction), torch.cos(direction)), dim=-1
         )
-        return s / (s.square().sum(dim=-1, keepdim=True).sqrt() / self.most).clamp(min=1.0)
+        return s / (s.square().sum(dim=-1, keepdim=True).sqrt() / self.max_drift).clamp(min=1.0)
 
 
 class LineOfSight(nn.Module, ABC):
@@ -319,7 +347,7 @@ class LineOfSight(nn.Module, ABC):
 
 
 @final
-class LookAhead(LineOfSight):
+class LookAheadLineOfSight(LineOfSight):
     """Steering for the point of the leg a distance ahead: -atan(error / distance).
 
     With an estimate of the drift D across the leg, -atan(error / distance + D), the crab angle that
@@ -339,13 +367,13 @@ class LookAhead(LineOfSight):
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         slope = error / self.distance
         if self.drift is not None:
-            slope = slope + self.drift.across(direction, s)
+            slope = slope + self.drift.cross_component(direction, s)
             s = self.drift(error, direction, s)
         return -torch.atan(slope), s
 
 
 @final
-class Enclosure(LineOfSight):
+class EnclosureLineOfSight(LineOfSight):
     """Steering for the forward point where a circle about the vessel meets the leg.
 
     The angle is -asin(error / radius) (Fossen, section 12.3).
@@ -376,7 +404,7 @@ class LookAheadConfig(Config):
 
     def build(self, dt: float) -> LineOfSight:
         """Return the law, for steps of dt seconds."""
-        return LookAhead(self.distance)
+        return LookAheadLineOfSight(self.distance)
 
 
 class EnclosureConfig(Config):
@@ -391,7 +419,7 @@ class EnclosureConfig(Config):
 
     def build(self, dt: float) -> LineOfSight:
         """Return the law, for steps of dt seconds."""
-        return Enclosure(self.radius)
+        return EnclosureLineOfSight(self.radius)
 
 
 class IntegralLookAheadConfig(Config):
@@ -409,7 +437,7 @@ class IntegralLookAheadConfig(Config):
 
     def build(self, dt: float) -> LineOfSight:
         """Return the law, for steps of dt seconds."""
-        return LookAhead(self.distance, DriftEstimate(self.distance, self.gain, dt))
+        return LookAheadLineOfSight(self.distance, DriftEstimate(self.distance, self.gain, dt))
 
 
 AnyLineOfSight = Annotated[
@@ -417,7 +445,7 @@ AnyLineOfSight = Annotated[
 ]
 
 
-_LEAST = 0.3
+_MIN_CURVATURE_FACTOR = 0.3
 """Of 1 - curvature x cross-track error: beyond, the centre of the turn is near and the nearest
 point no longer known.
 """
@@ -461,64 +489,77 @@ class CourseGuidance(Reference):
             "table", torch.from_numpy(np.stack(columns, axis=-1)), persistent=False
         )
         self.table: Tensor
-        self.spacing, self.length, self.lookahead = course.step, course.length, lookahead
-        self.farthest = course.step * (len(course.track) - 1)
+        self.table_step, self.length, self.lookahead = course.step, course.length, lookahead
+        self.max_arc_length = course.step * (len(course.track) - 1)
         self.x, self.y, self.psi = state.index("x"), state.index("y"), state.index("psi")
         self.u, self.v = state.index("u"), state.index("v")
-        self.least = _LEAST
+        self.min_curvature_factor = _MIN_CURVATURE_FACTOR
         self.drift = drift
         self.n_state = 1 if drift is None else 3
         self.may_finish = True
 
-    def at(self, place: Tensor) -> Tensor:
+    def plan_at(self, arc_length: Tensor) -> Tensor:
         """Return the plan [B, 7] at places [B] in m along the course.
 
         The columns are north, east, direction, heading, rudder, and the curvatures of direction and
         heading.
         """
-        along = (place / self.spacing).clamp(0.0, float(self.table.shape[0]) - 1.001)
-        before = along.floor()
-        share = (along - before).unsqueeze(-1)
-        number = before.long()
-        return (1.0 - share) * self.table[number].to(place.dtype) + share * self.table[
-            number + 1
-        ].to(place.dtype)
+        table_position = (arc_length / self.table_step).clamp(
+            0.0, float(self.table.shape[0]) - 1.001
+        )
+        lower_index = table_position.floor()
+        fraction = (table_position - lower_index).unsqueeze(-1)
+        row = lower_index.long()
+        return (1.0 - fraction) * self.table[row].to(arc_length.dtype) + fraction * self.table[
+            row + 1
+        ].to(arc_length.dtype)
 
-    def error(self, x: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
+    def track_error(self, x: Tensor, arc_length: Tensor) -> tuple[Tensor, Tensor]:
         """Return the distance ahead [B] of a place on the course and its cross-track error in m."""
-        planned = self.at(place)
+        planned = self.plan_at(arc_length)
         north, east = x[:, self.x] - planned[:, 0], x[:, self.y] - planned[:, 1]
         c, s = torch.cos(planned[:, 2]), torch.sin(planned[:, 2])
         return c * north + s * east, c * east - s * north
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        place = s[:, 0]
-        ahead, aside = self.error(x, place)
-        closeness = (1.0 - self.at(place)[:, 5] * aside).clamp(min=self.least)
-        place = (place + (ahead / closeness).clamp(0.0, self.lookahead)).clamp(max=self.farthest)
-        planned = self.at(place)
-        _, aside = self.error(x, place)
+        arc_length = s[:, 0]
+        along_track_error, cross_track_error = self.track_error(x, arc_length)
+        curvature_factor = (1.0 - self.plan_at(arc_length)[:, 5] * cross_track_error).clamp(
+            min=self.min_curvature_factor
+        )
+        arc_length = (
+            arc_length + (along_track_error / curvature_factor).clamp(0.0, self.lookahead)
+        ).clamp(max=self.max_arc_length)
+        planned = self.plan_at(arc_length)
+        _, cross_track_error = self.track_error(x, arc_length)
         direction, heading = planned[:, 2], planned[:, 3]
-        slope, memory = aside / self.lookahead, s[:, 1:]
-        across, along = torch.zeros_like(aside), torch.zeros_like(aside)
+        slope, memory = cross_track_error / self.lookahead, s[:, 1:]
+        cross_drift, along_drift = (
+            torch.zeros_like(cross_track_error),
+            torch.zeros_like(cross_track_error),
+        )
         if self.drift is not None:
-            across, along = (
-                self.drift.across(direction, memory),
-                self.drift.along(direction, memory),
+            cross_drift, along_drift = (
+                self.drift.cross_component(direction, memory),
+                self.drift.along_component(direction, memory),
             )
-            memory = self.drift(aside, direction, memory)
-        slope = slope + across
+            memory = self.drift(cross_track_error, direction, memory)
+        slope = slope + cross_drift
         speed = torch.sqrt(x[:, self.u].square() + x[:, self.v].square())
-        stream = speed / torch.sqrt(1.0 + across.square())
-        heading_error = wrap(x[:, self.psi] - heading)
-        closeness = (1.0 - planned[:, 5] * aside).clamp(min=self.least)
-        progress = (speed * torch.cos(heading_error) + stream * along).clamp(min=0.0) / closeness
-        sliding = (
-            speed * torch.sin(heading_error) + stream * across
-        ) / self.lookahead - along * planned[:, 5] * progress
-        rate = planned[:, 6] * progress - sliding / (1.0 + slope.square())
-        reference = torch.stack((heading - torch.atan(slope), rate, planned[:, 4]), dim=-1)
-        return reference, torch.cat((place.unsqueeze(-1), memory), dim=-1)
+        drift_speed = speed / torch.sqrt(1.0 + cross_drift.square())
+        heading_error = wrap_angle(x[:, self.psi] - heading)
+        curvature_factor = (1.0 - planned[:, 5] * cross_track_error).clamp(
+            min=self.min_curvature_factor
+        )
+        progress = (speed * torch.cos(heading_error) + drift_speed * along_drift).clamp(
+            min=0.0
+        ) / curvature_factor
+        slope_rate = (
+            speed * torch.sin(heading_error) + drift_speed * cross_drift
+        ) / self.lookahead - along_drift * planned[:, 5] * progress
+        yaw_rate = planned[:, 6] * progress - slope_rate / (1.0 + slope.square())
+        reference = torch.stack((heading - torch.atan(slope), yaw_rate, planned[:, 4]), dim=-1)
+        return reference, torch.cat((arc_length.unsqueeze(-1), memory), dim=-1)
 
     def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
         """Return the rows behind the end of the course."""
@@ -556,7 +597,7 @@ class TrackKeeping(Policy):
         super().__init__()
         self.law = law
         self.limit = limit
-        self.travel = 2.0 * limit if rate is None else min(rate * dt, 2.0 * limit)
+        self.max_rudder_step = 2.0 * limit if rate is None else min(rate * dt, 2.0 * limit)
         self.n_state = 1 + law.n_state
         self.psi, self.r = state.index("psi"), state.index("r")
 
@@ -572,14 +613,16 @@ class TrackKeeping(Policy):
             reference: reference [B, 3] as of `CourseGuidance`.
             s: memory [B, 1 + n_state of the law].
         """
-        needed = reference[:, 2:3]
-        relative = x.clone()
-        relative[:, self.psi] = x[:, self.psi] - reference[:, 0]
-        relative[:, self.r] = x[:, self.r] - reference[:, 1]
-        correction, memory = self.law(relative, torch.zeros_like(needed), s[:, 1:])
-        command = (needed + correction).clamp(-self.limit, self.limit)
-        rudder = s[:, 0:1] + (command - s[:, 0:1]).clamp(-self.travel, self.travel)
-        memory = self.law.told(memory, rudder - needed)
+        planned_rudder = reference[:, 2:3]
+        relative_state = x.clone()
+        relative_state[:, self.psi] = x[:, self.psi] - reference[:, 0]
+        relative_state[:, self.r] = x[:, self.r] - reference[:, 1]
+        correction, memory = self.law(relative_state, torch.zeros_like(planned_rudder), s[:, 1:])
+        command = (planned_rudder + correction).clamp(-self.limit, self.limit)
+        rudder = s[:, 0:1] + (command - s[:, 0:1]).clamp(
+            -self.max_rudder_step, self.max_rudder_step
+        )
+        memory = self.law.with_applied_rudder(memory, rudder - planned_rudder)
         return command, torch.cat((rudder, memory), dim=-1)
 
 
@@ -603,17 +646,17 @@ class CrossingConfig(Config):
     duration: Seconds = Field(gt=0)
 
     @model_validator(mode="after")
-    def _legs(self) -> CrossingConfig:
+    def _check_legs(self) -> CrossingConfig:
         if any(a == b for a, b in zip(self.points, self.points[1:], strict=False)):
             raise ValueError("points: two in a row are the same; a leg needs a direction")
         return self
 
-    def filter(self) -> ReferenceFilterConfig:
+    def filter_config(self) -> ReferenceFilterConfig:
         """Return the filter behind the guidance."""
-        last = (*self.points[-1], 0.0)
-        three = (self.frequency,) * 3
+        final_waypoint = (*self.points[-1], 0.0)
+        frequencies = (self.frequency,) * 3
         return ReferenceFilterConfig(
-            waypoints=(last,), frequency=three, damping=(self.damping,) * 3
+            waypoints=(final_waypoint,), frequency=frequencies, damping=(self.damping,) * 3
         )
 
 
@@ -626,57 +669,81 @@ class Crossing(Reference):
     """
 
     def __init__(
-        self, config: CrossingConfig, dt: float, models: Sequence[tuple[ForceModel, Lag | None]]
+        self,
+        config: CrossingConfig,
+        dt: float,
+        models: Sequence[tuple[ForceModel, ActuatorLag | None]],
     ) -> None:
         super().__init__()
         self.n_state = 13
         self.config, self.dt, self.models = config, dt, list(models)
-        self.filter_config = config.filter()
-        self.advance = self.filter_config.build(dt).advance[0]
+        self.filter_config = config.filter_config()
+        self.step_matrix = self.filter_config.build(dt).advance[0]
         self.points = torch.tensor(config.points, dtype=torch.float64)
 
     def initial_state(self, x: Tensor) -> Tensor:
         """Return the memory at rest where the ferry is, on the first leg; NaN for no point yet."""
-        rest = torch.zeros_like(x[:, :1])
-        return torch.cat((pose(x), rest.expand(-1, 7), torch.full_like(pose(x), torch.nan)), dim=-1)
+        zero_column = torch.zeros_like(x[:, :1])
+        return torch.cat(
+            (pose(x), zero_column.expand(-1, 7), torch.full_like(pose(x), torch.nan)), dim=-1
+        )
 
-    def target(self, x: Tensor, desired: Tensor, leg: Tensor) -> tuple[Tensor, Tensor]:
+    def steering_target(
+        self, x: Tensor, desired_heading: Tensor, leg: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return the point and heading [B, 3] to steer for, and the leg [B] after a change.
 
-        `desired` [B] is the desired heading in rad, x [B, nx] the state.
+        `desired_heading` [B] is the desired heading in rad, x [B, nx] the state.
         """
-        last = len(self.points) - 2
-        place = position(x)
-        near = (self.points[leg + 1] - place).norm(dim=-1) < self.config.circle
-        arrived = near & (leg == last)
-        leg = torch.where(near & (leg < last), leg + 1, leg)
+        last_leg = len(self.points) - 2
+        current_position = position(x)
+        is_near_end = (self.points[leg + 1] - current_position).norm(dim=-1) < self.config.circle
+        has_arrived = is_near_end & (leg == last_leg)
+        leg = torch.where(is_near_end & (leg < last_leg), leg + 1, leg)
         start, end = self.points[leg], self.points[leg + 1]
-        along = (end - start) / (end - start).norm(dim=-1, keepdim=True)
-        offset = place - start
-        travelled = (offset * along).sum(-1)
-        across = offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0]
-        reach = (self.config.circle**2 - across.square()).clamp(min=0.0).sqrt()
-        point = torch.where(arrived[:, None], end, start + (travelled + reach)[:, None] * along)
-        aim = torch.where(arrived[:, None], along, point - place)
-        direction = torch.atan2(aim[:, 1], aim[:, 0])
-        return torch.cat((point, (desired + wrap(direction - desired))[:, None]), dim=-1), leg
+        leg_direction = (end - start) / (end - start).norm(dim=-1, keepdim=True)
+        offset = current_position - start
+        distance_along_leg = (offset * leg_direction).sum(-1)
+        cross_track_error = offset[:, 0] * leg_direction[:, 1] - offset[:, 1] * leg_direction[:, 0]
+        forward_reach = (self.config.circle**2 - cross_track_error.square()).clamp(min=0.0).sqrt()
+        target_point = torch.where(
+            has_arrived[:, None],
+            end,
+            start + (distance_along_leg + forward_reach)[:, None] * leg_direction,
+        )
+        aim_vector = torch.where(
+            has_arrived[:, None], leg_direction, target_point - current_position
+        )
+        direction = torch.atan2(aim_vector[:, 1], aim_vector[:, 0])
+        return torch.cat(
+            (target_point, (desired_heading + wrap_angle(direction - desired_heading))[:, None]),
+            dim=-1,
+        ), leg
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        old = s[:, 9].long()
-        target, leg = self.target(x, heading(s), old)
+        previous_leg = s[:, 9].long()
+        target, leg = self.steering_target(x, heading(s), previous_leg)
         # where the point jumps (first step, change of leg, the stop) it has no rate
         rate = (target - s[:, 10:]) / self.dt
-        steady = (position(rate).norm(dim=-1) < self.config.circle) & (leg == old)
-        rate = torch.where(steady[:, None], rate, torch.zeros_like(rate))
-        motion = derivatives(self.filter_config, s[:, :9], target, rate)
+        is_continuous = (position(rate).norm(dim=-1) < self.config.circle) & (leg == previous_leg)
+        rate = torch.where(is_continuous[:, None], rate, torch.zeros_like(rate))
+        desired_motion = filter_derivatives(self.filter_config, s[:, :9], target, rate)
         forces = [
-            needed_force(model, Derivatives(*(part[i : i + 1] for part in motion)), lag, self.dt)
+            required_force(
+                model, PoseDerivatives(*(part[i : i + 1] for part in desired_motion)), lag, self.dt
+            )
             for i, (model, lag) in enumerate(self.models)
         ]
-        error = torch.stack((pose(s) - target, velocities(s), accelerations(s)), dim=-1)
-        after = torch.einsum("aij,baj->bia", self.advance, error)
+        error = torch.stack((pose(s) - target, dynamic_states(s), motion_accelerations(s)), dim=-1)
+        next_error = torch.einsum("aij,baj->bia", self.step_matrix, error)
         memory = torch.cat(
-            (after[:, 0] + target, after[:, 1], after[:, 2], leg[:, None].to(s.dtype), target),
+            (
+                next_error[:, 0] + target,
+                next_error[:, 1],
+                next_error[:, 2],
+                leg[:, None].to(s.dtype),
+                target,
+            ),
             dim=-1,
         )
-        return reference_row(motion, torch.cat(forces)), memory
+        return stack_reference(desired_motion, torch.cat(forces)), memory

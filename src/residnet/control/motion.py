@@ -15,10 +15,10 @@ from torch import Tensor, nn
 
 from residnet.control.base import Policy, Reference
 from residnet.core import columns
-from residnet.core.columns import accelerations, pose, velocities
+from residnet.core.columns import dynamic_states, motion_accelerations, pose
 from residnet.core.config import Config, Metres, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import ConfigError
-from residnet.core.frames import to_body, wrap
+from residnet.core.frames import to_body, wrap_angle
 from residnet.physics.force_model import ForceModel
 from residnet.physics.plant import Hull
 
@@ -79,15 +79,18 @@ class ReferenceFilter(Reference):
         intervals = {config.interval for config in configs}
         steps = max(intervals) / dt
         if len(intervals) > 1 or abs(steps - round(steps)) > 1e-6 * steps or round(steps) < 1:
-            given = ", ".join(f"{interval:g} s" for interval in sorted(intervals))
+            interval_text = ", ".join(f"{interval:g} s" for interval in sorted(intervals))
             raise ConfigError(
-                f"reference filter: interval ({given}) must be the same for all and a whole number"
+                f"reference filter: interval ({interval_text}) must be the same for all and a whole number"
                 f" of steps of {dt:g} s"
             )
-        self.every = round(steps)
-        self.count = max(len(config.waypoints) for config in configs)
+        self.steps_per_waypoint = round(steps)
+        self.n_waypoints = max(len(config.waypoints) for config in configs)
         points = [
-            (*config.waypoints, *[config.waypoints[-1]] * (self.count - len(config.waypoints)))
+            (
+                *config.waypoints,
+                *[config.waypoints[-1]] * (self.n_waypoints - len(config.waypoints)),
+            )
             for config in configs
         ]
         self.register_buffer(
@@ -124,31 +127,46 @@ class ReferenceFilter(Reference):
         """Return the memory [B, 9]: at rest at the vessel's pose."""
         return torch.cat((pose(x), torch.zeros_like(x[:, :1]).expand(-1, 6)), dim=-1)
 
-    def waypoint(self, k: int) -> Tensor:
+    def waypoint_at(self, k: int) -> Tensor:
         """Return the waypoint [B or 1, 3] that is given at step k."""
-        return self.waypoints[:, min(k // self.every, self.count - 1)]
+        return self.waypoints[:, min(k // self.steps_per_waypoint, self.n_waypoints - 1)]
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        place, rate, change = pose(s), velocities(s), accelerations(s)
-        nu, nu_dot = in_body_axes(place[:, 2], rate, change)
-        target = self.waypoint(k).to(s.dtype)
-        error = torch.stack((place - target, rate, change), dim=-1).unsqueeze(-1)
-        after = (self.advance.to(s.dtype) @ error).squeeze(-1)
-        memory = torch.cat((after[:, :, 0] + target, after[:, :, 1], after[:, :, 2]), dim=-1)
-        return torch.cat((place, nu, nu_dot), dim=-1), memory
+        desired_pose, pose_rate, pose_acceleration = (
+            pose(s),
+            dynamic_states(s),
+            motion_accelerations(s),
+        )
+        nu, nu_dot = to_body_derivatives(desired_pose[:, 2], pose_rate, pose_acceleration)
+        target = self.waypoint_at(k).to(s.dtype)
+        error = torch.stack(
+            (desired_pose - target, pose_rate, pose_acceleration), dim=-1
+        ).unsqueeze(-1)
+        next_error = (self.advance.to(s.dtype) @ error).squeeze(-1)
+        memory = torch.cat(
+            (next_error[:, :, 0] + target, next_error[:, :, 1], next_error[:, :, 2]), dim=-1
+        )
+        return torch.cat((desired_pose, nu, nu_dot), dim=-1), memory
 
 
-def in_body_axes(psi: Tensor, rate: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
+def to_body_derivatives(
+    psi: Tensor, pose_rate: Tensor, pose_acceleration: Tensor
+) -> tuple[Tensor, Tensor]:
     """Return nu and nu_dot [..., 3] of a pose's first and second derivative [..., 3] in the earth.
 
     A vector fixed in the earth turns by -r in the body (correction J7).
     """
-    u, v = to_body(rate[..., 0], rate[..., 1], psi)
-    along, across = to_body(change[..., 0], change[..., 1], psi)
-    r = rate[..., 2]
+    u, v = to_body(pose_rate[..., 0], pose_rate[..., 1], psi)
+    surge_acceleration, sway_acceleration = to_body(
+        pose_acceleration[..., 0], pose_acceleration[..., 1], psi
+    )
+    r = pose_rate[..., 2]
     return (
         torch.stack((u, v, r), dim=-1),
-        torch.stack((along + r * v, across - r * u, change[..., 2]), dim=-1),
+        torch.stack(
+            (surge_acceleration + r * v, sway_acceleration - r * u, pose_acceleration[..., 2]),
+            dim=-1,
+        ),
     )
 
 
@@ -181,7 +199,7 @@ class HullFeedForward(FeedForward):
         self.hull = hull
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        return self.hull.required(nu_dot, nu)
+        return self.hull.required_force(nu_dot, nu)
 
 
 class MotionPIDConfig(Config):
@@ -229,23 +247,23 @@ class MotionPID(Policy):
         self.register_buffer("gains", torch.tensor(gains, dtype=torch.float64), persistent=False)
         self.gains: Tensor
 
-    def error(self, x: Tensor, reference: Tensor) -> Tensor:
+    def body_error(self, x: Tensor, reference: Tensor) -> Tensor:
         """Return e [B, 3] in body axes: m, m, rad."""
         difference = pose(reference) - pose(x)
-        along, across = to_body(difference[:, 0], difference[:, 1], x[:, 2])
-        return torch.stack((along, across, wrap(difference[:, 2])), dim=-1)
+        forward_error, lateral_error = to_body(difference[:, 0], difference[:, 1], x[:, 2])
+        return torch.stack((forward_error, lateral_error, wrap_angle(difference[:, 2])), dim=-1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the command tau [B, 3] in N, N, N m, and the integral with this step's error."""
-        error = self.error(x, reference)
-        nu_d = velocities(reference)
+        error = self.body_error(x, reference)
+        nu_d = dynamic_states(reference)
         gains = self.gains.to(x.dtype)
-        feedback = gains[0] * error + gains[1] * s + gains[2] * (nu_d - velocities(x))
+        feedback = gains[0] * error + gains[1] * s + gains[2] * (nu_d - dynamic_states(x))
         return self.feed_forward(reference[:, 6:9], nu_d) + feedback, s + self.dt * error
 
 
 @final
-class Allocated(Policy):
+class AllocatedPolicy(Policy):
     """A controller whose demands are turned into the commands of a vessel.
 
     Its forces, for example, are allocated to revolutions and angles of azimuth thrusters.
@@ -263,21 +281,21 @@ class Allocated(Policy):
         return self.policy.initial_state(x)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        demanded, s = self.policy(x, reference, s)
-        return self.allocate(demanded), s
+        demand, s = self.policy(x, reference, s)
+        return self.allocate(demand), s
 
 
-_STEP = 0.05
+_DIFFERENCE_STEP = 0.05
 """Seconds between the points that the force's derivatives are taken from; the reference itself is
 known analytically there.
 """
-_MEND = 0.7
+_RECOVERY_RATIO = 0.7
 """How fast a miss of the needed force is made up for, in units of the lag's own frequency: the
 command's peaks grow with it.
 """
 
 
-class Lag(Config):
+class ActuatorLag(Config):
     """The lag of forces behind commands: tau'' + 2 zeta omega tau' + omega^2 tau = omega^2 tau_c.
 
     tau_c is taken at t - delay (document 002 eq. (4.3)).
@@ -293,7 +311,7 @@ class Lag(Config):
     delay: Seconds = Field(default=0.0, ge=0)
 
 
-class Derivatives(NamedTuple):
+class PoseDerivatives(NamedTuple):
     """A desired pose in earth axes (north, east [m], heading [rad]) with derivatives, [..., 3]."""
 
     pose: Tensor
@@ -302,7 +320,7 @@ class Derivatives(NamedTuple):
     jerk: Tensor
     snap: Tensor
 
-    def later(self, h: float) -> tuple[Tensor, Tensor, Tensor]:
+    def extrapolate(self, h: float) -> tuple[Tensor, Tensor, Tensor]:
         """Return heading [...], nu_d and nu_dot_d [..., 3] in body axes h seconds later.
 
         They follow the Taylor series.
@@ -311,14 +329,14 @@ class Derivatives(NamedTuple):
             self.rate + h / 2 * (self.acceleration + h / 3 * (self.jerk + h / 4 * self.snap))
         )
         rate = self.rate + h * (self.acceleration + h / 2 * (self.jerk + h / 3 * self.snap))
-        change = self.acceleration + h * (self.jerk + h / 2 * self.snap)
+        acceleration = self.acceleration + h * (self.jerk + h / 2 * self.snap)
         psi = pose[..., 2]
-        return psi, *in_body_axes(psi, rate, change)
+        return psi, *to_body_derivatives(psi, rate, acceleration)
 
 
-def derivatives(
+def filter_derivatives(
     config: ReferenceFilterConfig, memory: Tensor, target: Tensor, target_rate: Tensor
-) -> Derivatives:
+) -> PoseDerivatives:
     """Return the desired pose and its derivatives up to the snap, from the filter's memory.
 
     The third-order filter (2.15) has memory [..., 9] and a target [..., 3] that moves by
@@ -326,45 +344,58 @@ def derivatives(
     """
     w = torch.tensor(config.frequency, dtype=memory.dtype)
     d = 2.0 * torch.tensor(config.damping, dtype=memory.dtype) + 1.0
-    pose, rate, change = (
+    pose, rate, acceleration = (
         columns.pose(memory),
-        columns.velocities(memory),
-        columns.accelerations(memory),
+        columns.dynamic_states(memory),
+        columns.motion_accelerations(memory),
     )
-    jerk = w**3 * (target - pose) - d * w**2 * rate - d * w * change
-    snap = w**3 * (target_rate - rate) - d * w**2 * change - d * w * jerk
-    return Derivatives(pose, rate, change, jerk, snap)
+    jerk = w**3 * (target - pose) - d * w**2 * rate - d * w * acceleration
+    snap = w**3 * (target_rate - rate) - d * w**2 * acceleration - d * w * jerk
+    return PoseDerivatives(pose, rate, acceleration, jerk, snap)
 
 
-def needed_force(model: ForceModel, motion: Derivatives, lag: Lag | None, held: float) -> Tensor:
+def required_force(
+    model: ForceModel, motion: PoseDerivatives, lag: ActuatorLag | None, hold_time: float
+) -> Tensor:
     """Return the force that a model needs when a command given now takes effect, [..., 9].
 
     Its first and second derivative stand behind it.
 
     Args:
         lag: of the actuators; None commands the force itself, now and without derivatives.
-        held: seconds that a command is held; on average it comes late by half of them.
+        hold_time: seconds that a command is held; on average it comes late by half of them.
     """
 
-    def force(h: float) -> Tensor:
-        psi, nu, nu_dot = motion.later(h)
-        return model.at_heading(nu_dot, nu, psi)
+    def force_at(h: float) -> Tensor:
+        psi, nu, nu_dot = motion.extrapolate(h)
+        return model.thruster_force(nu_dot, nu, psi)
 
     if lag is None:
-        now = force(0.0)
-        return torch.cat((now, torch.zeros_like(now), torch.zeros_like(now)), dim=-1)
-    at = lag.delay + 0.5 * held
-    before, now, after = force(at - _STEP), force(at), force(at + _STEP)
+        force_now = force_at(0.0)
+        return torch.cat(
+            (force_now, torch.zeros_like(force_now), torch.zeros_like(force_now)), dim=-1
+        )
+    lead_time = lag.delay + 0.5 * hold_time
+    force_before, force_now, force_after = (
+        force_at(lead_time - _DIFFERENCE_STEP),
+        force_at(lead_time),
+        force_at(lead_time + _DIFFERENCE_STEP),
+    )
     return torch.cat(
-        (now, (after - before) / (2 * _STEP), (after - 2 * now + before) / _STEP**2), dim=-1
+        (
+            force_now,
+            (force_after - force_before) / (2 * _DIFFERENCE_STEP),
+            (force_after - 2 * force_now + force_before) / _DIFFERENCE_STEP**2,
+        ),
+        dim=-1,
     )
 
 
 @final
-class Assisted(Policy):
+class LagCompensatedPID(Policy):
     """PID on a reference that brings along what a model needs, led by the lag of the actuators.
 
-    Reference [B, 18]: eta_d, nu_d, nu_dot_d, then `needed_force`. Memory [B, 15]: the integral of
+    Reference [B, 18]: eta_d, nu_d, nu_dot_d, then `required_force`. Memory [B, 15]: the integral of
     the PID, then of each axis the predicted force of the actuators, its rate, and the integral and
     double integral of what it misses of the needed force.
 
@@ -379,69 +410,71 @@ class Assisted(Policy):
         dt: step in s.
     """
 
-    def __init__(self, feedback: MotionPID, lags: Sequence[Lag | None], dt: float) -> None:
+    def __init__(self, feedback: MotionPID, lags: Sequence[ActuatorLag | None], dt: float) -> None:
         super().__init__()
         self.feedback = feedback
         self.n_state = feedback.n_state + 12
         self.dt = dt
-        self.leads = any(lag is not None for lag in lags)
-        known = [lag or Lag(frequency=2.0, damping=1.0) for lag in lags]
-        told = [
-            [float(lag is not None), one.frequency, one.damping]
-            for lag, one in zip(lags, known, strict=True)
+        self.has_lag = any(lag is not None for lag in lags)
+        effective_lags = [lag or ActuatorLag(frequency=2.0, damping=1.0) for lag in lags]
+        lag_table = [
+            [float(lag is not None), effective_lag.frequency, effective_lag.damping]
+            for lag, effective_lag in zip(lags, effective_lags, strict=True)
         ]
-        rows = [
+        lag_matrices = [
             [[0.0, 1.0, 0.0], [-(w**2), -2 * z * w, w**2], [0.0, 0.0, 0.0]]
-            for w, z in ((lag.frequency, lag.damping) for lag in known)
+            for w, z in ((lag.frequency, lag.damping) for lag in effective_lags)
         ]
-        step = torch.linalg.matrix_exp(torch.tensor(rows, dtype=torch.float64) * dt)
-        self.register_buffer("lag", torch.tensor(told, dtype=torch.float64), persistent=False)
-        self.register_buffer("step", step, persistent=False)
+        step_matrix = torch.linalg.matrix_exp(torch.tensor(lag_matrices, dtype=torch.float64) * dt)
+        self.register_buffer("lag", torch.tensor(lag_table, dtype=torch.float64), persistent=False)
+        self.register_buffer("step", step_matrix, persistent=False)
         self.lag: Tensor
         self.step: Tensor
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         n = self.feedback.n_state
         correction, integral = self.feedback(x, reference[:, :9], s[:, :n])
-        needed = reference[:, 9:12]
-        if not self.leads:
-            return needed + correction, torch.cat((integral, s[:, n:]), dim=-1)
-        force, rate, missed, twice = s[:, n:].unflatten(-1, (4, 3)).unbind(1)
-        error = needed - force
-        led, frequency, damping = self.lag.split(1, dim=1)
+        target_force = reference[:, 9:12]
+        if not self.has_lag:
+            return target_force + correction, torch.cat((integral, s[:, n:]), dim=-1)
+        force, rate, integral_error, double_integral = s[:, n:].unflatten(-1, (4, 3)).unbind(1)
+        error = target_force - force
+        is_lagged, frequency, damping = self.lag.split(1, dim=1)
         k1, k2, k3, k4 = (
-            factor * (_MEND * frequency) ** power
+            factor * (_RECOVERY_RATIO * frequency) ** power
             for factor, power in ((4.0, 1), (6.0, 2), (4.0, 3), (1.0, 4))
         )
-        drive = (
+        required_acceleration = (
             reference[:, 15:18]
             + k1 * (reference[:, 12:15] - rate)
             + k2 * error
-            + k3 * missed
-            + k4 * twice
+            + k3 * integral_error
+            + k4 * double_integral
         )
-        lead = force + (2 * damping / frequency) * rate + drive / frequency**2
-        state = self.step @ torch.stack((force, rate, lead), dim=1)
+        lead_command = (
+            force + (2 * damping / frequency) * rate + required_acceleration / frequency**2
+        )
+        state = self.step @ torch.stack((force, rate, lead_command), dim=1)
         memory = torch.cat(
             (
                 integral,
                 state[:, 0],
                 state[:, 1],
-                missed + self.dt * error,
-                twice + self.dt * missed,
+                integral_error + self.dt * error,
+                double_integral + self.dt * integral_error,
             ),
             dim=-1,
         )
-        return torch.where(led > 0.0, lead, needed) + correction, memory
+        return torch.where(is_lagged > 0.0, lead_command, target_force) + correction, memory
 
 
-def reference_row(motion: Derivatives, needed: Tensor) -> Tensor:
-    """Return [..., 18] for `Assisted` from the desired motion and `needed_force` [..., 9]."""
-    _, nu, nu_dot = motion.later(0.0)
-    return torch.cat((motion.pose, nu, nu_dot, needed), dim=-1)
+def stack_reference(motion: PoseDerivatives, force: Tensor) -> Tensor:
+    """Return [..., 18] for `LagCompensatedPID` from the desired motion and `required_force` [..., 9]."""
+    _, nu, nu_dot = motion.extrapolate(0.0)
+    return torch.cat((motion.pose, nu, nu_dot, force), dim=-1)
 
 
-def course(config: ReferenceFilterConfig, dt: float) -> Derivatives:
+def sample_filtered_course(config: ReferenceFilterConfig, dt: float) -> PoseDerivatives:
     """Return the desired motion [T, 3] of a whole course from rest at the origin.
 
     It is what the filter of `config` gives step by step.
@@ -449,28 +482,28 @@ def course(config: ReferenceFilterConfig, dt: float) -> Derivatives:
     The filter is linear and its target constant over an interval, so that powers of its step matrix
     give each interval at once.
     """
-    filtered = config.build(dt)
-    matrix, every = filtered.advance[0], filtered.every
+    reference_filter = config.build(dt)
+    matrix, steps_per_waypoint = reference_filter.advance[0], reference_filter.steps_per_waypoint
     powers = torch.eye(3, dtype=torch.float64).expand(1, 3, 3, 3)
-    step = matrix
-    while len(powers) <= every:
-        powers = torch.cat((powers, powers @ step))
-        step = step @ step
-    memory, parts, targets = torch.zeros(9, dtype=torch.float64), [], []
-    for target in filtered.waypoints[0]:
+    step_power = matrix
+    while len(powers) <= steps_per_waypoint:
+        powers = torch.cat((powers, powers @ step_power))
+        step_power = step_power @ step_power
+    memory, memory_parts, targets = torch.zeros(9, dtype=torch.float64), [], []
+    for target in reference_filter.waypoints[0]:
         error = torch.stack(
             (
                 columns.pose(memory) - target,
-                columns.velocities(memory),
-                columns.accelerations(memory),
+                columns.dynamic_states(memory),
+                columns.motion_accelerations(memory),
             ),
             dim=-1,
         )
-        path = torch.einsum("taij,aj->tia", powers[: every + 1], error)
-        path[:, 0] += target
-        states = path.reshape(every + 1, 9)
-        parts.append(states[:every])
-        targets.append(target.expand(every, 3))
-        memory = states[every]
+        error_path = torch.einsum("taij,aj->tia", powers[: steps_per_waypoint + 1], error)
+        error_path[:, 0] += target
+        states = error_path.reshape(steps_per_waypoint + 1, 9)
+        memory_parts.append(states[:steps_per_waypoint])
+        targets.append(target.expand(steps_per_waypoint, 3))
+        memory = states[steps_per_waypoint]
     target = torch.cat(targets)
-    return derivatives(config, torch.cat(parts), target, torch.zeros_like(target))
+    return filter_derivatives(config, torch.cat(memory_parts), target, torch.zeros_like(target))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from residnet.core.frames import upright
+from residnet.core.frames import to_level_axes
 
 
 def pose(x: Tensor) -> Tensor:
@@ -17,27 +17,27 @@ def pose(x: Tensor) -> Tensor:
     return x[..., :3]
 
 
-def velocities(x: Tensor, n: int = 3) -> Tensor:
+def dynamic_states(x: Tensor, n_dynamic: int = 3) -> Tensor:
     """Return what moves [..., n] of states [..., nx]: u, v, r, and p and phi of a roll."""
-    return x[..., 3 : 3 + n]
+    return x[..., 3 : 3 + n_dynamic]
 
 
-def motion(x: Tensor, n: int = 3) -> Tensor:
+def pose_and_dynamic_states(x: Tensor, n_dynamic: int = 3) -> Tensor:
     """Return pose and what moves [..., 3 + n] of states [..., nx]."""
-    return x[..., : 3 + n]
+    return x[..., : 3 + n_dynamic]
 
 
-def actuators(x: Tensor, n: int = 3) -> Tensor:
+def actuator_states(x: Tensor, n_dynamic: int = 3) -> Tensor:
     """Return the states of actuators [..., nx - 3 - n] of states [..., nx]."""
-    return x[..., 3 + n :]
+    return x[..., 3 + n_dynamic :]
 
 
-def accelerations(x: Tensor) -> Tensor:
+def motion_accelerations(x: Tensor) -> Tensor:
     """Return the accelerations [..., 3] behind pose and velocities of a motion [..., 9]."""
     return x[..., 6:9]
 
 
-def velocities_on(x: Tensor) -> Tensor:
+def all_but_pose(x: Tensor) -> Tensor:
     """Return all but the pose [..., nx - 3] of states [..., nx]: velocities and what follows."""
     return x[..., 3:]
 
@@ -72,23 +72,23 @@ def roll_angle(x: Tensor) -> Tensor:
     return x[..., 7]
 
 
-def turning(nu: Tensor, n: int = 3) -> Tensor:
+def heading_rate(nu: Tensor, n_dynamic: int = 3) -> Tensor:
     """Return the rate of the heading [..., 1] in rad/s from what moves on the surface [..., n]."""
     r = nu[..., 2:3]
-    return r * torch.cos(nu[..., 4:5]) if n == 5 else r
+    return r * torch.cos(nu[..., 4:5]) if n_dynamic == 5 else r
 
 
-def tilted(nu: Tensor) -> list[Tensor]:
+def level_velocities(nu: Tensor) -> list[Tensor]:
     """Return the velocity forward, to starboard and down [...] of what moves in six [..., 9]."""
-    return upright(nu[..., 0], nu[..., 1], nu[..., 3], nu[..., 7], nu[..., 8])
+    return to_level_axes(nu[..., 0], nu[..., 1], nu[..., 3], nu[..., 7], nu[..., 8])
 
 
-def sinking(nu_dot: Tensor, nu: Tensor) -> Tensor:
+def with_depth_rate(nu_dot: Tensor, nu: Tensor) -> Tensor:
     """Return rates [..., 9] of what moves in six [..., 9] with that of the depth."""
-    down = tilted(nu)[2].unsqueeze(-1)
-    return torch.cat((nu_dot[..., :6], down, nu_dot[..., 7:]), dim=-1)
+    depth_rate = level_velocities(nu)[2].unsqueeze(-1)
+    return torch.cat((nu_dot[..., :6], depth_rate, nu_dot[..., 7:]), dim=-1)
 
 
-def zero_acceleration(z: Tensor, n: int = 3) -> Tensor:
+def zero_acceleration(z: Tensor, n_dynamic: int = 3) -> Tensor:
     """Return accelerations of zero [..., n], alike in type to channels [..., nz]."""
-    return torch.zeros_like(z[..., :n])
+    return torch.zeros_like(z[..., :n_dynamic])

@@ -23,16 +23,16 @@ from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, PydanticSerializationError, core_schema, to_json
 from yaml.nodes import Node
 
-from residnet.core.config_yaml import KeyPath, dump, line_of, parse
+from residnet.core.config_yaml import KeyPath, dump_yaml, find_line, parse_yaml
 from residnet.core.errors import ConfigError, UsageError
-from residnet.core.files import shipped_configs
-from residnet.core.names import nearest, shown
-from residnet.core.registry import Kinds, adapter
-from residnet.core.units import si_unit, to_si, units
+from residnet.core.files import find_shipped_configs
+from residnet.core.names import suggest_name, truncate
+from residnet.core.registry import PluginUnion, type_adapter
+from residnet.core.units import si_unit, to_si, unit_names
 
 # Keys of the tables are ends of dotted key paths, `*` for any one key; a kind that was renamed has
 # `=<old kind>` behind the path of its discriminator. Values are what to write instead.
-RENAMED: dict[str, str] = {
+RENAMED_KEYS: dict[str, str] = {
     "recurrent": "policies",
     "policies.*.hidden": "units",
     "policies.*.observer": "start",
@@ -51,7 +51,7 @@ RENAMED: dict[str, str] = {
 """For example `"free_run.lead": "warmup"`, `"baseline.kind=fossen": "hull"`."""
 
 
-GONE: dict[str, str] = {
+REMOVED_KEYS: dict[str, str] = {
     "training.*.average": "learning rates that fall to a few percent average by themselves",
     "refit.*.folds": "the prior is fixed by the length of the logs",
     "refit_baseline": "refit the baseline before its networks, by `refit`",
@@ -66,30 +66,30 @@ GONE: dict[str, str] = {
     "published_absolute": "its numbers are the last three of `published`",
 }
 """Keys that nothing took the place of, and what holds instead."""
-IDLE: dict[str, Any] = {
+IGNORED_KEYS: dict[str, Any] = {
     **{"disturbance": None, "encoder": False, "intercept": False, "one": False},
     **{"always": False, "longest_gap": 1.0},
 }
 """Keys that are gone, and the value with which they did nothing: runs of before hold them so."""
 
 
-def renamed(path: tuple[str | int, ...], value: str | None = None) -> str:
+def renamed_hint(path: tuple[str | int, ...], value: str | None = None) -> str:
     """Return `; it is 'new' now` for an old key or value, `; it is gone: ...`, or nothing."""
-    written = ".".join(map(str, path)) + ("" if value is None else f"={value}")
-    for old, new in RENAMED.items():
-        if fnmatchcase(f".{written}", f"*.{old}"):
-            return f"; it is '{new}' now"
-    for old, instead in GONE.items():
-        if fnmatchcase(f".{written}", f"*.{old}"):
-            return f"; it is gone: {instead}"
+    key_text = ".".join(map(str, path)) + ("" if value is None else f"={value}")
+    for old_key, new_key in RENAMED_KEYS.items():
+        if fnmatchcase(f".{key_text}", f"*.{old_key}"):
+            return f"; it is '{new_key}' now"
+    for old_key, replacement in REMOVED_KEYS.items():
+        if fnmatchcase(f".{key_text}", f"*.{old_key}"):
+            return f"; it is gone: {replacement}"
     return ""
 
 
 T = TypeVar("T")
 
-_LONGEST_FILE = 2_000_000
+_MAX_FILE_BYTES = 2_000_000
 """Bytes; chosen by hand, far above any config."""
-_HUGE = 1e30
+_MAX_NUMBER = 1e30
 """Largest size of a number, its inverse the least; no vessel has it, and float32 ends at 3e38."""
 
 
@@ -105,36 +105,38 @@ class Config(BaseModel):
 
 
 @dataclass(frozen=True)
-class _Origin:
+class _ConfigOrigin:
     """The file and the overrides that a config's values come from, for error messages."""
 
-    where: str
+    name: str
     root: Node | None = None
     overrides: tuple[Override, ...] = ()
 
-    def source(self, path: KeyPath) -> str:
+    def locate_value(self, path: KeyPath) -> str:
         """Return where the value at `path` was set: an override, or a line of the file.
 
         The last override that set the whole value counts; one that changed a part of it is named
         too.
         """
-        inside = ""
+        partial_override = ""
         for override in reversed(self.overrides):
             if path[: len(override.path)] == override.path:
-                return override.where + inside
+                return override.label + partial_override
             if override.path[: len(path)] == path:
-                inside = inside or f" with {override.where}"
-        line = "" if self.root is None else f":{line_of(self.root, path)}"
-        return self.where + line + inside
+                partial_override = partial_override or f" with {override.label}"
+        line = "" if self.root is None else f":{find_line(self.root, path)}"
+        return self.name + line + partial_override
 
 
-def _read(path: Path) -> tuple[dict[str, Any], Node]:
+def _read_mapping(path: Path) -> tuple[dict[str, Any], Node]:
     try:
         # a device has no end
         with path.open("rb") as file:
-            content = file.read(_LONGEST_FILE + 1)
-        if len(content) > _LONGEST_FILE:
-            raise ConfigError(f"{path}: is longer than {_LONGEST_FILE / 1e6:.0f} MB; no config is")
+            content = file.read(_MAX_FILE_BYTES + 1)
+        if len(content) > _MAX_FILE_BYTES:
+            raise ConfigError(
+                f"{path}: is longer than {_MAX_FILE_BYTES / 1e6:.0f} MB; no config is"
+            )
         text = content.decode("utf-8-sig")
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file") from error
@@ -146,12 +148,12 @@ def _read(path: Path) -> tuple[dict[str, Any], Node]:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
     except ValueError as error:
         raise ConfigError(f"{str(path)!r}: is no path ({error})") from error
-    data, root = parse(text, str(path))
+    data, root = parse_yaml(text, str(path))
     if root is None or data is None:
         raise ConfigError(f"{path}: empty; expected a mapping of keys to values")
     if not isinstance(data, dict):
-        kind = "a list" if isinstance(data, list) else f"the value {data!r}"
-        raise ConfigError(f"{path}: expected a mapping of keys to values, found {kind}")
+        found_type = "a list" if isinstance(data, list) else f"the value {data!r}"
+        raise ConfigError(f"{path}: expected a mapping of keys to values, found {found_type}")
     return data, root
 
 
@@ -162,7 +164,7 @@ def load_mapping(path: Path) -> dict[str, Any]:
         ConfigError: where the file is missing, a folder, not YAML, empty or not a mapping, or
             repeats a key.
     """
-    return _read(Path(path))[0]
+    return _read_mapping(Path(path))[0]
 
 
 @overload
@@ -188,22 +190,24 @@ def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any:
             given, the nearest valid name.
     """
     path = Path(path)
-    data, root = _read(path)
+    data, root = _read_mapping(path)
     applied = tuple(apply_override(data, text) for text in overrides)
-    return _validated(data, model, _Origin(str(path), root, applied), path.parent.absolute())
+    return _validate_data(
+        data, model, _ConfigOrigin(str(path), root, applied), path.parent.absolute()
+    )
 
 
 @overload
-def validate(data: Any, model: type[T], where: str, folder: Path | None = None) -> T:
+def validate_config(data: Any, model: type[T], where: str, folder: Path | None = None) -> T:
     """Build a config of one class from plain values."""
 
 
 @overload
-def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> Any:
+def validate_config(data: Any, model: Any, where: str, folder: Path | None = None) -> Any:
     """Build a config of a union of classes from plain values."""
 
 
-def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> Any:
+def validate_config(data: Any, model: Any, where: str, folder: Path | None = None) -> Any:
     """Build a config of type `model` from plain values, under the rules of `load_config`.
 
     Args:
@@ -214,41 +218,46 @@ def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> A
     Raises:
         ConfigError: as `load_config`.
     """
-    return _validated(data, model, _Origin(where), folder)
+    return _validate_data(data, model, _ConfigOrigin(where), folder)
 
 
-def _validated(data: Any, model: Any, origin: _Origin, folder: Path | None) -> Any:
+def _validate_data(data: Any, model: Any, origin: _ConfigOrigin, folder: Path | None) -> Any:
     # what is computed, as in a model's description, may be as good as zero
-    _require_usual(data, origin, 0.0 if origin.root is None else 1.0 / _HUGE)
+    _require_plausible_numbers(data, origin, 0.0 if origin.root is None else 1.0 / _MAX_NUMBER)
     # pydantic is strict without refusing lists for tuples or text for enums and paths only when it
     # reads JSON
     try:
-        return adapter(model).validate_json(to_json(data), strict=True, context={"folder": folder})
+        return type_adapter(model).validate_json(
+            to_json(data), strict=True, context={"folder": folder}
+        )
     except ValidationError as error:
-        idle = {
-            _locate(one["loc"], model)[0]
-            for one in error.errors(include_url=False)
-            if one["type"] == "extra_forbidden" and (one["loc"][-1], one["input"]) in IDLE.items()
+        ignored_paths = {
+            _locate_key(details["loc"], model)[0]
+            for details in error.errors(include_url=False)
+            if details["type"] == "extra_forbidden"
+            and (details["loc"][-1], details["input"]) in IGNORED_KEYS.items()
         }
-        if not idle:
-            raise ConfigError(describe(error, model, origin.source)) from error
-        return _validated(_without(data, idle), model, origin, folder)
+        if not ignored_paths:
+            raise ConfigError(describe_error(error, model, origin.locate_value)) from error
+        return _validate_data(_remove_paths(data, ignored_paths), model, origin, folder)
     except PydanticSerializationError as error:
-        raise ConfigError(f"{origin.where}: holds a value that YAML cannot ({error})") from error
+        raise ConfigError(f"{origin.name}: holds a value that YAML cannot ({error})") from error
 
 
-def _without(data: Any, paths: Iterable[KeyPath]) -> Any:
+def _remove_paths(data: Any, paths: Iterable[KeyPath]) -> Any:
     """Return plain values without the entries at some key paths."""
-    out = copy.deepcopy(data)
+    remaining = copy.deepcopy(data)
     for *parents, key in paths:
-        here = out
+        mapping = remaining
         for parent in parents:
-            here = here[parent]
-        del here[key]
-    return out
+            mapping = mapping[parent]
+        del mapping[key]
+    return remaining
 
 
-def _require_usual(data: Any, origin: _Origin, least: float, path: KeyPath = ()) -> None:
+def _require_plausible_numbers(
+    data: Any, origin: _ConfigOrigin, min_size: float, path: KeyPath = ()
+) -> None:
     """Stop at numbers that no vessel has: they would overflow wherever they are first used.
 
     Raises:
@@ -257,20 +266,20 @@ def _require_usual(data: Any, origin: _Origin, least: float, path: KeyPath = ())
     if isinstance(data, dict | list):
         items = data.items() if isinstance(data, dict) else enumerate(data)
         for key, value in items:
-            _require_usual(value, origin, least, (*path, key))
-    elif isinstance(data, int | float) and not _usual(data, least):
+            _require_plausible_numbers(value, origin, min_size, (*path, key))
+    elif isinstance(data, int | float) and not _is_plausible_number(data, min_size):
         key = ".".join(map(str, path))
         raise ConfigError(
-            f"{origin.source(path)}: {key}: expected a number of usual size (given"
+            f"{origin.locate_value(path)}: {key}: expected a number of usual size (given"
             f" {f'one of {data.bit_length()} bits' if isinstance(data, int) else data})"
         )
 
 
-def _usual(number: float, least: float) -> bool:
+def _is_plausible_number(number: float, min_size: float) -> bool:
     if isinstance(number, int):
         return abs(number) < 2**63
     # that it is no number is said with what was expected
-    return number == 0 or not math.isfinite(number) or least <= abs(number) <= _HUGE
+    return number == 0 or not math.isfinite(number) or min_size <= abs(number) <= _MAX_NUMBER
 
 
 def dump_config(config: BaseModel) -> str:
@@ -278,7 +287,7 @@ def dump_config(config: BaseModel) -> str:
 
     Every key is there, numbers are SI and paths absolute.
     """
-    return dump(config.model_dump(mode="json", by_alias=True))
+    return dump_yaml(config.model_dump(mode="json", by_alias=True))
 
 
 # overrides: `dotted.key=value` sets a value, `~dotted.key` takes a key away
@@ -292,7 +301,7 @@ class Override:
     path: KeyPath
 
     @property
-    def where(self) -> str:
+    def label(self) -> str:
         """The override as error messages name it."""
         return f"override '{self.text}'"
 
@@ -306,58 +315,58 @@ def apply_override(data: dict[str, Any], text: str) -> Override:
         ConfigError: where the text is no override, or names a key or item that cannot be there.
     """
     if text.startswith("~"):
-        return _remove(data, text)
+        return _apply_removal(data, text)
     key, equals, value_text = text.partition("=")
     keys = key.strip().split(".")
     if not equals or not all(keys):
         raise ConfigError(
             f"override '{text}': expected key=value, for example heads.lstm.hidden_size=64"
         )
-    where = f"override '{text}'"
-    value, _ = parse(value_text, where, located=False)
+    label = f"override '{text}'"
+    value, _ = parse_yaml(value_text, label, show_location=False)
     path: KeyPath = ()
-    here: Any = data
+    container: Any = data
     for i, name in enumerate(keys):
-        element = _element(here, name, where, path)
-        path += (element,)
+        resolved_key = _resolve_element(container, name, label, path)
+        path += (resolved_key,)
         if i == len(keys) - 1:
-            here[element] = value
-        elif isinstance(here, dict) and here.get(name) is None:
-            here[element] = {}
-        here = here[element]
+            container[resolved_key] = value
+        elif isinstance(container, dict) and container.get(name) is None:
+            container[resolved_key] = {}
+        container = container[resolved_key]
     return Override(text, path)
 
 
-def _remove(data: dict[str, Any], text: str) -> Override:
-    where = f"override '{text}'"
+def _apply_removal(data: dict[str, Any], text: str) -> Override:
+    label = f"override '{text}'"
     keys = text[1:].strip().split(".")
-    here: Any = data
+    container: Any = data
     path: KeyPath = ()
     for i, name in enumerate(keys):
-        if not isinstance(here, dict) or name not in here:
-            at = ".".join(keys[: i + 1])
+        if not isinstance(container, dict) or name not in container:
+            key_path = ".".join(keys[: i + 1])
             raise ConfigError(
-                f"{where}: there is no '{at}' to take"
-                f" away{nearest(name, here) if isinstance(here, dict) and here else ''}"
+                f"{label}: there is no '{key_path}' to take"
+                f" away{suggest_name(name, container) if isinstance(container, dict) and container else ''}"
             )
         path += (name,)
         if i == len(keys) - 1:
-            del here[name]
+            del container[name]
             break
-        here = here[name]
+        container = container[name]
     return Override(text, path)
 
 
-def _element(here: Any, name: str, where: str, path: KeyPath) -> str | int:
+def _resolve_element(container: Any, name: str, label: str, path: KeyPath) -> str | int:
     """Return `name` as a key or an index of `here`."""
-    at = ".".join(str(element) for element in path)
-    if isinstance(here, dict):
+    key_path = ".".join(str(path_element) for path_element in path)
+    if isinstance(container, dict):
         return name
-    if not isinstance(here, list):
-        raise ConfigError(f"{where}: {at}: has no key '{name}' {given(here)}")
-    if not name.isdecimal() or int(name) >= len(here):
+    if not isinstance(container, list):
+        raise ConfigError(f"{label}: {key_path}: has no key '{name}' {format_given(container)}")
+    if not name.isdecimal() or int(name) >= len(container):
         raise ConfigError(
-            f"{where}: {at}: a list of {len(here)} items has no item '{name}'; the first is 0"
+            f"{label}: {key_path}: a list of {len(container)} items has no item '{name}'; the first is 0"
         )
     return int(name)
 
@@ -372,7 +381,7 @@ class Quantity:
         si: SI unit of the dimension; the value that the config holds is in this unit.
 
     Raises:
-        UsageError: where `si` is not the SI unit of a known dimension.
+        UsageError: where `si_value` is not the SI unit of a known dimension.
     """
 
     si: str
@@ -395,42 +404,42 @@ class Quantity:
                 unknown or of another dimension.
         """
         try:
-            si = self._parsed(value)
+            si_value = self._parse_value(value)
         except OverflowError:
-            si = math.inf
-        if not math.isfinite(si):
-            raise ValueError(f"must be a finite number {given(value)}")
-        return si
+            si_value = math.inf
+        if not math.isfinite(si_value):
+            raise ValueError(f"must be a finite number {format_given(value)}")
+        return si_value
 
-    def _parsed(self, value: object) -> float:
+    def _parse_value(self, value: object) -> float:
         if isinstance(value, (int, float)) and not isinstance(value, bool):
             return float(value)
-        match = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
+        match = _QUANTITY_PATTERN.fullmatch(value) if isinstance(value, str) else None
         if match is None:
-            example = next((unit for unit in self._fitting() if unit != self.si), self.si)
+            example = next((unit for unit in self._compatible_units() if unit != self.si), self.si)
             raise ValueError(
-                f"expected a number in {self.si} or text such as '1.5 {example}' {given(value)}"
+                f"expected a number in {self.si} or text such as '1.5 {example}' {format_given(value)}"
             )
         number, unit = match.groups()
         try:
             return float(number) * to_si(unit or self.si, self.si)
         except UsageError as error:
-            raise ValueError(f"{error} {given(value)}") from error
+            raise ValueError(f"{error} {format_given(value)}") from error
 
-    def _fitting(self) -> list[str]:
-        return [unit for unit in units() if si_unit(unit) == self.si]
-
-
-_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
+    def _compatible_units(self) -> list[str]:
+        return [unit for unit in unit_names() if si_unit(unit) == self.si]
 
 
-def quantity(si: str) -> Any:
-    """Return the type of a float in `si`, for types that are put together at run time.
+_QUANTITY_PATTERN = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
+
+
+def quantity_type(si: str) -> Any:
+    """Return the type of a float in `si_value`, for types that are put together at run time.
 
     In annotations write `Annotated[float, Quantity(si)]`.
 
     Raises:
-        UsageError: where `si` is not the SI unit of a known dimension.
+        UsageError: where `si_value` is not the SI unit of a known dimension.
     """
     return Annotated[float, Quantity(si)]
 
@@ -451,7 +460,7 @@ NewtonMetres = Annotated[float, Quantity("N m")]
 @dataclass(frozen=True)
 class _PathRule:
     must_exist: bool
-    shipped: bool = False
+    allows_shipped: bool = False
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
@@ -463,38 +472,40 @@ class _PathRule:
 
     def resolve(self, value: object, info: ValidationInfo) -> Path:
         if not isinstance(value, (str, Path)) or not str(value):
-            raise ValueError(f"expected a path {given(value)}")
-        path = _expanded(str(value))
+            raise ValueError(f"expected a path {format_given(value)}")
+        path = _expand_path(str(value))
         folder: Path | None = (info.context or {}).get("folder")
-        places = [place / path for place in (folder, Path.cwd()) if place is not None]
-        found = next((place for place in places if _exists(place)), None)
-        if found is None and self.must_exist:
-            own = shipped_configs() if self.shipped and not path.suffix else {}
-            if path.as_posix() in own:
-                return own[path.as_posix()].absolute()
-            looked = " or ".join(str(place) for place in dict.fromkeys(places))
-            hint = f"; residnet has no config '{path}' either{nearest(str(path), own)}"
-            raise ValueError(f"no such file or folder: {looked}{hint if own else ''}")
-        return (found or places[-1]).absolute()
+        candidates = [
+            candidate / path for candidate in (folder, Path.cwd()) if candidate is not None
+        ]
+        existing = next((candidate for candidate in candidates if _path_exists(candidate)), None)
+        if existing is None and self.must_exist:
+            shipped = find_shipped_configs() if self.allows_shipped and not path.suffix else {}
+            if path.as_posix() in shipped:
+                return shipped[path.as_posix()].absolute()
+            searched = " or ".join(str(candidate) for candidate in dict.fromkeys(candidates))
+            hint = f"; residnet has no config '{path}' either{suggest_name(str(path), shipped)}"
+            raise ValueError(f"no such file or folder: {searched}{hint if shipped else ''}")
+        return (existing or candidates[-1]).absolute()
 
 
-def _expanded(text: str) -> Path:
-    def environment(match: re.Match[str]) -> str:
+def _expand_path(text: str) -> Path:
+    def expand_variable(match: re.Match[str]) -> str:
         # an empty variable would turn ${DATA}/logs into /logs
-        if not (value := os.environ.get(match[1])):
+        if not (variable_value := os.environ.get(match[1])):
             raise ValueError(
                 f"environment variable '{match[1]}' is not set; set it (export {match[1]}=...) or"
                 " write the path itself"
             )
-        return value
+        return variable_value
 
     try:
-        return Path(re.sub(r"\$\{([^}]*)\}", environment, text)).expanduser()
+        return Path(re.sub(r"\$\{([^}]*)\}", expand_variable, text)).expanduser()
     except RuntimeError as error:
-        raise ValueError(f"no home folder is known for '~' {given(text)}") from error
+        raise ValueError(f"no home folder is known for '~' {format_given(text)}") from error
 
 
-def _exists(path: Path) -> bool:
+def _path_exists(path: Path) -> bool:
     try:
         return path.exists()
     except (OSError, ValueError):
@@ -509,13 +520,13 @@ exists there, else from the current folder.
 ExistingPath = Annotated[Path, _PathRule(must_exist=True)]
 """As `ConfigPath`, and the file or folder exists."""
 
-BaseConfig = Annotated[Path, _PathRule(must_exist=True, shipped=True)]
+BaseConfig = Annotated[Path, _PathRule(must_exist=True, allows_shipped=True)]
 """As `ExistingPath`; without an ending it may name a config that comes with residnet."""
 
 
 # one line out of pydantic's validation errors
 
-_EXPECTED = {
+_EXPECTED_TYPES = {
     **dict.fromkeys(("int_type", "int_from_float", "int_parsing"), "a whole number"),
     **dict.fromkeys(("float_type", "float_parsing"), "a number"),
     **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
@@ -526,108 +537,133 @@ _EXPECTED = {
 
 
 @dataclass(frozen=True)
-class _Fault:
+class _ConfigFault:
     kind: str
     path: KeyPath
     text: str
 
 
-def describe(error: ValidationError, model: Any, where: Callable[[KeyPath], str]) -> str:
+def describe_error(error: ValidationError, model: Any, locate: Callable[[KeyPath], str]) -> str:
     """Return the first fault of a validation error as one line.
 
     Args:
-        where: file (with line) or override in which the value at a key path was set.
+        locate: file (with line) or override in which the value at a key path was set.
     """
-    faults = [_fault(details, model) for details in error.errors(include_url=False)]
+    faults = [_parse_fault(details, model) for details in error.errors(include_url=False)]
     # a mistyped key is also a missing one; the typo is what the user has to see
-    first = next((fault for fault in faults if fault.kind == "extra_forbidden"), faults[0])
+    main_fault = next((fault for fault in faults if fault.kind == "extra_forbidden"), faults[0])
     # below a plain union, the member that got furthest into the value is the one that was meant
-    first = max(
-        (fault for fault in faults if fault.path[: len(first.path)] == first.path),
+    main_fault = max(
+        (fault for fault in faults if fault.path[: len(main_fault.path)] == main_fault.path),
         key=lambda fault: len(fault.path),
     )
-    text = _either([fault.text for fault in faults if fault.path == first.path])
-    others = {fault.path for fault in faults if first.path[: len(fault.path)] != fault.path}
-    more = f" (and {len(others)} more)" if others else ""
-    key = ".".join(str(element) for element in first.path)
-    return " ".join(f"{where(first.path)}: {key + ': ' if key else ''}{text}{more}".split())
+    text = _join_alternatives([fault.text for fault in faults if fault.path == main_fault.path])
+    other_paths = {
+        fault.path for fault in faults if main_fault.path[: len(fault.path)] != fault.path
+    }
+    more_text = f" (and {len(other_paths)} more)" if other_paths else ""
+    key = ".".join(str(element) for element in main_fault.path)
+    return " ".join(
+        f"{locate(main_fault.path)}: {key + ': ' if key else ''}{text}{more_text}".split()
+    )
 
 
-def _either(texts: list[str]) -> str:
+def _join_alternatives(texts: list[str]) -> str:
     """Join what the members of a union say about one value into one phrase."""
     texts = list(dict.fromkeys(texts))
-    split = [re.fullmatch(r"expected (.*?)( \(given .*\))", text) for text in texts]
-    if all(split):
-        parts = [match for match in split if match]
-        return "expected " + " or ".join(dict.fromkeys(match[1] for match in parts)) + parts[0][2]
+    matches = [re.fullmatch(r"expected (.*?)( \(given .*\))", text) for text in texts]
+    if all(matches):
+        full_matches = [match for match in matches if match]
+        return (
+            "expected "
+            + " or ".join(dict.fromkeys(match[1] for match in full_matches))
+            + full_matches[0][2]
+        )
     return "; or ".join(texts)
 
 
-def _fault(details: ErrorDetails, model: Any) -> _Fault:
-    path, parents, here = _locate(details["loc"], model)
-    kind, context, value = details["type"], details.get("ctx", {}), details["input"]
-    match kind:
+def _parse_fault(details: ErrorDetails, model: Any) -> _ConfigFault:
+    path, parents, value_types = _locate_key(details["loc"], model)
+    error_type, error_context, value = details["type"], details.get("ctx", {}), details["input"]
+    match error_type:
         case "missing" if path and isinstance(path[-1], int):
-            return _Fault(kind, path[:-1], f"item {path[-1]} is missing {given(value)}")
+            return _ConfigFault(
+                error_type, path[:-1], f"item {path[-1]} is missing {format_given(value)}"
+            )
         case "missing":
-            text = f"missing{_of_kind(parents)}"
+            fault_text = f"missing{_kind_suffix(parents)}"
         case "extra_forbidden":
-            valid = [key for kind in parents if _is_model(kind) for key in _fields(kind)]
-            hint = renamed(path) or nearest(str(path[-1]), valid)
-            text = f"unknown key{hint}{_of_kind(parents)}"
+            valid_names = [
+                key
+                for error_type in parents
+                if _is_model_class(error_type)
+                for key in _annotations_by_key(error_type)
+            ]
+            hint = renamed_hint(path) or suggest_name(str(path[-1]), valid_names)
+            fault_text = f"unknown key{hint}{_kind_suffix(parents)}"
         case "union_tag_invalid":
-            path += _discriminator(context)
-            tag = str(context["tag"])
-            hint = renamed(path, tag) or nearest(tag, _quoted(context["expected_tags"]))
-            text = f"unknown value '{shown(tag)}'{hint}"
+            path += _discriminator_path(error_context)
+            tag = str(error_context["tag"])
+            hint = renamed_hint(path, tag) or suggest_name(
+                tag, _find_quoted(error_context["expected_tags"])
+            )
+            fault_text = f"unknown value '{truncate(tag)}'{hint}"
         case "union_tag_not_found":
-            path += _discriminator(context)
-            text = f"missing{nearest('', _tags(here, path[-1]))}"
+            path += _discriminator_path(error_context)
+            fault_text = f"missing{suggest_name('', _discriminator_values(value_types, path[-1]))}"
         case "literal_error" | "enum":
-            valid = _quoted(context["expected"])
-            unknown = isinstance(value, str) and bool(valid)
-            text = (
-                f"unknown value '{shown(value)}'{renamed(path, value) or nearest(value, valid)}"
-                if unknown
-                else f"expected {context['expected']} {given(value)}"
+            valid_names = _find_quoted(error_context["expected"])
+            is_unknown_value = isinstance(value, str) and bool(valid_names)
+            fault_text = (
+                f"unknown value '{truncate(value)}'{renamed_hint(path, value) or suggest_name(value, valid_names)}"
+                if is_unknown_value
+                else f"expected {error_context['expected']} {format_given(value)}"
             )
         case "value_error" | "assertion_error":
-            text = str(context["error"])
+            fault_text = str(error_context["error"])
             # a validator of a whole section has said which of its keys it means; the section
             # itself would only fill the line
-            scalar = isinstance(value, (str, int, float)) and "(given " not in text
-            text = f"{text} {given(value)}" if scalar else text
-        case _ if kind in _EXPECTED:
-            text = f"expected {_EXPECTED[kind]} {given(value)}"
+            is_scalar = isinstance(value, (str, int, float)) and "(given " not in fault_text
+            fault_text = f"{fault_text} {format_given(value)}" if is_scalar else fault_text
+        case _ if error_type in _EXPECTED_TYPES:
+            fault_text = f"expected {_EXPECTED_TYPES[error_type]} {format_given(value)}"
         case _:
             # a bound is told in the unit that it counts in, however deep it stands in the type
-            fields = [kind.model_fields for kind in parents if _is_model(kind)]
-            found = {
-                f.alias or n: (f.annotation, f.metadata) for one in fields for n, f in one.items()
+            model_fields = [
+                error_type.model_fields for error_type in parents if _is_model_class(error_type)
+            ]
+            field_types = {
+                model_field.alias or field_name: (model_field.annotation, model_field.metadata)
+                for fields_of_model in model_fields
+                for field_name, model_field in fields_of_model.items()
             }
-            unit = re.search(r"Quantity\(si='(.+?)'\)", repr(found.get(path[-1] if path else "")))
-            bound = details["msg"].replace("Input should", "must") + (f" {unit[1]}" if unit else "")
-            text = f"{bound} {given(value)}"
-    return _Fault(kind, path, text)
+            unit = re.search(
+                r"Quantity\(si='(.+?)'\)", repr(field_types.get(path[-1] if path else ""))
+            )
+            bound_text = details["msg"].replace("Input should", "must") + (
+                f" {unit[1]}" if unit else ""
+            )
+            fault_text = f"{bound_text} {format_given(value)}"
+    return _ConfigFault(error_type, path, fault_text)
 
 
-def given(value: Any) -> str:
+def format_given(value: Any) -> str:
     """Return `(given 'x')` for error messages: the value as YAML writes it, cut where long."""
     names = {None: "null", True: "true", False: "false"}
     text = names[value] if value is None or isinstance(value, bool) else repr(value)
-    return f"(given {shown(text)})"
+    return f"(given {truncate(text)})"
 
 
-def _quoted(text: str) -> list[str]:
+def _find_quoted(text: str) -> list[str]:
     return re.findall(r"'([^']*)'", text)
 
 
-def _discriminator(context: dict[str, Any]) -> KeyPath:
+def _discriminator_path(context: dict[str, Any]) -> KeyPath:
     # pydantic quotes the name of a key; a callable discriminator has none
-    return tuple(_quoted(context["discriminator"])[:1])
+    return tuple(_find_quoted(context["discriminator"])[:1])
 
 
-def _locate(
+def _locate_key(
     loc: tuple[str | int, ...], model: Any
 ) -> tuple[KeyPath, tuple[Any, ...], tuple[Any, ...]]:
     """Return the key path that the user wrote, the types around its last key, and of its value.
@@ -637,113 +673,158 @@ def _locate(
     """
     path: list[str | int] = []
     parents: tuple[Any, ...] = ()
-    here: tuple[Any, ...] = (_plain(model),)
+    value_types: tuple[Any, ...] = (_unwrap_type(model),)
     for element in loc:
-        if any(_is_union(kind) for kind in here):
-            here = _chosen(here, str(element))
+        if any(_is_union(value_type) for value_type in value_types):
+            value_types = _select_union_members(value_types, str(element))
         elif element != "[key]":
             path.append(element)
-            parents, here = here, tuple(inner for kind in here for inner in _inner(kind, element))
-    return tuple(path), parents, here
+            parents, value_types = (
+                value_types,
+                tuple(
+                    element_type
+                    for value_type in value_types
+                    for element_type in _element_types(value_type, element)
+                ),
+            )
+    return tuple(path), parents, value_types
 
 
-def _plain(annotation: Any) -> Any:
+def _unwrap_type(annotation: Any) -> Any:
     """Return the type without wrappers that leave an error's location alone (Annotated, None)."""
     while True:
         if get_origin(annotation) is Annotated:
-            inside, *metadata = get_args(annotation)
-            kinds = next((part for part in metadata if isinstance(part, Kinds)), None)
-            if kinds is not None:
-                return kinds
-            annotation = inside
-        elif _is_union(annotation) and len(_options(annotation)) == 1:
-            annotation = _options(annotation)[0]
+            wrapped_type, *metadata = get_args(annotation)
+            plugin_union = next(
+                (marker for marker in metadata if isinstance(marker, PluginUnion)), None
+            )
+            if plugin_union is not None:
+                return plugin_union
+            annotation = wrapped_type
+        elif _is_union(annotation) and len(_union_members(annotation)) == 1:
+            annotation = _union_members(annotation)[0]
         else:
             return annotation
 
 
 def _is_union(annotation: Any) -> bool:
-    return isinstance(annotation, Kinds) or get_origin(annotation) in (Union, types.UnionType)
+    return isinstance(annotation, PluginUnion) or get_origin(annotation) in (Union, types.UnionType)
 
 
-def _options(union: Any) -> list[Any]:
+def _union_members(union: Any) -> list[Any]:
     return [member for member in get_args(union) if member is not type(None)]
 
 
-def _chosen(kinds: tuple[Any, ...], label: str) -> tuple[Any, ...]:
+def _select_union_members(kinds: tuple[Any, ...], label: str) -> tuple[Any, ...]:
     """Return the members of unions that pydantic's label stands for; all where none fits.
 
     A label is a discriminator's value or the name of a type.
     """
-    named = [
-        kind.find(label) for kind in kinds if isinstance(kind, Kinds) and label in kind.names()
+    named_kinds = [
+        union_type.find_kind(label)
+        for union_type in kinds
+        if isinstance(union_type, PluginUnion) and label in union_type.kind_names()
     ]
-    if named:
-        return tuple(part for part in named if isinstance(part, type))
-    options = [_plain(member) for kind in kinds if _is_union(kind) for member in _options(kind)]
-    by_tag = [
+    if named_kinds:
+        return tuple(kind_class for kind_class in named_kinds if isinstance(kind_class, type))
+    options = [
+        _unwrap_type(member)
+        for union_type in kinds
+        if _is_union(union_type)
+        for member in _union_members(union_type)
+    ]
+    options_by_tag = [
         option
         for option in options
-        if any(label in values for values in _literals(option).values())
+        if any(label in values for values in _literal_fields(option).values())
     ]
-    words = re.findall(r"\w+", label)
-    by_name = [
+    label_words = re.findall(r"\w+", label)
+    options_by_name = [
         option
         for option in options
-        if getattr(get_origin(option) or option, "__name__", "") in words
+        if getattr(get_origin(option) or option, "__name__", "") in label_words
     ]
-    return tuple(by_tag or by_name or options)
+    return tuple(options_by_tag or options_by_name or options)
 
 
-def _inner(kind: Any, element: str | int) -> list[Any]:
+def _element_types(container_type: Any, element: str | int) -> list[Any]:
     """Return the types of what stands under `element` in a value of type `kind`."""
-    if _is_model(kind):
-        return [_plain(annotation) for key, annotation in _fields(kind).items() if key == element]
-    arguments = get_args(kind)
-    if get_origin(kind) is tuple and isinstance(element, int) and Ellipsis not in arguments:
-        return [_plain(argument) for argument in arguments[element : element + 1]]
+    if _is_model_class(container_type):
+        return [
+            _unwrap_type(annotation)
+            for key, annotation in _annotations_by_key(container_type).items()
+            if key == element
+        ]
+    arguments = get_args(container_type)
+    if (
+        get_origin(container_type) is tuple
+        and isinstance(element, int)
+        and Ellipsis not in arguments
+    ):
+        return [_unwrap_type(argument) for argument in arguments[element : element + 1]]
     # a mapping's values come last, a list's items first and last
-    return [_plain(argument) for argument in arguments if argument is not Ellipsis][-1:]
+    return [_unwrap_type(argument) for argument in arguments if argument is not Ellipsis][-1:]
 
 
-def _is_model(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, BaseModel)
+def _is_model_class(type_: Any) -> bool:
+    return isinstance(type_, type) and issubclass(type_, BaseModel)
 
 
-def _fields(model: type[BaseModel]) -> dict[str, Any]:
-    return {field.alias or name: _marked(field) for name, field in model.model_fields.items()}
+def _annotations_by_key(model: type[BaseModel]) -> dict[str, Any]:
+    return {
+        field.alias or name: _annotation_with_marker(field)
+        for name, field in model.model_fields.items()
+    }
 
 
-def _marked(field: FieldInfo) -> Any:
+def _annotation_with_marker(field: FieldInfo) -> Any:
     """Return a field's annotation with the marker that pydantic has moved into its metadata."""
-    kinds = next((part for part in field.metadata if isinstance(part, Kinds)), None)
-    return field.annotation if kinds is None else Annotated[field.annotation, kinds]
+    plugin_union = next(
+        (marker for marker in field.metadata if isinstance(marker, PluginUnion)), None
+    )
+    return field.annotation if plugin_union is None else Annotated[field.annotation, plugin_union]
 
 
-def _literals(kind: Any) -> dict[str, tuple[Any, ...]]:
+def _literal_fields(model: Any) -> dict[str, tuple[Any, ...]]:
     """Return the fields of a model that take only fixed values, with these values."""
-    if not _is_model(kind):
+    if not _is_model_class(model):
         return {}
-    plain = {key: _plain(annotation) for key, annotation in _fields(kind).items()}
+    unwrapped = {
+        key: _unwrap_type(annotation) for key, annotation in _annotations_by_key(model).items()
+    }
     return {
         key: get_args(annotation)
-        for key, annotation in plain.items()
+        for key, annotation in unwrapped.items()
         if get_origin(annotation) is Literal
     }
 
 
-def _of_kind(kinds: tuple[Any, ...]) -> str:
+def _kind_suffix(kinds: tuple[Any, ...]) -> str:
     # which keys a section has follows from its kind, and an override may have changed that
-    fixed = [
+    single_literals = [
         (key, values[0])
-        for kind in kinds
-        for key, values in _literals(kind).items()
+        for section_type in kinds
+        for key, values in _literal_fields(section_type).items()
         if len(values) == 1
     ]
-    return f" ({fixed[0][0]} '{fixed[0][1]}')" if len(fixed) == 1 else ""
+    return (
+        f" ({single_literals[0][0]} '{single_literals[0][1]}')" if len(single_literals) == 1 else ""
+    )
 
 
-def _tags(kinds: tuple[Any, ...], key: str | int) -> list[str]:
-    names = [name for kind in kinds if isinstance(kind, Kinds) for name in kind.names()]
-    options = [_plain(member) for kind in kinds if _is_union(kind) for member in _options(kind)]
-    return names + [str(tag) for option in options for tag in _literals(option).get(str(key), ())]
+def _discriminator_values(kinds: tuple[Any, ...], key: str | int) -> list[str]:
+    names = [
+        name
+        for union_type in kinds
+        if isinstance(union_type, PluginUnion)
+        for name in union_type.kind_names()
+    ]
+    options = [
+        _unwrap_type(member)
+        for union_type in kinds
+        if _is_union(union_type)
+        for member in _union_members(union_type)
+    ]
+    return names + [
+        str(tag) for option in options for tag in _literal_fields(option).get(str(key), ())
+    ]

@@ -23,8 +23,12 @@ class ResidnetError(Exception):
     def __init__(self, message: str = "") -> None:
         super().__init__(
             "".join(
-                char if char.isprintable() else " " if char.isspace() else f"\\x{ord(char):02x}"
-                for char in message
+                character
+                if character.isprintable()
+                else " "
+                if character.isspace()
+                else f"\\x{ord(character):02x}"
+                for character in message
             )
         )
 
@@ -66,7 +70,7 @@ class WithheldError(ExportError):
     """
 
 
-def require_package(package: str, what: str, extra: str) -> None:
+def require_package(package: str, feature: str, extra: str) -> None:
     """Refuse to go on without an optional package.
 
     Raises:
@@ -74,6 +78,6 @@ def require_package(package: str, what: str, extra: str) -> None:
     """
     if importlib.util.find_spec(package) is None:
         raise MissingPackageError(
-            f"{what} needs the package {package}, which is not installed; install it with:"
+            f"{feature} needs the package {package}, which is not installed; install it with:"
             f" pip install 'residnet[{extra}]'"
         )

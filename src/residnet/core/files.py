@@ -19,10 +19,10 @@ from residnet.core.errors import ResidnetError, UsageError
 from residnet.core.ownership import (
     FILE_MANIFEST,
     Manifest,
-    manifest_for,
+    find_manifest,
+    find_run_manifest,
     require_regular,
     require_replaceable,
-    run_manifest_above,
 )
 from residnet.core.ownership import sha256 as sha256
 from residnet.core.run_loader import SIZE_LIMITS, read_json_value
@@ -30,16 +30,16 @@ from residnet.core.run_loader import SIZE_LIMITS, read_json_value
 if TYPE_CHECKING:
     import pandas as pd
 
-_ROOM = 20_000_000
+_MIN_FREE_BYTES = 20_000_000
 """Bytes that must be free before a run."""
-_PROBE = 65_536
+_PROBE_BYTES = 65_536
 """Bytes that are written on trial: some blocks of any disk, since quotas count blocks."""
-_DEEPER = 300
+_PATH_MARGIN_BYTES = 300
 """Bytes that the names of a run's own folders and files add to its path, that of a log included."""
 
 
 @contextmanager
-def whole(path: Path, manifest: Manifest | None = None) -> Iterator[Path]:
+def atomic_write(path: Path, manifest: Manifest | None = None) -> Iterator[Path]:
     """Yield a path to write to, which takes the place of `path` once it is written to its end.
 
     A process that is killed meanwhile leaves the old file, or none. The file's folder is made. In a
@@ -52,30 +52,30 @@ def whole(path: Path, manifest: Manifest | None = None) -> Iterator[Path]:
     Raises:
         UsageError: if the file cannot be written, or is not residnet's to replace.
     """
-    manifest = manifest or run_manifest_above(path)
+    manifest = manifest or find_run_manifest(path)
     # a name that no file of the user has
-    partial = path.with_name(f"{path.name}.{secrets.token_hex(4)}.partial")
+    temporary_path = path.with_name(f"{path.name}.{secrets.token_hex(4)}.partial")
     try:
         if manifest is not None:
             manifest.require_replaceable(path)
-            manifest.record(partial, None)
+            manifest.record(temporary_path, None)
         path.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
+        yield temporary_path
         if manifest is not None:
-            manifest.record(path, sha256(partial))
-        partial.replace(path)
+            manifest.record(path, sha256(temporary_path))
+        temporary_path.replace(path)
     except BaseException as error:
         # where the folder itself cannot be written, the error under way says so
         with suppress(OSError):
-            partial.unlink(missing_ok=True)
+            temporary_path.unlink(missing_ok=True)
         if isinstance(error, OSError):
-            raise not_written(path, error) from error
+            raise write_error(path, error) from error
         raise
 
 
 @contextmanager
 def write_owned(path: Path) -> Iterator[Path]:
-    """Yield a path to write to, as `whole`, for a file that a command writes at any place.
+    """Yield a path to write to, as `atomic_write`, for a file that a command writes at any place.
 
     The file is recorded in the manifest of its run folder or, outside, of its own folder. It
     replaces nothing but a file that residnet wrote and nobody edited.
@@ -83,15 +83,15 @@ def write_owned(path: Path) -> Iterator[Path]:
     Raises:
         UsageError: if the file cannot be written, or is not residnet's to replace.
     """
-    manifest = manifest_for(path)
-    with whole(path, manifest) as partial:
-        yield partial
+    manifest = find_manifest(path)
+    with atomic_write(path, manifest) as temporary_path:
+        yield temporary_path
     if manifest.path.name == FILE_MANIFEST:
         manifest.compact()
 
 
 @contextmanager
-def staged_files(file: Path, inputs: Iterable[Path] = ()) -> Iterator[Path]:
+def stage_files(file: Path, inputs: Iterable[Path] = ()) -> Iterator[Path]:
     """Yield a path of the same name in an empty folder, for a writer of several files.
 
     At the end of the context all files that were written beside it move to the folder of `file`,
@@ -120,26 +120,26 @@ def staged_files(file: Path, inputs: Iterable[Path] = ()) -> Iterator[Path]:
         for target in targets:
             require_replaceable(target)
         for source, target in zip(sources, targets, strict=True):
-            with write_owned(target) as partial:
-                shutil.copyfile(source, partial)
+            with write_owned(target) as temporary_path:
+                shutil.copyfile(source, temporary_path)
 
 
-_UNSAFE = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff]+')
-_LONGEST_NAME = 200
+_UNSAFE_CHARACTERS = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff]+')
+_MAX_NAME_BYTES = 200
 """Bytes of a file's name before its suffix; file systems take 255."""
 
 
-def file_stem(name: str) -> str:
+def make_file_stem(name: str) -> str:
     """Return a log's, a manoeuvre's or a figure's name as that of a file within one folder.
 
     What no file system takes, or what would lead to another folder, becomes `_`; such names end in
     a part of their hash, so that two that differ stay apart.
     """
-    whole_name = _UNSAFE.sub("_", name).lstrip(".").encode("utf-8")
-    safe = whole_name[:_LONGEST_NAME].decode("utf-8", "ignore") or "_"
-    if safe == name:
+    encoded_name = _UNSAFE_CHARACTERS.sub("_", name).lstrip(".").encode("utf-8")
+    safe_name = encoded_name[:_MAX_NAME_BYTES].decode("utf-8", "ignore") or "_"
+    if safe_name == name:
         return name
-    return f"{safe}_{hashlib.sha256(name.encode('utf-8', 'surrogatepass')).hexdigest()[:8]}"
+    return f"{safe_name}_{hashlib.sha256(name.encode('utf-8', 'surrogatepass')).hexdigest()[:8]}"
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -175,13 +175,13 @@ def read_table(path: Path) -> pd.DataFrame:
         require_regular(path, SIZE_LIMITS[".parquet"])
         return pd.read_parquet(path)
     except (OSError, ValueError, TypeError, KeyError, pa.ArrowException) as error:
-        first = next(iter(str(error).splitlines()), "")
+        first_line = next(iter(str(error).splitlines()), "")
         raise UsageError(
-            f"{path}: not readable as Parquet ({first}); restore the file or run it again"
+            f"{path}: not readable as Parquet ({first_line}); restore the file or run it again"
         ) from error
 
 
-def require_room(folder: Path) -> None:
+def require_free_space(folder: Path) -> None:
     """Check that a folder, which need not be there yet, can be written and has room for a run.
 
     What the system allows is tried out: rights, quotas and limits show in no other way.
@@ -190,33 +190,37 @@ def require_room(folder: Path) -> None:
         UsageError: where it cannot be written, its name is too long, or less than 20 MB are free.
     """
     try:
-        there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-        if not there.is_dir():
-            raise UsageError(f"{there}: exists already and is no folder; give another place")
+        existing_parent = next(
+            candidate for candidate in (folder, *folder.absolute().parents) if candidate.exists()
+        )
+        if not existing_parent.is_dir():
+            raise UsageError(
+                f"{existing_parent}: exists already and is no folder; give another place"
+            )
         path = folder.absolute()
-        longest = os.pathconf(there, "PC_PATH_MAX")
-        if len(os.fsencode(path)) + _DEEPER > longest:
+        max_path_length = os.pathconf(existing_parent, "PC_PATH_MAX")
+        if len(os.fsencode(path)) + _PATH_MARGIN_BYTES > max_path_length:
             raise OSError(errno.ENAMETOOLONG, "path too long")
-        name = max((len(os.fsencode(part)) for part in path.parts), default=0)
-        if name > os.pathconf(there, "PC_NAME_MAX"):
+        max_name_length = max((len(os.fsencode(path_part)) for path_part in path.parts), default=0)
+        if max_name_length > os.pathconf(existing_parent, "PC_NAME_MAX"):
             raise OSError(errno.ENAMETOOLONG, "name too long")
-        with tempfile.TemporaryFile(dir=there) as file:
-            file.write(bytes(_PROBE))
+        with tempfile.TemporaryFile(dir=existing_parent) as file:
+            file.write(bytes(_PROBE_BYTES))
             file.flush()
             os.fsync(file.fileno())
-        free = shutil.disk_usage(there).free
+        free_bytes = shutil.disk_usage(existing_parent).free
     except OSError as error:
-        raise not_written(folder, error) from error
+        raise write_error(folder, error) from error
     except ValueError as error:
         raise UsageError(f"{folder}: is no path ({error})") from error
-    if free < _ROOM:
+    if free_bytes < _MIN_FREE_BYTES:
         raise UsageError(
-            f"{folder}: only {free / 1e6:.1f} MB are free there, and a run takes up to"
-            f" {_ROOM / 1e6:.0f} MB or more; make room or give a place with more of it"
+            f"{folder}: only {free_bytes / 1e6:.1f} MB are free there, and a run takes up to"
+            f" {_MIN_FREE_BYTES / 1e6:.0f} MB or more; make room or give a place with more of it"
         )
 
 
-def require_file_place(file: Path) -> None:
+def require_writable_file(file: Path) -> None:
     """Check that a file can be written in its place, before the work whose result it will hold.
 
     Raises:
@@ -226,13 +230,13 @@ def require_file_place(file: Path) -> None:
         if file.is_dir():
             raise UsageError(f"{file}: is a folder; give the name of a file")
     except OSError as error:
-        raise not_written(file, error) from error
+        raise write_error(file, error) from error
     except ValueError as error:
         raise UsageError(f"{file}: is no path ({error})") from error
-    require_room(file.parent)
+    require_free_space(file.parent)
 
 
-def not_written(path: Path, error: OSError) -> UsageError:
+def write_error(path: Path, error: OSError) -> UsageError:
     """Return the error of a file that cannot be written, with the reason that the system gives."""
     reason = error.strerror or str(error)
     return UsageError(
@@ -240,7 +244,7 @@ def not_written(path: Path, error: OSError) -> UsageError:
     )
 
 
-def config_folder() -> Path:
+def find_config_folder() -> Path:
     """Return the folder `configs` that comes with residnet.
 
     It lies inside an installed package, or at the top of the checkout that is installed.
@@ -250,9 +254,9 @@ def config_folder() -> Path:
     return inside if inside.is_dir() else package.parents[1] / "configs"
 
 
-def shipped_configs() -> dict[str, Path]:
+def find_shipped_configs() -> dict[str, Path]:
     """Return the configs that come with residnet by name; studies are named by their path too."""
-    folder = config_folder()
+    folder = find_config_folder()
     files = [file for file in sorted(folder.rglob("*.yaml")) if file.parent.name != "vessels"]
     by_path = {file.relative_to(folder).with_suffix("").as_posix(): file for file in files}
     stems = [file.stem for file in files]

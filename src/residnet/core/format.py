@@ -6,13 +6,13 @@ import math
 import re
 from collections.abc import Sequence
 
-DEG = 180.0 / math.pi
+DEGREES_PER_RADIAN = 180.0 / math.pi
 """Degrees in a radian."""
 DASH = "–"
 """Stands where there is no number."""
-SHOWN_UNITS = {"rad": ("deg", DEG), "rad/s": ("deg/s", DEG)}
+DISPLAY_UNITS = {"rad": ("deg", DEGREES_PER_RADIAN), "rad/s": ("deg/s", DEGREES_PER_RADIAN)}
 """SI units that are shown in another one, with the factor to it."""
-_TITLES = {
+_CHANNEL_TITLES = {
     "u": "surge u",
     "v": "sway v",
     "r": "yaw rate r",
@@ -23,35 +23,35 @@ _TITLES = {
     "z": "depth z",
     "theta": "pitch angle theta",
 }
-_COMMON = (-4, 6)
+_PLAIN_EXPONENTS = (-4, 6)
 """Powers of ten between which a number is written without an exponent."""
 
 
-def shown_unit(unit: str) -> tuple[str, float]:
+def display_unit(unit: str) -> tuple[str, float]:
     """Return the unit in which a quantity is shown and the factor to it from SI."""
-    return SHOWN_UNITS.get(unit, (unit, 1.0))
+    return DISPLAY_UNITS.get(unit, (unit, 1.0))
 
 
-def title_of(channel: str) -> str:
+def channel_title(channel: str) -> str:
     """Return the name of a channel in words."""
-    return _TITLES.get(channel, channel)
+    return _CHANNEL_TITLES.get(channel, channel)
 
 
-def minus(text: str) -> str:
+def format_minus_signs(text: str) -> str:
     """Return the text with hyphens before numbers written as minus signs."""
     return re.sub(r"(?<![\w-])-(?=\d)", "−", text)
 
 
-_POWERS = str.maketrans("234", "²³⁴")
+_SUPERSCRIPTS = str.maketrans("234", "²³⁴")
 
 
-def powers(text: str) -> str:
+def format_exponents(text: str) -> str:
     """Return the text with powers of units and variables as they are written by hand: m/s²."""
-    raised = r"(?<=[^\W\d_]|\))\^([234])(?!\w|\.\d)"
-    return re.sub(raised, lambda found: found[1].translate(_POWERS), text)
+    exponent_pattern = r"(?<=[^\W\d_]|\))\^([234])(?!\w|\.\d)"
+    return re.sub(exponent_pattern, lambda match: match[1].translate(_SUPERSCRIPTS), text)
 
 
-def number(value: float | None, digits: int = 3) -> str:
+def format_number(value: float | None, digits: int = 3) -> str:
     """Return a number with so many significant digits, and a dash where there is none.
 
     An exponent is written only for very small and very large numbers.
@@ -60,54 +60,54 @@ def number(value: float | None, digits: int = 3) -> str:
         return DASH
     if value == 0:
         return "0"
-    size = math.floor(math.log10(abs(value)))
-    low, high = _COMMON
-    if not low <= size < high:
+    exponent = math.floor(math.log10(abs(value)))
+    lower, upper = _PLAIN_EXPONENTS
+    if not lower <= exponent < upper:
         return f"{value:.{digits - 1}e}".replace("-", "−")
-    return f"{value:.{max(digits - 1 - size, 0)}f}".replace("-", "−")
+    return f"{value:.{max(digits - 1 - exponent, 0)}f}".replace("-", "−")
 
 
-def fixed(value: float | None, decimals: int) -> str:
+def format_fixed(value: float | None, decimals: int) -> str:
     """Return a number with so many decimals, and a dash where there is none."""
     if value is None or not math.isfinite(value):
         return DASH
     return f"{value:.{decimals}f}".replace("-", "−")
 
 
-def whole(value: float) -> str:
+def format_integer(value: float) -> str:
     """Return a count with thin spaces between thousands."""
     return f"{round(value):,}".replace(",", "\u2009")
 
 
-def percent(value: float) -> str:
+def format_percent_change(value: float) -> str:
     """Return a change in percent with its sign."""
     return f"{value:+.0f} %".replace("-", "−") if abs(value) >= 0.5 else "0 %"
 
 
-def change(value: float, reference: float) -> str:
+def format_relative_change(value: float, reference: float) -> str:
     """Return the change of an error against a reference in percent, empty without a reference."""
-    return percent(100 * (value / reference - 1)) if reference > 0 else ""
+    return format_percent_change(100 * (value / reference - 1)) if reference > 0 else ""
 
 
-def signed(value: float, decimals: int = 4) -> str:
+def format_signed(value: float, decimals: int = 4) -> str:
     """Return a difference with its sign and a fixed number of decimals."""
     if abs(value) < 0.5 * 10**-decimals:
         return "0"
     return f"{value:+.{decimals}f}".replace("-", "−")
 
 
-def interval(bounds: list[float] | None, factor: float = 1.0, digits: int = 3) -> str:
+def format_interval(bounds: list[float] | None, factor: float = 1.0, digits: int = 3) -> str:
     """Return the two ends of an interval, and a dash where there is none."""
     if not bounds:
         return DASH
-    return f"{number(factor * bounds[0], digits)} to {number(factor * bounds[1], digits)}"
+    return f"{format_number(factor * bounds[0], digits)} to {format_number(factor * bounds[1], digits)}"
 
 
-def listed(parts: Sequence[str]) -> str:
+def join_list(texts: Sequence[str]) -> str:
     """Return texts as `a, b and c`."""
-    return " and ".join(filter(None, (", ".join(parts[:-1]), *parts[-1:])))
+    return " and ".join(filter(None, (", ".join(texts[:-1]), *texts[-1:])))
 
 
-def plural(count: int, noun: str) -> str:
+def format_count(count: int, noun: str) -> str:
     """Return a count with its noun, as in "1 log" and "2 logs"."""
     return f"{count} {noun}" + ("" if count == 1 else "s")

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 
-def wrap(angle: Tensor) -> Tensor:
+def wrap_angle(angle: Tensor) -> Tensor:
     """Bring angles [rad] of any shape to [-pi, pi)."""
     return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi
 
 
-def wrap_array(angle: np.ndarray) -> np.ndarray:
+def wrap_angle_array(angle: np.ndarray) -> np.ndarray:
     """Bring angles [rad] of a NumPy array to [-pi, pi)."""
     return np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi
 
@@ -30,8 +30,8 @@ def to_body(north: Tensor, east: Tensor, psi: Tensor) -> tuple[Tensor, Tensor]:
 
     Source: document 003 eq. (4), transposed.
     """
-    c, s = torch.cos(psi), torch.sin(psi)
-    return c * north + s * east, c * east - s * north
+    cos_psi, sin_psi = torch.cos(psi), torch.sin(psi)
+    return cos_psi * north + sin_psi * east, cos_psi * east - sin_psi * north
 
 
 def to_earth(forward: Tensor, starboard: Tensor, psi: Tensor) -> tuple[Tensor, Tensor]:
@@ -44,11 +44,11 @@ def to_earth(forward: Tensor, starboard: Tensor, psi: Tensor) -> tuple[Tensor, T
 
     Source: document 003 eq. (4).
     """
-    c, s = torch.cos(psi), torch.sin(psi)
-    return c * forward - s * starboard, s * forward + c * starboard
+    cos_psi, sin_psi = torch.cos(psi), torch.sin(psi)
+    return cos_psi * forward - sin_psi * starboard, sin_psi * forward + cos_psi * starboard
 
 
-def upright(u: Tensor, v: Tensor, w: Tensor, phi: Tensor, theta: Tensor) -> list[Tensor]:
+def to_level_axes(u: Tensor, v: Tensor, w: Tensor, phi: Tensor, theta: Tensor) -> list[Tensor]:
     """Return a body vector forward, to starboard and down, as one sees it who stands upright.
 
     Args:
@@ -60,12 +60,12 @@ def upright(u: Tensor, v: Tensor, w: Tensor, phi: Tensor, theta: Tensor) -> list
 
     Source: Fossen 2021, eq. (2.31), without the heading.
     """
-    across, normal = to_earth(v, w, phi)
-    ahead, down = to_body(u, normal, theta)
-    return [ahead, across, down]
+    starboard, down_before_pitch = to_earth(v, w, phi)
+    forward, down = to_body(u, down_before_pitch, theta)
+    return [forward, starboard, down]
 
 
-def along_axes(north: Tensor, east: Tensor, angles: Tensor) -> list[Tensor]:
+def horizontal_to_body(north: Tensor, east: Tensor, angles: Tensor) -> list[Tensor]:
     """Return a horizontal vector along the body's x, y and z.
 
     Args:
@@ -74,12 +74,12 @@ def along_axes(north: Tensor, east: Tensor, angles: Tensor) -> list[Tensor]:
         angles: roll, pitch and heading [..., 3] in rad.
     """
     phi, theta, psi = angles.unbind(-1)
-    along, across = to_body(north, east, psi)
-    side, normal = to_body(across, along * torch.sin(theta), phi)
-    return [along * torch.cos(theta), side, normal]
+    forward, starboard = to_body(north, east, psi)
+    body_y, body_z = to_body(starboard, forward * torch.sin(theta), phi)
+    return [forward * torch.cos(theta), body_y, body_z]
 
 
-def rotated(angles: Tensor, turn: Tensor) -> Tensor:
+def compose_rotation(angles: Tensor, rotation_vector: Tensor) -> Tensor:
     """Return the attitude [..., 3] after a further rotation, by way of unit quaternions.
 
     Nothing in it is singular but the angles themselves, at a pitch of 90 deg, where any pair of
@@ -88,46 +88,50 @@ def rotated(angles: Tensor, turn: Tensor) -> Tensor:
 
     Args:
         angles: roll, pitch and heading [rad].
-        turn: the rotation vector about body axes [rad].
+        rotation_vector: the rotation vector about body axes [rad].
 
     Source: Fossen 2021, section 2.2.2.
     """
-    half = 0.5 * angles
-    cf, ct, cp = torch.cos(half).unbind(-1)
-    sf, st, sp = torch.sin(half).unbind(-1)
+    half_angles = 0.5 * angles
+    cf, ct, cp = torch.cos(half_angles).unbind(-1)
+    sf, st, sp = torch.sin(half_angles).unbind(-1)
     w, x = cf * ct * cp + sf * st * sp, sf * ct * cp - cf * st * sp
     y, z = cf * st * cp + sf * ct * sp, cf * ct * sp - sf * st * cp
     # the offset keeps the gradient finite where nothing turns
-    size = torch.sqrt(turn.square().sum(-1) + 1e-24)
-    a = torch.cos(0.5 * size)
-    bx, by, bz = (turn * (torch.sin(0.5 * size) / size).unsqueeze(-1)).unbind(-1)
+    rotation_angle = torch.sqrt(rotation_vector.square().sum(-1) + 1e-24)
+    cos_half_rotation = torch.cos(0.5 * rotation_angle)
+    bx, by, bz = (
+        rotation_vector * (torch.sin(0.5 * rotation_angle) / rotation_angle).unsqueeze(-1)
+    ).unbind(-1)
     w, x, y, z = (
-        w * a - x * bx - y * by - z * bz,
-        w * bx + x * a + y * bz - z * by,
-        w * by - x * bz + y * a + z * bx,
-        w * bz + x * by - y * bx + z * a,
+        w * cos_half_rotation - x * bx - y * by - z * bz,
+        w * bx + x * cos_half_rotation + y * bz - z * by,
+        w * by - x * bz + y * cos_half_rotation + z * bx,
+        w * bz + x * by - y * bx + z * cos_half_rotation,
     )
-    unit = torch.rsqrt(w * w + x * x + y * y + z * z)
-    w, x, y, z = w * unit, x * unit, y * unit, z * unit
-    across, normal = 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
-    level = torch.sqrt(across * across + normal * normal + 1e-24)
+    inverse_norm = torch.rsqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm
+    sin_roll_component, cos_roll_component = 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+    horizontal_norm = torch.sqrt(
+        sin_roll_component * sin_roll_component + cos_roll_component * cos_roll_component + 1e-24
+    )
     phi, psi = angles[..., 0], angles[..., 2]
     return torch.stack(
         (
-            phi + wrap(torch.atan2(across, normal) - phi),
-            torch.atan2(2.0 * (w * y - x * z), level),
-            psi + wrap(torch.atan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z)) - psi),
+            phi + wrap_angle(torch.atan2(sin_roll_component, cos_roll_component) - phi),
+            torch.atan2(2.0 * (w * y - x * z), horizontal_norm),
+            psi + wrap_angle(torch.atan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z)) - psi),
         ),
         dim=-1,
     )
 
 
-def cross(a: Tensor, b: Tensor) -> Tensor:
+def cross_product(a: Tensor, b: Tensor) -> Tensor:
     """Return the vector product [..., 3] of vectors [..., 3]."""
     return a.roll(-1, -1) * b.roll(-2, -1) - a.roll(-2, -1) * b.roll(-1, -1)
 
 
-def turn_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def rotation_angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the angle [...] in rad of the one rotation that leads from attitudes a to b.
 
     Args:
@@ -136,5 +140,7 @@ def turn_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """
     from scipy.spatial.transform import Rotation
 
-    one, other = (Rotation.from_euler("ZYX", np.reshape(x, (-1, 3))[:, ::-1]) for x in (a, b))
-    return np.asarray((one.inv() * other).magnitude().reshape(np.shape(a)[:-1]))
+    rotation_a, rotation_b = (
+        Rotation.from_euler("ZYX", np.reshape(attitude, (-1, 3))[:, ::-1]) for attitude in (a, b)
+    )
+    return np.asarray((rotation_a.inv() * rotation_b).magnitude().reshape(np.shape(a)[:-1]))

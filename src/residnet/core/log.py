@@ -12,15 +12,15 @@ import numpy as np
 
 from residnet.core.arrays import paged
 from residnet.core.errors import DataError, UsageError
-from residnet.core.files import whole
-from residnet.core.names import CHANNEL_UNITS, nearest
+from residnet.core.files import atomic_write
+from residnet.core.names import CHANNEL_UNITS, suggest_name
 
 SCHEMA = "residnet.log/1"
-_PIECE = 500_000
+_WRITE_ROWS = 500_000
 """Rows that are written at a time: 4 MB of each channel."""
 
 
-_WORDS: dict[str, type | tuple[type, ...]] = {
+_FIELD_TYPES: dict[str, type | tuple[type, ...]] = {
     **{"name": str, "manoeuvre": str, "units": dict, "meta": dict},
     **{"source": str, "sha256": str, "findings": list, "spikes": dict, "smoothed": list},
     **{"integrated": list, "stretch": list, "grid": dict},
@@ -70,8 +70,8 @@ class Log:
     def __repr__(self) -> str:
         seconds = float(self.t[-1] - self.t[0]) if len(self) else 0.0
         channels = ", ".join(f"{name} [{self.units[name]}]" for name in self.channels)
-        about = f"{self.manoeuvre}, {len(self)} samples over {seconds:.1f} s"
-        return f"Log({self.name!r}, {about}: {channels})"
+        summary = f"{self.manoeuvre}, {len(self)} samples over {seconds:.1f} s"
+        return f"Log({self.name!r}, {summary}: {channels})"
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Return the values [T] of one channel.
@@ -80,7 +80,9 @@ class Log:
             UsageError: where the log has no such channel.
         """
         if name not in self.channels:
-            raise UsageError(f"log {self.name}: no channel '{name}'{nearest(name, self.channels)}")
+            raise UsageError(
+                f"log {self.name}: no channel '{name}'{suggest_name(name, self.channels)}"
+            )
         return self.channels[name]
 
     def stack(self, names: tuple[str, ...] | list[str]) -> np.ndarray:
@@ -92,32 +94,32 @@ class Log:
     @property
     def usable(self) -> np.ndarray:
         """[T] bool: samples that no mask excludes."""
-        bad = np.zeros(len(self), dtype=bool)
+        is_masked = np.zeros(len(self), dtype=bool)
         for mask in self.masks.values():
-            bad |= mask
-        return ~bad
+            is_masked |= mask
+        return ~is_masked
 
     def replace(self, **changes: Any) -> Log:
         """Return a copy with some attributes changed."""
         return dataclasses.replace(self, **changes)
 
-    def rows(self, part: slice | np.ndarray) -> Log:
+    def select_rows(self, selection: slice | np.ndarray) -> Log:
         """Return the log at some of its samples, given as a slice or as a mask [T]."""
         return self.replace(
-            t=self.t[part],
-            channels={name: values[part] for name, values in self.channels.items()},
-            masks={reason: mask[part] for reason, mask in self.masks.items()},
+            t=self.t[selection],
+            channels={name: values[selection] for name, values in self.channels.items()},
+            masks={reason: mask[selection] for reason, mask in self.masks.items()},
         )
 
-    def on_disk(self) -> Log:
+    def move_to_disk(self) -> Log:
         """Return the same log with its arrays in a temporary file, out of memory."""
-        moved = self.replace(
-            t=paged.on_disk(self.t),
-            channels={name: paged.on_disk(values) for name, values in self.channels.items()},
-            masks={reason: paged.on_disk(mask) for reason, mask in self.masks.items()},
+        on_disk_log = self.replace(
+            t=paged.copy_to_disk(self.t),
+            channels={name: paged.copy_to_disk(values) for name, values in self.channels.items()},
+            masks={reason: paged.copy_to_disk(mask) for reason, mask in self.masks.items()},
         )
-        paged.forget()
-        return moved
+        paged.release_pages()
+        return on_disk_log
 
     def save(self, path: Path) -> None:
         """Write the log as a canonical Parquet file.
@@ -133,7 +135,7 @@ class Log:
             **self.channels,
             **{f"mask:{reason}": mask for reason, mask in self.masks.items()},
         }
-        about = {
+        metadata = {
             "schema": SCHEMA,
             "name": self.name,
             "manoeuvre": self.manoeuvre,
@@ -142,21 +144,24 @@ class Log:
         }
         schema = pa.table(
             {name: values[:0] for name, values in columns.items()}
-        ).schema.with_metadata({"residnet": json.dumps(about)})
-        with whole(path) as file, pq.ParquetWriter(file, schema) as writer:
+        ).schema.with_metadata({"residnet": json.dumps(metadata)})
+        with atomic_write(path) as file, pq.ParquetWriter(file, schema) as writer:
             # piece by piece: the columns of a large log lie on disk
-            for start in range(0, max(1, len(self)), _PIECE):
+            for start in range(0, max(1, len(self)), _WRITE_ROWS):
                 writer.write_table(
                     pa.table(
-                        {name: values[start : start + _PIECE] for name, values in columns.items()},
+                        {
+                            name: values[start : start + _WRITE_ROWS]
+                            for name, values in columns.items()
+                        },
                         schema=schema,
                     )
                 )
                 for values in columns.values():
-                    paged.forget_pages(values)
+                    paged.release_pages_of(values)
 
     @staticmethod
-    def recognises(path: Path) -> bool:
+    def is_canonical_log(path: Path) -> bool:
         """Return whether a file is a canonical log."""
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -197,28 +202,30 @@ class Log:
                 f"{path}: not a Parquet file ({str(error).splitlines()[0]})"
             ) from error
         try:
-            about = json.loads((table.schema.metadata or {}).get(b"residnet", b"{}"))
+            metadata = json.loads((table.schema.metadata or {}).get(b"residnet", b"{}"))
         except (ValueError, RecursionError) as error:
             raise DataError(f"{path}: damaged ({error}); write the file again") from error
-        if not isinstance(about, dict) or about.get("schema") != SCHEMA:
+        if not isinstance(metadata, dict) or metadata.get("schema") != SCHEMA:
             raise UsageError(
                 f"{path}: not a residnet log ({SCHEMA}); give a channel map to read a foreign table"
             )
-        needed = {key: about.get(key) for key in ("name", "manoeuvre", "units", "meta")}
-        meta = needed["meta"] if isinstance(needed["meta"], dict) else {}
-        told = {**needed, **{key: value for key, value in meta.items() if key in _WORDS}}
-        wrong = [key for key, value in told.items() if not isinstance(value, _WORDS[key])]
-        if not wrong and not all(isinstance(unit, str) for unit in about["units"].values()):
-            wrong = ["units"]
-        for found in meta.get("findings", ()) if not wrong else ():
-            known = isinstance(found, dict) and isinstance(found.get("figures", {}), dict)
-            if not known or not all(
-                isinstance(found.get(k), str) for k in ("level", "code", "text")
+        required = {key: metadata.get(key) for key in ("name", "manoeuvre", "units", "meta")}
+        meta = required["meta"] if isinstance(required["meta"], dict) else {}
+        stored = {**required, **{key: value for key, value in meta.items() if key in _FIELD_TYPES}}
+        damaged = [key for key, value in stored.items() if not isinstance(value, _FIELD_TYPES[key])]
+        if not damaged and not all(isinstance(unit, str) for unit in metadata["units"].values()):
+            damaged = ["units"]
+        for finding in meta.get("findings", ()) if not damaged else ():
+            is_valid_finding = isinstance(finding, dict) and isinstance(
+                finding.get("figures", {}), dict
+            )
+            if not is_valid_finding or not all(
+                isinstance(finding.get(field_name), str) for field_name in ("level", "code", "text")
             ):
-                wrong = ["findings"]
-        if wrong:
+                damaged = ["findings"]
+        if damaged:
             raise DataError(
-                f"{path}: canonical log whose '{wrong[0]}' is missing or damaged; write the file"
+                f"{path}: canonical log whose '{damaged[0]}' is missing or damaged; write the file"
                 " again"
             )
         columns: dict[str, np.ndarray] = {}
@@ -231,18 +238,26 @@ class Log:
                 )
             if name in columns:
                 raise DataError(f"{path}: column '{name}' stands twice; write the file again")
-            kind = bool if name.startswith("mask:") else np.float64
-            columns[name] = np.asarray(values, dtype=kind)
+            dtype = bool if name.startswith("mask:") else np.float64
+            columns[name] = np.asarray(values, dtype=dtype)
         if "t" not in columns:
             raise DataError(f"{path}: canonical log without a column 't'; write the file again")
-        masks = {n.removeprefix("mask:"): c for n, c in columns.items() if n.startswith("mask:")}
-        channels = {n: c for n, c in columns.items() if n != "t" and not n.startswith("mask:")}
+        masks = {
+            column_name.removeprefix("mask:"): column_values
+            for column_name, column_values in columns.items()
+            if column_name.startswith("mask:")
+        }
+        channels = {
+            column_name: column_values
+            for column_name, column_values in columns.items()
+            if column_name != "t" and not column_name.startswith("mask:")
+        }
         return cls(
-            about["name"],
+            metadata["name"],
             columns["t"],
             channels,
-            about["units"],
-            about["manoeuvre"],
+            metadata["units"],
+            metadata["manoeuvre"],
             masks,
-            about["meta"],
+            metadata["meta"],
         )

@@ -11,25 +11,25 @@ import difflib
 import re
 from collections.abc import Iterable, Sequence
 
-from residnet.core.units import si_unit, to_si, units
+from residnet.core.units import si_unit, to_si, unit_names
 
 __all__ = [
-    "ACCELERATION",
-    "BOW_WIND",
+    "ACCELERATION_NAMES",
+    "BOW_WIND_CHANNELS",
     "CHANNEL_UNITS",
-    "END_UNITS",
-    "POSE",
-    "STATE",
-    "VELOCITY",
+    "POSE_ERROR_UNITS",
+    "POSE_NAMES",
+    "STATE_NAMES",
+    "VELOCITY_NAMES",
     "WIND_INPUTS",
-    "nearest",
+    "get_si_unit",
+    "port_starboard_pairs",
     "require_plain_name",
-    "shown",
-    "si_of",
     "si_unit",
-    "sides",
+    "suggest_name",
     "to_si",
-    "units",
+    "truncate",
+    "unit_names",
 ]
 
 _BREAKS_A_COMMENT = ("*/", "/*", "//", "\\", '"')
@@ -52,21 +52,21 @@ def require_plain_name(name: str) -> str:
     return name
 
 
-POSE = ("x", "y", "psi")
-VELOCITY = ("u", "v", "r")
-STATE = POSE + VELOCITY
+POSE_NAMES = ("x", "y", "psi")
+VELOCITY_NAMES = ("u", "v", "r")
+STATE_NAMES = POSE_NAMES + VELOCITY_NAMES
 """State of a 3-DOF model, in the order of the tensors: north [m], east [m], heading [rad], surge
 [m/s], sway [m/s], yaw rate [rad/s].
 """
 
-END_UNITS = {"position": "m", "heading": "rad", "depth": "m", "attitude": "rad"}
+POSE_ERROR_UNITS = {"position": "m", "heading": "rad", "depth": "m", "attitude": "rad"}
 """Errors of the pose at the end of a free run: a distance, the angle of one rotation and so on."""
 
-ACCELERATION = tuple(f"{name}_dot" for name in VELOCITY)
+ACCELERATION_NAMES = tuple(f"{name}_dot" for name in VELOCITY_NAMES)
 
 WIND_INPUTS = ("wind_speed", "wind_dir")
 """True wind as inputs of a plant: speed [m/s] and where it comes FROM [rad], earth-fixed."""
-BOW_WIND = ("wind_angle", "apparent_wind_speed", "apparent_wind_angle")
+BOW_WIND_CHANNELS = ("wind_angle", "apparent_wind_speed", "apparent_wind_angle")
 """A wind that is told from the bow: where the true wind comes from, and the wind that is felt."""
 
 # SI unit of the channels that residnet knows by name; any other channel keeps the SI unit that its
@@ -117,49 +117,53 @@ CHANNEL_UNITS: dict[str, str] = {
 }
 
 
-_SI = {
+_SI_OF_PREFIX = {
     **{r"n(_|$)": "1/s", "delta|azimuth": "rad", "tau_x|tau_y|thrust": "N", "tau_n": "N m"},
     "throttle": "-",
 }
 """How names of one's own begin -> SI unit."""
 
 
-def si_of(channel: str) -> str | None:
+def get_si_unit(channel: str) -> str | None:
     """Return the SI unit of a channel, by its name where residnet does not know it, or None."""
-    first = channel.removeprefix("cmd_")
-    found = (si for start, si in _SI.items() if re.match(start, first))
-    return CHANNEL_UNITS.get(channel) or next(found, None)
+    base_name = channel.removeprefix("cmd_")
+    matches = (si for prefix, si in _SI_OF_PREFIX.items() if re.match(prefix, base_name))
+    return CHANNEL_UNITS.get(channel) or next(matches, None)
 
 
-def sides(names: Iterable[str]) -> dict[str, str]:
+def port_starboard_pairs(names: Iterable[str]) -> dict[str, str]:
     """Return the channels that end in `_port`, each with the one that ends in `_stbd`."""
-    known = dict.fromkeys(names)
-    ends = {name: f"{name[:-4]}stbd" for name in known if name[:-5] and name.endswith("_port")}
-    return {port: stbd for port, stbd in ends.items() if stbd in known}
+    known_names = dict.fromkeys(names)
+    starboard_names = {
+        name: f"{name[:-4]}stbd" for name in known_names if name[:-5] and name.endswith("_port")
+    }
+    return {port: stbd for port, stbd in starboard_names.items() if stbd in known_names}
 
 
-def shown(text: object, most: int = 60) -> str:
-    """Return what a message quotes from a file, cut to `most` characters."""
-    whole = str(text)
-    return whole if len(whole) <= most else f"{whole[: most - 3]}..."
+def truncate(text: object, max_length: int = 60) -> str:
+    """Return what a message quotes from a file, cut to `max_length` characters."""
+    full_text = str(text)
+    return full_text if len(full_text) <= max_length else f"{full_text[: max_length - 3]}..."
 
 
-def nearest(name: str, valid: Iterable[str]) -> str:
+def suggest_name(name: str, valid: Iterable[str]) -> str:
     """Return `; did you mean 'x'?` for error messages, or the valid names where none is near."""
-    names = sorted({shown(other) for other in valid})
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
-    if close:
-        return f"; did you mean '{close[0]}'?"
+    names = sorted({truncate(valid_name) for valid_name in valid})
+    close_matches = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
+    if close_matches:
+        return f"; did you mean '{close_matches[0]}'?"
     return f"; valid: {', '.join(names[:24])}" + (", ..." if len(names) > 24 else "")
 
 
-def thrusters_that_turn(names: Sequence[str]) -> dict[str, str]:
+def azimuth_thrusters(names: Sequence[str]) -> dict[str, str]:
     """Return the angle of each azimuth thruster -> what its thrust goes with."""
-    plain = {one.removeprefix("cmd_"): one for one in names}
-    out = {}
-    for angle in (one for one in plain if one.startswith("azimuth")):
-        end = angle.removeprefix("azimuth")
-        by = next((n for n in ("n", "throttle", "thrust") if f"{n}{end}" in plain), None)
-        if by and end != "_diff":
-            out[plain[angle]] = plain[f"{by}{end}"]
-    return out
+    name_of_base = {channel.removeprefix("cmd_"): channel for channel in names}
+    thrust_of_angle = {}
+    for angle in (channel for channel in name_of_base if channel.startswith("azimuth")):
+        suffix = angle.removeprefix("azimuth")
+        thrust_quantity = next(
+            (n for n in ("n", "throttle", "thrust") if f"{n}{suffix}" in name_of_base), None
+        )
+        if thrust_quantity and suffix != "_diff":
+            thrust_of_angle[name_of_base[angle]] = name_of_base[f"{thrust_quantity}{suffix}"]
+    return thrust_of_angle

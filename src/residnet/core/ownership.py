@@ -38,7 +38,7 @@ FILE_MANIFEST = ".residnet.json"
 """Name of the manifest of files that are written outside of a run folder."""
 SCHEMA = "residnet.checksums/1"
 
-_SIZE_LIMIT = 64_000_000
+_MAX_MANIFEST_BYTES = 64_000_000
 """Bytes of the largest manifest that is read; 100,000 files need 15 MB."""
 _FORBIDDEN_CHARACTERS = frozenset("\\\0")
 
@@ -99,7 +99,7 @@ def require_inside(folder: Path, path: Path) -> None:
             )
 
 
-def read_regular(path: Path, limit: int) -> bytes:
+def read_regular_file(path: Path, limit: int) -> bytes:
     """Return the contents of a regular file that is no symbolic link.
 
     Raises:
@@ -154,7 +154,7 @@ class Manifest:
         self.journal = folder / f"{name}l"
 
     @property
-    def exists(self) -> bool:
+    def is_recorded(self) -> bool:
         """Whether residnet recorded any file here; a file of that name by others does not count."""
         if self.journal.is_file():
             return True
@@ -181,11 +181,11 @@ class Manifest:
                 with suppress(ValueError):
                     entry = json.loads(line)
                     if isinstance(entry, dict) and set(entry) == {"name", "sha256"}:
-                        name = self._checked_name(entry["name"], self.journal)
+                        name = self._validate_name(entry["name"], self.journal)
                         digests.setdefault(name, set()).add(entry["sha256"])
         return digests
 
-    def begin(self) -> None:
+    def start_recording(self) -> None:
         """Let everything that is written below the folder from now on be recorded here.
 
         Raises:
@@ -204,11 +204,11 @@ class Manifest:
         Raises:
             UsageError: if the journal cannot be written.
         """
-        self._append(json.dumps({"name": self._name_of(path), "sha256": digest}) + "\n")
+        self._append(json.dumps({"name": self._relative_name(path), "sha256": digest}) + "\n")
 
     def record_existing(self) -> None:
         """Record every regular file of the folder as it is, except those of a nested manifest."""
-        for path, manifest in self._files_below(self.folder):
+        for path, manifest in self._iterate_files(self.folder):
             if manifest is self and not path.is_symlink() and path.is_file():
                 self.record(path, sha256(path))
 
@@ -228,7 +228,7 @@ class Manifest:
         digests = self.read()
         if self._is_owned(path, digests):
             return
-        raise self._not_owned(path, digests)
+        raise self._ownership_error(path, digests)
 
     def require_recorded_unchanged(self, *names: str) -> None:
         """Check that what was recorded may be written again: it is unchanged or gone.
@@ -247,7 +247,7 @@ class Manifest:
             if any(PurePosixPath(name).is_relative_to(start) for start in names) and (
                 os.path.lexists(path) and not self._is_owned(path, digests)
             ):
-                raise self._not_owned(path, digests)
+                raise self._ownership_error(path, digests)
 
     def remove_if_owned(self, path: Path) -> None:
         """Delete a file that residnet wrote and nobody edited; leave any other."""
@@ -255,7 +255,7 @@ class Manifest:
             require_inside(self.folder, path)
             path.unlink()
 
-    def require_all_owned(self, below: Path | None = None) -> None:
+    def require_all_owned(self, subfolder: Path | None = None) -> None:
         """Check that every file of the folder, or of one below it, is owned.
 
         A folder below with a manifest of its own, such as an evaluation, is checked by that.
@@ -263,15 +263,15 @@ class Manifest:
         Raises:
             UsageError: if one is the user's or was edited; it names the file.
         """
-        known: dict[Path, Digests] = {}
-        for path, manifest in self._files_below(below or self.folder):
-            if manifest.folder not in known:
-                known[manifest.folder] = manifest.read()
-            digests = known[manifest.folder]
+        digests_of_folder: dict[Path, Digests] = {}
+        for path, manifest in self._iterate_files(subfolder or self.folder):
+            if manifest.folder not in digests_of_folder:
+                digests_of_folder[manifest.folder] = manifest.read()
+            digests = digests_of_folder[manifest.folder]
             if not manifest._is_owned(path, digests):
-                raise manifest._not_owned(path, digests)
+                raise manifest._ownership_error(path, digests)
 
-    def remove_owned(self, below: Path | None = None) -> None:
+    def remove_owned(self, subfolder: Path | None = None) -> None:
         """Delete every file of the folder, or of one below it; all of them must be owned.
 
         Folders that become empty are deleted, except the folder of the manifest.
@@ -279,15 +279,18 @@ class Manifest:
         Raises:
             UsageError: if a file is the user's or was edited; then nothing was deleted.
         """
-        top = below or self.folder
-        if not top.is_dir():
+        start_folder = subfolder or self.folder
+        if not start_folder.is_dir():
             return
-        require_inside(self.folder, top)
-        self.require_all_owned(top)
-        paths = [path for path, _ in self._files_below(top, with_manifests=True)]
-        own = {self.path, self.journal}
+        require_inside(self.folder, start_folder)
+        self.require_all_owned(start_folder)
+        paths = [path for path, _ in self._iterate_files(start_folder, with_manifests=True)]
+        manifest_files = {self.path, self.journal}
         # the manifest is last, so that a kill leaves nothing that is not recorded
-        for path in [*(path for path in paths if path not in own), *(own & set(paths))]:
+        for path in [
+            *(path for path in paths if path not in manifest_files),
+            *(manifest_files & set(paths)),
+        ]:
             path.unlink(missing_ok=True)
         parents = {parent for path in paths for parent in path.parents if parent != self.folder}
         for parent in sorted(parents, key=lambda parent: -len(parent.parts)):
@@ -315,18 +318,20 @@ class Manifest:
                 files[name] = None
             elif self._is_owned(path, digests):
                 files[name] = sha256(path)
-            elif (nearest := run_manifest_above(path)) is None or nearest.path == self.path:
+            elif (
+                nearest_manifest := find_run_manifest(path)
+            ) is None or nearest_manifest.path == self.path:
                 files[name] = max(digest for digest in versions if digest is not None)
-        partial = self.path.with_name(f"{self.path.name}.{os.getpid()}.partial")
+        temporary_path = self.path.with_name(f"{self.path.name}.{os.getpid()}.partial")
         content = {"schema": SCHEMA, "files": files}
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-            partial.replace(self.path)
+            temporary_path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+            temporary_path.replace(self.path)
             self.journal.unlink(missing_ok=True)
         except OSError as error:
             with suppress(OSError):
-                partial.unlink(missing_ok=True)
+                temporary_path.unlink(missing_ok=True)
             raise UsageError(f"{self.path}: cannot be written ({error.strerror})") from error
 
     def verify(self, skipped: Collection[str] = ()) -> None:
@@ -370,15 +375,15 @@ class Manifest:
                 " that can be written"
             ) from error
 
-    def _name_of(self, path: Path) -> str:
+    def _relative_name(self, path: Path) -> str:
         return path.relative_to(self.folder).as_posix()
 
-    def _checked_name(self, name: object, source: Path) -> str:
+    def _validate_name(self, name: object, source: Path) -> str:
         resolve_name(self.folder, name, source)
         return str(name)
 
     def _is_owned(self, path: Path, digests: Digests) -> bool:
-        versions = digests.get(self._name_of(path))
+        versions = digests.get(self._relative_name(path))
         try:
             mode = path.lstat().st_mode
             if versions is None or not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
@@ -388,10 +393,10 @@ class Manifest:
         except FileNotFoundError:
             return False
 
-    def _not_owned(self, path: Path, digests: Digests) -> UsageError:
+    def _ownership_error(self, path: Path, digests: Digests) -> UsageError:
         if path.is_symlink():
             reason = "is a symbolic link, which residnet did not make"
-        elif self._name_of(path) in digests:
+        elif self._relative_name(path) in digests:
             reason = "was edited after residnet wrote it"
         else:
             reason = f"exists, and {self.path.name} does not say that residnet wrote it"
@@ -399,7 +404,7 @@ class Manifest:
 
     def _read(self, path: Path) -> str:
         try:
-            return read_regular(path, _SIZE_LIMIT).decode("utf-8")
+            return read_regular_file(path, _MAX_MANIFEST_BYTES).decode("utf-8")
         except (OSError, ValueError) as error:
             raise UsageError(
                 f"{path}: cannot be read ({error}); restore the file or run it again"
@@ -420,9 +425,9 @@ class Manifest:
             or not all(digest is None or isinstance(digest, str) for digest in files.values())
         ):
             raise UsageError(f"{self.path}: holds no checksums; restore the folder")
-        return {self._checked_name(name, self.path): digest for name, digest in files.items()}
+        return {self._validate_name(name, self.path): digest for name, digest in files.items()}
 
-    def _files_below(
+    def _iterate_files(
         self, folder: Path, *, with_manifests: bool = False
     ) -> Iterator[tuple[Path, Manifest]]:
         """Yield each file, link or device below a folder, and the manifest that it belongs to.
@@ -432,33 +437,33 @@ class Manifest:
         for entry in sorted(folder.iterdir()):
             if entry.is_dir() and not entry.is_symlink():
                 nested = Manifest(entry)
-                yield from (nested if nested.exists else self)._files_below(
+                yield from (nested if nested.is_recorded else self)._iterate_files(
                     entry, with_manifests=with_manifests
                 )
             elif with_manifests or entry not in (self.path, self.journal):
                 yield entry, self
 
 
-def run_manifest_above(path: Path) -> Manifest | None:
+def find_run_manifest(path: Path) -> Manifest | None:
     """Return the manifest of the run folder that a path lies in; None outside of run folders.
 
     In nested run folders it is the innermost; a folder that a symbolic link stands for counts only
     if no other run folder lies above.
     """
-    behind_link: Manifest | None = None
+    linked_manifest: Manifest | None = None
     for folder in path.parents:
         manifest = Manifest(folder)
-        if not manifest.exists:
+        if not manifest.is_recorded:
             continue
         if not folder.is_symlink():
             return manifest
-        behind_link = behind_link or manifest
-    return behind_link
+        linked_manifest = linked_manifest or manifest
+    return linked_manifest
 
 
-def manifest_for(path: Path) -> Manifest:
+def find_manifest(path: Path) -> Manifest:
     """Return the manifest that a file belongs to: of its run folder, else of its own folder."""
-    return run_manifest_above(path) or Manifest(path.parent, FILE_MANIFEST)
+    return find_run_manifest(path) or Manifest(path.parent, FILE_MANIFEST)
 
 
 def require_replaceable(path: Path) -> None:
@@ -469,18 +474,18 @@ def require_replaceable(path: Path) -> None:
     Raises:
         UsageError: if it is the user's, was edited, or lies behind a symbolic link.
     """
-    manifest_for(path).require_replaceable(path)
+    find_manifest(path).require_replaceable(path)
 
 
 @contextmanager
-def recorded_folder(folder: Path) -> Iterator[Manifest]:
+def record_folder(folder: Path) -> Iterator[Manifest]:
     """Record each file that is written below a folder within the context in its `checksums.json`.
 
     Raises:
         UsageError: if the manifest is damaged or somebody else's, or cannot be written.
     """
     manifest = Manifest(folder)
-    manifest.begin()
+    manifest.start_recording()
     try:
         yield manifest
     finally:

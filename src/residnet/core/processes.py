@@ -20,11 +20,11 @@ from residnet.core.trust import is_trusted, set_trusted
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """Numbers of the settings in malloc.h of the GNU C library."""
-_KEPT = 128 << 20
-_LARGEST = 64 << 20
+_MAX_KEPT_BYTES = 128 << 20
+_MAX_REUSED_BYTES = 64 << 20
 
 
-def keep_freed_memory() -> None:
+def retain_freed_memory() -> None:
     """Let this process keep up to 128 MB of freed memory, so that tensors find it ready again.
 
     By default the GNU C library gives the memory of tensors back when they are freed, and each new
@@ -34,24 +34,24 @@ def keep_freed_memory() -> None:
     if platform.libc_ver()[0] != "glibc":
         return
     library = ctypes.CDLL(None)
-    library.mallopt(_MMAP_THRESHOLD, _LARGEST)
-    library.mallopt(_TRIM_THRESHOLD, _KEPT)
+    library.mallopt(_MMAP_THRESHOLD, _MAX_REUSED_BYTES)
+    library.mallopt(_TRIM_THRESHOLD, _MAX_KEPT_BYTES)
 
 
-_cores: ContextVar[int] = ContextVar("residnet_cores", default=1)
+_core_limit: ContextVar[int] = ContextVar("residnet_cores", default=1)
 
 
-def free_cores() -> int:
+def available_cores() -> int:
     """Return how many cores work may spread over, where nobody names a number of processes.
 
-    One, unless `spread` says otherwise: a new process imports the program that it belongs to again,
+    One, unless `worker_limit` says otherwise: a new process imports the program that it belongs to again,
     and a program of the user's own need not be made for that.
     """
-    return _cores.get()
+    return _core_limit.get()
 
 
 @contextmanager
-def spread(cores: int | None = None) -> Iterator[None]:
+def worker_limit(cores: int | None = None) -> Iterator[None]:
     """Let the work within the context spread over several cores.
 
     Args:
@@ -61,28 +61,30 @@ def spread(cores: int | None = None) -> Iterator[None]:
         from joblib import cpu_count
 
         cores = int(cpu_count())
-    token = _cores.set(cores)
+    token = _core_limit.set(cores)
     try:
         yield
     finally:
-        _cores.reset(token)
+        _core_limit.reset(token)
 
 
 @contextmanager
-def processes(
-    workers: int, begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()
+def process_pool(
+    workers: int,
+    initializer: Callable[..., None] | None = None,
+    initializer_arguments: tuple[Any, ...] = (),
 ) -> Iterator[Executor]:
     """Hold processes for work side by side; an interruption ends them all at once.
 
     Args:
         workers: number of processes; each is started when it is first needed.
-        begin: is called once in each process, before its first work.
-        given: to `begin`.
+        initializer: is called once in each process, before its first work.
+        initializer_arguments: to `initializer`.
 
     Raises:
         FitError: where the system ends one of the processes.
     """
-    with _pool(workers, begin, given) as pool:
+    with _make_pool(workers, initializer, initializer_arguments) as pool:
         try:
             yield pool
         except BrokenProcessPool as error:
@@ -97,18 +99,20 @@ def processes(
             raise
 
 
-def _pool(
-    workers: int, begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()
+def _make_pool(
+    workers: int,
+    initializer: Callable[..., None] | None = None,
+    initializer_arguments: tuple[Any, ...] = (),
 ) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(
         workers,
         get_context("spawn"),
         initializer=_begin_pooled,
-        initargs=(is_trusted(), begin, given),
+        initargs=(is_trusted(), initializer, initializer_arguments),
     )
 
 
-class ApartProcesses(Executor):
+class IsolatedProcessPool(Executor):
     """Processes of which one that the system ends loses its own work alone, and is replaced.
 
     That work ends with a `BrokenProcessPool`. Leaving a `with` block by an exception ends all
@@ -120,42 +124,46 @@ class ApartProcesses(Executor):
 
     def __init__(self, workers: int) -> None:
         # one pool for each: a lost process ends its whole pool
-        self._pools = [_pool(1) for _ in range(workers)]
-        self._last: list[Future[Any] | None] = [None] * workers
+        self._pools = [_make_pool(1) for _ in range(workers)]
+        self._last_futures: list[Future[Any] | None] = [None] * workers
 
-    def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Hand work to a process that is free."""
-        free = next(i for i, last in enumerate(self._last) if last is None or last.done())
+        free_index = next(
+            i
+            for i, last_future in enumerate(self._last_futures)
+            if last_future is None or last_future.done()
+        )
         try:
-            future = self._pools[free].submit(work, *args, **kwargs)
+            future = self._pools[free_index].submit(function, *args, **kwargs)
         except BrokenProcessPool:
-            self._pools[free].shutdown()
-            self._pools[free] = _pool(1)
-            future = self._pools[free].submit(work, *args, **kwargs)
-        self._last[free] = future
+            self._pools[free_index].shutdown()
+            self._pools[free_index] = _make_pool(1)
+            future = self._pools[free_index].submit(function, *args, **kwargs)
+        self._last_futures[free_index] = future
         return future
 
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+    def shutdown(self, wait_for_work: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes, after their work where it is waited for."""
         for pool in self._pools:
-            pool.shutdown(wait, cancel_futures=cancel_futures)
+            pool.shutdown(wait_for_work, cancel_futures=cancel_futures)
 
-    def __exit__(self, kind: Any, value: Any, trace: Any) -> None:
-        if kind is not None:
-            self.shutdown(wait=False, cancel_futures=True)
+    def __exit__(self, error_type: Any, error: Any, traceback: Any) -> None:
+        if error_type is not None:
+            self.shutdown(wait_for_work=False, cancel_futures=True)
             for process in active_children():
                 process.terminate()
         self.shutdown()
 
 
-class ThisProcess(Executor):
+class InlineExecutor(Executor):
     """An executor that does its work at once, in the process that hands it over."""
 
-    def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Do the work; returns a future that is done, with what the work raised where it failed."""
         future: Future[Any] = Future()
         try:
-            future.set_result(work(*args, **kwargs))
+            future.set_result(function(*args, **kwargs))
         except Exception as error:
             future.set_exception(error)
         return future
@@ -166,10 +174,12 @@ def _begin_pooled(
 ) -> None:
     """Take over what the parent may load, then begin as every worker."""
     set_trusted(trust)
-    begin_worker(begin, given)
+    initialise_worker(begin, given)
 
 
-def begin_worker(begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()) -> None:
+def initialise_worker(
+    initializer: Callable[..., None] | None = None, initializer_arguments: tuple[Any, ...] = ()
+) -> None:
     """Leave Ctrl-C to the process that began this one, and end with it, however it ends.
 
     Ctrl-C reaches every process of a terminal; a process that is killed cannot tell its children.
@@ -177,11 +187,11 @@ def begin_worker(begin: Callable[..., None] | None = None, given: tuple[Any, ...
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     if parent is not None:
-        Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
-    if begin is not None:
-        begin(*given)
+        Thread(target=_exit_with_parent, args=(parent.sentinel,), daemon=True).start()
+    if initializer is not None:
+        initializer(*initializer_arguments)
 
 
-def _end_with(sentinel: int) -> None:
+def _exit_with_parent(sentinel: int) -> None:
     connection.wait([sentinel])
     os._exit(1)

@@ -1,6 +1,6 @@
 """Progress of long work: one callback hears of it, on the command line and in Python alike.
 
-Code that takes long calls `report`. Whoever wants to hear of it installs a callback with `listen`;
+Code that takes long calls `report_progress`. Whoever wants to hear of it installs a callback with `on_progress`;
 without one nothing is printed. The callback is held in a context variable, so that it need not be
 handed through every function, and so that two threads can listen separately.
 """
@@ -38,7 +38,7 @@ ProgressCallback = Callable[[Progress], None]
 _callback: ContextVar[ProgressCallback | None] = ContextVar("residnet_progress", default=None)
 
 
-def report(
+def report_progress(
     stage: str,
     done: float | None = None,
     total: float | None = None,
@@ -57,23 +57,23 @@ def report(
         callback(Progress(stage, done, total, message, score))
 
 
-def listener() -> ProgressCallback | None:
+def get_callback() -> ProgressCallback | None:
     """Return the callback that listens, for threads, which do not inherit it; None for none."""
     return _callback.get()
 
 
-def say(message: str) -> None:
+def log_message(message: str) -> None:
     """Tell the callback that listens, if there is one, what the work has found."""
-    report("", message=message)
+    report_progress("", message=message)
 
 
-def begin(stage: str) -> None:
+def begin_stage(stage: str) -> None:
     """Tell the callback that listens, if there is one, what is being done from now on."""
-    report(stage, message=f"  {stage}")
+    report_progress(stage, message=f"  {stage}")
 
 
 @contextmanager
-def listen(callback: ProgressCallback | None) -> Iterator[None]:
+def on_progress(callback: ProgressCallback | None) -> Iterator[None]:
     """Send the progress of everything within the context to `callback`; None keeps silent."""
     token = _callback.set(callback)
     try:

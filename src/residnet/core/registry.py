@@ -29,11 +29,11 @@ from pydantic_core import CoreSchema, core_schema, to_json
 
 import residnet
 from residnet.core.errors import Terminated, UsageError
-from residnet.core.files import config_folder
+from residnet.core.files import find_config_folder
 
 
 @dataclass(frozen=True)
-class ThirdParty:
+class EntryPointPart:
     """An entry point of another package.
 
     Attributes:
@@ -49,26 +49,26 @@ class ThirdParty:
     fault: str = ""
 
     @property
-    def complaint(self) -> str:
+    def error_message(self) -> str:
         """One line that says which part of which package cannot be used, and why."""
         return (
             f"'{self.name}' of the package {self.package} cannot be used: {self.fault}; repair or"
             " uninstall that package"
         )
 
-    def checked(self, check: Callable[[], str]) -> ThirdParty:
-        """Return the entry point, with a fault instead of its part where `check` returns one."""
-        fault = self.fault or check()
-        return ThirdParty(self.name, self.package, None, fault) if fault else self
+    def with_check(self, find_fault: Callable[[], str]) -> EntryPointPart:
+        """Return the entry point, with a fault instead of its part where `find_fault` returns one."""
+        fault = self.fault or find_fault()
+        return EntryPointPart(self.name, self.package, None, fault) if fault else self
 
 
-_loading: list[str] = []
-_broken: dict[tuple[str, str, str], ThirdParty] = {}
+_loading_groups: list[str] = []
+_broken: dict[tuple[str, str, str], EntryPointPart] = {}
 """Entry points that raised while they were loaded, by group, name and package."""
 
 
 @functools.cache
-def third_party(group: str) -> tuple[ThirdParty, ...]:
+def load_entry_points(group: str) -> tuple[EntryPointPart, ...]:
     """Return the entry points of one group, loaded once, sorted by name.
 
     Args:
@@ -77,30 +77,39 @@ def third_party(group: str) -> tuple[ThirdParty, ...]:
     Raises:
         UsageError: where a part is needed while it is itself being imported.
     """
-    if group in _loading:
+    if group in _loading_groups:
         raise UsageError(
             f"a package with entry points in {group} builds residnet configs while it is imported;"
             " build them inside a function"
         )
-    _loading.append(group)
+    _loading_groups.append(group)
     try:
-        points = importlib.metadata.entry_points(group=group)
-        return tuple(_loaded(point) for point in sorted(points, key=lambda point: point.name))
+        entry_points = importlib.metadata.entry_points(group=group)
+        return tuple(
+            _load_entry_point(entry_point)
+            for entry_point in sorted(entry_points, key=lambda point: point.name)
+        )
     finally:
-        _loading.remove(group)
+        _loading_groups.remove(group)
 
 
-def _loaded(point: importlib.metadata.EntryPoint) -> ThirdParty:
-    package = "unknown" if point.dist is None else f"{point.dist.name} {point.dist.version}"
+def _load_entry_point(entry_point: importlib.metadata.EntryPoint) -> EntryPointPart:
+    package = (
+        "unknown"
+        if entry_point.dist is None
+        else f"{entry_point.dist.name} {entry_point.dist.version}"
+    )
     try:
-        return ThirdParty(point.name, package, point.load())
+        return EntryPointPart(entry_point.name, package, entry_point.load())
     except (KeyboardInterrupt, Terminated):
         raise
     # a foreign package that raises anything at all, SystemExit included, must not stop the others
     except BaseException as error:
         lines = str(error).splitlines() or [""]
-        broken = ThirdParty(point.name, package, None, f"{type(error).__name__}: {lines[0]}")
-        _broken.setdefault((point.group, point.name, package), broken)
+        broken = EntryPointPart(
+            entry_point.name, package, None, f"{type(error).__name__}: {lines[0]}"
+        )
+        _broken.setdefault((entry_point.group, entry_point.name, package), broken)
         return broken
 
 
@@ -114,20 +123,20 @@ def load_faults() -> list[str]:
 
 
 @functools.cache
-def adapter(model: Any) -> TypeAdapter[Any]:
+def type_adapter(model: Any) -> TypeAdapter[Any]:
     """Return what reads a type; for a union of vessels pydantic takes 35 ms to make it."""
     return TypeAdapter(model)
 
 
-def forget() -> None:
+def clear_caches() -> None:
     """Read the entry points anew when they are next needed, for tests that install packages."""
-    third_party.cache_clear()
+    load_entry_points.cache_clear()
     _broken.clear()
-    adapter.cache_clear()
+    type_adapter.cache_clear()
 
 
 @dataclass(frozen=True, eq=False)
-class Kinds:
+class PluginUnion:
     """Marks a config field that takes one of several kinds, those of other packages included.
 
     Parts that are no configs, such as formats of exports, are kinds told apart by an attribute.
@@ -146,38 +155,46 @@ class Kinds:
     builtin: Mapping[str, str]
     key: str = "kind"
 
-    def others(self) -> list[ThirdParty]:
+    def entry_point_parts(self) -> list[EntryPointPart]:
         """Return the kinds of other packages, each checked against what a kind has to be."""
-        taken = dict.fromkeys(self.builtin, "residnet")
-        out = []
-        for found in third_party(self.group):
-            out.append(found.checked(functools.partial(self._fault, found, taken.get(found.name))))
-            taken.setdefault(found.name, found.package)
-        return out
+        package_of_name = dict.fromkeys(self.builtin, "residnet")
+        checked_parts = []
+        for entry_point in load_entry_points(self.group):
+            checked_parts.append(
+                entry_point.with_check(
+                    functools.partial(
+                        self._find_fault, entry_point, package_of_name.get(entry_point.name)
+                    )
+                )
+            )
+            package_of_name.setdefault(entry_point.name, entry_point.package)
+        return checked_parts
 
-    def _fault(self, found: ThirdParty, taken_by: str | None) -> str:
-        if taken_by is not None:
-            return f"{taken_by} has a {self.key} of that name already"
-        fault = _no_subclass(found.part, imported(self.base))
-        if fault or kind_of(found.part, self.key) == found.name:
+    def _find_fault(self, entry_point: EntryPointPart, owner: str | None) -> str:
+        if owner is not None:
+            return f"{owner} has a {self.key} of that name already"
+        fault = _subclass_fault(entry_point.part, import_object(self.base))
+        if fault or get_kind(entry_point.part, self.key) == entry_point.name:
             return fault
-        name = found.part.__name__
-        if issubclass(found.part, BaseModel):
-            return f"{name} has no field `{self.key}: Literal['{found.name}']`"
-        return f"{name} has no attribute `{self.key} = '{found.name}'`"
+        name = entry_point.part.__name__
+        if issubclass(entry_point.part, BaseModel):
+            return f"{name} has no field `{self.key}: Literal['{entry_point.name}']`"
+        return f"{name} has no attribute `{self.key} = '{entry_point.name}'`"
 
-    def names(self) -> list[str]:
+    def kind_names(self) -> list[str]:
         """Return the names of all kinds, broken ones included."""
-        return list(dict.fromkeys([*self.builtin, *(part.name for part in self.others())]))
+        return list(
+            dict.fromkeys([*self.builtin, *(part.name for part in self.entry_point_parts())])
+        )
 
-    def find(self, name: str) -> type[Any] | ThirdParty:
+    def find_kind(self, name: str) -> type[Any] | EntryPointPart:
         """Return the class of one kind; a broken one of another package as it is kept."""
         if name in self.builtin:
-            found: type[Any] = imported(self.builtin[name])
-            return found
+            kind_class: type[Any] = import_object(self.builtin[name])
+            return kind_class
         # a second part of the same name could never be told from the first
-        other = next(part for part in self.others() if part.name == name)
-        return other if other.fault else other.part
+        entry_point = next(part for part in self.entry_point_parts() if part.name == name)
+        return entry_point if entry_point.fault else entry_point.part
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
@@ -186,164 +203,179 @@ class Kinds:
         return core_schema.tagged_union_schema(
             {
                 name: core_schema.with_info_plain_validator_function(
-                    functools.partial(self._validated, name)
+                    functools.partial(self._validate_kind, name)
                 )
-                for name in self.names()
+                for name in self.kind_names()
             },
             discriminator=self.key,
             from_attributes=True,
         )
 
-    def _validated(self, name: str, value: Any, info: ValidationInfo) -> Any:
-        found = self.find(name)
-        if isinstance(found, ThirdParty):
-            raise ValueError(found.complaint)
-        if isinstance(value, found):
+    def _validate_kind(self, name: str, value: Any, info: ValidationInfo) -> Any:
+        kind_class = self.find_kind(name)
+        if isinstance(kind_class, EntryPointPart):
+            raise ValueError(kind_class.error_message)
+        if isinstance(value, kind_class):
             return value
         if info.mode == "json":
             # what is strict in JSON is stricter in Python: no list is a tuple there
-            return found.model_validate_json(to_json(value), strict=True, context=info.context)
-        return found.model_validate(value, context=info.context)
+            return kind_class.model_validate_json(to_json(value), strict=True, context=info.context)
+        return kind_class.model_validate(value, context=info.context)
 
 
-def imported(place: str) -> Any:
+def import_object(object_path: str) -> Any:
     """Return what stands at `module:name`."""
-    module, _, name = place.partition(":")
+    module, _, name = object_path.partition(":")
     return getattr(importlib.import_module(module), name)
 
 
-def deferred(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
+def make_lazy_getattr(package: str, module_of_name: Mapping[str, str]) -> Callable[[str], Any]:
     """Return the `__getattr__` of a package whose names are loaded when they are first used.
 
     Args:
         package: its `__name__`.
-        homes: module within the package, by the name that it offers.
+        module_of_name: module within the package, by the name that it offers.
     """
 
     def load(name: str) -> Any:
-        if name not in homes:
+        if name not in module_of_name:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        return imported(f"{package}.{homes[name]}:{name}")
+        return import_object(f"{package}.{module_of_name[name]}:{name}")
 
     return load
 
 
-def kind_of(config: type[Any], key: str = "kind") -> str | None:
+def get_kind(config: type[Any], key: str = "kind") -> str | None:
     """Return the value of the field that tells a class from others; None without one."""
     if not issubclass(config, BaseModel):
         return config.__dict__.get(key)
-    found = config.model_fields.get(key)
-    if found is None or get_origin(found.annotation) is not Literal:
+    kind_field = config.model_fields.get(key)
+    if kind_field is None or get_origin(kind_field.annotation) is not Literal:
         return None
-    return str(get_args(found.annotation)[0])
+    return str(get_args(kind_field.annotation)[0])
 
 
-def marker(union: Any) -> Kinds:
+def get_plugin_union(union: Any) -> PluginUnion:
     """Return the kinds that a field of this type takes.
 
     Raises:
         UsageError: where other packages cannot add to the union.
     """
-    found = next((part for part in get_args(union)[1:] if isinstance(part, Kinds)), None)
-    if found is None:
+    plugin_union = next(
+        (metadata for metadata in get_args(union)[1:] if isinstance(metadata, PluginUnion)), None
+    )
+    if plugin_union is None:
         raise UsageError(f"{union} is no union of kinds that other packages may add to")
-    return found
+    return plugin_union
 
 
-def kinds(union: Any) -> dict[str, Any]:
+def load_kinds(union: Any) -> dict[str, Any]:
     """Return the config classes by kind, all imported: built-in ones, then those of other packages.
 
     Args:
         union: for example `residnet.heads.HeadConfig`.
     """
-    mark = marker(union)
-    found = {name: mark.find(name) for name in mark.names()}
-    return {name: part for name, part in found.items() if not isinstance(part, ThirdParty)}
+    plugin_union = get_plugin_union(union)
+    classes = {name: plugin_union.find_kind(name) for name in plugin_union.kind_names()}
+    return {
+        name: kind_class
+        for name, kind_class in classes.items()
+        if not isinstance(kind_class, EntryPointPart)
+    }
 
 
-def listed(union: Any) -> list[tuple[str, str]]:
+def list_parts(union: Any) -> list[tuple[str, str]]:
     """Return name and first line of every part; residnet's own ones are read, not imported.
 
     Args:
         union: for example `residnet.heads.HeadConfig`.
     """
-    mark = union if isinstance(union, Kinds) else marker(union)
-    out = [(name, _first_line(place)) for name, place in mark.builtin.items()]
-    return out + [
-        (part.name, broken_line(part) if part.fault else _first_line(part.part))
-        for part in mark.others()
+    plugin_union = union if isinstance(union, PluginUnion) else get_plugin_union(union)
+    names_and_summaries = [
+        (name, _summary_line(object_path)) for name, object_path in plugin_union.builtin.items()
+    ]
+    return names_and_summaries + [
+        (part.name, describe_broken_part(part) if part.fault else _summary_line(part.part))
+        for part in plugin_union.entry_point_parts()
     ]
 
 
-def broken_line(part: ThirdParty) -> str:
+def describe_broken_part(part: EntryPointPart) -> str:
     """Return what a list says about a part that cannot be used."""
     return f"(cannot be used: {part.fault}; from {part.package})"
 
 
-def _first_line(place: Any) -> str:
-    """Return `about` of a class where it has one, else the first line of its docstring."""
-    if not isinstance(place, str):
-        about: str = getattr(place, "about", "") or (place.__doc__ or "").strip().splitlines()[0]
-        return about
-    module, _, name = place.partition(":")
-    at = Path(residnet.__file__).parent.joinpath(*module.split(".")[1:])
-    file = at / "__init__.py" if at.is_dir() else at.with_suffix(".py")
+def _summary_line(object_or_path: Any) -> str:
+    """Return `summary` of a class where it has one, else the first line of its docstring."""
+    if not isinstance(object_or_path, str):
+        summary: str = (
+            getattr(object_or_path, "about", "")
+            or (object_or_path.__doc__ or "").strip().splitlines()[0]
+        )
+        return summary
+    module, _, name = object_or_path.partition(":")
+    module_path = Path(residnet.__file__).parent.joinpath(*module.split(".")[1:])
+    file = module_path / "__init__.py" if module_path.is_dir() else module_path.with_suffix(".py")
     for node in ast.parse(file.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.ClassDef) and node.name == name:
             for line in node.body:
                 if isinstance(line, ast.AnnAssign) and ast.unparse(line.target) == "about":
                     return str(ast.literal_eval(line.value)) if line.value else ""
             return (ast.get_docstring(node) or "").partition("\n")[0]
-    return _first_line(imported(place))
+    return _summary_line(import_object(object_or_path))
 
 
-def _no_subclass(part: Any, base: type[Any]) -> str:
-    abstract: frozenset[str] = getattr(part, "__abstractmethods__", frozenset())
+def _subclass_fault(part: Any, base: type[Any]) -> str:
+    abstract_methods: frozenset[str] = getattr(part, "__abstractmethods__", frozenset())
     if not (inspect.isclass(part) and issubclass(part, base)):
         return f"its entry point is no subclass of {base.__module__}.{base.__name__}"
-    if abstract:
-        return f"{part.__name__} lacks {', '.join(sorted(abstract))}"
+    if abstract_methods:
+        return f"{part.__name__} lacks {', '.join(sorted(abstract_methods))}"
     return ""
 
 
-def folders(group: str) -> dict[str, Path | ThirdParty]:
+def entry_point_folders(group: str) -> dict[str, Path | EntryPointPart]:
     """Return the folders that packages offer in a group, by entry point; a broken one is kept.
 
     An entry point of such a group names a package (a folder with an `__init__.py`); what it offers
     lies beside that file.
     """
-    out: dict[str, Path | ThirdParty] = {}
-    for found in third_party(group):
-        file = getattr(found.part, "__file__", None)
-        if found.fault:
-            out[found.name] = found
-        elif not inspect.ismodule(found.part) or file is None:
+    folder_of_name: dict[str, Path | EntryPointPart] = {}
+    for entry_point in load_entry_points(group):
+        file = getattr(entry_point.part, "__file__", None)
+        if entry_point.fault:
+            folder_of_name[entry_point.name] = entry_point
+        elif not inspect.ismodule(entry_point.part) or file is None:
             fault = "its entry point is no package with files beside it"
-            out[found.name] = replace(found, part=None, fault=fault)
+            folder_of_name[entry_point.name] = replace(entry_point, part=None, fault=fault)
         else:
-            out[found.name] = Path(file).parent
-    return out
+            folder_of_name[entry_point.name] = Path(file).parent
+    return folder_of_name
 
 
-def vessel_files() -> dict[str, Path]:
+def find_vessel_files() -> dict[str, Path]:
     """Return names and files of the vessels of residnet, then those of other packages."""
-    found = {path.stem: path for path in sorted((config_folder() / "vessels").glob("*.yaml"))}
-    for folder in folders("residnet.vessels").values():
+    file_of_vessel = {
+        path.stem: path for path in sorted((find_config_folder() / "vessels").glob("*.yaml"))
+    }
+    for folder in entry_point_folders("residnet.vessels").values():
         if isinstance(folder, Path):
             for path in sorted(folder.glob("*.yaml")):
-                found.setdefault(path.stem, path)
-    return found
+                file_of_vessel.setdefault(path.stem, path)
+    return file_of_vessel
 
 
-def broken_vessels() -> list[ThirdParty]:
+def find_broken_vessels() -> list[EntryPointPart]:
     """Return entry points of vessels that lead to no folder, and vessels whose name is taken."""
-    files, out = vessel_files(), []
-    for name, folder in folders("residnet.vessels").items():
-        if isinstance(folder, ThirdParty):
-            out.append(folder)
+    files, broken_parts = find_vessel_files(), []
+    for name, folder in entry_point_folders("residnet.vessels").items():
+        if isinstance(folder, EntryPointPart):
+            broken_parts.append(folder)
             continue
         for path in sorted(folder.glob("*.yaml")):
             if files[path.stem] != path:
-                taken = f"{files[path.stem]} is the vessel of that name"
-                out.append(ThirdParty(path.stem, f"of the entry point {name}", fault=taken))
-    return out
+                fault_text = f"{files[path.stem]} is the vessel of that name"
+                broken_parts.append(
+                    EntryPointPart(path.stem, f"of the entry point {name}", fault=fault_text)
+                )
+    return broken_parts

@@ -22,9 +22,9 @@ from typing import Any
 from residnet.core.errors import ResidnetError, UsageError
 from residnet.core.ownership import (
     Manifest,
-    read_regular,
+    find_run_manifest,
+    read_regular_file,
     require_inside,
-    run_manifest_above,
     sha256,
 )
 from residnet.core.run_shapes import require_shape
@@ -133,7 +133,7 @@ def require_listed(run: Path, name: str) -> None:
         UsageError: if it does not.
     """
     path = run / name
-    manifest = run_manifest_above(path)
+    manifest = find_run_manifest(path)
     if manifest is None or not manifest.folder.is_relative_to(run):
         # not a run folder: what opens one has checked that there is a manifest
         return
@@ -172,7 +172,7 @@ def accept_run(run: Path) -> list[str]:
             before = {}
         manifest.path.unlink(missing_ok=True)
         manifest.journal.unlink(missing_ok=True)
-        manifest.begin()
+        manifest.start_recording()
         inner = {path for path in nested if path != folder and path.is_relative_to(folder)}
         for file in files:
             is_covered = file.is_relative_to(folder) and not inner.intersection(file.parents)
@@ -246,7 +246,7 @@ def read_json_value(path: Path, folder: Path | None = None) -> Any:
     """
     require_inside(folder or path.parent, path)
     try:
-        text = read_regular(path, SIZE_LIMITS[".json"]).decode("utf-8")
+        text = read_regular_file(path, SIZE_LIMITS[".json"]).decode("utf-8")
         _last_key.set((path, ""))
         content = json.loads(text)
     except FileNotFoundError:

@@ -17,7 +17,7 @@ from functools import cache, lru_cache
 from residnet.core.errors import UsageError
 
 # SI unit of a dimension -> factors to it
-_FACTORS: dict[str, dict[str, float]] = {
+_FACTORS_OF_DIMENSION: dict[str, dict[str, float]] = {
     "-": {"-": 1.0, "%": 0.01},
     "m": {
         "m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "nmi": 1852.0, "ft": 0.3048,
@@ -49,12 +49,14 @@ _FACTORS: dict[str, dict[str, float]] = {
     **{unit: {unit: 1.0} for unit in ("kg m", "kg m^2", "kg/m^3", "V", "A", "W")},
 }  # fmt: skip
 _UNITS = {
-    unit: (si, factor) for si, factors in _FACTORS.items() for unit, factor in factors.items()
+    unit: (si, factor)
+    for si, factors in _FACTORS_OF_DIMENSION.items()
+    for unit, factor in factors.items()
 }
 """SI unit of each unit's dimension, and the factor to it."""
 
 # a part of a unit -> what else people write for it
-_WORDS: dict[str, str] = {
+_SPELLINGS_OF_UNIT: dict[str, str] = {
     "%": "percent pct prozent procent prosent",
     "m": "meter meters metre metres mtr м 米 メートル",
     "nmi": "nm NM",
@@ -88,27 +90,27 @@ _WORDS: dict[str, str] = {
     "deg/min": "degmin",
     "-": "none dimensionless",
 }
-_TURNS = "rev revs revolutions r u tr o omw omdr obr об giri 转 turns vueltas 回転"
+_REVOLUTION_SPELLINGS = "rev revs revolutions r u tr o omw omdr obr об giri 转 turns vueltas 回転"
 # where one part of a quotient is written in another way than the table does
-_PARTS = ("m", "km", "cm", "rad", "deg", "kg", "rpm", "1")
-_POWERS = {"²": "^2", "³": "^3", "**": "^", "⁻": "^-", "¹": "1"}
+_QUOTIENT_PARTS = ("m", "km", "cm", "rad", "deg", "kg", "rpm", "1")
+_POWER_SPELLINGS = {"²": "^2", "³": "^3", "**": "^", "⁻": "^-", "¹": "1"}
 
 
 @cache
-def slips(si: str) -> dict[float, str]:
+def unit_confusions(si: str) -> dict[float, str]:
     """Return factor by which values are too large -> the two units of a dimension in question."""
-    factors, out = _FACTORS.get(si, {}), dict[float, str]()
-    for usual in (si.replace("rad", "deg"), si):
-        for unit, factor in factors.items() if usual in factors else ():
-            size = factors[usual] / factor
+    factors, confusions = _FACTORS_OF_DIMENSION.get(si, {}), dict[float, str]()
+    for reference_unit in (si.replace("rad", "deg"), si):
+        for unit, factor in factors.items() if reference_unit in factors else ():
+            ratio = factors[reference_unit] / factor
             # those closer together, as gon and deg, are no better explanation than chance
-            if abs(math.log(size)) > 0.2:
-                out.setdefault(round(size, 9), f"{unit} taken as {usual}")
-                out.setdefault(round(1.0 / size, 9), f"{usual} taken as {unit}")
-    return out
+            if abs(math.log(ratio)) > 0.2:
+                confusions.setdefault(round(ratio, 9), f"{unit} taken as {reference_unit}")
+                confusions.setdefault(round(1.0 / ratio, 9), f"{reference_unit} taken as {unit}")
+    return confusions
 
 
-def units() -> tuple[str, ...]:
+def unit_names() -> tuple[str, ...]:
     """Return the names of all units that residnet converts."""
     return tuple(_UNITS)
 
@@ -119,7 +121,7 @@ def si_unit(unit: str) -> str:
     Raises:
         UsageError: where the unit is not known, or may be one of two.
     """
-    return _UNITS[known_unit(unit)][0]
+    return _UNITS[canonical_unit(unit)][0]
 
 
 def to_si(unit: str, expected: str | None = None) -> float:
@@ -132,11 +134,11 @@ def to_si(unit: str, expected: str | None = None) -> float:
     Raises:
         UsageError: where the unit is not known or of another dimension than `expected`.
     """
-    return _UNITS[known_unit(unit, expected)][1]
+    return _UNITS[canonical_unit(unit, expected)][1]
 
 
 @lru_cache(maxsize=4096)
-def known_unit(unit: str, expected: str | None = None) -> str:
+def canonical_unit(unit: str, expected: str | None = None) -> str:
     """Return residnet's own name of a unit, whatever its spelling.
 
     Args:
@@ -146,119 +148,142 @@ def known_unit(unit: str, expected: str | None = None) -> str:
         UsageError: where the unit is not known, of another dimension than `expected`, or, without
             `expected`, may be one of two that differ in case.
     """
-    meant, fitting = _meant(unit, expected)
-    if len({_UNITS[name] for name in fitting}) == 1:
-        return fitting[0]
-    usual = [name for name, (base, _) in _UNITS.items() if base == expected]
-    if not meant:
-        hint = f"; did you mean '{near}'?" if (near := _near(unit, expected)) else ""
-        listed = sorted(usual) if expected is not None else [*sorted(_UNITS)[:24], "..."]
-        raise UsageError(f"unknown unit '{unit}'{hint or '; valid: ' + ', '.join(listed)}")
-    if not fitting:
+    possible_units, matches = _match_unit(unit, expected)
+    if len({_UNITS[name] for name in matches}) == 1:
+        return matches[0]
+    units_of_dimension = [
+        name for name, (unit_dimension, _) in _UNITS.items() if unit_dimension == expected
+    ]
+    if not possible_units:
+        hint = (
+            f"; did you mean '{suggestion}'?"
+            if (suggestion := _suggest_unit(unit, expected))
+            else ""
+        )
+        listed_units = (
+            sorted(units_of_dimension) if expected is not None else [*sorted(_UNITS)[:24], "..."]
+        )
+        raise UsageError(f"unknown unit '{unit}'{hint or '; valid: ' + ', '.join(listed_units)}")
+    if not matches:
         raise UsageError(
             f"unit '{unit}' does not measure [{expected}]; units that do:"
-            f" {', '.join(usual) or 'none'}"
+            f" {', '.join(units_of_dimension) or 'none'}"
         )
-    raise UsageError(f"unit '{unit}' may be {' or '.join(fitting)}; write the one that is meant")
+    raise UsageError(f"unit '{unit}' may be {' or '.join(matches)}; write the one that is meant")
 
 
 def is_unit(text: str) -> bool:
-    """Return whether a text is a unit that `known_unit` knows; no other name is looked for."""
-    return len({_UNITS[name] for name in _meant(text, None)[1]}) == 1
+    """Return whether a text is a unit that `canonical_unit` knows; no other name is looked for."""
+    return len({_UNITS[name] for name in _match_unit(text, None)[1]}) == 1
 
 
-def _meant(unit: str, expected: str | None) -> tuple[tuple[str, ...], list[str]]:
+def _match_unit(unit: str, expected: str | None) -> tuple[tuple[str, ...], list[str]]:
     """Return the units that a spelling may mean, and those of them that measure `expected`."""
-    exact, folded = _spellings()
-    text = _tidy(unit)
-    meant: tuple[str, ...] = ()
-    fitting: list[str] = []
-    for spellings, written in ((exact, text), (folded, text.casefold())):
-        meant = meant or spellings.get(written, ())
-        fitting = fitting or [
-            name for name in spellings.get(written, ()) if expected in (None, _UNITS[name][0])
+    exact, casefolded = _units_of_spelling()
+    unit_text = _normalise_unit_text(unit)
+    possible_units: tuple[str, ...] = ()
+    matches: list[str] = []
+    for spellings, spelling in ((exact, unit_text), (casefolded, unit_text.casefold())):
+        possible_units = possible_units or spellings.get(spelling, ())
+        matches = matches or [
+            name for name in spellings.get(spelling, ()) if expected in (None, _UNITS[name][0])
         ]
-    return meant, fitting
+    return possible_units, matches
 
 
-def _tidy(unit: str) -> str:
+def _normalise_unit_text(unit: str) -> str:
     """Return a unit with its blanks, powers and quotients in one style."""
-    text = " ".join(unit.split())
-    for written, power in _POWERS.items():
-        text = text.replace(written, power)
-    text = re.sub(r"\s*(?:/|\bper\b|\bpro\b|\bpar\b|\bpor\b|毎)\s*", "/", text)
+    unit_text = " ".join(unit.split())
+    for spelling, exponent in _POWER_SPELLINGS.items():
+        unit_text = unit_text.replace(spelling, exponent)
+    unit_text = re.sub(r"\s*(?:/|\bper\b|\bpro\b|\bpar\b|\bpor\b|毎)\s*", "/", unit_text)
     # `m s-1`, `m.s^-1` and `min-1` are quotients
-    quotient = re.fullmatch(r"(?:(.+?)[ .·*])?([^\W\d_]+)\^?-([12])", text)
+    quotient = re.fullmatch(r"(?:(.+?)[ .·*])?([^\W\d_]+)\^?-([12])", unit_text)
     if quotient is not None:
-        above, below, power = quotient.groups()
-        text = f"{above or 1}/{below}" + ("^2" if power == "2" else "")
-    return re.sub(r"(?<=[a-z])2$", "^2", text)
+        numerator, denominator, exponent = quotient.groups()
+        unit_text = f"{numerator or 1}/{denominator}" + ("^2" if exponent == "2" else "")
+    return re.sub(r"(?<=[a-z])2$", "^2", unit_text)
 
 
 @cache
-def _spellings() -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
+def _units_of_spelling() -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
     """Return what may be written for each unit, with and without regard to case."""
     exact: dict[str, list[str]] = {}
-    for text, unit in _written():
+    for text, unit in _iterate_spellings():
         if unit not in exact.setdefault(text, []):
             exact[text].append(unit)
-    folded: dict[str, list[str]] = {}
-    for text, meant in exact.items():
-        entry = folded.setdefault(text.casefold(), [])
-        entry += [unit for unit in meant if unit not in entry]
+    casefolded: dict[str, list[str]] = {}
+    for text, possible_units in exact.items():
+        folded_units = casefolded.setdefault(text.casefold(), [])
+        folded_units += [unit for unit in possible_units if unit not in folded_units]
     return (
-        {text: tuple(meant) for text, meant in exact.items()},
-        {text: tuple(meant) for text, meant in folded.items()},
+        {text: tuple(possible_units) for text, possible_units in exact.items()},
+        {text: tuple(possible_units) for text, possible_units in casefolded.items()},
     )
 
 
-def _written() -> Iterator[tuple[str, str]]:
+def _iterate_spellings() -> Iterator[tuple[str, str]]:
     """Yield (text, unit) for every spelling."""
     for unit in _UNITS:
         yield unit, unit
-        for word in _WORDS.get(unit, "").split():
-            yield word, unit
-        above, slash, below = unit.partition("/")
+        for spelling in _SPELLINGS_OF_UNIT.get(unit, "").split():
+            yield spelling, unit
+        numerator, slash, denominator = unit.partition("/")
         if not slash:
             continue
         # a power stays behind the word that it belongs to
-        below, caret, power = below.partition("^")
-        tops = [above, *_WORDS.get(above, "").split()] if above in _PARTS else [above]
-        tops += _TURNS.split() if above == "1" and not power else []
-        for top, bottom in itertools.product(tops, [below, *_WORDS.get(below, "").split()]):
-            yield f"{top}/{bottom}{caret}{power}", unit
+        denominator, caret, exponent = denominator.partition("^")
+        numerators = (
+            [numerator, *_SPELLINGS_OF_UNIT.get(numerator, "").split()]
+            if numerator in _QUOTIENT_PARTS
+            else [numerator]
+        )
+        numerators += _REVOLUTION_SPELLINGS.split() if numerator == "1" and not exponent else []
+        for numerator_text, denominator_text in itertools.product(
+            numerators, [denominator, *_SPELLINGS_OF_UNIT.get(denominator, "").split()]
+        ):
+            yield f"{numerator_text}/{denominator_text}{caret}{exponent}", unit
 
 
-def _near(unit: str, expected: str | None) -> str | None:
+def _suggest_unit(unit: str, expected: str | None) -> str | None:
     """Return the spelling that a text is a slip of the pen of; None where there is no single one.
 
     What can be read in the text must stay as it is: `deg/m` is never taken for `deg/s`.
     """
-    exact, _ = _spellings()
-    text = _tidy(unit)
-    wanted = [
+    exact, _ = _units_of_spelling()
+    unit_text = _normalise_unit_text(unit)
+    allowed_spellings = [
         spelling
-        for spelling, meant in exact.items()
-        if any(expected in (None, _UNITS[name][0]) for name in meant)
+        for spelling, possible_units in exact.items()
+        if any(expected in (None, _UNITS[name][0]) for name in possible_units)
     ]
-    close = [
+    close_spellings = [
         spelling
-        for spelling in difflib.get_close_matches(text, wanted, n=6, cutoff=0.6)
-        if sorted(spelling) == sorted(text) or _one_word_differs(spelling, text)
+        for spelling in difflib.get_close_matches(unit_text, allowed_spellings, n=6, cutoff=0.6)
+        if sorted(spelling) == sorted(unit_text) or _differs_in_one_word(spelling, unit_text)
     ]
     # swapped letters are likelier than another word
-    close = [spelling for spelling in close if sorted(spelling) == sorted(text)] or close
-    factors = {_UNITS[name][1] for spelling in close for name in exact[spelling]}
-    return exact[close[0]][0] if len(factors) == 1 else None
+    close_spellings = [
+        spelling for spelling in close_spellings if sorted(spelling) == sorted(unit_text)
+    ] or close_spellings
+    factors = {_UNITS[name][1] for spelling in close_spellings for name in exact[spelling]}
+    return exact[close_spellings[0]][0] if len(factors) == 1 else None
 
 
-def _one_word_differs(spelling: str, text: str) -> bool:
+def _differs_in_one_word(spelling: str, text: str) -> bool:
     """Return whether one part of a quotient differs, by little: a word of three letters or more."""
-    a, b = spelling.casefold().split("/"), text.casefold().split("/")
-    if len(a) != len(b):
+    spelling_parts, text_parts = spelling.casefold().split("/"), text.casefold().split("/")
+    if len(spelling_parts) != len(text_parts):
         return False
-    other = [(x, y) for x, y in zip(a, b, strict=True) if x != y]
-    if len(other) != 1 or min(len(part) for part in other[0]) < 3:
+    different_parts = [
+        (spelling_part, text_part)
+        for spelling_part, text_part in zip(spelling_parts, text_parts, strict=True)
+        if spelling_part != text_part
+    ]
+    if len(different_parts) != 1 or min(len(part) for part in different_parts[0]) < 3:
         return False
-    x, y = other[0]
-    return x[0] == y[0] and difflib.SequenceMatcher(None, x, y).ratio() >= 0.75
+    spelling_part, text_part = different_parts[0]
+    return (
+        spelling_part[0] == text_part[0]
+        and difflib.SequenceMatcher(None, spelling_part, text_part).ratio() >= 0.75
+    )

@@ -10,16 +10,16 @@ from pydantic import Field
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.data.masks import HARD
-from residnet.data.readers.base import unwrap
+from residnet.data.masks import HARD_PREFIX
+from residnet.data.readers.base import unwrap_angle
 
 # share of a step within which a sample counts as lying on the grid
-_ON_GRID = 1e-3
+_GRID_TOLERANCE = 1e-3
 # share of a time step within which a grid point is a sample, so that rounding of the clock does not
 # drag in the neighbour
-_AT_SAMPLE = 1e-5
+_SAMPLE_TOLERANCE = 1e-5
 # grid points per sample beyond which the clock or its unit must be wrong
-_MOST_POINTS = 1000
+_MAX_POINTS_PER_SAMPLE = 1000
 
 
 class GridConfig(Config):
@@ -38,12 +38,14 @@ class GridConfig(Config):
     longest_gap: Seconds | None = Field(default=None, gt=0.0)
 
 
-def align(log: Log, config: GridConfig, needed: Collection[str] | None = None) -> Log:
+def align_to_grid(
+    log: Log, config: GridConfig, required_channels: Collection[str] | None = None
+) -> Log:
     """Return the log on the grid.
 
     Args:
         log: with an increasing clock.
-        needed: channels without which a sample is missing; all where None. What nobody uses must
+        required_channels: channels without which a sample is missing; all where None. What nobody uses must
             cost no sample.
 
     A log that lies on the grid to a thousandth of a step keeps its times and samples exactly. Where
@@ -67,167 +69,222 @@ def align(log: Log, config: GridConfig, needed: Collection[str] | None = None) -
         )
     for name in config.held:
         log[name]
-    count = int(np.floor((log.t[-1] - log.t[0]) / config.step + _ON_GRID)) + 1
-    if count > _MOST_POINTS * len(log):
+    n_points = int(np.floor((log.t[-1] - log.t[0]) / config.step + _GRID_TOLERANCE)) + 1
+    if n_points > _MAX_POINTS_PER_SAMPLE * len(log):
         raise DataError(
             f"log {log.name}: a grid of {config.step:g} s from {log.t[0]:g} to {log.t[-1]:g} s has"
-            f" {count} points for {len(log)} samples; check the unit of time, or split the log"
+            f" {n_points} points for {len(log)} samples; check the unit of time, or split the log"
             " where its clock jumps"
         )
-    grid = log.t[0] + config.step * np.arange(count)
-    if count == len(log) and float(np.abs(log.t - grid).max()) <= _ON_GRID * config.step:
-        out = log
+    grid = log.t[0] + config.step * np.arange(n_points)
+    if n_points == len(log) and float(np.abs(log.t - grid).max()) <= _GRID_TOLERANCE * config.step:
+        gridded = log
     else:
-        out = _resampled(log, config, grid)
-    names = [name for name in out.channels if needed is None or name in needed]
-    missing = np.isnan(out.stack(names)).any(axis=1)
-    if not missing.any():
-        return out
-    reason = HARD + "gap"
-    return out.replace(
-        masks={**out.masks, reason: out.masks.get(reason, np.zeros(len(out), dtype=bool)) | missing}
+        gridded = _resample(log, config, grid)
+    names = [
+        name for name in gridded.channels if required_channels is None or name in required_channels
+    ]
+    is_missing = np.isnan(gridded.stack(names)).any(axis=1)
+    if not is_missing.any():
+        return gridded
+    mask_reason = HARD_PREFIX + "gap"
+    return gridded.replace(
+        masks={
+            **gridded.masks,
+            mask_reason: gridded.masks.get(mask_reason, np.zeros(len(gridded), dtype=bool))
+            | is_missing,
+        }
     )
 
 
-def onto(log: Log, config: GridConfig, times: np.ndarray) -> Log:
-    """Return the log at given times [G], increasing, in s on its clock, by the rules of `align`.
+def resample_at(log: Log, config: GridConfig, times: np.ndarray) -> Log:
+    """Return the log at given times [G], increasing, in s on its clock, by the rules of `align_to_grid`.
 
     NaN before its first sample and after its last.
 
     The length that is averaged over is the config's step.
     """
-    out = _resampled(log, config, times)
-    margin = _ON_GRID * config.step
-    outside = (times < log.t[0] - margin) | (times > log.t[-1] + margin)
-    channels = {name: np.where(outside, np.nan, values) for name, values in out.channels.items()}
-    return out.replace(channels=channels, masks={})
+    resampled = _resample(log, config, times)
+    margin = _GRID_TOLERANCE * config.step
+    is_outside = (times < log.t[0] - margin) | (times > log.t[-1] + margin)
+    channels = {
+        name: np.where(is_outside, np.nan, values) for name, values in resampled.channels.items()
+    }
+    return resampled.replace(channels=channels, masks={})
 
 
-def _resampled(log: Log, config: GridConfig, grid: np.ndarray) -> Log:
-    usual = float(np.median(np.diff(log.t)))
-    longest = config.longest_gap if config.longest_gap is not None else 3.0 * usual
-    gap = np.diff(log.t) > longest * (1.0 + _ON_GRID)
-    averaged = config.step >= 2.0 * usual * (1.0 - _ON_GRID)
-    half = (
+def _resample(log: Log, config: GridConfig, grid: np.ndarray) -> Log:
+    median_step = float(np.median(np.diff(log.t)))
+    longest_gap = config.longest_gap if config.longest_gap is not None else 3.0 * median_step
+    is_gap = np.diff(log.t) > longest_gap * (1.0 + _GRID_TOLERANCE)
+    is_averaged = config.step >= 2.0 * median_step * (1.0 - _GRID_TOLERANCE)
+    half_window = (
         np.minimum(
             0.5 * config.step, np.maximum(np.minimum(grid - log.t[0], log.t[-1] - grid), 0.0)
         )
-        if averaged
+        if is_averaged
         else np.zeros_like(grid)
     )
-    smooth, held = _Reach(log.t, grid, half, gap), _Reach(log.t, grid, np.zeros_like(grid), gap)
-    names = tuple(log.channels)
-    continuous = np.stack(
-        [unwrap(log[name]) if log.units[name] == "rad" else log[name] for name in names], axis=-1
+    averaging_weights, held_weights = (
+        _GridWeights(log.t, grid, half_window, is_gap),
+        _GridWeights(log.t, grid, np.zeros_like(grid), is_gap),
     )
-    is_held = np.array([name in config.held for name in names], dtype=bool)
+    channel_names = tuple(log.channels)
+    continuous = np.stack(
+        [
+            unwrap_angle(log[name]) if log.units[name] == "rad" else log[name]
+            for name in channel_names
+        ],
+        axis=-1,
+    )
+    is_held = np.array([name in config.held for name in channel_names], dtype=bool)
     # a NaN would poison the whole running integral: zeros stand in for it, and every point that
     # they reach is blanked below
-    values = np.where(is_held, held.previous(continuous), smooth.mean(np.nan_to_num(continuous)))
-    missing = np.isnan(continuous)
-    values[np.where(is_held, held.broken(missing), smooth.broken(missing))] = np.nan
+    values = np.where(
+        is_held,
+        held_weights.hold_previous(continuous),
+        averaging_weights.average(np.nan_to_num(continuous)),
+    )
+    is_missing = np.isnan(continuous)
+    values[
+        np.where(
+            is_held,
+            held_weights.is_unreliable(is_missing),
+            averaging_weights.is_unreliable(is_missing),
+        )
+    ] = np.nan
     channels = {
-        name: _rewrapped(log[name], continuous[:, i], values[:, i]) for i, name in enumerate(names)
+        name: _rewrap(log[name], continuous[:, i], values[:, i])
+        for i, name in enumerate(channel_names)
     }
-    masks = {reason: smooth.touched(mask[:, None])[:, 0] for reason, mask in log.masks.items()}
+    masks = {
+        reason: averaging_weights.any_weighted(mask[:, None])[:, 0]
+        for reason, mask in log.masks.items()
+    }
     meta = {
         **log.meta,
         "grid": {
             "step": config.step,
-            "longest_gap": longest,
-            "averaged": bool(averaged),
+            "longest_gap": longest_gap,
+            "averaged": bool(is_averaged),
             "samples_before": len(log),
         },
     }
     return log.replace(t=grid, channels=channels, masks=masks, meta=meta)
 
 
-class _Reach:
+class _GridWeights:
     """Which samples enter each point of a grid, and their weights.
 
     Args:
         t: sample times [T], s.
         grid: grid points [G], s.
-        half: half the length [G] that a point is averaged over, s; zero interpolates.
-        gap: [T - 1] bool, time steps that must not be bridged.
+        half_window: half the length [G] that a point is averaged over, s; zero interpolates.
+        is_gap: [T - 1] bool, time steps that must not be bridged.
     """
 
-    def __init__(self, t: np.ndarray, grid: np.ndarray, half: np.ndarray, gap: np.ndarray) -> None:
-        self._t, self._gap = t, gap
-        self._low, self._w_low = self._place(grid - half)
-        self._high, self._w_high = self._place(grid + half)
+    def __init__(
+        self, t: np.ndarray, grid: np.ndarray, half_window: np.ndarray, is_gap: np.ndarray
+    ) -> None:
+        self._t, self._is_gap = t, is_gap
+        self._window_start, self._start_weight = self._locate(grid - half_window)
+        self._window_end, self._end_weight = self._locate(grid + half_window)
         # first and last sample that carry weight
-        self._first = self._low + (self._w_low == 1.0)
-        self._last = self._high + (self._w_high > 0.0)
+        self._first_weighted = self._window_start + (self._start_weight == 1.0)
+        self._last_weighted = self._window_end + (self._end_weight > 0.0)
 
-    def _place(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _locate(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the index of the sample before each time, and the share of the way to the next."""
-        left = np.clip(np.searchsorted(self._t, at, side="right") - 1, 0, self._t.size - 2)
-        weight = np.clip((at - self._t[left]) / (self._t[left + 1] - self._t[left]), 0.0, 1.0)
-        return left, np.where(
-            weight < _AT_SAMPLE, 0.0, np.where(weight > 1.0 - _AT_SAMPLE, 1.0, weight)
+        previous_index = np.clip(
+            np.searchsorted(self._t, times, side="right") - 1, 0, self._t.size - 2
+        )
+        fraction = np.clip(
+            (times - self._t[previous_index])
+            / (self._t[previous_index + 1] - self._t[previous_index]),
+            0.0,
+            1.0,
+        )
+        return previous_index, np.where(
+            fraction < _SAMPLE_TOLERANCE,
+            0.0,
+            np.where(fraction > 1.0 - _SAMPLE_TOLERANCE, 1.0, fraction),
         )
 
-    def previous(self, x: np.ndarray) -> np.ndarray:
+    def hold_previous(self, x: np.ndarray) -> np.ndarray:
         """Return the last value at or before each grid point, [G, n] from [T, n]."""
-        held: np.ndarray = x[self._low + (self._w_low == 1.0)]
-        return held
+        held_values: np.ndarray = x[self._window_start + (self._start_weight == 1.0)]
+        return held_values
 
-    def mean(self, x: np.ndarray) -> np.ndarray:
+    def average(self, values: np.ndarray) -> np.ndarray:
         """Return the mean of the linear interpolant over each point's reach, [G, n] from [T, n]."""
         # without its mean the running integral keeps its digits for positions far from the origin
-        offset = x.mean(axis=0)
-        centred, dt = x - offset, np.diff(self._t)[:, None]
-        area = np.concatenate(
-            [np.zeros((1, x.shape[1])), np.cumsum(0.5 * dt * (centred[1:] + centred[:-1]), axis=0)]
+        mean_value = values.mean(axis=0)
+        centred_values, dt = values - mean_value, np.diff(self._t)[:, None]
+        cumulative_integral = np.concatenate(
+            [
+                np.zeros((1, values.shape[1])),
+                np.cumsum(0.5 * dt * (centred_values[1:] + centred_values[:-1]), axis=0),
+            ]
         )
 
-        def integral(left: np.ndarray, weight: np.ndarray) -> np.ndarray:
-            w, a, b = weight[:, None], centred[left], centred[left + 1]
-            integral: np.ndarray = area[left] + dt[left] * w * (a + 0.5 * w * (b - a))
-            return integral
+        def integral(previous_index: np.ndarray, weight: np.ndarray) -> np.ndarray:
+            weights, left_values, right_values = (
+                weight[:, None],
+                centred_values[previous_index],
+                centred_values[previous_index + 1],
+            )
+            integral_values: np.ndarray = cumulative_integral[previous_index] + dt[
+                previous_index
+            ] * weights * (left_values + 0.5 * weights * (right_values - left_values))
+            return integral_values
 
-        w = self._w_low[:, None]
-        point = np.where(
-            w == 1.0, x[self._low + 1], x[self._low] + w * (x[self._low + 1] - x[self._low])
+        start_weight = self._start_weight[:, None]
+        interpolated = np.where(
+            start_weight == 1.0,
+            values[self._window_start + 1],
+            values[self._window_start]
+            + start_weight * (values[self._window_start + 1] - values[self._window_start]),
         )
-        span = (self._t[self._high] + self._w_high * dt[self._high, 0]) - (
-            self._t[self._low] + self._w_low * dt[self._low, 0]
-        )
-        wide = span > 0.0
-        mean = (integral(self._high, self._w_high) - integral(self._low, self._w_low)) / np.where(
-            wide, span, 1.0
-        )[:, None] + offset
-        means: np.ndarray = np.where(wide[:, None], mean, point)
+        window_duration = (
+            self._t[self._window_end] + self._end_weight * dt[self._window_end, 0]
+        ) - (self._t[self._window_start] + self._start_weight * dt[self._window_start, 0])
+        is_window = window_duration > 0.0
+        averages = (
+            integral(self._window_end, self._end_weight)
+            - integral(self._window_start, self._start_weight)
+        ) / np.where(is_window, window_duration, 1.0)[:, None] + mean_value
+        means: np.ndarray = np.where(is_window[:, None], averages, interpolated)
         return means
 
-    def touched(self, flags: np.ndarray) -> np.ndarray:
+    def any_weighted(self, flags: np.ndarray) -> np.ndarray:
         """Return [G, k] bool: any flagged sample carries weight; flags [T, k]."""
-        return _any_between(flags, self._first, self._last + 1)
+        return _any_in_ranges(flags, self._first_weighted, self._last_weighted + 1)
 
-    def broken(self, missing: np.ndarray) -> np.ndarray:
+    def is_unreliable(self, is_missing: np.ndarray) -> np.ndarray:
         """Return [G, n] bool: a missing sample carries weight, or the reach crosses a gap."""
-        untrusted: np.ndarray = self.touched(missing) | _any_between(
-            self._gap[:, None], self._first, self._last
+        unreliable: np.ndarray = self.any_weighted(is_missing) | _any_in_ranges(
+            self._is_gap[:, None], self._first_weighted, self._last_weighted
         )
-        return untrusted
+        return unreliable
 
 
-def _any_between(flags: np.ndarray, first: np.ndarray, stop: np.ndarray) -> np.ndarray:
+def _any_in_ranges(flags: np.ndarray, starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
     """Return [G, k] bool: any of flags[first:stop], for index arrays [G]."""
-    count = np.concatenate(
+    cumulative_flags = np.concatenate(
         [np.zeros((1, flags.shape[1]), dtype=np.int64), np.cumsum(flags, axis=0)]
     )
-    between: np.ndarray = count[stop] > count[first]
-    return between
+    has_flag: np.ndarray = cumulative_flags[stops] > cumulative_flags[starts]
+    return has_flag
 
 
-def _rewrapped(original: np.ndarray, continuous: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _rewrap(
+    original_values: np.ndarray, unwrapped_values: np.ndarray, grid_values: np.ndarray
+) -> np.ndarray:
     """Return the grid values [G] in the range of the original channel [T].
 
     Unwrapping may have left that range.
     """
-    if np.array_equal(original, continuous, equal_nan=True):
-        return values
-    low = 0.0 if np.nanmin(original) >= 0.0 else -np.pi
-    return np.remainder(values - low, 2.0 * np.pi) + low
+    if np.array_equal(original_values, unwrapped_values, equal_nan=True):
+        return grid_values
+    lower_bound = 0.0 if np.nanmin(original_values) >= 0.0 else -np.pi
+    return np.remainder(grid_values - lower_bound, 2.0 * np.pi) + lower_bound

@@ -15,10 +15,10 @@ from pydantic import Field
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError
-from residnet.core.stretches import stretches
+from residnet.core.stretches import find_runs
 
 
-class Derivative(Config, ABC):
+class DerivativeRule(Config, ABC):
     """A rule that smooths and differentiates channels on a uniform grid.
 
     Where it has no smoother the values stay as they are, and where it has no rate of its own that
@@ -26,7 +26,7 @@ class Derivative(Config, ABC):
     """
 
     def derive(
-        self, values: np.ndarray, step: float, pieces: np.ndarray
+        self, values: np.ndarray, dt: float, segments: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the smoothed values and their rates.
 
@@ -35,8 +35,8 @@ class Derivative(Config, ABC):
 
         Args:
             values: channels [T, n], SI, angles unwrapped.
-            step: time between samples, s.
-            pieces: number of each sample's piece [T] int, -1 for samples of none
+            dt: time between samples, s.
+            segments: number of each sample's piece [T] int, -1 for samples of none
                 (`residnet.data.masks.segments`).
 
         Returns:
@@ -46,18 +46,20 @@ class Derivative(Config, ABC):
         Raises:
             ConfigError: where a window or cut-off does not go with the step.
         """
-        shortest = self.shortest(step)
-        smooth, rate = np.full(values.shape, np.nan), np.full(values.shape, np.nan)
-        runs = stretches(np.where(np.isfinite(values).all(axis=1), pieces, -1))
-        for start, stop in zip(*runs, strict=True):
-            part = slice(start, stop)
-            if stop - start >= shortest:
-                smooth[part], rate[part] = self.piece(values[part], step)
-        valid = np.isfinite(rate).all(axis=1)
-        smooth[~valid], rate[~valid] = np.nan, np.nan
-        return smooth, rate, valid
+        min_samples = self.min_samples(dt)
+        smoothed, rates = np.full(values.shape, np.nan), np.full(values.shape, np.nan)
+        segment_bounds = find_runs(np.where(np.isfinite(values).all(axis=1), segments, -1))
+        for start, stop in zip(*segment_bounds, strict=True):
+            segment_slice = slice(start, stop)
+            if stop - start >= min_samples:
+                smoothed[segment_slice], rates[segment_slice] = self.derive_segment(
+                    values[segment_slice], dt
+                )
+        is_valid = np.isfinite(rates).all(axis=1)
+        smoothed[~is_valid], rates[~is_valid] = np.nan, np.nan
+        return smoothed, rates, is_valid
 
-    def shortest(self, step: float) -> int:
+    def min_samples(self, dt: float) -> int:
         """Return fewest samples of a piece that the rule can treat.
 
         Raises:
@@ -65,15 +67,15 @@ class Derivative(Config, ABC):
         """
         return 2
 
-    def piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    def derive_segment(self, values: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the smoothed values and rates [T, n] of one piece, NaN where there is no rate."""
-        rate = np.full(values.shape, np.nan)
-        rate[:-1] = np.diff(values, axis=0)
-        return values, rate / step
+        rates = np.full(values.shape, np.nan)
+        rates[:-1] = np.diff(values, axis=0)
+        return values, rates / dt
 
 
 @final
-class SavitzkyGolay(Derivative):
+class SavitzkyGolay(DerivativeRule):
     """Savitzky-Golay smoothing: polynomials fitted to a moving window.
 
     The window is made an odd number of samples, rounded up.
@@ -90,55 +92,65 @@ class SavitzkyGolay(Derivative):
     window: Seconds = Field(default=1.5, gt=0.0)
     order: int = Field(default=2, ge=1)
 
-    def samples(self, step: float) -> int:
+    def n_window_samples(self, dt: float) -> int:
         """Return the samples in the window at a time step in s."""
-        return round(self.window / step) // 2 * 2 + 1
+        return round(self.window / dt) // 2 * 2 + 1
 
-    def shortest(self, step: float) -> int:
-        if self.samples(step) <= self.order:
-            needed = (self.order + 1 | 1) * step
+    def min_samples(self, dt: float) -> int:
+        if self.n_window_samples(dt) <= self.order:
+            min_window = (self.order + 1 | 1) * dt
             raise ConfigError(
-                f"savitzky_golay: a window of {self.window:g} s holds {self.samples(step)} samples"
-                f" of {step:g} s, order {self.order} needs more; set window to {needed:g} s or"
+                f"savitzky_golay: a window of {self.window:g} s holds {self.n_window_samples(dt)} samples"
+                f" of {dt:g} s, order {self.order} needs more; set window to {min_window:g} s or"
                 " longer"
             )
-        return self.samples(step)
+        return self.n_window_samples(dt)
 
-    def piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-        return local_polynomials(values, self.samples(step), self.order, step)
+    def derive_segment(self, values: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        return fit_local_polynomials(values, self.n_window_samples(dt), self.order, dt)
 
 
-def local_polynomials(
-    values: np.ndarray, size: int, order: int, step: float
+def fit_local_polynomials(
+    values: np.ndarray, window_samples: int, order: int, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return values [T, n] smoothed by polynomials over `size` samples, an odd number, and rates.
+    """Return values [T, n] smoothed by polynomials over `window_samples` samples, an odd number, and rates.
 
     As scipy.signal.savgol_filter, whose import takes longer than most checks of a config. The rates
     are per s for a step in s.
     """
-    half = size // 2
-    powers, fit, slopes = _fitting(size, order)
-    first, last = fit @ values[:size], fit @ values[-size:]
-    out = []
-    for rows in (powers, slopes / (half * step)):
-        weights = rows[half] @ fit
-        inner = [np.correlate(column, weights, "valid") for column in values.T]
-        ends = rows[:half] @ first, rows[half + 1 :] @ last
-        out.append(np.concatenate((ends[0], np.stack(inner, axis=1), ends[1])))
-    return out[0], out[1]
+    half_window = window_samples // 2
+    vandermonde, pseudo_inverse, vandermonde_slopes = _polynomial_matrices(window_samples, order)
+    first_coefficients, last_coefficients = (
+        pseudo_inverse @ values[:window_samples],
+        pseudo_inverse @ values[-window_samples:],
+    )
+    results = []
+    for evaluation_matrix in (vandermonde, vandermonde_slopes / (half_window * dt)):
+        weights = evaluation_matrix[half_window] @ pseudo_inverse
+        inner_values = [np.correlate(column, weights, "valid") for column in values.T]
+        boundary_values = (
+            evaluation_matrix[:half_window] @ first_coefficients,
+            evaluation_matrix[half_window + 1 :] @ last_coefficients,
+        )
+        results.append(
+            np.concatenate((boundary_values[0], np.stack(inner_values, axis=1), boundary_values[1]))
+        )
+    return results[0], results[1]
 
 
 @cache
-def _fitting(size: int, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _polynomial_matrices(
+    window_samples: int, order: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return powers [size, order + 1] of places from -1 to 1, their inverse and their slopes."""
-    powers = np.vander(np.linspace(-1.0, 1.0, size), order + 1, increasing=True)
-    slopes = np.zeros_like(powers)
-    slopes[:, 1:] = powers[:, :-1] * np.arange(1, order + 1)
-    return powers, np.linalg.pinv(powers), slopes
+    vandermonde = np.vander(np.linspace(-1.0, 1.0, window_samples), order + 1, increasing=True)
+    vandermonde_slopes = np.zeros_like(vandermonde)
+    vandermonde_slopes[:, 1:] = vandermonde[:, :-1] * np.arange(1, order + 1)
+    return vandermonde, np.linalg.pinv(vandermonde), vandermonde_slopes
 
 
 @final
-class ForwardDifference(Derivative):
+class ForwardDifference(DerivativeRule):
     """The difference to the next sample; values are not smoothed.
 
     The last sample of a piece is invalid.

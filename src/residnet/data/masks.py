@@ -4,7 +4,7 @@ A mask is stored in `Log.masks` under its reason, the kind with a prefix that sa
 
 * `hard:<kind>`: the log is split there; nothing is simulated, filtered or learned across.
 * `<kind>`: simulated across, but neither scored nor learned from.
-* `rate:<kind>`: only the derivatives there are biased; free runs may be scored (`scored`), one-step
+* `rate:<kind>`: only the derivatives there are biased; free runs may be scored (`find_scored_samples`), one-step
 fits leave the samples out (`Log.usable`).
 """
 
@@ -19,32 +19,32 @@ from pydantic import Field
 
 from residnet.core.config import Config, Seconds
 from residnet.core.log import Log
-from residnet.core.stretches import stretch_numbers, stretches
+from residnet.core.stretches import find_runs, number_runs
 from residnet.data.channels import (
     SIGMA_OF_MAD,
-    covered,
-    far_from_medians,
-    spike_cells,
-    steps_above,
-    usual_interval,
+    find_hampel_outliers,
+    find_spikes,
+    find_steps_above,
+    mask_from_ranges,
+    median_update_interval,
 )
-from residnet.data.readers.base import unwrap
+from residnet.data.readers.base import unwrap_angle
 
-HARD = "hard:"
-RATE = "rate:"
-DEAD_COMMANDS = f"{HARD}dead_commands"
+HARD_PREFIX = "hard:"
+RATE_PREFIX = "rate:"
+UNEXPLAINED_IDLE = f"{HARD_PREFIX}dead_commands"
 """Reason of what no recorded input explains while all inputs rest (see `PrepareConfig`)."""
 
 
-class Mask(Config, ABC):
+class MaskRule(Config, ABC):
     """A rule that marks samples of a log."""
 
     prefix: ClassVar[str] = ""
 
     @property
-    def hard(self) -> bool:
+    def is_hard(self) -> bool:
         """Whether the log is split at marked samples."""
-        return self.prefix == HARD
+        return self.prefix == HARD_PREFIX
 
     @property
     def reason(self) -> str:
@@ -61,7 +61,7 @@ class Mask(Config, ABC):
 
 
 @final
-class Frozen(Mask):
+class FrozenMask(MaskRule):
     """A receiver that holds its last fix: all `channels` bit-identical over several steps.
 
     Where a slow receiver repeats each value until its next one, a step is the time between these.
@@ -82,23 +82,25 @@ class Frozen(Mask):
 
     def apply(self, log: Log) -> np.ndarray:
         values = log.stack(self.channels)
-        starts, stops = stretches((np.diff(values, axis=0) == 0.0).all(axis=1))
-        long = stops - starts >= self.samples * usual_interval(values)
-        starts, last = starts[long], stops[long]
+        starts, stops = find_runs((np.diff(values, axis=0) == 0.0).all(axis=1))
+        is_long = stops - starts >= self.samples * median_update_interval(values)
+        starts, last_indices = starts[is_long], stops[is_long]
         # half a step of margin keeps `after` a whole number of samples in spite of rounding in t
-        ends = np.searchsorted(log.t, log.t[last] + self.after - 0.5 * _step(log.t))
-        return covered(len(log), starts, np.maximum(ends, last + 1))
+        mask_ends = np.searchsorted(
+            log.t, log.t[last_indices] + self.after - 0.5 * _median_time_step(log.t)
+        )
+        return mask_from_ranges(len(log), starts, np.maximum(mask_ends, last_indices + 1))
 
 
 @final
-class Gap(Mask):
+class GapMask(MaskRule):
     """Time steps longer than `longest`; the first sample after each is the one marked.
 
     Attributes:
         longest: longest time step that is no gap, in s.
     """
 
-    prefix: ClassVar[str] = HARD
+    prefix: ClassVar[str] = HARD_PREFIX
     kind: Literal["gap"] = "gap"
     longest: Seconds = Field(gt=0.0)
 
@@ -107,24 +109,26 @@ class Gap(Mask):
 
 
 @final
-class Missing(Mask):
+class MissingValues(MaskRule):
     """NaN in any of `channels` (all channels where empty).
 
     Attributes:
         channels: to look at; all where empty.
     """
 
-    prefix: ClassVar[str] = HARD
+    prefix: ClassVar[str] = HARD_PREFIX
     kind: Literal["nan"] = "nan"
     channels: tuple[str, ...] = ()
 
     def apply(self, log: Log) -> np.ndarray:
-        missing: np.ndarray = np.isnan(log.stack(self.channels or tuple(log.channels))).any(axis=1)
-        return missing
+        is_missing: np.ndarray = np.isnan(log.stack(self.channels or tuple(log.channels))).any(
+            axis=1
+        )
+        return is_missing
 
 
 @final
-class Jump(Mask):
+class JumpMask(MaskRule):
     """Differences of more than `limit` in `channel` (SI, per sample; angles the short way round).
 
     Marked are the `before` last samples ahead of the difference and the `after` first ones past it.
@@ -143,12 +147,12 @@ class Jump(Mask):
     after: int = Field(default=1, ge=0)
 
     def apply(self, log: Log) -> np.ndarray:
-        landed = steps_above(log, self.channel, self.limit)
-        return covered(len(log), landed - self.before, landed + self.after)
+        jump_indices = find_steps_above(log, self.channel, self.limit)
+        return mask_from_ranges(len(log), jump_indices - self.before, jump_indices + self.after)
 
 
 @final
-class Outlier(Mask):
+class OutlierMask(MaskRule):
     """Samples many standard deviations away from the moving average of their neighbours.
 
     Attributes:
@@ -171,30 +175,32 @@ class Outlier(Mask):
     samples: int = Field(default=10, ge=4)
 
     def apply(self, log: Log) -> np.ndarray:
-        return _each(log, self.channels, self._outliers)
+        return _apply_per_channel(log, self.channels, self.find_outliers)
 
-    def _outliers(self, channel: np.ndarray) -> np.ndarray:
+    def find_outliers(self, channel: np.ndarray) -> np.ndarray:
         """Return [T] bool for a channel [T]."""
-        out, known = np.zeros(channel.size, dtype=bool), np.isfinite(channel)
-        values = channel[known]
+        is_outlier, is_finite = np.zeros(channel.size, dtype=bool), np.isfinite(channel)
+        values = channel[is_finite]
         if values.size <= self.samples:
-            return out
-        count = np.arange(values.size)
-        first = np.clip(count - self.samples // 2, 0, values.size - self.samples - 1)
-        windows = np.lib.stride_tricks.sliding_window_view(values, self.samples + 1)[first]
-        itself = np.arange(self.samples + 1) == (count - first)[:, None]
-        others = windows[~itself].reshape(values.size, self.samples)
-        deviation = np.abs(values - others.mean(axis=1))
-        common = SIGMA_OF_MAD * float(np.median(deviation))
+            return is_outlier
+        indices = np.arange(values.size)
+        first_neighbours = np.clip(indices - self.samples // 2, 0, values.size - self.samples - 1)
+        windows = np.lib.stride_tricks.sliding_window_view(values, self.samples + 1)[
+            first_neighbours
+        ]
+        is_centre = np.arange(self.samples + 1) == (indices - first_neighbours)[:, None]
+        neighbours = windows[~is_centre].reshape(values.size, self.samples)
+        deviations = np.abs(values - neighbours.mean(axis=1))
+        typical_deviation = SIGMA_OF_MAD * float(np.median(deviations))
         # a spread at the level of rounding is none
         floor = 1e-9 * float(np.abs(values).max())
-        spread = np.maximum(others.std(axis=1, ddof=1), max(common, floor))
-        out[known] = deviation > self.sigmas * spread
-        return out
+        neighbour_std = np.maximum(neighbours.std(axis=1, ddof=1), max(typical_deviation, floor))
+        is_outlier[is_finite] = deviations > self.sigmas * neighbour_std
+        return is_outlier
 
 
 @final
-class Hampel(Mask):
+class HampelMask(MaskRule):
     """Samples that stand out of their neighbours by many robust standard deviations.
 
     This is the Hampel filter (Pearson, 2002).
@@ -218,15 +224,15 @@ class Hampel(Mask):
     samples: int = Field(default=11, ge=5)
 
     def apply(self, log: Log) -> np.ndarray:
-        return _each(
+        return _apply_per_channel(
             log,
             self.channels,
-            lambda values: far_from_medians([values], self.sigmas, self.samples)[0],
+            lambda values: find_hampel_outliers([values], self.sigmas, self.samples)[0],
         )
 
 
 @final
-class Spike(Mask):
+class SpikeMask(MaskRule):
     """Single samples, or pairs, that leave all others and return at once.
 
     Every run leaves them out by itself (`residnet.data.channels.spike_cells`).
@@ -235,12 +241,14 @@ class Spike(Mask):
     kind: Literal["spike"] = "spike"
 
     def apply(self, log: Log) -> np.ndarray:
-        cells = spike_cells(log)
-        return np.asarray(np.logical_or.reduce([np.zeros(len(log), dtype=bool), *cells.values()]))
+        spikes_by_channel = find_spikes(log)
+        return np.asarray(
+            np.logical_or.reduce([np.zeros(len(log), dtype=bool), *spikes_by_channel.values()])
+        )
 
 
 @final
-class InputJump(Mask):
+class InputJumpMask(MaskRule):
     """Steps of the inputs of more than `limit` per sample, with the seconds around them.
 
     A smoothed derivative spreads the response to a step over the time before it, so that the
@@ -253,7 +261,7 @@ class InputJump(Mask):
         after: seconds behind it that are masked.
     """
 
-    prefix: ClassVar[str] = RATE
+    prefix: ClassVar[str] = RATE_PREFIX
     kind: Literal["input_jump"] = "input_jump"
     channels: tuple[str, ...] = Field(min_length=1)
     limit: float = Field(gt=0.0)
@@ -261,21 +269,30 @@ class InputJump(Mask):
     after: Seconds = Field(ge=0.0)
 
     def apply(self, log: Log) -> np.ndarray:
-        landed = np.concatenate([steps_above(log, name, self.limit) for name in self.channels])
-        margin = 1e-6 * _step(log.t)
-        starts = np.searchsorted(log.t, log.t[landed] - self.before - margin)
-        stops = np.searchsorted(log.t, log.t[landed] + self.after + margin, side="right")
-        return covered(len(log), starts, stops)
+        jump_indices = np.concatenate(
+            [find_steps_above(log, name, self.limit) for name in self.channels]
+        )
+        margin = 1e-6 * _median_time_step(log.t)
+        starts = np.searchsorted(log.t, log.t[jump_indices] - self.before - margin)
+        stops = np.searchsorted(log.t, log.t[jump_indices] + self.after + margin, side="right")
+        return mask_from_ranges(len(log), starts, stops)
 
 
 MaskConfig = Annotated[
-    Frozen | Gap | Missing | Jump | Outlier | Hampel | Spike | InputJump,
+    FrozenMask
+    | GapMask
+    | MissingValues
+    | JumpMask
+    | OutlierMask
+    | HampelMask
+    | SpikeMask
+    | InputJumpMask,
     Field(discriminator="kind"),
 ]
 """Any masking rule; its `kind` says which."""
 
 
-def apply_masks(log: Log, rules: Sequence[Mask]) -> Log:
+def apply_masks(log: Log, rules: Sequence[MaskRule]) -> Log:
     """Return the log with the masks of all rules added to those that it has.
 
     Rules of one kind share one mask.
@@ -291,36 +308,41 @@ def apply_masks(log: Log, rules: Sequence[Mask]) -> Log:
     return log.replace(masks=masks)
 
 
-def hard_mask(log: Log) -> np.ndarray:
+def make_hard_mask(log: Log) -> np.ndarray:
     """Return [T] bool: samples at which the log is split."""
-    return _any(log, [name for name in log.masks if name.startswith(HARD)])
+    return _combine_masks(log, [name for name in log.masks if name.startswith(HARD_PREFIX)])
 
 
-def scored(log: Log) -> np.ndarray:
+def find_scored_samples(log: Log) -> np.ndarray:
     """Return [T] bool: samples that a free run is scored on.
 
     Neither a hard nor a soft mask excludes them.
     """
-    return ~_any(log, [name for name in log.masks if not name.startswith(RATE)])
+    return ~_combine_masks(log, [name for name in log.masks if not name.startswith(RATE_PREFIX)])
 
 
-def segments(log: Log) -> np.ndarray:
+def number_log_segments(log: Log) -> np.ndarray:
     """Return the number of the contiguous piece of each sample, [T] int from 0; -1 if masked."""
-    return stretch_numbers(~hard_mask(log))
+    return number_runs(~make_hard_mask(log))
 
 
-def _any(log: Log, names: Sequence[str]) -> np.ndarray:
-    bad = np.zeros(len(log), dtype=bool)
-    return np.asarray(np.logical_or.reduce([bad, *(log.masks[name] for name in names)]))
+def _combine_masks(log: Log, reasons: Sequence[str]) -> np.ndarray:
+    is_masked = np.zeros(len(log), dtype=bool)
+    return np.asarray(np.logical_or.reduce([is_masked, *(log.masks[name] for name in reasons)]))
 
 
-def _each(log: Log, names: Sequence[str], rule: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def _apply_per_channel(
+    log: Log, names: Sequence[str], find_bad_samples: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
     """Return [T] bool: samples that a rule marks in any channel, angles unwrapped."""
     channels = {name: log[name] for name in names}
-    marked = (rule(unwrap(v) if log.units[n] == "rad" else v) for n, v in channels.items())
-    return np.asarray(np.logical_or.reduce([np.zeros(len(log), dtype=bool), *marked]))
+    channel_masks = (
+        find_bad_samples(unwrap_angle(values) if log.units[channel_name] == "rad" else values)
+        for channel_name, values in channels.items()
+    )
+    return np.asarray(np.logical_or.reduce([np.zeros(len(log), dtype=bool), *channel_masks]))
 
 
-def _step(t: np.ndarray) -> float:
+def _median_time_step(t: np.ndarray) -> float:
     """Return the usual time step in s."""
     return float(np.median(np.diff(t))) if t.size > 1 else 0.0

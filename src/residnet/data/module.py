@@ -10,7 +10,7 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from residnet.data.windows import COLUMNS, WindowStage, WindowStore
+from residnet.data.windows import WINDOW_COLUMNS, WindowStage, WindowStore
 
 
 class EpochDataModule(L.LightningDataModule, ABC):
@@ -23,23 +23,23 @@ class EpochDataModule(L.LightningDataModule, ABC):
     every batch draws them in a subclass of its own.
 
     Args:
-        epoch: returns the number of the present epoch; None asks the trainer.
+        get_epoch: returns the number of the present epoch; None asks the trainer.
     """
 
-    def __init__(self, seed: int, epoch: Callable[[], int] | None = None) -> None:
+    def __init__(self, seed: int, get_epoch: Callable[[], int] | None = None) -> None:
         super().__init__()
         self.seed = seed
-        self._epoch = epoch
+        self._get_epoch = get_epoch
 
     @property
-    def epoch(self) -> int:
+    def current_epoch(self) -> int:
         """Number of the present epoch."""
-        if self._epoch is not None:
-            return self._epoch()
+        if self._get_epoch is not None:
+            return self._get_epoch()
         return 0 if self.trainer is None else int(self.trainer.current_epoch)
 
     @property
-    def share(self) -> tuple[int, int]:
+    def rank_and_world_size(self) -> tuple[int, int]:
         """Number of this process, and how many there are."""
         if self.trainer is None:
             return 0, 1
@@ -47,11 +47,11 @@ class EpochDataModule(L.LightningDataModule, ABC):
 
     @property
     @abstractmethod
-    def steps(self) -> int:
+    def n_batches(self) -> int:
         """Batches in an epoch."""
 
     @abstractmethod
-    def batches(self, epoch: int) -> Iterator[Any]:
+    def iterate_batches(self, epoch: int) -> Iterator[Any]:
         """Yield the batches of an epoch, those of this process."""
 
     def train_dataloader(self) -> EpochBatches:
@@ -67,40 +67,40 @@ class EpochBatches:
         self.module = module
 
     def __len__(self) -> int:
-        return self.module.steps
+        return self.module.n_batches
 
     def __iter__(self) -> Iterator[Any]:
-        return self.module.batches(self.module.epoch)
+        return self.module.iterate_batches(self.module.current_epoch)
 
 
-class Windows(NamedTuple):
+class WindowBatch(NamedTuple):
     """Windows of measured logs, B of L samples.
 
     Attributes are those of `Prepared` [B, L, ...], positions from the start of the log, and:
         past_y: measured states before the window [B, H, 3 + n].
         past_w: inputs before it [B, H, m].
-        depth: samples since the stretch began [B]; 0 where the window begins it.
-        told: what a training adds of each sample [B, L, k].
+        n_elapsed: samples since the stretch began [B]; 0 where the window begins it.
+        precomputed: what a training adds of each sample [B, L, k].
     """
 
     y: Tensor
-    smooth: Tensor
+    smoothed: Tensor
     nu_dot: Tensor
     w: Tensor
-    recorded: Tensor
+    rate_inputs: Tensor
     usable: Tensor
-    good: Tensor
+    trainable: Tensor
     past_y: Tensor
     past_w: Tensor
-    depth: Tensor
-    told: Tensor
+    n_elapsed: Tensor
+    precomputed: Tensor
 
 
 @final
 class WindowsDataModule(EpochDataModule):
     """Training windows of measured logs, for any module that Lightning trains.
 
-    A batch is a tuple of `Windows`: those from anywhere, then, where the stage asks for them, those
+    A batch is a tuple of `WindowBatch`: those from anywhere, then, where the stage asks for them, those
     that begin with a stretch. For example, with `prepared` logs and a module whose
     `training_step(self, batch, number)` takes such a tuple:
 
@@ -111,8 +111,8 @@ class WindowsDataModule(EpochDataModule):
 
     Args:
         stages: windows of each stage; None for a stage without epochs.
-        stage: epoch -> number of its stage; None where there is one.
-        epoch: as for `EpochDataModule`.
+        get_stage: epoch -> number of its stage; None where there is one.
+        get_epoch: as for `EpochDataModule`.
 
     Raises:
         DataError: where no log is long enough for a stage.
@@ -122,51 +122,59 @@ class WindowsDataModule(EpochDataModule):
         self,
         store: WindowStore,
         stages: Sequence[WindowStage | None],
-        steps: int,
+        n_batches: int,
         seed: int = 0,
-        stage: Callable[[int], int] | None = None,
-        epoch: Callable[[], int] | None = None,
+        get_stage: Callable[[int], int] | None = None,
+        get_epoch: Callable[[], int] | None = None,
     ) -> None:
-        super().__init__(seed, epoch)
+        super().__init__(seed, get_epoch)
         self.store = store
         self.stages = list(stages)
-        self._steps, self._stage = steps, stage or (lambda epoch: 0)
-        self._drawn = [one.sources(store, steps) if one else [] for one in self.stages]
+        self._n_batches, self._get_stage = n_batches, get_stage or (lambda epoch: 0)
+        self._samplers = [
+            stage_settings.make_samplers(store, n_batches) if stage_settings else []
+            for stage_settings in self.stages
+        ]
 
     @classmethod
-    def of(
-        cls, logs: Sequence[Any], stage: WindowStage, steps: int, seed: int = 0
+    def from_logs(
+        cls, logs: Sequence[Any], stage: WindowStage, n_batches: int, seed: int = 0
     ) -> WindowsDataModule:
         """Return the data module of one stage from prepared logs, in single precision."""
-        return cls(WindowStore.gather(logs), [stage], steps, seed)
+        return cls(WindowStore.from_logs(logs), [stage], n_batches, seed)
 
     @property
-    def steps(self) -> int:
-        return self._steps
+    def n_batches(self) -> int:
+        return self._n_batches
 
-    def batches(self, epoch: int) -> Iterator[tuple[Windows, ...]]:
+    def iterate_batches(self, epoch: int) -> Iterator[tuple[WindowBatch, ...]]:
         """Yield the batches of an epoch: of each source the windows of this process."""
-        number = self._stage(epoch)
-        stage, (rank, world) = self.stages[number], self.share
+        stage_index = self._get_stage(epoch)
+        stage, (rank, world_size) = self.stages[stage_index], self.rank_and_world_size
         assert stage is not None, "an epoch of a stage without windows"
-        histories = (stage.history, max(stage.lead, 1))
-        drawn = [source.epoch(self.seed, epoch)[:, rank::world] for source in self._drawn[number]]
-        for rows in zip(*drawn, strict=True):
+        histories = (stage.n_history, max(stage.n_lead, 1))
+        starts_by_source = [
+            sampler.draw_epoch(self.seed, epoch)[:, rank::world_size]
+            for sampler in self._samplers[stage_index]
+        ]
+        for starts_of_batch in zip(*starts_by_source, strict=True):
             yield tuple(
-                self.windows(starts, stage.length, history, stage.columns)
-                for starts, history in zip(rows, histories, strict=False)
+                self.make_window_batch(starts, stage.n_window_samples, history, stage.columns)
+                for starts, history in zip(starts_of_batch, histories, strict=False)
             )
 
-    def windows(
-        self, starts: Tensor, length: int, history: int, columns: Sequence[str] = COLUMNS
-    ) -> Windows:
+    def make_window_batch(
+        self, starts: Tensor, length: int, history: int, columns: Sequence[str] = WINDOW_COLUMNS
+    ) -> WindowBatch:
         """Return the windows of `length` samples from rows [B] of the store on."""
         store = self.store
-        taken = dict.fromkeys((*COLUMNS, "told"), store.y[:0]) | {
-            name: store.take(getattr(store, name), starts, length) for name in columns
+        window_columns = dict.fromkeys((*WINDOW_COLUMNS, "told"), store.y[:0]) | {
+            name: store.take_windows(getattr(store, name), starts, length) for name in columns
         }
-        past_y, past_w = store.history(starts, history)
-        return Windows(**taken, past_y=past_y, past_w=past_w, depth=store.depth[starts])
+        past_y, past_w = store.take_history(starts, history)
+        return WindowBatch(
+            **window_columns, past_y=past_y, past_w=past_w, n_elapsed=store.n_elapsed[starts]
+        )
 
 
 @final
@@ -175,33 +183,35 @@ class RowsDataModule(EpochDataModule):
 
     Args:
         tensors: each [N, ...].
-        batch: rows in a batch; the last batch of an epoch may have fewer.
+        batch_size: rows in a batch; the last batch of an epoch may have fewer.
         seed: of the order.
-        epoch: as for `EpochDataModule`.
+        get_epoch: as for `EpochDataModule`.
     """
 
     def __init__(
         self,
         tensors: Sequence[Tensor],
-        batch: int,
+        batch_size: int,
         seed: int = 0,
-        epoch: Callable[[], int] | None = None,
+        get_epoch: Callable[[], int] | None = None,
     ) -> None:
-        super().__init__(seed, epoch)
+        super().__init__(seed, get_epoch)
         self.tensors = tuple(tensors)
-        self.batch = batch
+        self.batch_size = batch_size
 
     @property
-    def steps(self) -> int:
-        return -(-self.tensors[0].shape[0] // self.batch)
+    def n_batches(self) -> int:
+        return -(-self.tensors[0].shape[0] // self.batch_size)
 
-    def batches(self, epoch: int) -> Iterator[tuple[Tensor, ...]]:
-        rank, world = self.share
-        generator = torch.Generator().manual_seed(epoch_seed(self.seed, epoch))
-        for rows in torch.randperm(len(self.tensors[0]), generator=generator).split(self.batch):
-            yield tuple(values[rows[rank::world]] for values in self.tensors)
+    def iterate_batches(self, epoch: int) -> Iterator[tuple[Tensor, ...]]:
+        rank, world_size = self.rank_and_world_size
+        generator = torch.Generator().manual_seed(compute_epoch_seed(self.seed, epoch))
+        for row_indices in torch.randperm(len(self.tensors[0]), generator=generator).split(
+            self.batch_size
+        ):
+            yield tuple(values[row_indices[rank::world_size]] for values in self.tensors)
 
 
-def epoch_seed(seed: int, epoch: int) -> int:
+def compute_epoch_seed(seed: int, epoch: int) -> int:
     """Return a seed of torch, below 2^63: resumed trainings shuffle as uninterrupted ones do."""
     return (seed * 7_919 + epoch) % (2**63)

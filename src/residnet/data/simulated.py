@@ -27,18 +27,18 @@ from residnet.core.config import (
 )
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
-from residnet.core.names import CHANNEL_UNITS, VELOCITY, WIND_INPUTS, nearest
+from residnet.core.names import CHANNEL_UNITS, VELOCITY_NAMES, WIND_INPUTS, suggest_name
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics, check_steps
 from residnet.manoeuvres import FamilyConfig
-from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource, Watched
-from residnet.physics.environment import Waves, WavesConfig
+from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource, StopRecorder
+from residnet.physics.environment import IrregularWaves, WavesConfig
 from residnet.physics.plant import HullPlant, Plant
 from residnet.physics.vessel import VesselName, load_vessel
 
 
-class WindField(Config):
+class WindConfig(Config):
     """Mean wind with gusts.
 
     The gusts along and across the mean wind are independent Ornstein-Uhlenbeck processes, whose
@@ -58,7 +58,7 @@ class WindField(Config):
     correlation: Seconds = Field(default=10.0, gt=0)
 
 
-class Disturbance(Config):
+class DisturbanceConfig(Config):
     """Random and constant forces, a constant current, wind and waves.
 
     Attributes:
@@ -92,11 +92,11 @@ class Disturbance(Config):
         tuple[Annotated[MetresPerSecond, Field(ge=0)], Annotated[MetresPerSecond, Field(ge=0)]]
         | None
     ) = None
-    wind: WindField | None = None
+    wind: WindConfig | None = None
     waves: WavesConfig | None = None
 
     @model_validator(mode="after")
-    def _one_current(self) -> Disturbance:
+    def check_current(self) -> DisturbanceConfig:
         if (self.current_speed is None) != (self.current_direction is None):
             raise ValueError(
                 "current_speed and current_direction belong together; give both, or current_north"
@@ -114,73 +114,73 @@ class Disturbance(Config):
             )
         return self
 
-    def currents(self, rows: int, seed: int) -> np.ndarray:
+    def draw_currents(self, n_trials: int, seed: int) -> np.ndarray:
         """Return the current of each trial towards north and east in m/s, [B, 2]."""
-        out = np.tile(self.current(), (rows, 1))
+        currents = np.tile(self.common_current(), (n_trials, 1))
         if self.current_each is not None:
-            random = np.random.default_rng([seed, 7])
-            speed = random.uniform(*self.current_each, rows)
-            direction = random.uniform(0.0, 2.0 * np.pi, rows)
-            out += speed[:, None] * np.stack((np.cos(direction), np.sin(direction)), axis=1)
-        return out
+            generator = np.random.default_rng([seed, 7])
+            speed = generator.uniform(*self.current_each, n_trials)
+            direction = generator.uniform(0.0, 2.0 * np.pi, n_trials)
+            currents += speed[:, None] * np.stack((np.cos(direction), np.sin(direction)), axis=1)
+        return currents
 
-    def current(self) -> tuple[float, float]:
+    def common_current(self) -> tuple[float, float]:
         """Return the current of all trials towards north and east in m/s."""
         if self.current_speed is None or self.current_direction is None:
             return self.current_north, self.current_east
-        along = self.current_speed * np.exp(1j * self.current_direction)
-        return float(along.real), float(along.imag)
+        complex_current = self.current_speed * np.exp(1j * self.current_direction)
+        return float(complex_current.real), float(complex_current.imag)
 
     @property
-    def logged(self) -> tuple[str, ...]:
+    def logged_inputs(self) -> tuple[str, ...]:
         """Inputs of the plant that a vessel measures: the true wind, where there is any."""
         return WIND_INPUTS if self.wind is not None else ()
 
-    def needs(self) -> dict[str, str]:
+    def required_plant_inputs(self) -> dict[str, str]:
         """Return the inputs that a plant must have for this disturbance, each with its key."""
-        north, east = self.current()
-        forces = ("force_x", "force_y", "force_n", "force_north", "force_east")
-        needs = {name: name for name in forces if getattr(self, name) != 0}
+        north, east = self.common_current()
+        force_names = ("force_x", "force_y", "force_n", "force_north", "force_east")
+        keys_by_input = {name: name for name in force_names if getattr(self, name) != 0}
         currents = {"current_north": north, "current_east": east}
-        needs |= {n: n for n, value in currents.items() if value != 0 or self.current_each}
-        needs |= dict.fromkeys(WIND_INPUTS, "wind") if self.wind is not None else {}
-        needs |= dict.fromkeys(forces[:3], "waves") if self.waves is not None else {}
-        return needs
+        keys_by_input |= {n: n for n, value in currents.items() if value != 0 or self.current_each}
+        keys_by_input |= dict.fromkeys(WIND_INPUTS, "wind") if self.wind is not None else {}
+        keys_by_input |= dict.fromkeys(force_names[:3], "waves") if self.waves is not None else {}
+        return keys_by_input
 
-    def check(self, plant: Plant, vessel: str) -> None:
+    def check_plant(self, plant: Plant, vessel: str) -> None:
         """Stop where a plant cannot feel this disturbance."""
-        for name, key in self.needs().items():
-            if name not in plant.inputs:
+        for name, key in self.required_plant_inputs().items():
+            if name not in plant.input_names:
                 hint = "; give its vessel file a section 'wind'" if key == "wind" else ""
                 raise ConfigError(
                     f"disturbance.{key}: vessel '{vessel}' has no input '{name}'{hint}; it has"
-                    f" {', '.join(plant.inputs)}"
+                    f" {', '.join(plant.input_names)}"
                 )
-        if self.waves is not None and not {"x", "y", "psi"} <= set(plant.state):
+        if self.waves is not None and not {"x", "y", "psi"} <= set(plant.state_names):
             raise ConfigError(
                 f"disturbance.waves: vessel '{vessel}' has no position in its state; waves need x,"
                 " y, psi"
             )
 
-    def series(
+    def draw_plant_inputs(
         self,
         plant: Plant,
-        rows: int,
-        steps: int,
-        step: float,
+        n_trials: int,
+        n_steps: int,
+        dt: float,
         seed: int,
-        random: np.random.Generator,
+        generator: np.random.Generator,
     ) -> np.ndarray:
         """Return the inputs of the plant [B, T, m], of all that does not depend on its place.
 
         The commands are zero.
 
-        The random forces are drawn from `random` (three values per step whatever their sizes, so
+        The random forces are drawn from `generator` (three values per step whatever their sizes, so
         that data of one seed stay the same), the gusts from generators of their own under `seed`.
         """
-        forces = ornstein_uhlenbeck(random, (rows, steps, 3), step, self.correlation)
-        currents = self.currents(rows, seed)
-        values: dict[str, np.ndarray | float] = {
+        forces = sample_ornstein_uhlenbeck(generator, (n_trials, n_steps, 3), dt, self.correlation)
+        currents = self.draw_currents(n_trials, seed)
+        values_by_input: dict[str, np.ndarray | float] = {
             "force_x": self.force_x * forces[:, :, 0],
             "force_y": self.force_y * forces[:, :, 1],
             "force_n": self.force_n * forces[:, :, 2],
@@ -188,59 +188,66 @@ class Disturbance(Config):
             "force_east": self.force_east,
             "current_north": currents[:, :1],
             "current_east": currents[:, 1:],
-            **gusty_wind(self.wind, rows, steps, step, seed),
+            **simulate_wind(self.wind, n_trials, n_steps, dt, seed),
         }
-        w = np.zeros((rows, steps, len(plant.inputs)))
-        for name in values.keys() & set(plant.inputs):
-            w[:, :, plant.inputs.index(name)] = values[name]
-        return w
+        inputs = np.zeros((n_trials, n_steps, len(plant.input_names)))
+        for name in values_by_input.keys() & set(plant.input_names):
+            inputs[:, :, plant.input_names.index(name)] = values_by_input[name]
+        return inputs
 
-    def surround(self, source: Source, plant: Plant, rows: int, step: float, seed: int) -> Source:
+    def add_waves(
+        self, source: Source, plant: Plant, n_trials: int, dt: float, seed: int
+    ) -> Source:
         """Return a source with the waves added to its inputs; the same one in calm water."""
         if self.waves is None:
             return source
-        return Seaway(source, self.waves.build(rows, np.random.default_rng([seed, 5])), plant, step)
+        return WaveForceSource(
+            source, self.waves.build(n_trials, np.random.default_rng([seed, 5])), plant, dt
+        )
 
 
 @final
-class Seaway(Source):
+class WaveForceSource(Source):
     """A source that adds the waves' forces to the inputs of another source.
 
     They are those at the vessel's place at the start of each step, held over it.
     """
 
-    def __init__(self, source: Source, waves: Waves, plant: Plant, step: float) -> None:
+    def __init__(self, source: Source, waves: IrregularWaves, plant: Plant, dt: float) -> None:
         super().__init__()
         self.source = source
         self.waves = waves
-        self.step = step
+        self.dt = dt
         self.may_stop = source.may_stop
-        self.place = [plant.state.index(name) for name in ("x", "y", "psi")]
-        axes = ("force_x", "force_y", "force_k", "force_n")
-        present = [name for name in axes if name in plant.inputs]
-        spread = torch.zeros(len(axes), len(plant.inputs), dtype=torch.float64)
-        for name in present:
-            spread[axes.index(name), plant.inputs.index(name)] = 1.0
-        self.register_buffer("spread", spread, persistent=False)
-        self.spread: Tensor
+        self.pose_columns = [plant.state_names.index(name) for name in ("x", "y", "psi")]
+        axis_names = ("force_x", "force_y", "force_k", "force_n")
+        available_axes = [name for name in axis_names if name in plant.input_names]
+        force_matrix = torch.zeros(len(axis_names), len(plant.input_names), dtype=torch.float64)
+        for name in available_axes:
+            force_matrix[axis_names.index(name), plant.input_names.index(name)] = 1.0
+        self.register_buffer("force_matrix", force_matrix, persistent=False)
+        self.force_matrix: Tensor
 
     def initial(self, x: Tensor) -> Tensor:
         return self.source.initial(x)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the inputs [B, m] with the force of the waves at the time of step k."""
-        acting, memory = self.source(x, w, k, memory)
+        inputs, memory = self.source(x, w, k, memory)
         force = self.waves(
-            x[:, self.place[0]], x[:, self.place[1]], x[:, self.place[2]], k * self.step
+            x[:, self.pose_columns[0]],
+            x[:, self.pose_columns[1]],
+            x[:, self.pose_columns[2]],
+            k * self.dt,
         )
-        return acting + (force @ self.spread).to(acting.dtype), memory
+        return inputs + (force @ self.force_matrix).to(inputs.dtype), memory
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         return self.source.finished(x, k, memory)
 
 
-def ornstein_uhlenbeck(
-    random: np.random.Generator, shape: tuple[int, int, int], step: float, correlation: float
+def sample_ornstein_uhlenbeck(
+    generator: np.random.Generator, shape: tuple[int, int, int], dt: float, correlation: float
 ) -> np.ndarray:
     """Return stationary first-order processes [B, T, k] of unit variance.
 
@@ -248,15 +255,15 @@ def ornstein_uhlenbeck(
     """
     from scipy.signal import lfilter
 
-    keep = np.exp(-step / correlation)
-    drive = random.standard_normal(shape) * np.sqrt(1 - keep**2)
-    drive[:, 0] /= np.sqrt(1 - keep**2)
-    out: np.ndarray = lfilter([1.0], [1.0, -keep], drive, axis=1)
-    return out
+    decay = np.exp(-dt / correlation)
+    driving_noise = generator.standard_normal(shape) * np.sqrt(1 - decay**2)
+    driving_noise[:, 0] /= np.sqrt(1 - decay**2)
+    processes: np.ndarray = lfilter([1.0], [1.0, -decay], driving_noise, axis=1)
+    return processes
 
 
-def gusty_wind(
-    wind: WindField | None, rows: int, steps: int, step: float, seed: int
+def simulate_wind(
+    wind: WindConfig | None, n_trials: int, n_steps: int, dt: float, seed: int
 ) -> dict[str, np.ndarray]:
     """Return the speed in m/s and direction in rad [B, T] of the wind with gusts, by input.
 
@@ -264,14 +271,18 @@ def gusty_wind(
     """
     if wind is None:
         return {}
-    random = np.random.default_rng([seed, 4])
-    gust = wind.gust * ornstein_uhlenbeck(random, (rows, steps, 2), step, wind.correlation)
-    along = wind.speed + gust[:, :, 0]
-    direction = wind.direction + np.arctan2(gust[:, :, 1], along)
-    return dict(zip(WIND_INPUTS, (np.hypot(along, gust[:, :, 1]), direction), strict=True))
+    generator = np.random.default_rng([seed, 4])
+    gusts = wind.gust * sample_ornstein_uhlenbeck(
+        generator, (n_trials, n_steps, 2), dt, wind.correlation
+    )
+    longitudinal_speed = wind.speed + gusts[:, :, 0]
+    direction = wind.direction + np.arctan2(gusts[:, :, 1], longitudinal_speed)
+    return dict(
+        zip(WIND_INPUTS, (np.hypot(longitudinal_speed, gusts[:, :, 1]), direction), strict=True)
+    )
 
 
-class Sensor(Config):
+class SensorConfig(Config):
     """What one channel's sensor does to it.
 
     Attributes:
@@ -289,7 +300,7 @@ class Sensor(Config):
     latency: Seconds = Field(default=0.0, ge=0)
 
 
-class SensorNoise(Config):
+class SensorsConfig(Config):
     """White noise on the measured velocities; all else is exact unless `sensors` says otherwise.
 
     Attributes:
@@ -302,14 +313,14 @@ class SensorNoise(Config):
     u: MetresPerSecond = Field(default=0.03, ge=0)
     v: MetresPerSecond = Field(default=0.03, ge=0)
     r: RadiansPerSecond = Field(default=float(np.radians(0.2)), ge=0)
-    sensors: dict[str, Sensor] = Field(default_factory=dict)
+    sensors: dict[str, SensorConfig] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _units(self) -> SensorNoise:
-        converted = {}
+    def convert_units(self) -> SensorsConfig:
+        converted_sensors = {}
         for name, sensor in self.sensors.items():
             if name not in CHANNEL_UNITS:
-                raise ValueError(f"sensors: no channel '{name}'{nearest(name, CHANNEL_UNITS)}")
+                raise ValueError(f"sensors: no channel '{name}'{suggest_name(name, CHANNEL_UNITS)}")
             unit = Quantity(CHANNEL_UNITS[name])
             try:
                 noise, bias = unit.convert(sensor.noise), unit.convert(sensor.bias)
@@ -320,126 +331,136 @@ class SensorNoise(Config):
                     f"sensors.{name}.noise: a standard deviation must not be negative, given"
                     f" {noise:g}"
                 )
-            if noise and name in VELOCITY:
+            if noise and name in VELOCITY_NAMES:
                 raise ValueError(
                     f"sensors.{name}.noise: the white noise of {name} is given as noise.{name}"
                 )
-            converted[name] = sensor.model_copy(update={"noise": noise, "bias": bias})
-        object.__setattr__(self, "sensors", converted)
+            converted_sensors[name] = sensor.model_copy(update={"noise": noise, "bias": bias})
+        object.__setattr__(self, "sensors", converted_sensors)
         return self
 
-    def check(self, channels: tuple[str, ...], step: float, vessel: str) -> None:
+    def check_sensors(self, channels: tuple[str, ...], dt: float, vessel: str) -> None:
         """Stop where a sensor measures what the log has not, or samples more often than it."""
         for name, sensor in self.sensors.items():
             if name not in channels:
                 raise ConfigError(
                     f"noise.sensors: vessel '{vessel}' has no channel"
-                    f" '{name}'{nearest(name, channels)}"
+                    f" '{name}'{suggest_name(name, channels)}"
                 )
-            every = 1.0 if sensor.interval is None else sensor.interval / step
-            if round(every) < 1 or abs(every - round(every)) > 1e-6 * every:
+            samples_per_reading = 1.0 if sensor.interval is None else sensor.interval / dt
+            if (
+                round(samples_per_reading) < 1
+                or abs(samples_per_reading - round(samples_per_reading))
+                > 1e-6 * samples_per_reading
+            ):
                 raise ConfigError(
                     f"noise.sensors.{name}.interval: {sensor.interval:g} s is not a multiple of the"
-                    f" log's step, {step:g} s"
+                    f" log's step, {dt:g} s"
                 )
 
-    def measured(
+    def measure(
         self,
-        clean: Mapping[str, np.ndarray],
+        true_channels: Mapping[str, np.ndarray],
         t: np.ndarray,
-        white: np.ndarray,
+        white_noise: np.ndarray,
         seed: tuple[int, ...],
     ) -> dict[str, np.ndarray]:
         """Return what the log holds.
 
         Args:
-            clean: channels [T] as they were.
+            true_channels: channels [T] as they were.
             t: times [T] in s, evenly spaced.
-            white: noise [T, 3] of u, v, r.
+            white_noise: noise [T, 3] of u, v, r.
             seed: of the noise of all other channels.
         """
-        out = {}
-        for name, truth in clean.items():
-            sensor = self.sensors.get(name, Sensor())
-            values = np.interp(t - sensor.latency, t, truth) if sensor.latency else truth.copy()
-            if name in VELOCITY:
-                values += white[:, VELOCITY.index(name)]
+        measured_channels = {}
+        for name, true_values in true_channels.items():
+            sensor = self.sensors.get(name, SensorConfig())
+            values = (
+                np.interp(t - sensor.latency, t, true_values)
+                if sensor.latency
+                else true_values.copy()
+            )
+            if name in VELOCITY_NAMES:
+                values += white_noise[:, VELOCITY_NAMES.index(name)]
             if name in self.sensors:
-                random = np.random.default_rng((*seed, *name.encode()))
-                values += float(sensor.bias) + float(sensor.noise) * random.standard_normal(t.size)
+                generator = np.random.default_rng((*seed, *name.encode()))
+                values += float(sensor.bias) + float(sensor.noise) * generator.standard_normal(
+                    t.size
+                )
             if sensor.interval is not None:
-                every = round(sensor.interval / float(t[1] - t[0]))
-                values[np.arange(t.size) % every != 0] = np.nan
-            out[name] = values
-        return out
+                samples_per_reading = round(sensor.interval / float(t[1] - t[0]))
+                values[np.arange(t.size) % samples_per_reading != 0] = np.nan
+            measured_channels[name] = values
+        return measured_channels
 
 
 @dataclass(frozen=True)
-class Craft:
+class SimulatedVessel:
     """A vessel that flies manoeuvres: a plant or a learned model.
 
     Attributes:
         name: in logs and tables.
         dynamics: a plant or a learned model, stepping as the logs do.
         helm: of it.
-        commands: how many of its inputs are commands.
-        start: state [1, nx] that trials start from, or one for each, [B, nx]; float64.
+        n_commands: how many of its inputs are commands.
+        initial_state: state [1, nx] that trials start from, or one for each, [B, nx]; float64.
     """
 
     name: str
     dynamics: Dynamics
     helm: Helm
-    commands: int
-    start: Tensor
+    n_commands: int
+    initial_state: Tensor
 
 
 @dataclass(frozen=True)
-class Sea:
+class TrialEnvironment:
     """What surrounds a craft, and what measures it.
 
     Attributes:
         plant: whose inputs the disturbance is laid out for; None for a model without a vessel,
             which feels the wind alone.
         disturbance: forces, current, wind, waves.
-        noise: of the sensors.
+        sensors: of the sensors.
         seed: of everything random in both.
     """
 
     plant: Plant | None
-    disturbance: Disturbance
-    noise: SensorNoise
+    disturbance: DisturbanceConfig
+    sensors: SensorsConfig
     seed: int
 
 
 @dataclass(frozen=True)
-class Flight:
+class ManoeuvreRun:
     """One manoeuvre as it was flown.
 
     Attributes:
         manoeuvre: what was to be flown.
-        motion: the motion itself.
-        log: what sensors measured of it. Its meta says `timed_out` where the stop condition was not
+        true_log: the motion itself.
+        measured_log: what sensors measured of it. Its meta says `timed_out` where the stop condition was not
             reached, `diverged` where the motion ceased to be finite; both logs end there.
     """
 
     manoeuvre: Manoeuvre
-    motion: Log
-    log: Log
+    true_log: Log
+    measured_log: Log
 
     @property
-    def fault(self) -> str | None:
+    def fault_text(self) -> str | None:
         """Why the manoeuvre did not end as it should, in words; None where it did."""
-        seconds = f"{self.motion.t[-1] - self.motion.t[0]:.5g} s"
-        if self.log.meta.get("diverged"):
-            return f"the motion was no longer finite after {seconds}"
+        duration_text = f"{self.true_log.t[-1] - self.true_log.t[0]:.5g} s"
+        if self.measured_log.meta.get("diverged"):
+            return f"the motion was no longer finite after {duration_text}"
         return (
-            f"timed out after {seconds} before {self.manoeuvre.goal}"
-            if self.log.meta.get("timed_out")
+            f"timed out after {duration_text} before {self.manoeuvre.end_condition}"
+            if self.measured_log.meta.get("timed_out")
             else None
         )
 
 
-def source_of(manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+def make_manoeuvre_source(manoeuvres: Sequence[Manoeuvre], helm: Helm, times: Tensor) -> Source:
     """Return the source that flies manoeuvres of any kinds side by side.
 
     t [T] are the times of the steps.
@@ -447,102 +468,136 @@ def source_of(manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
     Raises:
         UsageError: where the vessel lacks what a manoeuvre needs.
     """
-    runs = [list(members) for _, members in groupby(manoeuvres, key=lambda m: m.kind)]
+    manoeuvres_by_kind = [
+        list(manoeuvres_of_kind)
+        for _, manoeuvres_of_kind in groupby(manoeuvres, key=lambda manoeuvre: manoeuvre.kind)
+    ]
     return StackedSource(
-        [type(members[0]).source(members, helm, t) for members in runs],
-        [len(members) for members in runs],
+        [
+            type(manoeuvres_of_kind[0]).build_source(manoeuvres_of_kind, helm, times)
+            for manoeuvres_of_kind in manoeuvres_by_kind
+        ],
+        [len(manoeuvres_of_kind) for manoeuvres_of_kind in manoeuvres_by_kind],
     )
 
 
-def fly(
-    craft: Craft,
+def simulate_manoeuvres(
+    vessel: SimulatedVessel,
     manoeuvres: Sequence[Manoeuvre],
-    sea: Sea,
+    environment: TrialEnvironment,
     duration: float,
-    step: float,
-    about: Mapping[str, Any] | None = None,
-) -> list[Flight]:
+    dt: float,
+    metadata: Mapping[str, Any] | None = None,
+) -> list[ManoeuvreRun]:
     """Fly the manoeuvres in one batch.
 
     Args:
-        craft: plant or learned model.
+        vessel: plant or learned model.
         manoeuvres: in the order of the result; rows that reach their stop condition end there.
         duration: of manoeuvres that give none, in s.
-        step: of the logs in s.
-        about: what the meta of the logs shall say.
+        dt: of the logs in s.
+        metadata: what the meta of the logs shall say.
 
     Raises:
         UsageError: where the vessel lacks what a manoeuvre needs.
         DataError: where the motion of a manoeuvre is not finite from its first step on.
     """
-    rows = len(manoeuvres)
-    lengths = [max(round(manoeuvre.lasts(duration) / step), 2) for manoeuvre in manoeuvres]
-    steps = max(lengths)
-    t = torch.arange(steps, dtype=torch.float64) * step
-    random = np.random.default_rng([sea.seed, 3])
-    source = source_of(manoeuvres, craft.helm, t)
-    if sea.plant is not None:
-        w = sea.disturbance.series(sea.plant, rows, steps, step, sea.seed, random)
-        source = sea.disturbance.surround(source, sea.plant, rows, step, sea.seed)
-    else:
-        w = np.zeros((rows, steps, len(craft.helm.inputs)))
-        for channel, values in gusty_wind(
-            sea.disturbance.wind, rows, steps, step, sea.seed
-        ).items():
-            w[:, :, craft.helm.inputs.index(channel)] = values
-    watched = Watched(source, rows)
-    begun = zip(manoeuvres, craft.start.expand(rows, -1), strict=True)
-    start = torch.stack([manoeuvre.begin(x, craft.helm.state) for manoeuvre, x in begun])
-    with torch.no_grad():
-        memory = craft.dynamics.initial_state(rows).to(torch.float64)
-        rollout = Rollout(craft.dynamics, watched)
-        states, inputs, _ = rollout(start, torch.from_numpy(w), memory)
-    noise = random.standard_normal((rows, steps, 3)) * [sea.noise.u, sea.noise.v, sea.noise.r]
-    flights = []
-    for i, (manoeuvre, name) in enumerate(zip(manoeuvres, log_names(manoeuvres), strict=True)):
-        stopped = int(watched.stopped[i])
-        reached = 0 <= stopped < lengths[i]
-        length = stopped + 1 if reached else lengths[i]
-        finite = np.isfinite(states[i, :length].numpy()).all(axis=1)
-        demand = manoeuvre.model_dump(mode="json")
-        meta: dict[str, Any] = {**(about or {}), "demand": demand, "seed": sea.seed}
-        if not finite.all():
-            length, meta["diverged"] = int(np.argmin(finite)), True
-        elif manoeuvre.goal is not None and not reached:
-            meta["timed_out"] = True
-        if length < 2:
-            raise DataError(
-                f"{craft.name}, {name}: the motion is not finite from its first step on"
-            )
-        flown = dict(zip(craft.helm.state, states[i, :length].T, strict=True))
-        flown |= dict(zip(craft.helm.inputs, inputs[i, :length].T, strict=True))
-        clean = {n: flown[n].numpy().copy() for n in logged_channels(craft, sea)}
-        time = t[:length].numpy().copy()
-        measured = sea.noise.measured(clean, time, noise[i, :length], (sea.seed, 6, i))
-        units = {channel: CHANNEL_UNITS.get(channel, "-") for channel in clean}
-        motion = Log(name, time, clean, units, manoeuvre.kind, meta=meta)
-        flights.append(Flight(manoeuvre, motion, motion.replace(channels=measured)))
-    return flights
-
-
-def logged_channels(craft: Craft, sea: Sea) -> tuple[str, ...]:
-    """Return the names of the channels of a flight's log: states, commands, what is measured."""
-    names = [
-        *(name for name in craft.helm.state if not name.startswith("_")),
-        *craft.helm.inputs[: craft.commands],
-        *sea.disturbance.logged,
+    n_trials = len(manoeuvres)
+    max_steps_by_trial = [
+        max(round(manoeuvre.duration_within(duration) / dt), 2) for manoeuvre in manoeuvres
     ]
-    return tuple(dict.fromkeys(names))
+    n_steps = max(max_steps_by_trial)
+    times = torch.arange(n_steps, dtype=torch.float64) * dt
+    generator = np.random.default_rng([environment.seed, 3])
+    source = make_manoeuvre_source(manoeuvres, vessel.helm, times)
+    if environment.plant is not None:
+        plant_inputs = environment.disturbance.draw_plant_inputs(
+            environment.plant, n_trials, n_steps, dt, environment.seed, generator
+        )
+        source = environment.disturbance.add_waves(
+            source, environment.plant, n_trials, dt, environment.seed
+        )
+    else:
+        plant_inputs = np.zeros((n_trials, n_steps, len(vessel.helm.inputs)))
+        for channel, values in simulate_wind(
+            environment.disturbance.wind, n_trials, n_steps, dt, environment.seed
+        ).items():
+            plant_inputs[:, :, vessel.helm.inputs.index(channel)] = values
+    monitored_source = StopRecorder(source, n_trials)
+    manoeuvres_and_states = zip(manoeuvres, vessel.initial_state.expand(n_trials, -1), strict=True)
+    initial_states = torch.stack(
+        [
+            manoeuvre.initial_state(state, vessel.helm.state)
+            for manoeuvre, state in manoeuvres_and_states
+        ]
+    )
+    with torch.no_grad():
+        initial_memory = vessel.dynamics.initial_state(n_trials).to(torch.float64)
+        rollout = Rollout(vessel.dynamics, monitored_source)
+        states, inputs, _ = rollout(initial_states, torch.from_numpy(plant_inputs), initial_memory)
+    velocity_noise = generator.standard_normal((n_trials, n_steps, 3)) * [
+        environment.sensors.u,
+        environment.sensors.v,
+        environment.sensors.r,
+    ]
+    runs = []
+    for i, (manoeuvre, log_name) in enumerate(
+        zip(manoeuvres, make_log_names(manoeuvres), strict=True)
+    ):
+        stop_step = int(monitored_source.stop_step[i])
+        has_reached_goal = 0 <= stop_step < max_steps_by_trial[i]
+        n_valid_steps = stop_step + 1 if has_reached_goal else max_steps_by_trial[i]
+        is_finite = np.isfinite(states[i, :n_valid_steps].numpy()).all(axis=1)
+        manoeuvre_settings = manoeuvre.model_dump(mode="json")
+        log_metadata: dict[str, Any] = {
+            **(metadata or {}),
+            "demand": manoeuvre_settings,
+            "seed": environment.seed,
+        }
+        if not is_finite.all():
+            n_valid_steps, log_metadata["diverged"] = int(np.argmin(is_finite)), True
+        elif manoeuvre.end_condition is not None and not has_reached_goal:
+            log_metadata["timed_out"] = True
+        if n_valid_steps < 2:
+            raise DataError(
+                f"{vessel.name}, {log_name}: the motion is not finite from its first step on"
+            )
+        simulated_channels = dict(zip(vessel.helm.state, states[i, :n_valid_steps].T, strict=True))
+        simulated_channels |= dict(
+            zip(vessel.helm.inputs, inputs[i, :n_valid_steps].T, strict=True)
+        )
+        true_channels = {
+            channel_name: simulated_channels[channel_name].numpy().copy()
+            for channel_name in list_logged_channels(vessel, environment)
+        }
+        log_times = times[:n_valid_steps].numpy().copy()
+        measured_channels = environment.sensors.measure(
+            true_channels, log_times, velocity_noise[i, :n_valid_steps], (environment.seed, 6, i)
+        )
+        units = {channel: CHANNEL_UNITS.get(channel, "-") for channel in true_channels}
+        true_log = Log(log_name, log_times, true_channels, units, manoeuvre.kind, meta=log_metadata)
+        runs.append(ManoeuvreRun(manoeuvre, true_log, true_log.replace(channels=measured_channels)))
+    return runs
 
 
-def log_names(manoeuvres: Sequence[Manoeuvre]) -> list[str]:
+def list_logged_channels(vessel: SimulatedVessel, environment: TrialEnvironment) -> tuple[str, ...]:
+    """Return the names of the channels of a flight's log: states, commands, what is measured."""
+    channel_names = [
+        *(name for name in vessel.helm.state if not name.startswith("_")),
+        *vessel.helm.inputs[: vessel.n_commands],
+        *environment.disturbance.logged_inputs,
+    ]
+    return tuple(dict.fromkeys(channel_names))
+
+
+def make_log_names(manoeuvres: Sequence[Manoeuvre]) -> list[str]:
     """Return the names of the logs: as given, else the kind with its number."""
-    count: dict[str, int] = {}
-    out = []
+    n_by_kind: dict[str, int] = {}
+    names = []
     for manoeuvre in manoeuvres:
-        count[manoeuvre.kind] = count.get(manoeuvre.kind, 0) + 1
-        out.append(manoeuvre.name or f"{manoeuvre.kind}_{count[manoeuvre.kind]:02d}")
-    return out
+        n_by_kind[manoeuvre.kind] = n_by_kind.get(manoeuvre.kind, 0) + 1
+        names.append(manoeuvre.name or f"{manoeuvre.kind}_{n_by_kind[manoeuvre.kind]:02d}")
+    return names
 
 
 class SimulatedTrials(Config):
@@ -571,76 +626,89 @@ class SimulatedTrials(Config):
     duration: Seconds = Field(default=60.0, gt=0)
     step: Seconds = Field(default=0.05, gt=0)
     substeps: int = Field(default=5, ge=1, le=1_000)
-    noise: SensorNoise = SensorNoise()
-    disturbance: Disturbance = Disturbance()
+    noise: SensorsConfig = SensorsConfig()
+    disturbance: DisturbanceConfig = DisturbanceConfig()
     identification: dict[str, int]
     validation: dict[str, int]
     seed: int = Field(default=0, ge=0)
 
     @model_validator(mode="after")
-    def _check_plant(self) -> SimulatedTrials:
+    def check_plant(self) -> SimulatedTrials:
         try:
             plant = load_vessel(self.vessel).build()
             # actuators with dead time move by a step of their own
-            plant.end_step(
-                plant.approach(1),
-                torch.zeros(1, len(plant.inputs), dtype=torch.float64),
+            plant.finish_step(
+                plant.make_initial_state(1),
+                torch.zeros(1, len(plant.input_names), dtype=torch.float64),
                 self.step / self.substeps,
             )
-            self.disturbance.check(plant, self.vessel)
-            self.noise.check(
-                (*plant.state, *plant.inputs[: plant.commands], *self.disturbance.logged),
+            self.disturbance.check_plant(plant, self.vessel)
+            self.noise.check_sensors(
+                (
+                    *plant.state_names,
+                    *plant.input_names[: plant.n_commands],
+                    *self.disturbance.logged_inputs,
+                ),
                 self.step,
                 self.vessel,
             )
         except ConfigError as error:
             raise ValueError(str(error)) from None
-        for manoeuvre in self.draw():
+        for manoeuvre in self.draw_manoeuvres():
             check_steps(manoeuvre.duration or self.duration, self.step)
         return self
 
-    def draw(self) -> list[Manoeuvre]:
+    def draw_manoeuvres(self) -> list[Manoeuvre]:
         """Return the manoeuvres, by family."""
-        random = np.random.default_rng([self.seed, 1])
+        generator = np.random.default_rng([self.seed, 1])
         return [
-            manoeuvre for family in self.trials for manoeuvre in family.draw(random, self.duration)
+            manoeuvre
+            for family in self.trials
+            for manoeuvre in family.sample_all(generator, self.duration)
         ]
 
-    def splits(self, manoeuvres: Sequence[Manoeuvre]) -> list[str]:
+    def assign_splits(self, manoeuvres: Sequence[Manoeuvre]) -> list[str]:
         """Return `train`, `validation` or `test` of each manoeuvre; whole manoeuvres only."""
-        random = np.random.default_rng([self.seed, 2])
-        out = ["train"] * len(manoeuvres)
-        for kind, count in self.identification.items():
-            members = [i for i, manoeuvre in enumerate(manoeuvres) if manoeuvre.kind == kind]
-            held_back = self.validation.get(kind, 0)
-            if not 0 < count < len(members) or not 0 <= held_back < count:
+        generator = np.random.default_rng([self.seed, 2])
+        split_names = ["train"] * len(manoeuvres)
+        for manoeuvre_kind, n_identification in self.identification.items():
+            members_of_kind = [
+                i for i, manoeuvre in enumerate(manoeuvres) if manoeuvre.kind == manoeuvre_kind
+            ]
+            n_validation = self.validation.get(manoeuvre_kind, 0)
+            if (
+                not 0 < n_identification < len(members_of_kind)
+                or not 0 <= n_validation < n_identification
+            ):
                 raise ValueError(
-                    f"{count} of {len(members)} '{kind}' manoeuvres for identification, {held_back}"
+                    f"{n_identification} of {len(members_of_kind)} '{manoeuvre_kind}' manoeuvres for identification, {n_validation}"
                     " of them for validation: leaves a split empty"
                 )
-            order = random.permutation(members)
-            for i in order[:held_back]:
-                out[i] = "validation"
-            for i in order[count:]:
-                out[i] = "test"
-        return out
+            shuffled_indices = generator.permutation(members_of_kind)
+            for i in shuffled_indices[:n_validation]:
+                split_names[i] = "validation"
+            for i in shuffled_indices[n_identification:]:
+                split_names[i] = "test"
+        return split_names
 
 
-def fly_trials(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Flight]:
+def simulate_trials(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[ManoeuvreRun]:
     """Fly the manoeuvres in one batch and return the motion and the logs of sensors on it.
 
     Channels: the plant's state (for the WAM-V x, y, psi, u, v, r, n_port, n_stbd), the commands,
     and the true wind where there is any. Float64.
     """
-    plant = surrounded(config.vessel, config.disturbance)
-    traced = RecordedPlantDynamics(plant, config.step, config.substeps)
-    craft = replace(trials_craft(config), dynamics=traced)
-    sea = Sea(plant, config.disturbance, config.noise, config.seed)
-    return fly(craft, manoeuvres, sea, config.duration, config.step, {"vessel": config.vessel})
+    plant = build_plant(config.vessel, config.disturbance)
+    traced_dynamics = RecordedPlantDynamics(plant, config.step, config.substeps)
+    vessel = replace(build_trial_vessel(config), dynamics=traced_dynamics)
+    environment = TrialEnvironment(plant, config.disturbance, config.noise, config.seed)
+    return simulate_manoeuvres(
+        vessel, manoeuvres, environment, config.duration, config.step, {"vessel": config.vessel}
+    )
 
 
-def stand_ins(config: SimulatedTrials) -> list[Log]:
-    """Return logs with the names, channels, lengths and kinds of those of `simulate`, unflown.
+def make_dummy_logs(config: SimulatedTrials) -> list[Log]:
+    """Return logs with the names, channels, lengths and kinds of those of `simulate_trial_logs`, unflown.
 
     Their channels are slow sines: they tell what a run can be made of, before anything is flown.
 
@@ -648,45 +716,53 @@ def stand_ins(config: SimulatedTrials) -> list[Log]:
         UsageError: where the vessel lacks what a manoeuvre needs.
     """
     plant = load_vessel(config.vessel).build()
-    craft, sea = trials_craft(config), Sea(plant, config.disturbance, config.noise, config.seed)
-    manoeuvres = config.draw()
-    source_of(manoeuvres, craft.helm, torch.arange(2, dtype=torch.float64) * config.step)
-    out = []
-    for manoeuvre, name in zip(manoeuvres, log_names(manoeuvres), strict=True):
-        manoeuvre.begin(craft.start[0], craft.helm.state)
-        t = np.arange(max(round(manoeuvre.lasts(config.duration) / config.step), 2)) * config.step
+    vessel, environment = (
+        build_trial_vessel(config),
+        TrialEnvironment(plant, config.disturbance, config.noise, config.seed),
+    )
+    manoeuvres = config.draw_manoeuvres()
+    make_manoeuvre_source(
+        manoeuvres, vessel.helm, torch.arange(2, dtype=torch.float64) * config.step
+    )
+    logs = []
+    for manoeuvre, name in zip(manoeuvres, make_log_names(manoeuvres), strict=True):
+        manoeuvre.initial_state(vessel.initial_state[0], vessel.helm.state)
+        times = (
+            np.arange(max(round(manoeuvre.duration_within(config.duration) / config.step), 2))
+            * config.step
+        )
         channels = {
-            channel: 1.0 + np.sin(0.1 * t + place)
-            for place, channel in enumerate(logged_channels(craft, sea))
+            channel: 1.0 + np.sin(0.1 * times + channel_index)
+            for channel_index, channel in enumerate(list_logged_channels(vessel, environment))
         }
         units = {channel: CHANNEL_UNITS.get(channel, "-") for channel in channels}
-        out.append(Log(name, t, channels, units, manoeuvre.kind))
-    return out
+        logs.append(Log(name, times, channels, units, manoeuvre.kind))
+    return logs
 
 
-def surrounded(vessel: str, disturbance: Disturbance) -> Plant:
+def build_plant(vessel: str, disturbance: DisturbanceConfig) -> Plant:
     """Return the plant of a vessel, in calm water where nothing disturbs it.
 
     The numbers are the same there: a vessel under water is flown in half the time.
     """
     plant = load_vessel(vessel).build()
-    if isinstance(plant, HullPlant) and not disturbance.needs():
-        return plant.in_calm_water()
+    if isinstance(plant, HullPlant) and not disturbance.required_plant_inputs():
+        return plant.without_environment()
     return plant
 
 
-def trials_craft(config: SimulatedTrials) -> Craft:
+def build_trial_vessel(config: SimulatedTrials) -> SimulatedVessel:
     """Return the vessel of the trials."""
-    plant = surrounded(config.vessel, config.disturbance)
-    return Craft(
+    plant = build_plant(config.vessel, config.disturbance)
+    return SimulatedVessel(
         config.vessel,
         PlantDynamics(plant, config.step, config.substeps),
         Helm.from_plant(plant),
-        plant.commands,
-        plant.approach(1),
+        plant.n_commands,
+        plant.make_initial_state(1),
     )
 
 
-def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Log]:
-    """Return the logs of `fly_trials`."""
-    return [flight.log for flight in fly_trials(manoeuvres, config)]
+def simulate_trial_logs(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Log]:
+    """Return the logs of `simulate_trials`."""
+    return [run.measured_log for run in simulate_trials(manoeuvres, config)]

@@ -11,12 +11,12 @@ from residnet.core.arrays import paged
 from residnet.core.config import Config
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.core.progress import report
+from residnet.core.progress import report_progress
 from residnet.data.readers import ReaderConfig
-from residnet.data.simulated import SimulatedTrials, simulate
-from residnet.data.split import SplitConfig, check_leaks, divided, log_names
+from residnet.data.simulated import SimulatedTrials, simulate_trial_logs
+from residnet.data.split import SplitConfig, assign_log_names, check_leaks, split_logs
 
-Splits = dict[str, list[Log]]
+LogsBySplit = dict[str, list[Log]]
 
 
 class MeasuredLogs(Config):
@@ -35,7 +35,7 @@ class MeasuredLogs(Config):
 DataConfig = Annotated[MeasuredLogs | SimulatedTrials, Field(discriminator="kind")]
 
 
-def read_logs(config: MeasuredLogs | SimulatedTrials) -> Splits:
+def read_split_logs(config: MeasuredLogs | SimulatedTrials) -> LogsBySplit:
     """Return the logs of a run by split (train, validation, test).
 
     Raises:
@@ -43,39 +43,53 @@ def read_logs(config: MeasuredLogs | SimulatedTrials) -> Splits:
             measurements.
     """
     if isinstance(config, SimulatedTrials):
-        manoeuvres = config.draw()
-        splits: Splits = {"train": [], "validation": [], "test": []}
-        for log, split in zip(simulate(manoeuvres, config), config.splits(manoeuvres), strict=True):
-            splits[split].append(log)
-        return splits
-    reader, files = config.reader.build(), config.split.files()
-    names = log_names(files)
-    read: dict[Path, Log] = {}
-    samples = 0
-    for number, path in enumerate(files):
-        report("reading logs", number, len(files))
-        one = reader.read(path).replace(name=names[path])
-        samples += len(one)
-        read[path] = one if samples <= paged.LARGE else one.on_disk()
-    report("reading logs", len(files), len(files))
+        manoeuvres = config.draw_manoeuvres()
+        logs_by_split: LogsBySplit = {"train": [], "validation": [], "test": []}
+        for log, split in zip(
+            simulate_trial_logs(manoeuvres, config), config.assign_splits(manoeuvres), strict=True
+        ):
+            logs_by_split[split].append(log)
+        return logs_by_split
+    reader, paths = config.reader.build(), config.split.list_files()
+    names_by_path = assign_log_names(paths)
+    logs_by_path: dict[Path, Log] = {}
+    n_samples = 0
+    for file_index, path in enumerate(paths):
+        report_progress("reading logs", file_index, len(paths))
+        loaded_log = reader.read(path).replace(name=names_by_path[path])
+        n_samples += len(loaded_log)
+        logs_by_path[path] = (
+            loaded_log if n_samples <= paged.MAX_SAMPLES_IN_MEMORY else loaded_log.move_to_disk()
+        )
+    report_progress("reading logs", len(paths), len(paths))
     if config.split.auto:
-        splits = divided(list(read.values()))
+        logs_by_split = split_logs(list(logs_by_path.values()))
     else:
-        splits = {
-            split: [found for part in parts if (found := part.of(read[part.path])) is not None]
-            for split, parts in config.split.parts().items()
+        logs_by_split = {
+            split: [
+                part_log
+                for log_part in log_parts
+                if (part_log := log_part.extract(logs_by_path[log_part.path])) is not None
+            ]
+            for split, log_parts in config.split.resolve_parts().items()
         }
-        for split, members in splits.items():
-            if not members:
-                kinds = ", ".join(sorted({log.manoeuvre for log in read.values()}))
-                raise DataError(f"split: no log of {split} is of its manoeuvre (there are {kinds})")
-    check_leaks(splits)
-    return splits
+        for split, logs_of_split in logs_by_split.items():
+            if not logs_of_split:
+                kinds_text = ", ".join(sorted({log.manoeuvre for log in logs_by_path.values()}))
+                raise DataError(
+                    f"split: no log of {split} is of its manoeuvre (there are {kinds_text})"
+                )
+    check_leaks(logs_by_split)
+    return logs_by_split
 
 
-def input_files(config: MeasuredLogs | SimulatedTrials) -> list[Path]:
+def list_input_files(config: MeasuredLogs | SimulatedTrials) -> list[Path]:
     """Return files whose contents the run depends on."""
     if isinstance(config, SimulatedTrials):
         return []
     reader = config.reader.build()
-    return [file for path in dict.fromkeys(config.split.files()) for file in reader.files(path)]
+    return [
+        input_file
+        for path in dict.fromkeys(config.split.list_files())
+        for input_file in reader.list_member_files(path)
+    ]

@@ -9,107 +9,133 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-FEWEST = 50
+MIN_SAMPLES = 50
 """Samples below which nothing is compared."""
-AT_ONCE = 40_000
+CHUNK_SAMPLES = 40_000
 """Samples that are shifted at a time: each of some ten columns stays in a core's cache."""
-_MOST_SAMPLES = 20_000
+_MAX_LAG_SAMPLES = 20_000
 """Samples that a lag is looked for in, evenly spread: more tell the same."""
 
 
 @dataclass(frozen=True)
-class Blocks:
+class OverlappingBlocks:
     """Overlapping blocks of a log over which equations of motion are integrated.
 
     Noise then needs no derivative and averages out.
 
     Attributes:
         t: times of the log [T].
-        first: sample at which each block begins [K].
-        size: number of samples in a block.
+        starts: sample at which each block begins [K].
+        length: number of samples in a block.
     """
 
     t: np.ndarray
-    first: np.ndarray
-    size: int
+    starts: np.ndarray
+    length: int
 
-    def change(self, values: np.ndarray, shift: ArrayLike = 0) -> np.ndarray:
-        """Return the changes [K, ...] of values [T, ...] over the blocks, `shift` samples early.
+    def compute_changes(self, values: np.ndarray, shift: ArrayLike = 0) -> np.ndarray:
+        """Return the changes [K, ...] of values [T, ...] over the blocks, `subsample_shift` samples early.
 
         Of several shifts [S] they are [K, S, ...].
         """
-        first = np.subtract.outer(self.first, shift)
-        return np.asarray(values[first + self.size] - values[first])
+        starts = np.subtract.outer(self.starts, shift)
+        return np.asarray(values[starts + self.length] - values[starts])
 
-    def clear_of(self, bad: np.ndarray, shift: ArrayLike = 0) -> np.ndarray:
+    def are_clear_of(self, invalid: np.ndarray, shift: ArrayLike = 0) -> np.ndarray:
         """Return the blocks [K, ...] bool that touch none of the samples bad [T, ...]."""
-        count = np.zeros((len(bad) + 1, *bad.shape[1:]), dtype=int)
-        np.cumsum(bad, axis=0, out=count[1:])
-        first = np.subtract.outer(self.first, shift)
-        return np.asarray(count[first + self.size + 1] == count[first])
+        cumulative_invalid = np.zeros((len(invalid) + 1, *invalid.shape[1:]), dtype=int)
+        np.cumsum(invalid, axis=0, out=cumulative_invalid[1:])
+        starts = np.subtract.outer(self.starts, shift)
+        return np.asarray(
+            cumulative_invalid[starts + self.length + 1] == cumulative_invalid[starts]
+        )
 
-    def integrals(self, table: np.ndarray) -> Callable[[ArrayLike], np.ndarray]:
-        """Return the integrals of columns [T, ...] over the blocks, by shift as of `change`.
+    def make_integrator(self, columns: np.ndarray) -> Callable[[ArrayLike], np.ndarray]:
+        """Return the integrals of columns [T, ...] over the blocks, by shift as of `compute_changes`.
 
         They are NaN where a sample of the block is.
         """
-        bad, total = ~np.isfinite(table), np.zeros(table.shape)
-        spoilt = bool(bad.any())
-        filled = np.where(bad, 0.0, table) if spoilt else table
-        half = 0.5 * np.diff(self.t).reshape(-1, *(1 for _ in table.shape[1:]))
-        np.cumsum(half * (filled[1:] + filled[:-1]), axis=0, out=total[1:])
+        is_missing, cumulative_integral = ~np.isfinite(columns), np.zeros(columns.shape)
+        has_missing = bool(is_missing.any())
+        finite_values = np.where(is_missing, 0.0, columns) if has_missing else columns
+        half_time_steps = 0.5 * np.diff(self.t).reshape(-1, *(1 for _ in columns.shape[1:]))
+        np.cumsum(
+            half_time_steps * (finite_values[1:] + finite_values[:-1]),
+            axis=0,
+            out=cumulative_integral[1:],
+        )
 
-        def at(shift: ArrayLike) -> np.ndarray:
-            clear = self.clear_of(bad, shift) if spoilt else True
-            return np.where(clear, self.change(total, shift), np.nan)
+        def integrate(shift: ArrayLike) -> np.ndarray:
+            is_clear = self.are_clear_of(is_missing, shift) if has_missing else True
+            return np.where(is_clear, self.compute_changes(cumulative_integral, shift), np.nan)
 
-        return at
+        return integrate
 
 
-class Agreement(NamedTuple):
+class ChannelAgreement(NamedTuple):
     """How one channel follows another.
 
     Attributes:
         correlation: means removed, at the lag where it is largest.
         gain: least squares through the origin at that lag.
         lag: in s, positive where the channel trails.
-        spread: standard deviation of the reference.
+        reference_std: standard deviation of the reference.
     """
 
     correlation: float
     gain: float
     lag: float
-    spread: float
+    reference_std: float
 
 
-def agreement(reference: np.ndarray, measured: np.ndarray, step: float) -> Agreement | None:
+def estimate_agreement(
+    reference: np.ndarray, measured: np.ndarray, step: float
+) -> ChannelAgreement | None:
     """Return how `measured` [T] follows `reference` [T], at lags of up to 3 s.
 
     None where fewer than 50 samples can be compared at all lags, or either does not vary.
     """
-    reach = max(round(3.0 / step), 10)
-    if reference.size < 2 * reach + FEWEST:
+    max_lag = max(round(3.0 / step), 10)
+    if reference.size < 2 * max_lag + MIN_SAMPLES:
         return None
     # the same samples for every lag, or the comparison of lags would be one of samples
-    lost = np.append(0, np.cumsum(~np.isfinite(measured)))
-    known = lost[2 * reach + 1 :] == lost[: -2 * reach - 1]
-    at = np.flatnonzero(np.isfinite(reference[reach:-reach]) & known) + reach
-    if at.size < FEWEST:
+    cumulative_missing = np.append(0, np.cumsum(~np.isfinite(measured)))
+    is_complete = cumulative_missing[2 * max_lag + 1 :] == cumulative_missing[: -2 * max_lag - 1]
+    compared_indices = (
+        np.flatnonzero(np.isfinite(reference[max_lag:-max_lag]) & is_complete) + max_lag
+    )
+    if compared_indices.size < MIN_SAMPLES:
         return None
-    at = at[:: -(-at.size // _MOST_SAMPLES)]
-    a, lags = reference[at], np.arange(-reach, reach + 1)
-    spread, std, values = float(a.std()), np.empty(lags.size), np.empty(lags.size)
-    for some in np.array_split(lags, -(-lags.size * at.size // AT_ONCE)):
-        there = measured[at + some[:, None]]
-        std[some + reach], values[some + reach] = there.std(axis=1), there @ (a - a.mean())
-    if spread == 0.0 or std.min() <= 1e-12 * np.nanmax(np.abs(measured)):
+    compared_indices = compared_indices[:: -(-compared_indices.size // _MAX_LAG_SAMPLES)]
+    reference_values, lags = reference[compared_indices], np.arange(-max_lag, max_lag + 1)
+    reference_std, measured_std, correlations = (
+        float(reference_values.std()),
+        np.empty(lags.size),
+        np.empty(lags.size),
+    )
+    for lag_chunk in np.array_split(lags, -(-lags.size * compared_indices.size // CHUNK_SAMPLES)):
+        lagged_values = measured[compared_indices + lag_chunk[:, None]]
+        measured_std[lag_chunk + max_lag], correlations[lag_chunk + max_lag] = (
+            lagged_values.std(axis=1),
+            lagged_values @ (reference_values - reference_values.mean()),
+        )
+    if reference_std == 0.0 or measured_std.min() <= 1e-12 * np.nanmax(np.abs(measured)):
         return None
-    values /= at.size * spread * std
-    best = int(np.argmax(np.abs(values)))
-    shift = 0.0
-    if 0 < best < 2 * reach:
-        before, peak, after = np.abs(values[best - 1 : best + 2])
-        curvature = before - 2.0 * peak + after
-        shift = 0.5 * (before - after) / curvature if curvature < 0.0 else 0.0
-    gain = float(a @ measured[at + lags[best]] / (a @ a))
-    return Agreement(float(values[best]), gain, (best - reach + shift) * step, spread)
+    correlations /= compared_indices.size * reference_std * measured_std
+    best_index = int(np.argmax(np.abs(correlations)))
+    subsample_shift = 0.0
+    if 0 < best_index < 2 * max_lag:
+        left_value, peak, right_value = np.abs(correlations[best_index - 1 : best_index + 2])
+        curvature = left_value - 2.0 * peak + right_value
+        subsample_shift = 0.5 * (left_value - right_value) / curvature if curvature < 0.0 else 0.0
+    gain = float(
+        reference_values
+        @ measured[compared_indices + lags[best_index]]
+        / (reference_values @ reference_values)
+    )
+    return ChannelAgreement(
+        float(correlations[best_index]),
+        gain,
+        (best_index - max_lag + subsample_shift) * step,
+        reference_std,
+    )

@@ -26,7 +26,7 @@ STUDY_MODELS: dict[StudyName, tuple[str, ...]] = {
 """Models that a fit must have for a document's study."""
 
 
-def study_sections(name: StudyName, run: Path) -> Sequence[Section]:
+def build_study_sections(name: StudyName, run: Path) -> Sequence[Section]:
     """Draw a document's figures into a finished run and return its sections of the report.
 
     Raises:
@@ -34,13 +34,13 @@ def study_sections(name: StudyName, run: Path) -> Sequence[Section]:
     """
     from residnet.report.run_reader import RunFiles
 
-    found: Sequence[Section] = importlib.import_module(f"{__name__}.{name}").sections(RunFiles(run))
-    return found
+    study: Sequence[Section] = importlib.import_module(f"{__name__}.{name}").sections(RunFiles(run))
+    return study
 
 
-def published(document: str) -> dict[str, Any]:
+def load_published(document: str) -> dict[str, Any]:
     """Return the figures that a document prints, from published.yaml."""
     from residnet.core.config import load_mapping
 
-    found: dict[str, Any] = load_mapping(Path(__file__).with_name("published.yaml"))[document]
-    return found
+    figures: dict[str, Any] = load_mapping(Path(__file__).with_name("published.yaml"))[document]
+    return figures

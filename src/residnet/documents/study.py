@@ -11,24 +11,24 @@ import numpy as np
 
 from residnet.core.config import load_config
 from residnet.core.files import read_json
-from residnet.core.format import minus, number
+from residnet.core.format import format_minus_signs, format_number
 from residnet.report.blocks import Cell, Column, Section
-from residnet.report.figure import Case, Curve, Figure, Look, Panel
+from residnet.report.figure import Case, Curve, Figure, GlyphStyle, Panel
 from residnet.report.figure_files import read_figures, write_figure
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import Exports, MainFigure, Outcome, Task
+from residnet.runs.task import ExportWriters, SummaryMetric, Task, TaskOutcome
 
-Results = Mapping[str, Any]
+StudyResults = Mapping[str, Any]
 """What a study found, as its file in the run folder holds it."""
 
 
-class Study(Task):
+class StudyTask(Task):
     """An experiment of a document: its results stand in one file, and all that is said in them."""
 
     results_file: ClassVar[str] = "study.json"
 
     @abstractmethod
-    def results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
+    def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
         """Carry the study out; return its results in terms of JSON, and its pictures.
 
         Raises:
@@ -36,39 +36,43 @@ class Study(Task):
         """
 
     @abstractmethod
-    def verdict(self, results: Results) -> list[str]:
+    def summarize(self, results: StudyResults) -> list[str]:
         """Return the sentences that sum the results up."""
 
     @abstractmethod
-    def main_figures(self, results: Results) -> dict[str, MainFigure]:
+    def main_figures(self, results: StudyResults) -> dict[str, SummaryMetric]:
         """Return the numbers that sum the results up, by what they are."""
 
     @abstractmethod
-    def sections(self, results: Results, run: Path) -> list[Section]:
+    def build_sections(self, results: StudyResults, run: Path) -> list[Section]:
         """Return the sections of the report, with the document's figures beside ours."""
 
-    def exports(self, folder: RunFolder) -> Exports:
+    def exports(self, folder: RunFolder) -> ExportWriters:
         """Return what writes each export of the study, by its name: none."""
         return {}
 
     @final
-    def carry_out(self, folder: RunFolder) -> Outcome:
-        found, figures = self.results(folder)
-        folder.write_json(folder.path / self.results_file, found)
+    def execute(self, folder: RunFolder) -> TaskOutcome:
+        results, figures = self.compute_results(folder)
+        folder.write_json(folder.path / self.results_file, results)
         for figure in figures:
             write_figure(folder.figures, figure)
         # as a reader of the file sees them
-        read = read_json(folder.path / self.results_file)
-        return Outcome(self.verdict(read), self.main_figures(read), exports=self.exports(folder))
+        stored_results = read_json(folder.path / self.results_file)
+        return TaskOutcome(
+            self.summarize(stored_results),
+            self.main_figures(stored_results),
+            exports=self.exports(folder),
+        )
 
     @classmethod
     @final
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         results = read_json(run.path / cls.results_file)
-        return load_config(run.resolved, [], cls).sections(results, run.path)
+        return load_config(run.resolved_config, [], cls).build_sections(results, run.path)
 
 
-def beside_published(value: float | None, published: float | None, digits: int = 4) -> Cell:
+def published_cell(value: float | None, published: float | None, digits: int = 4) -> Cell:
     """Return a cell with a number of the run, and in small print the document's own number.
 
     Args:
@@ -76,11 +80,11 @@ def beside_published(value: float | None, published: float | None, digits: int =
         published: number that the document prints; None where it prints none.
     """
     # the document's number keeps the digits that it is printed with
-    note = "" if published is None else f"published {minus(f'{published:.{digits}g}')}"
-    return Cell(number(value, digits), note)
+    note = "" if published is None else f"published {format_minus_signs(f'{published:.{digits}g}')}"
+    return Cell(format_number(value, digits), note)
 
 
-def compared(
+def comparison_columns(
     key: str, titles: str | Sequence[str], digits: int = 4, factor: float = 1.0
 ) -> list[Column]:
     """Return the columns of a row's number, or of each of its numbers, beside the document's own.
@@ -92,78 +96,76 @@ def compared(
         factor: from our number to its unit in the table, in which the document prints its own.
     """
 
-    def shown(pick: Callable[[Any], float]) -> Callable[[Any], Cell]:
+    def make_cell(pick: Callable[[Any], float]) -> Callable[[Any], Cell]:
         def cell(row: Any) -> Cell:
-            ours, printed = row[key], row["published"].get(key)
-            return beside_published(
-                None if ours is None else factor * pick(ours),
-                None if printed is None else pick(printed),
+            values, published_values = row[key], row["published"].get(key)
+            return published_cell(
+                None if values is None else factor * pick(values),
+                None if published_values is None else pick(published_values),
                 digits,
             )
 
         return cell
 
     if isinstance(titles, str):
-        return [(titles, shown(lambda number: number))]
+        return [(titles, make_cell(lambda number: number))]
     return [
-        (title, shown(lambda numbers, i=i: numbers[i]))  # type: ignore[misc]
+        (title, make_cell(lambda numbers, i=i: numbers[i]))  # type: ignore[misc]
         for i, title in enumerate(titles)
     ]
 
 
-def joined(values: Sequence[float], digits: int = 3) -> str:
+def join_numbers(values: Sequence[float], digits: int = 3) -> str:
     """Return several numbers as text, with slashes between them."""
-    return " / ".join(number(value, digits) for value in values)
+    return " / ".join(format_number(value, digits) for value in values)
 
 
-def notes_text(notes: Mapping[str, Any]) -> str:
+def format_notes(notes: Mapping[str, Any]) -> str:
     """Return what an estimator chose in one line, such as "penalty 0.1; order 3/3/1"."""
 
-    def text(value: Any) -> str:
+    def format_value(value: Any) -> str:
         if isinstance(value, dict):
-            return ", ".join(f"{key} {text(part)}" for key, part in value.items())
+            return ", ".join(f"{key} {format_value(item)}" for key, item in value.items())
         if isinstance(value, list):
-            return "/".join(text(part) for part in value)
-        return number(value, 4) if isinstance(value, float) else str(value)
+            return "/".join(format_value(item) for item in value)
+        return format_number(value, 4) if isinstance(value, float) else str(value)
 
-    return "; ".join(f"{key} {text(value)}" for key, value in notes.items())
+    return "; ".join(f"{key} {format_value(value)}" for key, value in notes.items())
 
 
-def pictures(run: Path, *beginnings: str) -> list[Figure]:
+def find_figures(run: Path, *prefixes: str) -> list[Figure]:
     """Return the figures of a run whose names begin with one of the given beginnings.
 
     They stand in the order of the beginnings, then in that of their names.
     """
     stored = read_figures(run / "figures")
-    return [
-        figure for beginning in beginnings for figure in stored if figure.name.startswith(beginning)
-    ]
+    return [figure for prefix in prefixes for figure in stored if figure.name.startswith(prefix)]
 
 
-def histories(
+def plot_time_series(
     name: str,
-    words: tuple[str, str],
-    looks: Mapping[str, Look],
+    title_and_caption: tuple[str, str],
+    styles: Mapping[str, GlyphStyle],
     t: np.ndarray,
     paths: Mapping[str, np.ndarray],
     units: Sequence[tuple[str, float]],
     *,
     height: int = 165,
     x_label: str = "time [s]",
-    shared: Mapping[str, Curve] | None = None,
+    shared_traces: Mapping[str, Curve] | None = None,
 ) -> Figure:
     """Return a figure of one panel beneath the other, each with one column of all paths over time.
 
     Args:
-        looks: of the paths and of what all panels share, by name.
+        styles: of the paths and of what all panels share, by name.
         t: time [T].
         paths: columns [T, n] by name.
         units: label of each column with its unit, and the factor to that unit.
-        shared: curves of all panels by name.
+        shared_traces: curves of all panels by name.
     """
-    curves = [
-        dict(shared or {}) | {key: (t, factor * path[:, i]) for key, path in paths.items()}
+    panel_traces = [
+        dict(shared_traces or {}) | {key: (t, factor * path[:, i]) for key, path in paths.items()}
         for i, (_, factor) in enumerate(units)
     ]
     panels = [Panel(label, x_label, height=height, group="t") for label, _ in units]
-    return Figure(name, *words, looks, panels, [Case("", curves)])
+    return Figure(name, *title_and_caption, styles, panels, [Case("", panel_traces)])

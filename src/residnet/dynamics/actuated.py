@@ -12,12 +12,12 @@ from torch import Tensor, nn
 from residnet.core import columns
 from residnet.core.config import Config, Quantity
 from residnet.core.errors import ConfigError
-from residnet.core.names import CHANNEL_UNITS, nearest
+from residnet.core.names import CHANNEL_UNITS, suggest_name
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import RecordedPlantDynamics
-from residnet.physics.plant import ROLLING, SUBMERGED, Plant
-from residnet.physics.symmetry import live_of
+from residnet.physics.plant import ROLLING_LAYOUT, SUBMERGED_LAYOUT, Plant
+from residnet.physics.symmetry import get_dof
 
 _RATES = {"rad": "rad/s", "1/s": "1/s^2", "m": "m/s", "-": "1/s"}
 
@@ -63,17 +63,17 @@ class PlantActuators(Actuators):
     def __init__(self, plant: Plant, dt: float, substeps: int = 1) -> None:
         super().__init__()
         self.plant = plant
-        self.inputs, self.commands = plant.inputs, plant.commands
+        self.inputs, self.commands = plant.input_names, plant.n_commands
         self.columns = [
             i
-            for i, name in enumerate(plant.state)
-            if name not in (*ROLLING.names, *SUBMERGED.names)
+            for i, name in enumerate(plant.state_names)
+            if name not in (*ROLLING_LAYOUT.state_names, *SUBMERGED_LAYOUT.state_names)
         ]
-        self.state = tuple(plant.state[i] for i in self.columns)
+        self.state = tuple(plant.state_names[i] for i in self.columns)
         self.dynamics = RecordedPlantDynamics(plant, dt, substeps) if self.columns else None
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        return self.plant.demand(drive, steer)
+        return self.plant.commands_for_demand(drive, steer)
 
     def move(self, a: Tensor, w: Tensor) -> Tensor:
         """Return the states [B, k] one step later.
@@ -82,12 +82,14 @@ class PlantActuators(Actuators):
         """
         if self.dynamics is None:
             return a
-        x = self.plant.approach(a.shape[0])
+        x = self.plant.make_initial_state(a.shape[0])
         x[:, self.columns] = a
         return self.dynamics.step(x, w, x[:, :0])[0][:, self.columns]
 
     def approach(self, rows: int, hull: Sequence[str]) -> Tensor:
-        known = dict(zip(self.plant.state, self.plant.approach(rows).unbind(1), strict=True))
+        known = dict(
+            zip(self.plant.state_names, self.plant.make_initial_state(rows).unbind(1), strict=True)
+        )
         still = torch.zeros(rows, dtype=torch.float64)
         return torch.stack([known.get(name, still) for name in (*hull, *self.state)], dim=1)
 
@@ -214,7 +216,7 @@ class ActuatedDynamics(Dynamics):
         super().__init__(model.dt, model.integrator)
         self.model, self.actuators = model, actuators
         self.n_state, self.dof, self.rolls = model.n_state, model.dof, model.rolls
-        self.hull = live_of(model.signals.names).states
+        self.hull = get_dof(model.signals.names).state_names
         self.state = (*self.hull, *actuators.state)
         self.mean = hold == "mean"
         names = [*actuators.state, *actuators.inputs]
@@ -224,7 +226,7 @@ class ActuatedDynamics(Dynamics):
             if found is None:
                 raise ConfigError(
                     f"the model is driven by '{name}', which the vessel's actuators do not"
-                    f" have{nearest(name, names)}"
+                    f" have{suggest_name(name, names)}"
                 )
             self.take.append(names.index(found))
 
@@ -236,10 +238,10 @@ class ActuatedDynamics(Dynamics):
         return self.actuators.approach(rows, self.hull)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        a = columns.actuators(x, self.dof)
+        a = columns.actuator_states(x, self.dof)
         moved = self.actuators.move(a, w)
         given = torch.cat((a, w), dim=-1)[:, self.take]
         if self.mean:
             given = 0.5 * (given + torch.cat((moved, w), dim=-1)[:, self.take])
-        y, s = self.model.step(columns.motion(x, self.dof), given, s)
+        y, s = self.model.step(columns.pose_and_dynamic_states(x, self.dof), given, s)
         return torch.cat((y, moved), dim=-1), s

@@ -10,18 +10,18 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.columns import (
+    all_but_pose,
+    dynamic_states,
     heading,
+    level_velocities,
     pose,
     roll_angle,
     surge,
     sway,
-    tilted,
-    velocities,
-    velocities_on,
     yaw_rate,
 )
-from residnet.core.frames import cross, rotated, to_earth
-from residnet.core.layout import PLANAR
+from residnet.core.frames import compose_rotation, cross_product, to_earth
+from residnet.core.layout import PLANAR_LAYOUT
 
 Integrator = Literal["rk4", "heun", "euler", "semi_implicit_euler"]
 
@@ -59,7 +59,7 @@ class Dynamics(nn.Module, ABC):
         self.nodes, self.weights = (list(part) for part in _TABLEAUX[integrator])
         self.semi_implicit = integrator == "semi_implicit_euler"
         self.n_state = 0
-        self.dof, self.rolls = PLANAR.dof, False
+        self.dof, self.rolls = PLANAR_LAYOUT.n_dof, False
         self.positions = True
         self.turn_about((), 0)
 
@@ -98,7 +98,7 @@ class Dynamics(nn.Module, ABC):
         """
         if self.spatial:
             # the heading has its share of a rotation vector, which is r
-            forward, starboard, _ = tilted(velocities(x, self.dof))
+            forward, starboard, _ = level_velocities(dynamic_states(x, self.dof))
             north, east = to_earth(forward, starboard, heading(x))
             return torch.stack((north, east, yaw_rate(x)), dim=-1)
         across, turned = sway(x), yaw_rate(x)
@@ -121,8 +121,8 @@ class Dynamics(nn.Module, ABC):
     def from_start(self, change: Tensor, k: Tensor) -> Tensor:
         """Return rates k [B, nx] after a change [B, nx] as those of the change itself."""
         turn, rate = change.index_select(-1, self.attitude), k.index_select(-1, self.attitude)
-        bent = cross(turn, rate)
-        rate = rate + 0.5 * bent + cross(turn, bent) / 12.0
+        bent = cross_product(turn, rate)
+        rate = rate + 0.5 * bent + cross_product(turn, bent) / 12.0
         return torch.cat((k, rate), dim=-1).index_select(-1, self.rearranged)
 
     def integrate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
@@ -134,7 +134,9 @@ class Dynamics(nn.Module, ABC):
         after = x + change
         if not self.spatial:
             return after
-        turned = rotated(x.index_select(-1, self.attitude), change.index_select(-1, self.attitude))
+        turned = compose_rotation(
+            x.index_select(-1, self.attitude), change.index_select(-1, self.attitude)
+        )
         return torch.cat((after, turned), dim=-1).index_select(-1, self.rearranged)
 
     def integrate_from(self, k: Tensor, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
@@ -157,7 +159,7 @@ class Dynamics(nn.Module, ABC):
             after = self.angled(x, after)
             # the pose moves with the new velocities, which keeps an undamped oscillation bounded;
             # what stands behind the velocities goes along
-            moved = velocities_on(after)
+            moved = all_but_pose(after)
             return torch.cat(
                 (
                     pose(x) + self.dt * self.kinematics(torch.cat((pose(x), moved), dim=-1)),

@@ -21,7 +21,7 @@ import casadi as ca
 import numpy as np
 
 from residnet.core.errors import ExportError, UsageError
-from residnet.core.files import whole
+from residnet.core.files import atomic_write
 from residnet.core.ownership import Manifest
 
 FUNCTIONS: Final = {
@@ -472,7 +472,7 @@ def compiled_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
             with tempfile.TemporaryDirectory() as folder:
                 out = Path(folder) / "compiled.so"
                 _compile(tool, source, flags, out)
-                with whole(file, manifest) as partial:
+                with atomic_write(file, manifest) as partial:
                     shutil.copyfile(out, partial)
             _forget(manifest)
         file.touch()

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ExportError
-from residnet.core.processes import free_cores
+from residnet.core.processes import available_cores
 from residnet.dynamics.c_code import (
     FUNCTIONS,
     Body,
@@ -688,7 +688,7 @@ class CompiledRollout:
             ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else ctypes.c_long(a)
             for a in arguments
         ]
-        parts = min(max(torch.get_num_threads(), free_cores()), blocks)
+        parts = min(max(torch.get_num_threads(), available_cores()), blocks)
         ends = [ctypes.c_long(blocks * k // parts) for k in range(parts + 1)]
         if parts == 1:
             function(*given, *ends)

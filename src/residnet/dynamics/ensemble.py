@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from residnet.baselines.base import Baseline
-from residnet.baselines.given import StillConfig
-from residnet.core.columns import pose, velocities, zero_acceleration
+from residnet.baselines.given import ZeroBaselineConfig
+from residnet.core.columns import dynamic_states, pose, zero_acceleration
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import FARTHEST, HybridDynamics
 from residnet.heads.base import ResidualHead, ZeroHead
@@ -35,7 +35,7 @@ class MeanBaseline(Baseline):
             total = total + member(z)
         return total / len(self.members)
 
-    def parameter_count(self) -> list[float]:
+    def parameter_counts(self) -> list[float]:
         return _parameters(self.members)
 
 
@@ -45,7 +45,7 @@ class MeanHead(ResidualHead):
 
     def __init__(self, members: Sequence[ResidualHead]) -> None:
         super().__init__()
-        self.dof = members[0].dof
+        self.n_dof = members[0].n_dof
         self.members = nn.ModuleList(members)
         self.widths = [member.n_state for member in members]
         self.n_state = sum(self.widths)
@@ -61,7 +61,7 @@ class MeanHead(ResidualHead):
             begin += self.widths[i]
         return torch.stack(residuals).mean(dim=0), torch.cat(memory, dim=-1)
 
-    def sequence(self, z: Tensor) -> Tensor:
+    def teacher_forced_residuals(self, z: Tensor) -> Tensor:
         residuals: list[Tensor] = []
         for member in self.members:
             residuals.append(member.sequence(z))  # type: ignore[operator]
@@ -73,12 +73,12 @@ class MeanHead(ResidualHead):
             memory.append(member.warmup(z))  # type: ignore[operator]
         return torch.cat(memory, dim=-1)
 
-    def memory_range(self) -> tuple[Tensor, Tensor]:
+    def memory_bounds(self) -> tuple[Tensor, Tensor]:
         ranges = [member.memory_range() for member in self.members]  # type: ignore[operator]
         low, high = zip(*ranges, strict=True)
         return torch.cat(low), torch.cat(high)
 
-    def parameter_count(self) -> list[float]:
+    def parameter_counts(self) -> list[float]:
         return _parameters(self.members)
 
 
@@ -125,7 +125,7 @@ class MeanOfTrajectories(HybridDynamics):
         first = members[0]
         super().__init__(
             first.signals,
-            StillConfig().build(first.signals.names),
+            ZeroBaselineConfig().build(first.signals.names),
             ZeroHead(first.signals.names),
             first.dt,
             first.integrator,
@@ -134,7 +134,7 @@ class MeanOfTrajectories(HybridDynamics):
         for member in self.members:
             # the pose follows from the mean
             member.positions = False
-        self.copies = [member.head.copies for member in members]
+        self.copies = [member.head.batch_ensemble_size for member in members]
         self.widths = [self.dof + member.n_state for member in members]
         *self.begins, self.n_state = accumulate(
             (copies * width for copies, width in zip(self.copies, self.widths, strict=True)),
@@ -159,7 +159,7 @@ class MeanOfTrajectories(HybridDynamics):
 
     def _kept(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the share [B, 1] of their distances from the mean that members keep."""
-        missed = (velocities(x, self.dof) - s[:, 1 : 1 + self.dof]) / self.small.to(x.dtype)
+        missed = (dynamic_states(x, self.dof) - s[:, 1 : 1 + self.dof]) / self.small.to(x.dtype)
         return s[:, :1] / (1.0 + missed.square().sum(dim=-1, keepdim=True))
 
     def _part(self, s: Tensor, i: int) -> Tensor:
@@ -171,7 +171,7 @@ class MeanOfTrajectories(HybridDynamics):
     def _own(self, x: Tensor, s: Tensor, kept: Tensor, i: int) -> tuple[Tensor, Tensor]:
         """Return the states and memories [K B, ...] that a member steps from."""
         copies, rows, part = self.copies[i], x.shape[0], self._part(s, i)
-        moved = velocities(x, self.dof) + kept * part[..., : self.dof]
+        moved = dynamic_states(x, self.dof) + kept * part[..., : self.dof]
         at = torch.cat((pose(x).expand(copies, rows, 3), moved), dim=-1)
         width = self.widths[i] - self.dof
         own = part[..., self.dof :].reshape(copies * rows, width)
@@ -181,12 +181,12 @@ class MeanOfTrajectories(HybridDynamics):
         self, x: Tensor, states: list[Tensor], memories: list[Tensor]
     ) -> tuple[Tensor, Tensor]:
         """Return the mean's state and memory from those of the members, [K B, ...] each."""
-        nu, rows = velocities(x, self.dof), x.shape[0]
+        nu, rows = dynamic_states(x, self.dof), x.shape[0]
         total = torch.zeros_like(nu)
         own: list[Tensor] = []
         memory: list[Tensor] = []
         for i in range(len(states)):
-            reached = velocities(states[i], self.dof).reshape(self.copies[i], rows, self.dof)
+            reached = dynamic_states(states[i], self.dof).reshape(self.copies[i], rows, self.dof)
             total = total + reached.mean(dim=0)
             own.append(reached)
             memory.append(memories[i].reshape(self.copies[i], rows, self.widths[i] - self.dof))
@@ -228,8 +228,8 @@ class MeanOfTrajectories(HybridDynamics):
 
     def acceleration(self, x: Tensor, w: Tensor, s: Tensor) -> Tensor:
         """Return the mean change of what moves [B, n] over a step, by its length."""
-        after = velocities(self.step(x, w, s)[0], self.dof)
-        return (after - velocities(x, self.dof)) / self.dt
+        after = dynamic_states(self.step(x, w, s)[0], self.dof)
+        return (after - dynamic_states(x, self.dof)) / self.dt
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
         limit = torch.full((1 + self.dof,), FARTHEST, dtype=torch.float64)

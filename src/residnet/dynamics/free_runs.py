@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from residnet.core.progress import say
+from residnet.core.progress import log_message
 from residnet.dynamics.rollout import (
     WORTH_COMPILING,
     FreeRun,
@@ -96,4 +96,4 @@ def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> F
 @cache
 def _tell(reason: str) -> None:
     """Say once why free runs are not compiled."""
-    say(f"  free runs are not compiled, and take longer: {reason}")
+    log_message(f"  free runs are not compiled, and take longer: {reason}")

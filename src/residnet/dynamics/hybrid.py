@@ -15,12 +15,12 @@ import torch
 from torch import Tensor, nn
 
 from residnet.baselines.base import Baseline
-from residnet.core.columns import pose, sinking, velocities
-from residnet.core.layout import ATTITUDE, Live
+from residnet.core.columns import dynamic_states, pose, with_depth_rate
+from residnet.core.layout import ATTITUDE, DegreesOfFreedom
 from residnet.dynamics.base import Dynamics, Integrator
 from residnet.heads.base import ResidualHead
 from residnet.physics.signals import Signals
-from residnet.physics.symmetry import live_of
+from residnet.physics.symmetry import get_dof
 
 _PIECE = 20.0
 """Length in s of pieces of a measurement that run side by side, and of the past of each."""
@@ -43,11 +43,11 @@ class Missed(nn.Module):
         size: entries of the memory: whether there is a prediction, what it is, what was missed.
     """
 
-    def __init__(self, settle: float, dt: float, live: Live) -> None:
+    def __init__(self, settle: float, dt: float, live: DegreesOfFreedom) -> None:
         super().__init__()
-        self.dof, self.size = live.size, 1 + 2 * live.size
-        self.free = len(live.learned) == live.size
-        self.mask = nn.Buffer(live.mask(), persistent=False)
+        self.dof, self.size = live.n_dynamic, 1 + 2 * live.n_dynamic
+        self.free = len(live.regressed_indices) == live.n_dynamic
+        self.mask = nn.Buffer(live.equation_mask(), persistent=False)
         self.keep = math.exp(-dt / settle)
         self.gain = (1.0 - self.keep) / dt
 
@@ -59,7 +59,7 @@ class Missed(nn.Module):
             s: memory of the step before [B, 1 + 2 n].
         """
         known, predicted, before = s.split([1, self.dof, self.dof], dim=-1)
-        left = (velocities(x, self.dof) - predicted) * known
+        left = (dynamic_states(x, self.dof) - predicted) * known
         if not self.free:
             left = left * self.mask.to(left.dtype)
         missed: Tensor = self.keep * before + self.gain * left
@@ -67,7 +67,7 @@ class Missed(nn.Module):
 
     def remembered(self, after: Tensor, missed: Tensor) -> Tensor:
         """Return the memory [B, 1 + 2 n] from the predicted states [B, nx] and what was missed."""
-        predicted = velocities(after, self.dof)
+        predicted = dynamic_states(after, self.dof)
         return torch.cat((torch.ones_like(after[:, :1]), predicted, missed), dim=-1)
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
@@ -98,16 +98,20 @@ class HybridDynamics(Dynamics):
         self.signals = signals
         self.baseline = baseline
         self.head = head
-        live = live_of(signals.names)
-        self.dof = live.size
-        self.whole, self.free = live.whole, len(live.learned) == live.size
-        self.rolls, self.level = live.rolls, not live.rolls
-        self.turn_about(ATTITUDE if live.spatial else (), len(live.states))
-        self.live = nn.Buffer(live.mask(), persistent=False)
-        self.living = nn.Buffer(live.alive(), persistent=False)
-        self.known_rates = nn.Buffer(live.known_rates(), persistent=False)
+        live = get_dof(signals.names)
+        self.dof = live.n_dynamic
+        self.whole, self.free = live.is_complete, len(live.regressed_indices) == live.n_dynamic
+        self.rolls, self.level = live.has_roll, not live.has_roll
+        self.turn_about(ATTITUDE if live.is_six_dof else (), len(live.state_names))
+        self.live = nn.Buffer(live.equation_mask(), persistent=False)
+        self.living = nn.Buffer(live.active_mask(), persistent=False)
+        self.known_rates = nn.Buffer(live.angle_rate_matrix(), persistent=False)
         head.set_step(dt)
-        self.missed = Missed(head.settle, dt, live) if head.settle > 0.0 else None
+        self.missed = (
+            Missed(head.innovation_time_constant, dt, live)
+            if head.innovation_time_constant > 0.0
+            else None
+        )
         self.width = head.n_state
         self.n_state = head.n_state + (0 if self.missed is None else self.missed.size)
 
@@ -116,7 +120,7 @@ class HybridDynamics(Dynamics):
 
         That is p = signals.prepare(w) and the residual rho [B, n].
         """
-        nu_dot = self.found(self.baseline(self.signals(x, p)), rho, velocities(x, self.dof))
+        nu_dot = self.found(self.baseline(self.signals(x, p)), rho, dynamic_states(x, self.dof))
         return torch.cat((self.kinematics(x), nu_dot), dim=-1)
 
     def found(self, known: Tensor, rho: Tensor, nu: Tensor) -> Tensor:
@@ -124,13 +128,13 @@ class HybridDynamics(Dynamics):
 
         A velocity that is dead stays so, and an angle moves by what moves nu [..., n].
         """
-        nu_dot: Tensor = self.head.accelerations(known, rho)
+        nu_dot: Tensor = self.head.combine_accelerations(known, rho)
         if self.free:
             return nu_dot
         nu_dot = nu_dot * self.live.to(nu_dot.dtype)
         if self.rolls:
             nu_dot = nu_dot + nu @ self.known_rates.to(nu.dtype)
-        return sinking(nu_dot, nu) if self.spatial else nu_dot
+        return with_depth_rate(nu_dot, nu) if self.spatial else nu_dot
 
     def angled(self, x: Tensor, after: Tensor) -> Tensor:
         """Return states [B, 3 + n] whose angles moved with the new velocities."""
@@ -138,13 +142,13 @@ class HybridDynamics(Dynamics):
             return after
         if self.spatial:
             # pose, depth and attitude move from where they were, by the new velocities
-            nu = velocities(after, self.dof)
-            nu = torch.where(self.live.to(x.dtype) > 0.0, nu, velocities(x, self.dof))
-            rate = sinking(nu @ self.known_rates.to(nu.dtype), nu)
+            nu = dynamic_states(after, self.dof)
+            nu = torch.where(self.live.to(x.dtype) > 0.0, nu, dynamic_states(x, self.dof))
+            rate = with_depth_rate(nu @ self.known_rates.to(nu.dtype), nu)
             held = torch.cat((pose(x), nu), dim=-1)
             moved = torch.cat((self.kinematics(held), rate), dim=-1)
             return self.moved_on(held, self.dt * moved)
-        nu = self.turned(velocities(x, self.dof), velocities(after, self.dof))
+        nu = self.turned(dynamic_states(x, self.dof), dynamic_states(after, self.dof))
         return torch.cat((pose(after), nu), dim=-1)
 
     def turned(self, nu: Tensor, after: Tensor) -> Tensor:
@@ -159,7 +163,7 @@ class HybridDynamics(Dynamics):
         """Return states [..., 3 + n] whose dead velocities are zero, whatever somebody gave."""
         if self.whole:
             return x
-        return torch.cat((pose(x), velocities(x, self.dof) * self.living.to(x.dtype)), dim=-1)
+        return torch.cat((pose(x), dynamic_states(x, self.dof) * self.living.to(x.dtype)), dim=-1)
 
     def channels(self, x: Tensor, w: Tensor) -> Tensor:
         """Return what baseline and head see, z [..., nz].
@@ -195,7 +199,7 @@ class HybridDynamics(Dynamics):
             p: what `signals.prepare` returned for the step's inputs.
             rho: residual of the step [B, n].
         """
-        nu_dot = self.found(self.baseline(z), rho, velocities(x, self.dof))
+        nu_dot = self.found(self.baseline(z), rho, dynamic_states(x, self.dof))
         return self.integrate_from(torch.cat((self.kinematics(x), nu_dot), dim=-1), x, p, rho)
 
     def known(self, z: Tensor) -> Tensor:
@@ -214,14 +218,14 @@ class HybridDynamics(Dynamics):
         """Return what `one_step` does where the baseline's share [B, T, n] is known."""
         if self.missed is not None:
             return self._observed(z, known)
-        return self.found(known, self.head.sequence(z), z[..., : self.dof])
+        return self.found(known, self.head.teacher_forced_residuals(z), z[..., : self.dof])
 
     def _observed(self, z: Tensor, known: Tensor) -> Tensor:
         """Return nu_dot [B, T, n] where the head is shown what was predicted wrong.
 
         Long measurements are cut into pieces that run side by side, each behind as long a past.
         """
-        rows, steps, copies = z.shape[0], z.shape[1], self.head.copies
+        rows, steps, copies = z.shape[0], z.shape[1], self.head.batch_ensemble_size
         piece = max(round(_PIECE / self.dt), 1)
         first = torch.arange(-piece, steps, piece)
         at = first[:-1, None] if len(first) > 1 else first[:, None]
@@ -253,7 +257,7 @@ class HybridDynamics(Dynamics):
         else:
             missed = self.missed(x, s[:, self.width :])
             rho, _ = self.head(torch.cat((z, missed), dim=-1), s[:, : self.width])
-        return self.found(self.baseline(z), rho, velocities(x, self.dof))
+        return self.found(self.baseline(z), rho, dynamic_states(x, self.dof))
 
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
         """Return the memory [B, n_state] that a measured past leaves.
@@ -277,7 +281,7 @@ class HybridDynamics(Dynamics):
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
         """Return the least and largest memory [n_state], of the head and of what was missed."""
-        low, high = self.head.memory_range()
+        low, high = self.head.memory_bounds()
         if self.missed is None:
             return low, high
         least, most = self.missed.memory_range()

@@ -66,7 +66,7 @@ class StepJacobian:
     def __init__(self, model: HybridDynamics, baseline: ParametricBaseline) -> None:
         self.theta, self.free = baseline.theta, baseline.free_indices().tolist()
         self.n = 1 + model.dof
-        inputs = model.signals.inputs + 2 * model.signals.wind
+        inputs = model.signals.n_inputs + 2 * model.signals.has_wind
         sizes = {"x": HEADING + self.n, "w": inputs, "theta": self.theta.numel()}
         traced = _Step(model, baseline.theta.shape).with_theta
         step = lowered(traced, [*sizes.items()], ["after"], "step")

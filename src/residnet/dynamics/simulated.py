@@ -46,7 +46,7 @@ class PlantDynamics(Dynamics):
 
     def __init__(self, plant: Plant, dt: float, substeps: int = 1) -> None:
         super().__init__(dt / substeps, "rk4")
-        self.turn_about(plant.attitude, len(plant.state))
+        self.turn_about(plant.attitude_columns, len(plant.state_names))
         self.plant = plant
         self.substeps = substeps
 
@@ -55,11 +55,11 @@ class PlantDynamics(Dynamics):
 
         A step holds p = prepare(x, w).
         """
-        return self.plant.held_rate(x, p)
+        return self.plant.derivative_prepared(x, p)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         for _ in range(self.substeps):
-            x = self.plant.end_step(self.integrate(x, self.plant.prepare(x, w), s), w, self.dt)
+            x = self.plant.finish_step(self.integrate(x, self.plant.prepare(x, w), s), w, self.dt)
         return x, s
 
 
@@ -84,7 +84,7 @@ class RecordedPlantDynamics(Dynamics):
 
         from residnet.dynamics.lowering import in_numbers, lowered
 
-        sizes = [("x", len(self.plant.state)), ("w", len(self.plant.inputs))]
+        sizes = [("x", len(self.plant.state_names)), ("w", len(self.plant.input_names))]
         model = PlantDynamics(self.plant, self.dt / self.substeps).eval()
         part = in_numbers(
             lowered(lambda x, w: model.step(x, w, x[:, :0])[0], sizes, ["y"], "plant")

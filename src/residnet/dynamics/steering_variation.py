@@ -10,12 +10,12 @@ from typing import NamedTuple, final
 import torch
 from torch import Tensor, nn
 
-from residnet.core.columns import actuators, motion
+from residnet.core.columns import actuator_states, pose_and_dynamic_states
 from residnet.core.errors import ConfigError
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.physics.plant import Plant
-from residnet.physics.symmetry import live_of
+from residnet.physics.symmetry import get_dof
 
 
 class Axis(NamedTuple):
@@ -96,24 +96,27 @@ class VariedPlant(Dynamics):
         super().__init__(dt, "heun" if integrator == "heun" else "rk4")
         self.plant = plant
         self.n_state = len(VARIATION)
-        if axis.command not in plant.inputs[: plant.commands]:
+        if axis.command not in plant.input_names[: plant.n_commands]:
             raise ConfigError(
                 f"{axis.name} control needs a vessel with the command {axis.command}, found"
-                f" {', '.join(plant.inputs[: plant.commands])}"
+                f" {', '.join(plant.input_names[: plant.n_commands])}"
             )
-        self.turn_about(plant.attitude, len(plant.state))
-        first = plant.inputs.index(axis.command)
-        places = range(len(plant.inputs))
+        self.turn_about(plant.attitude_columns, len(plant.state_names))
+        first = plant.input_names.index(axis.command)
+        places = range(len(plant.input_names))
         self.take = [0 if k == first else k + 1 if k < first else k for k in places]
-        self.rudder = plant.state.index(axis.gear) if axis.gear in plant.state else -1
-        slowed = torch.tensor([1.0 if name in axis.slowed else 0.0 for name in plant.state])
+        self.rudder = plant.state_names.index(axis.gear) if axis.gear in plant.state_names else -1
+        slowed = torch.tensor([1.0 if name in axis.slowed else 0.0 for name in plant.state_names])
         self.slowed = nn.Buffer(slowed, persistent=False)
-        gear = torch.tensor([1.0 if "delta" in name else 0.0 for name in plant.state])
+        gear = torch.tensor([1.0 if "delta" in name else 0.0 for name in plant.state_names])
         self.gear = nn.Buffer(gear, persistent=False)
-        x, w = plant.approach(1), torch.zeros(1, len(plant.inputs), dtype=torch.float64)
+        x, w = (
+            plant.make_initial_state(1),
+            torch.zeros(1, len(plant.input_names), dtype=torch.float64),
+        )
         w[:, first] = 0.1
         # a rudder with a lag moves within a step
-        self.moving = self.rudder >= 0 and bool(plant.rate(x, w)[0, self.rudder] != 0)
+        self.moving = self.rudder >= 0 and bool(plant.derivative(x, w)[0, self.rudder] != 0)
 
     def initial_state(self, batch: int) -> Tensor:
         return torch.tensor([1.0, 1.0, 0.0]).expand(batch, 3)
@@ -125,16 +128,16 @@ class VariedPlant(Dynamics):
         """
         slower = 1.0 + self.slowed.to(x.dtype) * rho[:, 2:]
         if self.rudder < 0:
-            rate: Tensor = self.plant.held_rate(x, p) * slower
+            rate: Tensor = self.plant.derivative_prepared(x, p) * slower
             return rate
         angle = x[:, self.rudder : self.rudder + 1] * rho[:, :1] + rho[:, 1:2]
         felt = self._felt(x, angle)
         if not self.moving:
-            held: Tensor = self.plant.held_rate(felt, p) * slower
+            held: Tensor = self.plant.derivative_prepared(felt, p) * slower
             return held
-        hull = self.plant.rate(felt, p) * slower
+        hull = self.plant.derivative(felt, p) * slower
         # the steering gear knows its own angle
-        own = self.plant.rate(x, p)
+        own = self.plant.derivative(x, p)
         gear = self.gear.to(x.dtype)
         return hull * (1.0 - gear) + own * gear
 
@@ -154,7 +157,7 @@ class VariedPlant(Dynamics):
             ] + s[:, 2:]
             held = torch.cat((angle, w[:, 1:]), dim=-1)[:, self.take]
             p = self.plant.prepare(self._felt(x, angle), held)
-        return self.plant.end_step(self.integrate(x, p, varied), ordered, self.dt), s
+        return self.plant.finish_step(self.integrate(x, p, varied), ordered, self.dt), s
 
 
 @final
@@ -189,7 +192,7 @@ class VariedModel(Dynamics):
         axis: Axis = HEADING,
     ) -> None:
         super().__init__(dt, model.integrator)
-        states = live_of(model.signals.names).states
+        states = get_dof(model.signals.names).state_names
         slowed = torch.tensor([name in axis.slowed for name in states])
         self.slowed = nn.Buffer(slowed, persistent=False)
         if model.n_state > 0 and not math.isclose(model.dt, dt, rel_tol=1e-9):
@@ -218,7 +221,7 @@ class VariedModel(Dynamics):
         return self.models[1 if x.dtype == torch.float64 else 0]
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        command, angle = w[:, :1], actuators(x, self.dof)
+        command, angle = w[:, :1], actuator_states(x, self.dof)
         angle_before, angle_after = (angle, angle) if self.geared else (command, command)
         if self.travel is not None:
             angle_after = angle + (command - angle).clamp(-self.travel, self.travel)
@@ -228,7 +231,7 @@ class VariedModel(Dynamics):
         effect, time_share, bias = s[:, : len(VARIATION)].split(1, dim=1)
         effective = effect * held + bias
         given = torch.cat((effective, w[:, 1:]), dim=1)[:, self.take]
-        own = motion(x, self.dof)
+        own = pose_and_dynamic_states(x, self.dof)
         moved, memory = self._of(x).step(own, given, s[:, len(VARIATION) :])
         parts = [torch.where(self.slowed, own + (moved - own) / time_share, moved)]
         parts += [angle_after] if self.geared else []

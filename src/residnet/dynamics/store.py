@@ -17,12 +17,12 @@ from pydantic import Field, field_validator, model_validator
 from torch import Tensor, nn
 
 from residnet.baselines import BaselineConfig
-from residnet.core.config import Config, validate
+from residnet.core.config import Config, validate_config
 from residnet.core.errors import ConfigError, UsageError
-from residnet.core.files import read_json, whole
-from residnet.core.layout import PLANAR, ROLL, SIX
-from residnet.core.names import nearest, require_plain_name
-from residnet.core.ownership import read_regular, run_manifest_above
+from residnet.core.files import atomic_write, read_json
+from residnet.core.layout import PLANAR_LAYOUT, ROLL_LAYOUT, SIX_DOF_LAYOUT
+from residnet.core.names import require_plain_name, suggest_name
+from residnet.core.ownership import find_run_manifest, read_regular_file
 from residnet.core.run_loader import SIZE_LIMITS, require_trustworthy
 from residnet.core.version import __version__
 from residnet.dynamics.base import Integrator
@@ -80,8 +80,12 @@ class BandTable(Config):
     def channels(self) -> tuple[str, ...]:
         """What has half widths."""
         if self.z is not None:
-            return SIX.banded
-        return PLANAR.banded if self.p is None and self.phi is None else ROLL.banded
+            return SIX_DOF_LAYOUT.band_channels
+        return (
+            PLANAR_LAYOUT.band_channels
+            if self.p is None and self.phi is None
+            else ROLL_LAYOUT.band_channels
+        )
 
     @property
     def columns(self) -> tuple[tuple[float, ...], ...]:
@@ -155,11 +159,11 @@ class ModelSpec(Stored):
 
     def as_one(self, model: HybridDynamics) -> HybridDynamics:
         """Return the model of `single`, with the mean of its networks' trajectories."""
-        return self.mean([model]) if model.head.copies > 1 else model
+        return self.mean([model]) if model.head.batch_ensemble_size > 1 else model
 
     def mean(self, members: Sequence[HybridDynamics]) -> MeanOfTrajectories:
         """Return the mean of the trajectories of single models as this one."""
-        n = self.signals.live.size
+        n = self.signals.dof.n_dynamic
         return MeanOfTrajectories(members, self.low[:n], self.high[:n])
 
     def single(self) -> HybridDynamics:
@@ -167,20 +171,20 @@ class ModelSpec(Stored):
         if self.members:
             return mean_of([member.build() for member in self.members])
         signals = self.signals.build()
-        live = self.signals.live
+        live = self.signals.dof
         head = ZeroHead(signals.names) if self.head is None else self.head.build(signals.names)
-        if head.dof != live.size:
+        if head.n_dof != live.n_dynamic:
             raise ConfigError(
-                f"model {self.name}: its head tells {head.dof} accelerations, and the model moves"
-                f" {', '.join(live.moving)}; a head gives these to ResidualHead as its channels"
+                f"model {self.name}: its head tells {head.n_dof} accelerations, and the model moves"
+                f" {', '.join(live.dynamic_states)}; a head gives these to ResidualHead as its channels"
             )
         known = self.baseline.build(signals.names)
-        head.set_mass(known.mass())
+        head.set_inertia(known.inertia_matrix())
         model = HybridDynamics(signals, known, head, self.dt, self.integrator)
         if self.role == "zero":
             # all is held, angles too
             model.known_rates.zero_()
-            if live.spatial:
+            if live.is_six_dof:
                 # it goes on over the ground, level
                 model.rolls = False
                 model.turn_about((), 0)
@@ -197,7 +201,10 @@ class ModelSpec(Stored):
         return {
             name: (low, high)
             for name, low, high in zip(
-                self.signals.live.moving + self.signals.columns, self.low, self.high, strict=True
+                self.signals.dof.dynamic_states + self.signals.input_columns,
+                self.low,
+                self.high,
+                strict=True,
             )
         }
 
@@ -218,12 +225,12 @@ def save_model(folder: Path, spec: Stored, module: nn.Module) -> None:
     content[_OWN_SUM] = _description_sum(content)
     # an earlier description would promise other numbers between the two writes
     description = folder / _DESCRIPTION
-    if (manifest := run_manifest_above(description)) is not None:
+    if (manifest := find_run_manifest(description)) is not None:
         manifest.require_replaceable(description)
     description.unlink(missing_ok=True)
-    with whole(folder / _WEIGHTS) as file:
+    with atomic_write(folder / _WEIGHTS) as file:
         file.write_bytes(weights)
-    with whole(folder / _DESCRIPTION) as file:
+    with atomic_write(folder / _DESCRIPTION) as file:
         file.write_text(json.dumps(content, indent=1) + "\n")
 
 
@@ -287,7 +294,7 @@ def read_spec(folder: Path, kind: type[SpecT]) -> SpecT:
             f"{folder / _DESCRIPTION}: holds '{content.get('schema')}', expected '{wanted}'; name a"
             " folder of that kind"
         )
-    return validate(content, kind, str(folder / _DESCRIPTION))
+    return validate_config(content, kind, str(folder / _DESCRIPTION))
 
 
 def read_weights(folder: Path, module: nn.Module) -> None:
@@ -303,7 +310,7 @@ def read_weights(folder: Path, module: nn.Module) -> None:
     file = folder / _WEIGHTS
     again = "restore the folder or run the fit again"
     try:
-        weights = read_regular(file, SIZE_LIMITS[".safetensors"])
+        weights = read_regular_file(file, SIZE_LIMITS[".safetensors"])
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UsageError(f"{file}: cannot be read ({reason}); {again}") from None
@@ -343,7 +350,7 @@ def _description(folder: Path) -> dict[str, Any]:
     card = folder / _DESCRIPTION
     if not card.is_file():
         raise UsageError(
-            f"{folder}: no model here{nearest(folder.name, model_names(folder.parent))}"
+            f"{folder}: no model here{suggest_name(folder.name, model_names(folder.parent))}"
         )
     content = read_json(card)
     # descriptions of earlier versions have no sum of their own
@@ -391,6 +398,6 @@ def chosen_model(run: Path, name: str) -> str:
     if selected not in names:
         raise UsageError(
             f"{run}: no model"
-            f" '{name}'{nearest(name, names) if names else '; not the folder of a finished fit'}"
+            f" '{name}'{suggest_name(name, names) if names else '; not the folder of a finished fit'}"
         )
     return selected

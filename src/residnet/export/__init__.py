@@ -1,17 +1,17 @@
-"""Export for controllers: one file per format, found by name in `FORMATS`."""
+"""Export for controllers: one file per format, found by name in `EXPORT_FORMATS`."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from residnet.core.errors import ConfigError
-from residnet.core.names import nearest
-from residnet.core.registry import Kinds, ThirdParty
+from residnet.core.names import suggest_name
+from residnet.core.registry import EntryPointPart, PluginUnion
 
 if TYPE_CHECKING:
     from residnet.export.base import Exporter
 
-FORMATS = Kinds(
+EXPORT_FORMATS = PluginUnion(
     "residnet.exporters",
     "residnet.export.base:Exporter",
     {
@@ -31,16 +31,16 @@ FORMATS = Kinds(
 """All formats, those of other packages included."""
 
 
-def exporter(name: str) -> Exporter:
+def get_exporter(name: str) -> Exporter:
     """Return the format of that name.
 
     Raises:
         ConfigError: where there is none, or the package that offers it is broken.
     """
-    if name not in (known := FORMATS.names()):
-        raise ConfigError(f"no export format '{name}'{nearest(name, known)}")
-    found = FORMATS.find(name)
-    if isinstance(found, ThirdParty):
-        raise ConfigError(f"export format {found.complaint}")
-    format: Exporter = found()
-    return format
+    if name not in (format_names := EXPORT_FORMATS.kind_names()):
+        raise ConfigError(f"no export format '{name}'{suggest_name(name, format_names)}")
+    exporter_class = EXPORT_FORMATS.find_kind(name)
+    if isinstance(exporter_class, EntryPointPart):
+        raise ConfigError(f"export format {exporter_class.error_message}")
+    new_exporter: Exporter = exporter_class()
+    return new_exporter

@@ -40,8 +40,8 @@ from residnet.core.errors import ExportError, WithheldError
 from residnet.core.version import __version__
 from residnet.judge.assessment import Assessment
 
-Numbers = npt.NDArray[Any]
-SINGLE, DOUBLE = 1e-5, 1e-12
+NumberArray = npt.NDArray[Any]
+SINGLE_TOLERANCE, DOUBLE_TOLERANCE = 1e-5, 1e-12
 """Largest difference in each precision, as a share of a channel's range."""
 Attempt = TypeVar("Attempt")
 
@@ -50,25 +50,28 @@ class RoundingError(ExportError):
     """A file that rounds otherwise than what it was made of, and ends elsewhere for that alone."""
 
 
-class Loaded(ABC):
+class LoadedExport(ABC):
     """A file that was written, loaded back; arrays of one row.
 
     Attributes:
-        reorders: whether it adds up in another order than torch, so that rounding may grow.
+        reorders_sums: whether it adds up in another order than torch, so that rounding may grow.
     """
 
-    reorders: bool = True
+    reorders_sums: bool = True
 
     @abstractmethod
-    def step(self, *given: Numbers) -> tuple[Any, ...]:
+    def step(self, *step_arguments: NumberArray) -> tuple[Any, ...]:
         """Return the results of one step."""
 
-    def rows(self, *given: Numbers) -> tuple[Any, ...]:
+    def step_rows(self, *step_arguments: NumberArray) -> tuple[Any, ...]:
         """Return the results of one step of many rows."""
-        found = zip(*(self.step(*row) for row in zip(*given, strict=True)), strict=True)
-        return tuple(map(np.stack, found))
+        results = zip(
+            *(self.step(*row_arguments) for row_arguments in zip(*step_arguments, strict=True)),
+            strict=True,
+        )
+        return tuple(map(np.stack, results))
 
-    def memory(self, *past: Numbers) -> Numbers | None:
+    def initial_memory(self, *measured_past: NumberArray) -> NumberArray | None:
         """Return the memory that a past leaves; None where the format has only steps.
 
         It is measured states [T, nx] and inputs [T, m] of a vessel, and the first measurement of a
@@ -76,30 +79,30 @@ class Loaded(ABC):
         """
         return None
 
-    def rollout(self, *given: Numbers) -> Numbers | None:
+    def rollout(self, *rollout_arguments: NumberArray) -> NumberArray | None:
         """Return the states of a free run of one row; None where the format has only steps."""
         return None
 
 
-class Exported(ABC):
+class Exportable(ABC):
     """What is exported: a step, what its card says, and how a file of it is checked.
 
     Attributes:
         name: of the model or policy.
-        what: it is, with its name, for messages.
+        label: it is, with its name, for messages.
         dt: step in s; None where there is none.
         arguments: names and sizes of what a step takes; the memory stands last where there is any.
         results: names of what a step gives.
         flags: those of them that are truth values; they stand last.
         precisions: that are tried, one after the other.
-        methods: of `module`, beside `forward`.
-        objections: sentences on what speaks against its use, for the card; see `released`.
+        methods: of `build_module`, beside `forward`.
+        objections: sentences on what speaks against its use, for the card; see `require_releasable`.
         assessment: what its run says of it and of its logs, for the card; None where it is exported
             without a run folder.
     """
 
     name: str
-    what: str
+    label: str
     dt: float | None
     arguments: Sequence[tuple[str, int]]
     results: Sequence[str]
@@ -109,7 +112,7 @@ class Exported(ABC):
     objections: Sequence[str] = ()
     assessment: Assessment | None = None
 
-    def require_numbers(self) -> None:  # noqa: B027 (policies are built from finite numbers)
+    def require_finite_numbers(self) -> None:  # noqa: B027 (policies are built from finite numbers)
         """Refuse what holds numbers that are not finite.
 
         Raises:
@@ -117,24 +120,24 @@ class Exported(ABC):
         """
 
     @abstractmethod
-    def module(self, dtype: torch.dtype) -> nn.Module:
+    def build_module(self, dtype: torch.dtype) -> nn.Module:
         """Return the module of the TorchScript file, in evaluation mode.
 
         Its `forward` is the step, of batches.
         """
 
     @abstractmethod
-    def graph(self, dtype: torch.dtype) -> nn.Module:
+    def build_step_module(self, dtype: torch.dtype) -> nn.Module:
         """Return a module whose `forward` is the step, without checks of shapes."""
 
     @abstractmethod
-    def contents(self) -> dict[str, Any]:
+    def card_contents(self) -> dict[str, Any]:
         """Return what the card says of this kind of thing."""
 
     @final
-    def card(self) -> dict[str, Any]:
+    def build_card(self) -> dict[str, Any]:
         """Return the card, without format, precision and parity."""
-        return {**self.contents(), **self.provenance()}
+        return {**self.card_contents(), **self.provenance()}
 
     @final
     def provenance(self) -> dict[str, Any]:
@@ -156,12 +159,12 @@ class Exported(ABC):
         digest = hashlib.sha256()
         settings = {
             key: value
-            for key, value in self.contents().items()
+            for key, value in self.card_contents().items()
             if key not in ("exported", "metrics", "versions")
         }
         digest.update(json.dumps(settings, sort_keys=True, default=str).encode())
         # a module of TorchScript may be a trace, whose numbers have no names
-        module = self.graph(self.precisions[-1])
+        module = self.build_step_module(self.precisions[-1])
         numbers = {**dict(module.named_parameters()), **dict(module.named_buffers())}
         for name, value in sorted(numbers.items()):
             digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
@@ -174,8 +177,8 @@ class Exported(ABC):
         }
 
     @abstractmethod
-    def check(
-        self, loaded: Loaded, what: str, dtype: torch.dtype, tolerance: float | None = None
+    def check_parity(
+        self, loaded: LoadedExport, subject: str, dtype: torch.dtype, tolerance: float | None = None
     ) -> dict[str, Any]:
         """Return what the card says of the parity, once a file answers as it must.
 
@@ -208,7 +211,7 @@ class Exporter(ABC):
     default_name_from_run: ClassVar[bool] = False
 
     @abstractmethod
-    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
+    def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
         """Write a model or a policy, after a parity check, and return what its card says.
 
         Args:
@@ -222,31 +225,33 @@ class Exporter(ABC):
         """
 
 
-Made = TypeVar("Made", bound=Exported)
+Made = TypeVar("Made", bound=Exportable)
 
 
-def released(exported: Made, objections: Sequence[str], *, anyway: bool) -> Made:
+def require_releasable(
+    exported: Made, objections: Sequence[str], *, allows_objections: bool
+) -> Made:
     """Return what may be exported, with all that speaks against it in its card.
 
     Args:
         objections: sentences without a full stop on why one should do without it: it is worse than
             `zero`, than the believed model or than the law that it stands beside.
-        anyway: whether it is wanted all the same.
+        allows_objections: whether it is wanted all the same.
 
     Raises:
         WithheldError: where something speaks against it, and it is not wanted all the same.
     """
     exported.objections = tuple(objections)
-    if objections and not anyway:
+    if objections and not allows_objections:
         raise WithheldError(
-            f"{exported.what} is withheld: {'; '.join(objections)}; `residnet export --anyway`"
+            f"{exported.label} is withheld: {'; '.join(objections)}; `residnet export --anyway`"
             " writes it all the same, and its card says so"
         )
     return exported
 
 
-def in_precision(
-    exported: Exported, attempt: Callable[[torch.dtype], Attempt]
+def run_in_sufficient_precision(
+    exported: Exportable, attempt: Callable[[torch.dtype], Attempt]
 ) -> tuple[torch.dtype, Attempt]:
     """Return the first precision that determines the answers, and what an attempt gave in it."""
     for dtype in exported.precisions[:-1]:
@@ -257,12 +262,12 @@ def in_precision(
     return exported.precisions[-1], attempt(exported.precisions[-1])
 
 
-def name_of(dtype: torch.dtype) -> str:
+def get_dtype_name(dtype: torch.dtype) -> str:
     """Return a precision as cards name it."""
     return "float64" if dtype == torch.float64 else "float32"
 
 
-def filled(template: str, **given: Any) -> str:
+def render_template(template: str, **values: Any) -> str:
     """Return a text file of a format, filled in; values are escaped in XML."""
     environment = Environment(
         loader=PackageLoader("residnet", "export"),
@@ -271,7 +276,7 @@ def filled(template: str, **given: Any) -> str:
         trim_blocks=True,
         keep_trailing_newline=True,
     )
-    return environment.get_template(f"{template}.jinja").render(given)
+    return environment.get_template(f"{template}.jinja").render(values)
 
 
 def write_card(file: Path, card: Mapping[str, Any]) -> None:

@@ -24,44 +24,44 @@ import numpy as np
 import torch
 
 from residnet.core.errors import ExportError, UsageError
-from residnet.core.progress import say
+from residnet.core.progress import log_message
 from residnet.dynamics.c_code import Body, Tables, compiler, literal
 from residnet.dynamics.lowering import in_numbers, lowered
 from residnet.dynamics.store import BandTable
 from residnet.export.base import (
-    Exported,
+    Exportable,
     Exporter,
-    Loaded,
-    Numbers,
-    filled,
-    in_precision,
-    name_of,
+    LoadedExport,
+    NumberArray,
+    get_dtype_name,
+    render_template,
+    run_in_sufficient_precision,
     write_card,
 )
 from residnet.export.policy import ExportedController
 from residnet.export.vessel import ExportedVessel
 
-_SCALAR: Final = 1100
+_MAX_SCALAR_OPERATIONS: Final = 1100
 """Most operations of a function that is taken apart into operations on single numbers."""
 
 
-def taken_apart(function: ca.Function) -> ca.Function:
+def expand_if_small(function: ca.Function) -> ca.Function:
     """Return a function of single numbers where it is small; networks keep their matrices."""
-    count = 0
+    n_operations = 0
     for k in range(function.n_instructions()):
         if function.instruction_id(k) == ca.OP_MTIMES:
             product = function.instruction_MX(k)
-            count += product.numel() * product.dep(1).shape[1]
-    if count > _SCALAR:
+            n_operations += product.numel() * product.dep(1).shape[1]
+    if n_operations > _MAX_SCALAR_OPERATIONS:
         return function
-    alone = in_numbers(function)
-    return alone if alone.n_instructions() <= _SCALAR else function
+    expanded = in_numbers(function)
+    return expanded if expanded.n_instructions() <= _MAX_SCALAR_OPERATIONS else function
 
 
-def identifier(text: str) -> str:
+def to_c_identifier(text: str) -> str:
     """Return a name as an identifier of C."""
-    plain = re.sub(r"\W", "_", text.lower(), flags=re.ASCII)
-    return plain if re.match(r"[a-z]", plain) else f"m_{plain}"
+    cleaned = re.sub(r"\W", "_", text.lower(), flags=re.ASCII)
+    return cleaned if re.match(r"[a-z]", cleaned) else f"m_{cleaned}"
 
 
 _C_HEADERS: Final = frozenset(
@@ -87,7 +87,7 @@ def file_prefix(file: Path) -> str:
             f"{file.name}: its header {file.stem}.h would hide that of the C library; give another"
             " file name with --out"
         )
-    return identifier(file.stem)
+    return to_c_identifier(file.stem)
 
 
 @dataclass(frozen=True)
@@ -96,61 +96,63 @@ class CFunction:
 
     Attributes:
         name: without the file's prefix.
-        about: its comment in the header.
+        comment: its comment in the header.
         function: what it does.
         flags: which of its results are truth values; the first is what the C function returns.
     """
 
     name: str
-    about: str
+    comment: str
     function: ca.Function
     flags: Sequence[str] = ()
 
-    def prototype(self, prefix: str) -> str:
+    def render_prototype(self, prefix: str) -> str:
         """Return the prototype; arguments first, then where the results go."""
-        given = [f"const {prefix}_real *{name}" for name in self.function.name_in()]
-        taken = [
+        inputs = [f"const {prefix}_real *{name}" for name in self.function.name_in()]
+        outputs = [
             f"{'int' if name in self.flags else f'{prefix}_real'} *{name}"
             for name in self.function.name_out()
             if name not in self.flags[:1]
         ]
-        kind = "int" if self.flags else "void"
-        return f"{kind} {prefix}_{self.name}({', '.join(given + taken) or 'void'})"
+        return_type = "int" if self.flags else "void"
+        return f"{return_type} {prefix}_{self.name}({', '.join(inputs + outputs) or 'void'})"
 
-    def definition(self, prefix: str, tables: Tables) -> str:
+    def render_definition(self, prefix: str, tables: Tables) -> str:
         """Return the function in C."""
-        body = Body(taken_apart(self.function), tables, f"{prefix}_{self.name}")
+        statement_writer = Body(expand_if_small(self.function), tables, f"{prefix}_{self.name}")
         names = self.function.name_out()
-        ends = [
-            f"{name}[{i}] = {cell};"
-            for name, cells in zip(names, body.results, strict=True)
-            for i, cell in enumerate(cells)
+        store_statements = [
+            f"{name}[{i}] = {value};"
+            for name, values in zip(names, statement_writer.results, strict=True)
+            for i, value in enumerate(values)
             if name not in self.flags[:1]
         ]
         if self.flags:
-            ends.append(f"return {body.results[names.index(self.flags[0])][0]} != ZERO;")
-        statements = body.read(ends)
-        words = set(re.findall(r"\w+", "\n".join(statements)))
-        unread = [
+            store_statements.append(
+                f"return {statement_writer.results[names.index(self.flags[0])][0]} != ZERO;"
+            )
+        statements = statement_writer.read(store_statements)
+        used_words = set(re.findall(r"\w+", "\n".join(statements)))
+        unused_casts = [
             f"(void){name};"
-            for name in (*body.names, *names)
-            if name not in words and name not in self.flags[:1]
+            for name in (*statement_writer.names, *names)
+            if name not in used_words and name not in self.flags[:1]
         ]
-        counters = [name for name in "hij" if name in words]
-        lines = [*([f"int {', '.join(counters)};"] if counters else []), *unread, *statements]
-        inside = "".join(f"    {line}\n" for line in lines)
-        return f"{self.prototype(prefix)} {{\n{inside}}}\n"
+        counters = [name for name in "hij" if name in used_words]
+        lines = [*([f"int {', '.join(counters)};"] if counters else []), *unused_casts, *statements]
+        indented_lines = "".join(f"    {line}\n" for line in lines)
+        return f"{self.render_prototype(prefix)} {{\n{indented_lines}}}\n"
 
 
-def c_files(
+def render_c_files(
     prefix: str,
     functions: Sequence[CFunction],
-    extra: Sequence[tuple[str, str, str]],
-    sizes: Mapping[str, tuple[int | str, str]],
-    about: str,
+    extra_functions: Sequence[tuple[str, str, str]],
+    constants: Mapping[str, tuple[int | str, str]],
+    header_comment: str,
     header: str,
     *,
-    double_only: bool = False,
+    is_double_only: bool = False,
     build: str = "",
 ) -> tuple[str, str]:
     """Return the source and the header of functions.
@@ -158,15 +160,15 @@ def c_files(
     Args:
         prefix: stands before every name of the file.
         functions: in the order in which they stand there.
-        extra: comment, prototype and body of further functions that call those.
-        sizes: value and comment of each constant, by name without prefix.
-        about: comment at the top of the header, which tells how to use it.
-        double_only: whether single precision is not offered.
+        extra_functions: comment, prototype and body of further functions that call those.
+        constants: value and comment of each constant, by name without prefix.
+        header_comment: comment at the top of the header, which tells how to use it.
+        is_double_only: whether single precision is not offered.
         build: identity of what is exported, which ends in hexadecimal digits; empty for none.
     """
     tables = Tables(f"{prefix}_")
-    bodies = [function.definition(prefix, tables) for function in functions]
-    bodies += [f"{prototype} {{\n{body}}}\n" for _, prototype, body in extra]
+    definitions = [function.render_definition(prefix, tables) for function in functions]
+    definitions += [f"{prototype} {{\n{body}}}\n" for _, prototype, body in extra_functions]
     names = {
         "prefix": prefix,
         "macro": f"{prefix.upper()}_DOUBLE",
@@ -174,22 +176,31 @@ def c_files(
         # a preprocessor compares integers of 32 bits on every platform, and no strings
         "build_number": f"0x{build.rpartition('+')[2][:8]}UL",
     }
-    words = set(re.findall(r"\w+", "\n".join(bodies)))
-    used = [text for name, text in tables.lines.items() if name in words]
-    source = filled("c_source.c", header=header, body="\n".join((*used, *bodies)), **names)
-    told = [(function.about, function.prototype(prefix)) for function in functions]
-    told += [(comment, prototype) for comment, prototype, _ in extra]
-    return source, filled(
+    used_words = set(re.findall(r"\w+", "\n".join(definitions)))
+    used_tables = [
+        entry_comment for name, entry_comment in tables.lines.items() if name in used_words
+    ]
+    source = render_template(
+        "c_source.c", header=header, body="\n".join((*used_tables, *definitions)), **names
+    )
+    declarations = [(function.comment, function.render_prototype(prefix)) for function in functions]
+    declarations += [(comment, prototype) for comment, prototype, _ in extra_functions]
+    return source, render_template(
         "c_header.h",
-        comment="\n".join(f" * {x}".rstrip() for x in _comment(about).splitlines()),
+        comment="\n".join(
+            f" * {comment_line}".rstrip() for comment_line in _comment(header_comment).splitlines()
+        ),
         guard=f"{prefix.upper()}_H",
-        double_only=double_only,
+        double_only=is_double_only,
         **names,
         numbers="\n".join(
-            f"#define {prefix.upper()}_{name} {value} /* {_comment(text)} */"
-            for name, (value, text) in sizes.items()
+            f"#define {prefix.upper()}_{name} {value} /* {_comment(entry_comment)} */"
+            for name, (value, entry_comment) in constants.items()
         ),
-        prototypes="\n\n".join(f"/* {_comment(text)} */\n{line};" for text, line in told),
+        prototypes="\n\n".join(
+            f"/* {_comment(entry_comment)} */\n{prototype_line};"
+            for entry_comment, prototype_line in declarations
+        ),
     )
 
 
@@ -198,31 +209,41 @@ def _comment(text: str) -> str:
     return text.replace("*/", "* /").replace("/*", "/ *")
 
 
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+STRICT_FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 """Flags under which every exported file compiles without a warning."""
 
 
-def compile_shared(
-    sources: Sequence[Path], out: Path, flags: Sequence[str] = (), tool: str = ""
+def compile_shared_library(
+    sources: Sequence[Path], library_path: Path, flags: Sequence[str] = (), compiler_path: str = ""
 ) -> Path:
     """Compile C files to a shared library, without a single warning.
 
     Args:
         flags: of the compiler, beside its usual ones.
-        tool: the compiler; empty for that of this machine.
+        compiler_path: the compiler; empty for that of this machine.
 
     Raises:
         ExportError: with the compiler's first complaint.
     """
     # all code for Windows is independent of its position, and the flag a warning there
-    own = () if out.suffix == ".dll" else ("-fPIC",)
-    call = [tool or compiler(), "-O2", *STRICT, "-shared", *own, *flags, *map(str, sources)]
-    done = subprocess.run([*call, "-o", str(out), "-lm"], capture_output=True, text=True)
-    if done.returncode:
-        lines = done.stderr.strip().splitlines()
-        said = next((line for line in lines if "error" in line), "no message")
-        raise ExportError(f"{sources[0].name}: does not compile ({said})")
-    return out
+    position_flags = () if library_path.suffix == ".dll" else ("-fPIC",)
+    command = [
+        compiler_path or compiler(),
+        "-O2",
+        *STRICT_FLAGS,
+        "-shared",
+        *position_flags,
+        *flags,
+        *map(str, sources),
+    ]
+    completed = subprocess.run(
+        [*command, "-o", str(library_path), "-lm"], capture_output=True, text=True
+    )
+    if completed.returncode:
+        lines = completed.stderr.strip().splitlines()
+        error_line = next((line for line in lines if "error" in line), "no message")
+        raise ExportError(f"{sources[0].name}: does not compile ({error_line})")
+    return library_path
 
 
 STACK_LIMIT: Final = 4096
@@ -231,10 +252,10 @@ CODE_LIMIT: Final = 262_144
 """Bytes of code and constants above which an export warns: the flash of a small controller."""
 
 
-def footprint(source: Path) -> dict[str, Any]:
+def measure_footprint(source: Path) -> dict[str, Any]:
     """Return the stack and the size of a C file on this machine, built for size.
 
-    Stack is measured by `-fstack-usage`, size by `size`. What the tools here do not measure is
+    Stack is measured by `-fstack-usage`, size by `n_entries`. What the tools here do not measure is
     estimated from the source: arrays in memory, four bytes for each operation and constant.
 
     Returns:
@@ -248,26 +269,28 @@ def footprint(source: Path) -> dict[str, Any]:
     code = estimated_code(text)
     stack_from = code_from = "estimate"
     with tempfile.TemporaryDirectory() as folder:
-        made = Path(folder) / "made.o"
+        object_file = Path(folder) / "made.o"
         try:
-            tool = compiler()
+            size_tool = compiler()
         except ExportError:
-            tool = ""
-        call = [tool, "-std=c99", "-Os", "-c", str(source), "-o", str(made)]
+            size_tool = ""
+        command = [size_tool, "-std=c99", "-Os", "-c", str(source), "-o", str(object_file)]
         # a compiler that does not know the flag may still tell the size
-        for flags in (["-fstack-usage"], []) if tool else ():
-            if subprocess.run([*call, *flags], capture_output=True).returncode == 0:
+        for flags in (["-fstack-usage"], []) if size_tool else ():
+            if subprocess.run([*command, *flags], capture_output=True).returncode == 0:
                 break
-        usage = made.with_suffix(".su")
-        if usage.is_file():
-            rows = (line.split("\t") for line in usage.read_text().splitlines())
-            stack = {name.rsplit(":", 1)[-1]: int(size) for name, size, *_ in rows}
-            stack_from = f"{Path(tool).name} -Os -fstack-usage"
-        if made.is_file() and (program := shutil.which("size")) is not None:
-            lines = subprocess.run([program, str(made)], capture_output=True, text=True).stdout
+        stack_file = object_file.with_suffix(".su")
+        if stack_file.is_file():
+            usage_rows = (line.split("\t") for line in stack_file.read_text().splitlines())
+            stack = {name.rsplit(":", 1)[-1]: int(size) for name, size, *_ in usage_rows}
+            stack_from = f"{Path(size_tool).name} -Os -fstack-usage"
+        if object_file.is_file() and (program := shutil.which("size")) is not None:
+            lines = subprocess.run(
+                [program, str(object_file)], capture_output=True, text=True
+            ).stdout
             # the first column of Berkeley's format holds code and constants
             code = int(lines.splitlines()[1].split()[0])
-            code_from = f"{Path(tool).name} -Os, size"
+            code_from = f"{Path(size_tool).name} -Os, size"
     return {
         "machine": f"{platform.machine()}, -Os",
         "stack_bytes": stack,
@@ -318,7 +341,7 @@ def deepest_stack(stack: Mapping[str, int], bodies: Mapping[str, str]) -> int:
 def report_footprint(what: str, size: Mapping[str, Any]) -> list[str]:
     """Report stack and size to the user before a file is written; return the warnings."""
     stack, code = size["largest_stack_bytes"], size["code_bytes"]
-    say(
+    log_message(
         f"  {what}: {stack:,} bytes of stack ({size['stack_from']}), {code:,} bytes of code and"
         f" constants ({size['code_from']}) on {size['machine']}"
     )
@@ -334,11 +357,11 @@ def report_footprint(what: str, size: Mapping[str, Any]) -> list[str]:
             " controller; export a smaller model"
         )
     for warning in warnings:
-        say(f"  warning: {warning}")
+        log_message(f"  warning: {warning}")
     return warnings
 
 
-_STEP = {
+_STEP_COMMENTS = {
     "vessel": "state and memory one step later; returns 1 where anything was outside the training"
     "\n * range or no number, else 0; results may go where arguments came from",
     "policy": "command, s_after once per step; returns 1 where a measurement, the reference"
@@ -362,13 +385,13 @@ class CSource(NamedTuple):
     header: str
 
 
-def c_source(
-    exported: Exported,
+def generate_c_source(
+    exported: Exportable,
     card: Mapping[str, Any],
     header: str,
     prefix: str,
     *,
-    double_only: bool = False,
+    is_double_only: bool = False,
 ) -> CSource:
     """Return source and header.
 
@@ -376,143 +399,177 @@ def c_source(
         card: stands as a comment in the header.
         header: name of the header.
         prefix: of all names, see `file_prefix`.
-        double_only: whether single precision is not offered.
+        is_double_only: whether single precision is not offered.
 
     Raises:
         ExportError: where there is an operation that is not written in C.
     """
-    what = exported.what
+    label = exported.label
     functions: list[CFunction] = []
-    extra: list[tuple[str, str, str]] = []
-    sizes: dict[str, tuple[int | str, str]] = {
-        f"SIZE_{name.upper()}": (size, f"entries of {name}") for name, size in exported.arguments
+    extra_functions: list[tuple[str, str, str]] = []
+    constants: dict[str, tuple[int | str, str]] = {
+        f"SIZE_{name.upper()}": (n_entries, f"entries of {name}")
+        for name, n_entries in exported.arguments
     }
     # what is found in double precision is written for both
-    step = lowered(exported.graph(torch.float64), exported.arguments, exported.results, what)
-    kind, told = "force", "a feed-forward, written by residnet. All arrays are the caller's."
+    step_function = lowered(
+        exported.build_step_module(torch.float64), exported.arguments, exported.results, label
+    )
+    description_key, introduction = (
+        "force",
+        "a feed-forward, written by residnet. All arrays are the caller's.",
+    )
     if isinstance(exported, ExportedVessel):
-        kind = "vessel"
-        told = (
+        description_key = "vessel"
+        introduction = (
             "a vessel model, written by residnet. All arrays are the caller's; nothing is"
             "\nallocated, nothing is kept between calls.\n\nx [STATES] state, w [INPUTS] inputs"
             " held over the step, s [MEMORY] memory."
         )
-        guarded = exported.guarded(torch.float64)
-        measured = lowered(guarded.measured, exported.arguments[:2], ["good"], what)
-        about = "1 where every entry of a state and its inputs is a measurement, else 0"
-        functions.append(CFunction("measured", about, measured, ["good"]))
-        extra = _vessel_functions(prefix, exported)
-        units = {key: ", ".join(f"{e['name']} {e['unit']}" for e in card[key]) for key in
+        guarded = exported.guard_model(torch.float64)
+        measured_function = lowered(guarded.is_measurement, exported.arguments[:2], ["good"], label)
+        function_comment = "1 where every entry of a state and its inputs is a measurement, else 0"
+        functions.append(CFunction("measured", function_comment, measured_function, ["good"]))
+        extra_functions = _render_vessel_functions(prefix, exported)
+        unit_texts = {key: ", ".join(f"{entry['name']} {entry['unit']}" for entry in card[key]) for key in
                  ("states", "inputs")}  # fmt: skip
-        counts = [count for _, count in exported.arguments]
-        sizes = {
-            "STATES": (counts[0], units["states"]),
-            "INPUTS": (counts[1], units["inputs"]),
-            "MEMORY": (counts[2], "entries of the memory s"),
+        argument_sizes = [argument_size for _, argument_size in exported.arguments]
+        constants = {
+            "STATES": (argument_sizes[0], unit_texts["states"]),
+            "INPUTS": (argument_sizes[1], unit_texts["inputs"]),
+            "MEMORY": (argument_sizes[2], "entries of the memory s"),
         }
     elif isinstance(exported, ExportedController):
-        kind, told = "policy", "a policy, written by residnet. All arrays are the caller's."
-        begun = lowered(
-            exported.controller(torch.float64).initial_state, exported.arguments[:1], ["s"], what
+        description_key, introduction = (
+            "policy",
+            "a policy, written by residnet. All arrays are the caller's.",
         )
-        functions.append(CFunction("initial_state", "memory at the first measurement", begun))
-    functions.append(CFunction("step", _STEP[kind], step, exported.flags))
-    if exported.dt is not None:
-        sizes["DT"] = (repr(float(exported.dt)), "step in s")
-    about = f"{exported.name}: {told}\n\n{json.dumps(card, indent=1)}"
-    build = card["build"]["identity"]
-    files = c_files(
-        prefix, functions, extra, sizes, about, header, double_only=double_only, build=build
+        initial_function = lowered(
+            exported.build_controller(torch.float64).initial_state,
+            exported.arguments[:1],
+            ["s"],
+            label,
+        )
+        functions.append(
+            CFunction("initial_state", "memory at the first measurement", initial_function)
+        )
+    functions.append(
+        CFunction("step", _STEP_COMMENTS[description_key], step_function, exported.flags)
     )
-    return CSource(prefix, *files)
+    if exported.dt is not None:
+        constants["DT"] = (repr(float(exported.dt)), "step in s")
+    function_comment = f"{exported.name}: {introduction}\n\n{json.dumps(card, indent=1)}"
+    build = card["build"]["identity"]
+    file_texts = render_c_files(
+        prefix,
+        functions,
+        extra_functions,
+        constants,
+        function_comment,
+        header,
+        is_double_only=is_double_only,
+        build=build,
+    )
+    return CSource(prefix, *file_texts)
 
 
-def _vessel_functions(prefix: str, exported: ExportedVessel) -> list[tuple[str, str, str]]:
+def _render_vessel_functions(prefix: str, exported: ExportedVessel) -> list[tuple[str, str, str]]:
     """Return comment, prototype and body of the memory's functions and of the band."""
-    upper, real = prefix.upper(), f"{prefix}_real"
-    memory = exported.model.n_state > 0
-    begin = f"    size_t k;\n    for (k = 0; k < {upper}_MEMORY; k++) s[k] = 0;\n"
-    unread = "    (void)x;\n    (void)w;\n    (void)count;\n    (void)s;\n"
-    table: BandTable | None = exported.spec.band
-    steps = (1,) if table is None else table.steps
-    banded = exported.spec.signals.live.layout.banded
-    rows = [(math.inf,) * len(banded)] if table is None else list(zip(*table.columns, strict=True))
-    widths = ["{" + ", ".join(map(literal, row)) + "}" for row in rows]
-    band = filled("c_band.c", steps=steps, widths=widths, channels=len(banded))
+    prefix_upper, real_type = prefix.upper(), f"{prefix}_real"
+    has_memory = exported.model.n_state > 0
+    zero_loop = f"    size_t k;\n    for (k = 0; k < {prefix_upper}_MEMORY; k++) s[k] = 0;\n"
+    unused_casts = "    (void)x;\n    (void)w;\n    (void)count;\n    (void)s;\n"
+    band_table: BandTable | None = exported.spec.band
+    steps = (1,) if band_table is None else band_table.steps
+    band_channels = exported.spec.signals.dof.layout.band_channels
+    width_rows = (
+        [(math.inf,) * len(band_channels)]
+        if band_table is None
+        else list(zip(*band_table.columns, strict=True))
+    )
+    widths = ["{" + ", ".join(map(literal, half_widths)) + "}" for half_widths in width_rows]
+    band_body = render_template("c_band.c", steps=steps, widths=widths, channels=len(band_channels))
     return [
         (
             "memory without a past",
-            f"void {prefix}_initial_state({real} *s)",
-            begin if memory else "    (void)s;\n",
+            f"void {prefix}_initial_state({real_type} *s)",
+            zero_loop if has_memory else "    (void)s;\n",
         ),
         (
             "memory that a measured past leaves: count states and inputs, oldest first",
-            f"void {prefix}_warmup(const {real} *x, const {real} *w, size_t count, {real} *s)",
-            filled("c_warmup.c", p=prefix, P=upper) if memory else unread,
+            f"void {prefix}_warmup(const {real_type} *x, const {real_type} *w, size_t count, {real_type} *s)",
+            render_template("c_warmup.c", p=prefix, P=prefix_upper) if has_memory else unused_casts,
         ),
         (
-            f"half widths of {', '.join(banded)} k steps after a measured state: between"
+            f"half widths of {', '.join(band_channels)} k steps after a measured state: between"
             "\n * steps of the table interpolated, beyond the last in proportion to time, infinite"
             "\n * without a table",
-            f"void {prefix}_band(int k, {real} *half)",
-            band,
+            f"void {prefix}_band(int k, {real_type} *half)",
+            band_body,
         ),
     ]
 
 
-class CompiledModel(Loaded):
+class CompiledModel(LoadedExport):
     """An exported C file as a library; `prefix` is that of its names."""
 
     def __init__(
-        self, library: Path, exported: Exported, dtype: torch.dtype, prefix: str
+        self, library: Path, exported: Exportable, dtype: torch.dtype, prefix: str
     ) -> None:
-        self.real: Any = np.float64 if dtype == torch.float64 else np.float32
+        self.real_dtype: Any = np.float64 if dtype == torch.float64 else np.float32
         self.exported, self.prefix = exported, prefix
         self.library = ctypes.CDLL(str(library))
-        self.outputs = self._sizes()
+        self.output_sizes = self._result_sizes()
 
-    def _sizes(self) -> dict[str, int]:
+    def _result_sizes(self) -> dict[str, int]:
         """Return the sizes of the results."""
-        given = [torch.zeros(1, size, dtype=torch.float64) for _, size in self.exported.arguments]
+        zero_arguments = [
+            torch.zeros(1, n_entries, dtype=torch.float64)
+            for _, n_entries in self.exported.arguments
+        ]
         with torch.no_grad():
-            found = self.exported.graph(torch.float64)(*given)
-        return {name: part.numel() for name, part in zip(self.exported.results, found, strict=True)}
+            results = self.exported.build_step_module(torch.float64)(*zero_arguments)
+        return {
+            name: result.numel()
+            for name, result in zip(self.exported.results, results, strict=True)
+        }
 
-    def _call(self, name: str, *given: np.ndarray | int) -> int:
+    def _call_function(self, name: str, *call_arguments: np.ndarray | int) -> int:
         function = getattr(self.library, f"{self.prefix}_{name}")
         function.restype = ctypes.c_int
         return int(
             function(
                 *(
-                    ctypes.c_size_t(part) if isinstance(part, int) else
-                    ctypes.c_void_p(part.ctypes.data)
-                    for part in given
+                    ctypes.c_size_t(call_argument) if isinstance(call_argument, int) else
+                    ctypes.c_void_p(call_argument.ctypes.data)
+                    for call_argument in call_arguments
                 )
             )
         )  # fmt: skip
 
-    def step(self, *given: Numbers) -> tuple[Any, ...]:
+    def step(self, *step_arguments: NumberArray) -> tuple[Any, ...]:
         flags = self.exported.flags
-        out = {
-            name: np.zeros(size, np.int32 if name in flags else self.real)
-            for name, size in self.outputs.items()
+        outputs = {
+            name: np.zeros(n_entries, np.int32 if name in flags else self.real_dtype)
+            for name, n_entries in self.output_sizes.items()
             if name not in flags[:1]
         }
-        rows = [np.ascontiguousarray(part, dtype=self.real) for part in given]
-        returned = self._call("step", *rows, *out.values())
-        found = out | {name: np.array([returned]) for name in flags[:1]}
+        arrays = [np.ascontiguousarray(array, dtype=self.real_dtype) for array in step_arguments]
+        returned = self._call_function("step", *arrays, *outputs.values())
+        results = outputs | {name: np.array([returned]) for name in flags[:1]}
         return tuple(
-            bool(found[name][0]) if name in flags else found[name] for name in self.exported.results
+            bool(results[name][0]) if name in flags else results[name]
+            for name in self.exported.results
         )
 
-    def memory(self, *past: Numbers) -> Numbers | None:
-        s = np.zeros(self.exported.arguments[-1][1], self.real)
-        rows = [np.ascontiguousarray(part, dtype=self.real) for part in past]
-        if len(rows) > 1:
-            self._call("warmup", *rows, len(rows[0]), s)
+    def initial_memory(self, *measured_past: NumberArray) -> NumberArray | None:
+        initial_memory = np.zeros(self.exported.arguments[-1][1], self.real_dtype)
+        arrays = [np.ascontiguousarray(array, dtype=self.real_dtype) for array in measured_past]
+        if len(arrays) > 1:
+            self._call_function("warmup", *arrays, len(arrays[0]), initial_memory)
         else:
-            self._call("initial_state", *rows, s)
-        return s
+            self._call_function("initial_state", *arrays, initial_memory)
+        return initial_memory
 
 
 @final
@@ -524,63 +581,67 @@ class CExporter(Exporter):
     about: ClassVar[str] = "The model as one C99 file and header, without any runtime."
     default_name_from_run: ClassVar[bool] = True
 
-    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
+    def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
         """Write source, header and card, checked in single and in double precision.
 
         Where single precision does not determine the track, the file is in double precision alone.
         """
-        exported.require_numbers()
+        exported.require_finite_numbers()
         # a header that is asked for names the pair
         file = file.with_suffix(self.suffix) if file.suffix == ".h" else file
         prefix = file_prefix(file)
-        card = exported.card() | {
+        card = exported.build_card() | {
             "format": "c",
             "dtype": "float32; float64 with the macro _DOUBLE",
             "safety": "The file is source code: compile only what you trust.",
         }
         with tempfile.TemporaryDirectory() as name:
-            partial = Path(name) / file.name
+            temporary_path = Path(name) / file.name
 
-            def attempt(dtype: torch.dtype) -> tuple[CSource, dict[str, Any]]:
+            def write_and_check(dtype: torch.dtype) -> tuple[CSource, dict[str, Any]]:
                 double_only = dtype == torch.float64
-                told = card | {"dtype": name_of(dtype)} if double_only else card
-                header = partial.with_suffix(".h")
-                written = c_source(exported, told, header.name, prefix, double_only=double_only)
-                partial.write_text(written.source)
-                header.write_text(written.header)
-                macro = [f"-D{written.prefix.upper()}_DOUBLE"]
+                card_of_precision = card | {"dtype": get_dtype_name(dtype)} if double_only else card
+                header = temporary_path.with_suffix(".h")
+                c_files = generate_c_source(
+                    exported, card_of_precision, header.name, prefix, is_double_only=double_only
+                )
+                temporary_path.write_text(c_files.source)
+                header.write_text(c_files.header)
+                double_flags = [f"-D{c_files.prefix.upper()}_DOUBLE"]
                 parity = {}
-                for each in exported.precisions[exported.precisions.index(dtype) :]:
-                    precision = "double" if each == torch.float64 else "single"
-                    library = partial.with_name(f"{precision}.so")
-                    compile_shared([partial], library, macro if precision == "double" else [])
-                    parity[precision] = exported.check(
-                        CompiledModel(library, exported, each, prefix),
-                        f"the C file in {precision} precision",
-                        each,
+                for checked_dtype in exported.precisions[exported.precisions.index(dtype) :]:
+                    precision = "double" if checked_dtype == torch.float64 else "single"
+                    library = temporary_path.with_name(f"{precision}.so")
+                    compile_shared_library(
+                        [temporary_path], library, double_flags if precision == "double" else []
                     )
-                return written, parity
+                    parity[precision] = exported.check_parity(
+                        CompiledModel(library, exported, checked_dtype, prefix),
+                        f"the C file in {precision} precision",
+                        checked_dtype,
+                    )
+                return c_files, parity
 
-            dtype, (written, parity) = in_precision(exported, attempt)
+            dtype, (c_files, parity) = run_in_sufficient_precision(exported, write_and_check)
             if dtype == torch.float64:
-                card |= {"dtype": name_of(dtype)}
-            size = footprint(partial)
+                card |= {"dtype": get_dtype_name(dtype)}
+            size = measure_footprint(temporary_path)
             size["warnings"] = report_footprint(file.name, size)
             card |= {"size": size, "parity": parity}
             write_card(file, card)
-            file.with_suffix(".h").write_text(written.header)
-            file.write_text(written.source)
+            file.with_suffix(".h").write_text(c_files.header)
+            file.write_text(c_files.source)
         return card
 
 
-class CasadiModel(Loaded):
+class CasadiModel(LoadedExport):
     """A written function, loaded back."""
 
     def __init__(self, file: Path) -> None:
         self.function: Any = ca.Function.load(str(file))
 
-    def step(self, *given: Numbers) -> tuple[Any, ...]:
-        return tuple(part.full().reshape(-1) for part in self.function(*given))
+    def step(self, *step_arguments: NumberArray) -> tuple[Any, ...]:
+        return tuple(result.full().reshape(-1) for result in self.function(*step_arguments))
 
 
 @final
@@ -591,27 +652,34 @@ class CasadiExporter(Exporter):
     suffix: ClassVar[str] = ".casadi"
     about: ClassVar[str] = "The model's step as a CasADi function with exact derivatives, for MPC."
 
-    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
-        exported.require_numbers()
-        step = lowered(
-            exported.graph(torch.float64), exported.arguments, exported.results, exported.what
+    def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
+        exported.require_finite_numbers()
+        step_function = lowered(
+            exported.build_step_module(torch.float64),
+            exported.arguments,
+            exported.results,
+            exported.label,
         )
         with tempfile.TemporaryDirectory() as name:
-            partial = Path(name) / file.name
-            in_numbers(step).save(str(partial))
-            parity = exported.check(CasadiModel(partial), "the CasADi function", torch.float64)
-            card = exported.card() | {
+            temporary_path = Path(name) / file.name
+            in_numbers(step_function).save(str(temporary_path))
+            parity = exported.check_parity(
+                CasadiModel(temporary_path), "the CasADi function", torch.float64
+            )
+            card = exported.build_card() | {
                 "format": "casadi",
                 "dtype": "float64",
                 "parity": parity,
                 "safety": "The file holds expressions only.",
             }
             write_card(file, card)
-            file.write_bytes(partial.read_bytes())
+            file.write_bytes(temporary_path.read_bytes())
         return card
 
 
-def s_function(exported: Exported, prefix: str, name: str, sizes: Mapping[str, int]) -> str:
+def render_s_function(
+    exported: Exportable, prefix: str, name: str, result_sizes: Mapping[str, int]
+) -> str:
     """Return the source of the S-function of a vessel or a controller.
 
     A vessel's output is its state, which it keeps beside the memory, and its flags; a controller's
@@ -620,25 +688,29 @@ def s_function(exported: Exported, prefix: str, name: str, sizes: Mapping[str, i
     Args:
         exported: with its step.
         prefix: of the functions in the C file.
-        sizes: of the step's results.
+        result_sizes: of the step's results.
     """
-    given = dict(exported.arguments)
-    vessel = isinstance(exported, ExportedVessel)
-    held = [given.pop(name) for name in (("x", "s") if vessel else ("s",))]
-    out = "x" if vessel else next(one for one in exported.results if one in sizes)
-    return filled(
+    argument_sizes = dict(exported.arguments)
+    is_vessel = isinstance(exported, ExportedVessel)
+    memory_sizes = [argument_sizes.pop(name) for name in (("x", "s") if is_vessel else ("s",))]
+    output_name = (
+        "x"
+        if is_vessel
+        else next(result_name for result_name in exported.results if result_name in result_sizes)
+    )
+    return render_template(
         "s_function.c",
-        about=exported.what,
-        vessel=vessel,
+        about=exported.label,
+        vessel=is_vessel,
         prefix=prefix,
         name=name,
         dt=repr(float(exported.dt or 0.0)),
-        ports=list(given.items()),
-        out=out,
-        width=held[0] if vessel else sizes[out],
+        ports=list(argument_sizes.items()),
+        out=output_name,
+        width=memory_sizes[0] if is_vessel else result_sizes[output_name],
         flags=exported.flags,
-        memory=held[-1],
-        kept=sum(held),
+        memory=memory_sizes[-1],
+        kept=sum(memory_sizes),
     )
 
 
@@ -651,33 +723,33 @@ class SimulinkExporter(Exporter):
     about: ClassVar[str] = "A level-2 S-function for Simulink around the C code."
     default_name_from_run: ClassVar[bool] = True
 
-    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
+    def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
         """Write the S-function, the C file and header that it calls, and the card."""
         if exported.dt is None:
-            raise UsageError(f"{exported.what}: has no step of its own; export it as c")
-        exported.require_numbers()
-        name = identifier(file.stem)
+            raise UsageError(f"{exported.label}: has no step of its own; export it as c")
+        exported.require_finite_numbers()
+        name = to_c_identifier(file.stem)
         file = file.with_name(f"{name}.c")
-        card = exported.card() | {
+        card = exported.build_card() | {
             "format": self.name,
             "dtype": "float64",
             "safety": "The file is source code: compile only what you trust.",
         }
         prefix = f"{name}_model"
-        written = c_source(exported, card, f"{prefix}.h", prefix, double_only=True)
+        c_files = generate_c_source(exported, card, f"{prefix}.h", prefix, is_double_only=True)
         with tempfile.TemporaryDirectory() as folder:
-            partial = Path(folder) / f"{name}_model.c"
-            partial.write_text(written.source)
-            partial.with_suffix(".h").write_text(written.header)
-            library = compile_shared([partial], partial.with_suffix(".so"))
+            temporary_path = Path(folder) / f"{name}_model.c"
+            temporary_path.write_text(c_files.source)
+            temporary_path.with_suffix(".h").write_text(c_files.header)
+            library = compile_shared_library([temporary_path], temporary_path.with_suffix(".so"))
             loaded = CompiledModel(library, exported, torch.float64, prefix)
-            parity = exported.check(loaded, "the S-function's code", torch.float64)
-            size = footprint(partial)
-            size["warnings"] = report_footprint(partial.name, size)
+            parity = exported.check_parity(loaded, "the S-function's code", torch.float64)
+            size = measure_footprint(temporary_path)
+            size["warnings"] = report_footprint(temporary_path.name, size)
             card |= {"size": size, "parity": parity}
-        text = s_function(exported, written.prefix, name, loaded.outputs)
+        s_function_text = render_s_function(exported, c_files.prefix, name, loaded.output_sizes)
         write_card(file, card)
-        file.with_name(f"{name}_model.c").write_text(written.source)
-        file.with_name(f"{name}_model.h").write_text(written.header)
-        file.write_text(text)
+        file.with_name(f"{name}_model.c").write_text(c_files.source)
+        file.with_name(f"{name}_model.h").write_text(c_files.header)
+        file.write_text(s_function_text)
         return card

@@ -14,29 +14,29 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ExportError, UsageError
-from residnet.core.layout import PLANAR, RANGE_VELOCITIES
+from residnet.core.layout import PLANAR_LAYOUT, RANGE_VELOCITIES
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.export.base import Exported, Exporter, Loaded, released
-from residnet.export.guard import Ranges, widening
+from residnet.export.base import Exportable, Exporter, LoadedExport, require_releasable
+from residnet.export.guard import GuardRanges, accepted_margin
 from residnet.export.torchscript import (
     TorchScriptExporter,
+    get_size,
     require_shape,
-    size,
     trace_function,
 )
 from residnet.export.vessel import ExportedVessel
 from residnet.heads.force import ForceHead
-from residnet.physics.force_model import MOTION
+from residnet.physics.force_model import MOTION_CHANNELS
 from residnet.physics.signals import FORCE_CHANNELS
 
-FADE = 0.25
+FADE_SHARE = 0.25
 """Share of the width of a training range, beyond its edge, over which a correction fades out."""
-EFFORT = 1.2
+MAX_FORCE_RATIO = 1.2
 """Most force outside the training range, in forces of the believed model, axis by axis."""
-_SAME = 1e-9
+_TOLERANCE = 1e-9
 """Largest difference of a file, as a share of each force's range."""
-_EDGE = 0.05
+_EDGE_SHARE = 0.05
 """Share of the width of a training range, within its edge, over which that limit sets in."""
 
 
@@ -68,7 +68,7 @@ class ResidualForce(nn.Module):
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
         """Return the force [B, 3] at nu_dot [B, 3] and nu [B, 3]."""
-        return self.head.force(nu_dot, torch.cat((nu, torch.zeros_like(nu)), dim=-1))
+        return self.head.residual_force(nu_dot, torch.cat((nu, torch.zeros_like(nu)), dim=-1))
 
 
 @final
@@ -76,28 +76,30 @@ class RequiredForce(nn.Module):
     """The force tau [B, 3] = F(nu_dot [B, 3], nu [B, 3]) of a believed model and its correction.
 
     A vessel is the same to port and starboard, while a correction that was fitted to a log is not
-    quite: with `mirrored` it is the mean of itself and its mirror image, so that a straight course
+    quite: with `is_mirrored` it is the mean of itself and its mirror image, so that a straight course
     needs neither sway force nor yaw moment.
     """
 
-    def __init__(self, believed: nn.Module, correction: nn.Module, *, mirrored: bool) -> None:
+    def __init__(self, believed: nn.Module, correction: nn.Module, *, is_mirrored: bool) -> None:
         super().__init__()
-        self.believed, self.correction, self.mirrored = believed, correction, mirrored
-        self.turned = nn.Buffer(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+        self.believed, self.correction, self.is_mirrored = believed, correction, is_mirrored
+        self.mirror_sign = nn.Buffer(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
         """Return the force [B, 3] at nu_dot [B, 3] and nu [B, 3]."""
-        believed, more = self.parts(nu_dot, nu)
-        return believed + more
+        believed_force, correction_force = self.split_forces(nu_dot, nu)
+        return believed_force + correction_force
 
-    def parts(self, nu_dot: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
+    def split_forces(self, nu_dot: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
         """Return the believed force and the correction, [B, 3] each."""
-        believed: Tensor = self.believed(nu_dot, nu)
-        more: Tensor = self.correction(nu_dot, nu)
-        if self.mirrored:
-            other: Tensor = self.correction(nu_dot * self.turned, nu * self.turned)
-            more = 0.5 * (more + other * self.turned)
-        return believed, more
+        believed_force: Tensor = self.believed(nu_dot, nu)
+        correction_force: Tensor = self.correction(nu_dot, nu)
+        if self.is_mirrored:
+            mirrored_correction: Tensor = self.correction(
+                nu_dot * self.mirror_sign, nu * self.mirror_sign
+            )
+            correction_force = 0.5 * (correction_force + mirrored_correction * self.mirror_sign)
+        return believed_force, correction_force
 
 
 @final
@@ -119,34 +121,50 @@ class GuardedForce(nn.Module):
     def __init__(self, model: RequiredForce, ranges: Sequence[tuple[float, float]]) -> None:
         super().__init__()
         self.model = model
-        low, high = torch.tensor(ranges, dtype=torch.float64).T
-        reach = torch.tensor([widening(*limits) for limits in ranges], dtype=torch.float64)
-        self.ranges = Ranges(low, high, reach, torch.float64)
-        self.width = nn.Buffer((high - low).clamp(min=1e-9))
-        self.dof = PLANAR.dof
-        self.fade, self.edge, self.effort = FADE, _EDGE, EFFORT
+        lower, upper = torch.tensor(ranges, dtype=torch.float64).T
+        margin = torch.tensor([accepted_margin(*limits) for limits in ranges], dtype=torch.float64)
+        self.ranges = GuardRanges(lower, upper, margin, torch.float64)
+        self.range_width = nn.Buffer((upper - lower).clamp(min=1e-9))
+        self.n_dof = PLANAR_LAYOUT.n_dof
+        self.fade_width, self.edge_width, self.max_force_ratio = (
+            FADE_SHARE,
+            _EDGE_SHARE,
+            MAX_FORCE_RATIO,
+        )
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
         """Return the force tau [B, 3] in N, N, N m and `outside` [B].
 
         `outside` is True where a motion is beyond the training range or no number.
         """
-        seen = torch.cat((nu_dot, nu), dim=-1).to(torch.float64)
-        low, high, used = self.ranges.low, self.ranges.high, self.ranges.replaced(seen)
-        believed, more = self.model.parts(used[:, : self.dof], used[:, self.dof :])
+        motion = torch.cat((nu_dot, nu), dim=-1).to(torch.float64)
+        lower, upper, replaced_motion = (
+            self.ranges.lower,
+            self.ranges.upper,
+            self.ranges.replace_unaccepted(motion),
+        )
+        believed_force, correction_force = self.model.split_forces(
+            replaced_motion[:, : self.n_dof], replaced_motion[:, self.n_dof :]
+        )
         # how deep inside the range in widths, the least of all channels; negative outside
-        depth = torch.minimum((seen - low) / self.width, (high - seen) / self.width)
+        depth = torch.minimum(
+            (motion - lower) / self.range_width, (upper - motion) / self.range_width
+        )
         depth = torch.nan_to_num(depth, nan=-1.0).amin(dim=-1, keepdim=True)
-        force = believed + (1.0 + depth / self.fade).clamp(0.0, 1.0) * more
-        free = (depth / self.edge).clamp(0.0, 1.0)
+        force = believed_force + (1.0 + depth / self.fade_width).clamp(0.0, 1.0) * correction_force
+        unlimited_share = (depth / self.edge_width).clamp(0.0, 1.0)
         # a motion that was replaced may itself need less than what stands in its place
-        itself: Tensor = self.model.believed(seen[:, : self.dof], seen[:, self.dof :])
-        unknown = float("inf")
-        least = torch.nan_to_num(itself.abs(), nan=unknown, posinf=unknown)
-        most = self.effort * torch.minimum(believed.abs(), least)
-        most = most + free * (believed.abs() + more.abs())
-        force = torch.minimum(torch.maximum(force, -most), most)
-        return force, ~self.ranges.inside(seen)
+        force_of_motion: Tensor = self.model.believed(
+            motion[:, : self.n_dof], motion[:, self.n_dof :]
+        )
+        infinite = float("inf")
+        min_believed = torch.nan_to_num(force_of_motion.abs(), nan=infinite, posinf=infinite)
+        force_limit = self.max_force_ratio * torch.minimum(believed_force.abs(), min_believed)
+        force_limit = force_limit + unlimited_share * (
+            believed_force.abs() + correction_force.abs()
+        )
+        force = torch.minimum(torch.maximum(force, -force_limit), force_limit)
+        return force, ~self.ranges.is_in_training_range(motion)
 
 
 @final
@@ -159,20 +177,20 @@ class TracedForce(nn.Module):
 
     def __init__(self, force: GuardedForce) -> None:
         super().__init__()
-        self.dof = force.dof
+        self.dof = force.n_dof
         examples = (torch.zeros(2, self.dof).double(), torch.zeros(2, self.dof).double())
         self.force = trace_function(force, examples, "feed-forward")
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
         """Return the force tau [B, 3] in N, N, N m and `outside` [B]."""
-        rows = size(nu, 2, 0)
+        rows = get_size(nu, 2, 0)
         require_shape("nu_dot", nu_dot, [rows, self.dof])
         require_shape("nu", nu, [rows, self.dof])
         found: tuple[Tensor, Tensor] = self.force(nu_dot.double(), nu.double())
         return found
 
 
-def required_force(
+def build_feed_forward(
     spec: ModelSpec, model: HybridDynamics
 ) -> tuple[RequiredForce, list[tuple[float, float]]]:
     """Return the feed-forward of a model, with the ranges of nu_dot and nu that it was fitted on.
@@ -186,37 +204,37 @@ def required_force(
             f"model {spec.name}: no residual in force space, so no feed-forward; fit a head of kind"
             " plsr or ridge with space: force"
         )
-    if spec.signals.columns != FORCE_CHANNELS:
+    if spec.signals.input_columns != FORCE_CHANNELS:
         raise UsageError(
             f"model {spec.name}: a feed-forward needs the inputs {', '.join(FORCE_CHANNELS)}, in"
             " this order, and no others"
         )
     model = model.to(torch.float64)
     believed = BelievedForce(model.baseline, head.mass)
-    force = RequiredForce(believed, ResidualForce(head), mirrored=True)
-    ranges = list(
+    required = RequiredForce(believed, ResidualForce(head), is_mirrored=True)
+    motion_ranges = list(
         zip(
-            (*head.lowest.tolist(), *spec.low[RANGE_VELOCITIES]),
-            (*head.highest.tolist(), *spec.high[RANGE_VELOCITIES]),
+            (*head.lower_velocities.tolist(), *spec.low[RANGE_VELOCITIES]),
+            (*head.upper_velocities.tolist(), *spec.high[RANGE_VELOCITIES]),
             strict=True,
         )
     )
-    return force.eval().requires_grad_(False), ranges
+    return required.eval().requires_grad_(False), motion_ranges
 
 
 @final
-class ExportedForce(Exported):
+class ExportedForce(Exportable):
     """A feed-forward (tau, outside) = F(nu_dot, nu), in double precision.
 
     Args:
         name: of the model that it comes from.
         model: the believed force and its correction.
         ranges: of nu_dot and nu in the data that identified the correction, six.
-        lag: of the thrusters, for the card; None where it was not fitted.
+        thruster_lag: of the thrusters, for the card; None where it was not fitted.
     """
 
     dt = None
-    arguments = (("nu_dot", PLANAR.dof), ("nu", PLANAR.dof))
+    arguments = (("nu_dot", PLANAR_LAYOUT.n_dof), ("nu", PLANAR_LAYOUT.n_dof))
     results = ("tau", "outside")
     flags = ("outside",)
     precisions = (torch.float64,)
@@ -226,49 +244,61 @@ class ExportedForce(Exported):
         name: str,
         model: RequiredForce,
         ranges: Sequence[tuple[float, float]],
-        lag: dict[str, float] | None = None,
+        thruster_lag: dict[str, float] | None = None,
     ) -> None:
-        self.name, self.what = name, f"feed-forward of {name}"
-        self.inner, self.ranges, self.lag = model.eval(), ranges, lag
+        self.name, self.label = name, f"feed-forward of {name}"
+        self.force_model, self.ranges, self.thruster_lag = model.eval(), ranges, thruster_lag
 
-    def module(self, dtype: torch.dtype) -> nn.Module:
-        return TracedForce(self.graph(dtype)).eval()
+    def build_module(self, dtype: torch.dtype) -> nn.Module:
+        return TracedForce(self.build_step_module(dtype)).eval()
 
-    def graph(self, dtype: torch.dtype) -> GuardedForce:
-        return GuardedForce(self.inner, self.ranges).eval()
+    def build_step_module(self, dtype: torch.dtype) -> GuardedForce:
+        return GuardedForce(self.force_model, self.ranges).eval()
 
-    def check(
-        self, loaded: Loaded, what: str, dtype: torch.dtype, tolerance: float | None = None
+    def check_parity(
+        self, loaded: LoadedExport, subject: str, dtype: torch.dtype, tolerance: float | None = None
     ) -> dict[str, Any]:
         """Compare the force at random motions, in and far beyond the training ranges.
 
         Raises:
             ExportError: where it differs, or a flag does.
         """
-        low, high = torch.tensor(self.ranges, dtype=torch.float64).T
-        random = torch.Generator().manual_seed(0)
-        share = torch.rand(200, 2 * PLANAR.dof, generator=random, dtype=torch.float64)
+        lower, upper = torch.tensor(self.ranges, dtype=torch.float64).T
+        generator = torch.Generator().manual_seed(0)
+        range_share = torch.rand(
+            200, 2 * PLANAR_LAYOUT.n_dof, generator=generator, dtype=torch.float64
+        )
         # a tenth is replaced by what no vessel does
-        share[180:] = 1e6 * (share[180:] - 0.5)
-        motion = low + share * (high - low)
+        range_share[180:] = 1e6 * (range_share[180:] - 0.5)
+        motion = lower + range_share * (upper - lower)
         motion[190:195, 0] = torch.nan
-        parts = motion.split(PLANAR.dof, dim=1)
+        motion_parts = motion.split(PLANAR_LAYOUT.n_dof, dim=1)
         with torch.no_grad():
-            tau, outside = self.graph(dtype)(*parts)
-        found = [loaded.step(*(part[k].numpy() for part in parts)) for k in range(len(motion))]
-        off = (torch.from_numpy(np.stack([force for force, _ in found])) - tau).abs()
-        worst = float((off[:180].amax(0) / (tau[:180].amax(0) - tau[:180].amin(0))).max())
-        flags = [bool(flag) for _, flag in found] == outside.tolist()
-        if not (worst < _SAME and bool((off <= _SAME * (1.0 + tau.abs())).all()) and flags):
+            tau, outside = self.build_step_module(dtype)(*motion_parts)
+        answers = [
+            loaded.step(*(part[k].numpy() for part in motion_parts)) for k in range(len(motion))
+        ]
+        differences = (torch.from_numpy(np.stack([force for force, _ in answers])) - tau).abs()
+        max_difference = float(
+            (differences[:180].amax(0) / (tau[:180].amax(0) - tau[:180].amin(0))).max()
+        )
+        are_flags_equal = [bool(flag) for _, flag in answers] == outside.tolist()
+        if not (
+            max_difference < _TOLERANCE
+            and bool((differences <= _TOLERANCE * (1.0 + tau.abs())).all())
+            and are_flags_equal
+        ):
             raise ExportError(
-                f"{self.what}: {what} differs from the model by {worst:.1e} of its range; allowed"
-                f" {_SAME:g}"
+                f"{self.label}: {subject} differs from the model by {max_difference:.1e} of its range; allowed"
+                f" {_TOLERANCE:g}"
             )
-        return {"steps": len(motion), "share_of_range": worst}
+        return {"steps": len(motion), "share_of_range": max_difference}
 
-    def contents(self) -> dict[str, Any]:
-        known = GuardedForce(self.inner, self.ranges).ranges
-        accepted = torch.stack((known.least, known.most), dim=1).tolist()
+    def card_contents(self) -> dict[str, Any]:
+        guard_ranges = GuardedForce(self.force_model, self.ranges).ranges
+        accepted = torch.stack(
+            (guard_ranges.accepted_lower, guard_ranges.accepted_upper), dim=1
+        ).tolist()
         return {
             "schema": "residnet.feed_forward/1",
             "arguments": {
@@ -281,22 +311,23 @@ class ExportedForce(Exported):
                 " `accepted` the nearest value of the training range; `outside` is then true, as"
                 " for every motion beyond the training range"
             ),
-            "accepted": dict(zip(MOTION, accepted, strict=True)),
+            "accepted": dict(zip(MOTION_CHANNELS, accepted, strict=True)),
             "outside_the_training_range": (
-                f"the correction of the believed model fades out over {FADE:g} of the range's"
-                f" width; no axis commands more than {EFFORT:g} times the believed model's force,"
+                f"the correction of the believed model fades out over {FADE_SHARE:g} of the range's"
+                f" width; no axis commands more than {MAX_FORCE_RATIO:g} times the believed model's force,"
                 " beyond `accepted` neither that of the motion nor that of its nearest value"
             ),
             "mirror": (
                 "the correction is the mean of itself and its mirror image: a straight course needs"
                 " no sway force and no yaw moment beyond the believed model's"
-                if self.inner.mirrored
+                if self.force_model.is_mirrored
                 else "the correction is as it was fitted, not the same to port and starboard"
             ),
             "training_range": {
-                name: list(limits) for name, limits in zip(MOTION, self.ranges, strict=True)
+                name: list(limits)
+                for name, limits in zip(MOTION_CHANNELS, self.ranges, strict=True)
             },
-            "thruster_lag": self.lag,
+            "thruster_lag": self.thruster_lag,
         }
 
 
@@ -310,12 +341,12 @@ class FeedForwardExporter(Exporter):
         "The force tau = F(nu_dot, nu) that a motion needs, from a model in force space."
     )
 
-    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
+    def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
         if not isinstance(exported, ExportedVessel):
-            raise UsageError(f"{exported.what}: a feed-forward is made of a vessel model alone")
-        force, ranges = required_force(exported.spec, exported.at(torch.float64))
-        made = released(
-            ExportedForce(exported.name, force, ranges), exported.objections, anyway=True
+            raise UsageError(f"{exported.label}: a feed-forward is made of a vessel model alone")
+        force, ranges = build_feed_forward(exported.spec, exported.to_precision(torch.float64))
+        exported_force = require_releasable(
+            ExportedForce(exported.name, force, ranges), exported.objections, allows_objections=True
         )
-        made.assessment = exported.assessment
-        return TorchScriptExporter().export(made, file)
+        exported_force.assessment = exported.assessment
+        return TorchScriptExporter().export(exported_force, file)

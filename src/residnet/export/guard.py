@@ -28,52 +28,60 @@ from typing import final
 import torch
 from torch import Tensor, nn
 
-from residnet.core.columns import actuators, motion, pose, velocities, velocities_on
-from residnet.core.layout import ATTITUDE, PLANAR, POSITION
+from residnet.core.columns import (
+    actuator_states,
+    all_but_pose,
+    dynamic_states,
+    pose,
+    pose_and_dynamic_states,
+)
+from residnet.core.layout import ATTITUDE, PLANAR_LAYOUT, POSITION
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 
-REACH = 2.0
+ACCEPTED_RANGE_FACTOR = 2.0
 """How far beyond the training range a value is accepted, in largest magnitudes of that range."""
-_LARGEST = float(torch.finfo(torch.float32).max)
-_FARTHEST = 1e5
+_FLOAT32_MAX = float(torch.finfo(torch.float32).max)
+_MAX_POSITION = 1e5
 """Largest north and east in m."""
-_TURNS = 2000.0 * math.pi
+_MAX_HEADING = 2000.0 * math.pi
 """Largest heading in rad."""
-_TURN = 2.0 * math.pi
+_FULL_TURN = 2.0 * math.pi
 
 
 @final
-class Ranges(nn.Module):
+class GuardRanges(nn.Module):
     """Training range [low, high] and accepted range [least, most] of values [k].
 
     Args:
-        reach: how far beyond the training range a value is accepted [k].
+        margin: how far beyond the training range a value is accepted [k].
         dtype: of the numbers.
     """
 
-    def __init__(self, low: Tensor, high: Tensor, reach: Tensor, dtype: torch.dtype) -> None:
+    def __init__(self, lower: Tensor, upper: Tensor, margin: Tensor, dtype: torch.dtype) -> None:
         super().__init__()
-        self.low, self.high = nn.Buffer(low.to(dtype)), nn.Buffer(high.to(dtype))
-        self.least = nn.Buffer((low - reach).to(dtype))
-        self.most = nn.Buffer((high + reach).to(dtype))
-        self.middle = nn.Buffer((0.5 * (low + high)).to(dtype))
+        self.lower, self.upper = nn.Buffer(lower.to(dtype)), nn.Buffer(upper.to(dtype))
+        self.accepted_lower = nn.Buffer((lower - margin).to(dtype))
+        self.accepted_upper = nn.Buffer((upper + margin).to(dtype))
+        self.midpoint = nn.Buffer((0.5 * (lower + upper)).to(dtype))
 
-    def inside(self, seen: Tensor) -> Tensor:
+    def is_in_training_range(self, values: Tensor) -> Tensor:
         """Return which rows [...] of values [..., k] lie in the training range."""
-        return ((seen >= self.low) & (seen <= self.high)).all(dim=-1)
+        return ((values >= self.lower) & (values <= self.upper)).all(dim=-1)
 
-    def accepted(self, seen: Tensor) -> Tensor:
+    def is_accepted(self, values: Tensor) -> Tensor:
         """Return which rows [...] of values [..., k] are accepted."""
         # comparisons with what is no number are false
-        return ((seen >= self.least) & (seen <= self.most)).all(dim=-1)
+        return ((values >= self.accepted_lower) & (values <= self.accepted_upper)).all(dim=-1)
 
-    def replaced(self, seen: Tensor) -> Tensor:
+    def replace_unaccepted(self, values: Tensor) -> Tensor:
         """Return values [..., k] with those that are no measurements replaced, as stated above."""
-        known = (seen >= self.least) & (seen <= self.most)
-        nearest = torch.minimum(torch.maximum(seen, self.low), self.high)
-        return torch.where(known, seen, torch.where(torch.isnan(seen), self.middle, nearest))
+        is_measurement = (values >= self.accepted_lower) & (values <= self.accepted_upper)
+        clamped = torch.minimum(torch.maximum(values, self.lower), self.upper)
+        return torch.where(
+            is_measurement, values, torch.where(torch.isnan(values), self.midpoint, clamped)
+        )
 
 
 @final
@@ -90,91 +98,125 @@ class GuardedDynamics(Dynamics):
     def __init__(self, model: HybridDynamics, spec: ModelSpec) -> None:
         super().__init__(model.dt, model.integrator)
         self.model = model
-        self.largest = _LARGEST
+        self.float_max = _FLOAT32_MAX
         self.n_state = model.n_state
         self.dof, self.rolls = model.dof, model.rolls
-        self.turn_about(ATTITUDE if model.spatial else (), len(spec.signals.live.states) + 1)
-        low, high, reach = (
-            torch.tensor(part, dtype=torch.float64) for part in (spec.low, spec.high, _reach(spec))
+        self.turn_about(ATTITUDE if model.spatial else (), len(spec.signals.dof.state_names) + 1)
+        lower, upper, margin = (
+            torch.tensor(values, dtype=torch.float64)
+            for values in (spec.low, spec.high, _accepted_margins(spec))
         )
-        far = torch.full((len(PLANAR.pose),), _FARTHEST, dtype=torch.float64)
-        far[POSITION.stop :] = _TURNS
+        pose_limit = torch.full((len(PLANAR_LAYOUT.pose),), _MAX_POSITION, dtype=torch.float64)
+        pose_limit[POSITION.stop :] = _MAX_HEADING
         if model.spatial:
             # no training range bounds the depth
-            depth = spec.signals.live.moving.index("z")
-            low[depth], high[depth], reach[depth] = -_FARTHEST, _FARTHEST, 0.0
-        low, high = torch.cat((-far, low)), torch.cat((far, high))
-        reach = torch.cat((torch.zeros_like(far), reach))
-        self.ranges = Ranges(low, high, reach, torch.float32)
-        n = len(spec.signals.live.states)
-        self.of_state = Ranges(low[:n], high[:n], reach[:n], torch.float32)
-        first, last = model.memory_range()
+            depth_index = spec.signals.dof.dynamic_states.index("z")
+            lower[depth_index], upper[depth_index], margin[depth_index] = (
+                -_MAX_POSITION,
+                _MAX_POSITION,
+                0.0,
+            )
+        lower, upper = torch.cat((-pose_limit, lower)), torch.cat((pose_limit, upper))
+        margin = torch.cat((torch.zeros_like(pose_limit), margin))
+        self.ranges = GuardRanges(lower, upper, margin, torch.float32)
+        n_states = len(spec.signals.dof.state_names)
+        self.state_ranges = GuardRanges(
+            lower[:n_states], upper[:n_states], margin[:n_states], torch.float32
+        )
+        memory_minimum, memory_maximum = model.memory_range()
         # finite, so that comparisons alone tell what is no number
-        smallest = (first - 1e-3 * first.abs()).clamp(min=-_LARGEST)
-        largest = (last + 1e-3 * last.abs()).clamp(max=_LARGEST)
-        self.memory_low = nn.Buffer(smallest.to(torch.float32))
-        self.memory_high = nn.Buffer(largest.to(torch.float32))
+        memory_lower = (memory_minimum - 1e-3 * memory_minimum.abs()).clamp(min=-_FLOAT32_MAX)
+        memory_upper = (memory_maximum + 1e-3 * memory_maximum.abs()).clamp(max=_FLOAT32_MAX)
+        self.memory_lower = nn.Buffer(memory_lower.to(torch.float32))
+        self.memory_upper = nn.Buffer(memory_upper.to(torch.float32))
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return x_dot [B, nx] of the model at a stage; the flag has none."""
         return torch.cat(
             (
-                self.model.rate(motion(x, self.dof), p, rho),
-                torch.zeros_like(actuators(x, self.dof)),
+                self.model.rate(pose_and_dynamic_states(x, self.dof), p, rho),
+                torch.zeros_like(actuator_states(x, self.dof)),
             ),
             dim=-1,
         )
 
-    def measured(self, x: Tensor, w: Tensor) -> Tensor:
+    def is_measurement(self, x: Tensor, w: Tensor) -> Tensor:
         """Return which samples [...] are measurements in all entries of x and w [..., m]."""
-        return self.ranges.accepted(torch.cat((x, w), dim=-1))
+        return self.ranges.is_accepted(torch.cat((x, w), dim=-1))
 
-    def accept(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def replace_bad_inputs(
+        self, x: Tensor, w: Tensor, s: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return state [B, 3 + n], inputs [B, m] and memory as they are used, and the flag [B]."""
-        seen = torch.cat((x, w), dim=-1)
-        used, inside = self.ranges.replaced(seen), self.ranges.inside(seen)
+        measured_values = torch.cat((x, w), dim=-1)
+        replaced_values, is_inside = (
+            self.ranges.replace_unaccepted(measured_values),
+            self.ranges.is_in_training_range(measured_values),
+        )
         # no reductions over nothing: not every format has them
         if self.n_state > 0:
-            remembers = self.remembers(s)
-            inside = inside & remembers
-            s = torch.where(remembers.unsqueeze(-1), s, torch.zeros_like(s))
-        return motion(used, self.dof), actuators(used, self.dof), s, ~inside
+            is_memory_valid = self.is_valid_memory(s)
+            is_inside = is_inside & is_memory_valid
+            s = torch.where(is_memory_valid.unsqueeze(-1), s, torch.zeros_like(s))
+        return (
+            pose_and_dynamic_states(replaced_values, self.dof),
+            actuator_states(replaced_values, self.dof),
+            s,
+            ~is_inside,
+        )
 
-    def remembers(self, s: Tensor) -> Tensor:
+    def is_valid_memory(self, s: Tensor) -> Tensor:
         """Return which rows [B] of a memory [B, n_state] the head can have come to."""
-        return ((s >= self.memory_low) & (s <= self.memory_high)).all(dim=-1)
+        return ((s >= self.memory_lower) & (s <= self.memory_upper)).all(dim=-1)
 
-    def settle(self, x: Tensor, after: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def replace_bad_result(
+        self, x: Tensor, next_state: Tensor, s: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return state and memory after a step as they are given out, and the flag [B].
 
         Args:
             x: state before the step [B, 3 + n], accepted.
-            after: what the model made of it [B, 3 + n].
+            next_state: what the model made of it [B, 3 + n].
             s: memory after the step [B, n_state].
         """
-        kept = self.of_state.accepted(after).unsqueeze(-1)
-        new = velocities_on(after)
-        held = torch.where(torch.isnan(new), velocities(x, self.dof), new)
-        coasting = torch.cat((pose(x) + self.dt * self.kinematics(x), held), dim=-1)
-        coasting = torch.minimum(torch.maximum(coasting, self.of_state.least), self.of_state.most)
+        is_state_accepted = self.state_ranges.is_accepted(next_state).unsqueeze(-1)
+        next_velocities = all_but_pose(next_state)
+        finite_velocities = torch.where(
+            torch.isnan(next_velocities), dynamic_states(x, self.dof), next_velocities
+        )
+        fallback_state = torch.cat(
+            (pose(x) + self.dt * self.kinematics(x), finite_velocities), dim=-1
+        )
+        fallback_state = torch.minimum(
+            torch.maximum(fallback_state, self.state_ranges.accepted_lower),
+            self.state_ranges.accepted_upper,
+        )
         if self.n_state == 0:
-            return torch.where(kept, after, coasting), s, ~kept.squeeze(-1)
-        known = (s.abs() <= self.largest).all(dim=-1, keepdim=True)
+            return (
+                torch.where(is_state_accepted, next_state, fallback_state),
+                s,
+                ~is_state_accepted.squeeze(-1),
+            )
+        is_memory_finite = (s.abs() <= self.float_max).all(dim=-1, keepdim=True)
         # a head of another package may leave what it says of its memory
-        s = torch.minimum(torch.maximum(s, self.memory_low), self.memory_high)
-        s = torch.where(known, s, torch.zeros_like(s))
-        return torch.where(kept, after, coasting), s, ~(kept & known).squeeze(-1)
+        s = torch.minimum(torch.maximum(s, self.memory_lower), self.memory_upper)
+        s = torch.where(is_memory_finite, s, torch.zeros_like(s))
+        return (
+            torch.where(is_state_accepted, next_state, fallback_state),
+            s,
+            ~(is_state_accepted & is_memory_finite).squeeze(-1),
+        )
 
     def flagged_step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the state [B, 3 + n] and the memory one step later, and the flag [B]."""
-        x, w, s, outside = self.accept(x, w, s)
-        after, s = self.model.step(x, w, s)
-        after, s, left = self.settle(x, after, s)
-        return after, s, outside | left
+        x, w, s, outside = self.replace_bad_inputs(x, w, s)
+        next_state, s = self.model.step(x, w, s)
+        next_state, s, is_replaced = self.replace_bad_result(x, next_state, s)
+        return next_state, s, outside | is_replaced
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        after, s, outside = self.flagged_step(motion(x, self.dof), w, s)
-        return torch.cat((after, outside.to(x.dtype).unsqueeze(-1)), dim=-1), s
+        next_state, s, outside = self.flagged_step(pose_and_dynamic_states(x, self.dof), w, s)
+        return torch.cat((next_state, outside.to(x.dtype).unsqueeze(-1)), dim=-1), s
 
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
         """Return the memory [B, n_state] that a measured past leaves, bad samples left out.
@@ -188,11 +230,11 @@ class GuardedDynamics(Dynamics):
         """
         if y_history.shape[1] == 0:
             return torch.zeros(y_history.shape[0], self.n_state)
-        good = self.measured(y_history, w_history)
-        y, w = hold_measured(y_history, w_history, good)
+        is_good = self.is_measurement(y_history, w_history)
+        y, w = hold_measured(y_history, w_history, is_good)
         s = self.model.warmup(y, w)
-        known = (good.any(dim=1) & torch.isfinite(s).all(dim=-1)).unsqueeze(-1)
-        return torch.where(known, s, torch.zeros_like(s))
+        has_memory = (is_good.any(dim=1) & torch.isfinite(s).all(dim=-1)).unsqueeze(-1)
+        return torch.where(has_memory, s, torch.zeros_like(s))
 
 
 def hold_measured(y: Tensor, w: Tensor, good: Tensor) -> tuple[Tensor, Tensor]:
@@ -212,15 +254,15 @@ def hold_measured(y: Tensor, w: Tensor, good: Tensor) -> tuple[Tensor, Tensor]:
     return y.gather(1, chosen.expand_as(y)), w.gather(1, chosen.expand_as(w))
 
 
-def widening(low: float, high: float) -> float:
+def accepted_margin(lower: float, upper: float) -> float:
     """Return how far beyond its training range a value is accepted, in its own unit."""
-    return REACH * (max(abs(low), abs(high)) or 0.5)
+    return ACCEPTED_RANGE_FACTOR * (max(abs(lower), abs(upper)) or 0.5)
 
 
-def _reach(spec: ModelSpec) -> list[float]:
+def _accepted_margins(spec: ModelSpec) -> list[float]:
     """Return how far beyond the training range each velocity and input is accepted."""
-    units = spec.signals.units()
+    units = spec.signals.channel_units()
     return [
-        max(widening(low, high), _TURN if units[name] == "rad" else 0.0)
-        for name, (low, high) in spec.ranges.items()
+        max(accepted_margin(lower, upper), _FULL_TURN if units[name] == "rad" else 0.0)
+        for name, (lower, upper) in spec.ranges.items()
     ]

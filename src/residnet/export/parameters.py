@@ -18,27 +18,27 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from residnet.baselines.given import GivenBaseline
+from residnet.baselines.given import FixedBaseline
 from residnet.baselines.regressors import RegressorBaseline
-from residnet.core.config_yaml import parse
+from residnet.core.config_yaml import parse_yaml
 from residnet.core.errors import UsageError
-from residnet.core.names import ACCELERATION, VELOCITY
+from residnet.core.names import ACCELERATION_NAMES, VELOCITY_NAMES
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.export.base import Exported, Exporter, filled
-from residnet.export.c import identifier
+from residnet.export.base import Exportable, Exporter, render_template
+from residnet.export.c import to_c_identifier
 from residnet.export.vessel import ExportedVessel
 from residnet.physics.signals import FORCE_CHANNELS
 
 Matrix = npt.NDArray[np.float64]
-_SAMPLES = 4000
+_N_SAMPLES = 4000
 """Velocities that damping is fitted to; chosen by hand, for at most four coefficients an axis."""
 # surge is damped by itself, sway and yaw by both
-_DAMPED_BY = ((0,), (1, 2), (1, 2))
+_DAMPING_VELOCITIES = ((0,), (1, 2), (1, 2))
 
 
 @dataclass(frozen=True)
-class Coefficients:
+class VesselCoefficients:
     """A vessel in three degrees of freedom, SI.
 
     Attributes:
@@ -56,57 +56,73 @@ class Coefficients:
     terms_left_out: dict[str, list[str]]
 
 
-def coriolis(mass: Matrix, nu: Matrix) -> Matrix:
+def compute_coriolis_force(mass: Matrix, nu: Matrix) -> Matrix:
     """Return C(nu) nu [N, 3] for velocities nu [N, 3]."""
     u, v, r = nu.T
-    a = mass[1, 1] * v + 0.5 * (mass[1, 2] + mass[2, 1]) * r
-    b = mass[0, 0] * u
-    return np.stack((-a * r, b * r, a * u - b * v), axis=-1)
+    sway_momentum = mass[1, 1] * v + 0.5 * (mass[1, 2] + mass[2, 1]) * r
+    surge_momentum = mass[0, 0] * u
+    return np.stack(
+        (-sway_momentum * r, surge_momentum * r, sway_momentum * u - surge_momentum * v), axis=-1
+    )
 
 
-def coefficients(spec: ModelSpec, model: HybridDynamics) -> Coefficients:
+def identify_coefficients(spec: ModelSpec, model: HybridDynamics) -> VesselCoefficients:
     """Return the coefficients of a model's baseline.
 
     Raises:
         UsageError: where the baseline is no sum of terms of velocities and forces.
     """
-    theta, terms = _linear(spec, model)
-    forces = [terms.index(name) if name in terms else -1 for name in FORCE_CHANNELS]
-    by_force = theta[:, forces] if min(forces) >= 0 else np.zeros((3, 3))
-    if np.linalg.matrix_rank(by_force) < 3:
-        missing = [name for name, at in zip(FORCE_CHANNELS, forces, strict=True) if at < 0]
+    theta, terms = _baseline_terms(spec, model)
+    force_columns = [terms.index(name) if name in terms else -1 for name in FORCE_CHANNELS]
+    force_columns_theta = theta[:, force_columns] if min(force_columns) >= 0 else np.zeros((3, 3))
+    if np.linalg.matrix_rank(force_columns_theta) < 3:
+        missing = [
+            name
+            for name, term_index in zip(FORCE_CHANNELS, force_columns, strict=True)
+            if term_index < 0
+        ]
         raise UsageError(
             f"model {spec.name}: its accelerations do not tell all masses"
             f" ({', '.join(missing) or 'the forces act alike'} is not among the baseline's terms);"
             " fit a baseline of kind believed, or one of regressors with tau_x, tau_y and tau_n"
         )
-    mass: Matrix = np.linalg.inv(by_force).astype(np.float64)
-    low, high = np.array(spec.low[:3]), np.array(spec.high[:3])
-    nu = np.random.default_rng(0).uniform(low, high, (_SAMPLES, 3))
-    z = np.zeros((_SAMPLES, len(model.signals.names)))
+    mass: Matrix = np.linalg.inv(force_columns_theta).astype(np.float64)
+    lower, upper = np.array(spec.low[:3]), np.array(spec.high[:3])
+    nu = np.random.default_rng(0).uniform(lower, upper, (_N_SAMPLES, 3))
+    z = np.zeros((_N_SAMPLES, len(model.signals.names)))
     z[:, :3] = nu
     with torch.no_grad():
-        known = model.baseline(torch.from_numpy(z)).numpy()
-    force = known @ mass.T
-    rest = force + coriolis(mass, nu)
-    linear, quadratic, left = np.zeros((3, 3)), np.zeros((3, 3)), {}
-    for i, axis in enumerate(VELOCITY):
-        by = _DAMPED_BY[i]
-        basis = np.concatenate((nu[:, by], np.abs(nu[:, by]) * nu[:, by]), axis=1)
-        found = -np.linalg.lstsq(basis, rest[:, i], rcond=None)[0]
-        linear[i, by], quadratic[i, by] = found[: len(by)], found[len(by) :]
-        remains = rest[:, i] + basis @ found
-        left[axis] = float(np.sqrt(np.mean(remains**2) / max(np.mean(force[:, i] ** 2), 1e-30)))
-    return Coefficients(mass, linear, quadratic, left, _unplaced(theta, terms))
+        acceleration = model.baseline(torch.from_numpy(z)).numpy()
+    force = acceleration @ mass.T
+    damping_force = force + compute_coriolis_force(mass, nu)
+    linear, quadratic, residual_share = np.zeros((3, 3)), np.zeros((3, 3)), {}
+    for i, axis in enumerate(VELOCITY_NAMES):
+        damping_columns = _DAMPING_VELOCITIES[i]
+        basis = np.concatenate(
+            (nu[:, damping_columns], np.abs(nu[:, damping_columns]) * nu[:, damping_columns]),
+            axis=1,
+        )
+        damping_coefficients = -np.linalg.lstsq(basis, damping_force[:, i], rcond=None)[0]
+        linear[i, damping_columns], quadratic[i, damping_columns] = (
+            damping_coefficients[: len(damping_columns)],
+            damping_coefficients[len(damping_columns) :],
+        )
+        residual_force = damping_force[:, i] + basis @ damping_coefficients
+        residual_share[axis] = float(
+            np.sqrt(np.mean(residual_force**2) / max(np.mean(force[:, i] ** 2), 1e-30))
+        )
+    return VesselCoefficients(
+        mass, linear, quadratic, residual_share, _unplaced_terms(theta, terms)
+    )
 
 
-def _linear(spec: ModelSpec, model: HybridDynamics) -> tuple[Matrix, list[str]]:
+def _baseline_terms(spec: ModelSpec, model: HybridDynamics) -> tuple[Matrix, list[str]]:
     """Return the coefficients [3, J] of the accelerations and the terms that they belong to."""
     baseline = model.baseline
     if isinstance(baseline, RegressorBaseline):
-        theta = (baseline.theta * baseline.allowed).detach().double().numpy()
+        theta = (baseline.theta * baseline.term_mask).detach().double().numpy()
         return theta, list(baseline.library.terms)
-    if isinstance(baseline, GivenBaseline) and baseline.library.count:
+    if isinstance(baseline, FixedBaseline) and baseline.library.n_terms:
         return baseline.theta.double().numpy(), list(baseline.library.terms)
     raise UsageError(
         f"model {spec.name}: its baseline '{spec.baseline.kind}' is no sum of terms of velocities"
@@ -114,61 +130,79 @@ def _linear(spec: ModelSpec, model: HybridDynamics) -> tuple[Matrix, list[str]]:
     )
 
 
-def _unplaced(theta: Matrix, terms: list[str]) -> dict[str, list[str]]:
+def _unplaced_terms(theta: Matrix, terms: list[str]) -> dict[str, list[str]]:
     """Return the terms of each axis that are neither damping, Coriolis force nor a force."""
-    own = {f"{name}" for name in VELOCITY} | {f"{name}|{name}|" for name in VELOCITY}
-    placed = own | set(FORCE_CHANNELS) | {"v r", "r v", "u r", "r u", "u v", "v u", "r^2"}
+    damping_terms = {f"{name}" for name in VELOCITY_NAMES} | {
+        f"{name}|{name}|" for name in VELOCITY_NAMES
+    }
+    placed_terms = (
+        damping_terms | set(FORCE_CHANNELS) | {"v r", "r v", "u r", "r u", "u v", "v u", "r^2"}
+    )
     return {
-        ACCELERATION[i]: [
-            term for j, term in enumerate(terms) if theta[i, j] != 0 and term not in placed
+        ACCELERATION_NAMES[i]: [
+            term for j, term in enumerate(terms) if theta[i, j] != 0 and term not in placed_terms
         ]
         for i in range(3)
     }
 
 
-_PLACES = (0, 1, 5)
+_PLANAR_INDICES = (0, 1, 5)
 """Of surge, sway and yaw among six degrees of freedom."""
-_SIMPLE = ("xDotU", "yDotV", "nDotR", "xU", "yV", "nR")
+_VRX_NAMES = ("xDotU", "yDotV", "nDotR", "xU", "yV", "nR")
 """What VRX knows under the names that Gazebo has for it."""
 
 
-def texts(name: str, found: Coefficients, rigid: Mapping[str, float]) -> dict[str, str]:
+def render_simulator_files(
+    name: str, vessel_coefficients: VesselCoefficients, rigid_body: Mapping[str, float]
+) -> dict[str, str]:
     """Return what the simulators read by the ends of file names.
 
     The plugins of Gazebo and VRX as SDF, with the masses of the rigid body: Gazebo's coefficients
     are forces, and so negative; those of VRX are resistances. A MATLAB function with the six-by-six
     matrices that MSS' vessels have. A vehicle of PythonVehicleSimulator.
     """
-    matrices = {"M": found.mass, "D": found.linear, "Dn": found.quadratic}
-    six = {letter: np.zeros((6, 6)) for letter in matrices}
+    matrices = {
+        "M": vessel_coefficients.mass,
+        "D": vessel_coefficients.linear,
+        "Dn": vessel_coefficients.quadratic,
+    }
+    matrices_6x6 = {letter: np.zeros((6, 6)) for letter in matrices}
     for letter, matrix in matrices.items():
-        six[letter][np.ix_(_PLACES, _PLACES)] = matrix
-    own = (rigid["mass"], rigid["mass"], rigid["inertia"])
-    added = (found.mass.diagonal() - own).tolist()
-    entries = dict(zip(_SIMPLE, added, strict=False))
+        matrices_6x6[letter][np.ix_(_PLANAR_INDICES, _PLANAR_INDICES)] = matrix
+    rigid_body_mass = (rigid_body["mass"], rigid_body["mass"], rigid_body["inertia"])
+    added_mass = (vessel_coefficients.mass.diagonal() - rigid_body_mass).tolist()
+    damping_entries = dict(zip(_VRX_NAMES, added_mass, strict=False))
     for i, axis in enumerate("xyn"):
-        for j, speed in enumerate("UVR"):
-            if found.linear[i, j] or found.quadratic[i, j]:
-                entries[f"{axis}{speed}"] = float(found.linear[i, j])
-                entries[f"{axis}{speed}abs{speed}"] = float(found.quadratic[i, j])
-    simple = {key: key for key in _SIMPLE}
-    simple |= {f"{key}{key[-1]}": f"{key}abs{key[-1]}" for key in _SIMPLE[3:]}
-    title = "".join(part.capitalize() for part in name.split("_"))
-    lists = {
-        "mass": found.mass.tolist(),
-        "linear": found.linear.tolist(),
-        "quadratic": found.quadratic.tolist(),
+        for j, velocity_letter in enumerate("UVR"):
+            if vessel_coefficients.linear[i, j] or vessel_coefficients.quadratic[i, j]:
+                damping_entries[f"{axis}{velocity_letter}"] = float(
+                    vessel_coefficients.linear[i, j]
+                )
+                damping_entries[f"{axis}{velocity_letter}abs{velocity_letter}"] = float(
+                    vessel_coefficients.quadratic[i, j]
+                )
+    vrx_names = {key: key for key in _VRX_NAMES}
+    vrx_names |= {f"{key}{key[-1]}": f"{key}abs{key[-1]}" for key in _VRX_NAMES[3:]}
+    class_name = "".join(name_part.capitalize() for name_part in name.split("_"))
+    matrix_lists = {
+        "mass": vessel_coefficients.mass.tolist(),
+        "linear": vessel_coefficients.linear.tolist(),
+        "quadratic": vessel_coefficients.quadratic.tolist(),
     }
     return {
-        ".sdf": filled("gazebo.sdf", name=name, rigid=rigid, entries=entries, simple=simple),
-        "_parameters.m": filled(
-            "parameters.m", name=name, six={key: value.tolist() for key, value in six.items()}
+        ".sdf": render_template(
+            "gazebo.sdf", name=name, rigid=rigid_body, entries=damping_entries, simple=vrx_names
         ),
-        "_vehicle.py": filled("vehicle.py", name=name, title=title, **lists),
+        "_parameters.m": render_template(
+            "parameters.m",
+            name=name,
+            six={key: value.tolist() for key, value in matrices_6x6.items()},
+        ),
+        "_vehicle.py": render_template("vehicle.py", name=name, title=class_name, **matrix_lists),
     }
 
 
-_RIGID = {"mass": "kg", "inertia": "kg m^2 about z"}
+_RIGID_BODY_UNITS = {"mass": "kg", "inertia": "kg m^2 about z"}
 
 
 @final
@@ -181,56 +215,64 @@ class ParametersExporter(Exporter):
         "A baseline's masses and damping for Gazebo, VRX, MSS and PythonVehicleSimulator."
     )
 
-    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
+    def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
         """Write the coefficients as JSON, and beside it one file for each simulator.
 
         The masses of the rigid body, which no acceleration tells, are read from a file of the same
         name that ends in `.masses.yaml`.
         """
         if not isinstance(exported, ExportedVessel):
-            raise UsageError(f"{exported.what}: only vessel models have masses and damping")
-        exported.require_numbers()
+            raise UsageError(f"{exported.label}: only vessel models have masses and damping")
+        exported.require_finite_numbers()
         spec = exported.spec
-        found = coefficients(spec, exported.at(torch.float64))
-        name = identifier(spec.name)
-        stem = file.name.removesuffix(self.suffix)
-        rigid = _rigid(file.with_name(f"{stem}.masses.yaml"))
+        vessel_coefficients = identify_coefficients(spec, exported.to_precision(torch.float64))
+        name = to_c_identifier(spec.name)
+        file_stem = file.name.removesuffix(self.suffix)
+        rigid_body = _read_rigid_body(file.with_name(f"{file_stem}.masses.yaml"))
         card = {
             "schema": "residnet.parameters/1",
             "model": spec.name,
             "form": "M nu_dot + C(nu) nu + D nu + D_n |nu| nu = tau; u, v, r; SI",
-            "rigid_body": rigid,
-            "M": found.mass.tolist(),
-            "D": found.linear.tolist(),
-            "D_n": found.quadratic.tolist(),
-            "share_left_out": found.left_out,
-            "terms_left_out": found.terms_left_out,
+            "rigid_body": rigid_body,
+            "M": vessel_coefficients.mass.tolist(),
+            "D": vessel_coefficients.linear.tolist(),
+            "D_n": vessel_coefficients.quadratic.tolist(),
+            "share_left_out": vessel_coefficients.left_out,
+            "terms_left_out": vessel_coefficients.terms_left_out,
             "head_left_out": None if spec.head is None else spec.head.kind,
             **exported.provenance(),
         }
         file.parent.mkdir(parents=True, exist_ok=True)
-        for end, text in texts(name, found, rigid).items():
-            file.with_name(f"{stem if end == '.sdf' else name}{end}").write_text(text)
+        for file_ending, text in render_simulator_files(
+            name, vessel_coefficients, rigid_body
+        ).items():
+            file.with_name(
+                f"{file_stem if file_ending == '.sdf' else name}{file_ending}"
+            ).write_text(text)
         file.write_text(json.dumps(card, indent=1) + "\n")
         return card
 
 
-def _rigid(file: Path) -> dict[str, float]:
+def _read_rigid_body(file: Path) -> dict[str, float]:
     """Return the masses of the rigid body.
 
     Raises:
         UsageError: where the file is missing or holds something else.
     """
-    wanted = ", ".join(f"{name} ({unit})" for name, unit in _RIGID.items())
-    ask = f"{file}: write there {wanted} of the loaded vessel, for example 'mass: 180'"
+    required_keys = ", ".join(f"{name} ({unit})" for name, unit in _RIGID_BODY_UNITS.items())
+    instruction = (
+        f"{file}: write there {required_keys} of the loaded vessel, for example 'mass: 180'"
+    )
     if not file.is_file():
-        raise UsageError(f"{ask}; accelerations do not tell how much of a mass is added mass")
-    content, _ = parse(file.read_text(), str(file))
+        raise UsageError(
+            f"{instruction}; accelerations do not tell how much of a mass is added mass"
+        )
+    content, _ = parse_yaml(file.read_text(), str(file))
     content = content if isinstance(content, dict) else {}
-    found: dict[str, float] = {}
-    for name in _RIGID:
+    masses: dict[str, float] = {}
+    for name in _RIGID_BODY_UNITS:
         value = content.get(name)
         if not isinstance(value, int | float) or not 0 < value < math.inf:
-            raise UsageError(f"{ask}; {name} is missing or no positive number")
-        found[name] = float(value)
-    return found
+            raise UsageError(f"{instruction}; {name} is missing or no positive number")
+        masses[name] = float(value)
+    return masses

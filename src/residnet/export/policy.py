@@ -19,33 +19,33 @@ from torch import Tensor, nn
 
 from residnet.control.courses.course_plan import Course
 from residnet.control.guidance import CourseGuidance, TrackKeeping
-from residnet.control.heading.policies import DEEP, HeadingPolicy
+from residnet.control.heading.policies import MAX_DEPTH, HeadingPolicy
 from residnet.core.errors import ExportError
 from residnet.core.version import __version__
 from residnet.dynamics.steering_variation import DEPTH, HEADING
-from residnet.export.base import Exported, Loaded, RoundingError
-from residnet.export.torchscript import require_shape, size, trace_function
+from residnet.export.base import Exportable, LoadedExport, RoundingError
+from residnet.export.torchscript import get_size, require_shape, trace_function
 
-Safe = Literal["hold", "amidships"]
+FallbackCommand = Literal["hold", "amidships"]
 """Command while inputs are wrong: the last one, or rudder amidships."""
-COURSE = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
+COURSE_MEASUREMENTS = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
 """What a policy along a course sees: north and east, heading, surge and sway velocity, yaw rate."""
 PARITY_STEPS, PARITY_TOLERANCE = 1000, 1e-4
 """Steps over which exported commands must agree, and to which share of the rudder's limit.
 
 Of a limit of 35 deg it is 0.0035 deg, which no actuator follows, and float32 rounds less.
 """
-_FRAMES = {
+_FRAME_OF_AXIS = {
     HEADING: "NED; psi clockwise from north; delta > 0 turns to starboard",
     DEPTH: "NED; z down, theta and q bow up; delta_s > 0 dives",
 }
-_TURNS = 2000.0 * math.pi
+_MAX_HEADING = 2000.0 * math.pi
 """Largest heading in rad."""
-_FAR = 1e3
+_POSITION_MARGIN = 1e3
 """How many look-ahead distances outside the course's own extent a position is accepted."""
 
 
-class _Controller(nn.Module):
+class _GuardedController(nn.Module):
     """The checks that all exported policies share.
 
     The memory s [B, n] ends with the last command. Where a measurement or the memory is no number
@@ -54,70 +54,78 @@ class _Controller(nn.Module):
 
     Args:
         limits: [low, high] in which each measurement is accepted.
-        memory: [low, high] of the memory without the last command.
-        safe: command while inputs are wrong.
+        memory_limits: [low, high] of the memory without the last command.
+        fallback: command while inputs are wrong.
         dtype: of all numbers.
     """
 
     def __init__(
         self,
         limits: Sequence[tuple[float, float]],
-        memory: Sequence[tuple[float, float]],
+        memory_limits: Sequence[tuple[float, float]],
         policy: HeadingPolicy,
-        safe: Safe,
+        fallback: FallbackCommand,
         dtype: torch.dtype,
     ) -> None:
         super().__init__()
-        last = 1.001 * policy.limit
-        kept = [*memory, (-last, last)]
+        command_limit = 1.001 * policy.limit
+        all_memory_limits = [*memory_limits, (-command_limit, command_limit)]
         self.low, self.high, self.memory_low, self.memory_high = (
-            nn.Buffer(end.clone())
-            for ranges in (limits, kept)
-            for end in torch.tensor(ranges, dtype=dtype).T
+            nn.Buffer(bound.clone())
+            for ranges in (limits, all_memory_limits)
+            for bound in torch.tensor(ranges, dtype=dtype).T
         )
-        self.keep = 1.0 if safe == "hold" else 0.0
+        self.hold_factor = 1.0 if fallback == "hold" else 0.0
         # a large number where the rudder has no rate: infinity times zero would be no number
-        self.travel = min(policy.rate * policy.dt, 2.0 * policy.limit)
+        self.max_step = min(policy.rate * policy.dt, 2.0 * policy.limit)
         self.limit, self.dt, self.speed = policy.limit, policy.dt, policy.speed
 
     def initial_state(self, y: Tensor) -> Tensor:
         """Return the memory s [B, n] at the first measurement y [B, k], rudder amidships."""
         y = y.to(self.low.dtype)
-        return self.begun(torch.where(self.good(y), y, torch.zeros_like(y)))
+        return self.start_memory(torch.where(self.is_in_range(y), y, torch.zeros_like(y)))
 
-    def begun(self, y: Tensor) -> Tensor:
+    def start_memory(self, y: Tensor) -> Tensor:
         """Return the memory [B, n] at an accepted measurement [B, k]."""
         raise NotImplementedError
 
-    def good(self, y: Tensor) -> Tensor:
+    def is_in_range(self, measured: Tensor) -> Tensor:
         """Return which measurements are in range, [B, 1]; what is no number is not."""
-        return ((y >= self.low) & (y <= self.high)).all(dim=-1, keepdim=True)
+        return ((measured >= self.low) & (measured <= self.high)).all(dim=-1, keepdim=True)
 
-    def last(self, s: Tensor) -> Tensor:
+    def last_command(self, s: Tensor) -> Tensor:
         """Return the last command [B, 1] of a memory."""
         return torch.nan_to_num(s[:, -1:]).clamp(-self.limit, self.limit)
 
-    def remembers(self, s: Tensor) -> Tensor:
+    def is_valid_memory(self, s: Tensor) -> Tensor:
         """Return which memories [B, n] are in range, [B, 1]."""
         return ((s >= self.memory_low) & (s <= self.memory_high)).all(dim=-1, keepdim=True)
 
-    def settled(
-        self, wish: Tensor, new: Tensor, s: Tensor, begun: Tensor, last: Tensor, good: Tensor
+    def finish_step(
+        self,
+        wanted_command: Tensor,
+        next_memory: Tensor,
+        s: Tensor,
+        fresh_memory: Tensor,
+        last_command: Tensor,
+        is_valid: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return command [B, 1], memory [B, n] and fault [B] from what the policy wishes."""
         # a memory within its range can still lead out of it, where its entries do not belong
         # together
-        inside = (new >= self.memory_low[:-1]) & (new <= self.memory_high[:-1])
-        sound = inside.all(dim=-1, keepdim=True)
-        s = torch.where(sound, s, begun)
-        good = good & sound
-        wish = torch.where(good, wish, self.keep * last)
-        command = last + (wish - last).clamp(-self.travel, self.travel)
-        after = torch.where(good, new, s[:, :-1])
-        return command, torch.cat((after, command), dim=-1), ~good[:, 0]
+        is_inside = (next_memory >= self.memory_low[:-1]) & (next_memory <= self.memory_high[:-1])
+        is_sound = is_inside.all(dim=-1, keepdim=True)
+        s = torch.where(is_sound, s, fresh_memory)
+        is_valid = is_valid & is_sound
+        wanted_command = torch.where(is_valid, wanted_command, self.hold_factor * last_command)
+        command = last_command + (wanted_command - last_command).clamp(
+            -self.max_step, self.max_step
+        )
+        kept_memory = torch.where(is_valid, next_memory, s[:, :-1])
+        return command, torch.cat((kept_memory, command), dim=-1), ~is_valid[:, 0]
 
 
-class ExportedPolicy(_Controller):
+class GuardedPolicy(_GuardedController):
     """A heading policy that a controller calls once per step; SI and radians.
 
     Other precisions are converted.
@@ -127,14 +135,14 @@ class ExportedPolicy(_Controller):
         self,
         policy: HeadingPolicy,
         limits: Sequence[tuple[float, float]],
-        safe: Safe,
+        fallback: FallbackCommand,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        memory = policy.memory_ranges(limits[-1][1], policy.limit).values()
-        super().__init__(limits, list(memory), policy, safe, dtype)
+        memory_limits = policy.memory_ranges(limits[-1][1], policy.limit).values()
+        super().__init__(limits, list(memory_limits), policy, fallback, dtype)
         self.policy = policy
 
-    def begun(self, y: Tensor) -> Tensor:
+    def start_memory(self, y: Tensor) -> Tensor:
         return torch.cat((self.policy.initial_state(y), torch.zeros_like(y[:, :1])), dim=-1)
 
     def step(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -145,25 +153,33 @@ class ExportedPolicy(_Controller):
             reference: heading [B, 1] in rad, or depth in m.
             s: memory [B, n].
         """
-        kind = self.low.dtype
-        return self.answer(y.to(kind), reference.to(kind), s.to(kind))
+        dtype = self.low.dtype
+        return self.step_unchecked(y.to(dtype), reference.to(dtype), s.to(dtype))
 
-    def answer(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def step_unchecked(
+        self, y: Tensor, reference: Tensor, s: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return what `step` returns, of tensors of the right shape and type."""
-        good = self.good(y) & (reference.abs() <= self.high[0])
-        y = torch.where(good, y, torch.zeros_like(y))
-        reference = torch.where(good, reference, torch.zeros_like(reference))
-        last, remembers, begun = self.last(s), self.remembers(s), self.begun(y)
-        s = torch.where(remembers, s, begun)
-        wish, new = self.policy(y, reference, s[:, :-1])
-        return self.settled(wish, new, s, begun, last, good & remembers)
+        is_valid = self.is_in_range(y) & (reference.abs() <= self.high[0])
+        y = torch.where(is_valid, y, torch.zeros_like(y))
+        reference = torch.where(is_valid, reference, torch.zeros_like(reference))
+        last_command, has_valid_memory, fresh_memory = (
+            self.last_command(s),
+            self.is_valid_memory(s),
+            self.start_memory(y),
+        )
+        s = torch.where(has_valid_memory, s, fresh_memory)
+        wanted_command, next_memory = self.policy(y, reference, s[:, :-1])
+        return self.finish_step(
+            wanted_command, next_memory, s, fresh_memory, last_command, is_valid & has_valid_memory
+        )
 
     def forward(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return what `step` returns."""
         return self.step(y, reference, s)
 
 
-class ExportedCourse(_Controller):
+class GuardedCoursePolicy(_GuardedController):
     """A heading policy with the guidance of a course, in float64; SI and radians.
 
     Single precision does not tell places along a course of some hundred metres well enough: two
@@ -175,57 +191,73 @@ class ExportedCourse(_Controller):
     are converted.
     """
 
-    def __init__(self, policy: HeadingPolicy, guidance: CourseGuidance, safe: Safe) -> None:
+    def __init__(
+        self, policy: HeadingPolicy, guidance: CourseGuidance, fallback: FallbackCommand
+    ) -> None:
         policy = copy.deepcopy(policy).double().eval().requires_grad_(False)
-        policy.read_from(tuple(COURSE))
+        policy.set_state_columns(tuple(COURSE_MEASUREMENTS))
         guidance = copy.deepcopy(guidance).double()
         guidance.x, guidance.y, guidance.psi, guidance.u, guidance.v = range(5)
-        far = _FAR * guidance.lookahead
-        turn, fast = 5.0 * policy.gain * policy.limit, 3.0 * policy.speed
-        places = [
-            (float(column.min()) - far, float(column.max()) + far)
-            for column in guidance.table[:, :2].T
+        position_margin = _POSITION_MARGIN * guidance.lookahead
+        max_yaw_rate, max_speed = 5.0 * policy.gain * policy.limit, 3.0 * policy.speed
+        position_limits = [
+            (float(positions.min()) - position_margin, float(positions.max()) + position_margin)
+            for positions in guidance.table[:, :2].T
         ]
-        limits = [*places, (-_TURNS, _TURNS), (0.0, fast), (-fast, fast), (-turn, turn)]
-        angle = 1.001 * policy.limit
-        memory = [
-            (0.0, 1.001 * guidance.farthest),
+        limits = [
+            *position_limits,
+            (-_MAX_HEADING, _MAX_HEADING),
+            (0.0, max_speed),
+            (-max_speed, max_speed),
+            (-max_yaw_rate, max_yaw_rate),
+        ]
+        rudder_limit = 1.001 * policy.limit
+        memory_limits = [
+            (0.0, 1.001 * guidance.max_arc_length),
             *[(-1.01, 1.01)] * (guidance.n_state - 1),
-            (-angle, angle),
+            (-rudder_limit, rudder_limit),
             # relative to the course's motion: rudder and yaw rate may differ by twice their ranges
-            *policy.memory_ranges(2.0 * turn, 2.0 * policy.limit).values(),
+            *policy.memory_ranges(2.0 * max_yaw_rate, 2.0 * policy.limit).values(),
         ]
-        super().__init__(limits, memory, policy, safe, torch.float64)
-        rate = None if math.isinf(policy.rate) else policy.rate
-        self.follower = TrackKeeping(
-            policy, tuple(COURSE), limit=policy.limit, dt=policy.dt, rate=rate
+        super().__init__(limits, memory_limits, policy, fallback, torch.float64)
+        rate_limit = None if math.isinf(policy.rate) else policy.rate
+        self.track_keeping = TrackKeeping(
+            policy, tuple(COURSE_MEASUREMENTS), limit=policy.limit, dt=policy.dt, rate=rate_limit
         )
-        self.travel = self.follower.travel
+        self.max_step = self.track_keeping.max_rudder_step
         self.guidance = guidance
 
-    def begun(self, y: Tensor) -> Tensor:
-        parts = (self.guidance.initial_state(y), self.follower.initial_state(y))
-        return torch.cat((*parts, torch.zeros_like(y[:, :1])), dim=-1)
+    def start_memory(self, y: Tensor) -> Tensor:
+        memories = (self.guidance.initial_state(y), self.track_keeping.initial_state(y))
+        return torch.cat((*memories, torch.zeros_like(y[:, :1])), dim=-1)
 
     def step(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the rudder command [B, 1] in rad, memory [B, n], fault [B] and arrived [B].
 
         Args:
-            measured: y [B, 6], the names of `COURSE`.
+            measured: y [B, 6], the names of `COURSE_MEASUREMENTS`.
             s: memory [B, n].
         """
-        return self.answer(y.to(torch.float64), s.to(torch.float64))
+        return self.step_unchecked(y.to(torch.float64), s.to(torch.float64))
 
-    def answer(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def step_unchecked(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return what `step` returns, of tensors of the right shape and type."""
-        good = self.good(y)
-        y = torch.where(good, y, torch.zeros_like(y))
-        last, remembers, begun = self.last(s), self.remembers(s), self.begun(y)
-        s = torch.where(remembers, s, begun)
-        reference, place = self.guidance(y, 0, s[:, : self.guidance.n_state])
-        wish, memory = self.follower(y, reference, s[:, self.guidance.n_state : -1])
-        new = torch.cat((place, memory), dim=-1)
-        command, s, fault = self.settled(wish, new, s, begun, last, good & remembers)
+        is_valid = self.is_in_range(y)
+        y = torch.where(is_valid, y, torch.zeros_like(y))
+        last_command, has_valid_memory, fresh_memory = (
+            self.last_command(s),
+            self.is_valid_memory(s),
+            self.start_memory(y),
+        )
+        s = torch.where(has_valid_memory, s, fresh_memory)
+        reference, guidance_memory = self.guidance(y, 0, s[:, : self.guidance.n_state])
+        wanted_command, policy_memory = self.track_keeping(
+            y, reference, s[:, self.guidance.n_state : -1]
+        )
+        next_memory = torch.cat((guidance_memory, policy_memory), dim=-1)
+        command, s, fault = self.finish_step(
+            wanted_command, next_memory, s, fresh_memory, last_command, is_valid & has_valid_memory
+        )
         return command, s, fault, s[:, 0] >= self.guidance.length
 
     def forward(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -240,7 +272,7 @@ class _TracedController(nn.Module):
     subclasses. The policy's own code is only traced, so that it may be written in any Python.
     """
 
-    def __init__(self, inner: ExportedPolicy | ExportedCourse, sizes: Sequence[int]) -> None:
+    def __init__(self, inner: GuardedPolicy | GuardedCoursePolicy, sizes: Sequence[int]) -> None:
         super().__init__()
         self.measured, self.memory = inner.low.numel(), inner.memory_low.numel()
         # its type is that of all numbers
@@ -248,24 +280,24 @@ class _TracedController(nn.Module):
         # two rows: a batch of one would hide where the rows of a batch are confused
         examples = tuple(torch.zeros(2, size, dtype=inner.low.dtype) for size in sizes)
         self.first_memory = trace_function(inner.initial_state, examples[:1], "policy")
-        self.answer = trace_function(inner.answer, examples, "policy")
+        self.answer = trace_function(inner.step_unchecked, examples, "policy")
 
     @torch.jit.export
     def initial_state(self, y: Tensor) -> Tensor:
         """Return the memory s [B, n] at the first measurement y [B, k], rudder amidships."""
-        require_shape("measured", y, [size(y, 2, 0), self.measured])
+        require_shape("measured", y, [get_size(y, 2, 0), self.measured])
         s: Tensor = self.first_memory(y.to(self.low.dtype))
         return s
 
 
 @final
 class TracedPolicy(_TracedController):
-    """The TorchScript file of a heading policy; see `ExportedPolicy`."""
+    """The TorchScript file of a heading policy; see `GuardedPolicy`."""
 
     @torch.jit.export
     def step(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the rudder command [B, 1] in rad, memory [B, n] and fault [B]."""
-        rows = size(y, 2, 0)
+        rows = get_size(y, 2, 0)
         require_shape("measured", y, [rows, self.measured])
         require_shape("reference", reference, [rows, 1])
         require_shape("s", s, [rows, self.memory])
@@ -281,12 +313,12 @@ class TracedPolicy(_TracedController):
 
 @final
 class TracedCourse(_TracedController):
-    """The TorchScript file of a policy along a course; see `ExportedCourse`."""
+    """The TorchScript file of a policy along a course; see `GuardedCoursePolicy`."""
 
     @torch.jit.export
     def step(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the rudder command [B, 1] in rad, memory [B, n], fault [B] and arrived [B]."""
-        rows = size(y, 2, 0)
+        rows = get_size(y, 2, 0)
         require_shape("measured", y, [rows, self.measured])
         require_shape("s", s, [rows, self.memory])
         y, s = y.to(self.low.dtype), s.to(self.low.dtype)
@@ -298,44 +330,50 @@ class TracedCourse(_TracedController):
         return self.step(y, s)
 
 
-class _Answer(nn.Module):
+class _UncheckedStep(nn.Module):
     """The step of a controller without checks of shapes, for formats that hold one function."""
 
-    def __init__(self, inner: ExportedPolicy | ExportedCourse) -> None:
+    def __init__(self, controller: GuardedPolicy | GuardedCoursePolicy) -> None:
         super().__init__()
-        self.inner = inner
+        self.controller = controller
 
-    def forward(self, *given: Tensor) -> tuple[Tensor, ...]:
-        found: tuple[Tensor, ...] = self.inner.answer(*given)
-        return found
+    def forward(self, *step_arguments: Tensor) -> tuple[Tensor, ...]:
+        results: tuple[Tensor, ...] = self.controller.step_unchecked(*step_arguments)
+        return results
 
 
-def for_export(
-    policy: HeadingPolicy, safe: Safe, dtype: torch.dtype = torch.float32
-) -> ExportedPolicy:
+def guard_policy(
+    policy: HeadingPolicy, fallback: FallbackCommand, dtype: torch.dtype = torch.float32
+) -> GuardedPolicy:
     """Return the policy with its checks.
 
     It takes headings up to 1000 turns, three times its speed, five times the steady turn at full
     rudder; a depth policy depths of all seas, and pitches up to a right angle.
     """
     policy = copy.deepcopy(policy).to(dtype).eval().requires_grad_(False)
-    policy.read_from(tuple(policy.measured))
-    turn = 5.0 * policy.gain * policy.limit
-    most = {"psi": _TURNS, "r": turn, "q": turn, "theta": 0.5 * math.pi, "z": DEEP}
+    policy.set_state_columns(tuple(policy.measured))
+    max_rate = 5.0 * policy.gain * policy.limit
+    max_measured = {
+        "psi": _MAX_HEADING,
+        "r": max_rate,
+        "q": max_rate,
+        "theta": 0.5 * math.pi,
+        "z": MAX_DEPTH,
+    }
     limits = [
-        (0.0, 3.0 * policy.speed) if name == "u" else (-most[name], most[name])
+        (0.0, 3.0 * policy.speed) if name == "u" else (-max_measured[name], max_measured[name])
         for name in policy.measured
     ]
-    return ExportedPolicy(policy, limits, safe, dtype).eval()
+    return GuardedPolicy(policy, limits, fallback, dtype).eval()
 
 
-class ExportedController(Exported):
+class ExportedController(Exportable):
     """A policy that is exported: what heading policies and policies along a course share.
 
     Args:
         policy: at the step that it shall run with.
-        safe: command while inputs are wrong.
-        about: of the vessel, the training or the course, for the card.
+        fallback: command while inputs are wrong.
+        description: of the vessel, the training or the course, for the card.
         metrics: rows of metrics.json of this policy, for the card.
     """
 
@@ -348,82 +386,88 @@ class ExportedController(Exported):
         name: str,
         policy: HeadingPolicy,
         *,
-        safe: Safe,
-        about: Mapping[str, Any],
+        fallback: FallbackCommand,
+        description: Mapping[str, Any],
         metrics: Sequence[Mapping[str, Any]],
     ) -> None:
-        self.name, self.policy, self.safe = name, policy, safe
-        self.what = name if name == self.kind else f"{self.kind} {name}"
-        self.about, self.metrics, self.dt = about, metrics, policy.dt
-        self.axis = policy.axis
-        memory = self.controller(self.precisions[-1]).memory_low.numel()
-        self.arguments = (("y", len(self.measured)), *self._given(), ("s", memory))
+        self.name, self.policy, self.fallback = name, policy, fallback
+        self.label = name if name == self.kind else f"{self.kind} {name}"
+        self.description, self.metrics, self.dt = description, metrics, policy.dt
+        self.steering_axis = policy.axis
+        n_memory = self.build_controller(self.precisions[-1]).memory_low.numel()
+        self.arguments = (
+            ("y", len(self.measured_units)),
+            *self._reference_arguments(),
+            ("s", n_memory),
+        )
 
-    def _given(self) -> Sequence[tuple[str, int]]:
+    def _reference_arguments(self) -> Sequence[tuple[str, int]]:
         return ()
 
     @property
-    def measured(self) -> Mapping[str, str]:
+    def measured_units(self) -> Mapping[str, str]:
         """What is measured, with units."""
         return self.policy.measured
 
     @abstractmethod
-    def controller(self, dtype: torch.dtype) -> ExportedPolicy | ExportedCourse:
+    def build_controller(self, dtype: torch.dtype) -> GuardedPolicy | GuardedCoursePolicy:
         """Return the policy with its checks, in a precision."""
 
     @abstractmethod
-    def drive(self, module: Any) -> Sequence[Tensor]:
+    def parity_arguments(self, module: Any) -> Sequence[Tensor]:
         """Return the arguments [steps, n] of the parity check, without the memory."""
 
     @abstractmethod
-    def described(self, module: Any) -> dict[str, Any]:
+    def describe_for_card(self, module: Any) -> dict[str, Any]:
         """Return what the card says of this kind of policy."""
 
-    def module(self, dtype: torch.dtype) -> nn.Module:
-        inner, sizes = self.controller(dtype), [count for _, count in self.arguments]
-        traced = TracedCourse if isinstance(inner, ExportedCourse) else TracedPolicy
+    def build_module(self, dtype: torch.dtype) -> nn.Module:
+        inner, sizes = self.build_controller(dtype), [count for _, count in self.arguments]
+        traced = TracedCourse if isinstance(inner, GuardedCoursePolicy) else TracedPolicy
         return traced(inner, sizes).eval()
 
-    def graph(self, dtype: torch.dtype) -> nn.Module:
-        return _Answer(self.controller(dtype)).eval()
+    def build_step_module(self, dtype: torch.dtype) -> nn.Module:
+        return _UncheckedStep(self.build_controller(dtype)).eval()
 
-    def contents(self) -> dict[str, Any]:
-        module, policy = self.controller(self.precisions[0]), self.policy
-        ranges = zip(module.low.tolist(), module.high.tolist(), strict=True)
-        held = "held" if self.safe == "hold" else "amidships"
-        reference = ", reference" if self._given() else ""
+    def card_contents(self) -> dict[str, Any]:
+        module, policy = self.build_controller(self.precisions[0]), self.policy
+        measured_ranges = zip(module.low.tolist(), module.high.tolist(), strict=True)
+        fallback_text = "held" if self.fallback == "hold" else "amidships"
+        reference_text = ", reference" if self._reference_arguments() else ""
         return {
             "schema": self.schema,
             "policy": self.name,
             "measured": [
                 {"name": name, "unit": unit, "range": list(limits)}
-                for (name, unit), limits in zip(self.measured.items(), ranges, strict=True)
+                for (name, unit), limits in zip(
+                    self.measured_units.items(), measured_ranges, strict=True
+                )
             ],
-            **self.described(module),
+            **self.describe_for_card(module),
             "fault": (
-                f"measurement{reference} or memory no number or out of range: command {held}, flag"
+                f"measurement{reference_text} or memory no number or out of range: command {fallback_text}, flag"
                 " set"
             ),
             "command": [
                 {
-                    "name": self.axis.command,
+                    "name": self.steering_axis.command,
                     "unit": "rad",
                     "limit": policy.limit,
                     "rate": None if math.isinf(policy.rate) else policy.rate,
                 }
             ],
             "dt": policy.dt,
-            **policy.described(),
+            **policy.describe(),
             "turning": {"K": policy.gain, "T": policy.time, "speed": policy.speed},
-            "frame": _FRAMES[self.axis],
+            "frame": _FRAME_OF_AXIS[self.steering_axis],
             "versions": {"residnet": __version__, "torch": torch.__version__},
             "exported": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-            **self.about,
+            **self.description,
             "metrics": [dict(row) for row in self.metrics],
         }
 
-    def check(
-        self, loaded: Loaded, what: str, dtype: torch.dtype, tolerance: float | None = None
+    def check_parity(
+        self, loaded: LoadedExport, subject: str, dtype: torch.dtype, tolerance: float | None = None
     ) -> dict[str, Any]:
         """Return the largest difference of the command from the eager policy over 1,000 steps.
 
@@ -433,35 +477,39 @@ class ExportedController(Exported):
             RoundingError: where it exceeds 1e-4.
             ExportError: where a command is no number, or a wrong input raises no flag.
         """
-        module: Any = self.controller(dtype)
-        driven = [part.to(dtype) for part in self.drive(module)]
-        wrong = torch.arange(PARITY_STEPS) % 97 == 50
+        module: Any = self.build_controller(dtype)
+        parity_inputs = [array.to(dtype) for array in self.parity_arguments(module)]
+        is_bad_input = torch.arange(PARITY_STEPS) % 97 == 50
         # the yaw rate of a heading policy, the place of a course, the speed of a depth policy
-        driven[0][wrong, 2 if len(self.measured) == 3 else 1] = torch.nan
-        rows = [part.numpy() for part in driven]
-        eager = module.initial_state(driven[0][:1])
-        s = loaded.memory(rows[0][0])
-        if s is None:
-            eager = torch.full_like(eager, torch.nan)
-            s, wrong[0] = eager[0].numpy(), True
-        worst = 0.0
+        parity_inputs[0][is_bad_input, 2 if len(self.measured_units) == 3 else 1] = torch.nan
+        input_arrays = [array.numpy() for array in parity_inputs]
+        eager_memory = module.initial_state(parity_inputs[0][:1])
+        loaded_memory = loaded.initial_memory(input_arrays[0][0])
+        if loaded_memory is None:
+            eager_memory = torch.full_like(eager_memory, torch.nan)
+            loaded_memory, is_bad_input[0] = eager_memory[0].numpy(), True
+        max_difference = 0.0
         for k in range(PARITY_STEPS):
             with torch.no_grad():
-                wanted, eager, *_ = module.step(*(part[k : k + 1] for part in driven), eager)
-            command, s, fault, *_ = loaded.step(*(part[k] for part in rows), s)
-            difference = float(np.abs(command - wanted[0].numpy()).max()) / module.limit
-            if not math.isfinite(difference) or bool(fault) != bool(wrong[k]):
+                expected_command, eager_memory, *_ = module.step(
+                    *(array[k : k + 1] for array in parity_inputs), eager_memory
+                )
+            command, loaded_memory, fault, *_ = loaded.step(
+                *(array[k] for array in input_arrays), loaded_memory
+            )
+            difference = float(np.abs(command - expected_command[0].numpy()).max()) / module.limit
+            if not math.isfinite(difference) or bool(fault) != bool(is_bad_input[k]):
                 raise ExportError(
-                    f"{self.what}: step {k} of the parity check gives the command"
+                    f"{self.label}: step {k} of the parity check gives the command"
                     f" {float(command[0])} and the flag {bool(fault)}"
                 )
-            worst = max(worst, difference)
-        if worst > PARITY_TOLERANCE:
+            max_difference = max(max_difference, difference)
+        if max_difference > PARITY_TOLERANCE:
             raise RoundingError(
-                f"{self.what}: the exported commands differ by {worst:.2g} of the rudder's limit;"
+                f"{self.label}: the exported commands differ by {max_difference:.2g} of the rudder's limit;"
                 f" allowed {PARITY_TOLERANCE:g}"
             )
-        return {"steps": PARITY_STEPS, "share_of_limit": worst}
+        return {"steps": PARITY_STEPS, "share_of_limit": max_difference}
 
 
 @final
@@ -473,29 +521,34 @@ class ExportedHeading(ExportedController):
     results = ("command", "s_after", "fault")
     flags = ("fault",)
 
-    def _given(self) -> Sequence[tuple[str, int]]:
+    def _reference_arguments(self) -> Sequence[tuple[str, int]]:
         return (("reference", 1),)
 
-    def controller(self, dtype: torch.dtype) -> ExportedPolicy:
-        return for_export(self.policy, self.safe, dtype)
+    def build_controller(self, dtype: torch.dtype) -> GuardedPolicy:
+        return guard_policy(self.policy, self.fallback, dtype)
 
-    def drive(self, module: Any) -> Sequence[Tensor]:
+    def parity_arguments(self, module: Any) -> Sequence[Tensor]:
         """Return measurements and references of a swinging vessel.
 
         The depths of one that dives go by what a heading goes in rad, in m.
         """
-        steps = torch.arange(PARITY_STEPS, dtype=module.low.dtype)
-        turn = float(module.high[-1]) / 5.0
-        psi, r = 0.8 * torch.sin(0.01 * steps), turn * torch.cos(0.013 * steps)
-        parts = [psi, torch.full_like(psi, module.speed), r]
-        if self.axis is DEPTH:
-            parts.insert(2, 0.3 * torch.sin(0.013 * steps))
-        y = torch.stack(parts, dim=-1)
-        return y, 0.5 * torch.sign(torch.sin(0.004 * steps)).unsqueeze(-1)
+        step_index = torch.arange(PARITY_STEPS, dtype=module.low.dtype)
+        max_rate = float(module.high[-1]) / 5.0
+        psi, r = 0.8 * torch.sin(0.01 * step_index), max_rate * torch.cos(0.013 * step_index)
+        measurements = [psi, torch.full_like(psi, module.speed), r]
+        if self.steering_axis is DEPTH:
+            measurements.insert(2, 0.3 * torch.sin(0.013 * step_index))
+        y = torch.stack(measurements, dim=-1)
+        return y, 0.5 * torch.sign(torch.sin(0.004 * step_index)).unsqueeze(-1)
 
-    def described(self, module: Any) -> dict[str, Any]:
+    def describe_for_card(self, module: Any) -> dict[str, Any]:
         return {
-            "reference": [{"name": self.axis.name, "unit": self.measured[self.axis.value]}],
+            "reference": [
+                {
+                    "name": self.steering_axis.name,
+                    "unit": self.measured_units[self.steering_axis.value],
+                }
+            ],
             "memory": [*module.policy.memory_ranges(1.0, 1.0), "last_command"],
         }
 
@@ -517,47 +570,50 @@ class ExportedCoursePolicy(ExportedController):
         guidance: CourseGuidance,
         course: Course,
         *,
-        safe: Safe,
-        about: Mapping[str, Any],
+        fallback: FallbackCommand,
+        description: Mapping[str, Any],
         metrics: Sequence[Mapping[str, Any]],
     ) -> None:
         self.guidance, self.course = guidance, course
-        super().__init__(name, policy, safe=safe, about=about, metrics=metrics)
+        super().__init__(name, policy, fallback=fallback, description=description, metrics=metrics)
 
     @property
-    def measured(self) -> Mapping[str, str]:
-        return COURSE
+    def measured_units(self) -> Mapping[str, str]:
+        return COURSE_MEASUREMENTS
 
-    def controller(self, dtype: torch.dtype) -> ExportedCourse:
-        return ExportedCourse(self.policy, self.guidance, self.safe).eval()
+    def build_controller(self, dtype: torch.dtype) -> GuardedCoursePolicy:
+        return GuardedCoursePolicy(self.policy, self.guidance, self.fallback).eval()
 
-    def drive(self, module: Any) -> Sequence[Tensor]:
+    def parity_arguments(self, module: Any) -> Sequence[Tensor]:
         """Return measurements of a vessel beside the course, off its heading, at varying speed."""
-        steps, course = torch.arange(PARITY_STEPS, dtype=torch.float64), self.course
-        at = (steps * module.dt * module.speed / course.step).long()
-        at = at.clamp(max=len(course.track) - 1)
-        track, heading = torch.from_numpy(course.track)[at], torch.from_numpy(course.heading)[at]
-        aside = 0.1 * module.guidance.lookahead
+        step_index, course = torch.arange(PARITY_STEPS, dtype=torch.float64), self.course
+        track_index = (step_index * module.dt * module.speed / course.step).long()
+        track_index = track_index.clamp(max=len(course.track) - 1)
+        track, heading = (
+            torch.from_numpy(course.track)[track_index],
+            torch.from_numpy(course.heading)[track_index],
+        )
+        lateral_offset = 0.1 * module.guidance.lookahead
         y = (
-            track[:, 0] + aside * torch.sin(0.02 * steps),
-            track[:, 1] + aside * torch.cos(0.017 * steps),
-            heading + 0.2 * torch.sin(0.03 * steps),
-            module.speed * (1.0 + 0.1 * torch.sin(0.01 * steps)),
-            0.02 * module.speed * torch.cos(0.02 * steps),
-            0.1 * module.high[5] * torch.sin(0.013 * steps),
+            track[:, 0] + lateral_offset * torch.sin(0.02 * step_index),
+            track[:, 1] + lateral_offset * torch.cos(0.017 * step_index),
+            heading + 0.2 * torch.sin(0.03 * step_index),
+            module.speed * (1.0 + 0.1 * torch.sin(0.01 * step_index)),
+            0.02 * module.speed * torch.cos(0.02 * step_index),
+            0.1 * module.high[5] * torch.sin(0.013 * step_index),
         )
         return (torch.stack(y, dim=-1),)
 
-    def described(self, module: Any) -> dict[str, Any]:
-        course, count = self.course, module.guidance.n_state
-        names = ("place", "drift_north", "drift_east")[:count]
+    def describe_for_card(self, module: Any) -> dict[str, Any]:
+        course, n_guidance = self.course, module.guidance.n_state
+        guidance_names = ("place", "drift_north", "drift_east")[:n_guidance]
         (north, east), heading = course.track[0].tolist(), float(course.heading[0])
         return {
             "start": {"north": north, "east": east, "heading": heading},
             "length": course.length,
             "lookahead": module.guidance.lookahead,
             "memory": [
-                *names,
+                *guidance_names,
                 "rudder",
                 *(f"policy_{i}" for i in range(self.policy.n_state)),
                 "last_command",

@@ -21,19 +21,19 @@ from torch.jit._fuser import optimized_execution
 from torch.jit._trace import TracerWarning
 
 from residnet.core.errors import ExportError
-from residnet.core.files import whole
+from residnet.core.files import atomic_write
 from residnet.dynamics.lowering import recorded
 from residnet.export.base import (
-    Exported,
+    Exportable,
     Exporter,
-    Loaded,
-    Numbers,
-    in_precision,
-    name_of,
+    LoadedExport,
+    NumberArray,
+    get_dtype_name,
+    run_in_sufficient_precision,
     write_card,
 )
 
-_SETTINGS = {
+_EXECUTOR_SETTINGS = {
     "format": "torchscript",
     "safety": (
         "TorchScript is code that runs when loaded: load only files that you trust. The files under"
@@ -60,7 +60,7 @@ _SETTINGS = {
 """What the card of this format says besides: the settings that make its first call quick."""
 
 
-def size(tensor: Tensor, dimensions: int, dimension: int) -> int:
+def get_size(tensor: Tensor, dimensions: int, dimension: int) -> int:
     """Return the size of one dimension of a tensor, 1 where the tensor has not so many.
 
     TorchScript compiles it.
@@ -117,31 +117,35 @@ def trace_function(function: Callable[..., Any], examples: tuple[Tensor, ...], w
     return graph
 
 
-class ScriptedModel(Loaded):
+class ScriptedModel(LoadedExport):
     """A scripted module, for one row."""
 
-    reorders = False
+    reorders_sums = False
 
     def __init__(self, module: Any, dtype: torch.dtype) -> None:
         self.module, self.dtype = module, dtype
 
-    def _given(self, given: tuple[Numbers, ...]) -> list[Tensor]:
-        return [torch.as_tensor(part).to(self.dtype).unsqueeze(0) for part in given]
+    def _to_tensors(self, arrays: tuple[NumberArray, ...]) -> list[Tensor]:
+        return [torch.as_tensor(array).to(self.dtype).unsqueeze(0) for array in arrays]
 
-    def step(self, *given: Numbers) -> tuple[Any, ...]:
+    def step(self, *step_arguments: NumberArray) -> tuple[Any, ...]:
         with torch.no_grad():
-            return tuple(part[0].numpy() for part in self.module(*self._given(given)))
+            return tuple(
+                output[0].numpy() for output in self.module(*self._to_tensors(step_arguments))
+            )
 
-    def memory(self, *past: Numbers) -> Numbers | None:
-        begin = self.module.warmup if len(past) > 1 else self.module.initial_state
+    def initial_memory(self, *measured_past: NumberArray) -> NumberArray | None:
+        make_memory = self.module.warmup if len(measured_past) > 1 else self.module.initial_state
         with torch.no_grad():
-            found: Numbers = begin(*self._given(past))[0].numpy()
-        return found
+            initial_memory: NumberArray = make_memory(*self._to_tensors(measured_past))[0].numpy()
+        return initial_memory
 
-    def rollout(self, *given: Numbers) -> Numbers | None:
+    def rollout(self, *rollout_arguments: NumberArray) -> NumberArray | None:
         with torch.no_grad():
-            found: Numbers = self.module.rollout(*self._given(given))[0][0].numpy()
-        return found
+            states: NumberArray = self.module.rollout(*self._to_tensors(rollout_arguments))[0][
+                0
+            ].numpy()
+        return states
 
 
 @final
@@ -152,10 +156,10 @@ class TorchScriptExporter(Exporter):
     suffix: ClassVar[str] = ".pt"
     about: ClassVar[str] = "The model as TorchScript, which Python and C++ run with torch alone."
 
-    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
-        exported.require_numbers()
+    def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
+        exported.require_finite_numbers()
         dtype = exported.precisions[0]
-        module = exported.module(dtype)
+        module = exported.build_module(dtype)
         # freezing loses the methods where a program has switched the executor's optimisation off
         with warnings.catch_warnings(), optimized_execution(True):
             # TorchScript still works in torch 2.13 but announces its end; every export depends on
@@ -179,38 +183,48 @@ class TorchScriptExporter(Exporter):
                     passes._jit_pass_cse(graph)
                     passes._jit_pass_dce(graph)
             # what is checked was saved and read: the file differs from it by the card alone
-            stored = ScriptedModel(torch.jit.load(io.BytesIO(_saved(scripted))), dtype)
+            reloaded = ScriptedModel(torch.jit.load(io.BytesIO(_serialise(scripted))), dtype)
             with optimized_execution(False):
-                found = {"parity": exported.check(stored, "the exported module", dtype)}
-            card = exported.card() | _SETTINGS | {"dtype": name_of(dtype)} | found
-            with whole(file) as partial:
-                partial.write_bytes(_saved(scripted, card))
-                torch.jit.load(str(partial))
+                parity_entry = {
+                    "parity": exported.check_parity(reloaded, "the exported module", dtype)
+                }
+            card = (
+                exported.build_card()
+                | _EXECUTOR_SETTINGS
+                | {"dtype": get_dtype_name(dtype)}
+                | parity_entry
+            )
+            with atomic_write(file) as temporary_path:
+                temporary_path.write_bytes(_serialise(scripted, card))
+                torch.jit.load(str(temporary_path))
         return card
 
 
-def _saved(scripted: Any, card: Mapping[str, Any] | None = None) -> bytes:
+def _serialise(scripted: Any, card: Mapping[str, Any] | None = None) -> bytes:
     """Return a module as its file holds it.
 
     Through memory, so that a disk that is full is the system's error and not one of PyTorch.
     """
-    written = io.BytesIO()
-    extra = {} if card is None else {"card.json": json.dumps(card, indent=1)}
-    torch.jit.save(scripted, written, _extra_files=extra)
-    return written.getvalue()
+    buffer = io.BytesIO()
+    extra_files = {} if card is None else {"card.json": json.dumps(card, indent=1)}
+    torch.jit.save(scripted, buffer, _extra_files=extra_files)
+    return buffer.getvalue()
 
 
-class AotiModel(Loaded):
+class AotiModel(LoadedExport):
     """A compiled package, loaded back."""
 
     def __init__(self, file: Path, dtype: torch.dtype = torch.float32) -> None:
         self.package: Any = torch._inductor.aoti_load_package(str(file))
         self.dtype = dtype
 
-    def step(self, *given: Numbers) -> tuple[Any, ...]:
+    def step(self, *step_arguments: NumberArray) -> tuple[Any, ...]:
         # the package takes numbers as they lie in memory, whatever a tensor's strides say
-        rows = [torch.from_numpy(np.ascontiguousarray(part)).to(self.dtype)[None] for part in given]
-        return tuple(part[0].numpy() for part in self.package(*rows))
+        tensors = [
+            torch.from_numpy(np.ascontiguousarray(array)).to(self.dtype)[None]
+            for array in step_arguments
+        ]
+        return tuple(array[0].numpy() for array in self.package(*tensors))
 
 
 @final
@@ -221,37 +235,41 @@ class AotiExporter(Exporter):
     suffix: ClassVar[str] = ".pt2"
     about: ClassVar[str] = "The model's step compiled for this machine (AOTInductor), one row."
 
-    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
+    def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
         """Compile the step; the card stands beside the package.
 
         It works in float64 where float32 does not determine the track.
         """
-        exported.require_numbers()
+        exported.require_finite_numbers()
         with tempfile.TemporaryDirectory() as folder:
-            partial = Path(folder) / "model.pt2"
+            temporary_path = Path(folder) / "model.pt2"
 
-            def attempt(dtype: torch.dtype) -> dict[str, Any]:
+            def compile_and_check(dtype: torch.dtype) -> dict[str, Any]:
                 examples = tuple(
-                    torch.zeros(1, count, dtype=dtype) for _, count in exported.arguments
+                    torch.zeros(1, n_entries, dtype=dtype) for _, n_entries in exported.arguments
                 )
                 try:
                     with warnings.catch_warnings(), torch.no_grad():
                         warnings.simplefilter("ignore")
-                        program = torch.export.export(exported.graph(dtype), examples)
-                        torch._inductor.aoti_compile_and_package(program, package_path=str(partial))
+                        program = torch.export.export(exported.build_step_module(dtype), examples)
+                        torch._inductor.aoti_compile_and_package(
+                            program, package_path=str(temporary_path)
+                        )
                 except (RuntimeError, OSError) as error:
                     # what torch raises here has no class of its own
-                    first = str(error).strip().splitlines() or [type(error).__name__]
+                    error_lines = str(error).strip().splitlines() or [type(error).__name__]
                     raise ExportError(
-                        f"{exported.what}: cannot be compiled ahead of time ({first[0]}); export it"
+                        f"{exported.label}: cannot be compiled ahead of time ({error_lines[0]}); export it"
                         " as c or torchscript"
                     ) from None
-                return exported.check(AotiModel(partial, dtype), "the compiled package", dtype)
+                return exported.check_parity(
+                    AotiModel(temporary_path, dtype), "the compiled package", dtype
+                )
 
-            dtype, parity = in_precision(exported, attempt)
-            card = exported.card() | {
+            dtype, parity = run_in_sufficient_precision(exported, compile_and_check)
+            card = exported.build_card() | {
                 "format": "aoti",
-                "dtype": name_of(dtype),
+                "dtype": get_dtype_name(dtype),
                 "layout": "Give contiguous tensors: the package does not look at strides.",
                 "safety": "The package holds machine code that runs when loaded: load only what"
                 " you trust. It is for the kind of machine that it was made on.",
@@ -260,5 +278,5 @@ class AotiExporter(Exporter):
                 "parity": parity,
             }
             write_card(file, card)
-            file.write_bytes(partial.read_bytes())
+            file.write_bytes(temporary_path.read_bytes())
         return card

@@ -17,43 +17,43 @@ from torch import Tensor, nn
 
 from residnet.core.errors import ExportError
 from residnet.core.layout import SURGE
-from residnet.core.progress import say
+from residnet.core.progress import log_message
 from residnet.core.version import __version__
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout, trace_rollout
 from residnet.dynamics.store import ModelSpec
 from residnet.export import base
-from residnet.export.base import Exported, Loaded, Numbers, RoundingError
+from residnet.export.base import Exportable, LoadedExport, NumberArray, RoundingError
 from residnet.export.guard import GuardedDynamics, hold_measured
-from residnet.export.torchscript import require_shape, size, trace_function
+from residnet.export.torchscript import get_size, require_shape, trace_function
 from residnet.heads.base import ResidualHead
 
 PARITY_STEPS = 2000
 """Steps over which an export must follow the model: long enough for its memory to drift."""
-PAST = 50
+PAST_STEPS = 50
 """Steps of measured past that warm the memory up."""
-_SWEEPS = (0.8, 0.4, 0.2)
+_SWEEP_SHARES = (0.8, 0.4, 0.2)
 """Shares of the training range that inputs sweep together."""
-_TRACKS, _HELD = 16, 20
+_N_TRACKS, _STEPS_PER_INPUT = 16, 20
 """Tracks whose inputs jump, and steps between the jumps: eight may all miss what grows."""
-_FRAME = (
+_FRAME_TEXT = (
     "NED; body axes x forward, y starboard, z down; psi unwrapped, clockwise from north; wind_dir"
     " is where the wind comes from"
 )
-_RULES = (
-    "an entry that is no number becomes the one under `substitute`, any other beyond `accepted` the"
+_BAD_INPUT_RULES = (
+    "an entry that is no number becomes the one under `substitute`, any other beyond `state_ranges` the"
     " nearest value of its training range; a memory that is not finite or beyond what the head can"
-    " have begins anew; a step that would leave `accepted` is held at its edge; `outside` is then"
+    " have begins anew; a step that would leave `state_ranges` is held at its edge; `outside` is then"
     " true"
 )
-_BAND = (
+_BAND_TEXT = (
     "half widths of the errors of a free run so many steps after a measured state, whatever the run"
     " is like; between the steps they are interpolated, and beyond the last they grow in proportion"
     " to time, without any promise; the position's is the radius about the predicted one"
 )
 
 
-class ExportedModel(nn.Module):
+class GuardedVesselModule(nn.Module):
     """What a controller sees; all tensors are float32, SI and radians.
 
     Bad inputs and memories are treated as `residnet.export.base` says: a flag and a finite answer.
@@ -67,24 +67,27 @@ class ExportedModel(nn.Module):
         super().__init__()
         model = copy.deepcopy(model).requires_grad_(False)
         guard = GuardedDynamics(model, spec)
-        self.inputs = len(spec.signals.columns)
-        self.states = len(spec.signals.live.states)
+        self.n_inputs = len(spec.signals.input_columns)
+        self.n_states = len(spec.signals.dof.state_names)
         self.n_state = model.n_state
         # two rows: a batch of one would hide where the rows of a batch are confused
-        sizes = (self.states, self.inputs, self.n_state)
+        sizes = (self.n_states, self.n_inputs, self.n_state)
         examples = tuple(torch.zeros(2, size) for size in sizes)
         what = f"model {spec.name}"
         self.guarded_step = trace_function(guard.flagged_step, examples, what)
         self.next_memory = trace_function(lambda x, w, s: model.step(x, w, s)[1], examples, what)
-        self.ranges, self.of_state = guard.ranges, guard.of_state
-        known = spec.band
-        steps, widths = (
+        self.ranges, self.of_state = guard.ranges, guard.state_ranges
+        band_table = spec.band
+        band_steps, band_widths = (
             torch.ones(1),
-            torch.full((1, len(spec.signals.live.layout.banded)), torch.inf),
+            torch.full((1, len(spec.signals.dof.layout.band_channels)), torch.inf),
         )
-        if known is not None:
-            steps, widths = torch.tensor(known.steps), torch.tensor(known.columns).T
-        self.band_steps, self.band_widths = nn.Buffer(steps), nn.Buffer(widths)
+        if band_table is not None:
+            band_steps, band_widths = (
+                torch.tensor(band_table.steps),
+                torch.tensor(band_table.columns).T,
+            )
+        self.band_steps, self.band_widths = nn.Buffer(band_steps), nn.Buffer(band_widths)
 
     @torch.jit.export
     def band(self, k: int) -> Tensor:
@@ -94,15 +97,19 @@ class ExportedModel(nn.Module):
         are zero at k = 0, grow in proportion to time beyond the calibrated horizon, and are
         infinite where the model has no band.
         """
-        steps, widths = self.band_steps.float(), self.band_widths.float()
+        band_steps, band_widths = self.band_steps.float(), self.band_widths.float()
         if k <= 0:
-            return torch.zeros_like(widths[0])
-        last = steps.shape[0] - 1
-        if k >= int(steps[last]):
-            return widths[last] * (float(k) / float(steps[last]))
-        after = int((steps <= k).sum())
-        share = (float(k) - float(steps[after - 1])) / float(steps[after] - steps[after - 1])
-        return widths[after - 1] + share * (widths[after] - widths[after - 1])
+            return torch.zeros_like(band_widths[0])
+        last_index = band_steps.shape[0] - 1
+        if k >= int(band_steps[last_index]):
+            return band_widths[last_index] * (float(k) / float(band_steps[last_index]))
+        upper_index = int((band_steps <= k).sum())
+        fraction = (float(k) - float(band_steps[upper_index - 1])) / float(
+            band_steps[upper_index] - band_steps[upper_index - 1]
+        )
+        return band_widths[upper_index - 1] + fraction * (
+            band_widths[upper_index] - band_widths[upper_index - 1]
+        )
 
     @torch.jit.export
     def initial_state(self, batch: int) -> Tensor:
@@ -119,16 +126,16 @@ class ExportedModel(nn.Module):
             y_history: states [B, T, 3 + n], oldest first.
             w_history: inputs [B, T, m], oldest first.
         """
-        rows, steps = size(y_history, 3, 0), size(y_history, 3, 1)
-        require_shape("y_history", y_history, [rows, steps, self.states])
-        require_shape("w_history", w_history, [rows, steps, self.inputs])
-        s = torch.zeros(rows, self.n_state)
-        if steps == 0 or self.n_state == 0:
+        n_rows, n_steps = get_size(y_history, 3, 0), get_size(y_history, 3, 1)
+        require_shape("y_history", y_history, [n_rows, n_steps, self.n_states])
+        require_shape("w_history", w_history, [n_rows, n_steps, self.n_inputs])
+        s = torch.zeros(n_rows, self.n_state)
+        if n_steps == 0 or self.n_state == 0:
             return s
         y, w = y_history.float(), w_history.float()
-        good = self.ranges.accepted(torch.cat((y, w), dim=-1))
+        good = self.ranges.is_accepted(torch.cat((y, w), dim=-1))
         y, w = hold_measured(y, w, good)
-        for k in range(steps):
+        for k in range(n_steps):
             s = self.next_memory(y[:, k], w[:, k], s)
         known = (good.any(dim=1) & torch.isfinite(s).all(dim=-1)).unsqueeze(-1)
         return torch.where(known, s, torch.zeros_like(s))
@@ -140,10 +147,10 @@ class ExportedModel(nn.Module):
         `outside` [B] is True where a velocity or an input is beyond the training range, an entry or
         the memory is not finite, or the step was held.
         """
-        rows = size(x, 2, 0)
-        require_shape("x", x, [rows, self.states])
-        require_shape("w", w, [rows, self.inputs])
-        require_shape("s", s, [rows, self.n_state])
+        n_rows = get_size(x, 2, 0)
+        require_shape("x", x, [n_rows, self.n_states])
+        require_shape("w", w, [n_rows, self.n_inputs])
+        require_shape("s", s, [n_rows, self.n_state])
         found: tuple[Tensor, Tensor, Tensor] = self.guarded_step(x.float(), w.float(), s.float())
         return found
 
@@ -154,14 +161,17 @@ class ExportedModel(nn.Module):
         Behind them stand the memory [B, n_state] after the last step and `outside` [B, T], the flag
         of each step.
         """
-        rows, steps = size(x0, 2, 0), size(w, 3, 1)
-        require_shape("x0", x0, [rows, self.states])
-        require_shape("w", w, [rows, steps, self.inputs])
-        require_shape("s", s, [rows, self.n_state])
+        n_rows, n_steps = get_size(x0, 2, 0), get_size(w, 3, 1)
+        require_shape("x0", x0, [n_rows, self.n_states])
+        require_shape("w", w, [n_rows, n_steps, self.n_inputs])
+        require_shape("s", s, [n_rows, self.n_state])
         x, w, s = x0.float(), w.float(), s.float()
-        states, flags = [self.of_state.replaced(x)], [torch.zeros(rows, 0, dtype=torch.bool)]
+        states, flags = (
+            [self.of_state.replace_unaccepted(x)],
+            [torch.zeros(n_rows, 0, dtype=torch.bool)],
+        )
         # the first step sees x0 as it was given, for its flag
-        for k in range(steps):
+        for k in range(n_steps):
             x, s, outside = self.guarded_step(x, w[:, k], s)
             states.append(x)
             flags.append(outside.unsqueeze(1))
@@ -172,7 +182,7 @@ class ExportedModel(nn.Module):
         return self.step(x, w, s)
 
 
-class _Step(nn.Module):
+class _GuardedVesselStep(nn.Module):
     """The guarded step, for formats that hold one function."""
 
     def __init__(self, model: HybridDynamics, spec: ModelSpec) -> None:
@@ -180,13 +190,13 @@ class _Step(nn.Module):
         self.guarded = GuardedDynamics(model, spec)
 
     def forward(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        after, memory, outside = self.guarded.flagged_step(x, w, s)
+        next_state, memory, outside = self.guarded.flagged_step(x, w, s)
         # a result that is an argument is no result of its own
-        return after, memory.clone(), outside
+        return next_state, memory.clone(), outside
 
 
 @final
-class ExportedVessel(Exported):
+class ExportedVessel(Exportable):
     """A vessel model, whose own numbers are left alone.
 
     Args:
@@ -200,66 +210,70 @@ class ExportedVessel(Exported):
     def __init__(
         self, spec: ModelSpec, model: HybridDynamics, metrics: Sequence[Mapping[str, Any]] = ()
     ) -> None:
-        for part in model.modules():
-            if isinstance(part, ResidualHead) and part.refusal:
-                raise ExportError(f"model {spec.name}: {part.refusal}; export another model")
+        for submodule in model.modules():
+            if isinstance(submodule, ResidualHead) and submodule.export_error:
+                raise ExportError(
+                    f"model {spec.name}: {submodule.export_error}; export another model"
+                )
         self.spec, self.metrics = spec, metrics
         self.model = copy.deepcopy(model).eval().requires_grad_(False)
-        self.name, self.what, self.dt = spec.name, f"model {spec.name}", spec.dt
-        self.states, inputs = spec.signals.live.states, len(spec.signals.columns)
-        self.arguments = (("x", len(self.states)), ("w", inputs), ("s", model.n_state))
+        self.name, self.label, self.dt = spec.name, f"model {spec.name}", spec.dt
+        self.state_names, n_inputs = spec.signals.dof.state_names, len(spec.signals.input_columns)
+        self.arguments = (("x", len(self.state_names)), ("w", n_inputs), ("s", model.n_state))
         # what is written and what is read back are compared with one run
-        self._free: dict[torch.dtype, tuple[Tensor, Tensor, Tensor]] = {}
-        self._swept = _SWEEPS[0]
+        self._reference_runs: dict[torch.dtype, tuple[Tensor, Tensor, Tensor]] = {}
+        self._sweep_share = _SWEEP_SHARES[0]
 
-    def at(self, dtype: torch.dtype) -> HybridDynamics:
+    def to_precision(self, dtype: torch.dtype) -> HybridDynamics:
         """Return the model in a precision."""
         return copy.deepcopy(self.model).to(dtype)
 
-    def guarded(self, dtype: torch.dtype) -> GuardedDynamics:
+    def guard_model(self, dtype: torch.dtype) -> GuardedDynamics:
         """Return the model behind its guard."""
-        return GuardedDynamics(self.at(dtype), self.spec).to(dtype).eval()
+        return GuardedDynamics(self.to_precision(dtype), self.spec).to(dtype).eval()
 
-    def module(self, dtype: torch.dtype) -> nn.Module:
-        return ExportedModel(self.at(dtype), self.spec).eval()
+    def build_module(self, dtype: torch.dtype) -> nn.Module:
+        return GuardedVesselModule(self.to_precision(dtype), self.spec).eval()
 
-    def graph(self, dtype: torch.dtype) -> nn.Module:
-        return _Step(self.at(dtype), self.spec).to(dtype).eval()
+    def build_step_module(self, dtype: torch.dtype) -> nn.Module:
+        return _GuardedVesselStep(self.to_precision(dtype), self.spec).to(dtype).eval()
 
-    def require_numbers(self) -> None:
+    def require_finite_numbers(self) -> None:
         # limits of what has no limits are infinite from the start
-        fresh = self.spec.build().state_dict()
+        initial_state = self.spec.build().state_dict()
         for name, value in self.model.state_dict().items():
-            wrong = ~torch.isfinite(value)
-            if name in fresh and fresh[name].shape == value.shape:
-                wrong &= ~(torch.isinf(value) & (fresh[name].to(value.dtype) == value))
-            if bool(wrong.any()):
+            is_invalid = ~torch.isfinite(value)
+            if name in initial_state and initial_state[name].shape == value.shape:
+                is_invalid &= ~(torch.isinf(value) & (initial_state[name].to(value.dtype) == value))
+            if bool(is_invalid.any()):
                 raise ExportError(
-                    f"{self.what}: {name} holds {float(value[wrong][0])}, so it is no model; fit it"
+                    f"{self.label}: {name} holds {float(value[is_invalid][0])}, so it is no model; fit it"
                     " again"
                 )
 
-    def contents(self) -> dict[str, Any]:
+    def card_contents(self) -> dict[str, Any]:
         spec, band = self.spec, self.spec.band
-        units, live = spec.signals.units(), spec.signals.live
-        known = GuardedDynamics(self.model, spec).ranges
-        accepted = torch.stack((known.least, known.most), dim=1).tolist()
-        table: dict[str, Any] | None = None
+        units, dof = spec.signals.channel_units(), spec.signals.dof
+        guard_ranges = GuardedDynamics(self.model, spec).ranges
+        accepted = torch.stack(
+            (guard_ranges.accepted_lower, guard_ranges.accepted_upper), dim=1
+        ).tolist()
+        band_entry: dict[str, Any] | None = None
         if band is not None:
             horizon = band.steps[-1] * spec.dt
             widths = band.model_dump(mode="json", exclude_none=True)
-            table = {"about": _BAND, "horizon": horizon, **widths}
+            band_entry = {"about": _BAND_TEXT, "horizon": horizon, **widths}
         return {
             "schema": "residnet.card/1",
             "model": spec.name,
-            "states": [{"name": name, "unit": units[name]} for name in self.states],
+            "states": [{"name": name, "unit": units[name]} for name in self.state_names],
             "inputs": [
                 {
                     "name": name,
                     "unit": units[name],
                     "role": "command" if name in spec.signals.inputs else "exogenous",
                 }
-                for name in spec.signals.columns
+                for name in spec.signals.input_columns
             ],
             "inputs_held": {
                 "start": "the sample at the step's start",
@@ -268,14 +282,18 @@ class ExportedVessel(Exported):
             "memory": self.model.n_state,
             "dt": spec.dt,
             "integrator": spec.integrator,
-            "frame": _FRAME,
+            "frame": _FRAME_TEXT,
             # of a model of all velocities there is nothing to say
-            **({} if live.planar else {"velocities": list(live.velocities), "about": live.text}),
+            **(
+                {}
+                if dof.is_planar
+                else {"velocities": list(dof.velocities), "about": dof.description}
+            ),
             "training_range": {name: list(limits) for name, limits in spec.ranges.items()},
             "bad_inputs": {
-                "rules": _RULES,
+                "rules": _BAD_INPUT_RULES,
                 "accepted": dict(zip(units, accepted, strict=True)),
-                "substitute": dict(zip(units, known.middle.tolist(), strict=True)),
+                "substitute": dict(zip(units, guard_ranges.midpoint.tolist(), strict=True)),
             },
             "baseline": spec.baseline.model_dump(mode="json"),
             "head": None if spec.head is None else spec.head.model_dump(mode="json"),
@@ -283,14 +301,14 @@ class ExportedVessel(Exported):
                 member.model_dump(mode="json", include={"name", "baseline", "head"})
                 for member in spec.members
             ],
-            "band": table,
+            "band": band_entry,
             "metrics": [dict(row) for row in self.metrics],
             "versions": {"residnet": __version__, "torch": torch.__version__},
             "exported": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         }
 
-    def check(
-        self, loaded: Loaded, what: str, dtype: torch.dtype, tolerance: float | None = None
+    def check_parity(
+        self, loaded: LoadedExport, subject: str, dtype: torch.dtype, tolerance: float | None = None
     ) -> dict[str, Any]:
         """Return what the card says of the parity, once a file answers good and bad inputs.
 
@@ -298,73 +316,75 @@ class ExportedVessel(Exported):
             RoundingError: where the precision does not determine the track.
             ExportError: where the file is wrong otherwise, or the model leaves what is accepted.
         """
-        single = dtype == torch.float32
+        is_single = dtype == torch.float32
         if tolerance is None:
-            tolerance = base.SINGLE if single else base.DOUBLE
-        shares = self.require_parity(loaded, what, dtype, tolerance)
+            tolerance = base.SINGLE_TOLERANCE if is_single else base.DOUBLE_TOLERANCE
+        range_shares = self.check_long_run(loaded, subject, dtype, tolerance)
         # a library that adds up in another order may round otherwise in double precision too
-        if loaded.reorders and (single or tolerance > base.DOUBLE):
-            self.require_tracks(loaded, what, dtype, tolerance)
-        self.require_defined(loaded, what, dtype)
-        return {"steps": PARITY_STEPS, "sweep": self._swept, "share_of_range": shares}
+        if loaded.reorders_sums and (is_single or tolerance > base.DOUBLE_TOLERANCE):
+            self.check_tracks(loaded, subject, dtype, tolerance)
+        self.check_bad_inputs(loaded, subject, dtype)
+        return {"steps": PARITY_STEPS, "sweep": self._sweep_share, "share_of_range": range_shares}
 
-    def drive(self, dtype: torch.dtype, share: float = _SWEEPS[0]) -> tuple[Tensor, Tensor]:
+    def parity_inputs(
+        self, dtype: torch.dtype, sweep_share: float = _SWEEP_SHARES[0]
+    ) -> tuple[Tensor, Tensor]:
         """Return states of the past [1, 50, nx] and inputs [1, 50 + steps, m] of the parity check.
 
         Inputs sweep a share of the training range about its middle as slow sines, so that the run
         passes through what the model knows.
         """
         spec = self.spec
-        low, high = torch.tensor(spec.low, dtype=dtype), torch.tensor(spec.high, dtype=dtype)
-        steps = torch.arange(PARITY_STEPS + PAST, dtype=dtype)
-        n = self.model.dof
-        phase = torch.arange(low.numel() - n, dtype=dtype)
-        sweep = 0.5 + 0.5 * share * torch.sin(
-            0.02 * (1 + 0.37 * phase)[None] * steps[:, None] + phase[None]
+        lower, upper = torch.tensor(spec.low, dtype=dtype), torch.tensor(spec.high, dtype=dtype)
+        step_index = torch.arange(PARITY_STEPS + PAST_STEPS, dtype=dtype)
+        n_dof = self.model.dof
+        sweep_phase = torch.arange(lower.numel() - n_dof, dtype=dtype)
+        range_share = 0.5 + 0.5 * sweep_share * torch.sin(
+            0.02 * (1 + 0.37 * sweep_phase)[None] * step_index[:, None] + sweep_phase[None]
         )
-        w = (low[n:] + sweep * (high - low)[n:]).unsqueeze(0)
-        y = torch.zeros(1, PAST, len(self.states), dtype=dtype)
-        y[:, :, SURGE] = 0.5 * (low[0] + high[0])
-        return y, w
+        w = (lower[n_dof:] + range_share * (upper - lower)[n_dof:]).unsqueeze(0)
+        states = torch.zeros(1, PAST_STEPS, len(self.state_names), dtype=dtype)
+        states[:, :, SURGE] = 0.5 * (lower[0] + upper[0])
+        return states, w
 
-    def free_run(self, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what `drive` returns, and the states [1, steps + 1, nx] of the model's free run.
+    def run_reference(self, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what `parity_inputs` returns, and the states [1, steps + 1, nx] of the model's free run.
 
         All inputs at once may ask for more than logs that moved some of them at a time: the sweep
-        is the widest of `_SWEEPS` under which the states stay within what exports accept.
+        is the widest of `_SWEEP_SHARES` under which the states stay within what exports accept.
 
         Raises:
             ExportError: where it leaves that under each; the first step and channel beyond.
         """
-        if dtype in self._free:
-            return self._free[dtype]
-        model = self.at(dtype)
-        accepted = GuardedDynamics(self.model, self.spec).of_state
-        least, most = accepted.least, accepted.most
-        for share in _SWEEPS:
-            y, w = self.drive(dtype, share)
+        if dtype in self._reference_runs:
+            return self._reference_runs[dtype]
+        model = self.to_precision(dtype)
+        state_ranges = GuardedDynamics(self.model, self.spec).state_ranges
+        accepted_lower, accepted_upper = state_ranges.accepted_lower, state_ranges.accepted_upper
+        for sweep_share in _SWEEP_SHARES:
+            y, w = self.parity_inputs(dtype, sweep_share)
             with torch.no_grad():
-                s0 = model.warmup(y, w[:, :PAST])
-                states = Rollout(model)(y[:, -1], w[:, PAST:], s0)[0]
-            wrong = ~((states[0] >= least) & (states[0] <= most))
-            if not bool(wrong.any()):
-                self._free[dtype], self._swept = (y, w, states), share
-                return self._free[dtype]
-            say(
-                f"{self.what}: its free run leaves what exports accept while all inputs sweep"
-                f" {share:.0%} of the training range at once"
+                s0 = model.warmup(y, w[:, :PAST_STEPS])
+                states = Rollout(model)(y[:, -1], w[:, PAST_STEPS:], s0)[0]
+            is_outside = ~((states[0] >= accepted_lower) & (states[0] <= accepted_upper))
+            if not bool(is_outside.any()):
+                self._reference_runs[dtype], self._sweep_share = (y, w, states), sweep_share
+                return self._reference_runs[dtype]
+            log_message(
+                f"{self.label}: its free run leaves what exports accept while all inputs sweep"
+                f" {sweep_share:.0%} of the training range at once"
             )
-        k = int(wrong.any(dim=1).to(torch.int).argmax())
-        i = int(wrong[k].to(torch.int).argmax())
+        step_index = int(is_outside.any(dim=1).to(torch.int).argmax())
+        state_index = int(is_outside[step_index].to(torch.int).argmax())
         raise ExportError(
-            f"{self.what}: diverges in the export's free run, though its inputs keep to the middle"
-            f" {_SWEEPS[-1]:.0%} of the training range: {self.states[i]} is"
-            f" {float(states[0, k, i]):.3g} after {k * self.spec.dt:g} s, accepted"
-            f" {float(least[i]):.3g} to {float(most[i]):.3g}; not exported, choose another model"
+            f"{self.label}: diverges in the export's free run, though its inputs keep to the middle"
+            f" {_SWEEP_SHARES[-1]:.0%} of the training range: {self.state_names[state_index]} is"
+            f" {float(states[0, step_index, state_index]):.3g} after {step_index * self.spec.dt:g} s, accepted"
+            f" {float(accepted_lower[state_index]):.3g} to {float(accepted_upper[state_index]):.3g}; not exported, choose another model"
         )
 
-    def require_parity(
-        self, loaded: Loaded, what: str, dtype: torch.dtype, tolerance: float
+    def check_long_run(
+        self, loaded: LoadedExport, subject: str, dtype: torch.dtype, tolerance: float
     ) -> dict[str, float]:
         """Return the largest difference of each state from the model's, as a share of its range.
 
@@ -372,48 +392,51 @@ class ExportedVessel(Exported):
             RoundingError: where a share is larger than allowed.
             ExportError: where the model itself leaves what exports accept.
         """
-        y, w, eager = self.free_run(dtype)
-        past, inputs = y[0].numpy(), w[0].numpy()
-        s = self.memory(loaded, past, inputs[:PAST])
-        x = past[-1].copy()
-        together = loaded.rollout(x, inputs[PAST:], s)
-        path = [x]
-        for w_now in inputs[PAST:]:
+        y, w, eager_states = self.run_reference(dtype)
+        past_states, inputs = y[0].numpy(), w[0].numpy()
+        s = self.warm_up_memory(loaded, past_states, inputs[:PAST_STEPS])
+        x = past_states[-1].copy()
+        rollout_states = loaded.rollout(x, inputs[PAST_STEPS:], s)
+        stepped_states = [x]
+        for w_now in inputs[PAST_STEPS:]:
             x, s, _ = loaded.step(x, w_now, s)
-            path.append(x)
-        states = eager[0].numpy()
-        span = np.maximum(np.ptp(states, axis=0), 1e-6)
-        off = np.abs(np.stack(path) - states)
-        if together is not None:
-            off = np.maximum(off, np.abs(together - states))
-        worst = off.max(axis=0) / span
-        shares = dict(zip(self.states, worst.tolist(), strict=True))
-        if not bool((worst <= tolerance).all()):
+            stepped_states.append(x)
+        states = eager_states[0].numpy()
+        state_range = np.maximum(np.ptp(states, axis=0), 1e-6)
+        differences = np.abs(np.stack(stepped_states) - states)
+        if rollout_states is not None:
+            differences = np.maximum(differences, np.abs(rollout_states - states))
+        max_shares = differences.max(axis=0) / state_range
+        range_shares = dict(zip(self.state_names, max_shares.tolist(), strict=True))
+        if not bool((max_shares <= tolerance).all()):
             raise RoundingError(
-                f"{self.what}: {what} differs from the model by {shares} of each channel's range"
+                f"{self.label}: {subject} differs from the model by {range_shares} of each channel's range"
                 f" over {PARITY_STEPS} steps; allowed {tolerance:g}"
             )
-        return shares
+        return range_shares
 
-    def memory(self, loaded: Loaded, y: Numbers, w: Numbers) -> Numbers:
+    def warm_up_memory(self, loaded: LoadedExport, y: NumberArray, w: NumberArray) -> NumberArray:
         """Return the memory that states [T, 3 + n] and inputs [T, m] of a measured past leave.
 
         Where a format has only steps, these are taken. In the place of a sample that is no
         measurement stands the last one before it that is, or else the first one behind it.
         """
-        found = loaded.memory(y, w)
-        if found is not None:
-            return found
+        loaded_memory = loaded.initial_memory(y, w)
+        if loaded_memory is not None:
+            return loaded_memory
         ranges = GuardedDynamics(self.model, self.spec).ranges
-        good = ranges.accepted(torch.from_numpy(np.concatenate((y, w), axis=1))).tolist()
-        s, at = np.zeros(self.model.n_state, y.dtype), good.index(True) if any(good) else 0
-        for k in range(len(y) if any(good) else 0):
-            at = k if good[k] else at
-            s = loaded.step(y[at], w[at], s)[1]
+        is_good = ranges.is_accepted(torch.from_numpy(np.concatenate((y, w), axis=1))).tolist()
+        s, sample_index = (
+            np.zeros(self.model.n_state, y.dtype),
+            is_good.index(True) if any(is_good) else 0,
+        )
+        for k in range(len(y) if any(is_good) else 0):
+            sample_index = k if is_good[k] else sample_index
+            s = loaded.step(y[sample_index], w[sample_index], s)[1]
         return s
 
-    def require_tracks(
-        self, loaded: Loaded, what: str, dtype: torch.dtype, tolerance: float
+    def check_tracks(
+        self, loaded: LoadedExport, subject: str, dtype: torch.dtype, tolerance: float
     ) -> None:
         """Refuse a precision whose rounding grows, on tracks whose inputs jump within the range.
 
@@ -425,65 +448,74 @@ class ExportedVessel(Exported):
             RoundingError: where a state of a track differs by more.
         """
         generator = torch.Generator().manual_seed(1)
-        guard = self.guarded(dtype)
-        low, high = (torch.tensor(bound, dtype=dtype) for bound in (self.spec.low, self.spec.high))
-        places = (_TRACKS, PARITY_STEPS // _HELD + 1, low.numel())
-        seen = low + torch.rand(places, generator=generator).to(dtype) * (high - low)
-        n = guard.dof
-        w = seen[:, :, n:].repeat_interleave(_HELD, dim=1)[:, :PARITY_STEPS]
+        guarded = self.guard_model(dtype)
+        lower, upper = (
+            torch.tensor(limits, dtype=dtype) for limits in (self.spec.low, self.spec.high)
+        )
+        track_shape = (_N_TRACKS, PARITY_STEPS // _STEPS_PER_INPUT + 1, lower.numel())
+        track_inputs = lower + torch.rand(track_shape, generator=generator).to(dtype) * (
+            upper - lower
+        )
+        n_dof = guarded.dof
+        w = track_inputs[:, :, n_dof:].repeat_interleave(_STEPS_PER_INPUT, dim=1)[:, :PARITY_STEPS]
         # the last column is the guard's flag
-        x0 = torch.cat((torch.zeros(_TRACKS, 3), seen[:, 0, :n], torch.zeros(_TRACKS, 1)), dim=1)
-        x0, s0 = x0.to(dtype), guard.initial_state(_TRACKS).to(dtype)
+        x0 = torch.cat(
+            (torch.zeros(_N_TRACKS, 3), track_inputs[:, 0, :n_dof], torch.zeros(_N_TRACKS, 1)),
+            dim=1,
+        )
+        x0, s0 = x0.to(dtype), guarded.initial_state(_N_TRACKS).to(dtype)
         with torch.no_grad():
-            wanted = trace_rollout(Rollout(guard), PARITY_STEPS)(x0, w, s0)[0]
-        states = wanted[..., : len(self.states)].numpy()
-        x, s = x0[:, : len(self.states)].numpy(), s0.numpy()
-        path = [x]
+            expected = trace_rollout(Rollout(guarded), PARITY_STEPS)(x0, w, s0)[0]
+        states = expected[..., : len(self.state_names)].numpy()
+        x, s = x0[:, : len(self.state_names)].numpy(), s0.numpy()
+        stepped_states = [x]
         for k in range(PARITY_STEPS):
-            x, s, _ = loaded.rows(x, w[:, k].numpy(), s)
-            path.append(x)
-        span = np.maximum(np.ptp(states, axis=1), 1e-6)
-        worst = float((np.abs(np.stack(path, axis=1) - states).max(axis=1) / span).max())
-        if not worst <= tolerance:
+            x, s, _ = loaded.step_rows(x, w[:, k].numpy(), s)
+            stepped_states.append(x)
+        state_range = np.maximum(np.ptp(states, axis=1), 1e-6)
+        max_share = float(
+            (np.abs(np.stack(stepped_states, axis=1) - states).max(axis=1) / state_range).max()
+        )
+        if not max_share <= tolerance:
             raise RoundingError(
-                f"{self.what}: {what} differs from the model by {worst:.2g} of a state's range over"
+                f"{self.label}: {subject} differs from the model by {max_share:.2g} of a state's range over"
                 f" {PARITY_STEPS} steps; allowed {tolerance:g}"
             )
 
-    def require_defined(self, loaded: Loaded, what: str, dtype: torch.dtype) -> None:
+    def check_bad_inputs(self, loaded: LoadedExport, subject: str, dtype: torch.dtype) -> None:
         """Refuse what answers bad inputs, states or memories otherwise than the model's guard.
 
         Raises:
             ExportError: that names the first entry and its value.
         """
-        guarded = self.guarded(dtype)
-        y, w = self.drive(dtype)
-        memory = guarded.warmup(y, w[:, :PAST])[0]
-        good = torch.cat((y[0, -1], w[0, PAST], memory))
-        columns = self.spec.signals.columns
-        names = [*self.states, *columns, *(f"memory {i}" for i in range(memory.numel()))]
-        measured = len(self.states) + len(columns)
+        guarded = self.guard_model(dtype)
+        past_states, w = self.parity_inputs(dtype)
+        memory = guarded.warmup(past_states, w[:, :PAST_STEPS])[0]
+        good_values = torch.cat((past_states[0, -1], w[0, PAST_STEPS], memory))
+        columns = self.spec.signals.input_columns
+        names = [*self.state_names, *columns, *(f"memory {i}" for i in range(memory.numel()))]
+        n_measured = len(self.state_names) + len(columns)
         # a long memory is wrong in its first, its middle and its last entry
-        ends = {measured, len(names) // 2, len(names) - 1}
-        places = [i for i in range(len(names)) if i < measured or i in ends]
-        bad = (torch.nan, torch.inf, -torch.inf, 1e30, -1e30)
-        cases = [(i, value) for i in places for value in bad]
-        rows = good.repeat(len(cases), 1)
-        for row, (i, value) in zip(rows, cases, strict=True):
-            row[i] = value
-        x0, w0, s0 = rows.split([len(self.states), len(columns), memory.numel()], dim=1)
+        memory_indices = {n_measured, len(names) // 2, len(names) - 1}
+        tested_indices = [i for i in range(len(names)) if i < n_measured or i in memory_indices]
+        bad_values = (torch.nan, torch.inf, -torch.inf, 1e30, -1e30)
+        cases = [(i, value) for i in tested_indices for value in bad_values]
+        case_values = good_values.repeat(len(cases), 1)
+        for case_row, (i, value) in zip(case_values, cases, strict=True):
+            case_row[i] = value
+        x0, w0, s0 = case_values.split([len(self.state_names), len(columns), memory.numel()], dim=1)
         with torch.no_grad():
-            wanted = guarded.flagged_step(x0, w0, s0)
+            expected = guarded.flagged_step(x0, w0, s0)
         for k, (i, value) in enumerate(cases):
             x, s, outside = loaded.step(x0[k].numpy(), w0[k].numpy(), s0[k].numpy())
-            same = (
-                np.allclose(x, wanted[0][k].numpy(), rtol=1e-4, atol=1e-4)
-                and np.allclose(s, wanted[1][k].numpy(), rtol=1e-3, atol=1e-3)
-                and bool(outside) == bool(wanted[2][k])
+            is_equal = (
+                np.allclose(x, expected[0][k].numpy(), rtol=1e-4, atol=1e-4)
+                and np.allclose(s, expected[1][k].numpy(), rtol=1e-3, atol=1e-3)
+                and bool(outside) == bool(expected[2][k])
             )
-            if not same:
+            if not is_equal:
                 raise ExportError(
-                    f"{self.what}: {what} answers {names[i]} = {value} with {x.tolist()}, outside"
-                    f" {bool(outside)}; the model with {wanted[0][k].tolist()},"
-                    f" {bool(wanted[2][k])}"
+                    f"{self.label}: {subject} answers {names[i]} = {value} with {x.tolist()}, outside"
+                    f" {bool(outside)}; the model with {expected[0][k].tolist()},"
+                    f" {bool(expected[2][k])}"
                 )

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any
 
-from residnet.core.registry import Kinds
+from residnet.core.registry import PluginUnion
 
 if TYPE_CHECKING:
-    from residnet.heads.base import HeadKind
+    from residnet.heads.base import BaseHeadConfig
 
-    HeadConfig = HeadKind
+    HeadConfig = BaseHeadConfig
 else:
     HeadConfig = Annotated[
         Any,
-        Kinds(
+        PluginUnion(
             "residnet.heads",
-            "residnet.heads.base:HeadKind",
+            "residnet.heads.base:BaseHeadConfig",
             {
                 "plsr": "residnet.heads.linear:PlsrConfig",
                 "ridge": "residnet.heads.linear:RidgeConfig",
@@ -25,7 +25,7 @@ else:
                 "mlp": "residnet.heads.mlp:MlpConfig",
                 "lstm": "residnet.heads.lstm:LstmConfig",
                 "sklearn": "residnet.heads.scikit:SklearnConfig",
-                "recurrent": "residnet.heads.recurrent:RecurrentConfig",
+                "recurrent": "residnet.heads.recurrent:GRUEnsembleConfig",
             },
         ),
     ]

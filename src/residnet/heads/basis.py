@@ -13,19 +13,19 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from residnet.core.arrays.paged import row_pieces
-from residnet.core.names import ACCELERATION
+from residnet.core.arrays.paged import iterate_row_chunks
+from residnet.core.names import ACCELERATION_NAMES
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
-from residnet.physics.symmetry import live_of
-from residnet.physics.terms import TermLibrary, polynomial_terms
+from residnet.physics.symmetry import get_dof
+from residnet.physics.terms import TermLibrary, make_polynomial_terms
 from residnet.regression.estimator import (
     Estimator,
     Solution,
-    fold_numbers,
-    regressors,
+    assign_group_folds,
+    default_fold_count,
+    evaluate_regressors,
     require_finite,
-    usual_folds,
 )
 
 
@@ -54,17 +54,19 @@ class BasisConfig(FeatureConfig, ABC):
     folds: int | None = Field(default=None, ge=2, le=1_000)
 
     @model_validator(mode="after")
-    def _space(self) -> Self:
-        named = [term for term in self.terms if any(name in term for name in ACCELERATION)]
-        if self.space == "acceleration" and named:
+    def _validate_space(self) -> Self:
+        acceleration_terms = [
+            term for term in self.terms if any(name in term for name in ACCELERATION_NAMES)
+        ]
+        if self.space == "acceleration" and acceleration_terms:
             raise ValueError(
-                f"terms: '{named[0]}' names an acceleration, which only a residual in force space"
+                f"terms: '{acceleration_terms[0]}' names an acceleration, which only a residual in force space"
                 " may (space: force)"
             )
         return self
 
     @abstractmethod
-    def estimator(self, folds: int | None) -> Estimator:
+    def build_estimator(self, n_folds: int | None) -> Estimator:
         """Return the estimator of the coefficients, cross-validated over so many folds."""
 
 
@@ -74,42 +76,48 @@ class BasisHead(ClosedFormHead):
 
     def __init__(self, config: BasisConfig, names: Sequence[str]) -> None:
         super().__init__(names)
-        chosen, moving = config.chosen(names), live_of(names).moving
-        self.features = Features(chosen, names, config.margin)
-        magnitudes = [name for name in moving if name in chosen]
+        feature_names, dynamic_states = config.select_features(names), get_dof(names).dynamic_states
+        self.features = Features(feature_names, names, config.margin)
+        magnitudes = [name for name in dynamic_states if name in feature_names]
         self.library = TermLibrary(
-            config.terms or polynomial_terms(chosen, config.degree, magnitudes=magnitudes), chosen
+            config.terms
+            or make_polynomial_terms(feature_names, config.degree, magnitudes=magnitudes),
+            feature_names,
         )
         self.config = config
         self.coefficients = nn.Buffer(
-            torch.zeros(self.library.count, self.dof, dtype=torch.float64)
+            torch.zeros(self.library.n_terms, self.n_dof, dtype=torch.float64)
         )
-        self.intercept = nn.Buffer(torch.zeros(self.dof, dtype=torch.float64))
+        self.intercept = nn.Buffer(torch.zeros(self.n_dof, dtype=torch.float64))
 
-    def basis(self, z: Tensor) -> Tensor:
+    def basis_functions(self, z: Tensor) -> Tensor:
         """Return the basis functions [..., J] at channels z [..., nz].
 
         Features are scaled but not centred, so that names keep their meaning.
         """
-        values: Tensor = self.library(self.features.guarded(z) / self.features.std.to(z.dtype))
+        values: Tensor = self.library(
+            self.features.select_clamped(z) / self.features.std.to(z.dtype)
+        )
         return values
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        return self.basis(z) @ self.coefficients.to(z.dtype) + self.intercept.to(z.dtype), s
+        return self.basis_functions(z) @ self.coefficients.to(z.dtype) + self.intercept.to(
+            z.dtype
+        ), s
 
-    def require_samples(self, samples: Samples) -> None:
-        fold_numbers(samples.group, self.config.folds or usual_folds(samples.group))
+    def validate_samples(self, samples: Samples) -> None:
+        assign_group_folds(samples.group, self.config.folds or default_fold_count(samples.group))
 
-    def solutions(self, samples: Samples) -> list[Solution]:
+    def fit_solutions(self, samples: Samples) -> list[Solution]:
         columns = [samples.names.index(name) for name in self.features.names]
-        for rows in row_pieces(len(samples)):
-            chosen = samples.z[rows][:, columns]
-            require_finite(chosen, self.features.names, "channel", rows.start)
-        folds = self.config.folds or usual_folds(samples.group)
-        return self.config.estimator(folds).fit(
-            regressors(self.basis, samples.z, range(self.library.count)),
+        for rows in iterate_row_chunks(len(samples)):
+            features = samples.z[rows][:, columns]
+            require_finite(features, self.features.names, "channel", rows.start)
+        n_folds = self.config.folds or default_fold_count(samples.group)
+        return self.config.build_estimator(n_folds).fit(
+            evaluate_regressors(self.basis_functions, samples.z, range(self.library.n_terms)),
             samples.target,
             samples.group,
             names=self.library.terms,
-            outputs=self.outputs,
+            outputs=self.output_names,
         )

@@ -13,7 +13,12 @@ from residnet.core.samples import Samples
 from residnet.heads.base import EquationHead, FeatureConfig, Features
 from residnet.physics.terms import CandidatesConfig, TermLibrary, parse_term
 from residnet.regression.estimator import Solution
-from residnet.regression.expressions import ExpressionLibrary, Term, Weights, term
+from residnet.regression.expressions import (
+    CoefficientTable,
+    ExpressionLibrary,
+    Factors,
+    format_product,
+)
 from residnet.regression.genetic import EquationSearchConfig, GeneticEquations
 from residnet.regression.sparse import SparseRegression
 
@@ -33,7 +38,7 @@ class GeneticConfig(FeatureConfig, EquationSearchConfig):
     optional: bool = False
 
     def build(self, names: Sequence[str]) -> GeneticHead:
-        """Return the module for channels `names`."""
+        """Return the module for channels `format_terms`."""
         return GeneticHead(self, names)
 
 
@@ -46,27 +51,27 @@ class GeneticHead(EquationHead):
 
     def __init__(self, config: GeneticConfig, names: Sequence[str]) -> None:
         super().__init__(names)
-        self.features = Features(config.chosen(names), names, config.margin)
+        self.features = Features(config.select_features(names), names, config.margin)
         self.config = config
         self.library = ExpressionLibrary(config.evolution.nesting)
-        self.weights = Weights(self.dof)
+        self.weights = CoefficientTable(self.n_dof)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        return self.library(self.features.guarded(z)) @ self.weights.values.to(z.dtype), s
+        return self.library(self.features.select_clamped(z)) @ self.weights.values.to(z.dtype), s
 
-    def parameter_count(self) -> list[float]:
-        return [float(count) for count in (self.weights.values != 0).sum(0)]
-
-    @torch.jit.unused
-    def along(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        return self.library(self.features.guarded(z)), self.weights.values
+    def parameter_counts(self) -> list[float]:
+        return [float(n_nonzero) for n_nonzero in (self.weights.values != 0).sum(0)]
 
     @torch.jit.unused
-    def names(self) -> list[str]:
-        algebra, products = self.library.read(self.features.names)
-        return [term(algebra, product) for product in products]
+    def evaluate_terms(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        return self.library(self.features.select_clamped(z)), self.weights.values
 
-    def solutions(self, samples: Samples) -> list[Solution]:
+    @torch.jit.unused
+    def format_terms(self) -> list[str]:
+        algebra, products = self.library.decode_terms(self.features.names)
+        return [format_product(algebra, product) for product in products]
+
+    def fit_solutions(self, samples: Samples) -> list[Solution]:
         """Return the equations of the best individuals of the three searches.
 
         Where their terms are chosen from once more, those of a sparse search are among them: with
@@ -76,34 +81,34 @@ class GeneticHead(EquationHead):
             FitError: where the data do not determine an equation.
             UsageError: where DEAP is not installed.
         """
-        return GeneticEquations(self.config, self._known(samples)).fit(
-            self.features.guarded(samples.z),
+        return GeneticEquations(self.config, self._sparse_search_terms(samples)).fit(
+            self.features.select_clamped(samples.z),
             samples.target,
             samples.group,
             names=self.features.names,
-            outputs=self.outputs,
+            outputs=self.output_names,
         )
 
-    def _known(self, samples: Samples) -> list[list[Term]]:
+    def _sparse_search_terms(self, samples: Samples) -> list[list[Factors]]:
         """Return the factors of the terms that a sparse search finds for each output."""
-        search, names = self.config.final, self.features.names
-        if search is None:
+        search_settings, names = self.config.final, self.features.names
+        if search_settings is None:
             return []
-        space, z = CandidatesConfig(), self.features.guarded(samples.z)
-        candidates = space.candidates(names)
+        candidate_settings, z = CandidatesConfig(), self.features.select_clamped(samples.z)
+        candidates = candidate_settings.generate_candidates(names)
         library = TermLibrary([candidate.term for candidate in candidates], names)
-        clear = space.clear(library.terms, names, z)
+        is_nonsingular = candidate_settings.find_nonsingular_terms(library.terms, names, z)
         estimator = SparseRegression(
-            search,
+            search_settings,
             degrees=[candidate.degree for candidate in candidates],
-            efforts=[candidate.effort for candidate in candidates],
-            allowed=clear[:, None].expand(-1, len(self.outputs)),
+            complexities=[candidate.complexity for candidate in candidates],
+            allowed_terms=is_nonsingular[:, None].expand(-1, len(self.output_names)),
         )
-        terms = library(z)
+        term_values = library(z)
         try:
-            found = estimator.fit(terms, samples.target, names=library.terms, outputs=self.outputs)[
-                0
-            ].table
+            coefficients = estimator.fit(
+                term_values, samples.target, names=library.terms, outputs=self.output_names
+            )[0].table
         except FitError:
             # too few samples for all candidates say nothing against a bred equation
             return []
@@ -111,10 +116,10 @@ class GeneticHead(EquationHead):
             [
                 [
                     ("abs" if factor.magnitude else factor.function, factor.name, factor.power)
-                    for factor in parse_term(one.term, names)
+                    for factor in parse_term(coefficient.term, names)
                 ]
-                for one in found
-                if one.axis == output
+                for coefficient in coefficients
+                if coefficient.axis == output
             ]
-            for output in self.outputs
+            for output in self.output_names
         ]

@@ -14,12 +14,18 @@ from torch import Tensor, nn
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
-from residnet.physics.symmetry import live_of
+from residnet.physics.symmetry import get_dof
 from residnet.physics.terms import TermLibrary
-from residnet.regression.equation_rows import step_of, unbroken_stretches
-from residnet.regression.estimator import Solution, fold_numbers, usual_folds
-from residnet.regression.kernel import KernelRidge, Path, Polynomial, Rbf, Recursion
-from residnet.regression.shrinkage import CONSTANT
+from residnet.regression.equation_rows import median_time_step, number_regular_segments
+from residnet.regression.estimator import Solution, assign_group_folds, default_fold_count
+from residnet.regression.kernel import (
+    KernelRidge,
+    PolynomialConfig,
+    RbfConfig,
+    RecursiveErrors,
+    RegularizationPath,
+)
+from residnet.regression.shrinkage import CONSTANT_TOLERANCE
 
 
 class KernelConfig(FeatureConfig):
@@ -35,7 +41,7 @@ class KernelConfig(FeatureConfig):
             axes by the error of free runs on validation data, then the penalty of each axis in turn
             for as long as free runs gain, or no residual at all (document 001 section 4, second
             approach); `one_step`: setting and penalty of each axis for itself by cross-validated
-            errors of accelerations; `recursion`: of each axis for itself by the error of its own
+            errors of accelerations; `recursive_errors`: of each axis for itself by the error of its own
             velocity in free run along the training records, the other velocities as measured (first
             approach).
         folds: number of folds of the cross-validation; a manoeuvre is never split between folds.
@@ -43,7 +49,9 @@ class KernelConfig(FeatureConfig):
     """
 
     kind: Literal["kernel"] = "kernel"
-    kernel: Annotated[Rbf | Polynomial, Field(discriminator="kind")] = Field(default_factory=Rbf)
+    kernel: Annotated[RbfConfig | PolynomialConfig, Field(discriminator="kind")] = Field(
+        default_factory=RbfConfig
+    )
     terms: tuple[str, ...] = ()
     penalties: tuple[Annotated[float, Field(gt=0)], ...] = Field(
         default=(1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1), min_length=1
@@ -63,9 +71,9 @@ class TermFeatures(nn.Module):
     def __init__(self, terms: Sequence[str], channels: Sequence[str]) -> None:
         super().__init__()
         self.library = TermLibrary(terms, channels)
-        self.count = self.library.count
-        self.mean = nn.Buffer(torch.zeros(self.count, dtype=torch.float64))
-        self.std = nn.Buffer(torch.ones(self.count, dtype=torch.float64))
+        self.n_terms = self.library.n_terms
+        self.mean = nn.Buffer(torch.zeros(self.n_terms, dtype=torch.float64))
+        self.std = nn.Buffer(torch.ones(self.n_terms, dtype=torch.float64))
 
     def calibrate(self, channels: Tensor) -> None:
         """Take mean and standard deviation from the training samples of the channels [N, F].
@@ -75,10 +83,12 @@ class TermFeatures(nn.Module):
         """
         values = self.library(channels)
         std = values.std(0, correction=0)
-        for term, still in zip(
-            self.library.terms, (std <= CONSTANT * (1 + values.mean(0).abs())).tolist(), strict=True
+        for term, is_constant in zip(
+            self.library.terms,
+            (std <= CONSTANT_TOLERANCE * (1 + values.mean(0).abs())).tolist(),
+            strict=True,
         ):
-            if still:
+            if is_constant:
                 raise FitError(
                     f"feature '{term}' is constant over the training samples; leave it out of"
                     " `terms`"
@@ -98,77 +108,89 @@ class KernelHead(ClosedFormHead):
 
     def __init__(self, config: KernelConfig, names: Sequence[str]) -> None:
         super().__init__(names)
-        chosen = config.chosen(names)
-        self.features = Features(chosen, names, config.margin)
-        self.terms = TermFeatures(config.terms, chosen)
-        self.kernel = config.kernel.build(len(chosen) + self.terms.count, self.dof)
+        feature_names = config.select_features(names)
+        self.features = Features(feature_names, names, config.margin)
+        self.terms = TermFeatures(config.terms, feature_names)
+        self.kernel = config.kernel.build(len(feature_names) + self.terms.n_terms, self.n_dof)
         self.config = config
-        self.effective = nn.Buffer(torch.zeros(self.dof, dtype=torch.float64))
+        self.effective = nn.Buffer(torch.zeros(self.n_dof, dtype=torch.float64))
 
     def calibrate(self, samples: Samples) -> None:
         super().calibrate(samples)
-        if self.terms.count:
-            self.terms.calibrate(self.features.guarded(samples.z))
+        if self.terms.n_terms:
+            self.terms.calibrate(self.features.select_clamped(samples.z))
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        return self.kernel(self.columns(z)), s
+        return self.kernel(self.kernel_inputs(z)), s
 
-    def columns(self, z: Tensor) -> Tensor:
+    def kernel_inputs(self, z: Tensor) -> Tensor:
         """Return the standardised features and terms [..., F + J]."""
         x = self.features(z)
         return (
             x
-            if self.terms.count == 0
-            else torch.cat((x, self.terms(self.features.guarded(z))), dim=-1)
+            if self.terms.n_terms == 0
+            else torch.cat((x, self.terms(self.features.select_clamped(z))), dim=-1)
         )
 
-    def parameter_count(self) -> list[float]:
+    def parameter_counts(self) -> list[float]:
         """Return the effective number of parameters of each axis, the trace of the smoother."""
-        return [float(count) for count in self.effective]
+        return [float(n_effective) for n_effective in self.effective]
 
-    def require_samples(self, samples: Samples) -> None:
-        fold_numbers(samples.group, self.config.folds or usual_folds(samples.group))
+    def validate_samples(self, samples: Samples) -> None:
+        assign_group_folds(samples.group, self.config.folds or default_fold_count(samples.group))
 
-    def solutions(self, samples: Samples) -> list[Solution]:
-        scoring = None
+    def fit_solutions(self, samples: Samples) -> list[Solution]:
+        score_paths = None
         if self.config.choose == "recursion":
             group, t = samples.group.numpy(), samples.t.numpy()
-            step = step_of(group, t)
-            stretch = torch.from_numpy(unbroken_stretches(group, t, step))
-            columns = [samples.names.index(name) for name in live_of(samples.names).moving]
-            recursion = Recursion(samples.z, samples.target, stretch, step, columns)
-            scoring = partial(self._recursion_errors, recursion)
+            time_step = median_time_step(group, t)
+            segment = torch.from_numpy(number_regular_segments(group, t, time_step))
+            columns = [samples.names.index(name) for name in get_dof(samples.names).dynamic_states]
+            recursive_errors = RecursiveErrors(
+                samples.z, samples.target, segment, time_step, columns
+            )
+            score_paths = partial(self._recursion_errors, recursive_errors)
         estimator = KernelRidge(
             self.kernel,
             self.config.penalties,
-            folds=self.config.folds or usual_folds(samples.group),
-            scoring=scoring,
-            alternatives=self.config.choose == "free_run",
+            folds=self.config.folds or default_fold_count(samples.group),
+            scoring=score_paths,
+            has_alternatives=self.config.choose == "free_run",
         )
         with torch.no_grad():
-            x = self.columns(samples.z)
-        found = estimator.fit(x, samples.target, samples.group, outputs=self.outputs)
-        return [self._named(solution) for solution in found]
+            inputs = self.kernel_inputs(samples.z)
+        solutions = estimator.fit(inputs, samples.target, samples.group, outputs=self.output_names)
+        return [self._to_state(solution) for solution in solutions]
 
-    def _named(self, solution: Solution) -> Solution:
-        own = {"effective": "effective"}
-        state = {own.get(name, f"kernel.{name}"): value for name, value in solution.state.items()}
-        make = solution.neighbours
-        neighbours = None if make is None else lambda: [self._named(near) for near in make()]
+    def _to_state(self, solution: Solution) -> Solution:
+        state_names = {"effective": "effective"}
+        state = {
+            state_names.get(name, f"kernel.{name}"): value for name, value in solution.state.items()
+        }
+        make_neighbours = solution.neighbours
+        neighbours = (
+            None
+            if make_neighbours is None
+            else lambda: [self._to_state(neighbour) for neighbour in make_neighbours()]
+        )
         return replace(solution, state=state, neighbours=neighbours)
 
-    def _recursion_errors(self, recursion: Recursion, paths: Sequence[Path]) -> Tensor:
+    def _recursion_errors(
+        self, recursive_errors: RecursiveErrors, paths: Sequence[RegularizationPath]
+    ) -> Tensor:
         """Return mean square errors of velocities that run alone, [settings, penalties, n]."""
-        count = len(self.config.penalties)
-        out = torch.zeros(len(paths), count, self.dof, dtype=torch.float64)
+        n_penalties = len(self.config.penalties)
+        errors = torch.zeros(len(paths), n_penalties, self.n_dof, dtype=torch.float64)
         for i, path in enumerate(paths):
-            for axis in range(self.dof):
+            for axis in range(self.n_dof):
                 weights = path.coefficients[:, :, axis]
 
-                def predicted(z: Tensor, path: Path = path, weights: Tensor = weights) -> Tensor:
-                    features = self.kernel.features(path, self.columns(z))
+                def predict(
+                    z: Tensor, path: RegularizationPath = path, weights: Tensor = weights
+                ) -> Tensor:
+                    features = self.kernel.evaluate_features(path, self.kernel_inputs(z))
                     return torch.einsum("cgp,cp->cg", features, weights)
 
                 with torch.no_grad():
-                    out[i, :, axis] = recursion.errors(axis, predicted, count)
-        return out
+                    errors[i, :, axis] = recursive_errors.state_errors(axis, predict, n_penalties)
+        return errors

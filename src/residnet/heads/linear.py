@@ -8,16 +8,16 @@ from typing import Literal, final
 
 from pydantic import Field
 
-from residnet.core.names import ACCELERATION
+from residnet.core.names import ACCELERATION_NAMES
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisConfig, BasisHead
 from residnet.heads.force import ForceHead
-from residnet.physics.force_model import FERRY_TERMS, MOTION
+from residnet.physics.force_model import FERRY_TERMS, MOTION_CHANNELS
 from residnet.regression.estimator import Estimator
 from residnet.regression.shrinkage import PLSR, Ridge
 
 
-class _LinearConfig(BasisConfig, ABC):
+class LinearBasisConfig(BasisConfig, ABC):
     @final
     def build(self, names: Sequence[str]) -> ClosedFormHead:
         """Return the module for channels `names`, in the space that the config names.
@@ -28,11 +28,16 @@ class _LinearConfig(BasisConfig, ABC):
         """
         if self.space == "acceleration":
             return BasisHead(self, names)
-        chosen = {"features": self.features or MOTION, "terms": self.terms or FERRY_TERMS}
-        return ForceHead(BasisHead(self.model_copy(update=chosen), (*ACCELERATION, *names)))
+        force_defaults = {
+            "features": self.features or MOTION_CHANNELS,
+            "terms": self.terms or FERRY_TERMS,
+        }
+        return ForceHead(
+            BasisHead(self.model_copy(update=force_defaults), (*ACCELERATION_NAMES, *names))
+        )
 
 
-class PlsrConfig(_LinearConfig):
+class PlsrConfig(LinearBasisConfig):
     """A PLSR of the three residuals together.
 
     Attributes:
@@ -45,13 +50,15 @@ class PlsrConfig(_LinearConfig):
     order: int | None = Field(default=None, ge=1)
     max_order: int = Field(default=40, ge=1)
 
-    def estimator(self, folds: int | None) -> Estimator:
+    def build_estimator(self, n_folds: int | None) -> Estimator:
         """Return PLSR of all axes, other orders on offer where free runs choose."""
-        offered = self.choose == "free_run" and self.order is None
-        return PLSR(self.order, max_order=self.max_order, folds=folds, alternatives=offered)
+        has_alternatives = self.choose == "free_run" and self.order is None
+        return PLSR(
+            self.order, max_order=self.max_order, folds=n_folds, has_alternatives=has_alternatives
+        )
 
 
-class RidgeConfig(_LinearConfig):
+class RidgeConfig(LinearBasisConfig):
     """A ridge regression of each residual.
 
     Attributes:
@@ -65,6 +72,6 @@ class RidgeConfig(_LinearConfig):
         default=(1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0), min_length=1
     )
 
-    def estimator(self, folds: int | None) -> Estimator:
+    def build_estimator(self, n_folds: int | None) -> Estimator:
         """Return ridge regression, every penalty on offer where free runs choose."""
-        return Ridge(self.penalties, folds=folds, alternatives=self.choose == "free_run")
+        return Ridge(self.penalties, folds=n_folds, has_alternatives=self.choose == "free_run")

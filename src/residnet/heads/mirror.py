@@ -17,21 +17,21 @@ from torch import Tensor, nn
 from residnet.core.errors import ConfigError
 from residnet.core.samples import Samples
 from residnet.heads.base import ResidualHead
-from residnet.physics.symmetry import axis_parities, mirrored_channels
+from residnet.physics.symmetry import get_axis_parities, mirror_channels
 
 
-def quick_tanh(x: Tensor, many: int = 8_192) -> Tensor:
+def fast_tanh(x: Tensor, min_size: int = 8_192) -> Tensor:
     """Return the hyperbolic tangent of x [...], by way of the logistic function where x is large.
 
     On processors torch computes its sigmoid several times as fast as its tanh, and the two with
     gradients in 55 % of the time. Both ways agree to the rounding of numbers near one. Traced
-    graphs keep to torch's own, and so do fewer than `many` numbers, for which three operations take
+    graphs keep to torch's own, and so do fewer than `min_size` numbers, for which three operations take
     longer than one.
     """
-    traced = False
+    is_traced = False
     if not torch.jit.is_scripting():  # type: ignore[attr-defined]
-        traced = torch.compiler.is_compiling()
-    if traced or x.device.type != "cpu" or x.numel() < many:
+        is_traced = torch.compiler.is_compiling()
+    if is_traced or x.device.type != "cpu" or x.numel() < min_size:
         return torch.tanh(x)
     return 2.0 * torch.sigmoid(2.0 * x) - 1.0
 
@@ -42,7 +42,7 @@ class Tanh(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the hyperbolic tangent of x [...]."""
-        return quick_tanh(x)
+        return fast_tanh(x)
 
 
 @final
@@ -56,20 +56,20 @@ class MirroredHead(ResidualHead):
 
     def __init__(self, inner: ResidualHead, names: Sequence[str]) -> None:
         super().__init__(names)
-        mirror = mirrored_channels(names)
+        mirror = mirror_channels(names)
         if mirror is None:
             raise ConfigError(
                 f"mirror: it is not known how all of the channels {', '.join(names)} change in the"
                 " mirror (the torque of a lone propeller heels a vessel that rolls); leave `mirror`"
                 " out"
             )
-        self.inner = inner
-        self.width = inner.n_state
+        self.inner_head = inner
+        self.inner_state_size = inner.n_state
         self.n_state = 2 * inner.n_state
-        self.index = nn.Buffer(torch.tensor(mirror[0], dtype=torch.long), persistent=False)
-        self.sign = nn.Buffer(torch.tensor(mirror[1], dtype=torch.float64), persistent=False)
-        self.turned = nn.Buffer(
-            torch.tensor(axis_parities(names), dtype=torch.float64), persistent=False
+        self.mirror_index = nn.Buffer(torch.tensor(mirror[0], dtype=torch.long), persistent=False)
+        self.mirror_sign = nn.Buffer(torch.tensor(mirror[1], dtype=torch.float64), persistent=False)
+        self.axis_sign = nn.Buffer(
+            torch.tensor(get_axis_parities(names), dtype=torch.float64), persistent=False
         )
 
     def calibrate(self, samples: Samples) -> None:
@@ -77,45 +77,52 @@ class MirroredHead(ResidualHead):
 
         So the mirror of a known state is known too.
         """
-        other = samples.z.index_select(1, self.index) * self.sign
-        both = Samples(
-            torch.cat((samples.z, other)),
-            torch.cat((samples.target, samples.target * self.turned)),
+        mirrored = samples.z.index_select(1, self.mirror_index) * self.mirror_sign
+        symmetric_samples = Samples(
+            torch.cat((samples.z, mirrored)),
+            torch.cat((samples.target, samples.target * self.axis_sign)),
             torch.cat((samples.group, samples.group)),
             torch.cat((samples.t, samples.t)),
             samples.kinds,
             samples.names,
         )
-        self.inner.calibrate(both)
+        self.inner_head.calibrate(symmetric_samples)
 
-    def residual_std(self) -> Tensor:
-        return self.inner.residual_std()
+    def residual_scale(self) -> Tensor:
+        return self.inner_head.residual_scale()
 
-    def both(self, z: Tensor) -> Tensor:
+    def stack_mirrored(self, z: Tensor) -> Tensor:
         """Return channels and their mirror images, [2 B, ...]."""
-        return torch.cat((z, z.index_select(-1, self.index) * self.sign.to(z.dtype)), dim=0)
+        return torch.cat(
+            (z, z.index_select(-1, self.mirror_index) * self.mirror_sign.to(z.dtype)), dim=0
+        )
 
-    def mean(self, rho: Tensor) -> Tensor:
+    def average_mirrored(self, rho: Tensor) -> Tensor:
         """Return the mean of residuals [2 B, ..., n] and their mirror images, [B, ..., n]."""
-        half = rho.shape[0] // 2
-        return 0.5 * (rho[:half] + rho[half:] * self.turned.to(rho.dtype))
+        batch_size = rho.shape[0] // 2
+        return 0.5 * (rho[:batch_size] + rho[batch_size:] * self.axis_sign.to(rho.dtype))
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        rho, after = self.inner(
-            self.both(z), torch.cat((s[:, : self.width], s[:, self.width :]), dim=0)
+        rho, next_memory = self.inner_head(
+            self.stack_mirrored(z),
+            torch.cat((s[:, : self.inner_state_size], s[:, self.inner_state_size :]), dim=0),
         )
-        half = z.shape[0]
-        return self.mean(rho), torch.cat((after[:half], after[half:]), dim=-1)
+        batch_size = z.shape[0]
+        return self.average_mirrored(rho), torch.cat(
+            (next_memory[:batch_size], next_memory[batch_size:]), dim=-1
+        )
 
-    def sequence(self, z: Tensor) -> Tensor:
-        return self.mean(self.inner.sequence(self.both(z)))
+    def teacher_forced_residuals(self, z: Tensor) -> Tensor:
+        return self.average_mirrored(
+            self.inner_head.teacher_forced_residuals(self.stack_mirrored(z))
+        )
 
     def warmup(self, z: Tensor) -> Tensor:
-        s = self.inner.warmup(self.both(z))
-        half = z.shape[0]
-        return torch.cat((s[:half], s[half:]), dim=-1)
+        s = self.inner_head.warmup(self.stack_mirrored(z))
+        batch_size = z.shape[0]
+        return torch.cat((s[:batch_size], s[batch_size:]), dim=-1)
 
-    def memory_range(self) -> tuple[Tensor, Tensor]:
+    def memory_bounds(self) -> tuple[Tensor, Tensor]:
         """Return the least and largest memory [n_state], the inner head's for both halves."""
-        low, high = self.inner.memory_range()
-        return low.repeat(2), high.repeat(2)
+        lower, upper = self.inner_head.memory_bounds()
+        return lower.repeat(2), upper.repeat(2)

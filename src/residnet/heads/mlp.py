@@ -20,7 +20,7 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
 }
 
 
-_Units = Annotated[int, Field(ge=1, le=10_000)]
+_UnitCount = Annotated[int, Field(ge=1, le=10_000)]
 
 
 class MlpConfig(FeatureConfig):
@@ -36,7 +36,7 @@ class MlpConfig(FeatureConfig):
     """
 
     kind: Literal["mlp"] = "mlp"
-    hidden: tuple[_Units, ...] = Field(default=(64, 64), min_length=1, max_length=100)
+    hidden: tuple[_UnitCount, ...] = Field(default=(64, 64), min_length=1, max_length=100)
     activation: Literal["tanh", "silu", "relu", "softsign"] = "tanh"
     dropout: float = Field(default=0.0, ge=0, lt=1)
     mirror: bool = False
@@ -53,23 +53,23 @@ class MlpHead(ResidualHead):
 
     def __init__(self, config: MlpConfig, names: Sequence[str]) -> None:
         super().__init__(names)
-        self.features = Features(config.chosen(names), names, config.margin)
-        self.scale = ResidualScale(self.dof)
+        self.features = Features(config.select_features(names), names, config.margin)
+        self.scale = ResidualScale(self.n_dof)
         layers: list[nn.Module] = []
-        width = self.features.count
-        for units in config.hidden:
-            layers += [nn.Linear(width, units), ACTIVATIONS[config.activation]()]
+        n_inputs = self.features.n_features
+        for n_units in config.hidden:
+            layers += [nn.Linear(n_inputs, n_units), ACTIVATIONS[config.activation]()]
             if config.dropout > 0:
                 layers.append(nn.Dropout(config.dropout))
-            width = units
-        out = nn.Linear(width, self.dof)
+            n_inputs = n_units
+        output_layer = nn.Linear(n_inputs, self.n_dof)
         with torch.no_grad():
-            out.weight.mul_(0.1)
-            out.bias.zero_()
-        self.net = nn.Sequential(*layers, out)
+            output_layer.weight.mul_(0.1)
+            output_layer.bias.zero_()
+        self.network = nn.Sequential(*layers, output_layer)
 
-    def residual_std(self) -> Tensor:
-        return self.scale.spread
+    def residual_scale(self) -> Tensor:
+        return self.scale.std
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        return self.scale(self.net(self.features(z))), s
+        return self.scale(self.network(self.features(z))), s

@@ -12,15 +12,15 @@ from torch import Tensor, nn
 
 from residnet.core.config import Seconds
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
-from residnet.physics.signals import VelocityBound
+from residnet.physics.signals import RestoringAcceleration
 
-_FAR = 4.0
+_INNOVATION_CLIP_STD = 4.0
 """Standard deviations of the residual at which what was predicted wrong counts no further."""
-_LEAST = 1e-13
+_MIN_GATE = 1e-13
 """Least share of a memory that is kept: float32 knows its logarithm."""
 
 
-class RecurrentConfig(FeatureConfig):
+class GRUEnsembleConfig(FeatureConfig):
     """K gated recurrent units (Cho and others 2014) whose weights are found side by side.
 
     Their gates are shares of a memory kept over `step`; over a shorter step of the model as many
@@ -46,81 +46,104 @@ class RecurrentConfig(FeatureConfig):
 
     def build(self, names: Sequence[str]) -> ResidualHead:
         """Return the module for channels `names`."""
-        return RecurrentHead(self, names)
+        return GRUEnsembleHead(self, names)
 
 
 @final
-class RecurrentHead(ResidualHead):
+class GRUEnsembleHead(ResidualHead):
     """K networks with leading axes of weights; rows are those of one network after the other.
 
     Rows of z [K B, nz (+ n)] and s [K B, H] belong to the network that their K-th part belongs to.
     Behind the channels may stand the errors of accelerations that the past was predicted with.
     """
 
-    def __init__(self, config: RecurrentConfig, names: Sequence[str]) -> None:
+    def __init__(self, config: GRUEnsembleConfig, names: Sequence[str]) -> None:
         super().__init__(names)
-        self.copies, self.n_state = config.members, config.hidden_size
-        self.coarse, self.settle = config.step, 2.0 * config.step
-        self.share, self.far, self.least = 1.0, _FAR, _LEAST
-        self.channels = len(names)
-        self.features = Features(config.chosen(names), names, config.margin)
-        self.scale = ResidualScale(self.dof)
-        self.restoring: VelocityBound | None = (
-            VelocityBound(channels=self.dof, dof=self.dof) if config.restoring else None
+        self.batch_ensemble_size, self.n_state = config.members, config.hidden_size
+        self.training_step, self.innovation_time_constant = config.step, 2.0 * config.step
+        self.step_ratio, self.innovation_clip, self.min_gate = 1.0, _INNOVATION_CLIP_STD, _MIN_GATE
+        self.n_channels = len(names)
+        self.features = Features(config.select_features(names), names, config.margin)
+        self.scale = ResidualScale(self.n_dof)
+        self.restoring_acceleration: RestoringAcceleration | None = (
+            RestoringAcceleration(n_channels=self.n_dof, n_dof=self.n_dof)
+            if config.restoring
+            else None
         )
-        self.seen = seen = self.features.count + self.dof
-        hidden = config.hidden_size
+        self.n_inputs = n_inputs = self.features.n_features + self.n_dof
+        hidden_size = config.hidden_size
 
-        def drawn(*shape: int) -> nn.Parameter:
-            bound = 1.0 / math.sqrt(hidden)
+        def uniform_parameter(*shape: int) -> nn.Parameter:
+            bound = 1.0 / math.sqrt(hidden_size)
             return nn.Parameter(torch.empty(config.members, *shape).uniform_(-bound, bound))
 
-        self.w_input, self.w_hidden = drawn(seen, 3 * hidden), drawn(hidden, 3 * hidden)
-        self.bias, self.bias_hidden = drawn(1, 3 * hidden), drawn(1, hidden)
-        self.w_out, self.w_skip = drawn(hidden, self.dof), drawn(seen, self.dof)
-        self.bias_out = nn.Parameter(torch.zeros(config.members, 1, self.dof))
+        self.input_weight, self.hidden_weight = (
+            uniform_parameter(n_inputs, 3 * hidden_size),
+            uniform_parameter(hidden_size, 3 * hidden_size),
+        )
+        self.bias, self.bias_hidden = (
+            uniform_parameter(1, 3 * hidden_size),
+            uniform_parameter(1, hidden_size),
+        )
+        self.output_weight, self.skip_weight = (
+            uniform_parameter(hidden_size, self.n_dof),
+            uniform_parameter(n_inputs, self.n_dof),
+        )
+        self.bias_out = nn.Parameter(torch.zeros(config.members, 1, self.n_dof))
         with torch.no_grad():
-            for weight in (self.w_out, self.w_skip):
+            for weight in (self.output_weight, self.skip_weight):
                 weight.mul_(0.1)
 
     def set_step(self, dt: float) -> None:
-        self.share = dt / self.coarse
+        self.step_ratio = dt / self.training_step
 
-    def residual_std(self) -> Tensor:
-        return self.scale.spread
+    def residual_scale(self) -> Tensor:
+        return self.scale.std
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return residuals [K B, n] at channels z [K B, nz (+ n)] and memories for the next step.
 
         Where no errors stand behind the channels they are zero.
         """
-        if z.shape[-1] > self.channels:
-            z, wrong = z.split([self.channels, self.dof], dim=-1)
-            wrong = self.far * torch.tanh(wrong / (self.far * self.scale.spread.to(z.dtype)))
+        if z.shape[-1] > self.n_channels:
+            z, innovation = z.split([self.n_channels, self.n_dof], dim=-1)
+            innovation = self.innovation_clip * torch.tanh(
+                innovation / (self.innovation_clip * self.scale.std.to(z.dtype))
+            )
         else:
-            wrong = torch.zeros_like(z[..., : self.dof])
-        f = torch.cat((self.features(z), wrong), dim=-1).view(self.copies, -1, self.seen)
-        h = self.gated(torch.baddbmm(self.bias, f, self.w_input), s)
-        out = torch.baddbmm(torch.baddbmm(self.bias_out, f, self.w_skip), h, self.w_out)
-        rho: Tensor = self.scale(out.reshape(-1, self.dof))
-        if self.restoring is not None:
-            rho = rho + self.restoring(z)
-        return rho, h.reshape(-1, self.n_state)
+            innovation = torch.zeros_like(z[..., : self.n_dof])
+        network_inputs = torch.cat((self.features(z), innovation), dim=-1).view(
+            self.batch_ensemble_size, -1, self.n_inputs
+        )
+        hidden = self.update_memory(torch.baddbmm(self.bias, network_inputs, self.input_weight), s)
+        network_output = torch.baddbmm(
+            torch.baddbmm(self.bias_out, network_inputs, self.skip_weight),
+            hidden,
+            self.output_weight,
+        )
+        rho: Tensor = self.scale(network_output.reshape(-1, self.n_dof))
+        if self.restoring_acceleration is not None:
+            rho = rho + self.restoring_acceleration(z)
+        return rho, hidden.reshape(-1, self.n_state)
 
-    def gated(self, share: Tensor, s: Tensor) -> Tensor:
+    def update_memory(self, input_gates: Tensor, s: Tensor) -> Tensor:
         """Return the outputs [K, B, H] from the features' share [K, B, 3 H] and memories."""
-        hidden = self.n_state
-        h = s.reshape(self.copies, -1, hidden)
+        hidden_size = self.n_state
+        hidden = s.reshape(self.batch_ensemble_size, -1, hidden_size)
         # splits in place of slices: their gradients are joined and not added up
-        gates, new = share.split([2 * hidden, hidden], dim=-1)
-        held, old = torch.bmm(h, self.w_hidden).split([2 * hidden, hidden], dim=-1)
-        kept, reset = torch.sigmoid(gates + held).chunk(2, dim=-1)
-        if self.share != 1.0:
-            kept = torch.exp(self.share * torch.log(kept.clamp(min=self.least)))
-        new = torch.tanh(new + reset * (old + self.bias_hidden))
-        return new + kept * (h - new)
+        gates, candidate = input_gates.split([2 * hidden_size, hidden_size], dim=-1)
+        hidden_gates, hidden_candidate = torch.bmm(hidden, self.hidden_weight).split(
+            [2 * hidden_size, hidden_size], dim=-1
+        )
+        update_gate, reset_gate = torch.sigmoid(gates + hidden_gates).chunk(2, dim=-1)
+        if self.step_ratio != 1.0:
+            update_gate = torch.exp(
+                self.step_ratio * torch.log(update_gate.clamp(min=self.min_gate))
+            )
+        candidate = torch.tanh(candidate + reset_gate * (hidden_candidate + self.bias_hidden))
+        return candidate + update_gate * (hidden - candidate)
 
-    def sequence(self, z: Tensor) -> Tensor:
+    def teacher_forced_residuals(self, z: Tensor) -> Tensor:
         s = torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)
         residuals: list[Tensor] = []
         for k in range(z.shape[1]):
@@ -134,7 +157,7 @@ class RecurrentHead(ResidualHead):
             s = self.forward(z[:, k], s)[1]
         return s
 
-    def memory_range(self) -> tuple[Tensor, Tensor]:
+    def memory_bounds(self) -> tuple[Tensor, Tensor]:
         """Return the least and largest memory [H]: units are mixtures of hyperbolic tangents."""
-        limit = self.bias.detach().new_ones(self.n_state)
-        return -limit, limit
+        bound = self.bias.detach().new_ones(self.n_state)
+        return -bound, bound

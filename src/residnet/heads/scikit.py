@@ -19,14 +19,14 @@ from pydantic import Field, field_validator
 from torch import Tensor
 
 from residnet.core.errors import FitError, UsageError
-from residnet.core.names import nearest
+from residnet.core.names import suggest_name
 from residnet.core.samples import Samples
 from residnet.core.trust import is_trusted
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features, ResidualScale
 from residnet.heads.scikit_state import FITTED, KERNELS, StateError, decode, encode
 from residnet.regression.estimator import Solution
 
-_REACH = 0.1
+_DIFFERENCE_STEP = 0.1
 """Standard deviations of a feature over which a slope is taken: trees are flat in between."""
 _STATE = "_extra_state"
 _STORED_STATE, _STORED_SAMPLES = 1, 2
@@ -55,11 +55,11 @@ class SklearnConfig(FeatureConfig):
 
     @field_validator("pipeline")
     @classmethod
-    def _can_be_made(cls, steps: tuple[Any, ...]) -> tuple[Any, ...]:
+    def _validate_pipeline(cls, steps: tuple[Any, ...]) -> tuple[Any, ...]:
         estimators = [make_estimator(step) for step in steps]
-        last = estimators[-1]
-        if not callable(getattr(last, "predict", None)):
-            raise ValueError(f"the last step, {type(last).__name__}, is no regressor")
+        final_step = estimators[-1]
+        if not callable(getattr(final_step, "predict", None)):
+            raise ValueError(f"the last step, {type(final_step).__name__}, is no regressor")
         for estimator in estimators[:-1]:
             if not callable(getattr(estimator, "transform", None)):
                 raise ValueError(
@@ -77,7 +77,7 @@ class SklearnConfig(FeatureConfig):
         return SklearnHead(self, names)
 
 
-def _named(step: Any) -> tuple[str, Mapping[str, Any]] | None:
+def _parse_step(step: Any) -> tuple[str, Mapping[str, Any]] | None:
     """Return the name and the parameters of a part of a pipeline; None for a plain value."""
     if isinstance(step, str) and step.startswith("sklearn."):
         return step, {}
@@ -90,10 +90,10 @@ def _named(step: Any) -> tuple[str, Mapping[str, Any]] | None:
 
 def _is_listed(step: Any, names: Any) -> bool:
     """Return whether a class and all classes among its parameters are on their allow-lists."""
-    named = _named(step)
+    named = _parse_step(step)
     if named is None or named[0] not in names:
         return False
-    return all(_is_listed(value, KERNELS) for value in named[1].values() if _named(value))
+    return all(_is_listed(value, KERNELS) for value in named[1].values() if _parse_step(value))
 
 
 def make_estimator(step: Any, *, listed: Any = FITTED) -> Any:
@@ -106,14 +106,14 @@ def make_estimator(step: Any, *, listed: Any = FITTED) -> Any:
     Raises:
         ValueError: where there is no such class or parameter, or it is not allowed.
     """
-    named = _named(step)
+    named = _parse_step(step)
     if named is None:
         raise ValueError(f"{step!r} names nothing below `sklearn`, for example sklearn.svm.SVR")
     name, parameters = named
     if name not in listed and not is_trusted():
         raise ValueError(
             f"'{name}' is not among the classes of scikit-learn whose fitted state is stored as"
-            f" data{nearest(name, listed)}; docs/howto/head.md lists them. Give --trust (in Python"
+            f" data{suggest_name(name, listed)}; docs/howto/head.md lists them. Give --trust (in Python"
             " trust=True) only for configs and runs whose source you trust"
         )
     module, _, kind = name.rpartition(".")
@@ -151,7 +151,7 @@ def _parameter(owner: str, key: str, value: Any) -> Any:
     """
     if key in _STORES_PICKLES and value is not None:
         raise ValueError(f"{owner}: {key}: is a store of pickles, which residnet does not open")
-    if _named(value):
+    if _parse_step(value):
         return make_estimator(value, listed=KERNELS)
     if isinstance(value, list | tuple):
         return [_parameter(owner, key, part) for part in value]
@@ -169,18 +169,18 @@ class SklearnHead(ClosedFormHead):
 
     def __init__(self, config: SklearnConfig, names: Sequence[str]) -> None:
         super().__init__(names)
-        self.refusal = "scikit-learn predicts in Python, which no format of export holds"
+        self.export_error = "scikit-learn predicts in Python, which no format of export holds"
         self.config = config
-        self.features = Features(config.chosen(names), names, config.margin)
-        self.scale = ResidualScale(self.dof)
+        self.features = Features(config.select_features(names), names, config.margin)
+        self.scale = ResidualScale(self.n_dof)
         self.stored = np.zeros(0, dtype=np.uint8)
         self.sample_count = 0
-        self.axes: list[list[Any]] = []
+        self.axis_pipelines: list[list[Any]] = []
 
-    def residual_std(self) -> Tensor:
-        return self.scale.spread
+    def residual_scale(self) -> Tensor:
+        return self.scale.std
 
-    def solutions(self, samples: Samples) -> list[Solution]:
+    def fit_solutions(self, samples: Samples) -> list[Solution]:
         """Fit the pipelines, and return their state.
 
         Raises:
@@ -188,20 +188,20 @@ class SklearnHead(ClosedFormHead):
         """
         rows = torch.linspace(0, len(samples) - 1, min(len(samples), self.config.samples)).long()
         with torch.no_grad():
-            x = self.features(samples.z[rows]).double().numpy()
-            y = (samples.target[rows] / self.scale.spread).double().numpy()
-        axes = self._fit(x, y)
+            features = self.features(samples.z[rows]).double().numpy()
+            y = (samples.target[rows] / self.scale.std).double().numpy()
+        axes = self._fit(features, y)
         count = np.array([len(rows)], dtype="<u4").view(np.uint8)
         if self.config.is_storable:
-            names = [_named(step)[0] for step in self.config.pipeline]  # type: ignore[index]
+            names = [_parse_step(step)[0] for step in self.config.pipeline]  # type: ignore[index]
             try:
                 content = encode([list(zip(names, axis, strict=True)) for axis in axes])
             except StateError as error:
                 raise FitError(f"the fitted pipeline {error}") from None
             parts = [[_STORED_STATE], count, np.frombuffer(content, dtype=np.uint8)]
         else:
-            learned = np.ascontiguousarray(np.column_stack((x, y)))
-            parts = [[_STORED_SAMPLES], count, learned.reshape(-1).view(np.uint8)]
+            training_data = np.ascontiguousarray(np.column_stack((features, y)))
+            parts = [[_STORED_SAMPLES], count, training_data.reshape(-1).view(np.uint8)]
         stored = torch.from_numpy(np.concatenate([np.asarray(p, dtype=np.uint8) for p in parts]))
         self.set_extra_state(stored)
         return [Solution({}, {_STATE: stored}, notes={"fitted_on": len(rows)})]
@@ -209,7 +209,7 @@ class SklearnHead(ClosedFormHead):
     def _fit(self, x: np.ndarray, y: np.ndarray) -> list[list[Any]]:
         """Return the fitted steps of each axis, from features [N, F] and targets [N, n]."""
         axes = []
-        for i, name in enumerate(self.outputs):
+        for i, name in enumerate(self.output_names):
             steps = [make_estimator(step) for step in self.config.pipeline]
             columns = x
             try:
@@ -245,14 +245,16 @@ class SklearnHead(ClosedFormHead):
         self.sample_count = int(stored[1:5].copy().view("<u4")[0])
         content = stored[5:]
         if stored[0] == _STORED_STATE and self.config.is_storable:
-            self.axes = self._restore(content.tobytes())
+            self.axis_pipelines = self._restore(content.tobytes())
         elif stored[0] == _STORED_SAMPLES and is_trusted():
-            width = self.features.count + self.dof
+            width = self.features.n_features + self.n_dof
             try:
-                learned = content.copy().view(np.float64).reshape(self.sample_count, width)
+                training_data = content.copy().view(np.float64).reshape(self.sample_count, width)
             except ValueError:
                 raise UsageError("a head of kind sklearn: its samples are cut off") from None
-            self.axes = self._fit(learned[:, : -self.dof], learned[:, -self.dof :])
+            self.axis_pipelines = self._fit(
+                training_data[:, : -self.n_dof], training_data[:, -self.n_dof :]
+            )
         else:
             raise UsageError(
                 "a head of kind sklearn: would be fitted again when it is loaded; give --trust (in"
@@ -262,15 +264,17 @@ class SklearnHead(ClosedFormHead):
 
     def _restore(self, content: bytes) -> list[list[Any]]:
         """Return the steps of each axis with their stored state, after a trial prediction."""
-        axes = [[make_estimator(step) for step in self.config.pipeline] for _ in self.outputs]
-        names = [_named(step)[0] for step in self.config.pipeline]  # type: ignore[index]
+        axes = [[make_estimator(step) for step in self.config.pipeline] for _ in self.output_names]
+        names = [_parse_step(step)[0] for step in self.config.pipeline]  # type: ignore[index]
         again = "restore the model, or run the fit again with this version of scikit-learn"
         try:
-            decode(content, [list(zip(names, a, strict=True)) for a in axes], self.features.count)
+            decode(
+                content, [list(zip(names, a, strict=True)) for a in axes], self.features.n_features
+            )
         except StateError as error:
             raise UsageError(f"a head of kind sklearn: its state {error}; {again}") from None
         try:
-            answers = [_predict(steps, np.zeros((2, self.features.count))) for steps in axes]
+            answers = [_predict(steps, np.zeros((2, self.features.n_features))) for steps in axes]
             complete = all(part.shape == (2,) for part in answers)
         except Exception as error:
             first = next(iter(str(error).splitlines()), "")
@@ -281,21 +285,21 @@ class SklearnHead(ClosedFormHead):
             raise UsageError(f"a head of kind sklearn: it predicts several values; {again}")
         return axes
 
-    def asked(self, x: Tensor) -> Tensor:
+    def predict(self, x: Tensor) -> Tensor:
         """Return standardised residuals [N, n] at standardised features [N, F]."""
-        if not self.axes or not len(x):
-            return x.new_zeros(len(x), self.dof)
-        rows = x.double().numpy()
-        answers = [_predict(steps, rows) for steps in self.axes]
-        return torch.from_numpy(np.stack(answers, axis=1)).to(x)
+        if not self.axis_pipelines or not len(x):
+            return x.new_zeros(len(x), self.n_dof)
+        features = x.double().numpy()
+        predictions = [_predict(steps, features) for steps in self.axis_pipelines]
+        return torch.from_numpy(np.stack(predictions, axis=1)).to(x)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        found: Tensor = _Asked.apply(self.features(z), self)  # type: ignore[no-untyped-call]
-        return self.scale(found), s
+        standardised_residual: Tensor = _PredictFunction.apply(self.features(z), self)  # type: ignore[no-untyped-call]
+        return self.scale(standardised_residual), s
 
-    def parameter_count(self) -> list[float]:
+    def parameter_counts(self) -> list[float]:
         """Return the numbers that each axis was fitted on: nothing else bounds its freedom."""
-        return [float(self.sample_count)] * self.dof
+        return [float(self.sample_count)] * self.n_dof
 
 
 def _predict(steps: Sequence[Any], rows: np.ndarray) -> np.ndarray:
@@ -305,25 +309,27 @@ def _predict(steps: Sequence[Any], rows: np.ndarray) -> np.ndarray:
     return np.asarray(steps[-1].predict(rows)).reshape(-1)
 
 
-class _Asked(torch.autograd.Function):
+class _PredictFunction(torch.autograd.Function):
     """The answer of fitted pipelines, with slopes by central differences."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, head: SklearnHead) -> Tensor:
-        flat = x.detach().reshape(-1, x.shape[-1])
+        flat_features = x.detach().reshape(-1, x.shape[-1])
         ctx.head = head
-        ctx.save_for_backward(flat)
-        return head.asked(flat).reshape(*x.shape[:-1], head.dof)
+        ctx.save_for_backward(flat_features)
+        return head.predict(flat_features).reshape(*x.shape[:-1], head.n_dof)
 
     @staticmethod
-    def backward(ctx: Any, *given: Tensor) -> tuple[Tensor, None]:
-        (flat,) = ctx.saved_tensors
-        grad = given[0]
-        flow = grad.reshape(-1, ctx.head.dof)
-        out = torch.zeros_like(flat)
-        for i in range(flat.shape[1]):
-            step = torch.zeros_like(flat)
-            step[:, i] = _REACH
-            apart = ctx.head.asked(flat + step) - ctx.head.asked(flat - step)
-            out[:, i] = (flow * apart).sum(1) / (2.0 * _REACH)
-        return out.reshape(*grad.shape[:-1], flat.shape[1]), None
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None]:
+        (flat_features,) = ctx.saved_tensors
+        grad = grad_outputs[0]
+        flat_grad = grad.reshape(-1, ctx.head.dof)
+        grad_input = torch.zeros_like(flat_features)
+        for i in range(flat_features.shape[1]):
+            feature_step = torch.zeros_like(flat_features)
+            feature_step[:, i] = _DIFFERENCE_STEP
+            prediction_difference = ctx.head.asked(flat_features + feature_step) - ctx.head.asked(
+                flat_features - feature_step
+            )
+            grad_input[:, i] = (flat_grad * prediction_difference).sum(1) / (2.0 * _DIFFERENCE_STEP)
+        return grad_input.reshape(*grad.shape[:-1], flat_features.shape[1]), None

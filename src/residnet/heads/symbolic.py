@@ -16,27 +16,27 @@ from torch import Tensor, nn
 
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError, FitError
-from residnet.core.names import nearest
+from residnet.core.names import suggest_name
 from residnet.core.samples import Samples
 from residnet.heads.base import EquationHead, FeatureConfig, Features
-from residnet.physics.symmetry import axis_parities, term_parity
-from residnet.physics.terms import CandidatesConfig, TermLibrary, parse_term, rated
+from residnet.physics.symmetry import compute_term_parity, get_axis_parities
+from residnet.physics.terms import CandidatesConfig, TermLibrary, parse_term, rank_candidates
 from residnet.regression.equation_rows import (
-    Rows,
+    RegressionRows,
     RowsConfig,
     SampleRows,
-    step_of,
-    unbroken_stretches,
+    median_time_step,
+    number_regular_segments,
 )
 from residnet.regression.estimator import Coefficient, Solution
-from residnet.regression.expressions import equation, symbolic, total
-from residnet.regression.sparse import SearchConfig, SparseRegression
+from residnet.regression.expressions import format_equation, format_sum, terms_to_sympy
+from residnet.regression.sparse import SparseRegression, SparseSearchConfig
 
-_PRECISION = 1e-14
+_ROUNDING_SHARE = 1e-14
 """Share of the energy of a target that rounding leaves."""
-_ROUNDED = 1e-10
+_RANK_TOLERANCE = 1e-10
 """Share of the largest eigenvalue up to which one is what rounding leaves."""
-_TINY = 1e-300
+_MIN_NORM = 1e-300
 """Keeps the logarithm of the error of a target of zeros finite, and least length of a term."""
 
 
@@ -54,27 +54,27 @@ class DelayConfig(Config):
 
 
 class DelayLine(nn.Module):
-    """The channels with some of them as they were `steps` ago.
+    """The channels with some of them as they were `delay_steps` ago.
 
-    The memory holds the last `longest` values of these, oldest first, and behind them 1 once there
+    The memory holds the last `max_delay` values of these, oldest first, and behind them 1 once there
     was a sample, 0 before. What lies before the first sample is taken to be like it: zeros would
     be no state of the vessel, and a term that divides by one of them would be no number.
     """
 
     def __init__(self, config: DelayConfig | None, names: Sequence[str]) -> None:
         super().__init__()
-        late = config.channels if config is not None else ()
-        for name in late:
+        delayed_names = config.channels if config is not None else ()
+        for name in delayed_names:
             if name not in names:
                 raise ConfigError(
-                    f"delay: '{name}' is not a feature of the head{nearest(name, names)}"
+                    f"delay: '{name}' is not a feature of the head{suggest_name(name, names)}"
                 )
-        self.longest = config.longest if config is not None else 0
-        self.channels = late
-        self.count = len(late)
-        self.n_state = self.longest * self.count + 1 if self.count > 0 else 0
-        self.index = nn.Buffer(
-            torch.tensor([list(names).index(name) for name in late], dtype=torch.long),
+        self.max_delay = config.longest if config is not None else 0
+        self.delayed_names = delayed_names
+        self.n_delayed = len(delayed_names)
+        self.n_state = self.max_delay * self.n_delayed + 1 if self.n_delayed > 0 else 0
+        self.delayed_index = nn.Buffer(
+            torch.tensor([list(names).index(name) for name in delayed_names], dtype=torch.long),
             persistent=False,
         )
         # a float, as all stored numbers are
@@ -82,87 +82,101 @@ class DelayLine(nn.Module):
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return channels [B, nz] with the late ones delayed, and the next memory [B, n_state]."""
-        if self.count == 0:
+        if self.n_delayed == 0:
             return z, s
-        now = z.index_select(-1, self.index)
-        past = torch.where(s[..., -1:] > 0, s[..., :-1], self._repeated(now))
-        line = torch.cat((past, now), dim=-1)
-        first = (self.longest - self.steps.round().to(torch.long)) * self.count
-        late = line.index_select(-1, first + torch.arange(self.count, device=z.device))
-        after = torch.cat((line[..., self.count :], torch.ones_like(s[..., -1:])), dim=-1)
-        return z.index_copy(-1, self.index, late), after
+        current = z.index_select(-1, self.delayed_index)
+        buffered = torch.where(s[..., -1:] > 0, s[..., :-1], self._repeat_to_line(current))
+        delay_line = torch.cat((buffered, current), dim=-1)
+        first_column = (self.max_delay - self.steps.round().to(torch.long)) * self.n_delayed
+        delayed = delay_line.index_select(
+            -1, first_column + torch.arange(self.n_delayed, device=z.device)
+        )
+        next_memory = torch.cat(
+            (delay_line[..., self.n_delayed :], torch.ones_like(s[..., -1:])), dim=-1
+        )
+        return z.index_copy(-1, self.delayed_index, delayed), next_memory
 
-    def _repeated(self, late: Tensor) -> Tensor:
+    def _repeat_to_line(self, current: Tensor) -> Tensor:
         """Return the line [..., longest * count] that late channels [..., count] fill alone."""
-        return late.unsqueeze(-2).repeat_interleave(self.longest, dim=-2).flatten(-2)
+        return current.unsqueeze(-2).repeat_interleave(self.max_delay, dim=-2).flatten(-2)
 
-    def sequence(self, z: Tensor) -> Tensor:
+    def delay_sequence(self, z: Tensor) -> Tensor:
         """Return channels [..., T, nz] with the late ones delayed, from an empty memory."""
-        if self.count == 0:
+        if self.n_delayed == 0:
             return z
-        late = z.index_select(-1, self.index)
-        line = torch.cat((late[..., :1, :].repeat_interleave(self.longest, dim=-2), late), dim=-2)
-        first = self.longest - self.steps.round().to(torch.long)
+        undelayed = z.index_select(-1, self.delayed_index)
+        delay_line = torch.cat(
+            (undelayed[..., :1, :].repeat_interleave(self.max_delay, dim=-2), undelayed), dim=-2
+        )
+        first_row = self.max_delay - self.steps.round().to(torch.long)
         return z.index_copy(
             -1,
-            self.index,
-            line.index_select(-2, first + torch.arange(z.shape[-2], device=z.device)),
+            self.delayed_index,
+            delay_line.index_select(-2, first_row + torch.arange(z.shape[-2], device=z.device)),
         )
 
     def warmup(self, z: Tensor) -> Tensor:
         """Return the memory [B, n_state] after channels [B, T, nz]; zeros without any."""
-        if self.count == 0 or z.shape[1] == 0:
+        if self.n_delayed == 0 or z.shape[1] == 0:
             return z.new_zeros((z.shape[0], self.n_state))
-        late = z.index_select(-1, self.index)
-        line = torch.cat((late[:, :1].repeat_interleave(self.longest, dim=1), late), dim=1)
-        past = line[:, line.shape[1] - self.longest :].flatten(1)
-        return torch.cat((past, torch.ones_like(past[:, :1])), dim=-1)
+        undelayed = z.index_select(-1, self.delayed_index)
+        delay_line = torch.cat(
+            (undelayed[:, :1].repeat_interleave(self.max_delay, dim=1), undelayed), dim=1
+        )
+        buffered = delay_line[:, delay_line.shape[1] - self.max_delay :].flatten(1)
+        return torch.cat((buffered, torch.ones_like(buffered[:, :1])), dim=-1)
 
-    def memory_range(self, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    def memory_bounds(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
         """Return the least and largest memory [n_state], from those of all channels [nz]."""
-        if self.count == 0:
-            return low[:0], high[:0]
-        first, last = (edge[self.index].repeat(self.longest) for edge in (low, high))
+        if self.n_delayed == 0:
+            return lower[:0], upper[:0]
+        lower_memory, upper_memory = (
+            limit[self.delayed_index].repeat(self.max_delay) for limit in (lower, upper)
+        )
         # the memory without a past is zeros
-        return torch.cat((first.clamp(max=0.0), first.new_zeros(1))), (
-            torch.cat((last.clamp(min=0.0), last.new_ones(1)))
+        return torch.cat((lower_memory.clamp(max=0.0), lower_memory.new_zeros(1))), (
+            torch.cat((upper_memory.clamp(min=0.0), upper_memory.new_ones(1)))
         )
 
 
-class Past(NamedTuple):
+class SegmentedSamples(NamedTuple):
     """The samples of a fit with what lies before them.
 
     Attributes:
-        chosen: features [N, F].
+        features: features [N, F].
         target: outputs [N, n].
-        stretch: number of the unbroken stretch of each sample, ascending [N].
-        step: time between neighbouring samples, s.
+        segment: number of the unbroken stretch of each sample, ascending [N].
+        time_step: time between neighbouring samples, s.
     """
 
-    chosen: np.ndarray
+    features: np.ndarray
     target: np.ndarray
-    stretch: np.ndarray
-    step: float
+    segment: np.ndarray
+    time_step: float
 
-    def delayed(self, steps: int, index: np.ndarray, least: int = 0) -> Past:
-        """Return samples with the features `index` from `steps` before.
+    def with_delay(
+        self, delay_steps: int, delayed_index: np.ndarray, min_past: int = 0
+    ) -> SegmentedSamples:
+        """Return samples with the features `delayed_index` from `delay_steps` before.
 
-        Those are left out that have no past of so many samples, and of `least`.
+        Those are left out that have no past of so many samples, and of `min_past`.
         """
-        reach = max(steps, least)
-        now = np.arange(reach, len(self.stretch))
-        now = now[self.stretch[now] == self.stretch[now - reach]]
-        chosen = self.chosen[now].copy()
-        chosen[:, index] = self.chosen[now - steps][:, index]
-        return Past(chosen, self.target[now], self.stretch[now], self.step)
+        n_past = max(delay_steps, min_past)
+        current = np.arange(n_past, len(self.segment))
+        current = current[self.segment[current] == self.segment[current - n_past]]
+        features = self.features[current].copy()
+        features[:, delayed_index] = self.features[current - delay_steps][:, delayed_index]
+        return SegmentedSamples(
+            features, self.target[current], self.segment[current], self.time_step
+        )
 
 
-def best_delay(
-    past: Past,
+def find_best_delay(
+    samples: SegmentedSamples,
     terms: Sequence[Sequence[str]],
     names: Sequence[str],
-    index: np.ndarray,
-    longest: int,
+    delayed_index: np.ndarray,
+    max_delay: int,
 ) -> tuple[int, np.ndarray]:
     """Return the delay at which terms explain their targets best, and the profile of errors.
 
@@ -170,39 +184,46 @@ def best_delay(
     1]. All delays are judged on the same samples (document 000 section 5.3.4).
 
     Args:
-        past: samples.
+        samples: samples.
         terms: of each target.
         names: of the features.
-        index: places of those that act late.
-        longest: longest delay, in steps.
+        delayed_index: places of those that act late.
+        max_delay: longest delay, in steps.
 
     Raises:
         FitError: with fewer samples that have a past than terms.
     """
-    profile, libraries = np.zeros(longest + 1), [TermLibrary(row, names) for row in terms]
-    for steps in range(longest + 1):
-        late = past.delayed(steps, index, longest)
-        z, most = torch.from_numpy(late.chosen), max(map(len, terms))
-        if len(z) <= most:
+    profile, libraries = (
+        np.zeros(max_delay + 1),
+        [TermLibrary(target_terms, names) for target_terms in terms],
+    )
+    for delay_steps in range(max_delay + 1):
+        delayed = samples.with_delay(delay_steps, delayed_index, max_delay)
+        z, max_terms = torch.from_numpy(delayed.features), max(map(len, terms))
+        if len(z) <= max_terms:
             raise FitError(
-                f"delay: {len(z)} samples have a past of {longest} samples, {most} terms need more;"
+                f"delay: {len(z)} samples have a past of {max_delay} samples, {max_terms} terms need more;"
                 " give longer logs or a shorter delay"
             )
-        for library, y in zip(libraries, late.target.T, strict=True):
-            x = library(z).numpy()
-            x = x / np.maximum(np.linalg.norm(x, axis=0), _TINY)
+        for library, target in zip(libraries, delayed.target.T, strict=True):
+            columns = library(z).numpy()
+            columns = columns / np.maximum(np.linalg.norm(columns, axis=0), _MIN_NORM)
             # candidates may be collinear: what rounding cannot tell apart shares its part
-            inverse = np.linalg.pinv(x.T @ x, rcond=_ROUNDED, hermitian=True)
-            energy, along = float(y @ y), x.T @ y
-            rss = max(energy - float(along @ inverse @ along), 0.0)
+            gram_inverse = np.linalg.pinv(
+                columns.T @ columns, rcond=_RANK_TOLERANCE, hermitian=True
+            )
+            target_energy, projection = float(target @ target), columns.T @ target
+            rss = max(target_energy - float(projection @ gram_inverse @ projection), 0.0)
             # what rounding leaves of a perfect fit is no evidence
-            profile[steps] += np.log(rss + _PRECISION * energy + _TINY) / len(terms)
+            profile[delay_steps] += np.log(rss + _ROUNDING_SHARE * target_energy + _MIN_NORM) / len(
+                terms
+            )
     return int(profile.argmin()), profile
 
 
 _GAMMAS = (0.0, 0.5, 1.0)
 """Weights of the number of candidates that are offered where free runs choose: from BIC up."""
-_MOST_DELAYS = 6
+_MAX_DELAY_ROUNDS = 6
 """Most rounds of the search for a delay."""
 
 
@@ -225,14 +246,14 @@ class SymbolicConfig(FeatureConfig):
     kind: Literal["symbolic"] = "symbolic"
     candidates: CandidatesConfig = Field(default_factory=CandidatesConfig)
     terms: tuple[str, ...] = ()
-    search: SearchConfig = Field(default_factory=SearchConfig)
+    search: SparseSearchConfig = Field(default_factory=SparseSearchConfig)
     estimator: RowsConfig = Field(default_factory=SampleRows)
     symmetric: bool = False
     delay: DelayConfig | None = None
     choose: Literal["one_step", "free_run"] = "one_step"
 
     def build(self, names: Sequence[str]) -> SymbolicHead:
-        """Return the module for channels `names`."""
+        """Return the module for channels `format_terms`."""
         return SymbolicHead(self, names)
 
 
@@ -245,54 +266,54 @@ class SymbolicHead(EquationHead):
 
     def __init__(self, config: SymbolicConfig, names: Sequence[str]) -> None:
         super().__init__(names)
-        self.parities = axis_parities(names)
-        chosen = config.chosen(names)
-        self.features = Features(chosen, names, config.margin)
-        self.line = DelayLine(config.delay, chosen)
+        self.axis_signs = get_axis_parities(names)
+        feature_names = config.select_features(names)
+        self.features = Features(feature_names, names, config.margin)
+        self.line = DelayLine(config.delay, feature_names)
         self.n_state = self.line.n_state
         self.config = config
         self.candidates = (
-            rated(dict.fromkeys(config.terms), chosen)
+            rank_candidates(dict.fromkeys(config.terms), feature_names)
             if config.terms
-            else config.candidates.candidates(chosen)
+            else config.candidates.generate_candidates(feature_names)
         )
-        self.library = TermLibrary([candidate.term for candidate in self.candidates], chosen)
+        self.library = TermLibrary([candidate.term for candidate in self.candidates], feature_names)
         self.coefficients = nn.Buffer(
-            torch.zeros(self.library.count, self.dof, dtype=torch.float64)
+            torch.zeros(self.library.n_terms, self.n_dof, dtype=torch.float64)
         )
 
-    def basis(self, chosen: Tensor) -> Tensor:
+    def candidate_values(self, features: Tensor) -> Tensor:
         """Return all candidate terms [..., J] of chosen features [..., F].
 
         The features are held at the edge of the training range.
         """
-        values: Tensor = self.library(self.features.held(chosen))
-        return values
+        term_values: Tensor = self.library(self.features.clamp(features))
+        return term_values
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the residual [B, n] at channels z [B, nz], and the late inputs as memory."""
-        chosen, s = self.line(self.features.guarded(z), s)
-        return self.basis(chosen) @ self.coefficients.to(z.dtype), s
+        features, s = self.line(self.features.select_clamped(z), s)
+        return self.candidate_values(features) @ self.coefficients.to(z.dtype), s
 
-    def sequence(self, z: Tensor) -> Tensor:
-        chosen = self.line.sequence(self.features.guarded(z))
-        return self.basis(chosen) @ self.coefficients.to(z.dtype)
+    def teacher_forced_residuals(self, z: Tensor) -> Tensor:
+        features = self.line.delay_sequence(self.features.select_clamped(z))
+        return self.candidate_values(features) @ self.coefficients.to(z.dtype)
 
     def warmup(self, z: Tensor) -> Tensor:
-        return self.line.warmup(self.features.guarded(z))
+        return self.line.warmup(self.features.select_clamped(z))
 
-    def memory_range(self) -> tuple[Tensor, Tensor]:
+    def memory_bounds(self) -> tuple[Tensor, Tensor]:
         """Return the least and largest late inputs: those that the features are held between."""
-        return self.line.memory_range(self.features.low, self.features.high)
+        return self.line.memory_bounds(self.features.low, self.features.high)
 
-    def names(self) -> list[str]:
+    def format_terms(self) -> list[str]:
         return list(self.library.terms)
 
-    def along(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        chosen = self.line.sequence(z.index_select(-1, self.features.index))
-        return self.basis(chosen), self.coefficients
+    def evaluate_terms(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        features = self.line.delay_sequence(z.index_select(-1, self.features.index))
+        return self.candidate_values(features), self.coefficients
 
-    def solutions(self, samples: Samples) -> list[Solution]:
+    def fit_solutions(self, samples: Samples) -> list[Solution]:
         """Return the equations of the extended BIC, then what free runs may prefer.
 
         Those are the equations of weaker and stronger penalties, and none.
@@ -301,103 +322,152 @@ class SymbolicHead(EquationHead):
             FitError: where the samples do not tell the candidates apart, or hold no stretch as long
                 as the estimator or the delay needs.
         """
-        past = self._past(samples)
-        steps, delay = self._delay(past)
+        samples_with_past = self._segment_samples(samples)
+        delay_steps, delay_notes = self._fit_delay(samples_with_past)
         gammas = _GAMMAS if self.config.choose == "free_run" else ()
-        found = self._fit(past.delayed(steps, self.line.index.numpy()), gammas)
-        return [self._complete(solution, steps, delay) for solution in found]
+        solutions = self._fit_equations(
+            samples_with_past.with_delay(delay_steps, self.line.delayed_index.numpy()), gammas
+        )
+        return [
+            self._add_delay_and_text(solution, delay_steps, delay_notes) for solution in solutions
+        ]
 
-    def _past(self, samples: Samples) -> Past:
+    def _segment_samples(self, samples: Samples) -> SegmentedSamples:
         """Return features, targets and stretches of the samples.
 
         They are without times where nothing looks along them.
         """
-        chosen = samples.z.index_select(1, self.features.index).numpy()
+        features = samples.z.index_select(1, self.features.index).numpy()
         target, group = samples.target.numpy(), samples.group.numpy()
-        if not self.config.estimator.sequential and self.line.count == 0:
-            return Past(chosen, target, group, 0.0)
+        if not self.config.estimator.sequential and self.line.n_delayed == 0:
+            return SegmentedSamples(features, target, group, 0.0)
         t = samples.t.numpy()
-        step = step_of(group, t)
-        return Past(chosen, target, unbroken_stretches(group, t, step), step)
+        time_step = median_time_step(group, t)
+        return SegmentedSamples(
+            features, target, number_regular_segments(group, t, time_step), time_step
+        )
 
-    def _fit(self, past: Past, gammas: Sequence[float] = ()) -> list[Solution]:
+    def _fit_equations(
+        self, samples: SegmentedSamples, gammas: Sequence[float] = ()
+    ) -> list[Solution]:
         with torch.no_grad():
-            terms = self.basis(torch.from_numpy(past.chosen)).numpy()
-        rows = self.config.estimator.rows(Rows(terms, past.target, past.stretch), past.step)
+            term_values = self.candidate_values(torch.from_numpy(samples.features)).numpy()
+        regression_rows = self.config.estimator.build_rows(
+            RegressionRows(term_values, samples.target, samples.segment), samples.time_step
+        )
         estimator = SparseRegression(
             self.config.search,
             degrees=[candidate.degree for candidate in self.candidates],
-            efforts=[candidate.effort for candidate in self.candidates],
-            allowed=self._allowed(past),
+            complexities=[candidate.complexity for candidate in self.candidates],
+            allowed_terms=self._allowed_terms(samples),
             gammas=gammas,
         )
-        x, y = torch.from_numpy(rows.x), torch.from_numpy(rows.y)
-        return estimator.fit(x, y, names=self.library.terms, outputs=self.outputs)
+        design_matrix, targets = (
+            torch.from_numpy(regression_rows.x),
+            torch.from_numpy(regression_rows.y),
+        )
+        return estimator.fit(
+            design_matrix, targets, names=self.library.terms, outputs=self.output_names
+        )
 
-    def _allowed(self, past: Past) -> Tensor:
+    def _allowed_terms(self, samples: SegmentedSamples) -> Tensor:
         """Return which candidates each axis may have, [J, n] bool."""
         channels = self.features.names
-        allowed = torch.ones(self.library.count, self.dof, dtype=torch.bool)
+        is_allowed = torch.ones(self.library.n_terms, self.n_dof, dtype=torch.bool)
         if not self.config.terms:
-            z = torch.from_numpy(past.chosen)
-            allowed &= self.config.candidates.clear(self.library.terms, channels, z)[:, None]
+            z = torch.from_numpy(samples.features)
+            is_allowed &= self.config.candidates.find_nonsingular_terms(
+                self.library.terms, channels, z
+            )[:, None]
         if self.config.symmetric:
-            parities = [term_parity(term, channels) for term in self.library.terms]
-            even = [[parity in (None, own) for own in self.parities] for parity in parities]
-            allowed &= torch.tensor(even)
-        return allowed
+            term_parities = [compute_term_parity(term, channels) for term in self.library.terms]
+            matches_symmetry = [
+                [term_sign in (None, axis_sign) for axis_sign in self.axis_signs]
+                for term_sign in term_parities
+            ]
+            is_allowed &= torch.tensor(matches_symmetry)
+        return is_allowed
 
-    def _delay(self, past: Past) -> tuple[int, dict[str, Any]]:
+    def _fit_delay(self, samples: SegmentedSamples) -> tuple[int, dict[str, Any]]:
         """Return the delay in steps, and the notes about it.
 
         It is the one that fits best with the terms of degree one, then with those that are found at
         it, until it stays.
         """
-        if self.line.count == 0:
+        if self.line.n_delayed == 0:
             return 0, {}
-        possible, index = self._allowed(past).any(1).tolist(), self.line.index.numpy()
-        simple = [
-            c.term
-            for c, some in zip(self.candidates, possible, strict=True)
-            if some and c.degree <= 1
+        is_possible, delayed_index = (
+            self._allowed_terms(samples).any(1).tolist(),
+            self.line.delayed_index.numpy(),
+        )
+        linear_terms = [
+            coefficient.term
+            for coefficient, is_term_possible in zip(self.candidates, is_possible, strict=True)
+            if is_term_possible and coefficient.degree <= 1
         ]
-        terms: list[list[str]] = [simple] * self.dof
-        tried: list[int] = []
+        terms: list[list[str]] = [linear_terms] * self.n_dof
+        tried_delays: list[int] = []
         profile = np.zeros(0)
-        while len(tried) < 2 or (tried[-1] != tried[-2] and len(tried) < _MOST_DELAYS):
-            steps, profile = best_delay(past, terms, self.features.names, index, self.line.longest)
-            tried.append(steps)
-            table = self._fit(past.delayed(steps, index))[0].table
-            found = [[c.term for c in table if c.axis == name] for name in self.outputs]
-            terms = [list(dict.fromkeys((*row, *simple))) for row in found]
-        notes = {"steps": tried[-1], "seconds": tried[-1] * past.step, "profile": profile.tolist()}
-        return tried[-1], {"delay": notes}
-
-    def _complete(self, solution: Solution, steps: int, delay: dict[str, Any]) -> Solution:
-        equations = {
-            name: self._written(name, [c for c in solution.table if c.axis == name], steps) | about
-            for name, about in solution.notes["equations"].items()
+        while len(tried_delays) < 2 or (
+            tried_delays[-1] != tried_delays[-2] and len(tried_delays) < _MAX_DELAY_ROUNDS
+        ):
+            delay_steps, profile = find_best_delay(
+                samples, terms, self.features.names, delayed_index, self.line.max_delay
+            )
+            tried_delays.append(delay_steps)
+            coefficients = self._fit_equations(samples.with_delay(delay_steps, delayed_index))[
+                0
+            ].table
+            found_terms = [
+                [coefficient.term for coefficient in coefficients if coefficient.axis == name]
+                for name in self.output_names
+            ]
+            terms = [
+                list(dict.fromkeys((*axis_terms, *linear_terms))) for axis_terms in found_terms
+            ]
+        notes = {
+            "steps": tried_delays[-1],
+            "seconds": tried_delays[-1] * samples.time_step,
+            "profile": profile.tolist(),
         }
-        line = {"line.steps": torch.full((1,), float(steps), dtype=torch.float64)}
+        return tried_delays[-1], {"delay": notes}
+
+    def _add_delay_and_text(
+        self, solution: Solution, delay_steps: int, delay_notes: dict[str, Any]
+    ) -> Solution:
+        equations = {
+            name: self._format_solution(
+                name,
+                [coefficient for coefficient in solution.table if coefficient.axis == name],
+                delay_steps,
+            )
+            | notes
+            for name, notes in solution.notes["equations"].items()
+        }
+        delay_state = {"line.steps": torch.full((1,), float(delay_steps), dtype=torch.float64)}
         return replace(
             solution,
-            state=solution.state | line,
-            notes=solution.notes | {"equations": equations} | delay,
+            state=solution.state | delay_state,
+            notes=solution.notes | {"equations": equations} | delay_notes,
         )
 
-    def _written(self, name: str, terms: Sequence[Coefficient], steps: int) -> dict[str, str]:
+    def _format_solution(
+        self, name: str, terms: Sequence[Coefficient], delay_steps: int
+    ) -> dict[str, str]:
         channels = self.features.names
-        weights = [entry.value for entry in terms]
+        weights = [coefficient.value for coefficient in terms]
         factors = [
             [
                 ("abs" if factor.magnitude else factor.function, factor.name, factor.power)
-                for factor in parse_term(entry.term, channels)
+                for factor in parse_term(coefficient.term, channels)
             ]
-            for entry in terms
+            for coefficient in terms
         ]
-        late = ""
-        if self.line.count:
-            late = f"; {', '.join(self.line.channels)}: {steps} steps earlier"
-        comment = f"{name} in SI units, valid within the range of the training data{late}"
-        text = total([entry.term for entry in terms], weights)
-        return equation(name, text, symbolic(factors, weights), channels, comment)
+        delay_text = ""
+        if self.line.n_delayed:
+            delay_text = f"; {', '.join(self.line.delayed_names)}: {delay_steps} steps earlier"
+        comment = f"{name} in SI units, valid within the range of the training data{delay_text}"
+        right_hand_side = format_sum([coefficient.term for coefficient in terms], weights)
+        return format_equation(
+            name, right_hand_side, terms_to_sympy(factors, weights), channels, comment
+        )

@@ -13,41 +13,61 @@ from torch import nn
 
 from residnet.core.arrays import paged
 from residnet.core.errors import FitError
-from residnet.core.progress import begin
+from residnet.core.progress import begin_stage
 from residnet.core.samples import Samples
-from residnet.data.prepare import Prepared, samples
+from residnet.data.prepare import PreparedLog, make_samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.base import ClosedFormHead
-from residnet.identification.fitter import FittedModel, references, residual_samples
-from residnet.identification.identified import Identified, closed_form, members_of, unlike_models
-from residnet.judge.band import Band, BandsConfig, corrected, independent, quantile, run_weights
-from residnet.judge.bands import RunErrors, calibrate, few, run_errors
-from residnet.judge.freerun import Candidate, free_run
+from residnet.identification.fitter import (
+    FittedModel,
+    compute_residual_samples,
+    find_reference_names,
+)
+from residnet.identification.identified import (
+    IdentifiedModels,
+    has_closed_form_head,
+    spread_member_names,
+    trajectory_member_names,
+)
+from residnet.judge.band import (
+    Band,
+    BandsConfig,
+    compute_run_weights,
+    conformal_level,
+    effective_sample_size,
+    weighted_quantile,
+)
+from residnet.judge.bands import RunErrors, calibrate_band, compute_run_errors, describe_few_logs
+from residnet.judge.freerun import Candidate, run_free_runs
 from residnet.judge.protocol import Window
 from residnet.regression.estimator import Solution
 from residnet.training.left_out import without_logs
 from residnet.training.refit import parametric
 
 
-def fold_numbers(kinds: Sequence[str], folds: int, seed: int) -> np.ndarray:
+def assign_logs_to_folds(manoeuvre_kinds: Sequence[str], max_folds: int, seed: int) -> np.ndarray:
     """Return the number of the fold of each log [L]; logs of a kind are spread over the folds.
 
     Args:
-        folds: at most; fewer where there are fewer logs.
+        max_folds: at most; fewer where there are fewer logs.
     """
-    random = np.random.default_rng([seed, 3])
-    order = [
-        place
-        for kind in sorted(set(kinds))
-        for place in random.permutation([i for i, own in enumerate(kinds) if own == kind]).tolist()
+    generator = np.random.default_rng([seed, 3])
+    shuffled_indices = [
+        log_index
+        for manoeuvre_kind in sorted(set(manoeuvre_kinds))
+        for log_index in generator.permutation(
+            [i for i, log_kind in enumerate(manoeuvre_kinds) if log_kind == manoeuvre_kind]
+        ).tolist()
     ]
-    out = np.empty(len(kinds), dtype=int)
-    out[order] = np.arange(len(kinds)) % min(folds, len(kinds))
-    return out
+    fold_of_log = np.empty(len(manoeuvre_kinds), dtype=int)
+    fold_of_log[shuffled_indices] = np.arange(len(manoeuvre_kinds)) % min(
+        max_folds, len(manoeuvre_kinds)
+    )
+    return fold_of_log
 
 
-class FoldModels:
+class LeaveFoldOutModels:
     """The models of a fit that can quickly be fitted without a fold of the training logs.
 
     Baselines that went through a refit take one step of Gauss-Newton; what has a closed form is
@@ -55,97 +75,112 @@ class FoldModels:
     ensembles are not here.
 
     Args:
-        fold: number of the fold of each training log [L].
+        fold_of_log: number of the fold of each training log [L].
     """
 
-    def __init__(self, identified: Identified, fold: np.ndarray) -> None:
+    def __init__(self, identified: IdentifiedModels, fold_of_log: np.ndarray) -> None:
         self.identified = identified
-        self.fold = torch.from_numpy(fold)
-        self.count = int(fold.max()) + 1
-        self.samples = samples(identified.train, identified.settings.signals.build())
-        self.failed: dict[str, str] = {}
+        self.fold_of_log = torch.from_numpy(fold_of_log)
+        self.n_folds = int(fold_of_log.max()) + 1
+        self.training_samples = make_samples(
+            identified.training_logs, identified.settings.signals.build()
+        )
+        self.failure_reasons: dict[str, str] = {}
 
     @cached_property
-    def models(self) -> list[dict[str, HybridDynamics]]:
+    def models_by_fold(self) -> list[dict[str, HybridDynamics]]:
         """The models by name for each fold that is left out."""
-        out: list[dict[str, HybridDynamics]] = [{} for _ in range(self.count)]
-        for name, fitted in self.identified.items():
+        models_by_fold: list[dict[str, HybridDynamics]] = [{} for _ in range(self.n_folds)]
+        for name, fitted_model in self.identified.items():
             try:
-                found = self._without(fitted, out)
+                refitted_models = self._fit_without_folds(fitted_model, models_by_fold)
             except FitError as error:
-                self.failed[name] = str(error)
+                self.failure_reasons[name] = str(error)
                 continue
-            for models, model in zip(out, found, strict=False):
+            for models, model in zip(models_by_fold, refitted_models, strict=False):
                 models[name] = model
-        return out
+        return models_by_fold
 
-    def _without(
-        self, fitted: FittedModel, before: Sequence[dict[str, HybridDynamics]]
+    def _fit_without_folds(
+        self, fitted_model: FittedModel, models_by_fold: Sequence[dict[str, HybridDynamics]]
     ) -> list[HybridDynamics]:
         """Return a model without each fold; none where it cannot quickly be fitted again."""
-        role = fitted.spec.role
+        role = fitted_model.spec.role
         if role == "zero":
-            return [copy.deepcopy(fitted.model) for _ in range(self.count)]
+            return [copy.deepcopy(fitted_model.model) for _ in range(self.n_folds)]
         if role == "baseline":
-            return self._baseline(fitted)
-        name = self.identified.settings.baseline_name_of(fitted.name)
-        if not closed_form(fitted) or name not in before[0]:
+            return self._fit_baseline_without_folds(fitted_model)
+        name = self.identified.settings.get_baseline_name(fitted_model.name)
+        if not has_closed_form_head(fitted_model) or name not in models_by_fold[0]:
             return []
-        return [self._head(fitted, before[k][name], k) for k in range(self.count)]
+        return [
+            self._fit_head_without_fold(fitted_model, models_by_fold[k][name], k)
+            for k in range(self.n_folds)
+        ]
 
-    def _baseline(self, fitted: FittedModel) -> list[HybridDynamics]:
+    def _fit_baseline_without_folds(self, fitted_model: FittedModel) -> list[HybridDynamics]:
         settings = self.identified.settings
-        refit = settings.refit.get(fitted.name)
-        whole = copy.deepcopy(fitted.model).to(torch.float64)
-        out = [copy.deepcopy(whole) for _ in range(self.count)]
-        if refit is None or "refit" not in fitted.notes:
-            for k, model in enumerate(out):
-                config, kept = fitted.spec.baseline, self._kept(k)
-                _fill(model.baseline, config.solutions(model.baseline, kept), fitted)
-            return out
-        found = without_logs(
-            whole,
-            self.samples,
-            WindowStore.gather(self.identified.train, torch.float64),
-            refit.with_prior(float(fitted.notes["prior"])),
-            torch.from_numpy(settings.evaluation.scales.array()),
-            self.fold,
-            fitted.notes["refit"]["at_rest"],
+        refit_config = settings.refit.get(fitted_model.name)
+        full_model = copy.deepcopy(fitted_model.model).to(torch.float64)
+        fold_models = [copy.deepcopy(full_model) for _ in range(self.n_folds)]
+        if refit_config is None or "refit" not in fitted_model.notes:
+            for k, model in enumerate(fold_models):
+                config, fold_samples = fitted_model.spec.baseline, self._samples_without_fold(k)
+                _load_matching_solution(
+                    model.baseline, config.fit_solutions(model.baseline, fold_samples), fitted_model
+                )
+            return fold_models
+        parameters_by_fold = without_logs(
+            full_model,
+            self.training_samples,
+            WindowStore.from_logs(self.identified.training_logs, torch.float64),
+            refit_config.with_prior(float(fitted_model.notes["prior"])),
+            torch.from_numpy(settings.evaluation.scales.to_array()),
+            self.fold_of_log,
+            fitted_model.notes["refit"]["at_rest"],
         )
-        for model, theta in zip(out, found, strict=True):
+        for model, theta in zip(fold_models, parameters_by_fold, strict=True):
             parametric(model).theta.data.copy_(theta)
-        return out
+        return fold_models
 
-    def _head(self, fitted: FittedModel, baseline: HybridDynamics, k: int) -> HybridDynamics:
-        model = fitted.spec.build()
+    def _fit_head_without_fold(
+        self, fitted_model: FittedModel, baseline: HybridDynamics, fold: int
+    ) -> HybridDynamics:
+        model = fitted_model.spec.build()
         model.baseline.load_state_dict(copy.deepcopy(baseline.baseline.state_dict()))
         assert isinstance(model.head, ClosedFormHead)
-        residual = residual_samples(model, self._kept(k))
-        model.head.calibrate(residual)
-        _fill(model.head, model.head.solutions(residual), fitted)
+        residual_samples_of_fold = compute_residual_samples(model, self._samples_without_fold(fold))
+        model.head.calibrate(residual_samples_of_fold)
+        _load_matching_solution(
+            model.head, model.head.fit_solutions(residual_samples_of_fold), fitted_model
+        )
         return model.eval().requires_grad_(False)
 
-    def _kept(self, k: int) -> Samples:
+    def _samples_without_fold(self, fold: int) -> Samples:
         """Return the samples of all folds but one."""
-        return self.samples.where(self.fold[self.samples.group] != k)
+        return self.training_samples.select(self.fold_of_log[self.training_samples.group] != fold)
 
 
-def _fill(part: nn.Module, solutions: Sequence[Solution], fitted: FittedModel) -> None:
+def _load_matching_solution(
+    module: nn.Module, solutions: Sequence[Solution], fitted_model: FittedModel
+) -> None:
     """Fill a part with the solution that has the complexity of the fitted one, else the first."""
-    alike = (
+    matching_solutions = (
         solution
         for solution in solutions
-        if all(fitted.notes.get(key) == value for key, value in solution.choice.items())
+        if all(
+            fitted_model.notes.get(key) == value for key, value in solution.hyperparameters.items()
+        )
     )
-    part.load_state_dict(next(alike, solutions[0]).state, strict=False)
+    module.load_state_dict(next(matching_solutions, solutions[0]).state, strict=False)
 
 
-_MOST = 1_000_000
+_MAX_CALIBRATION_SAMPLES = 1_000_000
 """Samples of all windows together that calibrate; of more windows, every second or so is taken."""
 
 
 def calibrate_bands(
-    identified: Identified, validation: Sequence[Prepared], config: BandsConfig
+    identified: IdentifiedModels, validation: Sequence[PreparedLog], config: BandsConfig
 ) -> dict[str, FittedModel]:
     """Return the models of a fit with their bands under all protocols.
 
@@ -154,151 +189,225 @@ def calibrate_bands(
     band, with the level that its own errors on the validation logs ask for. Where these were fitted
     too, means take the band of their reference as it is, and networks have none.
     """
-    begin("calibrating bands")
-    fold = fold_numbers([log.log.manoeuvre for log in identified.train], config.folds, config.seed)
-    left_out = FoldModels(identified, fold)
-    refitted = left_out.models if int(fold.max()) > 0 else [{}]
-    out: dict[str, dict[str, Band]] = {}
+    begin_stage("calibrating bands")
+    fold_of_log = assign_logs_to_folds(
+        [log.log.manoeuvre for log in identified.training_logs], config.folds, config.seed
+    )
+    fold_models = LeaveFoldOutModels(identified, fold_of_log)
+    models_by_fold = fold_models.models_by_fold if int(fold_of_log.max()) > 0 else [{}]
+    bands_by_model: dict[str, dict[str, Band]] = {}
     for protocol in identified.settings.evaluation.protocols:
-        runs = _Calibration(identified, protocol, config, left_out.failed)
-        for k, models in enumerate(refitted):
-            own = paged.OneByOne(
-                log for log, number in zip(identified.train, fold, strict=True) if number == k
+        calibration = _ProtocolCalibration(
+            identified, protocol, config, fold_models.failure_reasons
+        )
+        for fold_index, models in enumerate(models_by_fold):
+            logs_of_fold = paged.PageReleasingList(
+                log
+                for log, fold_number in zip(identified.training_logs, fold_of_log, strict=True)
+                if fold_number == fold_index
             )
-            runs.add(models, own, validation=False)
-        if not identified.seen:
-            runs.add({name: entry.model for name, entry in identified.items()}, validation, True)
-        for name, band in runs.bands().items():
-            out.setdefault(name, {})[protocol] = band
-    found = dict(identified)
-    for name, bands in out.items():
+            calibration.add_runs(models, logs_of_fold, is_validation=False)
+        if not identified.validation_in_training:
+            calibration.add_runs(
+                {name: entry.model for name, entry in identified.items()}, validation, True
+            )
+        for name, band in calibration.calibrate_all().items():
+            bands_by_model.setdefault(name, {})[protocol] = band
+    models_with_bands = dict(identified)
+    for name, bands in bands_by_model.items():
         # the description of a model takes the band that reaches furthest
-        furthest = max(bands.values(), key=lambda band: band.horizon)
-        spec = found[name].spec.model_copy(update={"band": furthest.table()})
-        found[name] = replace(found[name], spec=spec, bands=bands)
-    return found
+        longest_band = max(bands.values(), key=lambda band: band.horizon)
+        spec = models_with_bands[name].spec.model_copy(update={"band": longest_band.to_table()})
+        models_with_bands[name] = replace(models_with_bands[name], spec=spec, bands=bands)
+    return models_with_bands
 
 
-class _Calibration:
+class _ProtocolCalibration:
     """The free runs that calibrate the bands under one protocol.
 
     Args:
-        failed: why a model cannot be fitted without some of the logs, by its name.
+        failure_reasons: why a model cannot be fitted without some of the logs, by its name.
     """
 
     def __init__(
-        self, identified: Identified, protocol: str, config: BandsConfig, failed: Mapping[str, str]
+        self,
+        identified: IdentifiedModels,
+        protocol_name: str,
+        config: BandsConfig,
+        failure_reasons: Mapping[str, str],
     ) -> None:
-        self.failed = failed
-        self.identified = identified
-        self.protocol = identified.settings.evaluation.protocols[protocol]
+        self.failure_reasons = failure_reasons
+        self.fitted_models = identified
+        self.protocol = identified.settings.evaluation.protocols[protocol_name]
         self.config = config
-        self.step = identified.settings.prepare.grid.step
-        laid = sum(len(log) for log in identified.train) * self.step / config.every
-        length = max(
-            (w.stop - w.start for log in identified.train[:1] for w in self._windows([log])),
+        self.dt = identified.settings.prepare.grid.step
+        n_expected_windows = (
+            sum(len(log) for log in identified.training_logs) * self.dt / config.every
+        )
+        window_length = max(
+            (
+                window.stop - window.start
+                for log in identified.training_logs[:1]
+                for window in self._make_windows([log])
+            ),
             default=1,
         )
-        self.every = max(1, round(laid * length / _MOST))
-        self.crossed: dict[str, list[RunErrors]] = {}
-        self.validated: dict[str, list[RunErrors]] = {}
+        self.window_stride = max(
+            1, round(n_expected_windows * window_length / _MAX_CALIBRATION_SAMPLES)
+        )
+        self.cross_validated_errors: dict[str, list[RunErrors]] = {}
+        self.validation_errors: dict[str, list[RunErrors]] = {}
 
-    def add(
-        self, models: Mapping[str, HybridDynamics], logs: Sequence[Prepared], validation: bool
+    def add_runs(
+        self, models: Mapping[str, HybridDynamics], logs: Sequence[PreparedLog], is_validation: bool
     ) -> None:
         """Run models over logs that they were not fitted on."""
-        windows = self._windows(logs)[:: 1 if validation else self.every]
+        windows = self._make_windows(logs)[:: 1 if is_validation else self.window_stride]
         if not windows or not models:
             return
-        unlike = unlike_models(self.identified[name] for name in models)
+        spread_members = spread_member_names(self.fitted_models[name] for name in models)
         candidates = [
-            Candidate(name, "", model, members=members_of(self.identified[name]), unlike=unlike)
+            Candidate(
+                name,
+                "",
+                model,
+                members=trajectory_member_names(self.fitted_models[name]),
+                spread_members=spread_members,
+            )
             for name, model in models.items()
         ]
-        found = free_run(candidates, windows, logs, self.step, self.identified.limit)
-        for name, predictions in found.items():
-            runs = run_errors(windows, predictions, logs)
-            (self.validated if validation else self.crossed).setdefault(name, []).extend(runs)
+        predictions_by_model = run_free_runs(
+            candidates, windows, logs, self.dt, self.fitted_models.velocity_limits
+        )
+        for name, predictions in predictions_by_model.items():
+            errors_of_runs = compute_run_errors(windows, predictions, logs)
+            (self.validation_errors if is_validation else self.cross_validated_errors).setdefault(
+                name, []
+            ).extend(errors_of_runs)
 
-    def _windows(self, logs: Sequence[Prepared]) -> list[Window]:
+    def _make_windows(self, logs: Sequence[PreparedLog]) -> list[Window]:
         return [
             window
-            for number, log in enumerate(logs)
-            for window in self.protocol.overlapping(log, number, self.step, self.config.every)
+            for log_index, log in enumerate(logs)
+            for window in self.protocol.make_overlapping_windows(
+                log, log_index, self.dt, self.config.every
+            )
         ]
 
-    def bands(self) -> dict[str, Band]:
+    def calibrate_all(self) -> dict[str, Band]:
         """Return the band of each model; none where no log is long enough."""
-        zero = self.crossed.get("zero", []) + self.validated.get("zero", [])
-        if not zero:
+        reference_errors = self.cross_validated_errors.get("zero", []) + self.validation_errors.get(
+            "zero", []
+        )
+        if not reference_errors:
             return {}
-        errors = np.concatenate([run.error for run in zero])
-        unit, seen = np.zeros(errors.shape[1]), np.isfinite(errors).any(axis=0)
-        unit[seen] = np.sqrt(np.nanmean(np.compress(seen, errors, axis=1) ** 2, axis=0))
+        constant_velocity_errors = np.concatenate([run.error for run in reference_errors])
+        score_unit, is_scored = (
+            np.zeros(constant_velocity_errors.shape[1]),
+            np.isfinite(constant_velocity_errors).any(axis=0),
+        )
+        score_unit[is_scored] = np.sqrt(
+            np.nanmean(np.compress(is_scored, constant_velocity_errors, axis=1) ** 2, axis=0)
+        )
         # a channel that zero predicts without any error has no scale of its own
-        unit = np.where(unit > 0, unit, 1.0)
-        out: dict[str, Band] = {}
-        for name in self.crossed:
-            runs = self.crossed[name] + self.validated.get(name, [])
-            out[name] = calibrate(runs, self.config.level, self.step, unit)
-        compared = references(self.identified.values())
-        for name, entry in self.identified.items():
-            reference = compared.get(name, "baseline")
-            if name not in out and self.validated.get(name):
-                out[name] = self._like(entry, out, reference, unit)
-            elif name not in out and members_of(entry) and reference in out:
-                band = out[reference]
-                cautions = (_BORROWED.format(reference), *band.cautions)
-                out[name] = replace(band, cautions=cautions)
-        return {name: out[name] for name in self.identified if name in out}
+        score_unit = np.where(score_unit > 0, score_unit, 1.0)
+        bands_by_model: dict[str, Band] = {}
+        for name in self.cross_validated_errors:
+            errors_of_runs = self.cross_validated_errors[name] + self.validation_errors.get(
+                name, []
+            )
+            bands_by_model[name] = calibrate_band(
+                errors_of_runs, self.config.level, self.dt, score_unit
+            )
+        reference_names = find_reference_names(self.fitted_models.values())
+        for name, fitted_model in self.fitted_models.items():
+            reference_name = reference_names.get(name, "baseline")
+            if name not in bands_by_model and self.validation_errors.get(name):
+                bands_by_model[name] = self._borrow_band(
+                    fitted_model, bands_by_model, reference_name, score_unit
+                )
+            elif (
+                name not in bands_by_model
+                and trajectory_member_names(fitted_model)
+                and reference_name in bands_by_model
+            ):
+                band = bands_by_model[reference_name]
+                cautions = (_REFERENCE_BAND_CAUTION.format(reference_name), *band.cautions)
+                bands_by_model[name] = replace(band, cautions=cautions)
+        return {name: bands_by_model[name] for name in self.fitted_models if name in bands_by_model}
 
-    def _like(
-        self, entry: FittedModel, known: Mapping[str, Band], reference: str, unit: np.ndarray
+    def _borrow_band(
+        self,
+        fitted_model: FittedModel,
+        known_bands: Mapping[str, Band],
+        reference_name: str,
+        score_unit: np.ndarray,
     ) -> Band:
         """Return the band of a model that was not fitted again without logs."""
-        runs = self.validated[entry.name]
-        logs = len({run.log for run in runs})
-        if reference not in known or not self.validated.get(reference):
-            band = calibrate(runs, self.config.level, self.step, unit)
-            why = f" ({self.failed[entry.name]})" if entry.name in self.failed else ""
-            return replace(band, cautions=(_ALONE.format(logs, why), *few(logs)))
-        single = known[reference]
-        ratio = _level(runs, single, self.config.level) / _level(
-            self.validated[reference], single, self.config.level
+        errors_of_runs = self.validation_errors[fitted_model.name]
+        n_logs = len({run.log for run in errors_of_runs})
+        if reference_name not in known_bands or not self.validation_errors.get(reference_name):
+            band = calibrate_band(errors_of_runs, self.config.level, self.dt, score_unit)
+            reason_text = (
+                f" ({self.failure_reasons[fitted_model.name]})"
+                if fitted_model.name in self.failure_reasons
+                else ""
+            )
+            return replace(
+                band,
+                cautions=(
+                    _VALIDATION_ONLY_CAUTION.format(n_logs, reason_text),
+                    *describe_few_logs(n_logs),
+                ),
+            )
+        reference_band = known_bands[reference_name]
+        width_ratios = _normalized_error_quantile(
+            errors_of_runs, reference_band, self.config.level
+        ) / _normalized_error_quantile(
+            self.validation_errors[reference_name], reference_band, self.config.level
         )
-        ratio = np.where(np.isfinite(ratio), ratio, 1.0)
+        width_ratios = np.where(np.isfinite(width_ratios), width_ratios, 1.0)
         return replace(
-            single,
-            width=single.width * ratio,
-            plain=single.plain * ratio,
-            constant=single.constant * ratio,
-            logs=logs,
-            cautions=(_SCALED.format(reference, logs), *few(logs)),
+            reference_band,
+            half_width=reference_band.half_width * width_ratios,
+            unconditional_width=reference_band.unconditional_width * width_ratios,
+            constant_width=reference_band.constant_width * width_ratios,
+            n_logs=n_logs,
+            cautions=(_SCALED_CAUTION.format(reference_name, n_logs), *describe_few_logs(n_logs)),
         )
 
 
-_SCALED = (
+_SCALED_CAUTION = (
     "This model was not fitted again without the logs that calibrate: its band has the form of that"
     " of {}, and its width from {} validation logs, which also chose between models or stopped the"
     " training early."
 )
-_ALONE = (
+_VALIDATION_ONLY_CAUTION = (
     "Only {} validation logs calibrate this band: no model could be fitted without some of the"
     " training logs{}. They also chose between models or stopped the training early."
 )
-_BORROWED = (
+_REFERENCE_BAND_CAUTION = (
     "Short logs leave none that this model was not fitted on: its band is that of {}, which was"
     " fitted again without some of them."
 )
 
 
-def _level(runs: Sequence[RunErrors], band: Band, level: float) -> np.ndarray:
+def _normalized_error_quantile(
+    errors_of_runs: Sequence[RunErrors], band: Band, level: float
+) -> np.ndarray:
     """Return the quantile [c] of errors over the half widths of a band."""
-    names = [run.log for run in runs]
-    weight = run_weights(names)
-    ratios = [run.error / run.within(band) for run in runs]
-    inside = np.array([np.nanmean(ratio <= 1.0) for ratio in ratios])
-    raised = corrected(level, independent(inside, weight, names, level))
-    joined = np.concatenate(ratios)
-    share = np.repeat(weight, [len(ratio) for ratio in ratios])
-    return np.array([quantile(joined[:, i], share, raised) for i in range(joined.shape[1])])
+    names = [run.log for run in errors_of_runs]
+    run_weights_ = compute_run_weights(names)
+    normalized_errors = [run.error / run.half_widths(band) for run in errors_of_runs]
+    coverage = np.array([np.nanmean(ratio <= 1.0) for ratio in normalized_errors])
+    corrected_level = conformal_level(
+        level, effective_sample_size(coverage, run_weights_, names, level)
+    )
+    pooled_errors = np.concatenate(normalized_errors)
+    sample_weights = np.repeat(run_weights_, [len(ratio) for ratio in normalized_errors])
+    return np.array(
+        [
+            weighted_quantile(pooled_errors[:, i], sample_weights, corrected_level)
+            for i in range(pooled_errors.shape[1])
+        ]
+    )

@@ -9,205 +9,270 @@ from typing import Any, final
 import torch
 from torch import Tensor
 
-from residnet.core.columns import turning
-from residnet.core.frames import along_axes, to_body
-from residnet.core.layout import ATTITUDE, HEADING, MOVING, SIX, SURGE, SWAY, YAW_RATE
+from residnet.core.columns import heading_rate
+from residnet.core.frames import horizontal_to_body, to_body
+from residnet.core.layout import (
+    ATTITUDE,
+    DYNAMIC_STATES,
+    HEADING,
+    SIX_DOF_LAYOUT,
+    SURGE,
+    SWAY,
+    YAW_RATE,
+)
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.physics.signals import SignalsConfig
-from residnet.physics.symmetry import live_of
+from residnet.physics.symmetry import get_dof
 
-_AXES = {"u": "surge", "v": "sway", "r": "yaw", "p": "roll", "w": "heave", "q": "pitch"}
-_TAKEN = {"u": 0.1}
+_AXIS_NAMES = {"u": "surge", "v": "sway", "r": "yaw", "p": "roll", "w": "heave", "q": "pitch"}
+_DAMPING_PROBE_SHARES = {"u": 0.1}
 """Share of a velocity whose absence shows what damps it; all of others."""
 
 
 @dataclass(frozen=True)
-class Change:
+class SystemChange:
     """A change of a vessel, of its commands, of its surroundings or of a sensor.
 
     Attributes:
         name: short, for tables.
-        words: what it is, completing "the logs look as if ...".
+        description: what it is, completing "the logs look as if ...".
         unit: of its size.
         size: of the change; a small one, where its effect is to be computed.
-        heavier: share of the size that is added to the inertia of all axes.
+        inertia_share: share of the size that is added to the inertia of all axes.
         damping: velocity whose damping changes by the size, a share of what the model has; empty
             for none.
-        by: what damps it: itself where empty, or an angle that holds it back.
-        push: shares of the size that push to north and east.
-        gain: number of the input whose gain changes by the size; None for none.
-        offset: number of the input that the size is added to; None for none.
+        damped_by: what damps it: itself where empty, or an angle that holds it back.
+        push_direction: shares of the size that push to north and east.
+        gain_input: number of the input whose gain changes by the size; None for none.
+        offset_input: number of the input that the size is added to; None for none.
         sensor: what a sensor adds: `gyro_scale`, `gyro_offset`, `speed_scale`, `lag`, or
             `current_north`, `current_east` for water that moves; empty for none.
     """
 
     name: str
-    words: str
+    description: str
     unit: str
     size: float
-    heavier: float = 0.0
+    inertia_share: float = 0.0
     damping: str = ""
-    by: str = ""
-    push: tuple[float, float] = (0.0, 0.0)
-    gain: int | None = None
-    offset: int | None = None
+    damped_by: str = ""
+    push_direction: tuple[float, float] = (0.0, 0.0)
+    gain_input: int | None = None
+    offset_input: int | None = None
     sensor: str = ""
 
 
-def causes(signals: SignalsConfig) -> list[Change]:
+def make_fault_hypotheses(signals: SignalsConfig) -> list[SystemChange]:
     """Return the changes that a monitor looks for, given the inputs of a model."""
 
-    def share(name: str, words: str, **what: Any) -> Change:
-        return Change(name, words, "share", 0.02, **what)
+    def share(name: str, description: str, **effect: Any) -> SystemChange:
+        return SystemChange(name, description, "share", 0.02, **effect)
 
-    units, live = signals.units(), signals.live
-    out = [share("mass", "the vessel has become heavier", heavier=1.0)]
-    for axis in live.velocities:
-        words = f"the damping in {_AXES[axis]} has grown"
-        out.append(share(f"damping {_AXES[axis]}", words, damping=axis))
-    if live.rolls:
-        words = "the vessel has become stiffer in roll"
-        out.append(share("restoring", words, damping="p", by="phi"))
-    if live.spatial:
-        words = "the vessel has become stiffer in pitch"
-        out.append(share("restoring pitch", words, damping="q", by="theta"))
-    for place, name in enumerate(signals.inputs):
-        out.append(share(f"gain {name}", f"{name} has grown stronger than it was", gain=place))
+    units, dof = signals.channel_units(), signals.dof
+    changes = [share("mass", "the vessel has become heavier", heavier=1.0)]
+    for velocity in dof.velocities:
+        description = f"the damping in {_AXIS_NAMES[velocity]} has grown"
+        changes.append(share(f"damping {_AXIS_NAMES[velocity]}", description, damping=velocity))
+    if dof.has_roll:
+        description = "the vessel has become stiffer in roll"
+        changes.append(share("restoring", description, damping="p", by="phi"))
+    if dof.is_six_dof:
+        description = "the vessel has become stiffer in pitch"
+        changes.append(share("restoring pitch", description, damping="q", by="theta"))
+    for input_index, name in enumerate(signals.inputs):
+        changes.append(
+            share(f"gain {name}", f"{name} has grown stronger than it was", gain=input_index)
+        )
         if units.get(name) == "rad":
-            words = f"{name} has an offset"
-            out.append(Change(f"offset {name}", words, "rad", 0.01, offset=place))
+            description = f"{name} has an offset"
+            changes.append(
+                SystemChange(f"offset {name}", description, "rad", 0.01, offset_input=input_index)
+            )
     gyro = [
         share("gyro scale", "the gyro shows too much", sensor="gyro_scale"),
-        Change("gyro offset", "the gyro has an offset", "rad/s", 0.001, sensor="gyro_offset"),
+        SystemChange("gyro offset", "the gyro has an offset", "rad/s", 0.001, sensor="gyro_offset"),
     ]
-    speed = share("speed scale", "u and v are shown too large", sensor="speed_scale")
-    lag = Change("lag", "velocities come late", "s", 0.1, sensor="lag")
-    return [*out, *gyro * live.turns, *[speed] * live.moves, lag]
+    speed_scale = share("speed scale", "u and v are shown too large", sensor="speed_scale")
+    lag = SystemChange("lag", "velocities come late", "s", 0.1, sensor="lag")
+    return [*changes, *gyro * dof.has_heading, *[speed_scale] * dof.has_position, lag]
 
 
-def surroundings() -> list[Change]:
+def make_nuisance_changes() -> list[SystemChange]:
     """Return what wind and current do, which is no change of the vessel."""
     return [
-        Change("current north", "", "m/s", 0.05, sensor="current_north"),
-        Change("current east", "", "m/s", 0.05, sensor="current_east"),
-        Change("push north", "", "m/s^2", 0.005, push=(1.0, 0.0)),
-        Change("push east", "", "m/s^2", 0.005, push=(0.0, 1.0)),
+        SystemChange("current north", "", "m/s", 0.05, sensor="current_north"),
+        SystemChange("current east", "", "m/s", 0.05, sensor="current_east"),
+        SystemChange("push north", "", "m/s^2", 0.005, push_direction=(1.0, 0.0)),
+        SystemChange("push east", "", "m/s^2", 0.005, push_direction=(0.0, 1.0)),
     ]
 
 
-def shown(sensor: str, x: Tensor, rate: Tensor, size: float) -> Tensor:
+def compute_sensor_effect(
+    sensor: str, x: Tensor, accelerations: Tensor, change_size: float
+) -> Tensor:
     """Return what a sensor adds to states [..., 3 + n] where what moves has the rates [..., n]."""
-    out = torch.zeros_like(x)
+    effect = torch.zeros_like(x)
     if sensor == "gyro_scale":
-        out[..., YAW_RATE] = size * x[..., YAW_RATE]
+        effect[..., YAW_RATE] = change_size * x[..., YAW_RATE]
     elif sensor == "gyro_offset":
-        out[..., YAW_RATE] = size
+        effect[..., YAW_RATE] = change_size
     elif sensor == "speed_scale":
-        out[..., SURGE : SWAY + 1] = size * x[..., SURGE : SWAY + 1]
+        effect[..., SURGE : SWAY + 1] = change_size * x[..., SURGE : SWAY + 1]
     elif sensor == "lag":
-        out[..., MOVING] = -size * rate
+        effect[..., DYNAMIC_STATES] = -change_size * accelerations
     elif sensor in ("current_north", "current_east"):
-        north = x.new_tensor(size if sensor == "current_north" else 0.0)
-        out = out + along_body(x, north, size - north)
-    return out
+        north = x.new_tensor(change_size if sensor == "current_north" else 0.0)
+        effect = effect + resolve_in_body_axes(x, north, change_size - north)
+    return effect
 
 
-def along_body(x: Tensor, north: Tensor, east: Tensor) -> Tensor:
+def resolve_in_body_axes(x: Tensor, north: Tensor, east: Tensor) -> Tensor:
     """Return a horizontal vector as velocities in states x [..., 3 + n], zero elsewhere."""
-    out = torch.zeros_like(x)
-    if x.shape[-1] == len(SIX.names):
-        parts = along_axes(north, east, x[..., list(ATTITUDE)])
-        places = [SURGE, SWAY, SIX.names.index("w")]
+    velocities = torch.zeros_like(x)
+    if x.shape[-1] == len(SIX_DOF_LAYOUT.state_names):
+        body_components = horizontal_to_body(north, east, x[..., list(ATTITUDE)])
+        columns = [SURGE, SWAY, SIX_DOF_LAYOUT.state_names.index("w")]
     else:
-        parts, places = [*to_body(north, east, x[..., HEADING])], [SURGE, SWAY]
-    for place, part in zip(places, parts, strict=True):
-        out[..., place] = part
-    return out
+        body_components, columns = [*to_body(north, east, x[..., HEADING])], [SURGE, SWAY]
+    for column, component in zip(columns, body_components, strict=True):
+        velocities[..., column] = component
+    return velocities
 
 
 @final
-class ChangedDynamics(Dynamics):
+class PerturbedDynamics(Dynamics):
     """A model with a change of its own for every block of rows.
 
     Args:
         changes: C of them; rows [C * B] are blocks of B.
-        rows: B.
+        block_size: B.
     """
 
     def __init__(
-        self, model: HybridDynamics, changes: Sequence[Change], rows: int, inputs: int
+        self, model: HybridDynamics, changes: Sequence[SystemChange], block_size: int, n_inputs: int
     ) -> None:
         super().__init__(model.dt, model.integrator)
         self.model = model
         self.n_state, self.dof, self.rolls = model.n_state, model.dof, model.rolls
-        moving = live_of(model.signals.names).moving
+        dynamic_states = get_dof(model.signals.names).dynamic_states
 
-        def each(values: Sequence[Sequence[float]]) -> Tensor:
+        def repeat_per_row(values: Sequence[Sequence[float]]) -> Tensor:
             table = torch.tensor(values, dtype=torch.float64)
-            return table.repeat_interleave(rows, dim=0)
+            return table.repeat_interleave(block_size, dim=0)
 
-        def changed(of: Callable[[Change], int | None]) -> Tensor:
-            span = range(inputs)
-            return each([[one.size * (of(one) == i) for i in span] for one in changes])
+        def size_per_input(get_input_index: Callable[[SystemChange], int | None]) -> Tensor:
+            input_indices = range(n_inputs)
+            return repeat_per_row(
+                [
+                    [change.size * (get_input_index(change) == i) for i in input_indices]
+                    for change in changes
+                ]
+            )
 
-        self.inertia = each([[1.0 + one.size * one.heavier] for one in changes])
-        self.push = each([[one.size * axis for axis in one.push] for one in changes])
-        self.gain = 1.0 + changed(lambda one: one.gain)
-        self.offset = changed(lambda one: one.offset)
-        damped = [k for k, one in enumerate(changes) if one.damping]
-        self.damps = len(damped) > 0
-        self.damped_rows = torch.tensor(damped).repeat_interleave(rows) * rows + torch.arange(
-            rows
-        ).repeat(len(damped))
+        self.inertia_factor = repeat_per_row(
+            [[1.0 + change.size * change.inertia_share] for change in changes]
+        )
+        self.push_acceleration = repeat_per_row(
+            [[change.size * axis for axis in change.push_direction] for change in changes]
+        )
+        self.input_gain = 1.0 + size_per_input(lambda one: one.gain_input)
+        self.input_offset = size_per_input(lambda one: one.offset_input)
+        damping_change_indices = [k for k, change in enumerate(changes) if change.damping]
+        self.has_damping_changes = len(damping_change_indices) > 0
+        self.damped_rows = torch.tensor(damping_change_indices).repeat_interleave(
+            block_size
+        ) * block_size + torch.arange(block_size).repeat(len(damping_change_indices))
 
-        def of_damped(values: Sequence[float], dtype: torch.dtype = torch.float64) -> Tensor:
-            return torch.tensor(values, dtype=dtype).repeat_interleave(rows)
+        def repeat_for_damped(
+            values: Sequence[float], dtype: torch.dtype = torch.float64
+        ) -> Tensor:
+            return torch.tensor(values, dtype=dtype).repeat_interleave(block_size)
 
-        by = [changes[k].by or changes[k].damping for k in damped]
-        self.damping = of_damped([moving.index(changes[k].damping) for k in damped], torch.long)
-        self.by = of_damped([moving.index(name) for name in by], torch.long)
-        self.taken = of_damped([_TAKEN.get(name, 1.0) for name in by])
-        self.damped = of_damped([changes[k].size for k in damped])
+        damping_names = [changes[k].damped_by or changes[k].damping for k in damping_change_indices]
+        self.damped_columns = repeat_for_damped(
+            [dynamic_states.index(changes[k].damping) for k in damping_change_indices], torch.long
+        )
+        self.damping_columns = repeat_for_damped(
+            [dynamic_states.index(name) for name in damping_names], torch.long
+        )
+        self.probe_shares = repeat_for_damped(
+            [_DAMPING_PROBE_SHARES.get(name, 1.0) for name in damping_names]
+        )
+        self.damping_sizes = repeat_for_damped([changes[k].size for k in damping_change_indices])
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        w = w * self.gain + self.offset
-        after, memory = self.model.step(x, w, s)
-        nu = x[:, MOVING]
-        gained = after[:, MOVING] - nu
-        if self.damps:
-            gained = gained - self._slowed(x, w, s, gained)
-        push = along_body(x, *self.push.unbind(1))[:, MOVING]
-        moved = nu + gained / self.inertia + self.dt * push
-        changed = after.clone()
+        w = w * self.input_gain + self.input_offset
+        nominal_next_state, next_memory = self.model.step(x, w, s)
+        nu = x[:, DYNAMIC_STATES]
+        velocity_increment = nominal_next_state[:, DYNAMIC_STATES] - nu
+        if self.has_damping_changes:
+            velocity_increment = velocity_increment - self._damping_perturbation(
+                x, w, s, velocity_increment
+            )
+        pushed_acceleration = resolve_in_body_axes(x, *self.push_acceleration.unbind(1))[
+            :, DYNAMIC_STATES
+        ]
+        changed_velocities = (
+            nu + velocity_increment / self.inertia_factor + self.dt * pushed_acceleration
+        )
+        changed_next_state = nominal_next_state.clone()
         if self.model.spatial:
-            moved = torch.where(self.model.live > 0.0, moved, after[:, MOVING])
-            changed[:, MOVING] = moved
-            turn = torch.zeros_like(after)
-            rates = [SIX.names.index(name) for name in "pqr"]
-            turn[:, ATTITUDE] = 0.5 * self.dt * (changed - after)[:, rates]
-            return self.model.moved_on(changed, turn), memory
+            changed_velocities = torch.where(
+                self.model.live > 0.0, changed_velocities, nominal_next_state[:, DYNAMIC_STATES]
+            )
+            changed_next_state[:, DYNAMIC_STATES] = changed_velocities
+            rotation_vector = torch.zeros_like(nominal_next_state)
+            rate_columns = [SIX_DOF_LAYOUT.state_names.index(name) for name in "pqr"]
+            rotation_vector[:, ATTITUDE] = (
+                0.5 * self.dt * (changed_next_state - nominal_next_state)[:, rate_columns]
+            )
+            return self.model.moved_on(changed_next_state, rotation_vector), next_memory
         # angles follow what their rates have gained over the step
-        known = (moved - after[:, MOVING]) @ self.model.known_rates
-        angles = after[:, MOVING] + 0.5 * self.dt * known
-        changed[:, MOVING] = torch.where(self.model.live > 0.0, moved, angles)
-        turned = turning(changed[:, MOVING], self.dof) - turning(after[:, MOVING], self.dof)
-        changed[:, HEADING] = after[:, HEADING] + 0.5 * self.dt * turned[:, 0]
-        return changed, memory
+        angle_increments = (
+            changed_velocities - nominal_next_state[:, DYNAMIC_STATES]
+        ) @ self.model.known_rates
+        changed_angles = nominal_next_state[:, DYNAMIC_STATES] + 0.5 * self.dt * angle_increments
+        changed_next_state[:, DYNAMIC_STATES] = torch.where(
+            self.model.live > 0.0, changed_velocities, changed_angles
+        )
+        yaw_rate_change = heading_rate(
+            changed_next_state[:, DYNAMIC_STATES], self.dof
+        ) - heading_rate(nominal_next_state[:, DYNAMIC_STATES], self.dof)
+        changed_next_state[:, HEADING] = (
+            nominal_next_state[:, HEADING] + 0.5 * self.dt * yaw_rate_change[:, 0]
+        )
+        return changed_next_state, next_memory
 
-    def _slowed(self, x: Tensor, w: Tensor, s: Tensor, gained: Tensor) -> Tensor:
+    def _damping_perturbation(
+        self, x: Tensor, w: Tensor, s: Tensor, velocity_increment: Tensor
+    ) -> Tensor:
         """Return what changed damping takes from the velocities gained over a step [B, n].
 
         What damps a velocity is what the step lacks without it; of surge only a part is taken away,
         for models that hold near a service speed alone.
         """
-        rows, axis, taken = self.damped_rows, self.damping, self.taken.to(x.dtype)
-        place = torch.arange(len(rows))
-        share = torch.ones(len(rows), self.dof, dtype=x.dtype)
-        share[place, self.by] = 1.0 - taken
-        still = x[rows].clone()
-        still[:, MOVING] = still[:, MOVING] * share
-        alone = self.model.step(still, w[rows], s[rows])[0][:, MOVING] - still[:, MOVING]
-        out = torch.zeros_like(gained)
-        out[rows, axis] = self.damped * (alone[place, axis] - gained[rows, axis]) / taken
-        return out
+        damped_rows, damped_columns, probe_shares = (
+            self.damped_rows,
+            self.damped_columns,
+            self.probe_shares.to(x.dtype),
+        )
+        row_indices = torch.arange(len(damped_rows))
+        velocity_shares = torch.ones(len(damped_rows), self.dof, dtype=x.dtype)
+        velocity_shares[row_indices, self.damping_columns] = 1.0 - probe_shares
+        probe_states = x[damped_rows].clone()
+        probe_states[:, DYNAMIC_STATES] = probe_states[:, DYNAMIC_STATES] * velocity_shares
+        increment_without_velocity = (
+            self.model.step(probe_states, w[damped_rows], s[damped_rows])[0][:, DYNAMIC_STATES]
+            - probe_states[:, DYNAMIC_STATES]
+        )
+        perturbation = torch.zeros_like(velocity_increment)
+        perturbation[damped_rows, damped_columns] = (
+            self.damping_sizes
+            * (
+                increment_without_velocity[row_indices, damped_columns]
+                - velocity_increment[damped_rows, damped_columns]
+            )
+            / probe_shares
+        )
+        return perturbation

@@ -14,28 +14,37 @@ from torch import Tensor
 
 from residnet.core.arrays import paged
 from residnet.core.errors import DataError, FitError, MissingPackageError
-from residnet.core.processes import free_cores, keep_freed_memory, processes
-from residnet.core.progress import Progress, begin, listen, listener, report, say
-from residnet.data.prepare import Prepared
+from residnet.core.processes import available_cores, process_pool, retain_freed_memory
+from residnet.core.progress import (
+    Progress,
+    begin_stage,
+    get_callback,
+    log_message,
+    on_progress,
+    report_progress,
+)
+from residnet.data.prepare import PreparedLog
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, restored
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.genetic import GeneticConfig
 from residnet.identification.bands import calibrate_bands
 from residnet.identification.fitter import FitStore, FittedModel, Fitter
-from residnet.identification.identified import Identified
-from residnet.identification.recipe import LONG
+from residnet.identification.identified import IdentifiedModels
+from residnet.identification.recipe import LONG_TRAINING_DURATION
 from residnet.identification.settings import FitSettings
 from residnet.training.config import TrainingConfig
 
-Logs = Mapping[str, Sequence[Prepared]]
-_LONG_TRAINING = 100_000
+Logs = Mapping[str, Sequence[PreparedLog]]
+_MIN_PARALLEL_STEPS = 100_000
 """Steps of windows that a training runs through, from which it is worth a process of its own: they
 take 13 s, and a process that imports all that it needs 4.5 s of a processor.
 """
 
 
-def fit(logs: Logs, settings: FitSettings, *, store: FitStore | None = None) -> Identified:
+def fit_models(
+    logs: Logs, settings: FitSettings, *, store: FitStore | None = None
+) -> IdentifiedModels:
     """Fit the baselines, then heads on what each leaves, then ensembles.
 
     Args:
@@ -48,49 +57,68 @@ def fit(logs: Logs, settings: FitSettings, *, store: FitStore | None = None) -> 
     """
     store = store or FitStore()
     fitter = Fitter(logs, settings, store)
-    if not final_fit(fitter.settings, logs["train"]):
-        return _fitted(fitter, logs)
-    say("  logs are short, and nothing is chosen: validation logs are fitted too")
-    whole = {**logs, "train": [*logs["train"], *logs["validation"]]}
-    return _fitted(Fitter(whole, fitter.settings, store, settle=False, seen=True), whole)
+    if not should_include_validation(fitter.settings, logs["train"]):
+        return _fit_all_parts(fitter, logs)
+    log_message("  logs are short, and nothing is chosen: validation logs are fitted too")
+    logs_with_validation = {**logs, "train": [*logs["train"], *logs["validation"]]}
+    return _fit_all_parts(
+        Fitter(
+            logs_with_validation,
+            fitter.settings,
+            store,
+            resolve_recipe=False,
+            validation_in_training=True,
+        ),
+        logs_with_validation,
+    )
 
 
-def final_fit(settings: FitSettings, train: Sequence[Prepared]) -> bool:
+def should_include_validation(settings: FitSettings, train: Sequence[PreparedLog]) -> bool:
     """Return whether a fit uses the validation logs too: the recipe's does, of short logs.
 
     A quarter of five minutes tells networks more than it tells a choice.
     """
-    seconds = sum(len(log) for log in train) * settings.prepare.grid.step
-    return settings.recipe is not None and seconds < LONG
+    training_duration = sum(len(log) for log in train) * settings.prepare.grid.step
+    return settings.recipe is not None and training_duration < LONG_TRAINING_DURATION
 
 
-def _fitted(fitter: Fitter, logs: Logs) -> Identified:
+def _fit_all_parts(fitter: Fitter, logs: Logs) -> IdentifiedModels:
     """Fit all parts on the training logs."""
     settings = fitter.settings
-    models = {"zero": fitter.zero()}
+    models = {"zero": fitter.build_constant_velocity()}
     for name in settings.all_baselines:
-        with _optional(settings, name):
-            begin(f"fitting {name}")
-            models[name] = fitter.baseline(name)
-            say(f"  {name}: {_said(models[name])}")
+        with _skip_if_optional(settings, name):
+            begin_stage(f"fitting {name}")
+            models[name] = fitter.fit_baseline(name)
+            log_message(f"  {name}: {_describe_validation(models[name])}")
     _fit_heads(fitter, logs, models)
     for name, members in settings.ensembles.items():
-        models[name] = fitter.ensemble(name, [models[member] for member in members])
-        say(f"  {name}: {_said(models[name])}")
+        models[name] = fitter.build_acceleration_ensemble(
+            name, [models[member] for member in members]
+        )
+        log_message(f"  {name}: {_describe_validation(models[name])}")
     for name, members in settings.means.items():
-        with _optional(settings, name):
-            models[name] = fitter.mean(name, [models[one] for one in members if one in models])
-            say(f"  {name}: {_said(models[name])}")
-    identified = Identified(settings, models, fitter.limit, fitter.train, fitter.seen)
+        with _skip_if_optional(settings, name):
+            models[name] = fitter.build_trajectory_ensemble(
+                name, [models[member_name] for member_name in members if member_name in models]
+            )
+            log_message(f"  {name}: {_describe_validation(models[name])}")
+    identified = IdentifiedModels(
+        settings,
+        models,
+        fitter.velocity_limits,
+        fitter.training_logs,
+        fitter.validation_in_training,
+    )
     if settings.bands is not None:
         identified.models.update(calibrate_bands(identified, logs["validation"], settings.bands))
         for model in identified.values():
-            fitter.store.keep(model)
+            fitter.store.save(model)
     return identified
 
 
 @contextmanager
-def _optional(settings: FitSettings, name: str) -> Iterator[None]:
+def _skip_if_optional(settings: FitSettings, name: str) -> Iterator[None]:
     """Leave a model out that the recipe can do without, or whose optional package is not installed.
 
     The recipe does without what the logs do not determine, except its first model. A head of kind
@@ -102,54 +130,66 @@ def _optional(settings: FitSettings, name: str) -> Iterator[None]:
     except MissingPackageError as error:
         if not (isinstance(head, GeneticConfig) and head.optional):
             raise
-        say(f"  {name} is left out: {error}")
+        log_message(f"  {name} is left out: {error}")
     except (DataError, FitError) as error:
         if settings.recipe is None or name == "baseline":
             raise
-        say(f"  {name} is left out: {error}")
+        log_message(f"  {name} is left out: {error}")
 
 
-def _said(fitted: FittedModel) -> str:
-    diverged = fitted.notes.get("validation_diverged", 0)
-    lost = f" ({diverged} windows DIVERGED)" if diverged else ""
-    return f"validation free-run error {fitted.notes['validation']:.4f}{lost}"
+def _describe_validation(fitted_model: FittedModel) -> str:
+    n_diverged = fitted_model.notes.get("validation_diverged", 0)
+    diverged_text = f" ({n_diverged} windows DIVERGED)" if n_diverged else ""
+    return f"validation free-run error {fitted_model.notes['validation']:.4f}{diverged_text}"
 
 
 def _fit_heads(fitter: Fitter, logs: Logs, models: dict[str, FittedModel]) -> None:
     """Fit the heads whose baseline is there, long trainings but one in processes of their own."""
-    settings, threads = fitter.settings, torch.get_num_threads()
-    heads = [name for name in settings.heads if settings.baseline_name_of(name) in models]
-    places = side_by_side(fitter)
-    long = [
+    settings, n_threads = fitter.settings, torch.get_num_threads()
+    head_names = [name for name in settings.heads if settings.get_baseline_name(name) in models]
+    n_parallel = count_parallel_heads(fitter)
+    long_heads = [
         name
-        for name in heads
-        if places > 1 and is_long(fitter, name) and fitter.store.finished(name) is None
+        for name in head_names
+        if n_parallel > 1
+        and is_long_training(fitter, name)
+        and fitter.store.load_finished(name) is None
     ]
     # this process trains the first itself, where each of the others has one
-    apart = long[1:] if len(long) <= places else long
-    given = (dict(logs), settings, fitter.store.training_folder, threads)
-    with _heard() if apart else nullcontext() as wire:
-        workers = min(places, len(apart))
-        pooled = processes(workers, _begin, (*given, wire)) if apart else nullcontext()
-        with pooled as pool:
-            there: dict[str, Any] = {}
-            for name in apart:
-                base = models[settings.baseline_name_of(name)]
-                if pool is not None:
-                    there[name] = pool.submit(_fit_there, name, _sent(base))
-            for name in heads:
-                begin(f"fitting {name}")
-                with _optional(settings, name):
-                    if name in there:
-                        models[name] = _opened(there[name].result())
-                        fitter.store.keep(models[name])
+    worker_heads = long_heads[1:] if len(long_heads) <= n_parallel else long_heads
+    initializer_arguments = (dict(logs), settings, fitter.store.training_folder, n_threads)
+    with _forward_progress() if worker_heads else nullcontext() as progress_queue:
+        n_workers = min(n_parallel, len(worker_heads))
+        executor_context = (
+            process_pool(n_workers, _initialize_worker, (*initializer_arguments, progress_queue))
+            if worker_heads
+            else nullcontext()
+        )
+        with executor_context as executor:
+            futures: dict[str, Any] = {}
+            for name in worker_heads:
+                fitted_baseline = models[settings.get_baseline_name(name)]
+                if executor is not None:
+                    futures[name] = executor.submit(
+                        _submit_to_worker, name, _serialize_model(fitted_baseline)
+                    )
+            for name in head_names:
+                begin_stage(f"fitting {name}")
+                with _skip_if_optional(settings, name):
+                    if name in futures:
+                        models[name] = _deserialize_model(futures[name].result())
+                        fitter.store.save(models[name])
                     else:
-                        models[name] = fitter.head(name, models[settings.baseline_name_of(name)])
-                    seconds = models[name].notes["seconds"]
-                    say(f"  {name}: {_said(models[name])} after {seconds:.1f} s")
+                        models[name] = fitter.fit_head(
+                            name, models[settings.get_baseline_name(name)]
+                        )
+                    fit_duration = models[name].notes["seconds"]
+                    log_message(
+                        f"  {name}: {_describe_validation(models[name])} after {fit_duration:.1f} s"
+                    )
 
 
-def side_by_side(fitter: Fitter) -> int:
+def count_parallel_heads(fitter: Fitter) -> int:
     """Return how many heads are to be fitted at a time.
 
     Only what takes longer than a process needs to start is worth one. Large logs lie in files that
@@ -157,80 +197,107 @@ def side_by_side(fitter: Fitter) -> int:
     """
     settings = fitter.settings
     trainings = [settings.training.get(name, TrainingConfig()) for name in settings.heads]
-    elsewhere = any(t.processes > 1 or t.device != "cpu" for t in trainings)
-    if elsewhere or len(fitter.samples) > paged.LARGE:
+    is_distributed = any(
+        training_config.processes > 1 or training_config.device != "cpu"
+        for training_config in trainings
+    )
+    if is_distributed or len(fitter.training_samples) > paged.MAX_SAMPLES_IN_MEMORY:
         return 1
-    long = sum(is_long(fitter, name) for name in settings.heads)
-    return max(min(free_cores() // torch.get_num_threads(), long), 1)
+    n_long_trainings = sum(is_long_training(fitter, name) for name in settings.heads)
+    return max(min(available_cores() // torch.get_num_threads(), n_long_trainings), 1)
 
 
-def is_long(fitter: Fitter, name: str) -> bool:
+def is_long_training(fitter: Fitter, name: str) -> bool:
     """Return whether a head is trained through so many steps that a process pays."""
     settings = fitter.settings
     if isinstance(settings.heads[name].build(fitter.signals.names), ClosedFormHead):
         return False
-    training = settings.training.get(name, TrainingConfig())
-    first = training.one_step
-    stages = [(first.epochs, first.window), *((s.epochs, s.horizon) for s in training.multi_step)]
-    steps = sum(epochs * length for epochs, length in stages) / settings.prepare.grid.step
-    return training.steps * steps >= _LONG_TRAINING
+    training_config = settings.training.get(name, TrainingConfig())
+    one_step_config = training_config.one_step
+    epochs_and_lengths = [
+        (one_step_config.epochs, one_step_config.window),
+        *((stage.epochs, stage.horizon) for stage in training_config.multi_step),
+    ]
+    steps_per_window = (
+        sum(epochs * window_duration for epochs, window_duration in epochs_and_lengths)
+        / settings.prepare.grid.step
+    )
+    return training_config.steps * steps_per_window >= _MIN_PARALLEL_STEPS
 
 
-_Sent = tuple[ModelSpec, dict[str, Any], Tensor | None, dict[str, Tensor]]
+_SerializedModel = tuple[ModelSpec, dict[str, Any], Tensor | None, dict[str, Tensor]]
 """A fitted model as it goes from one process to another: numbers in place of modules."""
 
 
-def _sent(fitted: FittedModel) -> _Sent:
-    return fitted.spec, fitted.notes, fitted.covariance, fitted.model.state_dict()
+def _serialize_model(fitted_model: FittedModel) -> _SerializedModel:
+    return (
+        fitted_model.spec,
+        fitted_model.notes,
+        fitted_model.covariance,
+        fitted_model.model.state_dict(),
+    )
 
 
-def _opened(sent: _Sent) -> FittedModel:
-    spec, notes, covariance, state = sent
-    model = restored(spec, state)
+def _deserialize_model(serialized: _SerializedModel) -> FittedModel:
+    spec, notes, covariance, state_dict = serialized
+    model = restored(spec, state_dict)
     assert isinstance(model, HybridDynamics)
     return FittedModel(spec, model, notes, covariance)
 
 
-_work: Callable[[str, _Sent], _Sent]
-"""Fits a head on a baseline, in a process that `_begin` has prepared."""
+_fit_in_worker: Callable[[str, _SerializedModel], _SerializedModel]
+"""Fits a head on a baseline, in a process that `_initialize_worker` has prepared."""
 
 
-def _begin(logs: Logs, settings: FitSettings, folder: Path | None, threads: int, wire: Any) -> None:
-    global _work
-    keep_freed_memory()
-    torch.set_num_threads(threads)
-    made: list[Fitter] = []
+def _initialize_worker(
+    logs: Logs, settings: FitSettings, folder: Path | None, n_threads: int, progress_queue: Any
+) -> None:
+    global _fit_in_worker
+    retain_freed_memory()
+    torch.set_num_threads(n_threads)
+    fitters: list[Fitter] = []
 
-    def work(name: str, base: _Sent) -> _Sent:
-        with listen(wire.put):
-            if not made:
-                made.append(Fitter(logs, settings, FitStore(folder), settle=False))
-            return _sent(made[0].head(name, _opened(base)))
+    def fit_head_in_worker(name: str, serialized_baseline: _SerializedModel) -> _SerializedModel:
+        with on_progress(progress_queue.put):
+            if not fitters:
+                fitters.append(Fitter(logs, settings, FitStore(folder), resolve_recipe=False))
+            return _serialize_model(
+                fitters[0].fit_head(name, _deserialize_model(serialized_baseline))
+            )
 
-    _work = work
+    _fit_in_worker = fit_head_in_worker
 
 
-def _fit_there(name: str, base: _Sent) -> _Sent:
-    return _work(name, base)
+def _submit_to_worker(name: str, serialized_baseline: _SerializedModel) -> _SerializedModel:
+    return _fit_in_worker(name, serialized_baseline)
 
 
 @contextmanager
-def _heard() -> Iterator[Any]:
+def _forward_progress() -> Iterator[Any]:
     """Hold a queue whose reports of progress reach who listens to this process."""
-    callback, over = listener(), Event()
-    wire: Any = get_context("spawn").SimpleQueue()
+    callback, stop_event = get_callback(), Event()
+    progress_queue: Any = get_context("spawn").SimpleQueue()
 
     def hand_on() -> None:
-        with listen(callback):
-            while not over.wait(0.0 if not wire.empty() else 0.1) or not wire.empty():
-                while not wire.empty():
-                    one: Progress = wire.get()
-                    report(one.stage, one.done, one.total, one.message, one.score)
+        with on_progress(callback):
+            while (
+                not stop_event.wait(0.0 if not progress_queue.empty() else 0.1)
+                or not progress_queue.empty()
+            ):
+                while not progress_queue.empty():
+                    progress: Progress = progress_queue.get()
+                    report_progress(
+                        progress.stage,
+                        progress.done,
+                        progress.total,
+                        progress.message,
+                        progress.score,
+                    )
 
     thread = Thread(target=hand_on, daemon=True)
     thread.start()
     try:
-        yield wire
+        yield progress_queue
     finally:
-        over.set()
+        stop_event.set()
         thread.join(1.0)

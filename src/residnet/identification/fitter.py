@@ -18,25 +18,25 @@ import torch
 from torch import Tensor, nn
 
 from residnet.baselines import BaselineConfig
-from residnet.baselines.given import StillConfig
+from residnet.baselines.given import ZeroBaselineConfig
 from residnet.core.arrays import paged
 from residnet.core.errors import FitError
-from residnet.core.progress import say
+from residnet.core.progress import log_message
 from residnet.core.samples import Samples
-from residnet.data.prepare import Prepared, envelope, samples
+from residnet.data.prepare import PreparedLog, compute_training_ranges, make_samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, rebuilt
 from residnet.heads.base import ClosedFormHead
-from residnet.identification.prepared import PreparedSplits, velocity_limit
-from residnet.identification.recipe import Facts
+from residnet.identification.prepared import PreparedSplits, compute_velocity_limits
+from residnet.identification.recipe import TrainingDataSummary
 from residnet.identification.settings import FitSettings
 from residnet.judge.band import Band
-from residnet.judge.freerun import Candidate, Errors, free_run
-from residnet.judge.protocol import EvaluationConfig, all_windows
+from residnet.judge.freerun import Candidate, FreeRunErrors, run_free_runs
+from residnet.judge.protocol import EvaluationConfig, make_windows
 from residnet.regression.estimator import Coefficient, Solution
-from residnet.regression.sparse import coefficient_row
+from residnet.regression.sparse import coefficient_to_dict
 from residnet.training.config import TrainingConfig
 from residnet.training.refit import free_run_starts, parametric, refit
 from residnet.training.score import Score, Shown
@@ -79,45 +79,50 @@ class FitStore:
     def __init__(self, training_folder: Path | None = None) -> None:
         self.training_folder = training_folder
 
-    def finished(self, name: str) -> FittedModel | None:
+    def load_finished(self, name: str) -> FittedModel | None:
         """Return a head that an earlier, interrupted fit had finished; None where it had not."""
         return None
 
-    def keep(self, fitted: FittedModel) -> None:
+    def save(self, fitted_model: FittedModel) -> None:
         """Keep a model that is done."""
 
 
-_FIRST = "baseline"
+_FIRST_BASELINE = "baseline"
 
 
-def references(models: Iterable[FittedModel]) -> dict[str, str]:
+def find_reference_names(models: Iterable[FittedModel]) -> dict[str, str]:
     """Return the name of each model's reference.
 
     A head is compared with the baseline that it was fitted on; an ensemble, which stands on none,
     with the baseline of the run that does best on the validation data; any other model with the
     run's first baseline, which itself has no reference.
     """
-    known = {one.name: one for one in models}
+    models_by_name = {model.name: model for model in models}
     # a baseline that diverged is the worse one, whatever its error
-    validated = {
+    validation_scores = {
         name: (
-            int(one.notes.get("validation_diverged", 0)),
-            float(one.notes.get("validation", math.inf)),
+            int(model.notes.get("validation_diverged", 0)),
+            float(model.notes.get("validation", math.inf)),
         )
-        for name, one in known.items()
-        if one.spec.role == "baseline"
+        for name, model in models_by_name.items()
+        if model.spec.role == "baseline"
     }
-    best = min(validated, key=lambda name: validated[name], default=_FIRST)
-    out = {}
-    for name, one in known.items():
-        named = {"head": str(one.notes.get("baseline", _FIRST)), "ensemble": best}
-        reference = named.get(one.spec.role, _FIRST)
-        if name != reference and reference in known:
-            out[name] = reference
-    return out
+    best_baseline = min(
+        validation_scores, key=lambda name: validation_scores[name], default=_FIRST_BASELINE
+    )
+    reference_names = {}
+    for name, model in models_by_name.items():
+        reference_by_role = {
+            "head": str(model.notes.get("baseline", _FIRST_BASELINE)),
+            "ensemble": best_baseline,
+        }
+        reference_name = reference_by_role.get(model.spec.role, _FIRST_BASELINE)
+        if name != reference_name and reference_name in models_by_name:
+            reference_names[name] = reference_name
+    return reference_names
 
 
-def residual_samples(model: HybridDynamics, known: Samples) -> Samples:
+def compute_residual_samples(model: HybridDynamics, samples: Samples) -> Samples:
     """Return samples whose target is what the model's baseline leaves.
 
     That is an acceleration (document 003 (19)) or a force (document 002 (3.20)), as the model's
@@ -125,24 +130,24 @@ def residual_samples(model: HybridDynamics, known: Samples) -> Samples:
 
     Args:
         model: with its baseline filled in.
-        known: samples whose target is the measured acceleration.
+        samples: samples whose target is the measured acceleration.
     """
     with torch.no_grad():
-        explained = paged.rows(len(known), known.target.shape[1])
-        for rows in paged.row_pieces(len(known)):
-            explained[rows] = model.baseline(known.z[rows])
-            paged.forget()
-        return model.head.residual_target(known, explained)
+        baseline_accelerations = paged.allocate_rows(len(samples), samples.target.shape[1])
+        for row_slice in paged.iterate_row_chunks(len(samples)):
+            baseline_accelerations[row_slice] = model.baseline(samples.z[row_slice])
+            paged.release_pages()
+        return model.head.residual_samples(samples, baseline_accelerations)
 
 
-class ValidationScore:
+class ValidationScorer:
     """The free-run score of a model on the validation logs; the windows are laid out once.
 
     Args:
         config: its `selection` protocol and scales are used.
-        step: of the grid in s.
-        limit: size of what moves [n] beyond which a free run has diverged.
-        dense: windows overlap, so that few logs tell more.
+        dt: of the grid in s.
+        velocity_limits: size of what moves [n] beyond which a free run has diverged.
+        use_overlapping_windows: windows overlap, so that few logs tell more.
 
     Raises:
         DataError: where no log holds a window of the protocol.
@@ -150,41 +155,50 @@ class ValidationScore:
 
     def __init__(
         self,
-        logs: Sequence[Prepared],
+        logs: Sequence[PreparedLog],
         config: EvaluationConfig,
-        step: float,
-        limit: np.ndarray,
+        dt: float,
+        velocity_limits: np.ndarray,
         *,
-        dense: bool = False,
+        use_overlapping_windows: bool = False,
     ) -> None:
         self.logs = logs
-        self.step = step
-        self.limit = limit
-        self.scales = config.scales.array()
+        self.dt = dt
+        self.velocity_limits = velocity_limits
+        self.state_scales = config.scales.to_array()
         protocol = config.protocols[config.selection]
-        self.windows = all_windows(protocol, logs, step, config.selection, dense=dense)
+        self.windows = make_windows(
+            protocol, logs, dt, config.selection, is_overlapping=use_overlapping_windows
+        )
 
     def __call__(self, model: HybridDynamics) -> Score:
         """Return the divergences and the mean nrmse of the validation windows, run in float32."""
         candidate = Candidate("validated", "head", model)
-        predictions = free_run(
-            [candidate], self.windows, self.logs, self.step, self.limit, dtype=torch.float32
+        predictions = run_free_runs(
+            [candidate], self.windows, self.logs, self.dt, self.velocity_limits, dtype=torch.float32
         )
-        errors = Errors.of(self.windows, predictions["validated"], self.logs)
-        diverged = sum(prediction.diverged for prediction in predictions["validated"])
-        live = errors.live
-        axes = (errors.rmse.mean(0) / self.scales)[live.axes]
-        window, states = self.windows[0], predictions["validated"][0].states
-        measured = self.logs[window.log].y[window.start : window.start + len(states)]
-        pairs = (torch.from_numpy(part[:, live.columns]).T for part in (measured, states))
-        columns = dict(zip(live.moving, zip(*pairs, strict=True), strict=True))
-        columns = {name: columns[name] for name in live.channels}
-        shown = Shown(self.step * torch.arange(len(states)), columns)
-        named = dict(zip(live.channels, axes.tolist(), strict=True))
-        return Score(diverged, float(axes.mean()), named, shown)
+        errors = FreeRunErrors.from_predictions(self.windows, predictions["validated"], self.logs)
+        n_diverged = sum(prediction.has_diverged for prediction in predictions["validated"])
+        dof = errors.dof
+        normalized_rmse = (errors.rmse.mean(0) / self.state_scales)[dof.active_indices]
+        window, predicted_states = self.windows[0], predictions["validated"][0].states
+        measured = self.logs[window.log_index].y[
+            window.start : window.start + len(predicted_states)
+        ]
+        measured_and_predicted = (
+            torch.from_numpy(trajectory[:, dof.dynamic_columns]).T
+            for trajectory in (measured, predicted_states)
+        )
+        columns = dict(
+            zip(dof.dynamic_states, zip(*measured_and_predicted, strict=True), strict=True)
+        )
+        columns = {name: columns[name] for name in dof.active_states}
+        example = Shown(self.dt * torch.arange(len(predicted_states)), columns)
+        nrmse_by_channel = dict(zip(dof.active_states, normalized_rmse.tolist(), strict=True))
+        return Score(n_diverged, float(normalized_rmse.mean()), nrmse_by_channel, example)
 
 
-def burden(members: Sequence[FittedModel]) -> FittedModel | None:
+def find_harmful_member(members: Sequence[FittedModel]) -> FittedModel | None:
     """Return the member that errs most, where it harms the mean even if errors are independent.
 
     The variance of a mean of K is the sum of theirs over K**2: to leave out the largest lowers it
@@ -192,63 +206,85 @@ def burden(members: Sequence[FittedModel]) -> FittedModel | None:
     """
     if len(members) < 2:
         return None
-    worst = max(members, key=lambda one: one.notes["validation"])
-    others = sum(one.notes["validation"] ** 2 for one in members if one is not worst)
-    count = len(members)
-    most = (2 * count - 1) / (count - 1) ** 2 * others
-    return worst if worst.notes["validation"] ** 2 > most else None
+    worst_member = max(members, key=lambda one: one.notes["validation"])
+    sum_of_squares_of_others = sum(
+        member.notes["validation"] ** 2 for member in members if member is not worst_member
+    )
+    n_members = len(members)
+    max_square = (2 * n_members - 1) / (n_members - 1) ** 2 * sum_of_squares_of_others
+    return worst_member if worst_member.notes["validation"] ** 2 > max_square else None
 
 
-def choose_solution(
+def select_by_free_run(
     model: HybridDynamics,
-    part: nn.Module,
+    module: nn.Module,
     solutions: Sequence[Solution],
-    score: Callable[[HybridDynamics], Score],
+    score_model: Callable[[HybridDynamics], Score],
 ) -> tuple[Solution, dict[str, Any]]:
     """Fill a part of the model with the solution whose free run is best.
 
     What lies around the best is tried for as long as it gains.
 
     Args:
-        part: its baseline or head, which the solutions belong to.
+        module: its baseline or head, which the solutions belong to.
         solutions: at least one; a single one is taken as it is.
-        score: of a model's free runs on validation data; fewer divergences come before less error.
+        score_model: of a model's free runs on validation data; fewer divergences come before less error.
 
     Returns:
         The solution, and for fit.json the free-run error of each; empty where there was nothing to
         choose.
     """
-    tried: list[tuple[Solution, Score]] = []
+    scored_solutions: list[tuple[Solution, Score]] = []
 
-    def attempt(batch: Sequence[Solution]) -> None:
-        for solution in batch:
-            part.load_state_dict(solution.state, strict=False)
-            tried.append((solution, score(model)))
+    def attempt(new_solutions: Sequence[Solution]) -> None:
+        for solution in new_solutions:
+            module.load_state_dict(solution.state, strict=False)
+            scored_solutions.append((solution, score_model(model)))
 
     attempt(solutions if len(solutions) > 1 else ())
-    centre = _best_with_neighbours(tried)
-    while centre is not None and centre[0].neighbours is not None:
-        choices = [solution.choice for solution, _ in tried]
-        attempt([solution for solution in centre[0].neighbours() if solution.choice not in choices])
-        better = _best_with_neighbours(tried)
-        if better is centre:
+    search_centre = _find_best_with_neighbours(scored_solutions)
+    while search_centre is not None and search_centre[0].neighbours is not None:
+        tried_choices = [solution.hyperparameters for solution, _ in scored_solutions]
+        attempt(
+            [
+                solution
+                for solution in search_centre[0].neighbours()
+                if solution.hyperparameters not in tried_choices
+            ]
+        )
+        new_centre = _find_best_with_neighbours(scored_solutions)
+        if new_centre is search_centre:
             break
-        centre = better
-    best = min(tried, key=itemgetter(1))[0] if tried else solutions[0]
-    part.load_state_dict(best.state, strict=False)
-    scores = [
-        {**solution.choice, "validation": found.error, "diverged": found.diverged}
-        for solution, found in tried
+        search_centre = new_centre
+    best_solution = (
+        min(scored_solutions, key=itemgetter(1))[0] if scored_solutions else solutions[0]
+    )
+    module.load_state_dict(best_solution.state, strict=False)
+    choice_records = [
+        {
+            **solution.hyperparameters,
+            "validation": solution_score.error,
+            "diverged": solution_score.diverged,
+        }
+        for solution, solution_score in scored_solutions
     ]
-    return best, {"free_run_choice": scores} if scores else {}
+    return best_solution, {"free_run_choice": choice_records} if choice_records else {}
 
 
-def _best_with_neighbours(tried: Sequence[tuple[Solution, Score]]) -> tuple[Solution, Score] | None:
+def _find_best_with_neighbours(
+    scored_solutions: Sequence[tuple[Solution, Score]],
+) -> tuple[Solution, Score] | None:
     """The best of those that have neighbours; one that has none, such as no residual at all, does
     not end the search.
     """
     return min(
-        (pair for pair in tried if pair[0].neighbours is not None), key=itemgetter(1), default=None
+        (
+            scored_solution
+            for scored_solution in scored_solutions
+            if scored_solution[0].neighbours is not None
+        ),
+        key=itemgetter(1),
+        default=None,
     )
 
 
@@ -256,45 +292,50 @@ class Fitter:
     """The single steps of a fit on one set of logs.
 
     Args:
-        logs: prepared logs by split; `train` and `validation` are used.
+        logs: prepared logs by split; `training_logs` and `validation` are used.
         store: keeps every model as it is done.
-        settle: whether the recipe's parts are yet to follow from the logs.
-        seen: the validation logs are among those of training, and judge nothing.
+        resolve_recipe: whether the recipe's parts are yet to follow from the logs.
+        validation_in_training: the validation logs are among those of training, and judge nothing.
     """
 
     def __init__(
         self,
-        logs: Mapping[str, Sequence[Prepared]],
+        logs: Mapping[str, Sequence[PreparedLog]],
         settings: FitSettings,
         store: FitStore,
         *,
-        settle: bool = True,
-        seen: bool = False,
+        resolve_recipe: bool = True,
+        validation_in_training: bool = False,
     ) -> None:
-        self.store, self.seen = store, seen
-        self.train = logs["train"]
+        self.store, self.validation_in_training = store, validation_in_training
+        self.training_logs = logs["train"]
         self.signals = settings.signals.build()
-        self.low, self.high = envelope(self.train)
-        self.limit = velocity_limit(
-            self.low, self.high, settings.evaluation.divergence, settings.signals.live
+        self.lower_limits, self.upper_limits = compute_training_ranges(self.training_logs)
+        self.velocity_limits = compute_velocity_limits(
+            self.lower_limits,
+            self.upper_limits,
+            settings.evaluation.divergence,
+            settings.signals.dof,
         )
-        self.samples = samples(self.train, self.signals)
-        self.held_back = samples(logs["validation"], self.signals)
-        if settle and settings.recipe is not None:
-            step = settings.prepare.grid.step
-            facts = Facts.of(self.samples, self.train, settings.evaluation, step)
-            settings = settings.with_parts(facts)
+        self.training_samples = make_samples(self.training_logs, self.signals)
+        self.validation_samples = make_samples(logs["validation"], self.signals)
+        if resolve_recipe and settings.recipe is not None:
+            dt = settings.prepare.grid.step
+            data_summary = TrainingDataSummary.from_logs(
+                self.training_samples, self.training_logs, settings.evaluation, dt
+            )
+            settings = settings.with_parts(data_summary)
         self.settings = settings
-        self.scales = torch.from_numpy(settings.evaluation.scales.array())
-        self.validate = ValidationScore(
+        self.state_scales = torch.from_numpy(settings.evaluation.scales.to_array())
+        self.score_on_validation = ValidationScorer(
             logs["validation"],
             settings.evaluation,
             settings.prepare.grid.step,
-            self.limit,
-            dense=settings.recipe is not None,
+            self.velocity_limits,
+            use_overlapping_windows=settings.recipe is not None,
         )
 
-    def spec(self, name: str, role: str, baseline: BaselineConfig) -> ModelSpec:
+    def build_spec(self, name: str, role: str, baseline: BaselineConfig) -> ModelSpec:
         """Return the description of a model of this fit.
 
         Args:
@@ -306,62 +347,76 @@ class Fitter:
                 "schema": "residnet.model/1",
                 "name": name,
                 "role": role,
-                "signals": settings.signals.resolved().model_dump(),
-                "baseline": baseline.resolved().model_dump(),
+                "signals": settings.signals.with_thrusters().model_dump(),
+                "baseline": baseline.without_file_references().model_dump(),
                 "head": settings.heads[name].model_dump() if role == "head" else None,
                 "dt": settings.prepare.grid.step,
                 "integrator": settings.integrator,
                 "hold": settings.prepare.hold,
-                "low": self.low.tolist(),
-                "high": self.high.tolist(),
+                "low": self.lower_limits.tolist(),
+                "high": self.upper_limits.tolist(),
             }
         )
 
-    def zero(self) -> FittedModel:
+    def build_constant_velocity(self) -> FittedModel:
         """Return the model that holds the velocities."""
-        spec = self.spec("zero", "zero", StillConfig())
-        return self._kept(FittedModel(spec, spec.build(), {}))
+        spec = self.build_spec("zero", "zero", ZeroBaselineConfig())
+        return self._save_and_reload(FittedModel(spec, spec.build(), {}))
 
-    def baseline(self, name: str = "baseline") -> FittedModel:
+    def fit_baseline(self, name: str = "baseline") -> FittedModel:
         """Identify a baseline; refit it through rollouts where the settings ask for it."""
-        spec = self.spec(name, "baseline", self.settings.all_baselines[name])
+        spec = self.build_spec(name, "baseline", self.settings.all_baselines[name])
         model = spec.build()
-        started = time.perf_counter()
-        solutions = spec.baseline.solutions(model.baseline, self.samples)
-        solution, tried = choose_solution(model, model.baseline, solutions, self.validate)
-        table, covariance = list(solution.table), None
+        start_time = time.perf_counter()
+        solutions = spec.baseline.fit_solutions(model.baseline, self.training_samples)
+        solution, choice_notes = select_by_free_run(
+            model, model.baseline, solutions, self.score_on_validation
+        )
+        coefficients, covariance = list(solution.table), None
         notes: dict[str, Any] = {
-            "samples": len(self.samples),
-            **solution.choice,
+            "samples": len(self.training_samples),
+            **solution.hyperparameters,
             **solution.notes,
-            **tried,
-            "least_squares": self.validate(model).error,
+            **choice_notes,
+            "least_squares": self.score_on_validation(model).error,
         }
         if name in self.settings.refit:
-            table, covariance = self._refit(name, model, table, notes)
-        notes["coefficients"] = [coefficient_row(entry) for entry in table]
-        notes |= self._validated(model)
-        notes["seconds"] = round(time.perf_counter() - started, 1)
-        return self._kept(FittedModel(spec, model, notes, covariance))
+            coefficients, covariance = self._refit_through_rollouts(
+                name, model, coefficients, notes
+            )
+        notes["coefficients"] = [coefficient_to_dict(entry) for entry in coefficients]
+        notes |= self._validation_notes(model)
+        notes["seconds"] = round(time.perf_counter() - start_time, 1)
+        return self._save_and_reload(FittedModel(spec, model, notes, covariance))
 
-    def _refit(
-        self, name: str, model: HybridDynamics, table: list[Coefficient], notes: dict[str, Any]
+    def _refit_through_rollouts(
+        self,
+        name: str,
+        model: HybridDynamics,
+        coefficients: list[Coefficient],
+        notes: dict[str, Any],
     ) -> tuple[list[Coefficient], torch.Tensor]:
         """Move coefficients through rollouts, to their new table and covariance."""
-        config = self.settings.refit[name]
-        store = WindowStore.gather(self.train, torch.float64)
-        refitted = refit(model, self.samples, store, config, self.scales)
+        refit_config = self.settings.refit[name]
+        window_store = WindowStore.from_logs(self.training_logs, torch.float64)
+        refitted = refit(
+            model, self.training_samples, window_store, refit_config, self.state_scales
+        )
         baseline = parametric(model)
-        notes["prior"] = config.prior
-        names = baseline.free_names()
+        notes["prior"] = refit_config.prior
+        parameter_names = baseline.free_parameter_names()
         notes["open"] = [
-            name for name, lies in zip(names, refitted.unidentifiable.tolist(), strict=True) if lies
+            name
+            for name, is_unidentified in zip(
+                parameter_names, refitted.unidentifiable.tolist(), strict=True
+            )
+            if is_unidentified
         ]
-        notes["feeding"] = [names[i] for i in refitted.notes["at_rest"]]
+        notes["feeding"] = [parameter_names[i] for i in refitted.notes["at_rest"]]
         notes["refit"] = refitted.notes
-        return baseline.updated_table(table, refitted.standard_errors), refitted.covariance
+        return baseline.refresh_table(coefficients, refitted.standard_errors), refitted.covariance
 
-    def head(self, name: str, baseline: FittedModel) -> FittedModel:
+    def fit_head(self, name: str, baseline: FittedModel) -> FittedModel:
         """Fit one head on top of a baseline, or take it from the store where it is finished there.
 
         Args:
@@ -370,51 +425,64 @@ class Fitter:
         Raises:
             FitError: where the data do not determine the head.
         """
-        finished = self.store.finished(name)
-        if finished is not None:
-            return finished
-        spec = self.spec(name, "head", self.settings.baseline_of(name))
+        finished_model = self.store.load_finished(name)
+        if finished_model is not None:
+            return finished_model
+        spec = self.build_spec(name, "head", self.settings.get_baseline_config(name))
         # seeded by the head's name, so that adding a head changes no other
         seed = self.settings.seed * 1_000 + sum(map(ord, name))
         torch.manual_seed(seed)
         model = spec.single()
         model.baseline.load_state_dict(copy.deepcopy(baseline.model.baseline.state_dict()))
-        residual = residual_samples(model, self.samples)
-        started = time.perf_counter()
+        residuals = compute_residual_samples(model, self.training_samples)
+        start_time = time.perf_counter()
         if isinstance(model.head, ClosedFormHead):
-            model.head.calibrate(residual)
+            model.head.calibrate(residuals)
             try:
-                solutions = model.head.solutions(residual)
-                solution, tried = choose_solution(model, model.head, solutions, self.validate)
+                solutions = model.head.fit_solutions(residuals)
+                solution, choice_notes = select_by_free_run(
+                    model, model.head, solutions, self.score_on_validation
+                )
             except FitError as error:
                 raise FitError(f"head {name}: {error}") from None
-            notes = solution.choice | solution.notes | tried
+            notes = solution.hyperparameters | solution.notes | choice_notes
         else:
             # its module imports Lightning, which a fit without networks must not wait for
             from residnet.training.heads import train
 
-            settings = self.settings.training.get(name, TrainingConfig())
-            dtype = torch.float64 if settings.double else torch.float32
-            windows, folder = WindowStore.gather(self.train, dtype), self.store.training_folder
+            training_config = self.settings.training.get(name, TrainingConfig())
+            dtype = torch.float64 if training_config.double else torch.float32
+            windows, folder = (
+                WindowStore.from_logs(self.training_logs, dtype),
+                self.store.training_folder,
+            )
 
-            def validate(trained: HybridDynamics) -> Score:
-                return self.validate(spec.as_one(trained))
+            def validate(trained_model: HybridDynamics) -> Score:
+                return self.score_on_validation(spec.as_one(trained_model))
 
             notes = train(
-                name, model, residual, windows, settings, self.scales, validate, seed, folder
+                name,
+                model,
+                residuals,
+                windows,
+                training_config,
+                self.state_scales,
+                validate,
+                seed,
+                folder,
             )
         notes |= {
-            "baseline": self.settings.baseline_name_of(name),
-            "seconds": round(time.perf_counter() - started, 1),
-            **self._validated(spec.as_one(model)),
+            "baseline": self.settings.get_baseline_name(name),
+            "seconds": round(time.perf_counter() - start_time, 1),
+            **self._validation_notes(spec.as_one(model)),
         }
-        return self._kept(FittedModel(spec, spec.as_one(model), notes))
+        return self._save_and_reload(FittedModel(spec, spec.as_one(model), notes))
 
-    def ensemble(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
+    def build_acceleration_ensemble(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
         """Return the mean acceleration of fitted models as one model."""
-        return self._kept(self._mean_of(name, members, "accelerations"))
+        return self._save_and_reload(self._build_ensemble(name, members, "accelerations"))
 
-    def mean(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
+    def build_trajectory_ensemble(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
         """Return the mean of what fitted models predict, each running by itself.
 
         Members that diverge on a validation window are left out, and so is one that errs so much
@@ -424,52 +492,80 @@ class Fitter:
         Raises:
             FitError: where less than two are left.
         """
-        kept = [one for one in members if not one.notes.get("validation_diverged")]
-        left = [one.name for one in members if one not in kept]
-        if left:
-            say(f"  {name}: {', '.join(left)} diverged on validation logs and is left out")
-        found = self._mean_of(name, kept) if len(kept) > 1 else None
-        while found is not None and not self.seen and (worst := burden(kept)) is not None:
-            others = [one for one in kept if one is not worst]
-            alone = self._mean_of(name, others) if len(others) > 1 else others[0]
-            if alone.notes["validation"] >= found.notes["validation"]:
-                break
-            say(f"  {name}: without {worst.name} it errs less on validation logs")
-            left, kept = [*left, worst.name], others
-            found = alone if len(kept) > 1 else None
-        if found is None:
-            raise FitError("no mean errs less on validation logs than one of its members")
-        found.notes["left_out"] = left
-        return self._kept(found)
-
-    def _mean_of(
-        self, name: str, members: Sequence[FittedModel], of: str = "trajectories"
-    ) -> FittedModel:
-        spec = self.spec(name, "ensemble", StillConfig()).model_copy(
-            update={"members": tuple(one.spec for one in members), "of": of}
+        retained_members = [
+            member for member in members if not member.notes.get("validation_diverged")
+        ]
+        excluded_names = [member.name for member in members if member not in retained_members]
+        if excluded_names:
+            log_message(
+                f"  {name}: {', '.join(excluded_names)} diverged on validation logs and is left out"
+            )
+        ensemble = (
+            self._build_ensemble(name, retained_members) if len(retained_members) > 1 else None
         )
-        parts = [copy.deepcopy(one.model).to(torch.float64) for one in members]
-        single = [p.members[0] if isinstance(p, MeanOfTrajectories) else p for p in parts]
-        model = spec.mean(single) if of == "trajectories" else mean_of(parts)
-        notes = {"members": [one.name for one in members], **self._validated(model)}
+        while (
+            ensemble is not None
+            and not self.validation_in_training
+            and (worst_member := find_harmful_member(retained_members)) is not None
+        ):
+            remaining_members = [
+                member for member in retained_members if member is not worst_member
+            ]
+            reduced_ensemble = (
+                self._build_ensemble(name, remaining_members)
+                if len(remaining_members) > 1
+                else remaining_members[0]
+            )
+            if reduced_ensemble.notes["validation"] >= ensemble.notes["validation"]:
+                break
+            log_message(f"  {name}: without {worst_member.name} it errs less on validation logs")
+            excluded_names, retained_members = (
+                [*excluded_names, worst_member.name],
+                remaining_members,
+            )
+            ensemble = reduced_ensemble if len(retained_members) > 1 else None
+        if ensemble is None:
+            raise FitError("no mean errs less on validation logs than one of its members")
+        ensemble.notes["left_out"] = excluded_names
+        return self._save_and_reload(ensemble)
+
+    def _build_ensemble(
+        self, name: str, members: Sequence[FittedModel], averaged_quantity: str = "trajectories"
+    ) -> FittedModel:
+        spec = self.build_spec(name, "ensemble", ZeroBaselineConfig()).model_copy(
+            update={"members": tuple(member.spec for member in members), "of": averaged_quantity}
+        )
+        member_models = [copy.deepcopy(member.model).to(torch.float64) for member in members]
+        trajectory_models = [
+            member_model.members[0]
+            if isinstance(member_model, MeanOfTrajectories)
+            else member_model
+            for member_model in member_models
+        ]
+        model = (
+            spec.mean(trajectory_models)
+            if averaged_quantity == "trajectories"
+            else mean_of(member_models)
+        )
+        notes = {"members": [member.name for member in members], **self._validation_notes(model)}
         return FittedModel(spec, model, notes)
 
-    def _validated(self, model: HybridDynamics) -> dict[str, Any]:
+    def _validation_notes(self, model: HybridDynamics) -> dict[str, Any]:
         """Notes on a model's free runs over the validation logs."""
-        found = self.validate(model)
-        return {"validation": found.error, "validation_diverged": found.diverged}
+        score = self.score_on_validation(model)
+        return {"validation": score.error, "validation_diverged": score.diverged}
 
-    def _kept(self, fitted: FittedModel) -> FittedModel:
+    def _save_and_reload(self, fitted_model: FittedModel) -> FittedModel:
         """Keep a model and return it as a load gives it back.
 
         What is judged is then bit for bit what is stored, and a resumed fit judges the same.
         """
-        kept = replace(fitted, model=rebuilt(fitted.spec, fitted.model))
-        self.store.keep(kept)
-        return kept
+        reloaded = replace(fitted_model, model=rebuilt(fitted_model.spec, fitted_model.model))
+        self.store.save(reloaded)
+        return reloaded
 
 
-def require_fit(logs: PreparedSplits, settings: FitSettings) -> Fitter:
+def check_fit(logs: PreparedSplits, settings: FitSettings) -> Fitter:
     """Check that prepared logs hold the manoeuvres, folds and windows that a fit asks for.
 
     The fit itself calls the same functions, so that it refuses with the same lines.
@@ -485,21 +581,21 @@ def require_fit(logs: PreparedSplits, settings: FitSettings) -> Fitter:
     fitter = Fitter(logs, settings, FitStore())
     # with the parts of the recipe for these logs, where it is asked for
     settings = fitter.settings
-    step, windows = settings.prepare.grid.step, WindowStore.gather(fitter.train)
+    dt, window_store = settings.prepare.grid.step, WindowStore.from_logs(fitter.training_logs)
     for baseline in settings.all_baselines.values():
-        baseline.require_samples(fitter.samples)
-    for moved in settings.refit.values():
-        free_run_starts(windows, moved, step)
+        baseline.validate_samples(fitter.training_samples)
+    for refit_config in settings.refit.values():
+        free_run_starts(window_store, refit_config, dt)
     for name, config in settings.heads.items():
         head = config.build(fitter.signals.names)
         if isinstance(head, ClosedFormHead):
             try:
-                head.require_samples(fitter.samples)
+                head.validate_samples(fitter.training_samples)
             except FitError as error:
                 raise FitError(f"head {name}: {error}") from None
         else:
-            training = settings.training.get(name, TrainingConfig())
-            for stage in training.windows(step):
-                if stage is not None:
-                    stage.sources(windows, training.steps)
+            training_config = settings.training.get(name, TrainingConfig())
+            for window_config in training_config.windows(dt):
+                if window_config is not None:
+                    window_config.make_samplers(window_store, training_config.steps)
     return fitter

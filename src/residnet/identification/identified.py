@@ -13,302 +13,363 @@ from torch import Tensor
 
 from residnet.core.arrays import paged
 from residnet.core.errors import UsageError
-from residnet.core.stretches import stretches
-from residnet.data.prepare import Prepared, channels
-from residnet.data.simulated import SimulatedTrials, surrounded
+from residnet.core.stretches import find_runs
+from residnet.data.prepare import PreparedLog, compute_channels
+from residnet.data.simulated import SimulatedTrials, build_plant
 from residnet.data.sources import MeasuredLogs
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.heads.base import ClosedFormHead, EquationHead
-from residnet.identification.fitter import FittedModel, references
-from residnet.identification.recipe import MEAN, SINGLE
+from residnet.identification.fitter import FittedModel, find_reference_names
+from residnet.identification.recipe import ENSEMBLE_NAME, SINGLE_MODEL_NAME
 from residnet.identification.settings import FitSettings
-from residnet.judge.band import Bands
-from residnet.judge.freerun import Candidate, FreeRun, free_run
-from residnet.judge.goodness import OneStep, table
-from residnet.judge.metrics import Judged, metrics_table
+from residnet.judge.band import BandsByModel
+from residnet.judge.freerun import Candidate, FreeRun, run_free_runs
+from residnet.judge.goodness import OneStepResiduals, build_goodness_table
+from residnet.judge.metrics import ProtocolEvaluation, build_metrics_table
 from residnet.judge.protocol import EvaluationConfig
-from residnet.judge.selection import Contender, Selection, blocks_of, choose, log_errors, shares
-from residnet.judge.soundness import Finding, Recorded, check_model
+from residnet.judge.selection import (
+    Selection,
+    SelectionCandidate,
+    block_error_shares,
+    block_log_errors,
+    make_selection_blocks,
+    select_models,
+)
+from residnet.judge.soundness import SanityFinding, TrainingPoints, check_model
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class SplitEvaluation:
     """The free runs of models over the logs of one split.
 
     Attributes:
         split: train, validation, test or external.
         logs: of the split, in the order that the windows count them in.
-        runs: free runs by protocol; protocols without a window are left out.
+        free_runs: free runs by protocol; protocols without a window are left out.
         rows: of metrics.json, without `selected`.
-        limits: contents of limits.json by protocol.
-        bands: that the models were judged with, by model and protocol.
+        limits_by_protocol: contents of limits.json by protocol.
+        bands_by_model: that the models were judged with, by model and protocol.
     """
 
     split: str
-    logs: Sequence[Prepared]
-    runs: list[FreeRun]
+    logs: Sequence[PreparedLog]
+    free_runs: list[FreeRun]
     rows: list[dict[str, Any]]
-    limits: dict[str, Any]
-    bands: Bands = field(default_factory=dict)
+    limits_by_protocol: dict[str, Any]
+    bands_by_model: BandsByModel = field(default_factory=dict)
 
     @property
-    def metrics(self) -> pd.DataFrame:
+    def metrics_table(self) -> pd.DataFrame:
         """The rows as a table, see `residnet.judge.metrics.metrics_table`."""
-        return metrics_table(self.rows)
+        return build_metrics_table(self.rows)
 
 
-def evaluate(
+def evaluate_splits(
     models: Sequence[Candidate],
-    splits: Mapping[str, Sequence[Prepared]],
+    splits: Mapping[str, Sequence[PreparedLog]],
     config: EvaluationConfig,
-    step: float,
-    limit: np.ndarray,
-) -> dict[str, Evaluation]:
+    dt: float,
+    velocity_limits: np.ndarray,
+) -> dict[str, SplitEvaluation]:
     """Free-run models over all protocols of several splits, all windows of a model side by side.
 
     Args:
-        models: to be judged, see `candidates`.
+        models: to be judged, see `make_candidates`.
         splits: their logs, at least one each.
-        step: of the grid in s.
-        limit: size of what moves [n] beyond which a free run has diverged.
+        dt: of the grid in s.
+        velocity_limits: size of what moves [n] beyond which a free run has diverged.
     """
-    laid = {
+    windows_by_split_and_protocol = {
         (split, name): [
             window
-            for number, log in enumerate(logs)
-            for window in protocol.windows(log, number, step)
+            for log_index, log in enumerate(logs)
+            for window in protocol.make_windows(log, log_index, dt)
         ]
         for split, logs in splits.items()
         for name, protocol in config.protocols.items()
     }
-    everywhere = [log for logs in splits.values() for log in logs]
-    before = dict(zip(splits, np.cumsum([0, *map(len, splits.values())]).tolist(), strict=False))
-    together = [
-        replace(window, log=window.log + before[split])
-        for (split, _), windows in laid.items()
+    all_logs = [log for logs in splits.values() for log in logs]
+    log_offsets = dict(
+        zip(splits, np.cumsum([0, *map(len, splits.values())]).tolist(), strict=False)
+    )
+    all_windows = [
+        replace(window, log_index=window.log_index + log_offsets[split])
+        for (split, _), windows in windows_by_split_and_protocol.items()
         for window in windows
     ]
-    predictions = free_run(models, together, everywhere, step, limit)
+    predictions = run_free_runs(models, all_windows, all_logs, dt, velocity_limits)
     bands = {model.name: model.bands for model in models}
-    scales = config.scales.named()
-    found = {split: Evaluation(split, logs, [], [], {}, bands) for split, logs in splits.items()}
-    begin = 0
-    for (split, name), windows in laid.items():
+    scales = config.scales.to_dict()
+    evaluations = {
+        split: SplitEvaluation(split, logs, [], [], {}, bands) for split, logs in splits.items()
+    }
+    first_window = 0
+    for (split, name), windows in windows_by_split_and_protocol.items():
         if not windows:
             continue
-        end = begin + len(windows)
-        own = {model: part[begin:end] for model, part in predictions.items()}
-        begin, out, logs = end, found[split], splits[split]
-        run = FreeRun(name, split, windows, own)
-        out.runs.append(run)
-        judged = Judged(run, models, logs, scales)
-        out.rows.extend(judged.rows(config.groups))
-        out.limits[name] = judged.limits(step)
-    return found
+        last_window = first_window + len(windows)
+        predictions_of_run = {
+            model: model_predictions[first_window:last_window]
+            for model, model_predictions in predictions.items()
+        }
+        first_window, evaluation, logs = last_window, evaluations[split], splits[split]
+        free_run_ = FreeRun(name, split, windows, predictions_of_run)
+        evaluation.free_runs.append(free_run_)
+        protocol_evaluation = ProtocolEvaluation(free_run_, models, logs, scales)
+        evaluation.rows.extend(protocol_evaluation.build_rows(config.groups))
+        evaluation.limits_by_protocol[name] = protocol_evaluation.build_limits(dt)
+    return evaluations
 
 
-def candidates(
-    fitted: Iterable[FittedModel], data: MeasuredLogs | SimulatedTrials | None = None
+def make_candidates(
+    fitted_models: Iterable[FittedModel], data: MeasuredLogs | SimulatedTrials | None = None
 ) -> list[Candidate]:
     """Return the models to judge, each with the one that it is compared with.
 
     Args:
-        data: where the logs came from; simulated trials add the plant that made them as `truth`.
+        data: where the logs came from; simulated trials add the plant that made them as `plant_candidate`.
     """
-    models = {entry.name: entry for entry in fitted}
-    compared_with = references(models.values())
-    unlike = unlike_models(models.values())
-    out = [
+    models_by_name = {fitted_model.name: fitted_model for fitted_model in fitted_models}
+    reference_names = find_reference_names(models_by_name.values())
+    spread_members = spread_member_names(models_by_name.values())
+    candidate_models = [
         Candidate(
             name,
-            entry.spec.role,
-            entry.model,
-            reference=compared_with.get(name),
-            ranges=entry.spec.ranges,
-            bands=entry.bands,
-            members=members_of(entry),
-            unlike=unlike,
+            fitted_model.spec.role,
+            fitted_model.model,
+            reference=reference_names.get(name),
+            training_ranges=fitted_model.spec.ranges,
+            bands=fitted_model.bands,
+            members=trajectory_member_names(fitted_model),
+            spread_members=spread_members,
         )
-        for name, entry in models.items()
+        for name, fitted_model in models_by_name.items()
     ]
-    truth = _truth(data) if isinstance(data, SimulatedTrials) else None
-    return out if truth is None else [*out, truth]
+    plant_candidate = _make_plant_candidate(data) if isinstance(data, SimulatedTrials) else None
+    return candidate_models if plant_candidate is None else [*candidate_models, plant_candidate]
 
 
-def members_of(entry: FittedModel) -> tuple[str, ...]:
+def trajectory_member_names(fitted_model: FittedModel) -> tuple[str, ...]:
     """Return the models whose trajectories a model is the mean of; empty for any other."""
-    return tuple(one.name for one in entry.spec.members if entry.spec.of == "trajectories")
+    return tuple(
+        member.name
+        for member in fitted_model.spec.members
+        if fitted_model.spec.of == "trajectories"
+    )
 
 
-def unlike_models(fitted: Iterable[FittedModel]) -> tuple[str, ...]:
+def spread_member_names(fitted_models: Iterable[FittedModel]) -> tuple[str, ...]:
     """Return the models whose distance tells where logs did not determine the motion.
 
     They are those that can quickly be fitted again without some of the logs: baselines and heads of
     closed form. Bands know of each how far they lie apart in free runs over logs left out.
     """
-    return tuple(one.name for one in fitted if one.spec.role == "baseline" or closed_form(one))
+    return tuple(
+        fitted_model.name
+        for fitted_model in fitted_models
+        if fitted_model.spec.role == "baseline" or has_closed_form_head(fitted_model)
+    )
 
 
-def closed_form(entry: FittedModel) -> bool:
+def has_closed_form_head(fitted_model: FittedModel) -> bool:
     """Return whether a model has a head of closed form that is solved again in no time."""
-    head = entry.model.head
-    quick = isinstance(head, ClosedFormHead) and not isinstance(head, EquationHead)
-    return entry.spec.role == "head" and quick
+    head = fitted_model.model.head
+    is_quickly_refitted = isinstance(head, ClosedFormHead) and not isinstance(head, EquationHead)
+    return fitted_model.spec.role == "head" and is_quickly_refitted
 
 
-def _truth(data: SimulatedTrials) -> Candidate | None:
+def _make_plant_candidate(data: SimulatedTrials) -> Candidate | None:
     """The plant that made the logs; None where a log does not show all of its state."""
-    plant = surrounded(data.vessel, data.disturbance)
-    if any(name.startswith("_") for name in plant.state):
+    plant = build_plant(data.vessel, data.disturbance)
+    if any(name.startswith("_") for name in plant.state_names):
         # no log shows what is under way in a delay line, so that the plant could not start from one
         return None
-    commands = plant.inputs[: plant.commands]
+    command_names = plant.input_names[: plant.n_commands]
     model = RecordedPlantDynamics(plant, data.step, data.substeps)
-    unknown = len(plant.inputs) - len(commands)
-    return Candidate("truth", "truth", model, plant.state, commands, unknown, "baseline")
+    n_unknown_inputs = len(plant.input_names) - len(command_names)
+    return Candidate(
+        "truth", "truth", model, plant.state_names, command_names, n_unknown_inputs, "baseline"
+    )
 
 
-_CHECKED = ("train", "validation")
+_DIVERGENCE_CHECKED_SPLITS = ("train", "validation")
 """Splits whose windows may not diverge; what the test data show comes too late for a choice."""
 
 
-def family(entry: FittedModel) -> str:
+def model_family(fitted_model: FittedModel) -> str:
     """Return what a model is, in the words of `residnet.judge.selection.FAMILIES`."""
-    if isinstance(entry.model, MeanOfTrajectories):
+    if isinstance(fitted_model.model, MeanOfTrajectories):
         return "ensemble"
-    if entry.spec.role != "head":
-        refitted = entry.spec.role == "baseline" and "refit" in entry.notes
-        return "refitted baseline" if refitted else str(entry.spec.role)
-    return "closed-form head" if isinstance(entry.model.head, ClosedFormHead) else "network"
+    if fitted_model.spec.role != "head":
+        is_refitted = fitted_model.spec.role == "baseline" and "refit" in fitted_model.notes
+        return "refitted baseline" if is_refitted else str(fitted_model.spec.role)
+    return "closed-form head" if isinstance(fitted_model.model.head, ClosedFormHead) else "network"
 
 
-def parameter_count(model: HybridDynamics) -> int:
+def count_parameters(model: HybridDynamics) -> int:
     """Return the number of fitted parameters of baseline and head together."""
     if isinstance(model, MeanOfTrajectories):
-        return sum(map(parameter_count, model.members))
-    of_head = (
-        sum(model.head.parameter_count())
+        return sum(map(count_parameters, model.members))
+    n_head_parameters = (
+        sum(model.head.parameter_counts())
         if isinstance(model.head, ClosedFormHead)
         else sum(parameter.numel() for parameter in model.head.parameters())
     )
-    return round(sum(model.baseline.parameter_count()) + of_head)
+    return round(sum(model.baseline.parameter_counts()) + n_head_parameters)
 
 
 @dataclass(frozen=True)
-class Identified(Mapping[str, FittedModel]):
+class IdentifiedModels(Mapping[str, FittedModel]):
     """The fitted models by name: zero, baselines, heads and ensembles, in this order.
 
     Attributes:
         settings: of the fit.
         models: by name.
-        limit: size of what moves [n] beyond which a free run has diverged.
-        train: the logs that fitted them.
-        seen: whether the validation logs are among them.
+        velocity_limits: size of what moves [n] beyond which a free run has diverged.
+        training_logs: the logs that fitted them.
+        validation_in_training: whether the validation logs are among them.
     """
 
     settings: FitSettings
     models: dict[str, FittedModel]
-    limit: np.ndarray
-    train: Sequence[Prepared]
-    seen: bool = False
+    velocity_limits: np.ndarray
+    training_logs: Sequence[PreparedLog]
+    validation_in_training: bool = False
 
     def evaluate(
         self,
-        splits: Mapping[str, Sequence[Prepared]],
+        splits: Mapping[str, Sequence[PreparedLog]],
         data: MeasuredLogs | SimulatedTrials | None = None,
-    ) -> dict[str, Evaluation]:
+    ) -> dict[str, SplitEvaluation]:
         """Free-run all models over the logs of several splits, side by side.
 
         Args:
             splits: logs by split, prepared as those of the fit.
-            data: where the logs came from; simulated trials add the plant as `truth`.
+            data: where the logs came from; simulated trials add the plant as `plant_candidate`.
         """
         settings = self.settings
-        return evaluate(
-            candidates(self.values(), data),
+        return evaluate_splits(
+            make_candidates(self.values(), data),
             splits,
             settings.evaluation,
             settings.prepare.grid.step,
-            self.limit,
+            self.velocity_limits,
         )
 
     @cached_property
-    def findings(self) -> dict[str, list[Finding]]:
+    def sanity_findings(self) -> dict[str, list[SanityFinding]]:
         """What the checks for physical sanity find, by model; `zero` is left out."""
-        fitted = list(self.values())
+        fitted_models = list(self.values())
         settings = self.settings
-        recorded = Recorded.of(self.train, settings.prepare.grid.step)
+        training_points = TrainingPoints.from_logs(self.training_logs, settings.prepare.grid.step)
         return {
-            one.name: check_model(one.spec, one.model, recorded, settings.evaluation.divergence)
-            for one in fitted
-            if one.spec.role != "zero"
+            fitted_model.name: check_model(
+                fitted_model.spec,
+                fitted_model.model,
+                training_points,
+                settings.evaluation.divergence,
+            )
+            for fitted_model in fitted_models
+            if fitted_model.spec.role != "zero"
         }
 
-    def select(self, judged: Mapping[str, Evaluation]) -> Selection:
+    def select_models(self, evaluations: Mapping[str, SplitEvaluation]) -> Selection:
         """Choose a single model and an ensemble by their free runs over the validation logs.
 
         The recipe chooses neither: the evidence is smaller than its noise. Its hull is the single
         model, unless it diverged in a window, and its mean the ensemble.
 
         Args:
-            judged: what `evaluate` returned, by split; `validation` is needed, and divergences on
-                `train` count where it is there.
+            evaluations: what `evaluate_splits` returned, by split; `validation` is needed, and divergences on
+                `training_logs` count where it is there.
 
         Raises:
             UsageError: where the validation logs have not been judged.
         """
         config = self.settings.evaluation
-        validation = judged.get("validation")
-        runs = [] if validation is None else validation.runs
-        run = next((run for run in runs if run.protocol == config.selection), None)
-        if validation is None or run is None:
+        validation = evaluations.get("validation")
+        validation_runs = [] if validation is None else validation.free_runs
+        selection_run = next(
+            (
+                selection_run
+                for selection_run in validation_runs
+                if selection_run.protocol == config.selection
+            ),
+            None,
+        )
+        if validation is None or selection_run is None:
             raise UsageError(
                 f"select: no free runs over validation logs by protocol '{config.selection}';"
                 " evaluate the validation split first"
             )
-        blocks, labels = blocks_of(run)
-        counted = {split: judged[split].runs for split in _CHECKED if split in judged}
-        scales = config.scales.named()
-        parts = {
-            name: shares(run, name, validation.logs, scales, labels, len(blocks.weights))
+        blocks, block_numbers = make_selection_blocks(selection_run)
+        checked_runs = {
+            split: evaluations[split].free_runs
+            for split in _DIVERGENCE_CHECKED_SPLITS
+            if split in evaluations
+        }
+        scales = config.scales.to_dict()
+        error_shares = {
+            name: block_error_shares(
+                selection_run, name, validation.logs, scales, block_numbers, len(blocks.weights)
+            )
             for name in self
         }
-        scores = log_errors(parts, blocks.weights)
-        contenders = []
-        for entry in self.values():
-            lost = [
-                (n, f"{n} of its {len(free.windows)} {split} windows diverged ({free.protocol})")
-                for split, runs in counted.items()
-                for free in runs
-                if (n := sum(one.diverged for one in free.predictions[entry.name]))
+        block_scores = block_log_errors(error_shares, blocks.weights)
+        candidates = []
+        for fitted_model in self.values():
+            divergences = [
+                (
+                    n_diverged,
+                    f"{n_diverged} of its {len(free_run_.windows)} {split} windows diverged ({free_run_.protocol})",
+                )
+                for split, validation_runs in checked_runs.items()
+                for free_run_ in validation_runs
+                if (
+                    n_diverged := sum(
+                        item.has_diverged for item in free_run_.predictions[fitted_model.name]
+                    )
+                )
             ]
-            found_wrong = [one.fault for one in self.findings.get(entry.name, ()) if one.fault]
-            contenders.append(
-                Contender(
-                    entry.name,
-                    family(entry),
-                    parameter_count(entry.model),
-                    float(parts[entry.name].sum()),
-                    scores[entry.name],
-                    sum(n for n, _ in lost),
-                    (*(said for _, said in lost), *found_wrong),
+            sanity_faults = [
+                item.fault for item in self.sanity_findings.get(fitted_model.name, ()) if item.fault
+            ]
+            candidates.append(
+                SelectionCandidate(
+                    fitted_model.name,
+                    model_family(fitted_model),
+                    count_parameters(fitted_model.model),
+                    float(error_shares[fitted_model.name].sum()),
+                    block_scores[fitted_model.name],
+                    sum(n_diverged for n_diverged, _ in divergences),
+                    (*(divergence_text for _, divergence_text in divergences), *sanity_faults),
                 )
             )
-        found = choose(contenders, blocks)
-        if self.settings.recipe is None or MEAN not in self.models:
-            return found
-        found = replace(found, selected_ensemble=MEAN, leading=MEAN)
-        hull = next((one for one in found.contenders if one.name == SINGLE), None)
-        if hull is None or hull.diverged:
-            return found
-        against = f"; against it speaks: {'; '.join(hull.faults)}" if hull.faults else ""
+        selection = select_models(candidates, blocks)
+        if self.settings.recipe is None or ENSEMBLE_NAME not in self.models:
+            return selection
+        selection = replace(
+            selection, selected_ensemble=ENSEMBLE_NAME, default_ensemble=ENSEMBLE_NAME
+        )
+        hull_candidate = next(
+            (item for item in selection.candidates if item.name == SINGLE_MODEL_NAME), None
+        )
+        if hull_candidate is None or hull_candidate.n_diverged:
+            return selection
+        faults_text = (
+            f"; against it speaks: {'; '.join(hull_candidate.faults)}"
+            if hull_candidate.faults
+            else ""
+        )
         return replace(
-            found, selected=SINGLE, reason=f"{SINGLE} is the recipe's single model{against}."
+            selection,
+            selected=SINGLE_MODEL_NAME,
+            reason=f"{SINGLE_MODEL_NAME} is the recipe's single model{faults_text}.",
         )
 
     def __getitem__(self, name: str) -> FittedModel:
@@ -322,21 +383,21 @@ class Identified(Mapping[str, FittedModel]):
 
 
 @dataclass(frozen=True)
-class TeacherForced:
+class TeacherForcedRun:
     """What a model computes along the measured states of a log, its memory empty at first.
 
     Attributes:
-        z: channels that baseline and head see [T, nz].
-        baseline: accelerations of the baseline [T, n].
-        predicted: accelerations of baseline and head together [T, n].
+        channels: channels that baseline and head see [T, nz].
+        baseline_accelerations: accelerations of the baseline [T, n].
+        predicted_accelerations: accelerations of baseline and head together [T, n].
     """
 
-    z: Tensor
-    baseline: np.ndarray
-    predicted: np.ndarray
+    channels: Tensor
+    baseline_accelerations: np.ndarray
+    predicted_accelerations: np.ndarray
 
 
-def teacher_forced(model: HybridDynamics, log: Prepared) -> TeacherForced:
+def run_teacher_forced(model: HybridDynamics, log: PreparedLog) -> TeacherForcedRun:
     """Run a model along a log without letting it move the vessel.
 
     Args:
@@ -344,87 +405,104 @@ def teacher_forced(model: HybridDynamics, log: Prepared) -> TeacherForced:
         log: gaps are filled with 0; what is predicted there means nothing.
     """
     model = model.to(torch.float64)
-    z = channels(log, model.signals)
+    z = compute_channels(log, model.signals)
     with torch.no_grad():
-        baseline = model.known(z).numpy()
-        predicted = model.one_step(z[None])[0].numpy()
-    return TeacherForced(z, baseline, predicted)
+        baseline_accelerations = model.known(z).numpy()
+        predicted_accelerations = model.one_step(z[None])[0].numpy()
+    return TeacherForcedRun(z, baseline_accelerations, predicted_accelerations)
 
 
-def residual_table(
-    fitted: Iterable[FittedModel], logs: Sequence[Prepared], most: int = 1500
+def build_residual_table(
+    fitted_models: Iterable[FittedModel], logs: Sequence[PreparedLog], max_samples: int = 1500
 ) -> pd.DataFrame:
     """Return residual targets against what each head predicts along the measured states.
 
     Every head runs teacher-forced over each log.
 
     Args:
-        fitted: models; those without a head are left out.
-        most: about how many samples of each model and axis are kept, evenly spaced.
+        fitted_models: models; those without a head are left out.
+        max_samples: about how many samples of each model and axis are kept, evenly spaced.
 
     Returns:
         Columns model, axis, target, predicted (accelerations, SI); no row where there is no head.
     """
     rows: list[tuple[Any, ...]] = []
-    for entry in fitted:
-        if entry.spec.role != "head":
+    for fitted_model in fitted_models:
+        if fitted_model.spec.role != "head":
             continue
-        pairs = []
+        residual_pairs = []
         for log in logs:
-            run = teacher_forced(entry.model, log)
-            residuals = (log.nu_dot - run.baseline, run.predicted - run.baseline)
-            pairs.append(np.stack(residuals, axis=-1)[log.good])
-        joined = np.concatenate(pairs)
-        joined = joined[:: max(len(joined) // most, 1)]
-        rows += [(entry.name, name, *joined[:, axis].T) for axis, name in _live(logs)]
-    return _table(["model", "axis", "target", "predicted"], rows)
+            teacher_forced_run = run_teacher_forced(fitted_model.model, log)
+            residuals = (
+                log.nu_dot - teacher_forced_run.baseline_accelerations,
+                teacher_forced_run.predicted_accelerations
+                - teacher_forced_run.baseline_accelerations,
+            )
+            residual_pairs.append(np.stack(residuals, axis=-1)[log.trainable])
+        pooled_pairs = np.concatenate(residual_pairs)
+        pooled_pairs = pooled_pairs[:: max(len(pooled_pairs) // max_samples, 1)]
+        rows += [
+            (fitted_model.name, name, *pooled_pairs[:, axis].T)
+            for axis, name in _identified_accelerations(logs)
+        ]
+    return _concatenate_table(["model", "axis", "target", "predicted"], rows)
 
 
-def term_table(fitted: Iterable[FittedModel], logs: Sequence[Prepared]) -> pd.DataFrame:
+def build_term_table(
+    fitted_models: Iterable[FittedModel], logs: Sequence[PreparedLog]
+) -> pd.DataFrame:
     """Return the terms of every head that is an equation along the longest log.
 
     Args:
-        fitted: models; heads that are no equation are left out.
+        fitted_models: models; heads that are no equation are left out.
         logs: of one split, at least one.
 
     Returns:
         Columns model, log, axis, term, t (s), value (the term times its coefficient). The term
-        `target` is what the baseline leaves of the measured acceleration, NaN where there is none.
+        `baseline_residual` is what the baseline leaves of the measured acceleration, NaN where there is none.
     """
     log = max(logs, key=len)
-    t = log.log.t - log.log.t[0]
+    time = log.log.t - log.log.t[0]
     rows: list[tuple[Any, ...]] = []
-    for entry in fitted:
-        head = entry.model.head if entry.spec.role == "head" else None
+    for fitted_model in fitted_models:
+        head = fitted_model.model.head if fitted_model.spec.role == "head" else None
         if not isinstance(head, EquationHead):
             continue
-        run = teacher_forced(entry.model, log)
-        target = np.where(log.good[:, None], log.nu_dot - run.baseline, np.nan)
-        for axis, name in _live([log]):
-            terms = {"target": target[:, axis], **head.contributions(run.z, axis)}
-            rows += [(entry.name, log.log.name, name, term, t, terms[term]) for term in terms]
-    return _table(["model", "log", "axis", "term", "t", "value"], rows)
+        teacher_forced_run = run_teacher_forced(fitted_model.model, log)
+        baseline_residual = np.where(
+            log.trainable[:, None], log.nu_dot - teacher_forced_run.baseline_accelerations, np.nan
+        )
+        for axis, name in _identified_accelerations([log]):
+            term_values = {
+                "target": baseline_residual[:, axis],
+                **head.term_contributions(teacher_forced_run.channels, axis),
+            }
+            rows += [
+                (fitted_model.name, log.log.name, name, term, time, term_values[term])
+                for term in term_values
+            ]
+    return _concatenate_table(["model", "log", "axis", "term", "t", "value"], rows)
 
 
-def _table(names: list[str], rows: list[tuple[Any, ...]]) -> pd.DataFrame:
+def _concatenate_table(column_names: list[str], rows: list[tuple[Any, ...]]) -> pd.DataFrame:
     """Return a table of rows, each with some arrays of one length in the place of a number."""
     import pandas as pd
 
-    parts = [pd.DataFrame(dict(zip(names, row, strict=True))) for row in rows]
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=names)
+    tables = [pd.DataFrame(dict(zip(column_names, row, strict=True))) for row in rows]
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=column_names)
 
 
-def _live(logs: Sequence[Prepared]) -> list[tuple[int, str]]:
+def _identified_accelerations(logs: Sequence[PreparedLog]) -> list[tuple[int, str]]:
     """Return number and name of each acceleration that logs tell."""
-    live = logs[0].live
-    return [(axis, live.rates[axis]) for axis in live.learned]
+    dof = logs[0].dof
+    return [(axis_index, dof.derivative_names[axis_index]) for axis_index in dof.regressed_indices]
 
 
-SPLITS = ("train", "test")
+GOODNESS_SPLITS = ("train", "test")
 
 
-def goodness_rows(
-    fitted: Iterable[FittedModel], logs: Mapping[str, Sequence[Prepared]], step: float
+def build_goodness_rows(
+    fitted_models: Iterable[FittedModel], logs: Mapping[str, Sequence[PreparedLog]], dt: float
 ) -> dict[str, list[dict[str, Any]]]:
     """Return statistics of what each model leaves of the measured accelerations, by split.
 
@@ -432,49 +510,60 @@ def goodness_rows(
 
     Args:
         logs: by split; training and test logs are used.
-        step: of the grid in s.
+        dt: of the grid in s.
     """
-    models = {entry.name: entry for entry in fitted}
-    compared_with = references(models.values())
-    splits = {}
-    for split in SPLITS:
-        every = -(-sum(len(log) for log in logs[split]) // paged.LARGE)
-        taken = logs[split][:: max(every, 1)]
-        measured = [piece for log in taken for piece in _learned(log, log.nu_dot)]
-        predictions = [
-            OneStep(
+    models_by_name = {fitted_model.name: fitted_model for fitted_model in fitted_models}
+    reference_names = find_reference_names(models_by_name.values())
+    rows_by_split = {}
+    for split in GOODNESS_SPLITS:
+        log_stride = -(-sum(len(log) for log in logs[split]) // paged.MAX_SAMPLES_IN_MEMORY)
+        selected_logs = logs[split][:: max(log_stride, 1)]
+        measured_accelerations = [
+            segment for log in selected_logs for segment in _trainable_segments(log, log.nu_dot)
+        ]
+        one_step_residuals = [
+            OneStepResiduals(
                 name,
-                entry.spec.role,
-                _parameter_counts(entry.model),
+                fitted_model.spec.role,
+                _count_parameters_by_axis(fitted_model.model),
                 [
-                    piece
-                    for log in taken
-                    for piece in _learned(
-                        log, log.nu_dot - teacher_forced(entry.model, log).predicted
+                    segment
+                    for log in selected_logs
+                    for segment in _trainable_segments(
+                        log,
+                        log.nu_dot
+                        - run_teacher_forced(fitted_model.model, log).predicted_accelerations,
                     )
                 ],
-                compared_with.get(name),
+                reference_names.get(name),
             )
-            for name, entry in models.items()
+            for name, fitted_model in models_by_name.items()
         ]
-        axes = _live(taken) if measured else []
-        splits[split] = table(predictions, measured, step, axes) if measured else []
-    return splits
+        axes = _identified_accelerations(selected_logs) if measured_accelerations else []
+        rows_by_split[split] = (
+            build_goodness_table(one_step_residuals, measured_accelerations, dt, axes)
+            if measured_accelerations
+            else []
+        )
+    return rows_by_split
 
 
-def _learned(log: Prepared, values: np.ndarray) -> list[np.ndarray]:
+def _trainable_segments(log: PreparedLog, values: np.ndarray) -> list[np.ndarray]:
     """Return values [T, n] of each stretch that may be learned from."""
-    return [values[begin:end] for begin, end in zip(*stretches(log.good), strict=True)]
+    return [
+        values[segment_start:segment_stop]
+        for segment_start, segment_stop in zip(*find_runs(log.trainable), strict=True)
+    ]
 
 
-def _parameter_counts(model: HybridDynamics) -> list[float]:
+def _count_parameters_by_axis(model: HybridDynamics) -> list[float]:
     """Fitted parameters of each axis, baseline and head together."""
     if isinstance(model, MeanOfTrajectories):
-        members = map(_parameter_counts, model.members)
-        return [sum(axis) for axis in zip(*members, strict=True)]
+        member_counts = map(_count_parameters_by_axis, model.members)
+        return [sum(counts_of_axis) for counts_of_axis in zip(*member_counts, strict=True)]
     return [
-        of_baseline + of_head
-        for of_baseline, of_head in zip(
-            model.baseline.parameter_count(), model.head.parameter_count(), strict=True
+        n_baseline_parameters + n_head_parameters
+        for n_baseline_parameters, n_head_parameters in zip(
+            model.baseline.parameter_counts(), model.head.parameter_counts(), strict=True
         )
     ]

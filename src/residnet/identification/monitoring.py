@@ -24,30 +24,36 @@ from torch import Tensor
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
-from residnet.core.layout import HEADING, MOVING, Live
-from residnet.data.prepare import Prepared
+from residnet.core.layout import DYNAMIC_STATES, HEADING, DegreesOfFreedom
+from residnet.data.prepare import PreparedLog
 from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
-from residnet.identification.changes import Change, ChangedDynamics, causes, shown, surroundings
-from residnet.physics.symmetry import live_of
+from residnet.identification.changes import (
+    PerturbedDynamics,
+    SystemChange,
+    compute_sensor_effect,
+    make_fault_hypotheses,
+    make_nuisance_changes,
+)
+from residnet.physics.symmetry import get_dof
 
 
-def seen_of(live: Live) -> dict[str, int]:
+def innovation_columns(dof: DegreesOfFreedom) -> dict[str, int]:
     """Return what innovations are taken of, and its columns in states."""
-    seen = {name: live.states.index(name) for name in live.channels}
-    return seen | ({"heading": HEADING} if live.turns else {})
+    columns = {name: dof.state_names.index(name) for name in dof.active_states}
+    return columns | ({"heading": HEADING} if dof.has_heading else {})
 
 
-_PAST = 5.0
+_WARMUP_DURATION = 5.0
 """Time in s before a window that warms a memory up."""
-_BLOCKS = 5
+_MAX_BLOCKS = 5
 """Parts of a window whose means count."""
 
 
 @dataclass(frozen=True)
-class Piece:
+class MeasuredWindow:
     """A measured window of K steps.
 
     Attributes:
@@ -63,334 +69,407 @@ class Piece:
     past_w: np.ndarray
 
 
-def innovations(
-    model: HybridDynamics, pieces: Sequence[Piece], changes: Sequence[Change]
+def compute_innovations(
+    model: HybridDynamics, windows: Sequence[MeasuredWindow], changes: Sequence[SystemChange]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return innovations [B, k] and what a unit of each change adds to them [B, C, k].
 
     Args:
         model: float64, in evaluation mode.
-        pieces: B windows of one length, with pasts of one length.
+        windows: B windows of one length, with pasts of one length.
         changes: C of them.
     """
-    y = torch.from_numpy(np.stack([piece.y for piece in pieces]))
-    w = torch.from_numpy(np.stack([piece.w for piece in pieces]))
-    none = Change("none", "", "", 1.0)
-    all_changes = [none, *changes]
-    rows, steps, count = len(pieces), w.shape[1], len(all_changes)
-    blocks = min(_BLOCKS, steps)
-    mean = torch.zeros(blocks, steps, dtype=torch.float64)
-    edges = np.linspace(0, steps, blocks + 1).round().astype(int)
-    for block, (first, last) in enumerate(pairwise(edges.tolist())):
-        mean[block, first:last] = 1.0 / (last - first)
+    y = torch.from_numpy(np.stack([window.y for window in windows]))
+    w = torch.from_numpy(np.stack([window.w for window in windows]))
+    no_change = SystemChange("none", "", "", 1.0)
+    all_changes = [no_change, *changes]
+    n_windows, n_steps, n_changes = len(windows), w.shape[1], len(all_changes)
+    n_blocks = min(_MAX_BLOCKS, n_steps)
+    block_average = torch.zeros(n_blocks, n_steps, dtype=torch.float64)
+    block_edges = np.linspace(0, n_steps, n_blocks + 1).round().astype(int)
+    for block, (block_start, block_stop) in enumerate(pairwise(block_edges.tolist())):
+        block_average[block, block_start:block_stop] = 1.0 / (block_stop - block_start)
     with torch.no_grad():
-        memory = model.warmup(
-            torch.from_numpy(np.stack([piece.past_y for piece in pieces])),
-            torch.from_numpy(np.stack([piece.past_w for piece in pieces])),
+        initial_memory = model.warmup(
+            torch.from_numpy(np.stack([window.past_y for window in windows])),
+            torch.from_numpy(np.stack([window.past_w for window in windows])),
         )
-        begin = (y[:, 1] - y[:, 0])[:, MOVING] / model.dt
+        initial_accelerations = (y[:, 1] - y[:, 0])[:, DYNAMIC_STATES] / model.dt
         x0 = torch.cat(
-            [y[:, 0] + shown(one.sensor, y[:, 0], begin, one.size) for one in all_changes]
+            [
+                y[:, 0]
+                + compute_sensor_effect(
+                    applied_change.sensor, y[:, 0], initial_accelerations, applied_change.size
+                )
+                for applied_change in all_changes
+            ]
         )
-        changed = ChangedDynamics(model, all_changes, rows, w.shape[2])
-        path, _, _ = compiled(Rollout(changed), steps)(
-            x0, w.repeat(count, 1, 1), memory.repeat(count, 1)
+        perturbed_model = PerturbedDynamics(model, all_changes, n_windows, w.shape[2])
+        predicted_states, _, _ = compiled(Rollout(perturbed_model), n_steps)(
+            x0, w.repeat(n_changes, 1, 1), initial_memory.repeat(n_changes, 1)
         )
-    path = path.reshape(count, rows, steps + 1, -1)
+    predicted_states = predicted_states.reshape(n_changes, n_windows, n_steps + 1, -1)
     # what a sensor shows is taken of the prediction: noise of the measurement is in the error too
-    rate = mean @ path[0].diff(dim=1)[..., MOVING] / model.dt
-    path = mean @ path[:, :, 1:]
-    columns = [*seen_of(live_of(model.signals.names)).values()]
-    error = _seen(mean @ y[:, 1:] - path[0], columns)
+    mean_accelerations = (
+        block_average @ predicted_states[0].diff(dim=1)[..., DYNAMIC_STATES] / model.dt
+    )
+    predicted_states = block_average @ predicted_states[:, :, 1:]
+    columns = [*innovation_columns(get_dof(model.signals.names)).values()]
+    innovation = _flatten_innovations(block_average @ y[:, 1:] - predicted_states[0], columns)
     effects = [
-        _seen(
-            path[number + 1] - path[0]
+        _flatten_innovations(
+            predicted_states[change_index + 1] - predicted_states[0]
             if not change.sensor
-            else shown(change.sensor, path[0], rate, change.size) - (path[number + 1] - path[0]),
+            else compute_sensor_effect(
+                change.sensor, predicted_states[0], mean_accelerations, change.size
+            )
+            - (predicted_states[change_index + 1] - predicted_states[0]),
             columns,
         )
         / change.size
-        for number, change in enumerate(changes)
+        for change_index, change in enumerate(changes)
     ]
     if not effects:
-        return error.numpy(), np.zeros((len(error), 0, error.shape[1]))
-    return error.numpy(), torch.stack(effects, dim=1).numpy()
+        return innovation.numpy(), np.zeros((len(innovation), 0, innovation.shape[1]))
+    return innovation.numpy(), torch.stack(effects, dim=1).numpy()
 
 
-def parted(piece: Piece, parts: int) -> list[Piece]:
+def split_window(window: MeasuredWindow, n_parts: int) -> list[MeasuredWindow]:
     """Return the equal parts of a window, each with what went before it; a rest is left out."""
-    past, steps = len(piece.past_y), len(piece.w) // parts
-    y = np.concatenate((piece.past_y, piece.y))
-    w = np.concatenate((piece.past_w, piece.w))
+    n_warmup, steps_per_part = len(window.past_y), len(window.w) // n_parts
+    y = np.concatenate((window.past_y, window.y))
+    w = np.concatenate((window.past_w, window.w))
     return [
-        Piece(
-            y[past + k : past + k + steps + 1],
-            w[past + k : past + k + steps],
-            y[k : past + k],
-            w[k : past + k],
+        MeasuredWindow(
+            y[n_warmup + part_start : n_warmup + part_start + steps_per_part + 1],
+            w[n_warmup + part_start : n_warmup + part_start + steps_per_part],
+            y[part_start : n_warmup + part_start],
+            w[part_start : n_warmup + part_start],
         )
-        for k in range(0, parts * steps, steps)
+        for part_start in range(0, n_parts * steps_per_part, steps_per_part)
     ]
 
 
-def _seen(states: Tensor, columns: Sequence[int]) -> Tensor:
+def _flatten_innovations(states: Tensor, columns: Sequence[int]) -> Tensor:
     """Return columns [c] of differences of states [B, k, 3 + n] as innovations [B, k c]."""
     return states[..., list(columns)].flatten(1)
 
 
-def pieces(log: Prepared, steps: int, past: int) -> list[Piece]:
+def make_measured_windows(log: PreparedLog, n_steps: int, n_warmup: int) -> list[MeasuredWindow]:
     """Return the windows of a log, back to back, whose samples can all be trusted.
 
     Args:
         log: prepared as those of the fit.
-        past: samples before a window that warm a memory up; the first windows go without.
+        n_warmup: samples before a window that warm a memory up; the first windows go without.
     """
-    out, start = [], past
-    while start + steps < len(log):
-        rows = slice(start - past, start + steps + 1)
-        trusted = log.usable[rows] & (log.piece[rows] == log.piece[start]) & (log.piece[start] >= 0)
-        if not trusted.all():
+    windows, window_start = [], n_warmup
+    while window_start + n_steps < len(log):
+        row_slice = slice(window_start - n_warmup, window_start + n_steps + 1)
+        is_trusted = (
+            log.usable[row_slice]
+            & (log.segment[row_slice] == log.segment[window_start])
+            & (log.segment[window_start] >= 0)
+        )
+        if not is_trusted.all():
             # the next window begins behind the last sample that is not to be trusted
-            start = rows.start + int(np.flatnonzero(~trusted)[-1]) + 1 + past
+            window_start = row_slice.start + int(np.flatnonzero(~is_trusted)[-1]) + 1 + n_warmup
             continue
-        out.append(
-            Piece(
-                log.y[start : start + steps + 1],
-                log.w[start : start + steps],
-                log.y[start - past : start],
-                log.w[start - past : start],
+        windows.append(
+            MeasuredWindow(
+                log.y[window_start : window_start + n_steps + 1],
+                log.w[window_start : window_start + n_steps],
+                log.y[window_start - n_warmup : window_start],
+                log.w[window_start - n_warmup : window_start],
             )
         )
-        start += steps
-    return out
+        window_start += n_steps
+    return windows
 
 
-def past_of(model: HybridDynamics) -> int:
+def count_warmup_samples(model: HybridDynamics) -> int:
     """Return the samples before a window that warm a model's memory up; 0 where it has none."""
-    return round(_PAST / model.dt) if model.n_state else 0
+    return round(_WARMUP_DURATION / model.dt) if model.n_state else 0
 
 
-_SHRINK = 0.1
+_SHRINKAGE = 0.1
 """Share of the diagonal in the covariance of innovations."""
-BELIEVED = 15.0
+PRIOR_STD = 15.0
 """Standard deviation of what a model has always got wrong, in the causes' own small sizes."""
 
 
 @dataclass(frozen=True)
-class Sums:
+class ScoreSums:
     """Scores [Q] and information [Q, Q] of a number of windows, and squares of innovations [n]."""
 
     score: np.ndarray
     information: np.ndarray
-    squares: np.ndarray
-    count: int
+    squared_innovations: np.ndarray
+    n_windows: int
 
-    def __add__(self, other: Sums) -> Sums:
-        parts = zip(vars(self).values(), vars(other).values(), strict=True)
-        return Sums(*(one + another for one, another in parts))
+    def __add__(self, other: ScoreSums) -> ScoreSums:
+        field_pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return ScoreSums(*(value + other_value for value, other_value in field_pairs))
 
 
-def weighed(
-    found: Sequence[tuple[np.ndarray, np.ndarray]], whiten: Sequence[np.ndarray], belief: np.ndarray
-) -> Sums:
+def compute_robust_score_sums(
+    innovations_and_effects: Sequence[tuple[np.ndarray, np.ndarray]],
+    whitening_matrices: Sequence[np.ndarray],
+    prior_precision: np.ndarray,
+) -> ScoreSums:
     """Return the sums over windows that were looked at as a whole, then in parts.
 
     A window that no change of a size thought possible explains tells of a manoeuvre that the model
     does not know. It counts by the inverse of what it leaves unexplained.
 
     Args:
-        found: innovations [B, parts n] and effects [B, C, parts n] for each look.
-        whiten: matrix [n, n] of each look.
-        belief: precision of the sizes of the changes [C, C].
+        innovations_and_effects: innovations [B, parts n] and effects [B, C, parts n] for each look.
+        whitening_matrices: matrix [n, n] of each look.
+        prior_precision: precision of the sizes of the changes [C, C].
     """
-    looks, number = [], 0
-    for (error, effects), matrix in zip(found, whiten, strict=True):
-        size, (windows, count, values) = len(matrix), effects.shape
-        e = (error.reshape(windows, -1, size) @ matrix.T).reshape(windows, values)
-        a = (effects.reshape(windows, count, -1, size) @ matrix.T).reshape(effects.shape)
-        looks.append((np.einsum("bqn,bn->bq", a, e), a @ a.swapaxes(1, 2), e**2))
-        number += values
-    scores, informations, squares = zip(*looks, strict=True)
+    sums_by_look, n_innovations = [], 0
+    for (innovation, effects), whitening_matrix in zip(
+        innovations_and_effects, whitening_matrices, strict=True
+    ):
+        block_size, (n_windows, n_changes, n_values) = len(whitening_matrix), effects.shape
+        whitened_innovations = (
+            innovation.reshape(n_windows, -1, block_size) @ whitening_matrix.T
+        ).reshape(n_windows, n_values)
+        whitened_effects = (
+            effects.reshape(n_windows, n_changes, -1, block_size) @ whitening_matrix.T
+        ).reshape(effects.shape)
+        sums_by_look.append(
+            (
+                np.einsum("bqn,bn->bq", whitened_effects, whitened_innovations),
+                whitened_effects @ whitened_effects.swapaxes(1, 2),
+                whitened_innovations**2,
+            )
+        )
+        n_innovations += n_values
+    scores, informations, squares = zip(*sums_by_look, strict=True)
     score, information = np.sum(scores, axis=0), np.sum(informations, axis=0)
-    own = np.linalg.solve(information + belief, score[..., None])[..., 0]
-    left = np.sum([one.sum(axis=1) for one in squares], axis=0) - (score * own).sum(axis=1)
-    weight = 1.0 / np.maximum(left / number, 1.0)
-    return Sums(
-        weight @ score,
-        np.tensordot(weight, information, 1),
+    estimated_sizes = np.linalg.solve(information + prior_precision, score[..., None])[..., 0]
+    unexplained_squares = np.sum(
+        [squares_of_look.sum(axis=1) for squares_of_look in squares], axis=0
+    ) - (score * estimated_sizes).sum(axis=1)
+    window_weights = 1.0 / np.maximum(unexplained_squares / n_innovations, 1.0)
+    return ScoreSums(
+        window_weights @ score,
+        np.tensordot(window_weights, information, 1),
         squares[0].sum(axis=0),
         len(squares[0]),
     )
 
 
-def apart_from(
-    score: np.ndarray, information: np.ndarray, count: int, belief: np.ndarray
+def marginalise(
+    score: np.ndarray, information: np.ndarray, n_target_changes: int, prior_precision: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return scores [..., Q] and information [..., Q, Q] once others have taken what they can.
 
     Args:
         score: of Q changes, then of what surrounds the vessel [..., Q + n].
         information: about them [..., Q + n, Q + n].
-        count: Q.
-        belief: precision of the sizes of what surrounds the vessel [n, n].
+        n_target_changes: Q.
+        prior_precision: precision of the sizes of what surrounds the vessel [n, n].
     """
-    known, beside = information[..., :count, :count], information[..., count:, :count]
-    own = np.linalg.solve(information[..., count:, count:] + belief, beside)
-    left = known - information[..., :count, count:] @ own
-    taken = np.einsum("...np,...n->...p", own, score[..., count:])
-    return score[..., :count] - taken, left + 1e-300 * np.eye(count)
+    target_information, cross_information = (
+        information[..., :n_target_changes, :n_target_changes],
+        information[..., n_target_changes:, :n_target_changes],
+    )
+    regression_coefficients = np.linalg.solve(
+        information[..., n_target_changes:, n_target_changes:] + prior_precision, cross_information
+    )
+    marginal_information = (
+        target_information
+        - information[..., :n_target_changes, n_target_changes:] @ regression_coefficients
+    )
+    explained_score = np.einsum(
+        "...np,...n->...p", regression_coefficients, score[..., n_target_changes:]
+    )
+    return score[..., :n_target_changes] - explained_score, marginal_information + 1e-300 * np.eye(
+        n_target_changes
+    )
 
 
-def always_wrong(
-    error: np.ndarray, effects: np.ndarray, causes: Sequence[Change], channels: int
+def estimate_model_bias(
+    innovation: np.ndarray, effects: np.ndarray, hypotheses: Sequence[SystemChange], n_channels: int
 ) -> np.ndarray:
     """Return what a model has always got wrong: a size [Q, 4] of each cause for each channel.
 
     Channels may disagree: a model whose form is wrong has no single set of sizes that mends it.
 
     Args:
-        error: innovations [B, n] of clean logs.
+        innovation: innovations [B, n] of clean logs.
         effects: of a unit of each change [B, C, n], the causes first.
-        causes: Q of them.
-        channels: number of channels that innovations are taken of.
+        hypotheses: Q of them.
+        n_channels: number of channels that innovations are taken of.
     """
-    count = len(causes)
+    n_causes = len(hypotheses)
     # sensors are taken to be right: how they are wrong looks like the motion itself
-    believed = np.array([0.0 if one.sensor else one.size * BELIEVED for one in causes])
-    out = np.zeros((count, channels))
-    for channel in range(channels):
-        e = error[:, channel::channels].ravel()
-        a = effects[:, :count, channel::channels].swapaxes(1, 2).reshape(len(e), count) * believed
-        matrix = a.T @ a + np.mean(e**2) * np.eye(count)
-        out[:, channel] = believed * np.linalg.solve(matrix, a.T @ e)
-    return out
+    prior_std = np.array([0.0 if cause.sensor else cause.size * PRIOR_STD for cause in hypotheses])
+    bias_by_channel = np.zeros((n_causes, n_channels))
+    for channel in range(n_channels):
+        channel_innovations = innovation[:, channel::n_channels].ravel()
+        channel_effects = (
+            effects[:, :n_causes, channel::n_channels]
+            .swapaxes(1, 2)
+            .reshape(len(channel_innovations), n_causes)
+            * prior_std
+        )
+        regularized_gram = channel_effects.T @ channel_effects + np.mean(
+            channel_innovations**2
+        ) * np.eye(n_causes)
+        bias_by_channel[:, channel] = prior_std * np.linalg.solve(
+            regularized_gram, channel_effects.T @ channel_innovations
+        )
+    return bias_by_channel
 
 
-def whitening(error: np.ndarray, parts: int) -> np.ndarray:
+def compute_whitening_matrix(innovations: np.ndarray, n_parts: int) -> np.ndarray:
     """Return the matrix [n, n] that makes innovations [B, parts n] of clean logs uncorrelated."""
     # windows that ran away were made nothing of
-    error = error[(error != 0.0).any(axis=1)]
-    error = error.reshape(len(error) * parts, -1)
-    second = error.T @ error / len(error)
-    covariance = (1.0 - _SHRINK) * second + _SHRINK * np.diag(np.diag(second))
-    found: np.ndarray = np.linalg.inv(np.linalg.cholesky(covariance + 1e-18 * np.eye(len(second))))
-    return found
+    innovations = innovations[(innovations != 0.0).any(axis=1)]
+    innovations = innovations.reshape(len(innovations) * n_parts, -1)
+    second_moment = innovations.T @ innovations / len(innovations)
+    covariance = (1.0 - _SHRINKAGE) * second_moment + _SHRINKAGE * np.diag(np.diag(second_moment))
+    whitening_matrix: np.ndarray = np.linalg.inv(
+        np.linalg.cholesky(covariance + 1e-18 * np.eye(len(second_moment)))
+    )
+    return whitening_matrix
 
 
-_NOISE = np.geomspace(1.0, 30.0, 25)
+_NOISE_VARIANCE_GRID = np.geomspace(1.0, 30.0, 25)
 """Variances of the noise, in those of white innovations, that are tried."""
-_APART = np.concatenate(([0.0], np.geomspace(1e-4, 1e3, 40)))
+_SIZE_VARIANCE_GRID = np.concatenate(([0.0], np.geomspace(1e-4, 1e3, 40)))
 """Variances of sizes, in what a group of middling information tells, that are tried."""
-_LEFT_OPEN = 1.0
+_MAX_DEVIANCE_DIFFERENCE = 1.0
 """Twice the logarithm of the likelihood by which a larger scatter may fall short of the likeliest.
 
 That is one standard error: clean logs have fitted the model too, and look better than others.
 """
-_NOTHING = 1e-12
+_TINY_INFORMATION = 1e-12
 """Keeps quotients of information defined where there is none."""
-_AT_ODDS = 1.345
+_HUBER_CONSTANT = 1.345
 """Standard deviations by which a log may differ from the others before it counts for less.
 
 It is the usual constant: where errors are normal, 95 % of what they say is kept.
 """
-_ROUNDS = 8
+_HUBER_ITERATIONS = 8
 """Of reweighting."""
 
 
 @dataclass(frozen=True)
-class Groups:
+class GroupScores:
     """Scores of G groups of windows, what surrounds the vessel taken out.
 
     Attributes:
-        log: number of the log that each is of [G].
+        log_index: number of the log that each is of [G].
         score: of each cause [G, Q]; [G, F, Q] where there are several readings of it.
         information: about them [G, Q, Q].
     """
 
-    log: np.ndarray
+    log_index: np.ndarray
     score: np.ndarray
     information: np.ndarray
 
-    def __getitem__(self, chosen: np.ndarray | slice) -> Groups:
-        return Groups(self.log[chosen], self.score[chosen], self.information[chosen])
+    def __getitem__(self, selection: np.ndarray | slice) -> GroupScores:
+        return GroupScores(
+            self.log_index[selection], self.score[selection], self.information[selection]
+        )
 
     @property
-    def own(self) -> np.ndarray:
+    def diagonal_information(self) -> np.ndarray:
         """Information about each cause alone [G, Q], never zero."""
-        return np.diagonal(self.information, axis1=1, axis2=2) + _NOTHING
+        return np.diagonal(self.information, axis1=1, axis2=2) + _TINY_INFORMATION
 
-    def without(self, bias: np.ndarray) -> Groups:
+    def subtract_bias(self, bias: np.ndarray) -> GroupScores:
         """Return the groups without what sizes [Q], such as clean logs ask for, say of them."""
         return replace(self, score=self.score - self.information @ bias)
 
-    def by_log(self, values: np.ndarray) -> np.ndarray:
+    def sum_by_log(self, values: np.ndarray) -> np.ndarray:
         """Return the sums of values [G, ...] over the groups of each log [K, ...]."""
-        logs = dict.fromkeys(self.log.tolist())
-        return np.stack([values[self.log == log].sum(axis=0) for log in logs])
+        log_indices = dict.fromkeys(self.log_index.tolist())
+        return np.stack(
+            [values[self.log_index == log_index_].sum(axis=0) for log_index_ in log_indices]
+        )
 
 
 @dataclass(frozen=True)
-class Scatter:
+class ScoreDistribution:
     """What clean groups say about the scatter of scores.
 
     Attributes:
-        noise: variance of each score in units of its information [Q].
-        apart: variance of the sizes that groups ask for [Q].
-        shared: part of it that is common to the groups of one log [Q].
-        known: variance of the mean size of all clean logs [Q].
+        noise_factor: variance of each score in units of its information [Q].
+        size_variance: variance of the sizes that groups ask for [Q].
+        shared_size_variance: part of it that is common to the groups of one log [Q].
+        mean_size_variance: variance of the mean size of all clean logs [Q].
         correlation: of the scores of different causes [Q, Q].
-        count: of the groups that told all this.
-        wider: how many times as far scores of clean stretches lie as all this says.
+        n_groups: of the groups that told all this.
+        inflation_factor: how many times as far scores of clean stretches lie as all this says.
     """
 
-    noise: np.ndarray
-    apart: np.ndarray
-    shared: np.ndarray
-    known: np.ndarray
+    noise_factor: np.ndarray
+    size_variance: np.ndarray
+    shared_size_variance: np.ndarray
+    mean_size_variance: np.ndarray
     correlation: np.ndarray
-    count: int
-    wider: float = 1.0
+    n_groups: int
+    inflation_factor: float = 1.0
 
-    def variance(self, own: np.ndarray) -> np.ndarray:
+    def variance(self, diagonal_information: np.ndarray) -> np.ndarray:
         """Return the variance of scores [..., Q] whose information is `own` [..., Q]."""
-        return np.asarray(self.noise * own + self.apart * own**2)
+        return np.asarray(
+            self.noise_factor * diagonal_information + self.size_variance * diagonal_information**2
+        )
 
     @property
-    def inflation(self) -> float:
+    def wishart_inflation(self) -> float:
         """How much larger variances are than they seem, their matrix being an estimate itself.
 
         Weights from few groups are not the best ones, and flatter what they weigh (R. N. Kackar and
         D. A. Harville, 1984, for the effect; the factors are those of Wishart matrices).
         """
-        size = len(self.noise)
-        left = max(self.count - size - 1, 1)
-        return max((self.count - 1) / left, 1.0) * self.count / (left + 1)
+        n_causes = len(self.noise_factor)
+        degrees_of_freedom = max(self.n_groups - n_causes - 1, 1)
+        return (
+            max((self.n_groups - 1) / degrees_of_freedom, 1.0)
+            * self.n_groups
+            / (degrees_of_freedom + 1)
+        )
 
-    def of(self, causes: Sequence[int]) -> Scatter:
+    def select_causes(self, cause_indices: Sequence[int]) -> ScoreDistribution:
         """Return what is known of some causes alone, by their numbers."""
-        some = list(causes)
-        of_each = {
-            name: getattr(self, name)[some] for name in ("noise", "apart", "shared", "known")
+        indices = list(cause_indices)
+        selected_fields = {
+            name: getattr(self, name)[indices] for name in ("noise", "apart", "shared", "known")
         }
-        return replace(self, correlation=self.correlation[np.ix_(some, some)], **of_each)
+        return replace(
+            self, correlation=self.correlation[np.ix_(indices, indices)], **selected_fields
+        )
 
-    def by_log(self, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def weigh_by_log(self, groups: GroupScores) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return scores [K, ..., Q] and information [K, Q, Q] of each log, weighed by the scatter.
 
         Groups of one log say in part the same: how many times over [K, Q] comes with them.
         """
-        own = groups.own
-        variance = self.variance(own)
-        deviation = np.sqrt(variance)
-        covariance = self.correlation * deviation[:, :, None] * deviation[:, None, :]
+        diagonal_information = groups.diagonal_information
+        variance = self.variance(diagonal_information)
+        std = np.sqrt(variance)
+        covariance = self.correlation * std[:, :, None] * std[:, None, :]
         gain = np.linalg.solve(covariance, groups.information).swapaxes(1, 2)
-        told = groups.by_log(np.einsum("gqp,g...p->g...q", gain, groups.score))
-        sure = groups.by_log(gain @ groups.information)
-        count = groups.by_log(np.ones_like(own))
-        alike = groups.by_log(self.shared * own**2 / variance) / count
-        return told, sure, 1.0 + (count - 1.0) * alike
+        weighted_scores = groups.sum_by_log(np.einsum("gqp,g...p->g...q", gain, groups.score))
+        weighted_information = groups.sum_by_log(gain @ groups.information)
+        n_groups_of_log = groups.sum_by_log(np.ones_like(diagonal_information))
+        intraclass_correlation = (
+            groups.sum_by_log(self.shared_size_variance * diagonal_information**2 / variance)
+            / n_groups_of_log
+        )
+        return (
+            weighted_scores,
+            weighted_information,
+            1.0 + (n_groups_of_log - 1.0) * intraclass_correlation,
+        )
 
-    def together(self, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def estimate_sizes(self, groups: GroupScores) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the size of each cause alone [Q], its error, and how much it explains.
 
         The scores of all causes tell better than each for itself which it is, and that there is
@@ -398,59 +477,85 @@ class Scatter:
         compared on the same scores: neither how well logs agree on the size of one, nor how surely
         clean logs asked for none of it, says that another one is more likely.
         """
-        told, sure, again = self.by_log(groups)
-        told, weight = told / again, np.diagonal(sure, axis1=1, axis2=2) / again + _NOTHING
-        size, agreed = _agreed(told, weight)
-        inflation = self.inflation * self.wider**2
-        explained = told.sum(axis=0) ** 2 / weight.sum(axis=0) / inflation
-        return size, np.sqrt((1.0 / agreed + self.known) * inflation), explained
+        weighted_scores, weighted_information, redundancy = self.weigh_by_log(groups)
+        weighted_scores, weights = (
+            weighted_scores / redundancy,
+            np.diagonal(weighted_information, axis1=1, axis2=2) / redundancy + _TINY_INFORMATION,
+        )
+        sizes, total_weight = _huber_mean(weighted_scores, weights)
+        inflation = self.wishart_inflation * self.inflation_factor**2
+        explained_squares = weighted_scores.sum(axis=0) ** 2 / weights.sum(axis=0) / inflation
+        return (
+            sizes,
+            np.sqrt((1.0 / total_weight + self.mean_size_variance) * inflation),
+            explained_squares,
+        )
 
 
-def _agreed(told: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _huber_mean(weighted_sizes: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the size [Q] on which logs agree, and the weight behind it (P. J. Huber, 1964).
 
     A vessel that has changed shows it in all logs. One that is at odds with the others, as a rare
     manoeuvre may be, counts by how far it is and not by the square of that.
 
     Args:
-        told: sizes times weights of the logs [K, Q].
-        weight: inverse variances of the sizes [K, Q].
+        weighted_sizes: sizes times weights of the logs [K, Q].
+        weights: inverse variances of the sizes [K, Q].
     """
-    each, root = told / weight, np.sqrt(weight)
-    trusted = np.ones_like(weight)
-    size = told.sum(axis=0) / weight.sum(axis=0)
-    for _ in range(_ROUNDS):
-        apart = np.abs(each - size) * root
-        trusted = np.minimum(1.0, _AT_ODDS / np.maximum(apart, 1e-9))
-        size = (trusted * told).sum(axis=0) / (trusted * weight).sum(axis=0)
-    return size, (trusted * weight).sum(axis=0)
+    sizes_by_log, root_weights = weighted_sizes / weights, np.sqrt(weights)
+    huber_weights = np.ones_like(weights)
+    mean_size = weighted_sizes.sum(axis=0) / weights.sum(axis=0)
+    for _ in range(_HUBER_ITERATIONS):
+        standardized_residuals = np.abs(sizes_by_log - mean_size) * root_weights
+        huber_weights = np.minimum(1.0, _HUBER_CONSTANT / np.maximum(standardized_residuals, 1e-9))
+        mean_size = (huber_weights * weighted_sizes).sum(axis=0) / (huber_weights * weights).sum(
+            axis=0
+        )
+    return mean_size, (huber_weights * weights).sum(axis=0)
 
 
-def scattered(groups: Groups) -> Scatter:
+def fit_score_distribution(groups: GroupScores) -> ScoreDistribution:
     """Return how the scores of groups of clean windows scatter about zero."""
-    score, own = groups.score, groups.own
-    count, size = score.shape
-    noise, apart = np.array([_likeliest(*one) for one in zip(score.T, own.T, strict=True)]).T
-    variance = noise * own + apart * own**2
-    unit = score / np.sqrt(variance)
-    second = unit.T @ unit / count
-    root = np.sqrt(np.diag(second)) + _NOTHING
+    score, diagonal_information = groups.score, groups.diagonal_information
+    n_groups, n_causes = score.shape
+    noise_factor, size_variance = np.array(
+        [
+            _fit_variance_components(*values)
+            for values in zip(score.T, diagonal_information.T, strict=True)
+        ]
+    ).T
+    variance = noise_factor * diagonal_information + size_variance * diagonal_information**2
+    standardized_scores = score / np.sqrt(variance)
+    second_moment = standardized_scores.T @ standardized_scores / n_groups
+    root_mean_squares = np.sqrt(np.diag(second_moment)) + _TINY_INFORMATION
     # few groups say little about how scores scatter together
-    kept = count / (count + size)
-    correlation = kept * second / np.outer(root, root) + (1.0 - kept) * np.eye(size)
+    shrinkage_weight = n_groups / (n_groups + n_causes)
+    correlation = shrinkage_weight * second_moment / np.outer(
+        root_mean_squares, root_mean_squares
+    ) + (1.0 - shrinkage_weight) * np.eye(n_causes)
     np.fill_diagonal(correlation, 1.0)
     # what pairs of groups of one log have in common; where no log holds two, all is taken for it
-    common, weight = (
-        (groups.by_log(one) ** 2 - groups.by_log(one**2)).sum(axis=0)
-        for one in (own * score / variance, own**2 / variance)
+    common_square, common_weight = (
+        (groups.sum_by_log(values) ** 2 - groups.sum_by_log(values**2)).sum(axis=0)
+        for values in (diagonal_information * score / variance, diagonal_information**2 / variance)
     )
-    shared = np.clip(common / np.maximum(weight, 1e-300), 0.0, apart) if weight.any() else apart
-    sure = groups.by_log(own**2 / (variance - shared * own**2))
-    known = 1.0 / (_NOTHING + (sure / (1.0 + shared * sure)).sum(axis=0))
-    return Scatter(noise, apart, shared, known, correlation, count)
+    shared_variance = (
+        np.clip(common_square / np.maximum(common_weight, 1e-300), 0.0, size_variance)
+        if common_weight.any()
+        else size_variance
+    )
+    log_precision = groups.sum_by_log(
+        diagonal_information**2 / (variance - shared_variance * diagonal_information**2)
+    )
+    mean_size_variance = 1.0 / (
+        _TINY_INFORMATION + (log_precision / (1.0 + shared_variance * log_precision)).sum(axis=0)
+    )
+    return ScoreDistribution(
+        noise_factor, size_variance, shared_variance, mean_size_variance, correlation, n_groups
+    )
 
 
-def wider(groups: Groups, fold: np.ndarray, size: int) -> float:
+def wider(groups: GroupScores, fold_of_group: np.ndarray, groups_per_stretch: int) -> float:
     """Return how many times as far scores of clean stretches lie as other clean logs say.
 
     Wind, waves and what a model does not know differ from log to log and last for minutes, so what
@@ -458,47 +563,57 @@ def wider(groups: Groups, fold: np.ndarray, size: int) -> float:
 
     Args:
         groups: of clean windows in the order of time.
-        fold: number of each; those of a number are left out together [G].
-        size: groups of a stretch.
+        fold_of_group: number of each; those of a number are left out together [G].
+        groups_per_stretch: groups of a stretch.
     """
-    found = []
-    for k in np.unique(fold):
-        own, scatter = np.flatnonzero(fold == k), scattered(groups[fold != k])
-        for first in range(0, len(own), size):
-            mean, error, _ = scatter.together(groups[own[first : first + size]])
-            found.append(mean / error)
-    return max(1.0, float(np.sqrt(np.mean(np.square(found)))))
+    standardized_sizes = []
+    for held_out_fold in np.unique(fold_of_group):
+        fold_indices, distribution = (
+            np.flatnonzero(fold_of_group == held_out_fold),
+            fit_score_distribution(groups[fold_of_group != held_out_fold]),
+        )
+        for stretch_start in range(0, len(fold_indices), groups_per_stretch):
+            sizes, standard_errors, _ = distribution.estimate_sizes(
+                groups[fold_indices[stretch_start : stretch_start + groups_per_stretch]]
+            )
+            standardized_sizes.append(sizes / standard_errors)
+    return max(1.0, float(np.sqrt(np.mean(np.square(standardized_sizes)))))
 
 
-def _likeliest(score: np.ndarray, own: np.ndarray) -> tuple[float, float]:
+def _fit_variance_components(
+    scores: np.ndarray, diagonal_information: np.ndarray
+) -> tuple[float, float]:
     """Return the variances of noise and sizes that scores [G] ask for, one standard error above."""
-    apart = _APART / np.median(own)
+    size_variances = _SIZE_VARIANCE_GRID / np.median(diagonal_information)
     variance = (
-        _NOISE[:, None, None] * own[None, None, :] + apart[None, :, None] * own[None, None, :] ** 2
+        _NOISE_VARIANCE_GRID[:, None, None] * diagonal_information[None, None, :]
+        + size_variances[None, :, None] * diagonal_information[None, None, :] ** 2
     )
-    scatter = np.log(variance).sum(axis=2)
-    unlikely = scatter + (score**2 / variance).sum(axis=2)
+    log_determinant = np.log(variance).sum(axis=2)
+    deviance = log_determinant + (scores**2 / variance).sum(axis=2)
     # few logs leave open how much others scatter
-    possible = unlikely <= unlikely.min() + _LEFT_OPEN
-    i, j = np.unravel_index(int(np.where(possible, scatter, -np.inf).argmax()), unlikely.shape)
-    return float(_NOISE[i]), float(apart[j])
+    is_acceptable = deviance <= deviance.min() + _MAX_DEVIANCE_DIFFERENCE
+    i, j = np.unravel_index(
+        int(np.where(is_acceptable, log_determinant, -np.inf).argmax()), deviance.shape
+    )
+    return float(_NOISE_VARIANCE_GRID[i]), float(size_variances[j])
 
 
-_OVERLAP = 3.0
+_LOOKS_PER_STRETCH = 3.0
 """Independent looks that a sliding stretch gives while it slides by its own length."""
-_FOLDS = 5
+_N_FOLDS = 5
 """Parts of the clean windows whose scores are scaled by what the others say."""
-_FEWEST = 5
+_MIN_GROUPS = 5
 """Groups of clean windows below which nothing can be said about false alarms."""
-_PARTS = 5
+_N_WINDOW_PARTS = 5
 """Parts that a window is also looked at in, each from its own measured start."""
-_LEAST_PART = 10
+_MIN_PART_STEPS = 10
 """Steps of a part below which windows are looked at as a whole only."""
-_FAR, _TURN = 3.0, 2.0 * np.pi
+_DIVERGENCE_FACTOR, _MAX_HEADING_INNOVATION = 3.0, 2.0 * np.pi
 """Innovation beyond which a free run ran away: in largest clean velocities; turns of heading."""
-_MOST_LOST = 0.5
+_MAX_DIVERGED_SHARE = 0.5
 """Share of clean windows that may run away."""
-_CURRENT, _PUSH = 0.5, 0.05
+_CURRENT_STD, _PUSH_STD = 0.5, 0.05
 """Standard deviations of a current in m/s and of a push in m/s^2 that are thought possible."""
 
 
@@ -519,55 +634,55 @@ class MonitorConfig(Config):
 
 
 @dataclass(frozen=True)
-class Suspect:
+class FaultHypothesis:
     """A cause, how well it explains the last minutes, and how large it would be.
 
     Attributes:
         change: the cause.
-        score: of its test by the scores of all causes, in standard deviations of clean logs.
-        size: of the change, in its unit.
-        error: standard error of the size.
-        explains: square that it alone takes off the scores of all causes.
+        test_statistic: of its test by the scores of all causes, in standard deviations of clean logs.
+        estimated_size: of the change, in its unit.
+        standard_error: standard error of the size.
+        explained_square: square that it alone takes off the scores of all causes.
     """
 
-    change: Change
-    score: float
-    size: float
-    error: float
-    explains: float
+    change: SystemChange
+    test_statistic: float
+    estimated_size: float
+    standard_error: float
+    explained_square: float
 
 
 @dataclass(frozen=True)
-class Verdict:
+class MonitorVerdict:
     """What a monitor says after a window.
 
     Attributes:
-        alarm: whether the largest score exceeds the threshold; of a watcher also where it has not
+        is_alarm: whether the largest score exceeds the threshold; of a watcher also where it has not
             fallen clearly below it since it did.
         threshold: of the scores.
-        suspects: causes, the one that explains most first.
-        innovation: root mean square of the whitened innovations of each channel; 1 on clean logs.
+        hypotheses: causes, the one that explains most first.
+        innovation_rms: root mean square of the whitened innovations of each channel; 1 on clean logs.
     """
 
-    alarm: bool
+    is_alarm: bool
     threshold: float
-    suspects: Sequence[Suspect]
-    innovation: dict[str, float]
+    hypotheses: Sequence[FaultHypothesis]
+    innovation_rms: dict[str, float]
 
     @property
-    def largest(self) -> float:
+    def max_score(self) -> float:
         """The largest score of any cause."""
-        return max(suspect.score for suspect in self.suspects)
+        return max(suspect.test_statistic for suspect in self.hypotheses)
 
 
-_Innovations = tuple[np.ndarray, np.ndarray]
+_InnovationsAndEffects = tuple[np.ndarray, np.ndarray]
 
 
-class Watch:
+class ChangeDetector:
     """What is known of clean logs, and the tests against it.
 
     Args:
-        clean: windows of clean logs, those of one log together; all of one length.
+        clean_windows: windows of clean logs, those of one log together; all of one length.
 
     Raises:
         DataError: where the clean logs are too few.
@@ -577,219 +692,332 @@ class Watch:
         self,
         spec: ModelSpec,
         model: HybridDynamics,
-        clean: Sequence[Sequence[Piece]],
+        clean_windows: Sequence[Sequence[MeasuredWindow]],
         config: MonitorConfig,
     ) -> None:
         self.model = model.to(torch.float64).eval()
         self.config = config
-        self.causes = causes(spec.signals)
-        self.seen = seen_of(spec.signals.live)
-        self.others = surroundings()
-        outside = [_CURRENT**-2] * 2 + [_PUSH**-2] * 2
-        self.belief = np.diag(outside)
-        believed = [(BELIEVED * one.size) ** -2 for one in self.causes]
-        self.possible = np.diag([*believed, *outside])
-        self.steps, self.past = round(config.window / spec.dt), past_of(model)
-        cut = [(k, part) for k, log in enumerate(clean) for part in self.groups(log)]
-        if len(cut) < _FEWEST:
+        self.hypotheses = make_fault_hypotheses(spec.signals)
+        self.innovation_columns_ = innovation_columns(spec.signals.dof)
+        self.nuisance_changes = make_nuisance_changes()
+        nuisance_precisions = [_CURRENT_STD**-2] * 2 + [_PUSH_STD**-2] * 2
+        self.nuisance_precision = np.diag(nuisance_precisions)
+        prior_precisions = [(PRIOR_STD * item.size) ** -2 for item in self.hypotheses]
+        self.prior_precision = np.diag([*prior_precisions, *nuisance_precisions])
+        self.window_steps, self.n_warmup = (
+            round(config.window / spec.dt),
+            count_warmup_samples(model),
+        )
+        indexed_groups = [
+            (k, group_windows_)
+            for k, log_of_group in enumerate(clean_windows)
+            for group_windows_ in self.group_windows(log_of_group)
+        ]
+        if len(indexed_groups) < _MIN_GROUPS:
             raise DataError(
-                f"the clean logs hold {len(cut)} stretches of {config.group:g} s; a monitor"
-                f" needs at least {_FEWEST} to know how innovations scatter"
+                f"the clean logs hold {len(indexed_groups)} stretches of {config.group:g} s; a monitor"
+                f" needs at least {_MIN_GROUPS} to know how innovations scatter"
             )
-        log = np.array([k for k, _ in cut])
-        most = np.max([np.abs(p.y).max(axis=0) for _, part in cut for p in part], axis=0)
-        most[HEADING] = _TURN
-        self.limit = _FAR * most[[*self.seen.values()]]
-        self.parts = [1, _PARTS] if self.steps >= _LEAST_PART * _PARTS else [1]
-        found = [[self.innovations(part, parts) for parts in self.parts] for _, part in cut]
-        lost = np.concatenate([(group[0][0] == 0.0).all(axis=1) for group in found])
-        if lost.mean() > _MOST_LOST:
+        log_of_group = np.array([k for k, _ in indexed_groups])
+        max_states = np.max(
+            [
+                np.abs(window.y).max(axis=0)
+                for _, group_windows_ in indexed_groups
+                for window in group_windows_
+            ],
+            axis=0,
+        )
+        max_states[HEADING] = _MAX_HEADING_INNOVATION
+        self.divergence_limits = (
+            _DIVERGENCE_FACTOR * max_states[[*self.innovation_columns_.values()]]
+        )
+        self.part_counts = (
+            [1, _N_WINDOW_PARTS] if self.window_steps >= _MIN_PART_STEPS * _N_WINDOW_PARTS else [1]
+        )
+        innovations_by_group = [
+            [self.compute_innovations(group_windows_, parts) for parts in self.part_counts]
+            for _, group_windows_ in indexed_groups
+        ]
+        has_diverged = np.concatenate(
+            [(group[0][0] == 0.0).all(axis=1) for group in innovations_by_group]
+        )
+        if has_diverged.mean() > _MAX_DIVERGED_SHARE:
             raise DataError(
-                f"model {spec.name}: free runs of {config.window:g} s run away in {lost.sum()} of"
-                f" {len(lost)} clean windows; watch with another model, or with a shorter window"
+                f"model {spec.name}: free runs of {config.window:g} s run away in {has_diverged.sum()} of"
+                f" {len(has_diverged)} clean windows; watch with another model, or with a shorter window"
             )
-        always = self._wrong(found)
-        self.whiten = [
-            whitening(
-                np.concatenate([own[i][0] - self.expected(own[i][1], always[i]) for own in found]),
+        model_bias = self._estimate_bias(innovations_by_group)
+        self.whitening_matrices = [
+            compute_whitening_matrix(
+                np.concatenate(
+                    [
+                        innovations_of_group[i][0]
+                        - self.expected_innovations(innovations_of_group[i][1], model_bias[i])
+                        for innovations_of_group in innovations_by_group
+                    ]
+                ),
                 parts,
             )
-            for i, parts in enumerate(self.parts)
+            for i, parts in enumerate(self.part_counts)
         ]
 
-        def learned(always: list[np.ndarray], kept: np.ndarray) -> tuple[np.ndarray, Groups]:
+        def learned(
+            model_bias: list[np.ndarray], is_used: np.ndarray
+        ) -> tuple[np.ndarray, GroupScores]:
             """Return the sizes [Q] that groups ask for together, and all groups without these."""
-            groups = self._groups(log, [self._sums(one, always) for one in found])
+            group_scores = self._to_group_scores(
+                log_of_group,
+                [
+                    self._compute_score_sums(innovations_of_group, model_bias)
+                    for innovations_of_group in innovations_by_group
+                ],
+            )
             # two causes that are wrong alike, such as damping and gain, must not look like one
-            matrix = groups.information[kept].sum(axis=0) + np.diag(believed)
-            bias = np.linalg.solve(matrix, groups.score[kept].sum(axis=0))
-            return bias, groups.without(bias)
+            regularized_information = group_scores.information[is_used].sum(axis=0) + np.diag(
+                prior_precisions
+            )
+            size_bias = np.linalg.solve(
+                regularized_information, group_scores.score[is_used].sum(axis=0)
+            )
+            return size_bias, group_scores.subtract_bias(size_bias)
 
-        self.usual = [(always, learned(always, log >= 0)[0])]
+        self.bias_by_fold = [(model_bias, learned(model_bias, log_of_group >= 0)[0])]
         # groups of one log are alike
-        fold = (log if len(set(log)) >= _FOLDS else np.arange(len(found))) % _FOLDS
-        held = []
+        fold_of_group = (
+            log_of_group
+            if len(set(log_of_group)) >= _N_FOLDS
+            else np.arange(len(innovations_by_group))
+        ) % _N_FOLDS
+        held_out_groups = []
         # scores scatter more where others say what is always wrong, as they do in service
-        for k in range(_FOLDS):
-            always = self._wrong([one for one, own in zip(found, fold, strict=True) if own != k])
-            bias, groups = learned(always, fold != k)
-            self.usual.append((always, bias))
-            held.append(vars(groups[fold == k]).values())
-        apart = Groups(*(np.concatenate(parts) for parts in zip(*held, strict=True)))
-        size = max(round(config.stretch / config.group), 1)
-        self.scatter = replace(scattered(apart), wider=wider(apart, np.sort(fold), size))
-        looks = config.false_alarm / config.stretch * _OVERLAP * len(self.causes)
-        self.threshold = float(scipy.stats.t.isf(0.5 / looks, len(found) - 1))
+        for k in range(_N_FOLDS):
+            model_bias = self._estimate_bias(
+                [
+                    item
+                    for item, innovations_of_group in zip(
+                        innovations_by_group, fold_of_group, strict=True
+                    )
+                    if innovations_of_group != k
+                ]
+            )
+            bias, groups = learned(model_bias, fold_of_group != k)
+            self.bias_by_fold.append((model_bias, bias))
+            held_out_groups.append(vars(groups[fold_of_group == k]).values())
+        cross_validated_groups = GroupScores(
+            *(np.concatenate(parts) for parts in zip(*held_out_groups, strict=True))
+        )
+        groups_per_stretch = max(round(config.stretch / config.group), 1)
+        self.score_distribution = replace(
+            fit_score_distribution(cross_validated_groups),
+            inflation_factor=wider(
+                cross_validated_groups, np.sort(fold_of_group), groups_per_stretch
+            ),
+        )
+        n_looks = config.false_alarm / config.stretch * _LOOKS_PER_STRETCH * len(self.hypotheses)
+        self.threshold = float(scipy.stats.t.isf(0.5 / n_looks, len(innovations_by_group) - 1))
 
-    def _wrong(self, found: Sequence[Sequence[_Innovations]]) -> list[np.ndarray]:
+    def _estimate_bias(
+        self, innovations_by_group: Sequence[Sequence[_InnovationsAndEffects]]
+    ) -> list[np.ndarray]:
         """Return what the model has always got wrong, by innovations of groups of clean windows."""
-        out = []
-        for look in zip(*found, strict=True):
-            error, effects = map(np.concatenate, zip(*look, strict=True))
-            out.append(always_wrong(error, effects, self.causes, len(self.seen)))
-        return out
+        bias_by_look = []
+        for innovations_of_look in zip(*innovations_by_group, strict=True):
+            innovation, effects = map(np.concatenate, zip(*innovations_of_look, strict=True))
+            bias_by_look.append(
+                estimate_model_bias(
+                    innovation, effects, self.hypotheses, len(self.innovation_columns_)
+                )
+            )
+        return bias_by_look
 
     @classmethod
-    def of(
+    def from_logs(
         cls,
         spec: ModelSpec,
         model: HybridDynamics,
-        clean: Sequence[Prepared],
+        clean_logs: Sequence[PreparedLog],
         config: MonitorConfig,
-    ) -> Watch:
+    ) -> ChangeDetector:
         """Return the watch over a model by its clean logs, prepared as those of the fit."""
-        steps, past = round(config.window / spec.dt), past_of(model)
-        return cls(spec, model, [pieces(log, steps, past) for log in clean], config)
+        n_steps, n_warmup = round(config.window / spec.dt), count_warmup_samples(model)
+        return cls(
+            spec,
+            model,
+            [make_measured_windows(log, n_steps, n_warmup) for log in clean_logs],
+            config,
+        )
 
-    def windows(self, log: Prepared) -> list[Piece]:
+    def make_windows(self, log: PreparedLog) -> list[MeasuredWindow]:
         """Return the windows of a new log.
 
         Raises:
             DataError: where it holds none.
         """
-        found = pieces(log, self.steps, self.past)
-        if not found:
+        windows = make_measured_windows(log, self.window_steps, self.n_warmup)
+        if not windows:
             raise DataError(
                 f"log {log.log.name}: holds no window of {self.config.window:g} s without a break;"
                 " shorten the window or leave the log out"
             )
-        return found
+        return windows
 
     @property
-    def changes(self) -> list[Change]:
+    def all_changes(self) -> list[SystemChange]:
         """The causes, then what surrounds the vessel."""
-        return [*self.causes, *self.others]
+        return [*self.hypotheses, *self.nuisance_changes]
 
-    def groups(self, log: Sequence[Piece]) -> list[Sequence[Piece]]:
+    def group_windows(self, windows: Sequence[MeasuredWindow]) -> list[Sequence[MeasuredWindow]]:
         """Return the windows of a log in groups whose wind and current are taken to be constant."""
-        each = max(round(self.config.group / self.config.window), 1)
-        return [log[i : i + each] for i in range(0, len(log), each)]
-
-    def over(self, model: HybridDynamics) -> Watch:
-        """Return the same watch over another model, judged by what clean logs were of this one."""
-        out = copy.copy(self)
-        out.model = model
-        return out
-
-    def sums(self, pieces: Sequence[Piece]) -> list[Sums]:
-        """Return the scores of each of several windows."""
-        found = [self.innovations(pieces, parts) for parts in self.parts]
+        windows_per_group = max(round(self.config.group / self.config.window), 1)
         return [
-            self._sums(
-                [(error[i : i + 1], effects[i : i + 1]) for error, effects in found],
-                self.usual[0][0],
-            )
-            for i in range(len(pieces))
+            windows[first : first + windows_per_group]
+            for first in range(0, len(windows), windows_per_group)
         ]
 
-    def innovations(self, pieces: Sequence[Piece], parts: int) -> _Innovations:
-        """Return innovations [B, parts n] and effects [B, C, parts n] of windows cut into parts."""
-        cut = [part for piece in pieces for part in parted(piece, parts)]
-        error, effects = innovations(self.model, cut, self.changes)
-        count = len(pieces)
-        by_change = effects.reshape(count, parts, len(self.changes), -1).swapaxes(1, 2)
-        error, effects = error.reshape(count, -1), by_change.reshape(count, len(self.changes), -1)
-        most = np.tile(self.limit, error.shape[1] // len(self.limit))
-        size = np.array([change.size for change in self.changes])[:, None]
-        # comparisons with what is no number are false
-        sound = (np.abs(error) <= most).all(axis=1)
-        lost = np.asarray(~(sound & (np.abs(effects * size) <= most).all(axis=(1, 2))))
-        error[lost], effects[lost] = 0.0, 0.0
-        return error, effects
+    def with_model(self, model: HybridDynamics) -> ChangeDetector:
+        """Return the same watch over another model, judged by what clean logs were of this one."""
+        detector = copy.copy(self)
+        detector.model = model
+        return detector
 
-    def expected(self, effects: np.ndarray, always: np.ndarray) -> np.ndarray:
+    def compute_sums(self, windows: Sequence[MeasuredWindow]) -> list[ScoreSums]:
+        """Return the scores of each of several windows."""
+        innovations_and_effects = [
+            self.compute_innovations(windows, n_parts) for n_parts in self.part_counts
+        ]
+        return [
+            self._compute_score_sums(
+                [
+                    (innovation[i : i + 1], effects[i : i + 1])
+                    for innovation, effects in innovations_and_effects
+                ],
+                self.bias_by_fold[0][0],
+            )
+            for i in range(len(windows))
+        ]
+
+    def compute_innovations(
+        self, windows: Sequence[MeasuredWindow], n_parts: int
+    ) -> _InnovationsAndEffects:
+        """Return innovations [B, parts n] and effects [B, C, parts n] of windows cut into parts."""
+        window_parts = [part for window in windows for part in split_window(window, n_parts)]
+        innovation, effects = compute_innovations(self.model, window_parts, self.all_changes)
+        n_windows = len(windows)
+        effects_by_change = effects.reshape(n_windows, n_parts, len(self.all_changes), -1).swapaxes(
+            1, 2
+        )
+        innovation, effects = (
+            innovation.reshape(n_windows, -1),
+            effects_by_change.reshape(n_windows, len(self.all_changes), -1),
+        )
+        limits = np.tile(self.divergence_limits, innovation.shape[1] // len(self.divergence_limits))
+        change_sizes = np.array([change.size for change in self.all_changes])[:, None]
+        # comparisons with what is no number are false
+        is_innovation_valid = (np.abs(innovation) <= limits).all(axis=1)
+        has_diverged = np.asarray(
+            ~(is_innovation_valid & (np.abs(effects * change_sizes) <= limits).all(axis=(1, 2)))
+        )
+        innovation[has_diverged], effects[has_diverged] = 0.0, 0.0
+        return innovation, effects
+
+    def expected_innovations(self, effects: np.ndarray, model_bias: np.ndarray) -> np.ndarray:
         """Return what innovations [B, n] are of clean logs, by their effects [B, C, n].
 
         Args:
-            always: what the model has always got wrong in this look [Q, 4].
+            model_bias: what the model has always got wrong in this look [Q, 4].
         """
-        share = np.tile(always, effects.shape[2] // len(self.seen))
-        return np.asarray((effects[:, : len(self.causes)] * share).sum(axis=1))
+        bias_by_column = np.tile(model_bias, effects.shape[2] // len(self.innovation_columns_))
+        return np.asarray((effects[:, : len(self.hypotheses)] * bias_by_column).sum(axis=1))
 
-    def _sums(self, found: Sequence[_Innovations], always: Sequence[np.ndarray]) -> Sums:
+    def _compute_score_sums(
+        self,
+        innovations_and_effects: Sequence[_InnovationsAndEffects],
+        bias_by_look: Sequence[np.ndarray],
+    ) -> ScoreSums:
         """Return the sums of the same windows as a whole and in parts."""
-        left = [
-            (error - self.expected(effects, wrong), effects)
-            for (error, effects), wrong in zip(found, always, strict=True)
+        corrected_innovations = [
+            (innovation - self.expected_innovations(effects, model_bias), effects)
+            for (innovation, effects), model_bias in zip(
+                innovations_and_effects, bias_by_look, strict=True
+            )
         ]
-        return weighed(left, self.whiten, self.possible)
+        return compute_robust_score_sums(
+            corrected_innovations, self.whitening_matrices, self.prior_precision
+        )
 
-    def _groups(self, logs: Sequence[int] | np.ndarray, sums: Sequence[Sums]) -> Groups:
+    def _to_group_scores(
+        self, log_indices: Sequence[int] | np.ndarray, sums_by_group: Sequence[ScoreSums]
+    ) -> GroupScores:
         """Return scores and information of the causes once the surroundings have had their part."""
         score, information = (
-            np.stack([getattr(one, name) for one in sums]) for name in ("score", "information")
+            np.stack([getattr(group_sums, name) for group_sums in sums_by_group])
+            for name in ("score", "information")
         )
-        return Groups(
-            np.asarray(logs), *apart_from(score, information, len(self.causes), self.belief)
+        return GroupScores(
+            np.asarray(log_indices),
+            *marginalise(score, information, len(self.hypotheses), self.nuisance_precision),
         )
 
-    def judge(self, logs: Sequence[int], sums: Sequence[Sums]) -> Verdict:
+    def evaluate(
+        self, log_indices: Sequence[int], sums_by_group: Sequence[ScoreSums]
+    ) -> MonitorVerdict:
         """Return the verdict on groups of windows; wind and current are their own in each.
 
         Args:
-            logs: number of the log that each group is of.
+            log_indices: number of the log that each group is of.
         """
-        groups = self._groups(logs, sums).without(self.usual[0][1])
-        size, error, explains = self.scatter.together(groups)
-        suspects = [
-            Suspect(change, float(abs(a) / b), float(a), float(b), float(c))
-            for change, a, b, c in zip(self.causes, size, error, explains, strict=True)
+        group_scores = self._to_group_scores(log_indices, sums_by_group).subtract_bias(
+            self.bias_by_fold[0][1]
+        )
+        sizes, standard_errors, explained_squares = self.score_distribution.estimate_sizes(
+            group_scores
+        )
+        hypotheses = [
+            FaultHypothesis(change, float(abs(a) / b), float(a), float(b), float(c))
+            for change, a, b, c in zip(
+                self.hypotheses, sizes, standard_errors, explained_squares, strict=True
+            )
         ]
-        alarm = max(suspect.score for suspect in suspects) > self.threshold
-        suspects.sort(key=lambda suspect: -suspect.explains)
-        count = sum(one.count for one in sums)
-        squares = np.sum([one.squares for one in sums], axis=0) / count
-        by_channel = squares.reshape(-1, len(self.seen)).mean(axis=0)
-        innovation = dict(zip(self.seen, np.sqrt(by_channel).tolist(), strict=True))
-        return Verdict(alarm, self.threshold, suspects, innovation)
+        is_alarm = max(hypothesis.test_statistic for hypothesis in hypotheses) > self.threshold
+        hypotheses.sort(key=lambda suspect: -suspect.explained_square)
+        n_windows = sum(group_sums.n_windows for group_sums in sums_by_group)
+        squares = (
+            np.sum([group_sums.squared_innovations for group_sums in sums_by_group], axis=0)
+            / n_windows
+        )
+        mean_squares = squares.reshape(-1, len(self.innovation_columns_)).mean(axis=0)
+        innovation_rms = dict(
+            zip(self.innovation_columns_, np.sqrt(mean_squares).tolist(), strict=True)
+        )
+        return MonitorVerdict(is_alarm, self.threshold, hypotheses, innovation_rms)
 
 
-_DEADBAND = 1.0
+_ALARM_HYSTERESIS = 1.0
 """Standard deviations by which scores fall below the threshold before an alarm ends."""
 
 
-class Watcher:
+class OnlineChangeDetector:
     """A watch that goes along with measurements, sample by sample.
 
     A score that wavers about the threshold is one alarm: it ends where all scores lie clearly below
     the threshold.
 
     Args:
-        watch: what is known of clean logs.
+        detector: what is known of clean logs.
     """
 
-    def __init__(self, watch: Watch) -> None:
-        self.watch, self.past, self.steps = watch, watch.past, watch.steps
-        self.size = max(round(watch.config.group / watch.config.window), 1)
-        self.windows = max(round(watch.config.stretch / watch.config.window), 1)
-        self.recent: deque[tuple[int, Sums]] = deque()
-        self.log = 0
-        self.closed = True
-        self.alarmed = False
-        self.y: list[np.ndarray] = []
-        self.w: list[np.ndarray] = []
+    def __init__(self, watch: ChangeDetector) -> None:
+        self.detector, self.n_warmup, self.window_steps = watch, watch.n_warmup, watch.window_steps
+        self.windows_per_group = max(round(watch.config.group / watch.config.window), 1)
+        self.max_windows = max(round(watch.config.stretch / watch.config.window), 1)
+        self.recent_groups: deque[tuple[int, ScoreSums]] = deque()
+        self.log_index = 0
+        self.is_group_closed = True
+        self.is_alarmed = False
+        self.measured_states: list[np.ndarray] = []
+        self.measured_inputs: list[np.ndarray] = []
 
-    def step(self, y: np.ndarray, w: np.ndarray) -> Verdict | None:
+    def update(self, y: np.ndarray, w: np.ndarray) -> MonitorVerdict | None:
         """Take one sample: measured state [3 + n], and the inputs [m] held over the step after it.
 
         Returns:
@@ -797,39 +1025,50 @@ class Watcher:
             the window that it lies in.
         """
         if not (np.isfinite(y).all() and np.isfinite(w).all()):
-            self.restart()
+            self.start_new_log()
             return None
-        self.y.append(np.asarray(y, dtype=float))
-        self.w.append(np.asarray(w, dtype=float))
-        if len(self.y) < self.past + self.steps + 1:
+        self.measured_states.append(np.asarray(y, dtype=float))
+        self.measured_inputs.append(np.asarray(w, dtype=float))
+        if len(self.measured_states) < self.n_warmup + self.window_steps + 1:
             return None
-        known, given = np.stack(self.y), np.stack(self.w)
-        piece = Piece(
-            known[self.past :], given[self.past : -1], known[: self.past], given[: self.past]
+        states, inputs = np.stack(self.measured_states), np.stack(self.measured_inputs)
+        window = MeasuredWindow(
+            states[self.n_warmup :],
+            inputs[self.n_warmup : -1],
+            states[: self.n_warmup],
+            inputs[: self.n_warmup],
         )
         # the next window begins where this one ends
-        keep = self.past + 1
-        self.y, self.w = self.y[-keep:], self.w[-keep:]
-        return self.take(self.watch.sums([piece])[0])
+        n_retained = self.n_warmup + 1
+        self.measured_states, self.measured_inputs = (
+            self.measured_states[-n_retained:],
+            self.measured_inputs[-n_retained:],
+        )
+        return self.update_with_sums(self.detector.compute_sums([window])[0])
 
-    def restart(self) -> None:
+    def start_new_log(self) -> None:
         """Begin a new log, whose wind and current are its own."""
-        self.y, self.w = [], []
-        self.log += 1
-        self.closed = True
+        self.measured_states, self.measured_inputs = [], []
+        self.log_index += 1
+        self.is_group_closed = True
 
-    def take(self, sums: Sums) -> Verdict:
+    def update_with_sums(self, window_sums: ScoreSums) -> MonitorVerdict:
         """Take the scores of a window, and return the verdict on the last stretch."""
-        if self.closed or self.recent[-1][1].count >= self.size:
-            self.recent.append((self.log, sums))
+        if self.is_group_closed or self.recent_groups[-1][1].n_windows >= self.windows_per_group:
+            self.recent_groups.append((self.log_index, window_sums))
         else:
-            self.recent[-1] = (self.log, self.recent[-1][1] + sums)
-        self.closed = False
-        counts = [group.count for _, group in self.recent]
-        while sum(counts) - counts[0] >= self.windows:
-            self.recent.popleft()
-            counts.pop(0)
-        verdict = self.watch.judge([log for log, _ in self.recent], [one for _, one in self.recent])
-        lasts = self.alarmed and verdict.largest > verdict.threshold - _DEADBAND
-        self.alarmed = verdict.alarm or lasts
-        return replace(verdict, alarm=self.alarmed)
+            self.recent_groups[-1] = (self.log_index, self.recent_groups[-1][1] + window_sums)
+        self.is_group_closed = False
+        windows_per_recent_group = [group.n_windows for _, group in self.recent_groups]
+        while sum(windows_per_recent_group) - windows_per_recent_group[0] >= self.max_windows:
+            self.recent_groups.popleft()
+            windows_per_recent_group.pop(0)
+        verdict = self.detector.evaluate(
+            [log for log, _ in self.recent_groups],
+            [group_sums for _, group_sums in self.recent_groups],
+        )
+        alarm_persists = (
+            self.is_alarmed and verdict.max_score > verdict.threshold - _ALARM_HYSTERESIS
+        )
+        self.is_alarmed = verdict.is_alarm or alarm_persists
+        return replace(verdict, is_alarm=self.is_alarmed)

@@ -14,8 +14,22 @@ from torch import Tensor
 
 from residnet.core.config import Config, Metres, MetresPerSecond, Seconds
 from residnet.core.errors import DataError, UsageError
-from residnet.core.layout import ALIVE, MOVING, POSITION, SURGE, SWAY, Live
-from residnet.data.simulated import Craft, Disturbance, Flight, Sea, SensorNoise, fly
+from residnet.core.layout import (
+    DYNAMIC_STATES,
+    POSITION,
+    SURGE,
+    SURGE_SWAY_YAW,
+    SWAY,
+    DegreesOfFreedom,
+)
+from residnet.data.simulated import (
+    DisturbanceConfig,
+    ManoeuvreRun,
+    SensorsConfig,
+    SimulatedVessel,
+    TrialEnvironment,
+    simulate_manoeuvres,
+)
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, commanded
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
@@ -43,44 +57,48 @@ def moments(
         horizon: steps of the free runs of a refit.
         scales: of what moves [n].
     """
-    places = [
-        (run, k * horizon) for run, (_, w) in enumerate(runs) for k in range(len(w) // horizon)
+    window_starts = [
+        (run, window_index * horizon)
+        for run, (_, inputs) in enumerate(runs)
+        for window_index in range(len(inputs) // horizon)
     ]
-    size = len(parametric(model).free_indices())
-    out = torch.zeros(len(runs), size, size, dtype=scales.dtype)
-    if not places:
-        return out
-    number = torch.tensor([run for run, _ in places])
-    x = torch.stack([runs[run][0][start : start + horizon] for run, start in places])
-    w = torch.stack([runs[run][1][start : start + horizon] for run, start in places])
-    for _, s in sensitivities(model, x, w):
-        for seen in s[:, :, 1:] / scales[:, None]:
-            out.index_add_(0, number, seen.transpose(1, 2) @ seen)
-    return out
+    n_parameters = len(parametric(model).free_indices())
+    gram_by_run = torch.zeros(len(runs), n_parameters, n_parameters, dtype=scales.dtype)
+    if not window_starts:
+        return gram_by_run
+    run_indices = torch.tensor([run for run, _ in window_starts])
+    states = torch.stack([runs[run][0][start : start + horizon] for run, start in window_starts])
+    inputs = torch.stack([runs[run][1][start : start + horizon] for run, start in window_starts])
+    for _, sensitivity in sensitivities(model, states, inputs):
+        for normalized_sensitivity in sensitivity[:, :, 1:] / scales[:, None]:
+            gram_by_run.index_add_(
+                0, run_indices, normalized_sensitivity.transpose(1, 2) @ normalized_sensitivity
+            )
+    return gram_by_run
 
 
-def after(covariance: Tensor, information: Tensor) -> Tensor:
+def update_covariance(covariance: Tensor, information: Tensor) -> Tensor:
     """Return the covariance [P, P] once data of some information [P, P] are in.
 
     Parameters that have no covariance stay as they are.
     """
-    eye = torch.eye(len(covariance), dtype=covariance.dtype)
-    left: Tensor = covariance @ torch.linalg.inv(eye + information @ covariance)
-    return left
+    identity = torch.eye(len(covariance), dtype=covariance.dtype)
+    posterior: Tensor = covariance @ torch.linalg.inv(identity + information @ covariance)
+    return posterior
 
 
-def volume_gain(covariance: Tensor, information: Tensor) -> float:
+def compute_volume_gain(covariance: Tensor, information: Tensor) -> float:
     """Return by how much the logarithm of the ellipsoid's volume shrinks (D-optimality)."""
-    eye = torch.eye(len(covariance), dtype=covariance.dtype)
-    return 0.5 * float(torch.linalg.slogdet(eye + information @ covariance)[1])
+    identity = torch.eye(len(covariance), dtype=covariance.dtype)
+    return 0.5 * float(torch.linalg.slogdet(identity + information @ covariance)[1])
 
 
-def spread(covariance: Tensor, goal: Tensor) -> float:
+def compute_expected_uncertainty(covariance: Tensor, goal_weights: Tensor) -> float:
     """Return the root mean square uncertainty of what a goal [P, P] weighs (A-optimality)."""
-    return float((goal * covariance).sum().clamp(min=0.0).sqrt())
+    return float((goal_weights * covariance).sum().clamp(min=0.0).sqrt())
 
 
-_SIDES = {"port": 1.0, "stbd": -1.0, "starboard": -1.0, "left": 1.0, "right": -1.0}
+_SIDE_STEER_SIGNS = {"port": 1.0, "stbd": -1.0, "starboard": -1.0, "left": 1.0, "right": -1.0}
 """Which way more of a side's thrust turns the vessel."""
 
 
@@ -102,90 +120,109 @@ class TrialLimits(Config):
     count: int = Field(default=3, ge=1)
 
 
-def candidates(limits: TrialLimits, live: Live = ALIVE) -> list[Manoeuvre]:
+def propose_manoeuvres(
+    trial_limits: TrialLimits, dof: DegreesOfFreedom = SURGE_SWAY_YAW
+) -> list[Manoeuvre]:
     """Return zigzags, turns, 3-2-1-1, multi-sines and speed changes at several drives.
 
     Those that wait for a heading are for a vessel that turns, and several drives and changes of
     speed for one that moves ahead.
     """
-    out: list[Manoeuvre] = []
-    time, full = limits.time, limits.rudder
-    early: dict[str, Any] = {"duration": time, "start": 0.05 * time}
-    late: dict[str, Any] = {"duration": time, "start": 0.1 * time}
-    for drive in (0.4, 0.7, 1.0) if live.moves else (1.0,):
-        per = f"drive_{round(100 * drive)}"
-        if live.turns:
-            out += [
+    manoeuvres: list[Manoeuvre] = []
+    duration, max_steer = trial_limits.time, trial_limits.rudder
+    open_loop_timing: dict[str, Any] = {"duration": duration, "start": 0.05 * duration}
+    closed_loop_timing: dict[str, Any] = {"duration": duration, "start": 0.1 * duration}
+    for drive in (0.4, 0.7, 1.0) if dof.has_position else (1.0,):
+        drive_label = f"drive_{round(100 * drive)}"
+        if dof.has_heading:
+            manoeuvres += [
                 Zigzag(
-                    name=f"zigzag_{angle:.0f}_steer_{round(100 * share * full)}_{per}",
+                    name=f"zigzag_{angle:.0f}_steer_{round(100 * steer_share * max_steer)}_{drive_label}",
                     drive=drive,
-                    steer=share * full,
+                    steer=steer_share * max_steer,
                     heading=math.radians(angle),
-                    **late,
+                    **closed_loop_timing,
                 )
                 for angle in (10.0, 20.0)
-                for share in (0.5, 1.0)
+                for steer_share in (0.5, 1.0)
             ]
-            out += [
-                TurningCircle(name=f"turn_{word}_{per}", drive=drive, steer=side * full, **late)
-                for word, side in (("starboard", 1.0), ("port", -1.0))
+            manoeuvres += [
+                TurningCircle(
+                    name=f"turn_{side_name}_{drive_label}",
+                    drive=drive,
+                    steer=steer_sign * max_steer,
+                    **closed_loop_timing,
+                )
+                for side_name, steer_sign in (("starboard", 1.0), ("port", -1.0))
             ]
-        out += [
+        manoeuvres += [
             ThreeTwoOneOne(
-                name=f"3211_{unit * time:.0f}s_{per}",
+                name=f"3211_{unit_share * duration:.0f}s_{drive_label}",
                 drive=drive,
-                steer=full,
-                unit=unit * time,
-                **early,
+                steer=max_steer,
+                unit=unit_share * duration,
+                **open_loop_timing,
             )
-            for unit in (0.02, 0.05)
+            for unit_share in (0.02, 0.05)
         ]
-        out.append(
+        manoeuvres.append(
             MultiSine(
-                name=f"multi_sine_{per}",
+                name=f"multi_sine_{drive_label}",
                 drive=0.5 * drive,
                 drive_amplitude=0.5 * drive,
-                steer_amplitude=full,
-                band=(2.0 / time, 20.0 / time),
-                duration=time,
+                steer_amplitude=max_steer,
+                band=(2.0 / duration, 20.0 / duration),
+                duration=duration,
             )
         )
-    if live.moves:
-        times, levels = tuple(0.25 * time * k for k in range(4)), (1.0, 0.0, 0.6, 0.2)
-        out.append(
+    if dof.has_position:
+        switch_times, drive_levels = (
+            tuple(0.25 * duration * k for k in range(4)),
+            (1.0, 0.0, 0.6, 0.2),
+        )
+        manoeuvres.append(
             AccelerationDeceleration(
-                name="speed_changes", times=times, levels=levels, duration=time
+                name="speed_changes", times=switch_times, levels=drive_levels, duration=duration
             )
         )
-    return out
+    return manoeuvres
 
 
-def shares_of(spec: ModelSpec) -> Mapping[str, InputShare]:
+def infer_input_shares(spec: ModelSpec) -> Mapping[str, InputShare]:
     """Return how the inputs of a model follow drive and steer, within what its data have seen.
 
     Raises:
         UsageError: where no input can be told to steer.
     """
-    units, ranges, out = spec.signals.units(), spec.ranges, {}
+    units, ranges, shares = spec.signals.channel_units(), spec.ranges, {}
     for name in spec.signals.inputs:
-        most = max(map(abs, ranges[name]))
-        side = next((sign for word, sign in _SIDES.items() if word in name.split("_")), 0.0)
+        max_input = max(map(abs, ranges[name]))
+        steer_sign = next(
+            (
+                side_sign
+                for side_name, side_sign in _SIDE_STEER_SIGNS.items()
+                if side_name in name.split("_")
+            ),
+            0.0,
+        )
         if units.get(name) == "rad" or name == "tau_n":
-            out[name] = InputShare(steer=most, limit=most)
-        elif side:
-            out[name] = InputShare(drive=0.6 * most, steer=0.6 * side * most, limit=most)
+            shares[name] = InputShare(steer=max_input, limit=max_input)
+        elif steer_sign:
+            shares[name] = InputShare(
+                drive=0.6 * max_input, steer=0.6 * steer_sign * max_input, limit=max_input
+            )
         else:
-            out[name] = InputShare(drive=most, limit=most)
-    if spec.signals.live.turns and not any(share.steer for share in out.values()):
+            shares[name] = InputShare(drive=max_input, limit=max_input)
+    if spec.signals.dof.has_heading and not any(share.steer for share in shares.values()):
         raise UsageError(
             f"model {spec.name}: none of {', '.join(spec.signals.inputs)} is known to steer; say"
             " how inputs follow drive and steer in the run's `booklet.inputs`"
         )
-    return out
+    return shares
 
 
 @dataclass(frozen=True)
-class Aim:
+class PredictionGoal:
     """Manoeuvres whose prediction is to become surer, such as those of a booklet.
 
     Attributes:
@@ -200,152 +237,221 @@ class Aim:
 
 
 @dataclass(frozen=True)
-class Trial:
+class CandidateTrial:
     """A candidate as the model flies it.
 
     Attributes:
-        flight: of the model.
-        moments: summed squares of its sensitivities [P, P].
-        minutes: that it lasts.
-        volume: logarithm by which it shrinks the ellipsoid of the parameters, per minute.
-        shrinks: share by which it narrows the intervals of predictions.
-        reach: largest distance from the start in m.
+        simulated_run: of the model.
+        information: summed squares of its sensitivities [P, P].
+        duration_minutes: that it lasts.
+        volume_gain_per_minute: logarithm by which it shrinks the ellipsoid of the parameters, per minute.
+        uncertainty_reduction: share by which it narrows the intervals of predictions.
+        max_distance: largest distance from the start in m.
     """
 
-    flight: Flight
-    moments: Tensor
-    minutes: float
-    volume: float
-    shrinks: float
-    reach: float
+    simulated_run: ManoeuvreRun
+    information: Tensor
+    duration_minutes: float
+    volume_gain_per_minute: float
+    uncertainty_reduction: float
+    max_distance: float
 
 
 @dataclass(frozen=True)
-class Plan:
+class TrialPlan:
     """Candidates, the most telling per minute first, and the trials to run.
 
     Attributes:
-        trials: all candidates within the limits.
-        chosen: the trials to run, in their order.
-        shrinks: share by which they narrow the intervals of predictions together.
+        candidates: all candidates within the limits.
+        selected_trials: the trials to run, in their order.
+        uncertainty_reduction: share by which they narrow the intervals of predictions together.
     """
 
-    trials: Sequence[Trial]
-    chosen: Sequence[Trial]
-    shrinks: float
+    candidates: Sequence[CandidateTrial]
+    selected_trials: Sequence[CandidateTrial]
+    uncertainty_reduction: float
 
 
-def plan(
-    fitted: FittedModel,
-    open_: LeftOpen,
-    refit: RefitConfig,
-    scales: np.ndarray,
-    shares: Mapping[str, InputShare],
-    limit: np.ndarray,
-    limits: TrialLimits,
-    aim: Aim | None = None,
-) -> Plan:
+def plan_trials(
+    fitted_model: FittedModel,
+    unidentified: LeftOpen,
+    refit_config: RefitConfig,
+    state_scales_array: np.ndarray,
+    input_shares: Mapping[str, InputShare],
+    velocity_limits: np.ndarray,
+    trial_limits: TrialLimits,
+    goal_manoeuvres: PredictionGoal | None = None,
+) -> TrialPlan:
     """Return the trials that narrow the intervals of predictions most per minute.
 
-    Predictions are those of the velocities over the manoeuvres of `aim`. Trials are chosen one
+    Predictions are those of the velocities over the manoeuvres of `goal_manoeuvres`. Trials are chosen one
     after the other, each given those before it.
 
     Args:
-        open_: what its refit has left open.
-        scales: of what moves [n].
-        shares: of the inputs in drive and steer.
-        limit: of what moves [n] beyond which a flight has diverged.
-        aim: what is to be predicted; None for all candidates alike.
+        unidentified: what its refit has left open.
+        state_scales_array: of what moves [n].
+        input_shares: of the inputs in drive and steer.
+        velocity_limits: of what moves [n] beyond which a flight has diverged.
+        goal_manoeuvres: what is to be predicted; None for all candidates alike.
 
     Raises:
         DataError: where no candidate stays within the limits, or nothing is open.
     """
-    spec, model = fitted.spec, fitted.model.double()
-    spec.signals.live.require_on_surface("the plan of a trial")
-    horizon = round(refit.horizon / spec.dt)
-    divisor, offered = torch.from_numpy(scales), candidates(limits, spec.signals.live)
+    spec, model = fitted_model.spec, fitted_model.model.double()
+    spec.signals.dof.require_on_surface("the plan of a trial")
+    horizon = round(refit_config.horizon / spec.dt)
+    state_scales, manoeuvres = (
+        torch.from_numpy(state_scales_array),
+        propose_manoeuvres(trial_limits, spec.signals.dof),
+    )
     # those of one kind fly together
-    every = Aim(sorted(offered, key=lambda one: one.kind), limits.time, {})
-    flown = [(flight, *_path(flight, spec.signals)) for flight in _flights(fitted, shares, every)]
-    kept = [one for one in flown if _allowed(one[1], limit, limits)]
-    if not kept:
+    all_candidates = PredictionGoal(
+        sorted(manoeuvres, key=lambda one: one.kind), trial_limits.time, {}
+    )
+    simulated_trajectories = [
+        (simulated_run, *_to_trajectory(simulated_run, spec.signals))
+        for simulated_run in _simulate_manoeuvres(fitted_model, input_shares, all_candidates)
+    ]
+    allowed_trajectories = [
+        item
+        for item in simulated_trajectories
+        if _is_within_limits(item[1], velocity_limits, trial_limits)
+    ]
+    if not allowed_trajectories:
         raise DataError(
-            f"none of {len(flown)} candidates stays within the limits; allow more area, speed or"
+            f"none of {len(simulated_trajectories)} candidates stays within the limits; allow more area, speed or"
             " rudder, or less time"
         )
-    told = moments(model, [(states, w) for _, states, w in kept], horizon, divisor)
+    grams = moments(
+        model, [(states, w) for _, states, w in allowed_trajectories], horizon, state_scales
+    )
     # so many samples hang together that they count as one
-    each = spec.dt / refit.correlation / max(open_.square, 1e-12)
-    goal = told.sum(dim=0)
-    if aim is not None:
-        paths = [_path(one, spec.signals) for one in _flights(fitted, shares, aim)]
-        goal = moments(model, paths, horizon, divisor).sum(dim=0)
-    before = spread(open_.covariance, goal)
-    if not (np.isfinite(before) and before > 0.0):
+    information_per_gram = spec.dt / refit_config.correlation / max(unidentified.square, 1e-12)
+    goal_weights = grams.sum(dim=0)
+    if goal_manoeuvres is not None:
+        goal_trajectories = [
+            _to_trajectory(item, spec.signals)
+            for item in _simulate_manoeuvres(fitted_model, input_shares, goal_manoeuvres)
+        ]
+        goal_weights = moments(model, goal_trajectories, horizon, state_scales).sum(dim=0)
+    initial_uncertainty = compute_expected_uncertainty(unidentified.covariance, goal_weights)
+    if not (np.isfinite(initial_uncertainty) and initial_uncertainty > 0.0):
         raise DataError(
-            f"model {fitted.name}: its refit leaves nothing open of the manoeuvres to predict, or"
-            f" it cannot fly them for {refit.horizon:g} s; add logs that cover their speeds and"
+            f"model {fitted_model.name}: its refit leaves nothing open of the manoeuvres to predict, or"
+            f" it cannot fly them for {refit_config.horizon:g} s; add logs that cover their speeds and"
             " rudder angles, or shorten refit.horizon"
         )
     trials = []
-    for (flight, states, _), own in zip(kept, told, strict=True):
-        minutes, told_of = (len(states) - 1) * spec.dt / 60.0, each * own
-        volume = volume_gain(open_.covariance, told_of) / minutes
-        shrinks = 1.0 - spread(after(open_.covariance, told_of), goal) / before
-        trials.append(Trial(flight, told_of, minutes, volume, shrinks, _reach(states)))
-    trials.sort(key=lambda trial: -trial.shrinks / trial.minutes)
-    chosen: list[Trial] = []
-    now = open_.covariance
-    for _ in range(min(limits.count, len(trials))):
-        width = spread(now, goal)
+    for (simulated_run, states, _), gram in zip(allowed_trajectories, grams, strict=True):
+        duration_minutes, information = (
+            (len(states) - 1) * spec.dt / 60.0,
+            information_per_gram * gram,
+        )
+        volume_gain_ = compute_volume_gain(unidentified.covariance, information) / duration_minutes
+        uncertainty_reduction = (
+            1.0
+            - compute_expected_uncertainty(
+                update_covariance(unidentified.covariance, information), goal_weights
+            )
+            / initial_uncertainty
+        )
+        trials.append(
+            CandidateTrial(
+                simulated_run,
+                information,
+                duration_minutes,
+                volume_gain_,
+                uncertainty_reduction,
+                _distance_from_start(states),
+            )
+        )
+    trials.sort(key=lambda trial: -trial.uncertainty_reduction / trial.duration_minutes)
+    selected_trials: list[CandidateTrial] = []
+    current_covariance = unidentified.covariance
+    for _ in range(min(trial_limits.count, len(trials))):
+        current_uncertainty = compute_expected_uncertainty(current_covariance, goal_weights)
 
-        def gain(trial: Trial, now: Tensor = now, width: float = width) -> float:
-            return (width - spread(after(now, trial.moments), goal)) / trial.minutes
+        def gain(
+            trial: CandidateTrial,
+            covariance: Tensor = current_covariance,
+            uncertainty: float = current_uncertainty,
+        ) -> float:
+            return (
+                uncertainty
+                - compute_expected_uncertainty(
+                    update_covariance(covariance, trial.information), goal_weights
+                )
+            ) / trial.duration_minutes
 
-        best = max((trial for trial in trials if trial not in chosen), key=gain)
-        chosen.append(best)
-        now = after(now, best.moments)
-    total = sum((trial.moments for trial in chosen), torch.zeros_like(goal))
-    return Plan(trials, chosen, 1.0 - spread(after(open_.covariance, total), goal) / before)
-
-
-def _flights(fitted: FittedModel, shares: Mapping[str, InputShare], aim: Aim) -> list[Flight]:
-    spec, model = fitted.spec, fitted.model.double()
-    gear = GivenActuators(shares, spec.signals.exogenous, spec.dt)
-    actuated = ActuatedDynamics(model, spec.signals.columns, spec.hold, gear)
-    start = actuated.approach(1)
-    # trials begin at a speed in the middle of what the model knows
-    start[:, SURGE] = 0.5 * (max(spec.low[0], 0.0) + spec.high[0])
-    for name, value in aim.initial.items():
-        start[:, actuated.state.index(name)] = float(value)
-    craft = Craft(
-        fitted.name, actuated, Helm(gear.demand, actuated.state, gear.inputs), gear.commands, start
+        best_trial = max((trial for trial in trials if trial not in selected_trials), key=gain)
+        selected_trials.append(best_trial)
+        current_covariance = update_covariance(current_covariance, best_trial.information)
+    total_information = sum(
+        (trial.information for trial in selected_trials), torch.zeros_like(goal_weights)
     )
-    sea = Sea(None, Disturbance(), SensorNoise(), 0)
-    return fly(craft, list(aim.manoeuvres), sea, aim.duration, spec.dt)
+    return TrialPlan(
+        trials,
+        selected_trials,
+        1.0
+        - compute_expected_uncertainty(
+            update_covariance(unidentified.covariance, total_information), goal_weights
+        )
+        / initial_uncertainty,
+    )
 
 
-def _path(flight: Flight, signals: SignalsConfig) -> tuple[Tensor, Tensor]:
+def _simulate_manoeuvres(
+    fitted_model: FittedModel,
+    input_shares: Mapping[str, InputShare],
+    goal_manoeuvres: PredictionGoal,
+) -> list[ManoeuvreRun]:
+    spec, model = fitted_model.spec, fitted_model.model.double()
+    actuators = GivenActuators(input_shares, spec.signals.exogenous, spec.dt)
+    actuated = ActuatedDynamics(model, spec.signals.input_columns, spec.hold, actuators)
+    initial_state = actuated.approach(1)
+    # trials begin at a speed in the middle of what the model knows
+    initial_state[:, SURGE] = 0.5 * (max(spec.low[0], 0.0) + spec.high[0])
+    for name, value in goal_manoeuvres.initial.items():
+        initial_state[:, actuated.state.index(name)] = float(value)
+    vessel = SimulatedVessel(
+        fitted_model.name,
+        actuated,
+        Helm(actuators.demand, actuated.state, actuators.inputs),
+        actuators.commands,
+        initial_state,
+    )
+    environment = TrialEnvironment(None, DisturbanceConfig(), SensorsConfig(), 0)
+    return simulate_manoeuvres(
+        vessel, list(goal_manoeuvres.manoeuvres), environment, goal_manoeuvres.duration, spec.dt
+    )
+
+
+def _to_trajectory(simulated_run: ManoeuvreRun, signals: SignalsConfig) -> tuple[Tensor, Tensor]:
     """Return states [T + 1, 3 + n] and inputs [T, m] of a flight."""
-    motion = flight.motion
-    known: dict[str, Any] = motion.channels
-    still = np.zeros(len(motion))
+    motion = simulated_run.true_log
+    channel_values: dict[str, Any] = motion.channels
+    zeros = np.zeros(len(motion))
     # what nobody commands, such as the wind, is left at rest
-    w = [known.get(name, known.get(commanded(name), still)) for name in signals.columns]
-    states = torch.from_numpy(motion.stack(signals.live.states))
-    return states, torch.from_numpy(np.stack(w, axis=1))[:-1]
+    inputs = [
+        channel_values.get(name, channel_values.get(commanded(name), zeros))
+        for name in signals.input_columns
+    ]
+    states = torch.from_numpy(motion.stack(signals.dof.state_names))
+    return states, torch.from_numpy(np.stack(inputs, axis=1))[:-1]
 
 
-def _reach(states: Tensor) -> float:
+def _distance_from_start(states: Tensor) -> float:
     return float((states[:, POSITION] - states[0, POSITION]).norm(dim=1).max())
 
 
-def _allowed(states: Tensor, limit: np.ndarray, limits: TrialLimits) -> bool:
+def _is_within_limits(
+    states: Tensor, velocity_limits: np.ndarray, trial_limits: TrialLimits
+) -> bool:
     """Whether a flight stays sound and within the limits."""
-    fastest = states[:, MOVING].abs().amax(0).numpy()
-    speed = float(torch.hypot(states[:, SURGE], states[:, SWAY]).max())
+    max_velocities = states[:, DYNAMIC_STATES].abs().amax(0).numpy()
+    max_speed = float(torch.hypot(states[:, SURGE], states[:, SWAY]).max())
     return bool(
-        (fastest <= limit).all()
-        and (limits.area is None or _reach(states) <= limits.area)
-        and (limits.speed is None or speed <= limits.speed)
+        (max_velocities <= velocity_limits).all()
+        and (trial_limits.area is None or _distance_from_start(states) <= trial_limits.area)
+        and (trial_limits.speed is None or max_speed <= trial_limits.speed)
     )

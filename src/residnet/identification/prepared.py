@@ -11,21 +11,21 @@ import numpy as np
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.arrays import paged
 from residnet.core.errors import DataError
-from residnet.core.layout import Live
+from residnet.core.layout import DegreesOfFreedom
 from residnet.core.log import Log
-from residnet.core.progress import say
-from residnet.data.masks import DEAD_COMMANDS
-from residnet.data.prepare import Prepared, prepare
+from residnet.core.progress import log_message
+from residnet.data.masks import UNEXPLAINED_IDLE
+from residnet.data.prepare import PreparedLog, prepare_log
 from residnet.identification.settings import FitSettings
-from residnet.judge.protocol import longest_stretch
+from residnet.judge.protocol import longest_segment_length
 from residnet.training.current import estimate_currents, through_water
 
-_LONGEST = 500_000
+_MAX_SAMPLES = 500_000
 """Samples of a log that are prepared at once."""
-PreparedSplits = dict[str, paged.OneByOne[Prepared]]
+PreparedSplits = dict[str, paged.PageReleasingList[PreparedLog]]
 
 
-def prepare_logs(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> PreparedSplits:
+def prepare_splits(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> PreparedSplits:
     """Prepare every log of every split.
 
     Args:
@@ -40,103 +40,122 @@ def prepare_logs(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> 
         # what explains motion is learned from training and validation logs
         # a config is checked without what only data need
         from residnet.data.doctor.others import dead_commands
-        from residnet.data.doctor.statistics import Record
+        from residnet.data.doctor.statistics import LogStatistics
 
-        seen = {
-            split: [Record(log, signals.columns) for log in logs] for split, logs in splits.items()
+        statistics_by_split = {
+            split: [LogStatistics(log, signals.input_columns) for log in logs]
+            for split, logs in splits.items()
         }
-        learned = [log for split in ("train", "validation") for log in seen.get(split, ())]
-        further = [log for split in seen.keys() - {"train", "validation"} for log in seen[split]]
-        found = dead_commands(learned, further, signals.columns)
+        training_statistics = [
+            log for split in ("train", "validation") for log in statistics_by_split.get(split, ())
+        ]
+        other_statistics = [
+            log
+            for split in statistics_by_split.keys() - {"train", "validation"}
+            for log in statistics_by_split[split]
+        ]
+        idle_segments = dead_commands(training_statistics, other_statistics, signals.input_columns)
 
         def masked(log: Log) -> Log:
-            bad = np.zeros(len(log), dtype=bool)
-            for start, stop in found.get(log.name, ()):
-                bad[start : stop + 1] = True
-                say(
-                    f"  {log.name}: t = {log.t[start]:.1f} to {log.t[stop]:.1f} s is left out: all"
+            is_idle = np.zeros(len(log), dtype=bool)
+            for start, last in idle_segments.get(log.name, ()):
+                is_idle[start : last + 1] = True
+                log_message(
+                    f"  {log.name}: t = {log.t[start]:.1f} to {log.t[last]:.1f} s is left out: all"
                     " inputs rest, and the other logs do not explain the motion"
                     " (prepare.dead_commands: keep would keep it)"
                 )
-            return log.replace(masks={**log.masks, DEAD_COMMANDS: bad}) if bad.any() else log
+            return (
+                log.replace(masks={**log.masks, UNEXPLAINED_IDLE: is_idle})
+                if is_idle.any()
+                else log
+            )
 
         splits = {split: [masked(log) for log in logs] for split, logs in splits.items()}
     prepared = {
-        split: paged.OneByOne(
-            prepare(part, split, signals.columns, settings.prepare, signals.live)
+        split: paged.PageReleasingList(
+            prepare_log(log_part, split, signals.input_columns, settings.prepare, signals.dof)
             for log in logs
-            for part in shortened(log)
+            for log_part in split_long_log(log)
         )
         for split, logs in splits.items()
     }
     for logs in prepared.values():
         for log in logs:
-            if not log.good.any():
-                seconds = len(log) * settings.prepare.grid.step
+            if not log.trainable.any():
+                duration = len(log) * settings.prepare.grid.step
                 raise DataError(
-                    f"log {log.log.name}: its {seconds:.1f} s hold no stretch as long as the"
+                    f"log {log.log.name}: its {duration:.1f} s hold no stretch as long as the"
                     " derivative's window; leave it out or shorten prepare.derivative.window"
                 )
             if log.split != "train":
-                require_window(log, settings)
-    every = [log for logs in prepared.values() for log in logs]
-    for key, source in (
+                check_window_fits(log, settings)
+    all_logs = [log for logs in prepared.values() for log in logs]
+    for key, source_text in (
         ("smoothed", "come from a smoother of the measured motion"),
         ("integrated", "are integrated from the velocities: their errors are those of no place"),
     ):
-        made = [", ".join(log.log.meta[key]) for log in every if key in log.log.meta]
-        for names in dict.fromkeys(made):
-            say(f"  {names} of {made.count(names)} logs {source}")
-    for log in every:
-        spikes = log.log.meta.get("spikes", {})
-        if spikes:
-            counts = ", ".join(f"{name} {count}" for name, count in spikes.items())
-            say(f"  {log.log.name}: spikes are bridged and left out (samples: {counts})")
+        derived_channel_texts = [
+            ", ".join(log.log.meta[key]) for log in all_logs if key in log.log.meta
+        ]
+        for names in dict.fromkeys(derived_channel_texts):
+            log_message(f"  {names} of {derived_channel_texts.count(names)} logs {source_text}")
+    for log in all_logs:
+        spike_counts = log.log.meta.get("spikes", {})
+        if spike_counts:
+            counts_text = ", ".join(f"{name} {count}" for name, count in spike_counts.items())
+            log_message(
+                f"  {log.log.name}: spikes are bridged and left out (samples: {counts_text})"
+            )
     return prepared
 
 
-def shortened(log: Log) -> list[Log]:
+def split_long_log(log: Log) -> list[Log]:
     """Return a log as it is, or its parts one after the other where it is very long."""
-    if len(log) <= _LONGEST:
+    if len(log) <= _MAX_SAMPLES:
         return [log]
-    count = -(-len(log) // _LONGEST)
-    bounds = np.linspace(0, len(log), count + 1).astype(int)
+    n_parts = -(-len(log) // _MAX_SAMPLES)
+    bounds = np.linspace(0, len(log), n_parts + 1).astype(int)
     return [
-        log.rows(slice(begin, end)).replace(name=f"{log.name}_{number + 1}_of_{count}")
-        for number, (begin, end) in enumerate(pairwise(bounds))
+        log.select_rows(slice(part_start, part_stop)).replace(
+            name=f"{log.name}_{part_index + 1}_of_{n_parts}"
+        )
+        for part_index, (part_start, part_stop) in enumerate(pairwise(bounds))
     ]
 
 
-def require_window(log: Prepared, settings: FitSettings) -> None:
+def check_window_fits(log: PreparedLog, settings: FitSettings) -> None:
     """Check that a log holds at least one window of some protocol.
 
     Raises:
         DataError: where it does not.
     """
-    step, protocols = settings.prepare.grid.step, settings.evaluation.protocols
-    if not any(protocol.windows(log, 0, step) for protocol in protocols.values()):
+    dt, protocols = settings.prepare.grid.step, settings.evaluation.protocols
+    if not any(protocol.make_windows(log, 0, dt) for protocol in protocols.values()):
         raise DataError(
-            f"log {log.log.name}: lasts {len(log) * step:.1f} s, its longest stretch without a gap"
-            f" {longest_stretch(log) * step:.1f} s: no window of a protocol"
+            f"log {log.log.name}: lasts {len(log) * dt:.1f} s, its longest stretch without a gap"
+            f" {longest_segment_length(log) * dt:.1f} s: no window of a protocol"
             f" ({', '.join(protocols)}) fits; fill gaps that may be interpolated, leave it out or"
             " shorten evaluation.protocols"
         )
 
 
-def velocity_limit(low: np.ndarray, high: np.ndarray, divergence: float, live: Live) -> np.ndarray:
+def compute_velocity_limits(
+    lower: np.ndarray, upper: np.ndarray, divergence_factor: float, dof: DegreesOfFreedom
+) -> np.ndarray:
     """Return the size [n] of what moves beyond which a free run has diverged.
 
     Args:
-        low: smallest training velocities (and inputs, which are not used), [n + m], from robust
+        lower: smallest training velocities (and inputs, which are not used), [n + m], from robust
             quantiles (`residnet.data.prepare.envelope`).
-        high: largest ones, [n + m].
-        divergence: the multiple of the largest training value.
+        upper: largest ones, [n + m].
+        divergence_factor: the multiple of the largest training value.
     """
-    return divergence * live.largest(low, high)
+    return divergence_factor * dof.range_limits(lower, upper)
 
 
-def through_currents(
-    logs: Mapping[str, Sequence[Prepared]], settings: FitSettings
+def convert_to_motion_through_water(
+    logs: Mapping[str, Sequence[PreparedLog]], settings: FitSettings
 ) -> tuple[PreparedSplits, list[dict[str, Any]]]:
     """Return logs by split as motion through the water, and the table of their currents.
 
@@ -151,27 +170,33 @@ def through_currents(
     Raises:
         FitError: where the logs do not determine their currents.
     """
-    splits = {split: paged.OneByOne(members) for split, members in logs.items()}
+    splits = {split: paged.PageReleasingList(split_logs) for split, split_logs in logs.items()}
     if settings.current is None:
         return splits, []
     signals = settings.signals.build()
     baseline = settings.all_baselines[settings.current.baseline].build(signals.names)
     assert isinstance(baseline, RegressorBaseline), "the settings were validated"
-    order = sorted(splits, key=lambda split: split not in ("train", "validation"))
-    every = [log for split in order for log in logs[split]]
-    fitted = sum(len(logs[split]) for split in ("train", "validation"))
-    values, table = estimate_currents(
-        baseline, signals, every[:fitted], settings.current, every[fitted:]
+    split_order = sorted(splits, key=lambda split: split not in ("train", "validation"))
+    all_logs = [log for split in split_order for log in logs[split]]
+    n_fitted = sum(len(logs[split]) for split in ("train", "validation"))
+    currents, current_rows = estimate_currents(
+        baseline, signals, all_logs[:n_fitted], settings.current, all_logs[n_fitted:]
     )
     north, east = (
-        np.array([row[f"current_{axis}"] for row in table]) for axis in ("north", "east")
+        np.array([row[f"current_{axis}"] for row in current_rows]) for axis in ("north", "east")
     )
-    speed = np.hypot(north, east)
-    say(
-        f"  currents of {len(table)} logs: {speed.mean():.3f} m/s on average, at most"
-        f" {speed.max():.3f} m/s"
+    current_speeds = np.hypot(north, east)
+    log_message(
+        f"  currents of {len(current_rows)} logs: {current_speeds.mean():.3f} m/s on average, at most"
+        f" {current_speeds.max():.3f} m/s"
     )
-    moved = iter(
-        [through_water(log, value, signals) for log, value in zip(every, values, strict=True)]
+    converted_logs = iter(
+        [
+            through_water(log, current, signals)
+            for log, current in zip(all_logs, currents, strict=True)
+        ]
     )
-    return {split: paged.OneByOne([next(moved) for _ in logs[split]]) for split in order}, table
+    return {
+        split: paged.PageReleasingList([next(converted_logs) for _ in logs[split]])
+        for split in split_order
+    }, current_rows

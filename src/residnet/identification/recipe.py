@@ -9,146 +9,166 @@ from typing import Any
 
 import numpy as np
 
-from residnet.baselines.sets import HULL, ROLL, WIND, Roles, submerged
-from residnet.core.layout import ALIVE, Live
+from residnet.baselines.sets import (
+    HULL_TERMS,
+    ROLL_TERMS,
+    WIND_TERMS,
+    ChannelRoles,
+    submerged_terms,
+)
+from residnet.core.layout import SURGE_SWAY_YAW, DegreesOfFreedom
 from residnet.core.log import Log
-from residnet.core.names import BOW_WIND, CHANNEL_UNITS, WIND_INPUTS, thrusters_that_turn
+from residnet.core.names import BOW_WIND_CHANNELS, CHANNEL_UNITS, WIND_INPUTS, azimuth_thrusters
 from residnet.core.samples import Samples
-from residnet.core.stretches import stretches
-from residnet.data.motion import without_pauses
-from residnet.data.prepare import PrepareConfig, Prepared, prepare
+from residnet.core.stretches import find_runs
+from residnet.data.motion import remove_pauses
+from residnet.data.prepare import PrepareConfig, PreparedLog, prepare_log
 from residnet.dynamics.base import Integrator
-from residnet.judge.protocol import EvaluationConfig, Windows, longest_stretch
+from residnet.judge.protocol import EvaluationConfig, WindowProtocol, longest_segment_length
 from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
-from residnet.physics.symmetry import live_of, mirrored_channels, wrong_parity
+from residnet.physics.symmetry import get_dof, mirror_channels, violates_symmetry
 
-_STILL = 1e-3
+_MIN_RELATIVE_SPREAD = 1e-3
 """Spread of a channel, as a share of its size, below which it tells nothing."""
-_ASTERN = 0.01
+_MIN_ASTERN_SHARE = 0.01
 """Share of the samples from which a propeller that turns astern counts."""
-_ROOM = 0.6
+_MAX_SEGMENT_SHARE = 0.6
 """Share of a usual stretch that a free run may take, so that it can start at several places."""
-_USUAL = 60.0
+_DEFAULT_FREE_RUN_LENGTH = 60.0
 """Length of a free run in s where no log says how long it is."""
 
 
 @dataclass(frozen=True)
-class Facts:
+class TrainingDataSummary:
     """What the portfolio of a fit depends on.
 
     Attributes:
-        names: channels that models see.
-        moving: inputs, forces and wind channels that vary in the training logs.
-        astern: inputs that take both signs there.
-        step: of the grid, s.
-        length: of the free runs that choose between models, s.
+        channel_names: channels that models see.
+        varying_channels: inputs, forces and wind channels that vary in the training logs.
+        reversing_inputs: inputs that take both signs there.
+        dt: of the grid, s.
+        free_run_length: of the free runs that choose between models, s.
         history: measured past that a free run may look back on, s.
-        stretch: half of the training samples lie in uninterrupted stretches at least so long, s.
-        samples: of the training logs.
-        rolling: time in s in which a roll turns by a radian of its period; infinite without one.
+        median_segment_duration: half of the training samples lie in uninterrupted stretches at least so long, s.
+        n_samples: of the training logs.
+        roll_time_per_radian: time in s in which a roll turns by a radian of its period; infinite without one.
     """
 
-    names: tuple[str, ...]
-    moving: tuple[str, ...]
-    astern: tuple[str, ...]
-    step: float
-    length: float
+    channel_names: tuple[str, ...]
+    varying_channels: tuple[str, ...]
+    reversing_inputs: tuple[str, ...]
+    dt: float
+    free_run_length: float
     history: float
-    stretch: float
-    samples: int
-    rolling: float = math.inf
+    median_segment_duration: float
+    n_samples: int
+    roll_time_per_radian: float = math.inf
 
     @classmethod
-    def supposed(cls, names: tuple[str, ...]) -> Facts:
+    def from_channel_names(cls, channel_names: tuple[str, ...]) -> TrainingDataSummary:
         """Return facts before any log is read: every channel moves, ahead only, for long."""
-        return cls(names, _acting(names), (), 0.1, _USUAL, 0.1 * _USUAL, math.inf, 20_000)
+        return cls(
+            channel_names,
+            _input_names(channel_names),
+            (),
+            0.1,
+            _DEFAULT_FREE_RUN_LENGTH,
+            0.1 * _DEFAULT_FREE_RUN_LENGTH,
+            math.inf,
+            20_000,
+        )
 
     @classmethod
-    def of(
-        cls, samples: Samples, logs: Sequence[Prepared], evaluation: EvaluationConfig, step: float
-    ) -> Facts:
+    def from_logs(
+        cls, samples: Samples, logs: Sequence[PreparedLog], evaluation: EvaluationConfig, dt: float
+    ) -> TrainingDataSummary:
         """Return what training logs and the protocol that chooses say.
 
         Args:
-            step: of the grid, s.
+            dt: of the grid, s.
         """
-        z, names = samples.z, samples.names
-        spread, size = z.std(0, correction=0), z.abs().amax(0)
-        moving = [
+        channel_values, channel_names = samples.z, samples.names
+        std, max_abs = channel_values.std(0, correction=0), channel_values.abs().amax(0)
+        varying_channels = [
             name
-            for name in _acting(names)
-            if spread[names.index(name)] > _STILL * size[names.index(name)]
+            for name in _input_names(channel_names)
+            if std[channel_names.index(name)]
+            > _MIN_RELATIVE_SPREAD * max_abs[channel_names.index(name)]
         ]
-        astern = []
-        for name in moving:
-            column = z[:, names.index(name)]
-            shares = [float(side.double().mean()) for side in (column > 0, column < 0)]
-            astern += [name] if min(shares) > _ASTERN else []
-        length, history = _free_run(logs, evaluation, step)
-        lengths = np.concatenate(
-            [np.diff(np.stack(stretches(log.piece)), axis=0).flatten() for log in logs]
+        reversing_inputs = []
+        for name in varying_channels:
+            values = channel_values[:, channel_names.index(name)]
+            sign_shares = [float(has_sign.double().mean()) for has_sign in (values > 0, values < 0)]
+            reversing_inputs += [name] if min(sign_shares) > _MIN_ASTERN_SHARE else []
+        free_run_length, history = _free_run_length(logs, evaluation, dt)
+        segment_lengths = np.concatenate(
+            [np.diff(np.stack(find_runs(log.segment)), axis=0).flatten() for log in logs]
         )
-        falling = np.sort(lengths)[::-1]
-        half = falling[np.searchsorted(np.cumsum(falling), 0.5 * falling.sum())]
-        stretch, rolling = float(half) * step, math.inf
-        if "p" in names:
-            angle, rate = (float(spread[names.index(name)]) for name in ("phi", "p"))
-            rolling = angle / max(rate, 1e-9)
+        sorted_lengths = np.sort(segment_lengths)[::-1]
+        median_segment_length = sorted_lengths[
+            np.searchsorted(np.cumsum(sorted_lengths), 0.5 * sorted_lengths.sum())
+        ]
+        median_segment_duration, roll_time_per_radian = float(median_segment_length) * dt, math.inf
+        if "p" in channel_names:
+            angle_std, rate_std = (float(std[channel_names.index(name)]) for name in ("phi", "p"))
+            roll_time_per_radian = angle_std / max(rate_std, 1e-9)
         return cls(
-            names, tuple(moving), tuple(astern), step, length, history, stretch, len(samples),
-            rolling,
+            channel_names, tuple(varying_channels), tuple(reversing_inputs), dt, free_run_length, history, median_segment_duration, len(samples),
+            roll_time_per_radian,
         )  # fmt: skip
 
     @property
-    def longest(self) -> float:
+    def max_free_run_length(self) -> float:
         """Length of the longest free runs that there is a use and enough room for, s."""
-        return min(self.length, _ROOM * self.stretch)
+        return min(self.free_run_length, _MAX_SEGMENT_SHARE * self.median_segment_duration)
 
     @property
-    def inputs(self) -> tuple[str, ...]:
+    def varying_inputs(self) -> tuple[str, ...]:
         """Channels that drive the vessel and vary; forces where the model makes them."""
-        return tuple(name for name in self.moving if name not in WIND_CHANNELS)
+        return tuple(name for name in self.varying_channels if name not in WIND_CHANNELS)
 
     @property
-    def wind(self) -> bool:
+    def has_wind(self) -> bool:
         """Whether the true wind is known."""
-        return any(name in WIND_CHANNELS for name in self.moving)
+        return any(name in WIND_CHANNELS for name in self.varying_channels)
 
 
-def _acting(names: Sequence[str]) -> tuple[str, ...]:
-    forces = "tau_x" in names
+def _input_names(channel_names: Sequence[str]) -> tuple[str, ...]:
+    has_forces = "tau_x" in channel_names
     return tuple(
         name
-        for name in names
-        if name not in live_of(names).moving
-        and (not forces or name in FORCE_CHANNELS or name in WIND_CHANNELS)
+        for name in channel_names
+        if name not in get_dof(channel_names).dynamic_states
+        and (not has_forces or name in FORCE_CHANNELS or name in WIND_CHANNELS)
     )
 
 
-def _free_run(
-    logs: Sequence[Prepared], evaluation: EvaluationConfig, step: float
+def _free_run_length(
+    logs: Sequence[PreparedLog], evaluation: EvaluationConfig, dt: float
 ) -> tuple[float, float]:
     """Return how long the free runs are that choose between models, and their measured past, s."""
     protocol = evaluation.protocols[evaluation.selection]
-    if isinstance(protocol, Windows):
+    if isinstance(protocol, WindowProtocol):
         return protocol.length, protocol.history
-    found = [
+    window_lengths = [
         window.stop - window.start
-        for number, log in enumerate(logs)
-        for window in protocol.windows(log, number, step)
+        for log_index, log in enumerate(logs)
+        for window in protocol.make_windows(log, log_index, dt)
     ]
-    return (float(np.median(found)) * step if found else _USUAL), protocol.initial
+    return (
+        float(np.median(window_lengths)) * dt if window_lengths else _DEFAULT_FREE_RUN_LENGTH
+    ), protocol.initial
 
 
-_FURTHER = ("u^2 v", "u^2 r", "v^2", "r^2")
+_LONG_LOG_TERMS = ("u^2 v", "u^2 r", "v^2", "r^2")
 """Terms that only long logs determine."""
-LONG = 1200.0
+LONG_TRAINING_DURATION = 1200.0
 """Length of the training logs in s from which they are taken in."""
-_MANY = 3
+_MIN_PROPELLERS_WITHOUT_RACE = 3
 """Propellers from which a rudder is not told by the race of each."""
 
 
-def hull_terms(facts: Facts) -> list[str] | dict[str, list[str]]:
+def make_hull_terms(data_summary: TrainingDataSummary) -> list[str] | dict[str, list[str]]:
     """Return the terms of a manoeuvring model: hull, propellers, rudders and wind.
 
     A rudder is known by its name. Every other input is taken for a propeller: a force that is
@@ -157,184 +177,245 @@ def hull_terms(facts: Facts) -> list[str] | dict[str, list[str]]:
     Short logs give each axis the terms that a mirror-symmetric vessel has there, and what a lone
     propeller adds to them: half as many coefficients as all terms in all axes.
     """
-    terms = _terms(facts)
-    if long(facts):
+    terms = _all_terms(data_summary)
+    if has_long_logs(data_summary):
         return terms
-    kept = ("1", *(f"{name}|{name}|" for name in facts.inputs))
+    asymmetric_terms = ("1", *(f"{name}|{name}|" for name in data_summary.varying_inputs))
     return {
-        axis: [t for t in terms if t in kept or not wrong_parity(t, number, facts.names)]
-        for number, axis in enumerate(live_of(facts.names).layout.velocities)
+        axis: [
+            term
+            for term in terms
+            if term in asymmetric_terms
+            or not violates_symmetry(term, axis_index, data_summary.channel_names)
+        ]
+        for axis_index, axis in enumerate(get_dof(data_summary.channel_names).layout.velocities)
     }
 
 
-def full_hull_terms(facts: Facts) -> list[str]:
+def make_full_hull_terms(data_summary: TrainingDataSummary) -> list[str]:
     """Return the terms of a hull with all that long logs determine."""
-    _, turning, driving = _acting_terms(facts)
-    more = ["wind_mag r", "wind_u r"] if facts.wind else []
-    more += [*_FURTHER, *(term for n in driving for term in (f"{n} v", f"{n} r"))]
-    return [*_terms(facts), *more, *(t for n in turning for t in _large_angles(n, driving))]
+    _, rudders, propellers = _classify_inputs(data_summary)
+    additional_terms = ["wind_mag r", "wind_u r"] if data_summary.has_wind else []
+    additional_terms += [
+        *_LONG_LOG_TERMS,
+        *(term for name in propellers for term in (f"{name} v", f"{name} r")),
+    ]
+    return [
+        *_all_terms(data_summary),
+        *additional_terms,
+        *(t for name in rudders for t in _large_angle_terms(name, propellers)),
+    ]
 
 
-def long(facts: Facts) -> bool:
+def has_long_logs(data_summary: TrainingDataSummary) -> bool:
     """Return whether the training logs are long enough for a hull of many terms."""
-    return facts.samples * facts.step >= LONG
+    return data_summary.n_samples * data_summary.dt >= LONG_TRAINING_DURATION
 
 
-def _acting_terms(facts: Facts) -> tuple[list[str], list[str], list[str]]:
+def _classify_inputs(data_summary: TrainingDataSummary) -> tuple[list[str], list[str], list[str]]:
     """Return the inputs that are forces, that turn the flow, and that drive."""
-    forces = [name for name in facts.inputs if name in FORCE_CHANNELS]
-    turned = thrusters_that_turn(facts.inputs)
-    acting = [n for n in facts.inputs if n not in (*forces, *turned, *turned.values())]
-    turning = [name for name in acting if _turns(name)]
-    return forces, turning, [name for name in acting if name not in turning]
+    forces = [name for name in data_summary.varying_inputs if name in FORCE_CHANNELS]
+    rotatable_thrusters = azimuth_thrusters(data_summary.varying_inputs)
+    remaining_inputs = [
+        input_name
+        for input_name in data_summary.varying_inputs
+        if input_name not in (*forces, *rotatable_thrusters, *rotatable_thrusters.values())
+    ]
+    rudders = [name for name in remaining_inputs if _is_rudder(name)]
+    return forces, rudders, [name for name in remaining_inputs if name not in rudders]
 
 
-def _terms(facts: Facts) -> list[str]:
+def _all_terms(data_summary: TrainingDataSummary) -> list[str]:
     """Return the terms of all axes together.
 
     A thruster that turns pushes along and across; its thrust falls with the inflow.
     """
-    forces, turning, driving = _acting_terms(facts)
-    turned, live = thrusters_that_turn(facts.inputs), live_of(facts.names)
-    moving = live.moving
-    if live.spatial:
-        return submerged(Roles(live.channels, (*forces, *driving), tuple(turning), (), False))
+    forces, rudders, propellers = _classify_inputs(data_summary)
+    rotatable_thrusters, dof = (
+        azimuth_thrusters(data_summary.varying_inputs),
+        get_dof(data_summary.channel_names),
+    )
+    dynamic_states = dof.dynamic_states
+    if dof.is_six_dof:
+        return submerged_terms(
+            ChannelRoles(dof.active_states, (*forces, *propellers), tuple(rudders), (), False)
+        )
     return [
-        *("1", *moving, *HULL, *(ROLL if "p" in moving else ()), *forces),
         *(
-            f"{flow} {way}({angle})"
-            for angle, n in turned.items()
-            for flow in (f"{n}|{n}|", f"u |{n}|")[: 1 + ("u" in moving)]
-            for way in ("cos", "sin")
+            "1",
+            *dynamic_states,
+            *HULL_TERMS,
+            *(ROLL_TERMS if "p" in dynamic_states else ()),
+            *forces,
         ),
-        *(term for name in driving for term in _propeller(name, name in facts.astern)),
-        *(term for name in turning for term in _rudder(name, driving, facts)),
-        *(WIND if facts.wind else ()),
+        *(
+            f"{inflow_term} {trigonometric_function}({angle})"
+            for angle, rev_name in rotatable_thrusters.items()
+            for inflow_term in (f"{rev_name}|{rev_name}|", f"u |{rev_name}|")[
+                : 1 + ("u" in dynamic_states)
+            ]
+            for trigonometric_function in ("cos", "sin")
+        ),
+        *(
+            term
+            for name in propellers
+            for term in _propeller_terms(name, name in data_summary.reversing_inputs)
+        ),
+        *(term for name in rudders for term in _rudder_terms(name, propellers, data_summary)),
+        *(WIND_TERMS if data_summary.has_wind else ()),
     ]
 
 
-def _turns(name: str) -> bool:
-    plain = name.removeprefix("cmd_")
-    return plain.startswith(("delta", "rudder", "azimuth"))
+def _is_rudder(name: str) -> bool:
+    base_name = name.removeprefix("cmd_")
+    return base_name.startswith(("delta", "rudder", "azimuth"))
 
 
-def _propeller(name: str, astern: bool) -> list[str]:
+def _propeller_terms(name: str, is_reversing: bool) -> list[str]:
     """Return the thrust of a propeller; one that turns astern differs from one ahead."""
-    back = [f"{name}^2", f"{name} u"] if astern else []
-    return [name, f"{name}|{name}|", f"|{name}| u", *back]
+    astern_terms = [f"{name}^2", f"{name} u"] if is_reversing else []
+    return [name, f"{name}|{name}|", f"|{name}| u", *astern_terms]
 
 
-def _rudder(name: str, driving: Sequence[str], facts: Facts) -> list[str]:
+def _rudder_terms(
+    name: str, propellers: Sequence[str], data_summary: TrainingDataSummary
+) -> list[str]:
     """Return the lift of a rudder in the inflow from speed and propellers.
 
     Where no log tells the speed it is that of a usual one.
     """
-    if "u" in live_of(facts.names).dead:
-        return [name, f"{name}|{name}|", *(f"{n}|{n}| {name}" for n in driving)]
-    if len(driving) >= _MANY:
+    if "u" in get_dof(data_summary.channel_names).fixed_states:
+        return [name, f"{name}|{name}|", *(f"{n}|{n}| {name}" for n in propellers)]
+    if len(propellers) >= _MIN_PROPELLERS_WITHOUT_RACE:
         return [name, f"u|u| {name}"]
-    race = [f"{n}|{n}| {name}" for n in driving] + [f"u {n} {name}" for n in driving]
-    return [f"u|u| {name}", *race, *(f"{n}^2 {name}" for n in driving if n in facts.astern)]
-
-
-def _large_angles(name: str, driving: Sequence[str]) -> list[str]:
-    """Return how the lift of a rudder flattens, and its drag."""
-    if len(driving) != 1:
-        return [name, f"u|u| {name}|{name}|", f"u|u| |{name}|"]
-    race = (f"{driving[0]}|{driving[0]}|", f"u {driving[0]}")
+    race_terms = [f"{n}|{n}| {name}" for n in propellers] + [f"u {n} {name}" for n in propellers]
     return [
-        name,
-        *(f"{flow} {name}|{name}|" for flow in race),
-        *(f"{flow} |{name}|" for flow in race),
+        f"u|u| {name}",
+        *race_terms,
+        *(f"{n}^2 {name}" for n in propellers if n in data_summary.reversing_inputs),
     ]
 
 
-_THROUGH = 100
+def _large_angle_terms(name: str, propellers: Sequence[str]) -> list[str]:
+    """Return how the lift of a rudder flattens, and its drag."""
+    if len(propellers) != 1:
+        return [name, f"u|u| {name}|{name}|", f"u|u| |{name}|"]
+    race_terms = (f"{propellers[0]}|{propellers[0]}|", f"u {propellers[0]}")
+    return [
+        name,
+        *(f"{inflow_term} {name}|{name}|" for inflow_term in race_terms),
+        *(f"{inflow_term} |{name}|" for inflow_term in race_terms),
+    ]
+
+
+_NETWORK_STEPS_PER_RUN = 100
 """Steps of the networks in a free run of the protocol's length."""
-_OF_ROLL = 0.5
+_STEP_PER_ROLL_RADIAN = 0.5
 """Steps of the networks in radians of a roll."""
-_REFIT = 200
+_REFIT_STEPS = 200
 """Steps of the free runs of a refit, where its share of the protocol's length is less."""
-_BATCH = 32
+_BATCH_PER_NETWORK = 32
 """Windows in a batch for each network."""
-_STEPS, _STEPS_LONG = 15, 40
+_BATCHES_PER_EPOCH, _BATCHES_PER_EPOCH_LONG = 15, 40
 """Batches in each of twenty epochs, for short logs and for long ones."""
 
 
-def refit_settings(facts: Facts) -> dict[str, Any]:
+def make_refit_settings(data_summary: TrainingDataSummary) -> dict[str, Any]:
     """Return the refit of a baseline: its prior weak where logs are long."""
-    horizon = min(facts.longest, max(0.2 * facts.length, _REFIT * facts.step))
+    horizon = min(
+        data_summary.max_free_run_length,
+        max(0.2 * data_summary.free_run_length, _REFIT_STEPS * data_summary.dt),
+    )
     return {
-        "horizon": readable(horizon),
-        "every": readable(0.5 * horizon),
-        "prior": 1e-2 if long(facts) or live_of(facts.names).spatial else 1.0,
+        "horizon": round_to_three_digits(horizon),
+        "every": round_to_three_digits(0.5 * horizon),
+        "prior": 1e-2
+        if has_long_logs(data_summary) or get_dof(data_summary.channel_names).is_six_dof
+        else 1.0,
         "asymmetric": 0.05,
     }
 
 
-def training_settings(facts: Facts, effort: float) -> dict[str, Any]:
+def make_training_settings(data_summary: TrainingDataSummary, effort: float) -> dict[str, Any]:
     """Return the training of networks in free run, over growing horizons and of a fixed length."""
     stages = [
         {
-            "horizon": readable(max(share * facts.longest, 2.0 * coarse_step(facts))),
+            "horizon": round_to_three_digits(
+                max(
+                    horizon_share * data_summary.max_free_run_length,
+                    2.0 * compute_network_step(data_summary),
+                )
+            ),
             "epochs": epochs,
-            "batch": _BATCH * members(facts),
-            "learning_rate": rate,
-            "final": final,
+            "batch": _BATCH_PER_NETWORK * count_networks(data_summary),
+            "learning_rate": learning_rate,
+            "final": final_rate_share,
         }
         # one cosine over all stages, down to a fiftieth
-        for share, epochs, rate, final in (
+        for horizon_share, epochs, learning_rate, final_rate_share in (
             (0.3, 5, 3.0e-3, 0.854),
             (0.6, 5, 2.56e-3, 0.586),
             (1.0, 10, 1.5e-3, 0.04),
         )
     ]
     return {
-        "history": readable(facts.history),
+        "history": round_to_three_digits(data_summary.history),
         "one_step": {"epochs": 0},
         "multi_step": stages,
-        "steps": max(1, round((_STEPS_LONG if long(facts) else _STEPS) * effort)),
+        "steps": max(
+            1,
+            round(
+                (_BATCHES_PER_EPOCH_LONG if has_long_logs(data_summary) else _BATCHES_PER_EPOCH)
+                * effort
+            ),
+        ),
         "start_noise": 0.03,
         "weight_decay": 0.001,
         "robust": 0.05,
-        "mirror": mirrored_channels(facts.names) is not None,
+        "mirror": mirror_channels(data_summary.channel_names) is not None,
         # the length is fixed: the last weights are kept
         "validate_every": 20,
     }
 
 
-def readable(value: float) -> float:
+def round_to_three_digits(value: float) -> float:
     """Return a number of at most three digits."""
     return float(f"{value:.3g}")
 
 
-def coarse_step(facts: Facts) -> float:
+def compute_network_step(data_summary: TrainingDataSummary) -> float:
     """Return the step of the networks in s: a free run is trained through in so many.
 
     A roll takes at least twelve a period, or what it does between them is lost.
     """
-    steps = min(facts.length / _THROUGH, _OF_ROLL * facts.rolling) / facts.step
-    return facts.step * max(1, round(steps))
+    n_grid_steps = (
+        min(
+            data_summary.free_run_length / _NETWORK_STEPS_PER_RUN,
+            _STEP_PER_ROLL_RADIAN * data_summary.roll_time_per_radian,
+        )
+        / data_summary.dt
+    )
+    return data_summary.dt * max(1, round(n_grid_steps))
 
 
-def members(facts: Facts) -> int:
+def count_networks(data_summary: TrainingDataSummary) -> int:
     """Return the number of networks in an ensemble."""
-    return 4 if long(facts) else 6
+    return 4 if has_long_logs(data_summary) else 6
 
 
-PARTS = (
+PART_KEYS = (
     "baseline", "baselines", "refit", "heads", "base_of", "ensembles", "means", "training",
 )  # fmt: skip
 """Keys of a fit that the recipe stands in place of."""
-SINGLE = "hull"
+SINGLE_MODEL_NAME = "hull"
 """Name of the model that is taken where one single is needed."""
-_BASES = {"hull_network": SINGLE, "network": "zero"}
+_HEAD_BASELINES = {"hull_network": SINGLE_MODEL_NAME, "network": "zero"}
 """What the networks stand on."""
-MEAN = "mean"
+ENSEMBLE_NAME = "mean"
 """Name of the mean of unlike models, which is reported first."""
 
 
-def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
+def make_portfolio(data_summary: TrainingDataSummary, effort: float = 1.0) -> dict[str, Any]:
     """Return baselines, refits, heads and trainings by the names that the recipe gives them.
 
     `baseline` is linear and `hull` nonlinear in velocities and inputs, both refitted; long logs
@@ -342,140 +423,176 @@ def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
     are long. The mean of the trajectories of hull and networks is the predictor.
 
     Args:
-        facts: of the logs; `Facts.supposed` before they are read.
+        data_summary: of the logs; `Facts.supposed` before they are read.
         effort: how long networks are trained, 1 for usual.
     """
-    network = {
+    network_config = {
         "kind": "recurrent",
-        "members": members(facts),
-        "hidden_size": 48 if long(facts) else 32,
-        "step": readable(coarse_step(facts)),
+        "members": count_networks(data_summary),
+        "hidden_size": 48 if has_long_logs(data_summary) else 32,
+        "step": round_to_three_digits(compute_network_step(data_summary)),
         "restoring": True,
         "margin": 0.0,
     }
-    heads = {"hull_network": network} | ({"network": network} if long(facts) else {})
-    terms = full_hull_terms(facts) if long(facts) else hull_terms(facts)
-    ridge = 1e-6 if live_of(facts.names).spatial else 1e-4
-    wind = ["wind_u", "wind_v"] if facts.wind else []
-    moving = [name for name in live_of(facts.names).moving if name != "z"]
+    heads = {"hull_network": network_config} | (
+        {"network": network_config} if has_long_logs(data_summary) else {}
+    )
+    regressors = (
+        make_full_hull_terms(data_summary)
+        if has_long_logs(data_summary)
+        else make_hull_terms(data_summary)
+    )
+    ridge = 1e-6 if get_dof(data_summary.channel_names).is_six_dof else 1e-4
+    wind_channels = ["wind_u", "wind_v"] if data_summary.has_wind else []
+    dynamic_states = [
+        name for name in get_dof(data_summary.channel_names).dynamic_states if name != "z"
+    ]
     return {
-        "baseline": _regressors(1e-6, ["1", *moving, *facts.inputs, *wind]),
-        "baselines": {SINGLE: _regressors(ridge, terms)},
-        "refit": dict.fromkeys(("baseline", SINGLE), refit_settings(facts)),
+        "baseline": _regressor_settings(
+            1e-6, ["1", *dynamic_states, *data_summary.varying_inputs, *wind_channels]
+        ),
+        "baselines": {SINGLE_MODEL_NAME: _regressor_settings(ridge, regressors)},
+        "refit": dict.fromkeys(("baseline", SINGLE_MODEL_NAME), make_refit_settings(data_summary)),
         "heads": heads,
-        "base_of": {name: base for name, base in _BASES.items() if name in heads},
+        "base_of": {
+            name: baseline_name for name, baseline_name in _HEAD_BASELINES.items() if name in heads
+        },
         "ensembles": {},
-        "means": {MEAN: (SINGLE, *heads)},
-        "training": dict.fromkeys(heads, training_settings(facts, effort)),
+        "means": {ENSEMBLE_NAME: (SINGLE_MODEL_NAME, *heads)},
+        "training": dict.fromkeys(heads, make_training_settings(data_summary, effort)),
     }
 
 
-def _regressors(ridge: float, terms: list[str] | dict[str, list[str]]) -> dict[str, Any]:
+def _regressor_settings(ridge: float, terms: list[str] | dict[str, list[str]]) -> dict[str, Any]:
     """Return a model of regressors that neither feeds itself energy nor runs away."""
-    sound = {"dissipative": True, "bounded": True}
-    return {"kind": "regressors", "ridge": ridge, "terms": terms, **sound}
+    stability_settings = {"dissipative": True, "bounded": True}
+    return {"kind": "regressors", "ridge": ridge, "terms": terms, **stability_settings}
 
 
-_WINDOWS = (100.0, 60.0, 40.0, 30.0, 20.0, 10.0, 5.0, 2.0, 1.0)
-_ROOMY = 1.15
+_WINDOW_LENGTHS = (100.0, 60.0, 40.0, 30.0, 20.0, 10.0, 5.0, 2.0, 1.0)
+_MIN_LENGTH_RATIO = 1.15
 """Times of a free run that a log lasts so that it starts somewhere in it."""
-_PART = 40_000
+_N_PROBED_SAMPLES = 40_000
 """First samples of a long log that mostly tell how long its stretches are."""
 
 
 @dataclass(frozen=True)
-class Preparation:
+class PreparationPlan:
     """How logs are prepared for a fit, by what they hold.
 
     Attributes:
-        interval: usual step of the logs, s.
-        memory: time after which `rate` is another, s.
-        step: of the grid, s.
-        window: of the derivative, s.
-        held: inputs that rest at one value most of the time, as commands do.
-        hold: whether an input over a step is the sample at its `start` or the `mean` of its ends.
-        exogenous: channels of the true wind, where every log holds them.
-        rate: what the memory is that of: the yaw rate, or the speed where no log tells that.
-        swings: whether the vessel rolls.
+        sample_interval: usual step of the logs, s.
+        correlation_time: time after which `rate` is another, s.
+        grid_step: of the grid, s.
+        derivative_window: of the derivative, s.
+        held_inputs: inputs that rest at one value most of the time, as commands do.
+        input_hold: whether an input over a step is the sample at its `start` or the `mean` of its ends.
+        wind_channels: channels of the true wind, where every log holds them.
+        correlated_quantity: what the memory is that of: the yaw rate, or the speed where no log tells that.
+        has_roll: whether the vessel rolls.
     """
 
-    interval: float
-    memory: float
-    step: float
-    window: float
-    held: tuple[str, ...]
-    hold: str
-    exogenous: tuple[str, ...]
-    rate: str = "yaw rate"
-    swings: bool = False
+    sample_interval: float
+    correlation_time: float
+    grid_step: float
+    derivative_window: float
+    held_inputs: tuple[str, ...]
+    input_hold: str
+    wind_channels: tuple[str, ...]
+    correlated_quantity: str = "yaw rate"
+    has_roll: bool = False
 
     @classmethod
-    def of(cls, logs: Sequence[Log], inputs: Sequence[str], live: Live = ALIVE) -> Preparation:
+    def from_logs(
+        cls, logs: Sequence[Log], inputs: Sequence[str], dof: DegreesOfFreedom = SURGE_SWAY_YAW
+    ) -> PreparationPlan:
         """Return how logs that hold velocities are prepared for models with these inputs."""
-        interval = float(np.median([np.median(np.diff(log.t)) for log in logs]))
-        memories = [_memory(log) for log in logs]
-        memory = float(np.median([m for m in memories if np.isfinite(m)] or [20.0 * interval]))
+        sample_interval = float(np.median([np.median(np.diff(log.t)) for log in logs]))
+        correlation_times = [_correlation_time(log) for log in logs]
+        correlation_time = float(
+            np.median(
+                [time for time in correlation_times if np.isfinite(time)]
+                or [20.0 * sample_interval]
+            )
+        )
         # a roll is quicker than the yaw
-        rolls = [_memory(log, ("phi",)) for log in logs] if live.rolls else []
-        quick = min(memory, float(np.median([m for m in rolls if np.isfinite(m)] or [memory])))
-        step = float(f"{interval * max(1, int(quick / 40.0 / interval)):.4g}")
-        samples = min(max(5, 2 * round(0.5 * quick / 5.0 / step) + 1), 41)
-        held = tuple(name for name in inputs if _rests(logs, name))
+        roll_correlation_times = (
+            [_correlation_time(log, ("phi",)) for log in logs] if dof.has_roll else []
+        )
+        shortest_time = min(
+            correlation_time,
+            float(
+                np.median(
+                    [time for time in roll_correlation_times if np.isfinite(time)]
+                    or [correlation_time]
+                )
+            ),
+        )
+        grid_step = float(
+            f"{sample_interval * max(1, int(shortest_time / 40.0 / sample_interval)):.4g}"
+        )
+        window_samples = min(max(5, 2 * round(0.5 * shortest_time / 5.0 / grid_step) + 1), 41)
+        held_inputs = tuple(name for name in inputs if _is_held(logs, name))
         # a true wind acts from where the vessel points, and one from the bow tells it by itself
-        wind = not live.dead and all(
+        has_wind = not dof.fixed_states and all(
             {*WIND_INPUTS} <= {*log.channels}
-            and ("psi" not in log.meta.get("integrated", ()) or {*BOW_WIND} & {*log.channels})
+            and (
+                "psi" not in log.meta.get("integrated", ())
+                or {*BOW_WIND_CHANNELS} & {*log.channels}
+            )
             for log in logs
         )
         return cls(
-            interval,
-            memory,
-            step,
-            float(f"{samples * step:.6g}"),
-            held,
-            "start" if len(held) == len(inputs) else "mean",
-            WIND_INPUTS if wind else (),
-            "yaw rate" if live.turns else "speed",
-            live.rolls,
+            sample_interval,
+            correlation_time,
+            grid_step,
+            float(f"{window_samples * grid_step:.6g}"),
+            held_inputs,
+            "start" if len(held_inputs) == len(inputs) else "mean",
+            WIND_INPUTS if has_wind else (),
+            "yaw rate" if dof.has_heading else "speed",
+            dof.has_roll,
         )
 
     @property
     def reason(self) -> str:
         """What the numbers of time follow from."""
         return (
-            f"logs have a sample each {self.interval:.3g} s, and a {self.rate} that stays alike"
-            f" for {self.memory:.3g} s"
+            f"logs have a sample each {self.sample_interval:.3g} s, and a {self.correlated_quantity} that stays alike"
+            f" for {self.correlation_time:.3g} s"
         )
 
-    def content(self) -> dict[str, Any]:
+    def to_config(self) -> dict[str, Any]:
         """Return `prepare` as a config has it.
 
         Angles that swing are set against means, as a smoothed rate is one itself.
         """
-        grid: dict[str, Any] = {"step": f"{self.step:g} s"}
-        grid |= {"held": list(self.held)} if self.held else {}
-        window = f"{self.window:g} s"
+        grid: dict[str, Any] = {"step": f"{self.grid_step:g} s"}
+        grid |= {"held": list(self.held_inputs)} if self.held_inputs else {}
+        window = f"{self.derivative_window:g} s"
         derivative = {"kind": "savitzky_golay", "window": window, "order": 2}
-        beside = {"beside": "means"} if self.swings else {}
-        return {"grid": grid, "derivative": derivative, "hold": self.hold, **beside}
+        method_override = {"beside": "means"} if self.has_roll else {}
+        return {"grid": grid, "derivative": derivative, "hold": self.input_hold, **method_override}
 
 
-def _rests(logs: Sequence[Log], name: str) -> bool:
-    resting = [float(np.mean(np.diff(log[name]) == 0.0)) for log in logs if len(log) > 1]
-    return bool(resting) and float(np.median(resting)) > 0.9
+def _is_held(logs: Sequence[Log], name: str) -> bool:
+    constant_shares = [float(np.mean(np.diff(log[name]) == 0.0)) for log in logs if len(log) > 1]
+    return bool(constant_shares) and float(np.median(constant_shares)) > 0.9
 
 
-def integrator(live: Live) -> Integrator:
+def choose_integrator(dof: DegreesOfFreedom) -> Integrator:
     """Return how a drafted model steps.
 
     A vessel in six degrees of freedom swings in few steps of its logs, which a scheme of first
     order takes for a damping of its own: the hull of a BlueROV2 erred 2.0 to 2.8 times as much as
     the vessel itself with `semi_implicit_euler`, and 1.1 to 1.4 times with `rk4`.
     """
-    return "rk4" if live.spatial else "semi_implicit_euler"
+    return "rk4" if dof.is_six_dof else "semi_implicit_euler"
 
 
-def longest_time(log: Log, columns: Sequence[str], config: PrepareConfig, live: Live) -> float:
+def longest_usable_duration(
+    log: Log, input_names: Sequence[str], config: PrepareConfig, dof: DegreesOfFreedom
+) -> float:
     """Return the longest time in s without a gap that preparing leaves of a log.
 
     It is 0 where nothing is left to learn from. Of a long log its first part tells, unless that
@@ -483,26 +600,28 @@ def longest_time(log: Log, columns: Sequence[str], config: PrepareConfig, live: 
 
     Args:
         log: as its reader gives it.
-        columns: inputs of the model.
+        input_names: inputs of the model.
 
     Raises:
         DataError: where no sample is usable.
     """
-    longest = 0.0
-    for part in (log.rows(slice(_PART)), log)[: 1 + (len(log) > _PART)]:
-        prepared = prepare(part, "train", columns, config, live)
-        if prepared.good.any():
-            longest = longest_stretch(prepared) * config.grid.step
-        if longest >= _ROOMY * _WINDOWS[0]:
+    longest_duration = 0.0
+    for log_part in (log.select_rows(slice(_N_PROBED_SAMPLES)), log)[
+        : 1 + (len(log) > _N_PROBED_SAMPLES)
+    ]:
+        prepared = prepare_log(log_part, "train", input_names, config, dof)
+        if prepared.trainable.any():
+            longest_duration = longest_segment_length(prepared) * config.grid.step
+        if longest_duration >= _MIN_LENGTH_RATIO * _WINDOW_LENGTHS[0]:
             break
-    return longest
+    return longest_duration
 
 
-def judging(
+def make_evaluation_settings(
     splits: Mapping[str, Sequence[Log]],
-    lasting: Mapping[str, Sequence[float]],
-    memory: float,
-    live: Live = ALIVE,
+    usable_durations: Mapping[str, Sequence[float]],
+    correlation_time: float,
+    dof: DegreesOfFreedom = SURGE_SWAY_YAW,
 ) -> dict[str, Any]:
     """Return protocols, selection and scales of a config, for logs by split.
 
@@ -511,19 +630,34 @@ def judging(
 
     Args:
         splits: `train`, `validation` and `test`.
-        lasting: the longest time in s without a gap that preparing leaves of each of their logs.
-        memory: how long the vessel remembers, s.
+        usable_durations: the longest time in s without a gap that preparing leaves of each of their logs.
+        correlation_time: how long the vessel remembers, s.
     """
-    length = window_length(lasting["validation"] or lasting["train"], memory)
-    laid = protocols(length)
-    both = [*splits["train"], *splits["validation"]]
-    out = {"selection": next(iter(laid)), "scales": scales(both, live)}
-    if lasting["test"] and (shorter := window_length(lasting["test"], memory)) < length:
-        laid |= {name: one for name, one in protocols(shorter).items() if name not in laid}
-    return {"protocols": laid, **out}
+    window_duration = choose_window_length(
+        usable_durations["validation"] or usable_durations["train"], correlation_time
+    )
+    protocol_settings = make_protocols(window_duration)
+    training_and_validation_logs = [*splits["train"], *splits["validation"]]
+    evaluation_settings = {
+        "selection": next(iter(protocol_settings)),
+        "scales": make_scales(training_and_validation_logs, dof),
+    }
+    if (
+        usable_durations["test"]
+        and (
+            test_window_duration := choose_window_length(usable_durations["test"], correlation_time)
+        )
+        < window_duration
+    ):
+        protocol_settings |= {
+            name: protocol
+            for name, protocol in make_protocols(test_window_duration).items()
+            if name not in protocol_settings
+        }
+    return {"protocols": protocol_settings, **evaluation_settings}
 
 
-def _memory(log: Log, names: Sequence[str] = ("r", "u", "v")) -> float:
+def _correlation_time(log: Log, names: Sequence[str] = ("r", "u", "v")) -> float:
     """Return the time in s after which the yaw rate is correlated by 1/e only.
 
     Where it holds noise alone that of the speed is taken; so with other names, the first that
@@ -531,56 +665,68 @@ def _memory(log: Log, names: Sequence[str] = ("r", "u", "v")) -> float:
     """
     for name in names:
         values = log[name] if name in log.channels else log.t[:0]
-        known = np.isfinite(values)
-        if known.sum() < 50:
+        is_finite = np.isfinite(values)
+        if is_finite.sum() < 50:
             continue
-        t, x = log.t[known], values[known] - values[known].mean()
-        step = float(np.median(np.diff(t)))
-        gone = without_pauses(t)
-        even = np.interp(np.arange(0.0, gone[-1], step), gone, x)[:20_000]
-        power = np.abs(np.fft.rfft(even, 2 * even.size)) ** 2
-        correlation = np.fft.irfft(power)[: even.size]
-        below = np.flatnonzero(correlation < correlation[0] / np.e)
-        if below.size and below[0] > 1:
-            return float(below[0] * step)
+        t, centred_values = log.t[is_finite], values[is_finite] - values[is_finite].mean()
+        dt = float(np.median(np.diff(t)))
+        elapsed = remove_pauses(t)
+        resampled = np.interp(np.arange(0.0, elapsed[-1], dt), elapsed, centred_values)[:20_000]
+        power_spectrum = np.abs(np.fft.rfft(resampled, 2 * resampled.size)) ** 2
+        correlation = np.fft.irfft(power_spectrum)[: resampled.size]
+        low_correlation_lags = np.flatnonzero(correlation < correlation[0] / np.e)
+        if low_correlation_lags.size and low_correlation_lags[0] > 1:
+            return float(low_correlation_lags[0] * dt)
     return float("nan")
 
 
-def window_length(lasting: Sequence[float], memory: float) -> float:
+def choose_window_length(usable_durations: Sequence[float], correlation_time: float) -> float:
     """Return the length in s of free runs that most of the logs hold.
 
     Args:
-        lasting: the longest time in s without a gap of each log to be judged on; none ask for half
+        usable_durations: the longest time in s without a gap of each log to be judged on; none ask for half
             a second.
-        memory: how long the vessel remembers, s.
+        correlation_time: how long the vessel remembers, s.
     """
-    lengths = sorted(lasting) or [1.0]
-    usual = lengths[int(0.25 * (len(lengths) - 1))]
-    room = [length for length in _WINDOWS if _ROOMY * length <= usual] or [0.5 * usual]
-    return next((length for length in room if length <= 15.0 * memory), room[-1])
+    sorted_durations = sorted(usable_durations) or [1.0]
+    lower_quartile = sorted_durations[int(0.25 * (len(sorted_durations) - 1))]
+    possible_lengths = [
+        length for length in _WINDOW_LENGTHS if _MIN_LENGTH_RATIO * length <= lower_quartile
+    ] or [0.5 * lower_quartile]
+    return next(
+        (length for length in possible_lengths if length <= 15.0 * correlation_time),
+        possible_lengths[-1],
+    )
 
 
-def protocols(length: float) -> dict[str, Any]:
+def make_protocols(window_duration: float) -> dict[str, Any]:
     """Return two protocols: free runs of a length and of a third of it."""
-    short = max((w for w in _WINDOWS if w <= 0.4 * length), default=0.5 * length)
-    first = min(5.0, 0.1 * length)
+    short_length = max(
+        (
+            window_length_
+            for window_length_ in _WINDOW_LENGTHS
+            if window_length_ <= 0.4 * window_duration
+        ),
+        default=0.5 * window_duration,
+    )
+    first_start = min(5.0, 0.1 * window_duration)
     return {
-        f"T{seconds:g}".replace(".", "_"): {
+        f"T{duration:g}".replace(".", "_"): {
             "kind": "windows",
-            "length": f"{seconds:g} s",
-            "first": f"{first:g} s",
-            "history": f"{first:g} s",
+            "length": f"{duration:g} s",
+            "first": f"{first_start:g} s",
+            "history": f"{first_start:g} s",
         }
-        for seconds in (length, short)
+        for duration in (window_duration, short_length)
     }
 
 
-def scales(logs: Sequence[Log], live: Live = ALIVE) -> dict[str, Any]:
+def make_scales(logs: Sequence[Log], dof: DegreesOfFreedom = SURGE_SWAY_YAW) -> dict[str, Any]:
     """Return the standard deviations of what lives of the motion, in units that read well."""
-    least, out = 1e-4, {}
-    for name in live.channels:
-        spread = max(float(np.nanstd(np.concatenate([log[name] for log in logs]))), least)
+    min_scale, scale_texts = 1e-4, {}
+    for name in dof.active_states:
+        std = max(float(np.nanstd(np.concatenate([log[name] for log in logs]))), min_scale)
         unit = CHANNEL_UNITS[name]
-        shown = np.degrees(spread) if unit.startswith("rad") else spread
-        out[name] = f"{shown:.3g} {unit.replace('rad', 'deg')}"
-    return out
+        display_value = np.degrees(std) if unit.startswith("rad") else std
+        scale_texts[name] = f"{display_value:.3g} {unit.replace('rad', 'deg')}"
+    return scale_texts

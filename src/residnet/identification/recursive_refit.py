@@ -21,300 +21,403 @@ from torch import Tensor
 
 from residnet.baselines.base import ParametricBaseline
 from residnet.core.errors import UsageError
-from residnet.core.layout import MOVING
+from residnet.core.layout import DYNAMIC_STATES
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.identification.changes import Change, ChangedDynamics
+from residnet.identification.changes import PerturbedDynamics, SystemChange
 from residnet.identification.fitter import FittedModel
 from residnet.identification.monitoring import (
-    BELIEVED,
-    Groups,
-    Piece,
-    Verdict,
-    Watch,
-    apart_from,
-    innovations,
-    parted,
-    weighed,
+    PRIOR_STD,
+    ChangeDetector,
+    GroupScores,
+    MeasuredWindow,
+    MonitorVerdict,
+    compute_innovations,
+    compute_robust_score_sums,
+    marginalise,
+    split_window,
 )
 from residnet.training.refit import parametric
 
-_MOST = 3
+_MAX_CHANGES = 3
 """Changes that a refit puts into a model at most."""
-_RIDGE = 1e-6
+_DIRECTION_RIDGE = 1e-6
 """Of the least squares that find a direction, as a share of each parameter's information."""
-_EXPRESSED = 0.7
+_MIN_EXPRESSED_SHARE = 0.7
 """Share of a change's accelerations that the parameters must be able to follow."""
-_BRIEF = 1e-4
+_SHORT_STEP_SHARE = 1e-4
 """Share of a step over which the accelerations of a change are found."""
-_SAMPLES = 4_000
+_MAX_SAMPLES = 4_000
 """Samples that a direction is found from, at most."""
 
 
 @dataclass(frozen=True)
-class Moved:
+class IdentifiedChange:
     """A change that a refit has put into a model.
 
     Attributes:
         change: the cause that the monitor named.
-        size: of the change, in its unit.
-        error: standard error of the size.
-        after: size after each log, in their order.
+        estimated_size: of the change, in its unit.
+        standard_error: standard error of the size.
+        size_by_log: size after each log, in their order.
     """
 
-    change: Change
-    size: float
-    error: float
-    after: Sequence[float]
+    change: SystemChange
+    estimated_size: float
+    standard_error: float
+    size_by_log: Sequence[float]
 
 
 @dataclass(frozen=True)
-class Refit:
+class RecursiveRefit:
     """What a recursive refit found.
 
     Attributes:
         model: with the changes put into its baseline; as it was where there are none.
-        moved: the changes, in the order in which the monitor named them.
-        before: verdict on the logs with the old model.
-        verdict: with the new one.
-        ended: why no further change was taken, in words.
+        identified_changes: the changes, in the order in which the monitor named them.
+        verdict_before: verdict on the logs with the old model.
+        verdict_after: with the new one.
+        stopping_reason: why no further change was taken, in words.
     """
 
     model: HybridDynamics
-    moved: Sequence[Moved]
-    before: Verdict
-    verdict: Verdict
-    ended: str
+    identified_changes: Sequence[IdentifiedChange]
+    verdict_before: MonitorVerdict
+    verdict_after: MonitorVerdict
+    stopping_reason: str
 
 
-def recursive_refit(watch: Watch, logs: Sequence[Sequence[Piece]]) -> Refit:
+def refit_recursively(
+    detector: ChangeDetector, windows_by_log: Sequence[Sequence[MeasuredWindow]]
+) -> RecursiveRefit:
     """Put the changes that a monitor names into a copy of its model, until it names none.
 
     Args:
-        watch: over the model, which stays as it is.
-        logs: windows of the new logs, in the order of time.
+        detector: over the model, which stays as it is.
+        windows_by_log: windows of the new logs, in the order of time.
 
     Raises:
         UsageError: where the model's baseline has no parameters that could move.
     """
-    baseline = watch.model.baseline
+    baseline = detector.model.baseline
     if not isinstance(baseline, ParametricBaseline):
         raise UsageError(
             f"a recursive refit moves the parameters of one baseline; the model's is of class"
             f" {type(baseline).__name__}, which has none; choose another one with --model"
         )
-    groups = [(k, part) for k, log in enumerate(logs) for part in watch.groups(log)]
-    before = verdict = _judged(watch, groups)
-    model, moved = watch.model, list[Moved]()
+    indexed_groups = [
+        (log_index, group)
+        for log_index, log in enumerate(windows_by_log)
+        for group in detector.group_windows(log)
+    ]
+    verdict_before = verdict = _evaluate_groups(detector, indexed_groups)
+    model, identified_changes = detector.model, list[IdentifiedChange]()
     while True:
-        first = verdict.suspects[0].change
-        ended = _ended(verdict, [one.change for one in moved])
-        if not ended:
-            _, share = _direction(watch.model, first, groups)
-            if share < _EXPRESSED:
-                ended = (
-                    f"the baseline's terms can follow only {share:.0%} of what '{first.name}' does"
-                )
-        if ended:
-            return Refit(model, moved, before, verdict, ended)
-        changes = [*(one.change for one in moved), first]
-        filtered = _Filter(watch, changes)
-        moved = filtered.through(groups)
-        model = filtered.model
-        verdict = _judged(watch.over(model), groups)
+        first_change = verdict.hypotheses[0].change
+        stopping_reason = _stopping_reason(
+            verdict, [identified_change.change for identified_change in identified_changes]
+        )
+        if not stopping_reason:
+            _, expressed_share = _parameter_direction(detector.model, first_change, indexed_groups)
+            if expressed_share < _MIN_EXPRESSED_SHARE:
+                stopping_reason = f"the baseline's terms can follow only {expressed_share:.0%} of what '{first_change.name}' does"
+        if stopping_reason:
+            return RecursiveRefit(
+                model, identified_changes, verdict_before, verdict, stopping_reason
+            )
+        changes = [
+            *(identified_change.change for identified_change in identified_changes),
+            first_change,
+        ]
+        information_filter = _InformationFilter(detector, changes)
+        identified_changes = information_filter.run_filter(indexed_groups)
+        model = information_filter.model
+        verdict = _evaluate_groups(detector.with_model(model), indexed_groups)
 
 
-def refitted(fitted: FittedModel, found: Refit) -> FittedModel:
+def make_refitted_model(fitted_model: FittedModel, refit: RecursiveRefit) -> FittedModel:
     """Return the refitted model under a name of its own, with notes on what was put into it.
 
     Bands that were calibrated for the old model are left out.
     """
-    baseline = parametric(found.model)
-    known = dict(zip(baseline.free_names(), baseline.free().tolist(), strict=True))
-    notes = dict(fitted.notes)
+    baseline = parametric(refit.model)
+    values_by_parameter = dict(
+        zip(baseline.free_parameter_names(), baseline.get_free().tolist(), strict=True)
+    )
+    notes = dict(fitted_model.notes)
     notes["coefficients"] = [
-        {**row, "value": known[row["axis"], row["term"]]}
-        for row in fitted.notes.get("coefficients", ())
-        if (row["axis"], row["term"]) in known
+        {
+            **coefficient_row,
+            "value": values_by_parameter[coefficient_row["axis"], coefficient_row["term"]],
+        }
+        for coefficient_row in fitted_model.notes.get("coefficients", ())
+        if (coefficient_row["axis"], coefficient_row["term"]) in values_by_parameter
     ]
-    notes["refit_of"] = fitted.name
+    notes["refit_of"] = fitted_model.name
     notes["refit_changes"] = [
-        {"cause": one.change.name, "size": one.size, "standard_error": one.error}
-        for one in found.moved
+        {
+            "cause": identified_change.change.name,
+            "size": identified_change.estimated_size,
+            "standard_error": identified_change.standard_error,
+        }
+        for identified_change in refit.identified_changes
     ]
-    spec = fitted.spec.model_copy(update={"name": f"{fitted.name}_refit", "band": None})
-    return FittedModel(spec, copy.deepcopy(found.model), notes)
+    spec = fitted_model.spec.model_copy(update={"name": f"{fitted_model.name}_refit", "band": None})
+    return FittedModel(spec, copy.deepcopy(refit.model), notes)
 
 
-def _judged(watch: Watch, groups: Sequence[tuple[int, Sequence[Piece]]]) -> Verdict:
-    sums = [reduce(add, watch.sums(part)) for _, part in groups]
-    return watch.judge([log for log, _ in groups], sums)
+def _evaluate_groups(
+    detector: ChangeDetector, indexed_groups: Sequence[tuple[int, Sequence[MeasuredWindow]]]
+) -> MonitorVerdict:
+    sums = [reduce(add, detector.compute_sums(group)) for _, group in indexed_groups]
+    return detector.evaluate([log for log, _ in indexed_groups], sums)
 
 
-def _ended(verdict: Verdict, taken: Sequence[Change]) -> str:
+def _stopping_reason(verdict: MonitorVerdict, changes_in_model: Sequence[SystemChange]) -> str:
     """Return why no further change is taken, empty where one is."""
-    first = verdict.suspects[0]
-    if not verdict.alarm:
+    first_hypothesis = verdict.hypotheses[0]
+    if not verdict.is_alarm:
         return (
-            f"no cause exceeds the threshold (largest score {verdict.largest:.1f} of"
+            f"no cause exceeds the threshold (largest score {verdict.max_score:.1f} of"
             f" {verdict.threshold:.1f})"
         )
-    if first.change.sensor:
+    if first_hypothesis.change.sensor:
         return (
-            f"'{first.change.name}' is named first, which is an error of the data; mend the sensor,"
+            f"'{first_hypothesis.change.name}' is named first, which is an error of the data; mend the sensor,"
             " since a refit would put its error into the vessel"
         )
-    if first.change in taken:
-        return f"'{first.change.name}' is named again, so that its size does not explain the logs"
-    if len(taken) >= _MOST:
-        return f"{_MOST} changes are in the model; fit it anew from the new logs"
+    if first_hypothesis.change in changes_in_model:
+        return f"'{first_hypothesis.change.name}' is named again, so that its size does not explain the logs"
+    if len(changes_in_model) >= _MAX_CHANGES:
+        return f"{_MAX_CHANGES} changes are in the model; fit it anew from the new logs"
     return ""
 
 
-def _direction(
-    model: HybridDynamics, change: Change, groups: Sequence[tuple[int, Sequence[Piece]]]
+def _parameter_direction(
+    model: HybridDynamics,
+    change: SystemChange,
+    indexed_groups: Sequence[tuple[int, Sequence[MeasuredWindow]]],
 ) -> tuple[Tensor, float]:
     """Return what a unit of a change adds to the free parameters [P].
 
     The share of its accelerations that they can follow comes with it.
     """
-    pieces = [piece for _, part in groups for piece in part]
-    x = torch.from_numpy(np.concatenate([piece.y[:-1] for piece in pieces]))
-    w = torch.from_numpy(np.concatenate([piece.w for piece in pieces]))
-    every = max(len(x) // _SAMPLES, 1)
-    x, w = x[::every], w[::every]
-    memory = x.new_zeros(len(x), model.n_state)
+    windows = [window for _, group in indexed_groups for window in group]
+    states = torch.from_numpy(np.concatenate([window.y[:-1] for window in windows]))
+    inputs = torch.from_numpy(np.concatenate([window.w for window in windows]))
+    sample_stride = max(len(states) // _MAX_SAMPLES, 1)
+    states, inputs = states[::sample_stride], inputs[::sample_stride]
+    initial_memory = states.new_zeros(len(states), model.n_state)
     # over a whole step the vessel answers to the change already, which would hide a part of it
-    brief = copy.deepcopy(model)
-    brief.dt = _BRIEF * model.dt
+    short_step_model = copy.deepcopy(model)
+    short_step_model.dt = _SHORT_STEP_SHARE * model.dt
     with torch.no_grad():
-        changed = ChangedDynamics(brief, [change], len(x), w.shape[1])
-        gained = changed.step(x, w, memory)[0] - brief.step(x, w, memory)[0]
-        wanted = gained[:, MOVING].flatten() / (brief.dt * change.size)
-        slopes = parametric(model).sensitivity(model.channels(x, w)).flatten(0, 1)
+        perturbed_model = PerturbedDynamics(
+            short_step_model, [change], len(states), inputs.shape[1]
+        )
+        added_increment = (
+            perturbed_model.step(states, inputs, initial_memory)[0]
+            - short_step_model.step(states, inputs, initial_memory)[0]
+        )
+        target_accelerations = added_increment[:, DYNAMIC_STATES].flatten() / (
+            short_step_model.dt * change.size
+        )
+        sensitivities = (
+            parametric(model).parameter_jacobian(model.channels(states, inputs)).flatten(0, 1)
+        )
         # axes count alike, though an acceleration in yaw is no acceleration in surge
-        weight = gained[:, MOVING].square().mean(0)
-        weight = (weight + 1e-4 * weight.max()).rsqrt().repeat(len(x))
-        slopes, wanted = slopes * weight[:, None], wanted * weight
-        gram = slopes.T @ slopes
-        ridge = torch.diag(_RIDGE * gram.diagonal() + 1e-300)
-        found = torch.linalg.solve(gram + ridge, slopes.T @ wanted)
-        left = (wanted - slopes @ found).square().sum() / wanted.square().sum()
-    return found, 1.0 - float(left)
+        axis_weights = added_increment[:, DYNAMIC_STATES].square().mean(0)
+        axis_weights = (axis_weights + 1e-4 * axis_weights.max()).rsqrt().repeat(len(states))
+        sensitivities, target_accelerations = (
+            sensitivities * axis_weights[:, None],
+            target_accelerations * axis_weights,
+        )
+        gram = sensitivities.T @ sensitivities
+        ridge = torch.diag(_DIRECTION_RIDGE * gram.diagonal() + 1e-300)
+        direction = torch.linalg.solve(gram + ridge, sensitivities.T @ target_accelerations)
+        unexplained_share = (
+            target_accelerations - sensitivities @ direction
+        ).square().sum() / target_accelerations.square().sum()
+    return direction, 1.0 - float(unexplained_share)
 
 
-class _Filter:
+class _InformationFilter:
     """An extended information filter for the sizes of changes.
 
     Args:
         changes: Q of them, causes of the watch.
     """
 
-    def __init__(self, watch: Watch, changes: Sequence[Change]) -> None:
-        self.watch, self.changes = watch, changes
-        self.model = copy.deepcopy(watch.model)
+    def __init__(self, detector: ChangeDetector, changes: Sequence[SystemChange]) -> None:
+        self.detector, self.changes = detector, changes
+        self.model = copy.deepcopy(detector.model)
         self.baseline = parametric(self.model)
-        self.start = self.baseline.free()
-        self.steps = np.array([change.size for change in changes])
-        names = [change.name for change in watch.causes]
-        self.places = [names.index(change.name) for change in changes]
-        self.size = np.zeros(len(changes))
-        self.directions = torch.zeros(len(self.start), len(changes), dtype=self.start.dtype)
+        self.initial_parameters = self.baseline.get_free()
+        self.small_sizes = np.array([change.size for change in changes])
+        cause_names = [change.name for change in detector.hypotheses]
+        self.cause_indices = [cause_names.index(change.name) for change in changes]
+        self.sizes = np.zeros(len(changes))
+        self.directions = torch.zeros(
+            len(self.initial_parameters), len(changes), dtype=self.initial_parameters.dtype
+        )
 
-    def through(self, groups: Sequence[tuple[int, Sequence[Piece]]]) -> list[Moved]:
+    def run_filter(
+        self, indexed_groups: Sequence[tuple[int, Sequence[MeasuredWindow]]]
+    ) -> list[IdentifiedChange]:
         """Take the logs one after the other, twice, and return what has become of the sizes.
 
         The second time the logs are free-run with the sizes that the first time ended with, and
         the directions are those of changes so large.
         """
-        for again in (False, True):
-            sizes = np.where(np.abs(self.size) > self.steps, self.size, self.steps)
+        for is_second_pass in (False, True):
+            linearisation_sizes = np.where(
+                np.abs(self.sizes) > self.small_sizes, self.sizes, self.small_sizes
+            )
             self.directions = torch.stack(
                 [
-                    _direction(self.watch.model, replace(change, size=float(size)), groups)[0]
-                    for change, size in zip(self.changes, sizes, strict=True)
+                    _parameter_direction(
+                        self.detector.model,
+                        replace(change, size=float(change_size)),
+                        indexed_groups,
+                    )[0]
+                    for change, change_size in zip(self.changes, linearisation_sizes, strict=True)
                 ],
                 dim=1,
             )
-            after, covariance, folds = self._pass(groups, fixed=again)
-        scatter = self.watch.scatter
-        variance = np.diag(covariance) + scatter.known[self.places]
+            sizes_by_log, covariance, sizes_by_fold = self._run_pass(
+                indexed_groups, use_initial_sizes=is_second_pass
+            )
+        score_distribution = self.detector.score_distribution
+        variance = np.diag(covariance) + score_distribution.mean_size_variance[self.cause_indices]
         # what the model has always got wrong is an estimate too (the jackknife over clean logs)
-        apart = (len(folds) - 1) * folds.var(axis=0)
-        error = np.sqrt(variance * scatter.inflation + apart)
+        jackknife_variance = (len(sizes_by_fold) - 1) * sizes_by_fold.var(axis=0)
+        standard_errors = np.sqrt(
+            variance * score_distribution.wishart_inflation + jackknife_variance
+        )
         return [
-            Moved(change, float(self.size[q]), float(error[q]), [float(one[q]) for one in after])
-            for q, change in enumerate(self.changes)
+            IdentifiedChange(
+                change,
+                float(self.sizes[change_index]),
+                float(standard_errors[change_index]),
+                [float(log_sizes[change_index]) for log_sizes in sizes_by_log],
+            )
+            for change_index, change in enumerate(self.changes)
         ]
 
-    def _pass(
-        self, groups: Sequence[tuple[int, Sequence[Piece]]], *, fixed: bool
+    def _run_pass(
+        self,
+        indexed_groups: Sequence[tuple[int, Sequence[MeasuredWindow]]],
+        *,
+        use_initial_sizes: bool,
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
         """Take the logs one after the other: sizes after each, their covariance, sizes by fold.
 
-        Free runs have the sizes known by then, or, where these are `fixed`, those of the start.
+        Free runs have the sizes known by then, or, where these are `use_initial_sizes`, those of the start.
         """
-        precision = np.diag((BELIEVED * self.steps) ** -2.0)
-        told, size = np.zeros((len(self.watch.usual), len(self.size))), self.size
-        after: list[np.ndarray] = []
-        for log in dict.fromkeys(number for number, _ in groups):
-            self._place(self.size)
-            scores, sure = self._log([part for number, part in groups if number == log])
-            precision = precision + sure
-            told = told + scores + sure @ self.size
-            size = np.linalg.solve(precision, told[0])
-            after.append(size)
-            if not fixed:
-                self.size = size
-        self.size = size
-        self._place(size)
+        precision = np.diag((PRIOR_STD * self.small_sizes) ** -2.0)
+        weighted_sizes, sizes = (
+            np.zeros((len(self.detector.bias_by_fold), len(self.sizes))),
+            self.sizes,
+        )
+        sizes_by_log: list[np.ndarray] = []
+        for log_index in dict.fromkeys(log_number for log_number, _ in indexed_groups):
+            self._set_sizes(self.sizes)
+            scores, log_information = self._process_log(
+                [group for log_number, group in indexed_groups if log_number == log_index]
+            )
+            precision = precision + log_information
+            weighted_sizes = weighted_sizes + scores + log_information @ self.sizes
+            sizes = np.linalg.solve(precision, weighted_sizes[0])
+            sizes_by_log.append(sizes)
+            if not use_initial_sizes:
+                self.sizes = sizes
+        self.sizes = sizes
+        self._set_sizes(sizes)
         covariance = np.linalg.inv(precision)
-        return after, covariance, told[1:] @ covariance
+        return sizes_by_log, covariance, weighted_sizes[1:] @ covariance
 
-    def _log(self, parts: Sequence[Sequence[Piece]]) -> tuple[np.ndarray, np.ndarray]:
+    def _process_log(
+        self, groups_of_log: Sequence[Sequence[MeasuredWindow]]
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return scores [1 + F, Q] and information of a log, weighed by how clean logs scatter."""
-        score, information = (np.stack(one) for one in zip(*map(self._told, parts), strict=True))
-        groups = Groups(np.zeros(len(parts)), score, information)
-        told, sure, again = self.watch.scatter.of(self.places).by_log(groups)
-        return told[0] / again.mean(), sure[0] / again.mean()
+        score, information = (
+            np.stack(arrays)
+            for arrays in zip(*map(self._process_group, groups_of_log), strict=True)
+        )
+        group_scores = GroupScores(np.zeros(len(groups_of_log)), score, information)
+        weighted_scores, weighted_information, redundancy = (
+            self.detector.score_distribution.select_causes(self.cause_indices).weigh_by_log(
+                group_scores
+            )
+        )
+        return weighted_scores[0] / redundancy.mean(), weighted_information[0] / redundancy.mean()
 
-    def _place(self, size: np.ndarray) -> None:
+    def _set_sizes(self, sizes: np.ndarray) -> None:
         """Give the model its parameters for changes of some sizes."""
-        self.baseline.place(self.start + self.directions @ torch.from_numpy(size))
+        self.baseline.set_free(self.initial_parameters + self.directions @ torch.from_numpy(sizes))
 
-    def _told(self, part: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray]:
+    def _process_group(self, windows: Sequence[MeasuredWindow]) -> tuple[np.ndarray, np.ndarray]:
         """Return scores and information about further changes of the sizes, from a few windows.
 
         Scores [1 + F, Q] are by what all clean logs say is always wrong, then without each fold.
         """
-        watch = self.watch
-        looks: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in watch.usual]
-        for i, parts in enumerate(watch.parts):
-            _, known = watch.innovations(part, parts)
+        detector = self.detector
+        innovations_by_fold: list[list[tuple[np.ndarray, np.ndarray]]] = [
+            [] for _ in detector.bias_by_fold
+        ]
+        for i, n_parts in enumerate(detector.part_counts):
+            _, cause_effects = detector.compute_innovations(windows, n_parts)
             # windows in which a free run ran away have no effects, and tell nothing
-            sound = (known != 0.0).any(axis=(1, 2))
-            cut = [one for piece in part for one in parted(piece, parts)]
-            error, beside = innovations(self.model, cut, watch.others)
-            effects = []
-            for q, step in enumerate(self.steps):
-                self._place(self.size + np.where(np.arange(len(self.size)) == q, step, 0.0))
-                effects.append((error - innovations(self.model, cut, [])[0]) / step)
-            self._place(self.size)
-            every = np.concatenate((np.stack(effects, axis=1), beside), axis=1)
-            count, changes = len(part), every.shape[1]
-            every = every.reshape(count, parts, changes, -1).swapaxes(1, 2)
-            every = every.reshape(count, changes, -1) * sound[:, None, None]
-            for look, (always, bias) in zip(looks, watch.usual, strict=True):
+            is_valid = (cause_effects != 0.0).any(axis=(1, 2))
+            window_parts = [item for window in windows for item in split_window(window, n_parts)]
+            innovation, nuisance_effects = compute_innovations(
+                self.model, window_parts, detector.nuisance_changes
+            )
+            change_effects = []
+            for change_index, small_size in enumerate(self.small_sizes):
+                self._set_sizes(
+                    self.sizes
+                    + np.where(np.arange(len(self.sizes)) == change_index, small_size, 0.0)
+                )
+                change_effects.append(
+                    (innovation - compute_innovations(self.model, window_parts, [])[0]) / small_size
+                )
+            self._set_sizes(self.sizes)
+            all_effects = np.concatenate(
+                (np.stack(change_effects, axis=1), nuisance_effects), axis=1
+            )
+            n_windows, n_changes = len(windows), all_effects.shape[1]
+            all_effects = all_effects.reshape(n_windows, n_parts, n_changes, -1).swapaxes(1, 2)
+            all_effects = all_effects.reshape(n_windows, n_changes, -1) * is_valid[:, None, None]
+            for innovations_of_fold, (model_bias, size_bias) in zip(
+                innovations_by_fold, detector.bias_by_fold, strict=True
+            ):
                 # what clean logs ask for too is no change
-                wrong = watch.expected(known, always[i])
-                wrong = wrong + np.einsum("q,bqn->bn", bias, known[:, : len(watch.causes)])
-                look.append(((error.reshape(count, -1) - wrong) * sound[:, None], every))
-        own = [*self.places, *range(len(watch.causes), len(watch.changes))]
-        possible = watch.possible[np.ix_(own, own)]
-        told = [weighed(look, watch.whiten, possible) for look in looks]
-        score, information = apart_from(
-            np.stack([one.score for one in told]),
-            np.stack([one.information for one in told]),
-            len(self.size),
-            watch.belief,
+                expected_innovation = detector.expected_innovations(cause_effects, model_bias[i])
+                expected_innovation = expected_innovation + np.einsum(
+                    "q,bqn->bn", size_bias, cause_effects[:, : len(detector.hypotheses)]
+                )
+                innovations_of_fold.append(
+                    (
+                        (innovation.reshape(n_windows, -1) - expected_innovation)
+                        * is_valid[:, None],
+                        all_effects,
+                    )
+                )
+        change_indices = [
+            *self.cause_indices,
+            *range(len(detector.hypotheses), len(detector.all_changes)),
+        ]
+        prior_precision = detector.prior_precision[np.ix_(change_indices, change_indices)]
+        score_sums = [
+            compute_robust_score_sums(
+                innovations_of_fold, detector.whitening_matrices, prior_precision
+            )
+            for innovations_of_fold in innovations_by_fold
+        ]
+        score, information = marginalise(
+            np.stack([item.score for item in score_sums]),
+            np.stack([item.information for item in score_sums]),
+            len(self.sizes),
+            detector.nuisance_precision,
         )
         return score, information[0]

@@ -9,15 +9,15 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 
 from residnet.baselines import BaselineConfig
 from residnet.baselines.base import ParametricBaseline
-from residnet.baselines.given import StillConfig
+from residnet.baselines.given import ZeroBaselineConfig
 from residnet.baselines.regressors import RegressorBaseline
-from residnet.core.config import Config, validate
+from residnet.core.config import Config, validate_config
 from residnet.core.errors import ConfigError
-from residnet.core.names import nearest
+from residnet.core.names import suggest_name
 from residnet.data.prepare import PrepareConfig
 from residnet.dynamics.base import Integrator
 from residnet.heads import HeadConfig
-from residnet.identification.recipe import PARTS, Facts, portfolio
+from residnet.identification.recipe import PART_KEYS, TrainingDataSummary, make_portfolio
 from residnet.judge.band import BandsConfig
 from residnet.judge.protocol import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
@@ -25,10 +25,10 @@ from residnet.training.config import TrainingConfig
 from residnet.training.current import CurrentConfig
 from residnet.training.refit import RefitConfig
 
-_RESERVED = ("zero", "baseline", "truth")
+_RESERVED_NAMES = ("zero", "baseline", "truth")
 
 
-class Parts(Config):
+class ModelPartsConfig(Config):
     """The models of a fit.
 
     Attributes:
@@ -46,7 +46,7 @@ class Parts(Config):
         training: of network heads by the name of the head; the defaults where absent.
     """
 
-    baseline: BaselineConfig = StillConfig()
+    baseline: BaselineConfig = ZeroBaselineConfig()
     baselines: dict[str, BaselineConfig] = Field(default_factory=dict)
     refit: dict[str, RefitConfig] = Field(default_factory=dict)
     heads: dict[str, HeadConfig] = Field(default_factory=dict)
@@ -58,7 +58,7 @@ class Parts(Config):
     training: dict[str, TrainingConfig] = Field(default_factory=dict)
 
 
-class FitSettings(Parts):
+class FitSettings(ModelPartsConfig):
     """Settings of an identification.
 
     Attributes:
@@ -88,103 +88,116 @@ class FitSettings(Parts):
     effort: float = Field(default=1.0, gt=0, le=10)
 
     @model_validator(mode="after")
-    def _of_recipe(self) -> FitSettings:
+    def apply_recipe(self) -> FitSettings:
         """Put the portfolio in the place of the parts, as it is before any log is read."""
-        given = [key for key in PARTS if key in self.model_fields_set]
+        specified_parts = [key for key in PART_KEYS if key in self.model_fields_set]
         if self.recipe is None:
-            if "baseline" not in given:
+            if "baseline" not in specified_parts:
                 raise ValueError("baseline: missing; name its kind, or take `recipe: standard`")
             return self
-        if given:
+        if specified_parts:
             raise ValueError(
-                f"recipe: standard stands in place of {', '.join(PARTS)}; leave '{given[0]}' out"
+                f"recipe: standard stands in place of {', '.join(PART_KEYS)}; leave '{specified_parts[0]}' out"
             )
-        return self.with_parts(Facts.supposed(self.signals.build().names))
+        return self.with_parts(TrainingDataSummary.from_channel_names(self.signals.build().names))
 
-    def with_parts(self, facts: Facts) -> Self:
+    def with_parts(self, data_summary: TrainingDataSummary) -> Self:
         """Return the settings with the parts of the recipe for what is known of the logs."""
-        parts = validate(portfolio(facts, self.effort), Parts, "recipe")
-        return self.model_copy(update={key: getattr(parts, key) for key in PARTS})
+        parts = validate_config(
+            make_portfolio(data_summary, self.effort), ModelPartsConfig, "recipe"
+        )
+        return self.model_copy(update={key: getattr(parts, key) for key in PART_KEYS})
 
     @model_serializer(mode="wrap")
-    def _as_given(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def serialize_without_recipe_parts(
+        self, default_serializer: SerializerFunctionWrapHandler
+    ) -> dict[str, Any]:
         """Leave out what the recipe stands in place of."""
-        content: dict[str, Any] = plain(self)
+        content: dict[str, Any] = default_serializer(self)
         if self.recipe is not None:
-            content = {key: value for key, value in content.items() if key not in PARTS}
+            content = {key: value for key, value in content.items() if key not in PART_KEYS}
         return content
 
     @model_validator(mode="after")
-    def _combination(self) -> FitSettings:
-        if self.current is not None and not self.signals.live.planar:
+    def check_combination(self) -> FitSettings:
+        if self.current is not None and not self.signals.dof.is_planar:
             raise ValueError(
                 "current: currents are told by u, v and r beside a position; leave `current` out of"
                 f" a model of {', '.join(self.signals.velocities)}"
             )
-        given, wanted = tuple(self.evaluation.scales.named()), self.signals.live.channels
-        if given != wanted:
+        scale_names, required_names = (
+            tuple(self.evaluation.scales.to_dict()),
+            self.signals.dof.active_states,
+        )
+        if scale_names != required_names:
             raise ValueError(
-                f"evaluation.scales: the velocities of the model are {', '.join(wanted)}"
-                f" (signals.velocities), and scales are given of {', '.join(given) or 'none'}; give"
+                f"evaluation.scales: the velocities of the model are {', '.join(required_names)}"
+                f" (signals.velocities), and scales are given of {', '.join(scale_names) or 'none'}; give"
                 " one of each"
             )
-        baselines = self.all_baselines
-        single = (*baselines, *self.heads)
-        further = (*self.ensembles, *self.means)
-        models = (*single, *further)
-        for name in (*self.baselines, *self.heads, *further):
+        baseline_configs = self.all_baselines
+        single_names = (*baseline_configs, *self.heads)
+        combined_names = (*self.ensembles, *self.means)
+        model_names = (*single_names, *combined_names)
+        for name in (*self.baselines, *self.heads, *combined_names):
             if (
-                name in _RESERVED
-                or models.count(name) > 1
+                name in _RESERVED_NAMES
+                or model_names.count(name) > 1
                 or not name.replace("_", "").replace("-", "").isalnum()
             ):
                 raise ValueError(
                     f"'{name}' cannot name a model; use letters, digits, '-', '_', each name once"
-                    f" and none of {', '.join(_RESERVED)}"
+                    f" and none of {', '.join(_RESERVED_NAMES)}"
                 )
-        require_known("training", self.training, self.heads, "head")
-        require_known("base_of", self.base_of, self.heads, "head")
-        require_known("base_of", self.base_of.values(), ("zero", *baselines), "baseline")
-        require_known("refit", self.refit, baselines, "baseline")
+        check_known_names("training", self.training, self.heads, "head")
+        check_known_names("base_of", self.base_of, self.heads, "head")
+        check_known_names("base_of", self.base_of.values(), ("zero", *baseline_configs), "baseline")
+        check_known_names("refit", self.refit, baseline_configs, "baseline")
         members = (name for names in self.ensembles.values() for name in names)
-        require_known("ensembles", members, single, "model")
+        check_known_names("ensembles", members, single_names, "model")
         members = (name for names in self.means.values() for name in names)
-        require_known("means", members, single, "model")
-        self._parts_fit_together()
+        check_known_names("means", members, single_names, "model")
+        self.check_parts_fit_together()
         return self
 
-    def _parts_fit_together(self) -> None:
+    def check_parts_fit_together(self) -> None:
         """Build every part once, so that what does not fit together is refused before any work."""
-        names = self.signals.build().names
-        parts: dict[str, Any] = {**self.all_baselines, **self.heads}
-        for key, part in parts.items():
+        channel_names = self.signals.build().names
+        part_configs: dict[str, Any] = {**self.all_baselines, **self.heads}
+        for part_name, part_config in part_configs.items():
             try:
-                part.build(names)
+                part_config.build(channel_names)
             except ConfigError as error:
-                raise ValueError(f"{key}: {error}") from None
-        for key, config in self.heads.items():
-            head, baseline = config.build(names), self.baseline_of(key).build(names)
+                raise ValueError(f"{part_name}: {error}") from None
+        for part_name, config in self.heads.items():
+            head, baseline = (
+                config.build(channel_names),
+                self.get_baseline_config(part_name).build(channel_names),
+            )
             try:
-                head.set_mass(baseline.mass())
+                head.set_inertia(baseline.inertia_matrix())
             except ConfigError as error:
-                raise ValueError(f"heads.{key}: {error}") from None
+                raise ValueError(f"heads.{part_name}: {error}") from None
         for ensemble, members in self.ensembles.items():
             for name in members:
-                if name in self.heads and self.heads[name].build(names).settle > 0.0:
+                if (
+                    name in self.heads
+                    and self.heads[name].build(channel_names).innovation_time_constant > 0.0
+                ):
                     raise ValueError(
                         f"ensembles.{ensemble}: '{name}' runs on states of its own, whose"
                         " accelerations have no mean; name the ensemble under `means`"
                     )
         for name in self.refit:
-            if not isinstance(self.all_baselines[name].build(names), ParametricBaseline):
+            if not isinstance(self.all_baselines[name].build(channel_names), ParametricBaseline):
                 raise ValueError(
                     f"refit.{name}: a refit through rollouts needs a baseline of kind 'regressors',"
                     " 'linear_steady', 'mmg', 'nomoto' or 'nomoto_sideslip'"
                 )
         if self.current is not None:
             name, baselines = self.current.baseline, self.all_baselines
-            require_known("current.baseline", (name,), baselines, "baseline")
-            if not isinstance(baselines[name].build(names), RegressorBaseline):
+            check_known_names("current.baseline", (name,), baselines, "baseline")
+            if not isinstance(baselines[name].build(channel_names), RegressorBaseline):
                 raise ValueError(
                     f"current.baseline: '{name}' has no regressors to tell a current by; name a"
                     " baseline that has"
@@ -200,23 +213,27 @@ class FitSettings(Parts):
         """Names of all models but `zero`: baselines, heads, ensembles."""
         return (*self.all_baselines, *self.heads, *self.ensembles, *self.means)
 
-    def baseline_name_of(self, head: str) -> str:
+    def get_baseline_name(self, head_name: str) -> str:
         """Return the name of the baseline that a head stands on."""
-        return self.base_of.get(head, "baseline")
+        return self.base_of.get(head_name, "baseline")
 
-    def baseline_of(self, head: str) -> BaselineConfig:
+    def get_baseline_config(self, head_name: str) -> BaselineConfig:
         """Return the settings of the baseline that a head stands on."""
-        name = self.baseline_name_of(head)
-        return StillConfig() if name == "zero" else self.all_baselines[name]
+        name = self.get_baseline_name(head_name)
+        return ZeroBaselineConfig() if name == "zero" else self.all_baselines[name]
 
 
-def require_known(key: str, given: Iterable[str], valid: Iterable[str], what: str) -> None:
+def check_known_names(
+    config_key: str, names_to_check: Iterable[str], valid_names: Iterable[str], noun: str
+) -> None:
     """Check that every given name is one of the valid ones.
 
     Raises:
         ValueError: where one is not; the message names the nearest.
     """
-    valid = tuple(valid)
-    for name in given:
-        if name not in valid:
-            raise ValueError(f"{key}: no {what} is named '{name}'{nearest(name, valid)}")
+    valid_names = tuple(valid_names)
+    for name in names_to_check:
+        if name not in valid_names:
+            raise ValueError(
+                f"{config_key}: no {noun} is named '{name}'{suggest_name(name, valid_names)}"
+            )

@@ -18,24 +18,24 @@ from torch import Tensor
 
 from residnet.control.base import Policy
 from residnet.control.courses.config import PlannedCourse
-from residnet.control.courses.course_check import passages
+from residnet.control.courses.course_check import find_passages
 from residnet.control.heading.conditions import (
-    ConditionedRun,
+    ClosedLoopSimulation,
+    ClosedLoopTrajectories,
     ConditionsConfig,
-    Flights,
-    HeadingChanges,
+    HeadingStepBatch,
     SteadinessLimits,
-    fly,
+    simulate_heading_steps,
 )
 from residnet.control.heading.vessels import SteeredPlant, SteeredVessel
-from residnet.core.columns import velocities_on
-from residnet.core.frames import wrap
+from residnet.core.columns import all_but_pose
+from residnet.core.frames import wrap_angle
 from residnet.core.layout import HEADING, POSITION, RANGE_VELOCITIES
-from residnet.data.simulated import Disturbance
+from residnet.data.simulated import DisturbanceConfig
 from residnet.physics.environment import WavesConfig
 from residnet.physics.plant import Plant
 
-QUANTITIES = {
+METRIC_UNITS = {
     "settling": "s",
     "overshoot": "rad",
     "iae": "rad s",
@@ -47,19 +47,21 @@ of the rudder command, integral of its square.
 """
 
 
-def measure(flights: Flights, band: float) -> dict[str, Tensor]:
-    """Return each of `QUANTITIES` by flight, [B]."""
+def compute_run_metrics(
+    trajectories: ClosedLoopTrajectories, tolerance: float
+) -> dict[str, Tensor]:
+    """Return each of `METRIC_UNITS` by flight, [B]."""
     values = (
-        flights.settled(band),
-        flights.overshoot(),
-        flights.absolute_error(),
-        flights.travel(),
-        flights.effort(),
+        trajectories.settling_time(tolerance),
+        trajectories.overshoot(),
+        trajectories.integrated_absolute_error(),
+        trajectories.rudder_travel(),
+        trajectories.control_effort(),
     )
-    return dict(zip(QUANTITIES, values, strict=True))
+    return dict(zip(METRIC_UNITS, values, strict=True))
 
 
-def distribution(values: Tensor) -> dict[str, float]:
+def summarize_distribution(values: Tensor) -> dict[str, float]:
     """Return mean, median, 95th percentile and largest of values [B]."""
     array = values.double().numpy()
     return {
@@ -70,241 +72,298 @@ def distribution(values: Tensor) -> dict[str, float]:
     }
 
 
-def objections(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def list_policy_objections(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return what rows of metrics.json say against using a policy rather than a tuned law."""
-    return _cheaper(model, rows, "conditions", "under its conditions")
+    return _describe_cheaper_law(model, rows, "conditions", "under its conditions")
 
 
-def not_for(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def list_unsuitable_conditions(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return under which conditions beyond its own a tuned law costs less than a policy."""
-    beyond = dict.fromkeys(row["protocol"] for row in rows if row["protocol"].startswith("beyond_"))
+    protocols = dict.fromkeys(
+        row["protocol"] for row in rows if row["protocol"].startswith("beyond_")
+    )
     return [
-        sentence
-        for protocol in beyond
-        for sentence in _cheaper(model, rows, protocol, f"under '{protocol[7:]}'")
+        objection
+        for protocol in protocols
+        for objection in _describe_cheaper_law(model, rows, protocol, f"under '{protocol[7:]}'")
     ]
 
 
-def cycling(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def describe_limit_cycles(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return in a sentence in how many flights without noise a policy keeps swinging, if any."""
-    quiet = {row["model"]: row for row in rows if row["protocol"] == "quiet"}
-    if not (own := quiet.get(model)) or not own.get("cycling"):
+    rows_by_model = {row["model"]: row for row in rows if row["protocol"] == "quiet"}
+    if not (policy_row := rows_by_model.get(model)) or not policy_row.get("cycling"):
         return []
-    calm = [
-        name for name, row in quiet.items() if row["kind"] == "classical" and not row["cycling"]
+    steady_laws = [
+        name
+        for name, row in rows_by_model.items()
+        if row["kind"] == "classical" and not row["cycling"]
     ]
     return [
-        f"'{model}' keeps swinging in {own['cycling']} of {own['n']} flights without noise, its"
-        f" command by up to {math.degrees(own['rudder_swing']['max']):.3g} deg; "
-        + (f"not so {', '.join(calm)}." if calm else "each tuned law does so too.")
+        f"'{model}' keeps swinging in {policy_row['cycling']} of {policy_row['n']} flights without noise, its"
+        f" command by up to {math.degrees(policy_row['rudder_swing']['max']):.3g} deg; "
+        + (f"not so {', '.join(steady_laws)}." if steady_laws else "each tuned law does so too.")
     ]
 
 
-def _cheaper(model: str, rows: Sequence[Mapping[str, Any]], protocol: str, what: str) -> list[str]:
+def _describe_cheaper_law(
+    model: str, rows: Sequence[Mapping[str, Any]], protocol: str, condition_text: str
+) -> list[str]:
     """Return in a sentence what the cheapest tuned law costs, where a policy costs more."""
-    judged = {
+    costs = {
         row["model"]: (row["kind"], row["cost"]["mean"])
         for row in rows
         if row["protocol"] == protocol and "cost" in row
     }
-    laws = {name: cost for name, (kind, cost) in judged.items() if kind == "classical"}
-    if model not in judged or not laws:
+    laws = {name: cost for name, (model_kind, cost) in costs.items() if model_kind == "classical"}
+    if model not in costs or not laws:
         return []
-    own, best = judged[model][1], min(laws, key=laws.__getitem__)
+    policy_cost, cheapest_law = costs[model][1], min(laws, key=laws.__getitem__)
     # a policy that learned nothing flies as the law that it began with, but for rounding
-    if own <= laws[best] or math.isclose(own, laws[best]):
+    if policy_cost <= laws[cheapest_law] or math.isclose(policy_cost, laws[cheapest_law]):
         return []
-    return [f"{what} a flight costs {own:.4g} s, with {best} {laws[best]:.4g} s"]
+    return [
+        f"{condition_text} a flight costs {policy_cost:.4g} s, with {cheapest_law} {laws[cheapest_law]:.4g} s"
+    ]
 
 
-def _row(controller: str, kind: str, protocol: str, found: Mapping[str, Tensor]) -> dict[str, Any]:
+def _build_row(
+    controller: str, model_kind: str, protocol: str, metrics: Mapping[str, Tensor]
+) -> dict[str, Any]:
     """Return a row of metrics.json with the distributions of what was found, [B] by name."""
-    row = {"model": controller, "kind": kind, "split": "simulated", "protocol": protocol}
-    return row | {name: distribution(values) for name, values in found.items()}
+    row = {"model": controller, "kind": model_kind, "split": "simulated", "protocol": protocol}
+    return row | {name: summarize_distribution(values) for name, values in metrics.items()}
 
 
-def step_row(
-    controller: str, kind: str, protocol: str, flights: Flights, band: float
+def build_step_row(
+    controller: str,
+    model_kind: str,
+    protocol: str,
+    trajectories: ClosedLoopTrajectories,
+    tolerance: float,
 ) -> dict[str, Any]:
     """Return a row of metrics.json: distributions, flights not settled at the end, flights."""
-    finite = torch.isfinite(flights.states).all(dim=2).all(dim=1)
-    unsettled = (flights.error[:, -1].abs() > band) | ~finite
-    return _row(controller, kind, protocol, measure(flights, band)) | {
-        "unsettled": int(unsettled.sum()),
-        "n": len(finite),
-        "diverged": int((~finite).sum()),
+    is_finite = torch.isfinite(trajectories.states).all(dim=2).all(dim=1)
+    is_unsettled = (trajectories.error[:, -1].abs() > tolerance) | ~is_finite
+    return _build_row(
+        controller, model_kind, protocol, compute_run_metrics(trajectories, tolerance)
+    ) | {
+        "unsettled": int(is_unsettled.sum()),
+        "n": len(is_finite),
+        "diverged": int((~is_finite).sum()),
     }
 
 
-def corners(effect: tuple[float, float], time: tuple[float, float]) -> Tensor:
+def build_variation_grid(
+    effect_range: tuple[float, float], time_range: tuple[float, float]
+) -> Tensor:
     """Return effect, time and zero bias [9, 3]: nominal first, then ends and middles."""
-    return torch.tensor([(e, t, 0.0) for e in (1.0, *effect) for t in (1.0, *time)]).double()
+    return torch.tensor(
+        [
+            (effect_factor, time_factor, 0.0)
+            for effect_factor in (1.0, *effect_range)
+            for time_factor in (1.0, *time_range)
+        ]
+    ).double()
 
 
-def random_variations(
-    effect: tuple[float, float], time: tuple[float, float], count: int, seed: int
+def draw_variations(
+    effect_range: tuple[float, float], time_range: tuple[float, float], n_variations: int, seed: int
 ) -> Tensor:
     """Return effect and time drawn evenly from their ranges, no bias: [count, 3]."""
-    drawn = torch.rand(count, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    low, high = torch.tensor([effect, time], dtype=torch.float64).T
-    return torch.cat((low + (high - low) * drawn, torch.zeros(count, 1).double()), dim=1)
-
-
-def step_flights(
-    vessel: SteeredVessel,
-    policy: Policy,
-    heading: float,
-    dt: float,
-    duration: float,
-    variations: Tensor,
-) -> Flights:
-    """Run steps of the reference, to starboard and to port in turn."""
-    side = torch.where(torch.arange(len(variations)) % 2 == 0, 1.0, -1.0)
-    return fly(vessel, policy, heading * side, variations, dt=dt, duration=duration)
-
-
-def wind_flights(
-    plant: Plant, policy: Policy, speed: float, heading: float, dt: float, duration: float
-) -> Flights:
-    """Run steps of the reference with the nominal vessel in wind from eight directions."""
-    weather: dict[str, float | Tensor] = {
-        "wind_speed": speed,
-        "wind_dir": torch.arange(8) * (torch.pi / 4.0),
-    }
-    vessel, headings = SteeredPlant(plant, calm=False), torch.full((8,), heading)
-    return fly(vessel, policy, headings, _nominal(8), dt=dt, duration=duration, weather=weather)
-
-
-def sea_flights(
-    plant: Plant,
-    policy: Policy,
-    waves: WavesConfig,
-    heading: float,
-    dt: float,
-    duration: float,
-    seed: int,
-) -> Flights:
-    """Run steps of the reference with the nominal vessel in eight seaways."""
-    disturbance, rows = Disturbance(waves=waves), 8
-    return fly(
-        SteeredPlant(plant, calm=False),
-        policy,
-        torch.full((rows,), heading),
-        _nominal(rows),
-        dt=dt,
-        duration=duration,
-        surround=lambda source: disturbance.surround(source, plant, rows, dt, seed),
+    uniform = torch.rand(
+        n_variations, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
+    lower, upper = torch.tensor([effect_range, time_range], dtype=torch.float64).T
+    return torch.cat(
+        (lower + (upper - lower) * uniform, torch.zeros(n_variations, 1).double()), dim=1
     )
 
 
-def sea_row(controller: str, kind: str, flights: Flights, start: float) -> dict[str, Any]:
+def simulate_steps(
+    vessel: SteeredVessel,
+    policy: Policy,
+    heading_step: float,
+    dt: float,
+    duration: float,
+    variations: Tensor,
+) -> ClosedLoopTrajectories:
+    """Run steps of the reference, to starboard and to port in turn."""
+    turn_sign = torch.where(torch.arange(len(variations)) % 2 == 0, 1.0, -1.0)
+    return simulate_heading_steps(
+        vessel, policy, heading_step * turn_sign, variations, dt=dt, duration=duration
+    )
+
+
+def simulate_steps_in_wind(
+    plant: Plant, policy: Policy, speed: float, heading_step: float, dt: float, duration: float
+) -> ClosedLoopTrajectories:
+    """Run steps of the reference with the nominal vessel in wind from eight directions."""
+    wind_channels: dict[str, float | Tensor] = {
+        "wind_speed": speed,
+        "wind_dir": torch.arange(8) * (torch.pi / 4.0),
+    }
+    vessel, heading_steps = SteeredPlant(plant, in_calm_water=False), torch.full((8,), heading_step)
+    return simulate_heading_steps(
+        vessel,
+        policy,
+        heading_steps,
+        _nominal_variations(8),
+        dt=dt,
+        duration=duration,
+        weather=wind_channels,
+    )
+
+
+def simulate_steps_in_waves(
+    plant: Plant,
+    policy: Policy,
+    waves: WavesConfig,
+    heading_step: float,
+    dt: float,
+    duration: float,
+    seed: int,
+) -> ClosedLoopTrajectories:
+    """Run steps of the reference with the nominal vessel in eight seaways."""
+    disturbance, n_seaways = DisturbanceConfig(waves=waves), 8
+    return simulate_heading_steps(
+        SteeredPlant(plant, in_calm_water=False),
+        policy,
+        torch.full((n_seaways,), heading_step),
+        _nominal_variations(n_seaways),
+        dt=dt,
+        duration=duration,
+        wrap_source=lambda source: disturbance.add_waves(source, plant, n_seaways, dt, seed),
+    )
+
+
+def build_sea_row(
+    controller: str, model_kind: str, trajectories: ClosedLoopTrajectories, start_time: float
+) -> dict[str, Any]:
     """Return a row of metrics.json: roots of mean squares from a time [s] on.
 
     They are of heading error, rudder and, where the vessel rolls, heel.
     """
-    kept = {"heading": flights.error, "rudder": flights.command}
-    if "phi" in flights.names:
-        kept["heel"] = flights.state("phi")
-    first = round(start / flights.dt)
-    found = {f"{key}_rms": of[:, first:].square().mean(1).sqrt() for key, of in kept.items()}
-    return _row(controller, kind, "sea", found) | {"n": len(flights.heading)}
+    signals = {"heading": trajectories.error, "rudder": trajectories.command}
+    if "phi" in trajectories.names:
+        signals["heel"] = trajectories.state("phi")
+    first_sample = round(start_time / trajectories.dt)
+    rms_values = {
+        f"{key}_rms": signal[:, first_sample:].square().mean(1).sqrt()
+        for key, signal in signals.items()
+    }
+    return _build_row(controller, model_kind, "sea", rms_values) | {"n": len(trajectories.target)}
 
 
-def _nominal(rows: int) -> Tensor:
-    return torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(rows, -1)
+def _nominal_variations(count: int) -> Tensor:
+    return torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(count, -1)
 
 
-def series(name: str, flights: Flights, variations: Tensor) -> pd.DataFrame:
+def build_time_series(
+    name: str, trajectories: ClosedLoopTrajectories, variations: Tensor
+) -> pd.DataFrame:
     """Return heading, or depth, its rate and rudder every 0.05 s, all turned to starboard."""
-    every = max(round(0.05 / flights.dt), 1)
-    parts = []
+    stride = max(round(0.05 / trajectories.dt), 1)
+    tables = []
     for i, variation in enumerate(variations):
-        side = 1.0 if i % 2 == 0 else -1.0
-        parts.append(
+        turn_sign = 1.0 if i % 2 == 0 else -1.0
+        tables.append(
             pd.DataFrame(
                 {
                     "controller": name,
                     "effect": float(variation[0]),
                     "time": float(variation[1]),
-                    "t": torch.arange(0, flights.command.shape[1], every).numpy() * flights.dt,
+                    "t": torch.arange(0, trajectories.command.shape[1], stride).numpy()
+                    * trajectories.dt,
                     **{
-                        state: side * flights.state(state)[i, :-1:every].numpy()
-                        for state in (flights.axis.value, flights.axis.rate)
+                        state: turn_sign * trajectories.state(state)[i, :-1:stride].numpy()
+                        for state in (trajectories.axis.value, trajectories.axis.rate)
                     },
-                    "rudder": side * flights.command[i, ::every].numpy(),
+                    "rudder": turn_sign * trajectories.command[i, ::stride].numpy(),
                 }
             )
         )
-    return pd.concat(parts, ignore_index=True)
+    return pd.concat(tables, ignore_index=True)
 
 
-_ALLOWED = 1.25
+_SWING_TOLERANCE = 1.25
 """Of the limits that choose an epoch of training, which are a fifth below what a policy may do."""
-QUIET_FLIGHTS = 100
+N_QUIET_RUNS = 100
 """Flights without noise, waves and push; chosen by hand: fewer tell, and each takes longer."""
 
 
-def drawn(conditions: ConditionsConfig, flights: int, seed: int) -> HeadingChanges:
+def draw_heading_changes(conditions: ConditionsConfig, n_runs: int, seed: int) -> HeadingStepBatch:
     """Return flights that no tuning or training has seen, the same for all controllers."""
-    random = torch.Generator().manual_seed(seed + 2_000_003)
-    return conditions.draw(flights, conditions.dt, random)
+    generator = torch.Generator().manual_seed(seed + 2_000_003)
+    return conditions.sample_steps(n_runs, conditions.dt, generator)
 
 
-def judged(
+def evaluate_under_conditions(
     controller: str,
-    kind: str,
+    model_kind: str,
     protocol: str,
-    run: ConditionedRun,
+    run: ClosedLoopSimulation,
     conditions: ConditionsConfig,
-    changes: HeadingChanges,
+    changes: HeadingStepBatch,
 ) -> tuple[dict[str, Any], pd.DataFrame]:
     """Return a row of metrics.json, and a table with a line for each flight, in SI units.
 
     A flight whose heading is no number counts as diverged, and with a heading error of 180 deg all
     the time in the means.
     """
-    flown = run.fly(changes)
-    value = flown.state(flown.axis.value)[:, :-1]
-    finite = torch.isfinite(value).all(1) & torch.isfinite(flown.command).all(1)
-    worst = conditions.duration + 0.5 * 180.0
-    found = {
-        name: torch.where(finite, values, worst if name == "cost" else torch.nan)
-        for name, values in flown.measured(conditions).items()
+    trajectories = run.simulate(changes)
+    controlled_angle = trajectories.state(trajectories.axis.value)[:, :-1]
+    is_finite = torch.isfinite(controlled_angle).all(1) & torch.isfinite(trajectories.command).all(
+        1
+    )
+    worst_cost = conditions.duration + 0.5 * 180.0
+    metrics = {
+        name: torch.where(is_finite, values, worst_cost if name == "cost" else torch.nan)
+        for name, values in trajectories.step_metrics(conditions).items()
     }
-    kept = {name: values if name == "cost" else values[finite] for name, values in found.items()}
-    known = {name: values for name, values in kept.items() if len(values)}
+    finite_metrics = {
+        name: values if name == "cost" else values[is_finite] for name, values in metrics.items()
+    }
+    available_metrics = {name: values for name, values in finite_metrics.items() if len(values)}
     table = pd.DataFrame(
         {
             "controller": controller,
             "protocol": protocol,
-            "flight": range(len(finite)),
-            **{name: values.numpy() for name, values in found.items()},
+            "flight": range(len(is_finite)),
+            **{name: values.numpy() for name, values in metrics.items()},
         }
     )
-    row = _row(controller, kind, protocol, known)
-    return row | {"n": len(finite), "diverged": int((~finite).sum())}, table
+    row = _build_row(controller, model_kind, protocol, available_metrics)
+    return row | {"n": len(is_finite), "diverged": int((~is_finite).sum())}, table
 
 
-def swinging(
-    controller: str, kind: str, run: ConditionedRun, changes: HeadingChanges, after: float
+def evaluate_limit_cycles(
+    controller: str,
+    model_kind: str,
+    run: ClosedLoopSimulation,
+    changes: HeadingStepBatch,
+    settling_time: float,
 ) -> dict[str, Any]:
     """Return the row of metrics.json of flights without noise: what still swings at their end.
 
-    `after` is the time in s from the change on from which they are looked at.
+    `settling_time` is the time in s from the change on from which they are looked at.
     """
-    flown = run.fly(changes)
-    heading, rudder = flown.swing(after)
-    limits = SteadinessLimits()
-    most = _ALLOWED * limits.of(flown.axis)[0], _ALLOWED * limits.rudder_swing
+    trajectories = run.simulate(changes)
+    heading_swing, rudder_swing = trajectories.peak_to_peak(settling_time)
+    steadiness_limits = SteadinessLimits()
+    tolerances = (
+        _SWING_TOLERANCE * steadiness_limits.limits_for(trajectories.axis)[0],
+        _SWING_TOLERANCE * steadiness_limits.rudder_swing,
+    )
     # what is no number is not within its limit
-    steady = (heading <= most[0]) & (rudder <= most[1])
-    found = {"heading_swing": heading, "rudder_swing": rudder}
-    row = _row(controller, kind, "quiet", found)
-    return row | {"cycling": int((~steady).sum()), "n": len(heading)}
+    is_steady = (heading_swing <= tolerances[0]) & (rudder_swing <= tolerances[1])
+    swings = {"heading_swing": heading_swing, "rudder_swing": rudder_swing}
+    row = _build_row(controller, model_kind, "quiet", swings)
+    return row | {"cycling": int((~is_steady).sum()), "n": len(heading_swing)}
 
 
 @dataclass(frozen=True)
-class Tracking:
+class TrackingMetrics:
     """The metrics of one run in closed loop; SI, angles in rad.
 
     Attributes:
@@ -331,7 +390,7 @@ class Tracking:
     power: tuple[float, float]
     iaew: tuple[float, float]
 
-    def row(self) -> dict[str, float | list[float]]:
+    def to_json(self) -> dict[str, float | list[float]]:
         """Return the metrics for JSON."""
         return {
             key: list(value) if isinstance(value, tuple) else value
@@ -339,51 +398,59 @@ class Tracking:
         }
 
 
-def tracking(
-    pose: Tensor, motion: Tensor, desired: Tensor, command: Tensor, feedback: Tensor, dt: float
-) -> Tracking:
+def compute_tracking_metrics(
+    pose: Tensor,
+    motion: Tensor,
+    desired_motion: Tensor,
+    command: Tensor,
+    feedback: Tensor,
+    dt: float,
+) -> TrackingMetrics:
     """Return the metrics of a run in closed loop.
 
     Args:
         pose: x, y, psi [T, 3].
         motion: nu, nu_dot [T, 6].
-        desired: eta_d, nu_d, nu_dot_d [T, 9].
+        desired_motion: eta_d, nu_d, nu_dot_d [T, 9].
         command: tau_c [T, 3].
         feedback: its part tau_FB [T, 3].
         dt: step in s.
     """
-    position = (desired[:, POSITION] - pose[:, POSITION]).norm(dim=-1)
-    heading = wrap(desired[:, HEADING] - pose[:, HEADING]).abs()
-    work = command * motion[:, RANGE_VELOCITIES]
+    position_error = (desired_motion[:, POSITION] - pose[:, POSITION]).norm(dim=-1)
+    heading_error = wrap_angle(desired_motion[:, HEADING] - pose[:, HEADING]).abs()
+    power = command * motion[:, RANGE_VELOCITIES]
     # the power of keeping the position and of keeping the heading are told apart (Table 4.13)
-    energy = [float(work[:, :2].sum(-1).abs().sum() * dt), float(work[:, 2].abs().sum() * dt)]
-    errors = [float(position.sum() * dt), float(heading.sum() * dt)]
-    seconds, missed = dt * len(pose), (velocities_on(desired) - motion).square().mean(0).tolist()
-    tau, fed = command.abs().mean(0).tolist(), feedback.abs().mean(0).tolist()
-    return Tracking(
-        float(position.mean()),
-        float(position.square().mean()),
-        float(heading.mean()),
-        float(heading.square().mean()),
-        (tau[0], tau[1], tau[2]),
-        (fed[0], fed[1], fed[2]),
-        tuple(missed),
+    energy = [float(power[:, :2].sum(-1).abs().sum() * dt), float(power[:, 2].abs().sum() * dt)]
+    integrated_errors = [float(position_error.sum() * dt), float(heading_error.sum() * dt)]
+    duration, motion_mse = (
+        dt * len(pose),
+        (all_but_pose(desired_motion) - motion).square().mean(0).tolist(),
+    )
+    mean_command, mean_feedback = command.abs().mean(0).tolist(), feedback.abs().mean(0).tolist()
+    return TrackingMetrics(
+        float(position_error.mean()),
+        float(position_error.square().mean()),
+        float(heading_error.mean()),
+        float(heading_error.square().mean()),
+        (mean_command[0], mean_command[1], mean_command[2]),
+        (mean_feedback[0], mean_feedback[1], mean_feedback[2]),
+        tuple(motion_mse),
         (energy[0], energy[1]),
-        (energy[0] / seconds, energy[1] / seconds),
-        (errors[0] * energy[0], errors[1] * energy[1]),
+        (energy[0] / duration, energy[1] / duration),
+        (integrated_errors[0] * energy[0], integrated_errors[1] * energy[1]),
     )
 
 
-def mse(residual: Tensor) -> list[float]:
+def mean_squares_by_axis(residuals: Tensor) -> list[float]:
     """Return the mean square of a residual [N, 3] by axis."""
-    return [float(value) for value in torch.mean(residual.square(), dim=0)]
+    return [float(value) for value in torch.mean(residuals.square(), dim=0)]
 
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class CourseFlight:
+class CourseRun:
     """A flight of one vessel along one course, until it ended.
 
     Attributes:
@@ -405,75 +472,86 @@ class CourseFlight:
     finished: bool
 
 
-def row(
+def build_course_row(
     model: str,
-    kind: str,
+    model_kind: str,
     guidance: str,
     planned: PlannedCourse,
-    flight: CourseFlight,
-    acceptance: float,
-    speed: float,
+    run: CourseRun,
+    acceptance_radius: float,
+    service_speed: float,
 ) -> dict[str, Any]:
     """Return a row of metrics.json.
 
-    `ratio` is course time over the reference's length at the service speed; `ratio_turning` takes
-    the speed that the vessel keeps in its smallest turn, for vessels that slow down. `margin` is
+    `ratios` is course time over the reference's length at the service speed; `ratio_turning` takes
+    the speed that the vessel keeps in its smallest turn, for vessels that slow down. `margins` is
     how far inside the circle that was entered least, or outside the one that was passed most
     closely.
     """
-    enters = planned.protocol == "enter"
+    must_enter = planned.protocol == "enter"
     buoys = [
-        buoy.model_copy(update={"radius": acceptance}) if enters else buoy for buoy in planned.buoys
+        buoy.model_copy(update={"radius": acceptance_radius}) if must_enter else buoy
+        for buoy in planned.buoys
     ]
-    seen = passages(flight.track, buoys)
-    time = (len(flight.track) - 1) * flight.dt
-    rate = np.abs(np.diff(flight.heading)) / flight.dt
-    out: dict[str, Any] = {
+    closest_passages = find_passages(run.track, buoys)
+    course_time = (len(run.track) - 1) * run.dt
+    yaw_rate = np.abs(np.diff(run.heading)) / run.dt
+    metrics: dict[str, Any] = {
         "model": model,
-        "kind": kind,
+        "kind": model_kind,
         "guidance": guidance,
         "split": "simulated",
         "protocol": planned.protocol,
-        "finished": flight.finished,
-        "course_time": time,
-        "reference_time": planned.reference / speed,
-        "ratio": time * speed / planned.reference,
-        "ratio_turning": time * planned.steady.speed / planned.reference,
-        "cross_track_rms": float(np.sqrt(np.mean(flight.cross_track**2))),
-        "cross_track_max": float(np.abs(flight.cross_track).max()),
-        "travel": float(abs(flight.rudder[0]) + np.abs(np.diff(flight.rudder)).sum()),
-        "tightest_turn": float((flight.speed[:-1] / np.maximum(rate, 1e-9)).min()),
-        "distances": [passage.least for passage in seen],
+        "finished": run.finished,
+        "course_time": course_time,
+        "reference_time": planned.reference_length / service_speed,
+        "ratio": course_time * service_speed / planned.reference_length,
+        "ratio_turning": course_time * planned.steady.speed / planned.reference_length,
+        "cross_track_rms": float(np.sqrt(np.mean(run.cross_track**2))),
+        "cross_track_max": float(np.abs(run.cross_track).max()),
+        "travel": float(abs(run.rudder[0]) + np.abs(np.diff(run.rudder)).sum()),
+        "tightest_turn": float((run.speed[:-1] / np.maximum(yaw_rate, 1e-9)).min()),
+        "distances": [passage.min_distance for passage in closest_passages],
     }
-    outside = [passage.least - buoy.radius for passage, buoy in zip(seen, buoys, strict=True)]
-    margins = [-distance for distance in outside] if enters else outside
-    kept, right = sum(margin >= 0 for margin in margins), len(seen)
-    if enters:
-        out |= {"entered": kept}
+    boundary_distances = [
+        passage.min_distance - buoy.radius
+        for passage, buoy in zip(closest_passages, buoys, strict=True)
+    ]
+    margins = [-distance for distance in boundary_distances] if must_enter else boundary_distances
+    n_cleared, n_on_correct_side = sum(margin >= 0 for margin in margins), len(closest_passages)
+    if must_enter:
+        metrics |= {"entered": n_cleared}
     else:
-        right = sum(one.side == buoy.leave_to for one, buoy in zip(seen, buoys, strict=True))
-        out |= {"right_side": right, "clear": kept, "clearance": min(margins)}
-    return out | {"passed": right == kept == len(seen), "margin": min(margins), "n": len(seen)}
+        n_on_correct_side = sum(
+            closest_passage.passing_side == buoy.leave_to
+            for closest_passage, buoy in zip(closest_passages, buoys, strict=True)
+        )
+        metrics |= {"right_side": n_on_correct_side, "clear": n_cleared, "clearance": min(margins)}
+    return metrics | {
+        "passed": n_on_correct_side == n_cleared == len(closest_passages),
+        "margin": min(margins),
+        "n": len(closest_passages),
+    }
 
 
-def spread_row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def build_ensemble_row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return a row of metrics.json for many flights of one controller, from their own rows.
 
     `passed` and `finished` are shares of the flights; flights that were given up count with the
     time until then.
     """
-    ratio, margin = (np.array([row[name] for row in rows]) for name in ("ratio", "margin"))
-    out = {
+    ratios, margins = (np.array([row[name] for row in rows]) for name in ("ratio", "margin"))
+    summary = {
         name: rows[0][name] for name in ("model", "kind", "guidance", "protocol", "reference_time")
     }
-    return out | {
+    return summary | {
         "split": "spread",
         "n": len(rows),
         "passed": float(np.mean([row["passed"] for row in rows])),
         "finished": float(np.mean([row["finished"] for row in rows])),
-        "ratio": float(np.median(ratio)),
-        "ratio_worst": float(ratio.max()),
-        "margin": float(np.median(margin)),
-        "margin_worst": float(margin.min()),
+        "ratio": float(np.median(ratios)),
+        "ratio_worst": float(ratios.max()),
+        "margin": float(np.median(margins)),
+        "margin_worst": float(margins.min()),
         "cross_track_rms": float(np.median([row["cross_track_rms"] for row in rows])),
     }

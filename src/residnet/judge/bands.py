@@ -8,27 +8,35 @@ from typing import Any
 
 import numpy as np
 
-from residnet.core.layout import ALIVE, BESIDE, HEADING, PLANAR, POSITION, VELOCITIES, Live
-from residnet.data.prepare import Prepared
-from residnet.judge.band import (
-    Activity,
-    Band,
-    by_channel,
-    corrected,
-    covered,
-    disagreement,
-    factor,
-    independent,
-    interval_score,
-    mean_squares,
-    quantile,
-    run_weights,
-    worst,
+from residnet.core.layout import (
+    EXTRA_STATES,
+    HEADING,
+    PLANAR_LAYOUT,
+    POSITION,
+    SURGE_SWAY_YAW,
+    VELOCITIES,
+    DegreesOfFreedom,
 )
-from residnet.judge.freerun import Errors, Prediction
+from residnet.data.prepare import PreparedLog
+from residnet.judge.band import (
+    Band,
+    MotionIntensity,
+    band_channels,
+    compute_run_weights,
+    conformal_level,
+    effective_sample_size,
+    excess_disagreement,
+    interval_score,
+    is_covered,
+    largest_error_ratios,
+    running_mean_squares,
+    weighted_quantile,
+    width_factors,
+)
+from residnet.judge.freerun import FreeRunErrors, Prediction
 from residnet.judge.protocol import Window
 
-_MASKED = tuple(PLANAR.banded.index(name) for name in ("u", "v", "position"))
+_MASKED_CHANNELS = tuple(PLANAR_LAYOUT.band_channels.index(name) for name in ("u", "v", "position"))
 """Channels that are scored over usable samples alone."""
 
 
@@ -42,7 +50,7 @@ class RunErrors:
         error: absolute errors [L, c] by channel, NaN where they are not scored.
         states: predicted [L + 1, 3 + n], from the initial state on.
         spread: standard deviation between unlike models [L, c]; None where there are none.
-        live: what moves, by which channels are.
+        dof: what moves, by which channels are.
     """
 
     log: str
@@ -50,9 +58,9 @@ class RunErrors:
     error: np.ndarray
     states: np.ndarray
     spread: np.ndarray | None = None
-    live: Live = ALIVE
+    dof: DegreesOfFreedom = SURGE_SWAY_YAW
 
-    def within(self, band: Band) -> np.ndarray:
+    def half_widths(self, band: Band) -> np.ndarray:
         """Return the half widths [L, c] that a band gives the run."""
         return band.half_widths(self.states, self.spread)
 
@@ -60,26 +68,35 @@ class RunErrors:
         return len(self.error)
 
 
-def run_errors(
+def compute_run_errors(
     windows: Sequence[Window],
     predictions: Sequence[Prediction],
-    logs: Sequence[Prepared],
-    found: Errors | None = None,
+    logs: Sequence[PreparedLog],
+    errors: FreeRunErrors | None = None,
 ) -> list[RunErrors]:
     """Return the errors of one model's free runs over W windows, their first samples left out."""
-    found = Errors.of(windows, predictions, logs) if found is None else found
-    channels = by_channel(np.abs(found.error), np.hypot(*found.error[:, POSITION].T))
-    channels[np.ix_(~found.usable, np.array(_MASKED))] = np.nan
-    live = found.live
-    moved = {*live.channels, *["heading"] * live.turns, *["position"] * live.moves}
-    channels[:, [name not in moved for name in live.layout.banded]] = np.nan
-    parts = np.split(channels, found.begins[1:])
+    errors = (
+        FreeRunErrors.from_predictions(windows, predictions, logs) if errors is None else errors
+    )
+    channel_errors = band_channels(np.abs(errors.error), np.hypot(*errors.error[:, POSITION].T))
+    channel_errors[np.ix_(~errors.is_usable, np.array(_MASKED_CHANNELS))] = np.nan
+    dof = errors.dof
+    scored_channels = {
+        *dof.active_states,
+        *["heading"] * dof.has_heading,
+        *["position"] * dof.has_position,
+    }
+    channel_errors[:, [name not in scored_channels for name in dof.layout.band_channels]] = np.nan
+    errors_by_window = np.split(channel_errors, errors.window_starts[1:])
     return [
         RunErrors(
-            log.log.name, log.log.manoeuvre, error[1:], prediction.states, prediction.spread, live
+            log.log.name, log.log.manoeuvre, error[1:], prediction.states, prediction.spread, dof
         )
         for log, error, prediction in zip(
-            (logs[window.log] for window in windows), parts, predictions, strict=True
+            (logs[window.log_index] for window in windows),
+            errors_by_window,
+            predictions,
+            strict=True,
         )
     ]
 
@@ -90,52 +107,52 @@ class BandCounts:
 
     Attributes:
         channels: names.
-        scored: number of samples.
-        inside: how many of them the band holds.
-        whole: 1 where the band of whole runs holds the window, NaN where nothing is scored.
-        score: sum of the interval scores, in the units of the band.
-        constant: the same of a band of one width.
+        n_scored: number of samples.
+        n_inside: how many of them the band holds.
+        is_run_inside: 1 where the band of whole runs holds the window, NaN where nothing is scored.
+        interval_score_sum: sum of the interval scores, in the units of the band.
+        constant_score_sum: the same of a band of one width.
     """
 
     channels: tuple[str, ...]
-    scored: np.ndarray
-    inside: np.ndarray
-    whole: np.ndarray
-    score: np.ndarray
-    constant: np.ndarray
+    n_scored: np.ndarray
+    n_inside: np.ndarray
+    is_run_inside: np.ndarray
+    interval_score_sum: np.ndarray
+    constant_score_sum: np.ndarray
 
-    def row(self, chosen: np.ndarray) -> dict[str, Any]:
+    def to_row(self, window_mask: np.ndarray) -> dict[str, Any]:
         """Return what a row of metrics.json says of chosen windows [W] bool."""
-        count = self.scored[chosen].sum(axis=0)
-        seen = count > 0
+        n_scored = self.n_scored[window_mask].sum(axis=0)
+        is_scored = n_scored > 0
 
-        def mean(sums: np.ndarray) -> np.ndarray:
-            return np.asarray(sums[chosen].sum(axis=0)[seen] / count[seen])
+        def compute_mean(window_sums: np.ndarray) -> np.ndarray:
+            return np.asarray(window_sums[window_mask].sum(axis=0)[is_scored] / n_scored[is_scored])
 
-        inside = mean(self.inside)
-        names = [name for name, known in zip(self.channels, seen, strict=True) if known]
+        coverage = compute_mean(self.n_inside)
+        names = [name for name, scored in zip(self.channels, is_scored, strict=True) if scored]
         return {
             "band_coverage": {
-                **dict(zip(names, map(float, inside), strict=True)),
-                "mean": float(inside.mean()),
-                "whole": float(np.nanmean(self.whole[chosen])),
+                **dict(zip(names, map(float, coverage), strict=True)),
+                "mean": float(coverage.mean()),
+                "whole": float(np.nanmean(self.is_run_inside[window_mask])),
             },
-            "band_score": float(mean(self.score).mean()),
-            "band_score_constant": float(mean(self.constant).mean()),
+            "band_score": float(compute_mean(self.interval_score_sum).mean()),
+            "band_score_constant": float(compute_mean(self.constant_score_sum).mean()),
         }
 
 
-def counted(runs: Sequence[RunErrors], band: Band) -> BandCounts:
+def count_coverage(runs: Sequence[RunErrors], band: Band) -> BandCounts:
     """Return how a band fared over free runs of its model."""
-    errors = [own.error for own in runs]
-    widths = [own.within(band) for own in runs]
-    largest = worst(errors, widths)
+    errors = [run.error for run in runs]
+    widths = [run.half_widths(band) for run in runs]
+    largest_ratios = largest_error_ratios(errors, widths)
 
-    def scores(given: Sequence[np.ndarray]) -> np.ndarray:
+    def scores(half_widths: Sequence[np.ndarray]) -> np.ndarray:
         return np.stack(
             [
-                np.nansum(interval_score(error, width, band.level), axis=0) / band.unit
-                for error, width in zip(errors, given, strict=True)
+                np.nansum(interval_score(error, width, band.level), axis=0) / band.score_unit
+                for error, width in zip(errors, half_widths, strict=True)
             ]
         )
 
@@ -145,13 +162,13 @@ def counted(runs: Sequence[RunErrors], band: Band) -> BandCounts:
         np.stack(
             [(error <= width).sum(axis=0) for error, width in zip(errors, widths, strict=True)]
         ),
-        np.where(np.isnan(largest), np.nan, largest <= band.whole),
+        np.where(np.isnan(largest_ratios), np.nan, largest_ratios <= band.simultaneous_factor),
         scores(widths),
-        scores([np.broadcast_to(band.constant, error.shape) for error in errors]),
+        scores([np.broadcast_to(band.constant_width, error.shape) for error in errors]),
     )
 
 
-def limits(states: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def band_limits(states: np.ndarray, half_width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower and upper limits [L + 1, 3 + n] of predicted states.
 
     The initial state is given, and has no width. Limits of x and y are those of the box about the
@@ -159,231 +176,305 @@ def limits(states: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
     Args:
         states: predicted [L + 1, 3 + n], from the initial state on.
-        width: half widths [L, c] after it.
+        half_width: half widths [L, c] after it.
     """
-    reach = np.zeros_like(states)
-    reach[1:, VELOCITIES] = width[:, :3]
-    reach[1:, HEADING] = width[:, 3]
-    reach[1:, POSITION] = width[:, 4:5]
-    reach[1:, BESIDE] = width[:, 5:]
-    return states - reach, states + reach
+    half_widths_of_states = np.zeros_like(states)
+    half_widths_of_states[1:, VELOCITIES] = half_width[:, :3]
+    half_widths_of_states[1:, HEADING] = half_width[:, 3]
+    half_widths_of_states[1:, POSITION] = half_width[:, 4:5]
+    half_widths_of_states[1:, EXTRA_STATES] = half_width[:, 5:]
+    return states - half_widths_of_states, states + half_widths_of_states
 
 
-FEWEST_LOGS = 9
+MIN_LOGS = 9
 """Logs below which no band can promise 90 % whatever errors are distributed like."""
-_POINTS = 100
+_MAX_HORIZONS = 100
 """Horizons that half widths are kept at."""
-_SMOOTHED = 0.11
+_SMOOTHING_SHARE = 0.11
 """Share of the horizon over which widths are smoothed."""
-_RIDGE = 0.02
+_SLOPE_RIDGE = 0.02
 """Pull of the slopes to zero, against measures of unit variance."""
-_ROUNDS = 2
+_ALTERNATIONS = 2
 """Turns of shape and slopes, each given the other; chosen by hand."""
-_FOLDS = 5
+_SCALE_FOLDS = 5
 """Groups of logs whose errors are scaled by what the others say."""
-_THINNED = 3
+_HORIZON_STRIDE = 3
 """Of so many horizons one says how liveliness acts."""
-_STEPS = 8
+_NEWTON_STEPS = 8
 """Of Newton's method; chosen by hand: near the end each doubles the digits."""
 
 
 @dataclass(frozen=True)
-class _Runs:
+class _CalibrationRuns:
     """Errors [W, G, c] of W runs at G horizons, and measures [W, G, 2 n] of how lively they are."""
 
     names: Sequence[str]
-    weight: np.ndarray
+    weights: np.ndarray
     steps: np.ndarray
-    error: np.ndarray
-    measures: np.ndarray
-    activity: Activity
+    errors: np.ndarray
+    intensities: np.ndarray
+    intensity: MotionIntensity
 
-    def where(self, chosen: np.ndarray) -> _Runs:
+    def select(self, run_mask: np.ndarray) -> _CalibrationRuns:
         """Return those runs that are chosen [W] bool."""
         return replace(
             self,
-            names=[name for name, wanted in zip(self.names, chosen, strict=True) if wanted],
-            weight=self.weight[chosen] / self.weight[chosen].sum(),
-            error=self.error[chosen],
-            measures=self.measures[chosen],
+            names=[name for name, selected in zip(self.names, run_mask, strict=True) if selected],
+            weights=self.weights[run_mask] / self.weights[run_mask].sum(),
+            errors=self.errors[run_mask],
+            intensities=self.intensities[run_mask],
         )
 
 
-def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.ndarray) -> Band:
-    """Return the band that holds a share `level` of the errors of runs to come.
+def calibrate_band(
+    runs: Sequence[RunErrors], coverage_level: float, step: float, score_unit: np.ndarray
+) -> Band:
+    """Return the band that holds a share `coverage_level` of the errors of runs to come.
 
     Args:
         runs: over logs that the model was not fitted on, under one protocol; at least one.
-        level: wanted.
+        coverage_level: wanted.
         step: of the runs in s.
-        unit: that scores are given in, [c].
+        score_unit: that scores are given in, [c].
     """
-    whole_error = _at_horizons(runs, step)
-    names, weight, channels = whole_error.names, whole_error.weight, runs[0].live.layout.banded
-    given = whole_error
-    usual: np.ndarray | None = None
-    spreads = [run.spread for run in runs if run.spread is not None]
-    if len(spreads) == len(runs):
-        spread = _at(spreads, given.steps)
-        usual = _rms(spread, given)
+    all_errors = _to_calibration_runs(runs, step)
+    names, weights, channels = (
+        all_errors.names,
+        all_errors.weights,
+        runs[0].dof.layout.band_channels,
+    )
+    unexplained_errors = all_errors
+    typical_spread: np.ndarray | None = None
+    run_spreads = [run.spread for run in runs if run.spread is not None]
+    if len(run_spreads) == len(runs):
+        spreads = _sample_at_horizons(run_spreads, unexplained_errors.steps)
+        typical_spread = _smoothed_rms(spreads, unexplained_errors)
         # what the disagreement of models explains is no error that the rest of the band must hold
-        explained = np.nan_to_num(disagreement(spread, usual, level, channels))
-        given = replace(given, error=np.sqrt(np.maximum(given.error**2 - explained, 0.0)))
-    shape, slope = _scale(given)
-    scale = _scales_of_others(given)
-    inside = np.nanmean(covered(given.error, _quantiles(given, scale, level) * scale), axis=(1, 2))
-    number = independent(inside, weight, names, level)
-    raised = corrected(level, number)
-    quantiles = _quantiles(given, scale, raised)
+        disagreement_variance = np.nan_to_num(
+            excess_disagreement(spreads, typical_spread, coverage_level, channels)
+        )
+        unexplained_errors = replace(
+            unexplained_errors,
+            errors=np.sqrt(np.maximum(unexplained_errors.errors**2 - disagreement_variance, 0.0)),
+        )
+    rms_shape, slopes = _fit_scale(unexplained_errors)
+    cross_fitted_scale = _cross_fitted_scales(unexplained_errors)
+    coverage = np.nanmean(
+        is_covered(
+            unexplained_errors.errors,
+            _normalized_quantiles(unexplained_errors, cross_fitted_scale, coverage_level)
+            * cross_fitted_scale,
+        ),
+        axis=(1, 2),
+    )
+    n_scores = effective_sample_size(coverage, weights, names, coverage_level)
+    corrected_level = conformal_level(coverage_level, n_scores)
+    quantiles = _normalized_quantiles(unexplained_errors, cross_fitted_scale, corrected_level)
     # a channel that no velocity moves is not scored, and its band has no width
-    width = np.nan_to_num(shape * quantiles)
-    same = _shape(whole_error, np.zeros_like(slope))
-    plain = same * _quantiles(whole_error, np.broadcast_to(same, given.error.shape), raised)
-    plain = np.nan_to_num(plain)
-    flat = whole_error.error.reshape(-1, len(channels))
+    half_width = np.nan_to_num(rms_shape * quantiles)
+    unconditional_shape = _rms_shape(all_errors, np.zeros_like(slopes))
+    unconditional_width = unconditional_shape * _normalized_quantiles(
+        all_errors,
+        np.broadcast_to(unconditional_shape, unexplained_errors.errors.shape),
+        corrected_level,
+    )
+    unconditional_width = np.nan_to_num(unconditional_width)
+    flat_errors = all_errors.errors.reshape(-1, len(channels))
     band = Band(
-        level,
+        coverage_level,
         step,
-        given.steps,
-        width,
-        plain,
+        unexplained_errors.steps,
+        half_width,
+        unconditional_width,
         np.ones(len(channels)),
-        np.nan_to_num(quantile(flat, np.repeat(weight, given.error.shape[1]), raised)),
-        unit,
-        given.activity,
-        slope,
+        np.nan_to_num(
+            weighted_quantile(
+                flat_errors, np.repeat(weights, unexplained_errors.errors.shape[1]), corrected_level
+            )
+        ),
+        score_unit,
+        unexplained_errors.intensity,
+        slopes,
         len(set(names)),
-        number,
-        usual=usual,
+        n_scores,
+        typical_spread=typical_spread,
         channels=channels,
     )
-    largest = worst([run.error for run in runs], [run.within(band) for run in runs])
+    largest_ratios = largest_error_ratios(
+        [run.error for run in runs], [run.half_widths(band) for run in runs]
+    )
     # as far as the runs of other logs know the scale
-    seen = shape * factor(given.measures, slope)
-    largest *= _largest(given.error, scale * quantiles) / _largest(given.error, seen * quantiles)
-    whole = np.nan_to_num(quantile(largest, weight, raised), nan=1.0)
-    return replace(band, whole=whole, cautions=few(band.logs))
+    in_sample_scale = rms_shape * width_factors(unexplained_errors.intensities, slopes)
+    largest_ratios *= _largest_error_ratios(
+        unexplained_errors.errors, cross_fitted_scale * quantiles
+    ) / _largest_error_ratios(unexplained_errors.errors, in_sample_scale * quantiles)
+    simultaneous_factor = np.nan_to_num(
+        weighted_quantile(largest_ratios, weights, corrected_level), nan=1.0
+    )
+    return replace(
+        band, simultaneous_factor=simultaneous_factor, cautions=describe_few_logs(band.n_logs)
+    )
 
 
-def _at(rows: Sequence[np.ndarray], steps: np.ndarray) -> np.ndarray:
+def _sample_at_horizons(series: Sequence[np.ndarray], steps: np.ndarray) -> np.ndarray:
     """Return rows [L, c] of each run at some steps [W, G, c]; NaN beyond its end."""
-    out = np.full((len(rows), len(steps), rows[0].shape[1]), np.nan)
-    for one, row in zip(out, rows, strict=True):
-        reached = steps[steps <= len(row)] - 1
-        one[: len(reached)] = row[reached]
-    return out
+    values = np.full((len(series), len(steps), series[0].shape[1]), np.nan)
+    for values_of_run, run_series in zip(values, series, strict=True):
+        reached_samples = steps[steps <= len(run_series)] - 1
+        values_of_run[: len(reached_samples)] = run_series[reached_samples]
+    return values
 
 
-def _rms(values: np.ndarray, given: _Runs) -> np.ndarray:
+def _smoothed_rms(values: np.ndarray, runs: _CalibrationRuns) -> np.ndarray:
     """Return the root mean square [G, c] of values [W, G, c] over runs, smoothed over horizons."""
-    weight = np.where(np.isfinite(values), given.weight[:, None, None], 0.0)
-    total = weight.sum(axis=0)
-    sums = np.where(total > 0, (weight * np.nan_to_num(values) ** 2).sum(axis=0), np.nan)
-    return np.asarray(np.sqrt(_smooth(sums / np.where(total > 0, total, 1.0), given.steps)))
+    sample_weights = np.where(np.isfinite(values), runs.weights[:, None, None], 0.0)
+    total_weights = sample_weights.sum(axis=0)
+    mean_squares = np.where(
+        total_weights > 0, (sample_weights * np.nan_to_num(values) ** 2).sum(axis=0), np.nan
+    )
+    return np.asarray(
+        np.sqrt(
+            _smooth_over_horizons(
+                mean_squares / np.where(total_weights > 0, total_weights, 1.0), runs.steps
+            )
+        )
+    )
 
 
-def _largest(error: np.ndarray, width: np.ndarray) -> np.ndarray:
+def _largest_error_ratios(error: np.ndarray, half_width: np.ndarray) -> np.ndarray:
     """Return the largest error in half widths of each run [W, c], over horizons."""
-    ratio = np.where(np.isfinite(error) & (width > 0.0), error / np.maximum(width, 1e-300), 0.0)
-    return np.asarray(np.maximum(ratio.max(axis=1), 1e-12))
+    ratios = np.where(
+        np.isfinite(error) & (half_width > 0.0), error / np.maximum(half_width, 1e-300), 0.0
+    )
+    return np.asarray(np.maximum(ratios.max(axis=1), 1e-12))
 
 
-def _scale(given: _Runs) -> tuple[np.ndarray, np.ndarray]:
+def _fit_scale(runs: _CalibrationRuns) -> tuple[np.ndarray, np.ndarray]:
     """Return shape [G, c] and slopes [2 n, c] of the errors of runs."""
-    slope = np.zeros((given.measures.shape[2], given.error.shape[2]))
-    for _ in range(_ROUNDS):
-        slope = _slopes(given, _shape(given, slope), slope)
-    return _shape(given, slope), slope
+    slopes = np.zeros((runs.intensities.shape[2], runs.errors.shape[2]))
+    for _ in range(_ALTERNATIONS):
+        slopes = _fit_slopes(runs, _rms_shape(runs, slopes), slopes)
+    return _rms_shape(runs, slopes), slopes
 
 
-def _scales_of_others(given: _Runs) -> np.ndarray:
+def _cross_fitted_scales(runs: _CalibrationRuns) -> np.ndarray:
     """Return the scale [W, G, c] of every run's errors as the runs of other logs have it.
 
     A scale that has seen a run would take its errors for smaller than those of runs to come.
     """
-    _, place = np.unique(given.names, return_inverse=True)
-    fold = place % _FOLDS
-    out = np.empty_like(given.error)
-    for k in np.unique(fold):
-        own = fold == k
-        others = given.where(~own) if (~own).any() else given
-        shape, slope = _scale(others)
-        out[own] = shape * factor(given.measures[own], slope)
-    return out
+    _, log_indices = np.unique(runs.names, return_inverse=True)
+    fold_indices = log_indices % _SCALE_FOLDS
+    scales = np.empty_like(runs.errors)
+    for k in np.unique(fold_indices):
+        in_fold = fold_indices == k
+        other_runs = runs.select(~in_fold) if (~in_fold).any() else runs
+        rms_shape, slopes = _fit_scale(other_runs)
+        scales[in_fold] = rms_shape * width_factors(runs.intensities[in_fold], slopes)
+    return scales
 
 
-def few(logs: int) -> tuple[str, ...]:
+def describe_few_logs(n_logs: int) -> tuple[str, ...]:
     """Return what to say where logs are too few for a promise."""
-    if logs >= FEWEST_LOGS:
+    if n_logs >= MIN_LOGS:
         return ()
-    counted = f"{logs} logs calibrate" if logs > 1 else "One log calibrates"
+    subject = f"{n_logs} logs calibrate" if n_logs > 1 else "One log calibrates"
     return (
-        f"{counted} this band; below {FEWEST_LOGS} no method can promise 90 % for every"
+        f"{subject} this band; below {MIN_LOGS} no method can promise 90 % for every"
         " distribution of errors.",
     )
 
 
-def _at_horizons(runs: Sequence[RunErrors], step: float) -> _Runs:
+def _to_calibration_runs(runs: Sequence[RunErrors], step: float) -> _CalibrationRuns:
     """Return the errors and measures of runs at the horizons that a band is kept at."""
-    longest = max(map(len, runs))
-    steps = np.unique(np.linspace(1, longest, min(_POINTS, longest)).round().astype(int))
+    longest_run = max(map(len, runs))
+    steps = np.unique(
+        np.linspace(1, longest_run, min(_MAX_HORIZONS, longest_run)).round().astype(int)
+    )
     names = [run.log for run in runs]
-    weight = run_weights(names)
-    squares = [mean_squares(run.states, step) for run in runs]
-    activity = Activity.of(squares, weight)
-    error, measures = _at([run.error for run in runs], steps), _at(squares, steps)
-    measures = np.nan_to_num(activity.standard(measures))
-    return _Runs(names, weight, steps, error, measures, activity)
+    weights = compute_run_weights(names)
+    mean_squares_of_runs = [running_mean_squares(run.states, step) for run in runs]
+    intensity = MotionIntensity.from_runs(mean_squares_of_runs, weights)
+    errors, intensities = (
+        _sample_at_horizons([run.error for run in runs], steps),
+        _sample_at_horizons(mean_squares_of_runs, steps),
+    )
+    intensities = np.nan_to_num(intensity.standardize(intensities))
+    return _CalibrationRuns(names, weights, steps, errors, intensities, intensity)
 
 
-def _shape(given: _Runs, slope: np.ndarray) -> np.ndarray:
+def _rms_shape(runs: _CalibrationRuns, slopes: np.ndarray) -> np.ndarray:
     """Return the root mean square [G, c] of errors over what liveliness explains, smoothed."""
-    root = _rms(given.error / factor(given.measures, slope), given)
-    return np.asarray(np.maximum(root, 1e-12 + 1e-6 * np.nan_to_num(root).max(axis=0)))
+    rms = _smoothed_rms(runs.errors / width_factors(runs.intensities, slopes), runs)
+    return np.asarray(np.maximum(rms, 1e-12 + 1e-6 * np.nan_to_num(rms).max(axis=0)))
 
 
-def _quantiles(given: _Runs, scale: np.ndarray, level: float) -> np.ndarray:
+def _normalized_quantiles(runs: _CalibrationRuns, scale: np.ndarray, level: float) -> np.ndarray:
     """Return the quantile [G, c] of errors over a scale [W, G, c], smoothed over horizons."""
-    return _smooth(quantile(given.error / scale, given.weight, level), given.steps)
+    return _smooth_over_horizons(
+        weighted_quantile(runs.errors / scale, runs.weights, level), runs.steps
+    )
 
 
-def _smooth(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
+def _smooth_over_horizons(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Return moving means [G, c] over neighbouring horizons; gaps are filled from beside them."""
-    reach = 0.5 * _SMOOTHED * steps[-1]
+    half_window = 0.5 * _SMOOTHING_SHARE * steps[-1]
     # the first steps, where errors begin, are smoothed over what lies as near as the start itself
-    near = np.minimum(reach, steps - 1 + 0.5)
-    close = np.abs(steps[:, None] - steps[None, :]) <= near[:, None]
-    known = np.isfinite(values)
-    count = close @ known.astype(float)
-    mean = (close @ np.where(known, values, 0.0)) / np.maximum(count, 1.0)
-    for column, good in zip(mean.T, (count > 0).T, strict=True):
-        column[:] = np.interp(steps, steps[good], column[good]) if good.any() else np.nan
-    return np.asarray(mean)
+    half_windows = np.minimum(half_window, steps - 1 + 0.5)
+    is_neighbour = np.abs(steps[:, None] - steps[None, :]) <= half_windows[:, None]
+    is_finite = np.isfinite(values)
+    n_neighbours = is_neighbour @ is_finite.astype(float)
+    smoothed = (is_neighbour @ np.where(is_finite, values, 0.0)) / np.maximum(n_neighbours, 1.0)
+    for column, has_neighbours in zip(smoothed.T, (n_neighbours > 0).T, strict=True):
+        column[:] = (
+            np.interp(steps, steps[has_neighbours], column[has_neighbours])
+            if has_neighbours.any()
+            else np.nan
+        )
+    return np.asarray(smoothed)
 
 
-def _slopes(given: _Runs, shape: np.ndarray, slope: np.ndarray) -> np.ndarray:
+def _fit_slopes(
+    runs: _CalibrationRuns, rms_shape: np.ndarray, initial_slopes: np.ndarray
+) -> np.ndarray:
     """Return by how much liveliness raises the logarithm of the errors [2 n, c].
 
     Errors over the shape are taken for gamma distributed with a logarithmic link; Newton's method.
     """
-    out = slope.copy()
-    rows = slice(None, None, _THINNED)
-    error, z, shape = given.error[:, rows], given.measures[:, rows], shape[rows]
-    weight = given.weight[:, None] / error.shape[1]
-    pull, flat = _RIDGE * np.eye(z.shape[2]), z.reshape(-1, z.shape[2])
-    for channel in range(error.shape[2]):
-        ratio = error[:, :, channel] / shape[:, channel]
-        seen = np.isfinite(ratio)
-        y, w = np.where(seen, ratio, 0.0), np.where(seen, weight, 0.0)
-        if not seen.any():
+    slopes = initial_slopes.copy()
+    horizon_stride = slice(None, None, _HORIZON_STRIDE)
+    errors, intensities, rms_shape = (
+        runs.errors[:, horizon_stride],
+        runs.intensities[:, horizon_stride],
+        rms_shape[horizon_stride],
+    )
+    run_weights = runs.weights[:, None] / errors.shape[1]
+    ridge, flat_intensities = (
+        _SLOPE_RIDGE * np.eye(intensities.shape[2]),
+        intensities.reshape(-1, intensities.shape[2]),
+    )
+    for channel in range(errors.shape[2]):
+        normalized_errors = errors[:, :, channel] / rms_shape[:, channel]
+        is_scored = np.isfinite(normalized_errors)
+        y, sample_weights = (
+            np.where(is_scored, normalized_errors, 0.0),
+            np.where(is_scored, run_weights, 0.0),
+        )
+        if not is_scored.any():
             continue
-        own = out[:, channel].copy()
-        for _ in range(_STEPS):
-            mean = np.exp(np.clip(z @ own, -20.0, 20.0))
-            mean *= (w * y).sum() / max((w * mean).sum(), 1e-300)
-            part = w * y / np.maximum(mean, 1e-300)
-            gradient = flat.T @ (part - w).ravel() - pull @ own
-            hessian = flat.T @ (part.reshape(-1, 1) * flat) + pull
-            own = own + np.clip(np.linalg.solve(hessian, gradient), -1.0, 1.0)
-        out[:, channel] = own
-    return out
+        coefficients = slopes[:, channel].copy()
+        for _ in range(_NEWTON_STEPS):
+            predicted = np.exp(np.clip(intensities @ coefficients, -20.0, 20.0))
+            predicted *= (sample_weights * y).sum() / max(
+                (sample_weights * predicted).sum(), 1e-300
+            )
+            weighted_ratio = sample_weights * y / np.maximum(predicted, 1e-300)
+            gradient = (
+                flat_intensities.T @ (weighted_ratio - sample_weights).ravel()
+                - ridge @ coefficients
+            )
+            hessian = (
+                flat_intensities.T @ (weighted_ratio.reshape(-1, 1) * flat_intensities) + ridge
+            )
+            coefficients = coefficients + np.clip(np.linalg.solve(hessian, gradient), -1.0, 1.0)
+        slopes[:, channel] = coefficients
+    return slopes

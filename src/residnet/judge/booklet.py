@@ -13,15 +13,15 @@ from residnet.core.config import Config, Metres, Quantity, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
-from residnet.data.simulated import Craft, Flight
+from residnet.data.simulated import ManoeuvreRun, SimulatedVessel
 from residnet.dynamics.actuated import InputShare
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.manoeuvres.base import Manoeuvre
-from residnet.manoeuvres.indices import IN_LENGTHS, UNITS
+from residnet.manoeuvres.indices import INDEX_UNITS, LENGTH_INDICES
 
 SCHEMA = "residnet.booklet/1"
 # power of the scale by which Froude's law brings a unit from the model to the ship
-_POWER = {"m": 1.0, "s": 0.5, "m/s": 0.5, "rad/s": -0.5, "rad": 0.0, "-": 0.0}
+_FROUDE_EXPONENTS = {"m": 1.0, "s": 0.5, "m/s": 0.5, "rad/s": -0.5, "rad": 0.0, "-": 0.0}
 
 
 class BookletConfig(Config):
@@ -60,53 +60,55 @@ class BookletConfig(Config):
 
     @field_validator("initial")
     @classmethod
-    def _units(cls, initial: dict[str, float | str]) -> dict[str, float | str]:
+    def convert_initial_units(cls, initial: dict[str, float | str]) -> dict[str, float | str]:
         return {
             name: Quantity(CHANNEL_UNITS.get(name, "-")).convert(value)
             for name, value in initial.items()
         }
 
-    def rudder(self) -> str:
+    def steering_input(self) -> str:
         """Return the input that steers.
 
         Raises:
             ConfigError: where none or several do.
         """
-        steering = [name for name, share in self.inputs.items() if share.steer not in (0, 0.0)]
-        if len(steering) != 1:
+        steering_inputs = [
+            name for name, share in self.inputs.items() if share.steer not in (0, 0.0)
+        ]
+        if len(steering_inputs) != 1:
             raise ConfigError(
-                f"booklet.inputs: one input must have a share in steer, given {steering or 'none'}"
+                f"booklet.inputs: one input must have a share in steer, given {steering_inputs or 'none'}"
             )
-        return steering[0]
+        return steering_inputs[0]
 
 
 @dataclass(frozen=True)
-class Page:
+class BookletPage:
     """A page of the booklet, for one manoeuvre.
 
     Attributes:
         name: of it.
         manoeuvre: what was flown.
-        flights: with the fitted parameters, then with drawn ones.
+        runs: with the fitted parameters, then with drawn ones.
         indices: of each flight; empty where it had a fault or diverged.
         limits: of IMO, for the ship.
-        measured: the log that was repeated; None for a standard manoeuvre.
+        measured_log: the log that was repeated; None for a standard manoeuvre.
         split: of that log.
-        found: its indices.
+        measured_indices: its indices.
     """
 
     name: str
     manoeuvre: Manoeuvre
-    flights: Sequence[Flight]
+    runs: Sequence[ManoeuvreRun]
     indices: Sequence[Mapping[str, Any]]
     limits: Mapping[str, float]
-    measured: Log | None
+    measured_log: Log | None
     split: str
-    found: Mapping[str, Any]
+    measured_indices: Mapping[str, Any]
 
 
-def contents(
-    model: str, length: float, scale: float, draws: int, level: float, pages: Sequence[Page]
+def build_booklet(
+    model: str, length: float, scale: float, draws: int, level: float, pages: Sequence[BookletPage]
 ) -> dict[str, Any]:
     """Return the contents of booklet.json, SI and rad, in the scale of the logs.
 
@@ -115,9 +117,9 @@ def contents(
     Args:
         length: of the hull in the scale of the logs, m.
     """
-    rows = [_row(page, length, scale, level) for page in pages]
-    used = sorted({name for row in rows for name in row["indices"]})
-    about = {
+    rows = [_page_row(page, length, scale, level) for page in pages]
+    index_names = sorted({name for row in rows for name in row["indices"]})
+    metadata = {
         "schema": SCHEMA,
         "model": model,
         "length": length,
@@ -125,55 +127,66 @@ def contents(
         "draws": draws,
         "level": level,
     }
-    return about | {"units": {name: UNITS[name] for name in used}, "pages": rows}
+    return metadata | {"units": {name: INDEX_UNITS[name] for name in index_names}, "pages": rows}
 
 
-def _row(page: Page, length: float, scale: float, level: float) -> dict[str, Any]:
+def _page_row(page: BookletPage, length: float, scale: float, level: float) -> dict[str, Any]:
     names = [
         name
         for name, value in page.indices[0].items()
-        if name in UNITS and not isinstance(value, list)
+        if name in INDEX_UNITS and not isinstance(value, list)
     ]
-    indices = {name: _index(page, name, length, scale, level) for name in names}
+    indices = {name: _index_summary(page, name, length, scale, level) for name in names}
     return {
         "name": page.name,
         "manoeuvre": page.manoeuvre.kind,
         "demand": page.manoeuvre.model_dump(mode="json"),
         "split": page.split,
-        "faults": sum(not found for found in page.indices[1:]),
+        "faults": sum(not run_indices for run_indices in page.indices[1:]),
         "indices": indices,
     }
 
 
-def _index(page: Page, name: str, length: float, scale: float, level: float) -> dict[str, Any]:
+def _index_summary(
+    page: BookletPage, name: str, length: float, scale: float, level: float
+) -> dict[str, Any]:
     """`value` of the fitted parameters, `interval` over draws, and what there is of `lengths`,
-    `measured`, `difference`, `limit`, `kept`.
+    `measured_log`, `difference`, `limit`, `kept`.
     """
     value = float(page.indices[0][name])
-    others = np.array([float(found[name]) for found in page.indices[1:] if name in found])
-    factor = scale ** _POWER[UNITS[name]]
-    out: dict[str, Any] = {"value": value, "ship": factor * value, "draws": int(others.size)}
-    if others.size:
-        out["interval"] = np.quantile(others, (0.5 - level / 2, 0.5 + level / 2)).tolist()
-    if name in IN_LENGTHS:
-        out["lengths"] = value / length
-    if name in page.found:
-        out |= {"measured": float(page.found[name]), "difference": value - float(page.found[name])}
+    draws = np.array(
+        [float(run_indices[name]) for run_indices in page.indices[1:] if name in run_indices]
+    )
+    froude_factor = scale ** _FROUDE_EXPONENTS[INDEX_UNITS[name]]
+    summary: dict[str, Any] = {
+        "value": value,
+        "ship": froude_factor * value,
+        "draws": int(draws.size),
+    }
+    if draws.size:
+        summary["interval"] = np.quantile(draws, (0.5 - level / 2, 0.5 + level / 2)).tolist()
+    if name in LENGTH_INDICES:
+        summary["lengths"] = value / length
+    if name in page.measured_indices:
+        summary |= {
+            "measured": float(page.measured_indices[name]),
+            "difference": value - float(page.measured_indices[name]),
+        }
     if name in page.limits:
         limit = page.limits[name]
-        out |= {
+        summary |= {
             "limit": limit,
-            "kept": factor * value <= limit,
-            "kept_share": float(np.mean(factor * others <= limit)) if others.size else None,
+            "kept": froude_factor * value <= limit,
+            "kept_share": float(np.mean(froude_factor * draws <= limit)) if draws.size else None,
         }
-    return out
+    return summary
 
 
 INDICES_SCHEMA = "residnet.indices/1"
 
 
-def index_rows(
-    craft: Craft, flights: Sequence[Flight], length: float | None
+def build_index_rows(
+    vessel: SimulatedVessel, runs: Sequence[ManoeuvreRun], length: float | None
 ) -> list[dict[str, Any]]:
     """Return log, manoeuvre, craft, faults, indices and limits of each flight.
 
@@ -182,26 +195,26 @@ def index_rows(
     Args:
         length: of the hull in m; None where unknown, then there are neither lengths nor limits.
     """
-    out = []
-    for flight in flights:
+    rows = []
+    for run in runs:
         indices = (
             {}
-            if flight.log.meta.get("diverged")
-            else flight.manoeuvre.indices(flight.motion, length)
+            if run.measured_log.meta.get("diverged")
+            else run.manoeuvre.compute_indices(run.true_log, length)
         )
         speed = indices.get("approach_speed", 0.0)
         limits = (
-            flight.manoeuvre.limits(craft.helm, length, speed)
+            run.manoeuvre.imo_limits(vessel.helm, length, speed)
             if length is not None and speed > 0
             else {}
         )
-        out.append(
+        rows.append(
             {
-                "log": flight.motion.name,
-                "manoeuvre": flight.manoeuvre.kind,
-                "craft": craft.name,
-                "fault": flight.fault,
-                "timed_out": bool(flight.log.meta.get("timed_out", False)),
+                "log": run.true_log.name,
+                "manoeuvre": run.manoeuvre.kind,
+                "craft": vessel.name,
+                "fault": run.fault_text,
+                "timed_out": bool(run.measured_log.meta.get("timed_out", False)),
                 "indices": indices,
                 "limits": {
                     name: {"limit": limit, "kept": indices[name] <= limit}
@@ -210,15 +223,15 @@ def index_rows(
                 },
             }
         )
-    return out
+    return rows
 
 
-def index_contents(
+def build_index_table(
     run: str, length: float | None, rows: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
     """Return the contents of indices.json."""
-    used = {name for row in rows for name in row["indices"]}
-    units = {name: UNITS.get(name, "-") for name in sorted(used)}
+    index_names = {name for row in rows for name in row["indices"]}
+    units = {name: INDEX_UNITS.get(name, "-") for name in sorted(index_names)}
     return {
         "schema": INDICES_SCHEMA,
         "run": run,

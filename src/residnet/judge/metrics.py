@@ -12,24 +12,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from residnet.core.files import file_stem, whole
-from residnet.core.layout import PLANAR, VELOCITIES, Live
-from residnet.core.names import END_UNITS
-from residnet.data.prepare import Prepared
-from residnet.judge.band import Bands
-from residnet.judge.bands import counted, limits, run_errors
-from residnet.judge.freerun import Candidate, Errors, FreeRun, drift
-from residnet.judge.verdict import FEW_LOGS, diverged_note
+from residnet.core.files import atomic_write, make_file_stem
+from residnet.core.layout import PLANAR_LAYOUT, VELOCITIES, DegreesOfFreedom
+from residnet.core.names import POSE_ERROR_UNITS
+from residnet.data.prepare import PreparedLog
+from residnet.judge.band import BandsByModel
+from residnet.judge.bands import band_limits, compute_run_errors, count_coverage
+from residnet.judge.freerun import Candidate, FreeRun, FreeRunErrors, compute_integration_errors
+from residnet.judge.verdict import MIN_LOGS_FOR_INTERVAL, describe_divergence
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-LEVEL = 0.95
+CONFIDENCE_LEVEL = 0.95
 """Of all intervals."""
-_RESAMPLES = 10_000
+_N_RESAMPLES = 10_000
 """Of the blocks: their 2.5 % tail then holds 250."""
-MANY_LOGS, WANTED_BLOCKS, _LEAST_BLOCKS = 5, 8, 5
+MIN_LOGS_AS_BLOCKS, TARGET_BLOCKS, _MIN_BLOCKS = 5, 8, 5
 """Logs from which on each is a block; blocks that fewer are cut into, and need at least.
 
 Chosen by hand: to resample fewer blocks tells little, and smaller ones are alike.
@@ -37,26 +37,26 @@ Chosen by hand: to resample fewer blocks tells little, and smaller ones are alik
 
 
 @dataclass(frozen=True)
-class Blocks:
+class ResamplingBlocks:
     """What is drawn together.
 
     Attributes:
-        labels: number of each window's block, [W], from 0 on.
-        of: `logs` where a block is all windows of a log, else `windows`: consecutive windows of one
+        block_indices: number of each window's block, [W], from 0 on.
+        block_kind: `log_indices` where a block is all windows of a log, else `windows`: consecutive windows of one
             log.
-        count: number of blocks.
+        n_blocks: number of blocks.
     """
 
-    labels: np.ndarray
-    of: str
-    count: int
+    block_indices: np.ndarray
+    block_kind: str
+    n_blocks: int
 
-    def row(self) -> dict[str, Any]:
+    def to_row(self) -> dict[str, Any]:
         """Return the blocks as they stand in metrics.json."""
-        return {"of": self.of, "count": self.count}
+        return {"of": self.block_kind, "count": self.n_blocks}
 
 
-def blocks(logs: Sequence[int] | np.ndarray) -> Blocks | None:
+def make_resampling_blocks(log_indices: Sequence[int] | np.ndarray) -> ResamplingBlocks | None:
     """Return blocks of windows from the number of the log that each comes from.
 
     Windows of a log are in time order.
@@ -67,24 +67,32 @@ def blocks(logs: Sequence[int] | np.ndarray) -> Blocks | None:
     interval holds only as far as what lies between logs is small against what lies between such
     runs. None, and so no interval, where there are fewer than three logs or five blocks.
     """
-    numbers = np.asarray(logs, dtype=int)
-    names, sizes = np.unique(numbers, return_counts=True)
-    if len(names) >= MANY_LOGS:
-        return Blocks(np.searchsorted(names, numbers), "logs", len(names))
-    if len(names) < FEW_LOGS:
+    log_numbers = np.asarray(log_indices, dtype=int)
+    unique_logs, windows_per_log = np.unique(log_numbers, return_counts=True)
+    if len(unique_logs) >= MIN_LOGS_AS_BLOCKS:
+        return ResamplingBlocks(np.searchsorted(unique_logs, log_numbers), "logs", len(unique_logs))
+    if len(unique_logs) < MIN_LOGS_FOR_INTERVAL:
         return None
-    length = int(sizes.max())
-    while length > 1 and sum(math.ceil(size / length) for size in sizes) < WANTED_BLOCKS:
-        length -= 1
-    labels, count = np.zeros(len(numbers), dtype=int), 0
-    for name, size in zip(names, sizes, strict=True):
-        for run in np.array_split(np.flatnonzero(numbers == name), math.ceil(size / length)):
-            labels[run] = count
-            count += 1
-    return Blocks(labels, "windows", count) if count >= _LEAST_BLOCKS else None
+    block_length = int(windows_per_log.max())
+    while (
+        block_length > 1
+        and sum(math.ceil(n_windows / block_length) for n_windows in windows_per_log)
+        < TARGET_BLOCKS
+    ):
+        block_length -= 1
+    block_indices, n_blocks = np.zeros(len(log_numbers), dtype=int), 0
+    for log_number, n_windows in zip(unique_logs, windows_per_log, strict=True):
+        for consecutive_windows in np.array_split(
+            np.flatnonzero(log_numbers == log_number), math.ceil(n_windows / block_length)
+        ):
+            block_indices[consecutive_windows] = n_blocks
+            n_blocks += 1
+    return ResamplingBlocks(block_indices, "windows", n_blocks) if n_blocks >= _MIN_BLOCKS else None
 
 
-def intervals(values: np.ndarray, blocks: Blocks | None) -> list[list[float] | None]:
+def bootstrap_intervals(
+    values: np.ndarray, resampling_blocks: ResamplingBlocks | None
+) -> list[list[float] | None]:
     """Return 95 % intervals of the means of columns [W, C] over windows, [low, high] of each.
 
     None where there are no blocks.
@@ -93,21 +101,32 @@ def intervals(values: np.ndarray, blocks: Blocks | None) -> list[list[float] | N
     for few blocks as Student's t is against the normal distribution (Hesterberg 2015, The American
     Statistician 69, 371-386, section 5.3): plain percentiles cover some 83 % with five blocks.
     """
-    if blocks is None:
+    if resampling_blocks is None:
         return [None] * values.shape[1]
-    sums = np.stack(
-        [np.bincount(blocks.labels, column, blocks.count) for column in values.T], axis=1
+    block_sums = np.stack(
+        [
+            np.bincount(resampling_blocks.block_indices, column, resampling_blocks.n_blocks)
+            for column in values.T
+        ],
+        axis=1,
     )
-    draws = _draws(blocks.count)
-    means = (draws @ sums) / (draws @ np.bincount(blocks.labels, minlength=blocks.count))[:, None]
-    low = tail(blocks.count)
+    block_counts = _draw_block_counts(resampling_blocks.n_blocks)
+    resampled_means = (block_counts @ block_sums) / (
+        block_counts
+        @ np.bincount(resampling_blocks.block_indices, minlength=resampling_blocks.n_blocks)
+    )[:, None]
+    tail_probability = bootstrap_tail_probability(resampling_blocks.n_blocks)
     return [
         [float(lower), float(upper)]
-        for lower, upper in np.quantile(means, [low, 1 - low], axis=0).T
+        for lower, upper in np.quantile(
+            resampled_means, [tail_probability, 1 - tail_probability], axis=0
+        ).T
     ]
 
 
-def new_trials(values: np.ndarray, logs: np.ndarray) -> list[list[float] | None]:
+def prediction_intervals(
+    window_errors: np.ndarray, log_indices: np.ndarray
+) -> list[list[float] | None]:
     """Return 95 % intervals of the means of columns [W, C] over as many new logs, [low, high].
 
     The windows of a log have its manoeuvre, weather and speed in common, so that the means of logs
@@ -119,70 +138,85 @@ def new_trials(values: np.ndarray, logs: np.ndarray) -> list[list[float] | None]
     they count as two.
 
     Args:
-        values: errors of windows, none negative; a column is a model's error of one kind.
-        logs: number [W] of the log that each window is of.
+        window_errors: errors of windows, none negative; a column is a model's error of one kind.
+        log_indices: number [W] of the log that each window is of.
 
     Returns:
         An interval for each column; None where there are fewer than three logs.
     """
-    names, places = np.unique(logs, return_inverse=True)
-    count = len(names)
-    if count < FEW_LOGS:
-        return [None] * values.shape[1]
-    sums = np.stack([np.bincount(places, column, count) for column in values.T], axis=1)
-    sizes = (sums / np.bincount(places)[:, None])[:, sums.any(axis=0) & np.isfinite(sums).all(0)]
-    told = (sizes / sizes.mean(axis=0)).var(axis=0, ddof=1)
-    scatter = math.sqrt(told.mean()) if told.size else 0.0
-    freedom = min(values.shape[1], 2) * (count - 1)
-    wide = scipy.stats.t.ppf(0.5 + LEVEL / 2, freedom) * math.sqrt(2 / count)
-    factor = math.exp(wide * scatter)
-    return [[float(mean / factor), float(mean * factor)] for mean in values.mean(0)]
+    unique_logs, log_positions = np.unique(log_indices, return_inverse=True)
+    n_logs = len(unique_logs)
+    if n_logs < MIN_LOGS_FOR_INTERVAL:
+        return [None] * window_errors.shape[1]
+    log_sums = np.stack(
+        [np.bincount(log_positions, column, n_logs) for column in window_errors.T], axis=1
+    )
+    log_means = (log_sums / np.bincount(log_positions)[:, None])[
+        :, log_sums.any(axis=0) & np.isfinite(log_sums).all(0)
+    ]
+    relative_variances = (log_means / log_means.mean(axis=0)).var(axis=0, ddof=1)
+    relative_std = math.sqrt(relative_variances.mean()) if relative_variances.size else 0.0
+    degrees_of_freedom = min(window_errors.shape[1], 2) * (n_logs - 1)
+    half_width_factor = scipy.stats.t.ppf(
+        0.5 + CONFIDENCE_LEVEL / 2, degrees_of_freedom
+    ) * math.sqrt(2 / n_logs)
+    interval_factor = math.exp(half_width_factor * relative_std)
+    return [
+        [float(mean / interval_factor), float(mean * interval_factor)]
+        for mean in window_errors.mean(0)
+    ]
 
 
-def tail(count: int) -> float:
+def bootstrap_tail_probability(n_blocks: int) -> float:
     """Return the share of resampled means left out at either end, for at least 2 blocks.
 
     It is 0.025 for many blocks and less for few.
     """
-    wide = math.sqrt(count / (count - 1)) * scipy.stats.t.ppf(0.5 + LEVEL / 2, count - 1)
-    return float(scipy.stats.norm.cdf(-wide))
+    widened_t_quantile = math.sqrt(n_blocks / (n_blocks - 1)) * scipy.stats.t.ppf(
+        0.5 + CONFIDENCE_LEVEL / 2, n_blocks - 1
+    )
+    return float(scipy.stats.norm.cdf(-widened_t_quantile))
 
 
 @lru_cache(maxsize=16)
-def _draws(count: int) -> np.ndarray:
+def _draw_block_counts(n_blocks: int) -> np.ndarray:
     """How often each block is drawn, [resamples, count]."""
     return (
         np.random.default_rng(0)
-        .multinomial(count, np.full(count, 1 / count), size=_RESAMPLES)
+        .multinomial(n_blocks, np.full(n_blocks, 1 / n_blocks), size=_N_RESAMPLES)
         .astype(float)
     )
 
 
-def difference(
-    model: np.ndarray, reference: np.ndarray, to: str, blocks: Blocks | None
+def paired_difference(
+    model_errors: np.ndarray,
+    reference_errors: np.ndarray,
+    reference_name: str,
+    resampling_blocks: ResamplingBlocks | None,
 ) -> dict[str, Any]:
     """Return the paired difference of two models' mean errors, as in metrics.json.
 
     Both are over the same windows.
 
     Args:
-        model: error of each window, [W].
-        reference: error of the reference model over the same windows, [W].
+        model_errors: error of each window, [W].
+        reference_errors: error of the reference model over the same windows, [W].
 
     Returns:
         to; nrmse_mean, the mean of model minus reference (negative where the model is better), with
         its interval ci95 (None where there is none) and excludes_zero; ratio of the means (None
         where the reference has no error) and worse, a ratio above 1.05.
     """
-    apart = model - reference
-    (interval,) = intervals(apart[:, None], blocks)
-    level = float(reference.mean())
-    ratio = float(model.mean()) / level if level > 0 else None
+    differences = model_errors - reference_errors
+    (confidence_interval,) = bootstrap_intervals(differences[:, None], resampling_blocks)
+    reference_mean = float(reference_errors.mean())
+    ratio = float(model_errors.mean()) / reference_mean if reference_mean > 0 else None
     return {
-        "to": to,
-        "nrmse_mean": float(apart.mean()),
-        "ci95": interval,
-        "excludes_zero": interval is not None and (interval[0] > 0 or interval[1] < 0),
+        "to": reference_name,
+        "nrmse_mean": float(differences.mean()),
+        "ci95": confidence_interval,
+        "excludes_zero": confidence_interval is not None
+        and (confidence_interval[0] > 0 or confidence_interval[1] < 0),
         "ratio": ratio,
         "worse": ratio is not None and ratio > 1.05,
     }
@@ -190,183 +224,226 @@ def difference(
 
 SCHEMA = "residnet.metrics/1"
 LIMITS_SCHEMA = "residnet.limits/1"
-ZERO = "zero"
-_WORST, _BANDS, _LEAST = 3, 3, 3
+CONSTANT_VELOCITY = "zero"
+_N_WORST_WINDOWS, _N_SPEED_CLASSES, _MIN_CLASS_WINDOWS = 3, 3, 3
 """Worst windows that are told, bands of speed, and windows that a band needs; chosen by hand."""
-_WIND = "wind_speed"
+_WIND_CHANNEL = "wind_speed"
 _HORIZONS = (10.0, 30.0, 100.0)
 """Times in s after which errors of the pose are told."""
 
 
-class Judged:
+class ProtocolEvaluation:
     """The errors of all models over the W windows of one protocol, and what is read off them.
 
     Args:
-        run: free runs of all models.
+        free_run: free runs of all models.
         scales: of what moves, which nrmse divides by.
     """
 
     def __init__(
         self,
-        run: FreeRun,
+        free_run: FreeRun,
         candidates: Sequence[Candidate],
-        logs: Sequence[Prepared],
+        logs: Sequence[PreparedLog],
         scales: Mapping[str, float],
     ) -> None:
-        self.run, self.candidates, self.logs = run, candidates, logs
-        self.live = logs[0].live
-        self.scale = np.array([scales.get(name, 1.0) for name in self.live.moving])
-        self.parts = [(logs[w.log], slice(w.start, w.stop)) for w in run.windows]
-        self.numbers = np.array([window.log for window in run.windows])
-        self.found = {
-            one.name: Errors.of(run.windows, run.predictions[one.name], logs) for one in candidates
+        self.free_run, self.candidates, self.logs = free_run, candidates, logs
+        self.dof = logs[0].dof
+        self.state_scales = np.array([scales.get(name, 1.0) for name in self.dof.dynamic_states])
+        self.log_slices = [(logs[w.log_index], slice(w.start, w.stop)) for w in free_run.windows]
+        self.log_indices = np.array([window.log_index for window in free_run.windows])
+        self.errors = {
+            candidate.name: FreeRunErrors.from_predictions(
+                free_run.windows, free_run.predictions[candidate.name], logs
+            )
+            for candidate in candidates
         }
-        self.nrmse = {name: found.nrmse(self.scale) for name, found in self.found.items()}
+        self.nrmse_by_window = {
+            name: errors.nrmse(self.state_scales) for name, errors in self.errors.items()
+        }
 
-    def difference(
+    def paired_difference(
         self,
-        name: str,
-        other: str | None,
-        chosen: np.ndarray,
-        values: Mapping[str, np.ndarray] | None = None,
+        model_name: str,
+        reference_name: str | None,
+        window_mask: np.ndarray,
+        errors_by_model: Mapping[str, np.ndarray] | None = None,
     ) -> dict[str, Any] | None:
         """Return the paired difference of two models over chosen windows [W] bool.
 
         None where the other is not among the models. `values` [W] by model stand for the nrmse.
         """
-        values = self.nrmse if values is None else values
-        if other is None or other not in values:
+        errors_by_model = self.nrmse_by_window if errors_by_model is None else errors_by_model
+        if reference_name is None or reference_name not in errors_by_model:
             return None
-        drawn = blocks(self.numbers[chosen])
-        return difference(values[name][chosen], values[other][chosen], other, drawn)
+        resampling_blocks = make_resampling_blocks(self.log_indices[window_mask])
+        return paired_difference(
+            errors_by_model[model_name][window_mask],
+            errors_by_model[reference_name][window_mask],
+            reference_name,
+            resampling_blocks,
+        )
 
-    def rows(self, groups: Mapping[str, Sequence[str]]) -> list[dict[str, Any]]:
+    def build_rows(self, groups: Mapping[str, Sequence[str]]) -> list[dict[str, Any]]:
         """Return the rows of metrics.json.
 
         Every model, over all windows, every kind of manoeuvre and every named group of kinds.
-        `difference` compares a model with its reference (`Candidate.reference`); None where it has
+        `paired_difference` compares a model with its reference (`Candidate.reference`); None where it has
         none. Models with a band have its coverage and interval score, too.
         """
-        kinds = [log.log.manoeuvre for log, _ in self.parts]
-        subsets: dict[str, Sequence[str]] = {"all": kinds}
-        subsets |= {kind: [kind] for kind in sorted(set(kinds))} | dict(groups)
-        banded = {
-            one.name: counted(
-                run_errors(
-                    self.run.windows,
-                    self.run.predictions[one.name],
+        manoeuvre_kinds = [log.log.manoeuvre for log, _ in self.log_slices]
+        kinds_by_group: dict[str, Sequence[str]] = {"all": manoeuvre_kinds}
+        kinds_by_group |= {
+            manoeuvre_kind: [manoeuvre_kind] for manoeuvre_kind in sorted(set(manoeuvre_kinds))
+        } | dict(groups)
+        coverage_by_model = {
+            candidate.name: count_coverage(
+                compute_run_errors(
+                    self.free_run.windows,
+                    self.free_run.predictions[candidate.name],
                     self.logs,
-                    self.found[one.name],
+                    self.errors[candidate.name],
                 ),
-                one.bands[self.run.protocol],
+                candidate.bands[self.free_run.protocol],
             )
-            for one in self.candidates
-            if self.run.protocol in one.bands
+            for candidate in self.candidates
+            if self.free_run.protocol in candidate.bands
         }
-        out = []
-        for one in self.candidates:
-            for name, members in subsets.items():
-                chosen = np.isin(kinds, list(members))
-                if not chosen.any():
+        metric_rows = []
+        for candidate in self.candidates:
+            for group_name, group_kinds in kinds_by_group.items():
+                window_mask = np.isin(manoeuvre_kinds, list(group_kinds))
+                if not window_mask.any():
                     continue
                 labels = {
-                    "model": one.name,
-                    "kind": one.kind,
-                    "split": self.run.split,
-                    "protocol": self.run.protocol,
-                    "manoeuvre": name,
+                    "model": candidate.name,
+                    "kind": candidate.model_kind,
+                    "split": self.free_run.split,
+                    "protocol": self.free_run.protocol,
+                    "manoeuvre": group_name,
                 }
-                row = labels | self._summary(one.name, chosen)
-                row["difference"] = self.difference(one.name, one.reference, chosen)
-                out.append(row | (banded[one.name].row(chosen) if one.name in banded else {}))
-        return out
+                row = labels | self._summarize_windows(candidate.name, window_mask)
+                row["difference"] = self.paired_difference(
+                    candidate.name, candidate.reference, window_mask
+                )
+                metric_rows.append(
+                    row
+                    | (
+                        coverage_by_model[candidate.name].to_row(window_mask)
+                        if candidate.name in coverage_by_model
+                        else {}
+                    )
+                )
+        return metric_rows
 
-    def _summary(self, name: str, chosen: np.ndarray) -> dict[str, Any]:
-        found, drawn = self.found[name], blocks(self.numbers[chosen])
-        live, ends = self.live, found.ends()
-        by_window = np.column_stack((found.rmse, self.nrmse[name], *ends.values()))[chosen]
-        rmse, mae = by_window[:, : live.size].mean(0), found.mae[chosen].mean(0)
-        nrmse = rmse / self.scale
-        spread = intervals(by_window, drawn)
-        samples = found.samples[chosen]
+    def _summarize_windows(self, model_name: str, window_mask: np.ndarray) -> dict[str, Any]:
+        errors, resampling_blocks = (
+            self.errors[model_name],
+            make_resampling_blocks(self.log_indices[window_mask]),
+        )
+        dof, pose_errors = self.dof, errors.final_pose_errors()
+        errors_by_window = np.column_stack(
+            (errors.rmse, self.nrmse_by_window[model_name], *pose_errors.values())
+        )[window_mask]
+        rmse, mae = errors_by_window[:, : dof.n_dynamic].mean(0), errors.mae[window_mask].mean(0)
+        nrmse = rmse / self.state_scales
+        confidence_intervals = bootstrap_intervals(errors_by_window, resampling_blocks)
+        n_usable = errors.n_usable[window_mask]
 
-        def named(values: np.ndarray) -> dict[str, float]:
-            return {live.moving[axis]: float(values[axis]) for axis in live.axes}
+        def map_by_state(by_state: np.ndarray) -> dict[str, float]:
+            return {dof.dynamic_states[axis]: float(by_state[axis]) for axis in dof.active_indices}
 
-        out = {
-            "windows": len(samples),
-            "n": int(samples.sum()),
+        summary = {
+            "windows": len(n_usable),
+            "n": int(n_usable.sum()),
             "diverged": sum(
-                one.diverged
-                for one, taken in zip(self.run.predictions[name], chosen, strict=True)
-                if taken
+                prediction.has_diverged
+                for prediction, is_selected in zip(
+                    self.free_run.predictions[model_name], window_mask, strict=True
+                )
+                if is_selected
             ),
-            "rmse": named(rmse),
-            "mae": named(mae),
-            "nrmse": named(nrmse) | {"mean": float(nrmse[live.axes].mean())},
-            "rmse_ci95": {live.moving[axis]: spread[axis] for axis in live.axes},
-            "nrmse_mean_ci95": spread[live.size],
-            "ci95_blocks": drawn.row() if drawn is not None else None,
+            "rmse": map_by_state(rmse),
+            "mae": map_by_state(mae),
+            "nrmse": map_by_state(nrmse) | {"mean": float(nrmse[dof.active_indices].mean())},
+            "rmse_ci95": {
+                dof.dynamic_states[axis]: confidence_intervals[axis] for axis in dof.active_indices
+            },
+            "nrmse_mean_ci95": confidence_intervals[dof.n_dynamic],
+            "ci95_blocks": resampling_blocks.to_row() if resampling_blocks is not None else None,
         }
         # they stand behind the errors of what moves and their mean
-        for column, name in enumerate(ends, live.size + 1):
-            out[f"{name}_error_end"] = float(by_window[:, column].mean())
-            out[f"{name}_error_end_ci95"] = spread[column]
-        return out
+        for column, model_name in enumerate(pose_errors, dof.n_dynamic + 1):
+            summary[f"{model_name}_error_end"] = float(errors_by_window[:, column].mean())
+            summary[f"{model_name}_error_end_ci95"] = confidence_intervals[column]
+        return summary
 
-    def limits(self, step: float) -> dict[str, Any]:
-        """Return the part of limits.json for one protocol and split; `step` of the grid in s."""
+    def build_limits(self, dt: float) -> dict[str, Any]:
+        """Return the part of limits.json for one protocol and split; `dt` of the grid in s."""
         return {
-            "kinematics": self.kinematics(step),
-            "bands": self.bands(),
-            "worst": {name: self.worst(name) for name in self.found},
-            "compared": self.compared(),
-            "outside": self.outside(),
-            "horizons": self.horizons(step),
+            "kinematics": self.evaluate_kinematics(dt),
+            "bands": self.evaluate_by_class(),
+            "worst": {name: self.list_worst_windows(name) for name in self.errors},
+            "compared": self.compare_with_references(),
+            "outside": self.share_outside_training_range(),
+            "horizons": self.evaluate_horizons(dt),
         }
 
-    def horizons(self, step: float) -> list[dict[str, Any]]:
+    def evaluate_horizons(self, dt: float) -> list[dict[str, Any]]:
         """Return how far models are off after some times that matter, in metres and radians.
 
         Returns:
             One entry for 10, 30 and 100 s, as far as the windows go, and for the end of the longest
-            window: `seconds`; `windows` and `logs` that last so long, `slowest` and `fastest` of
-            them (mean speeds, m/s) and the mean way `sailed` in m; `floor`: what integrated
+            window: `seconds`; `windows` and `log_indices` that last so long, `slowest` and `fastest` of
+            them (mean speeds, m/s) and the mean way `distances` in m; `integration_errors`: what integrated
             measured velocities are off in each of `Live.ends`; and by model the mean of each over
-            the windows, with `intervals` for as many new logs, see `new_trials`.
+            the windows, with `intervals` for as many new logs, see `prediction_intervals`.
         """
-        laid, speeds = next(iter(self.found.values())), self._speeds()
-        longest = int(laid.counts.max()) - 1
-        after = [round(seconds / step) for seconds in _HORIZONS]
-        out = []
-        for k in [*(k for k in after if 0 < k < longest), longest]:
-            there = laid.counts > k
-            there[there] = laid.usable[(laid.begins + k)[there]]
-            if not there.any():
+        any_errors, mean_speeds = next(iter(self.errors.values())), self._mean_speeds()
+        max_steps = int(any_errors.window_lengths.max()) - 1
+        horizon_steps = [round(seconds / dt) for seconds in _HORIZONS]
+        entries = []
+        for n_steps in [
+            *(n_steps for n_steps in horizon_steps if 0 < n_steps < max_steps),
+            max_steps,
+        ]:
+            reaches_horizon = any_errors.window_lengths > n_steps
+            reaches_horizon[reaches_horizon] = any_errors.is_usable[
+                (any_errors.window_starts + n_steps)[reaches_horizon]
+            ]
+            if not reaches_horizon.any():
                 continue
-            numbers = self.numbers[there]
-            lasting = (self.parts[i] for i in np.flatnonzero(there).tolist())
-            measured = [log.y[part][: k + 1] for log, part in lasting]
-            sailed = [float(np.hypot(*y[:, VELOCITIES][:, :2].T).sum()) * step for y in measured]
-            models = {
-                name: found.ends((found.begins + k)[there]) for name, found in self.found.items()
+            log_indices = self.log_indices[reaches_horizon]
+            long_slices = (self.log_slices[i] for i in np.flatnonzero(reaches_horizon).tolist())
+            measured_states = [
+                log.y[window_slice][: n_steps + 1] for log, window_slice in long_slices
+            ]
+            distances = [
+                float(np.hypot(*states[:, VELOCITIES][:, :2].T).sum()) * dt
+                for states in measured_states
+            ]
+            pose_errors_by_model = {
+                name: errors.final_pose_errors((errors.window_starts + n_steps)[reaches_horizon])
+                for name, errors in self.errors.items()
             }
-            floor = {"floor": drift(np.stack(measured), self.live, step)}
-            out.append(
+            integration_errors = {
+                "floor": compute_integration_errors(np.stack(measured_states), self.dof, dt)
+            }
+            entries.append(
                 {
-                    "seconds": k * step,
-                    "windows": len(measured),
-                    "logs": len(set(numbers.tolist())),
-                    "slowest": float(speeds[there].min()),
-                    "fastest": float(speeds[there].max()),
-                    "sailed": float(np.mean(sailed)),
-                    "floor": _sizes(floor, numbers)["floor"],
-                    "models": _sizes(models, numbers),
+                    "seconds": n_steps * dt,
+                    "windows": len(measured_states),
+                    "logs": len(set(log_indices.tolist())),
+                    "slowest": float(mean_speeds[reaches_horizon].min()),
+                    "fastest": float(mean_speeds[reaches_horizon].max()),
+                    "sailed": float(np.mean(distances)),
+                    "floor": _summarize_pose_errors(integration_errors, log_indices)["floor"],
+                    "models": _summarize_pose_errors(pose_errors_by_model, log_indices),
                 }
             )
-        return out
+        return entries
 
-    def kinematics(self, step: float) -> dict[str, float]:
+    def evaluate_kinematics(self, dt: float) -> dict[str, float]:
         """Return how far integrated measured velocities end from the measured pose.
 
         They are integrated over each window from its measured pose, as predictions are.
@@ -376,97 +453,126 @@ class Judged:
             position_mean and position_rms. A model that predicted the measured velocities exactly
             would have these errors. Empty where only some velocities were recorded.
         """
-        if self.live.dead:
+        if self.dof.fixed_states:
             return {}
-        of_length: dict[int, list[np.ndarray]] = {}
-        for log, part in self.parts:
-            of_length.setdefault(part.stop - part.start, []).append(log.y[part])
-        found = [drift(np.stack(alike), self.live, step) for alike in of_length.values()]
-        out: dict[str, float] = {"windows": len(self.parts)}
-        for name in self.live.ends:
-            values = np.concatenate([one[name] for one in found])
-            out[f"{name}_mean"] = float(values.mean())
-            out[f"{name}_rms"] = float(np.sqrt(np.mean(values**2)))
-        return out
+        states_by_length: dict[int, list[np.ndarray]] = {}
+        for log, window_slice in self.log_slices:
+            states_by_length.setdefault(window_slice.stop - window_slice.start, []).append(
+                log.y[window_slice]
+            )
+        integration_errors = [
+            compute_integration_errors(np.stack(states_of_length), self.dof, dt)
+            for states_of_length in states_by_length.values()
+        ]
+        summary: dict[str, float] = {"windows": len(self.log_slices)}
+        for name in self.dof.pose_error_names:
+            values = np.concatenate(
+                [errors_of_length[name] for errors_of_length in integration_errors]
+            )
+            summary[f"{name}_mean"] = float(values.mean())
+            summary[f"{name}_rms"] = float(np.sqrt(np.mean(values**2)))
+        return summary
 
-    def _speeds(self) -> np.ndarray:
+    def _mean_speeds(self) -> np.ndarray:
         return np.array(
-            [np.hypot(*log.y[part, VELOCITIES][:, :2].T).mean() for log, part in self.parts]
+            [
+                np.hypot(*log.y[window_slice, VELOCITIES][:, :2].T).mean()
+                for log, window_slice in self.log_slices
+            ]
         )
 
-    def bands(self) -> list[dict[str, Any]]:
+    def evaluate_by_class(self) -> list[dict[str, Any]]:
         """Return errors by thirds of the windows in mean speed and in mean true wind speed.
 
         The wind only where every log has it. A band of fewer than three windows is left out, and
         so is a quantity of which one band remains. Each entry: `by` (speed or wind), `low` and
-        `high` in m/s (extremes of the windows' means), `windows`, and by model `nrmse_mean` and
-        `difference` as in metrics.json.
+        `upper` in m/s (extremes of the windows' means), `windows`, and by model `nrmse_mean` and
+        `paired_difference` as in metrics.json.
         """
-        quantities = {"speed": self._speeds()}
-        if all(_WIND in log.log.channels for log, _ in self.parts):
-            winds = [log.log[_WIND][part].mean() for log, part in self.parts]
-            quantities["wind"] = np.array(winds)
-        out = []
-        for quantity, values in quantities.items():
+        values_by_quantity = {"speed": self._mean_speeds()}
+        if all(_WIND_CHANNEL in log.log.channels for log, _ in self.log_slices):
+            mean_wind_speeds = [
+                log.log[_WIND_CHANNEL][window_slice].mean() for log, window_slice in self.log_slices
+            ]
+            values_by_quantity["wind"] = np.array(mean_wind_speeds)
+        entries = []
+        for quantity, values in values_by_quantity.items():
             if not np.isfinite(values).all():
                 continue
             # equal values stay together
-            edges = np.quantile(values, np.arange(1, _BANDS) / _BANDS)
-            place = np.searchsorted(edges, values, side="left")
-            thirds = [place == k for k in range(_BANDS) if (place == k).sum() >= _LEAST]
-            out += [
+            class_limits = np.quantile(values, np.arange(1, _N_SPEED_CLASSES) / _N_SPEED_CLASSES)
+            class_indices = np.searchsorted(class_limits, values, side="left")
+            class_masks = [
+                class_indices == k
+                for k in range(_N_SPEED_CLASSES)
+                if (class_indices == k).sum() >= _MIN_CLASS_WINDOWS
+            ]
+            entries += [
                 {
                     "by": quantity,
-                    "low": float(values[chosen].min()),
-                    "high": float(values[chosen].max()),
-                    "windows": int(chosen.sum()),
+                    "low": float(values[class_mask].min()),
+                    "high": float(values[class_mask].max()),
+                    "windows": int(class_mask.sum()),
                     "models": {
-                        one.name: {
-                            "nrmse_mean": float(self.nrmse[one.name][chosen].mean()),
-                            "difference": self.difference(one.name, one.reference, chosen),
+                        candidate.name: {
+                            "nrmse_mean": float(
+                                self.nrmse_by_window[candidate.name][class_mask].mean()
+                            ),
+                            "difference": self.paired_difference(
+                                candidate.name, candidate.reference, class_mask
+                            ),
                         }
-                        for one in self.candidates
+                        for candidate in self.candidates
                     },
                 }
-                for chosen in (thirds if len(thirds) > 1 else ())
+                for class_mask in (class_masks if len(class_masks) > 1 else ())
             ]
-        return out
+        return entries
 
-    def worst(self, name: str) -> list[dict[str, Any]]:
+    def list_worst_windows(self, model_name: str) -> list[dict[str, Any]]:
         """Return the three windows with the largest nrmse of a model.
 
         Each with log, manoeuvre, t (start, the log's clock, s), nrmse, rmse, position_error_end
         (heading_error_end where no velocity moves the position).
         """
-        found, nrmse, end = self.found[name], self.nrmse[name], self.live.ends[0]
-        ends = found.ends()[end]
+        errors, nrmse, pose_error_name = (
+            self.errors[model_name],
+            self.nrmse_by_window[model_name],
+            self.dof.pose_error_names[0],
+        )
+        pose_errors = errors.final_pose_errors()[pose_error_name]
         return [
             {
-                "log": self.parts[i][0].log.name,
-                "manoeuvre": self.parts[i][0].log.manoeuvre,
-                "t": float(self.parts[i][0].log.t[self.run.windows[i].start]),
+                "log": self.log_slices[i][0].log.name,
+                "manoeuvre": self.log_slices[i][0].log.manoeuvre,
+                "t": float(self.log_slices[i][0].log.t[self.free_run.windows[i].start]),
                 "nrmse": float(nrmse[i]),
                 "rmse": {
-                    self.live.moving[axis]: float(found.rmse[i, axis]) for axis in self.live.axes
+                    self.dof.dynamic_states[axis]: float(errors.rmse[i, axis])
+                    for axis in self.dof.active_indices
                 },
-                f"{end}_error_end": float(ends[i]),
+                f"{pose_error_name}_error_end": float(pose_errors[i]),
             }
-            for i in np.argsort(-nrmse, kind="stable")[:_WORST].tolist()
+            for i in np.argsort(-nrmse, kind="stable")[:_N_WORST_WINDOWS].tolist()
         ]
 
-    def compared(self) -> dict[str, dict[str, Any]]:
+    def compare_with_references(self) -> dict[str, dict[str, Any]]:
         """Return by model its paired differences to `zero` and to the first baseline."""
-        everywhere = np.ones(len(self.numbers), dtype=bool)
-        others = [ZERO] if ZERO in self.found else []
-        others += [one.name for one in self.candidates if one.kind == "baseline"][:1]
+        all_windows = np.ones(len(self.log_indices), dtype=bool)
+        reference_names = [CONSTANT_VELOCITY] if CONSTANT_VELOCITY in self.errors else []
+        reference_names += [
+            candidate.name for candidate in self.candidates if candidate.model_kind == "baseline"
+        ][:1]
         return {
-            name: {
-                other: self.difference(name, other, everywhere) for other in others if other != name
+            model_name: {
+                reference_name: self.paired_difference(model_name, reference_name, all_windows)
+                for reference_name in reference_names
+                if reference_name != model_name
             }
-            for name in self.found
+            for model_name in self.errors
         }
 
-    def outside(self) -> dict[str, Any]:
+    def share_outside_training_range(self) -> dict[str, Any]:
         """Return how much of the windows lies outside the range of the training data.
 
         Returns:
@@ -474,62 +580,78 @@ class Judged:
             `channels`: the share of each channel that is; empty where no model says its ranges. A
             depth, which drives nothing, does not count.
         """
-        ranges = next((one.ranges for one in self.candidates if one.ranges), {})
+        ranges = next(
+            (
+                candidate.training_ranges
+                for candidate in self.candidates
+                if candidate.training_ranges
+            ),
+            {},
+        )
         if not ranges:
             return {}
         values = np.concatenate(
             [
-                np.concatenate((log.y[part, log.live.columns], log.w[part]), axis=1)[
-                    log.usable[part]
-                ]
-                for log, part in self.parts
+                np.concatenate(
+                    (log.y[window_slice, log.dof.dynamic_columns], log.w[window_slice]), axis=1
+                )[log.usable[window_slice]]
+                for log, window_slice in self.log_slices
             ]
         )
-        low, high = np.array(list(ranges.values())).T
-        hidden = self.parts[0][0].live.hidden
-        beyond = (values < low) | (values > high)
-        beyond &= np.array([name not in hidden for name in ranges])
-        shares = dict(zip(ranges, beyond.mean(0).tolist(), strict=True))
+        lower, upper = np.array(list(ranges.values())).T
+        unused_channels = self.log_slices[0][0].dof.unmodelled_states
+        is_outside = (values < lower) | (values > upper)
+        is_outside &= np.array([name not in unused_channels for name in ranges])
+        shares = dict(zip(ranges, is_outside.mean(0).tolist(), strict=True))
         return {
-            "share": float(beyond.any(1).mean()),
+            "share": float(is_outside.any(1).mean()),
             "channels": {name: share for name, share in shares.items() if share > 0},
         }
 
 
-def _sizes(
-    errors: Mapping[str, Mapping[str, np.ndarray]], numbers: np.ndarray
+def _summarize_pose_errors(
+    pose_errors: Mapping[str, Mapping[str, np.ndarray]], log_indices: np.ndarray
 ) -> dict[str, dict[str, Any]]:
     """Return means and intervals of sizes [W] of errors of the pose, by model and name."""
-    values = np.column_stack([one for of in errors.values() for one in of.values()])
-    told = zip(values.mean(0).tolist(), new_trials(values, numbers), strict=True)
-    out: dict[str, dict[str, Any]] = {}
-    for model, of in errors.items():
-        found = {name: next(told) for name in of}
+    values = np.column_stack(
+        [sizes for sizes_by_name in pose_errors.values() for sizes in sizes_by_name.values()]
+    )
+    means_and_intervals = zip(
+        values.mean(0).tolist(), prediction_intervals(values, log_indices), strict=True
+    )
+    summary: dict[str, dict[str, Any]] = {}
+    for model, sizes_by_name in pose_errors.items():
+        mean_and_interval = {name: next(means_and_intervals) for name in sizes_by_name}
         # an angle is off by half a turn at most
-        most = {name: math.pi if END_UNITS[name] == "rad" else math.inf for name in of}
-        intervals = {
-            name: ends and [ends[0], min(ends[1], most[name])] for name, (_, ends) in found.items()
+        upper_bounds = {
+            name: math.pi if POSE_ERROR_UNITS[name] == "rad" else math.inf for name in sizes_by_name
         }
-        out[model] = {name: mean for name, (mean, _) in found.items()} | {"intervals": intervals}
-    return out
+        intervals_by_name = {
+            name: interval and [interval[0], min(interval[1], upper_bounds[name])]
+            for name, (_, interval) in mean_and_interval.items()
+        }
+        summary[model] = {name: mean for name, (mean, _) in mean_and_interval.items()} | {
+            "intervals": intervals_by_name
+        }
+    return summary
 
 
-def find(table: Sequence[Mapping[str, Any]], **wanted: str) -> Mapping[str, Any]:
+def find_row(rows: Sequence[Mapping[str, Any]], **labels: str) -> Mapping[str, Any]:
     """Return the one row of a model, split, protocol and manoeuvre (`all` where not given)."""
-    keys = {"manoeuvre": "all"} | wanted
-    found = [row for row in table if all(row[key] == value for key, value in keys.items())]
-    if len(found) != 1:
-        raise KeyError(f"{len(found)} rows with {keys}")
-    return found[0]
+    keys = {"manoeuvre": "all"} | labels
+    matching_rows = [row for row in rows if all(row[key] == value for key, value in keys.items())]
+    if len(matching_rows) != 1:
+        raise KeyError(f"{len(matching_rows)} rows with {keys}")
+    return matching_rows[0]
 
 
-_LABELS = ("model", "kind", "split", "protocol", "manoeuvre", "selected")
-_COUNTS = ("windows", "diverged", "n")
-_BY_CHANNEL = ("rmse", "mae", "nrmse")
-_ENDS = tuple(f"{end}_error_end" for end in END_UNITS)
+_LABEL_COLUMNS = ("model", "kind", "split", "protocol", "manoeuvre", "selected")
+_COUNT_COLUMNS = ("windows", "diverged", "n")
+_CHANNEL_COLUMNS = ("rmse", "mae", "nrmse")
+_POSE_ERROR_COLUMNS = tuple(f"{end}_error_end" for end in POSE_ERROR_UNITS)
 
 
-def metrics_content(
+def build_metrics_content(
     run: str,
     units: Mapping[str, str],
     scales: Mapping[str, float],
@@ -546,7 +668,7 @@ def metrics_content(
         predictor: name of the model that is reported first and exported where none is named.
         rows: of all splits, without `selected`.
     """
-    marked = [{**row, "selected": row["model"] == selected} for row in rows]
+    marked_rows = [{**row, "selected": row["model"] == selected} for row in rows]
     return {
         "schema": SCHEMA,
         "run": run,
@@ -555,11 +677,11 @@ def metrics_content(
         "selected": selected,
         "selected_ensemble": selected_ensemble,
         "predictor": predictor,
-        "rows": marked,
+        "rows": marked_rows,
     }
 
 
-def metrics_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+def build_metrics_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Return rows of metrics.json as a table with one column per number.
 
     Args:
@@ -574,34 +696,37 @@ def metrics_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """
     import pandas as pd
 
-    return pd.DataFrame([_flat(row) for row in rows])
+    return pd.DataFrame([_flatten_row(row) for row in rows])
 
 
-def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
-    out = {name: row[name] for name in (*_LABELS, *_COUNTS) if name in row}
-    for name in _BY_CHANNEL:
-        out |= {f"{name}_{channel}": value for channel, value in row[name].items()}
+def _flatten_row(row: Mapping[str, Any]) -> dict[str, Any]:
+    flat_row = {name: row[name] for name in (*_LABEL_COLUMNS, *_COUNT_COLUMNS) if name in row}
+    for name in _CHANNEL_COLUMNS:
+        flat_row |= {f"{name}_{channel}": value for channel, value in row[name].items()}
     # beside the score, since the diverged windows in it are no errors of the model
-    out["note"] = diverged_note(row)
-    return out | {name: row[name] for name in _ENDS if name in row}
+    flat_row["note"] = describe_divergence(row)
+    return flat_row | {name: row[name] for name in _POSE_ERROR_COLUMNS if name in row}
 
 
-INPUT = "input_"
+INPUT_PREFIX = "input_"
 """Stands before the name of an input among the columns."""
 
 
-def columns_of(live: Live) -> tuple[str, ...]:
+def state_column_names(dof: DegreesOfFreedom) -> tuple[str, ...]:
     """Return the names of the columns of states: u, v, r, heading and position, then the rest."""
-    planar, beside = live.moving[: PLANAR.dof], live.moving[PLANAR.dof :]
-    return (*planar, "psi", "x", "y", *beside)
+    planar, non_planar_states = (
+        dof.dynamic_states[: PLANAR_LAYOUT.n_dof],
+        dof.dynamic_states[PLANAR_LAYOUT.n_dof :],
+    )
+    return (*planar, "psi", "x", "y", *non_planar_states)
 
 
-def rollout_columns(
+def iterate_rollout_columns(
     runs: Sequence[FreeRun],
-    logs: Sequence[Prepared],
+    logs: Sequence[PreparedLog],
     inputs: Sequence[str] = (),
-    bands: Bands | None = None,
-) -> Iterator[tuple[Prepared, dict[str, np.ndarray]]]:
+    bands: BandsByModel | None = None,
+) -> Iterator[tuple[PreparedLog, dict[str, np.ndarray]]]:
     """Yield each log that has a window, with a row for each step of each model's free runs.
 
     Columns: protocol, model, window, t (s, the log's clock), usable, diverged, then u, v, r, psi,
@@ -614,52 +739,74 @@ def rollout_columns(
         inputs: names of the inputs, in the order of their columns.
         bands: by model and protocol; None for none.
     """
-    known = bands or {}
-    for number, log in enumerate(logs):
-        parts: list[dict[str, np.ndarray]] = []
-        order = {name: log.live.states.index(name) for name in columns_of(log.live)}
+    bands_by_model = bands or {}
+    for log_index, log in enumerate(logs):
+        tables: list[dict[str, np.ndarray]] = []
+        state_columns = {
+            name: log.dof.state_names.index(name) for name in state_column_names(log.dof)
+        }
         for run in runs:
-            of_log = [i for i, window in enumerate(run.windows) if window.log == number]
+            window_indices = [
+                window_index
+                for window_index, window in enumerate(run.windows)
+                if window.log_index == log_index
+            ]
             for model, predictions in run.predictions.items():
-                band = known.get(model, {}).get(run.protocol)
-                for place, i in enumerate(of_log):
-                    rows, found = slice(run.windows[i].start, run.windows[i].stop), predictions[i]
-                    labels = {"protocol": run.protocol, "model": model, "window": place}
-                    tables = {"": log.y[rows], "_hat": found.states}
-                    if any(known.values()):
-                        low = high = np.full_like(found.states, np.nan)
-                        if band is not None:
-                            width = band.half_widths(found.states, found.spread)
-                            low, high = limits(found.states, width)
-                        tables |= {"_low": low, "_high": high}
-                    parts.append(
-                        {name: np.full(len(found.states), label) for name, label in labels.items()}
-                        | {"t": log.log.t[rows], "usable": log.usable[rows]}
-                        | {"diverged": np.full(len(found.states), found.diverged)}
-                        | {
-                            f"{name}{ending}": values[:, column]
-                            for ending, values in tables.items()
-                            for name, column in order.items()
-                        }
-                        | {f"{INPUT}{n}": log.w[rows, k] for k, n in enumerate(inputs)}
+                band = bands_by_model.get(model, {}).get(run.protocol)
+                for window_number, window_index in enumerate(window_indices):
+                    window_slice, prediction = (
+                        slice(run.windows[window_index].start, run.windows[window_index].stop),
+                        predictions[window_index],
                     )
-        if parts:
-            yield log, {name: np.concatenate([one[name] for one in parts]) for name in parts[0]}
+                    label_columns = {
+                        "protocol": run.protocol,
+                        "model": model,
+                        "window": window_number,
+                    }
+                    states_by_suffix = {"": log.y[window_slice], "_hat": prediction.states}
+                    if any(bands_by_model.values()):
+                        lower = upper = np.full_like(prediction.states, np.nan)
+                        if band is not None:
+                            half_widths = band.half_widths(prediction.states, prediction.spread)
+                            lower, upper = band_limits(prediction.states, half_widths)
+                        states_by_suffix |= {"_low": lower, "_high": upper}
+                    tables.append(
+                        {
+                            name: np.full(len(prediction.states), label)
+                            for name, label in label_columns.items()
+                        }
+                        | {"t": log.log.t[window_slice], "usable": log.usable[window_slice]}
+                        | {"diverged": np.full(len(prediction.states), prediction.has_diverged)}
+                        | {
+                            f"{name}{suffix}": values[:, column]
+                            for suffix, values in states_by_suffix.items()
+                            for name, column in state_columns.items()
+                        }
+                        | {
+                            f"{INPUT_PREFIX}{input_name}": log.w[window_slice, k]
+                            for k, input_name in enumerate(inputs)
+                        }
+                    )
+        if tables:
+            yield (
+                log,
+                {name: np.concatenate([table[name] for table in tables]) for name in tables[0]},
+            )
 
 
 def write_rollouts(
     folder: Path,
     runs: Sequence[FreeRun],
-    logs: Sequence[Prepared],
+    logs: Sequence[PreparedLog],
     inputs: Sequence[str],
-    bands: Bands | None = None,
+    bands: BandsByModel | None = None,
 ) -> None:
-    """Write one file per log of a split, as `rollout_columns` gives it."""
+    """Write one file per log of a split, as `iterate_rollout_columns` gives it."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    for log, columns in rollout_columns(runs, logs, inputs, bands):
+    for log, columns in iterate_rollout_columns(runs, logs, inputs, bands):
         table = pa.table({name: pa.array(values) for name, values in columns.items()})
-        with whole(folder / f"{file_stem(log.log.name)}.parquet") as file:
+        with atomic_write(folder / f"{make_file_stem(log.log.name)}.parquet") as file:
             # dictionaries of numbers that do not repeat take time and room
             pq.write_table(table, file, compression="zstd", use_dictionary=["protocol", "model"])

@@ -11,10 +11,10 @@ from pydantic import Field, model_validator
 
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import DataError
-from residnet.core.layout import PLANAR, ROLL, SIX
-from residnet.core.names import nearest
-from residnet.core.stretches import stretch_bounds
-from residnet.data.prepare import Prepared
+from residnet.core.layout import PLANAR_LAYOUT, ROLL_LAYOUT, SIX_DOF_LAYOUT
+from residnet.core.names import suggest_name
+from residnet.core.stretches import find_run_bounds
+from residnet.data.prepare import PreparedLog
 
 
 @dataclass(frozen=True)
@@ -22,28 +22,28 @@ class Window:
     """A free run over samples start .. stop-1 of a log, the first of them the initial state.
 
     Attributes:
-        log: number of the log.
+        log_index: number of the log.
         start: sample of the initial state.
         stop: one past the last sample.
-        past: first sample of the measured past that may warm up a memory.
-        nu: initially, what moves [n].
+        history_start: first sample of the measured past that may warm up a memory.
+        initial_velocities: initially, what moves [n].
     """
 
-    log: int
+    log_index: int
     start: int
     stop: int
-    past: int
-    nu: np.ndarray
+    history_start: int
+    initial_velocities: np.ndarray
 
 
-class Windows(Config):
+class WindowProtocol(Config):
     """A protocol of back-to-back windows of one length, as for the measured tanker.
 
     A start on a sample that is not usable moves on to the first that is; an incomplete tail is
     dropped. The initial state is measured.
 
     Attributes:
-        kind: `windows`.
+        kind: `make_windows`.
         length: of a window in s.
         first: start of the first window after the log's start, in s.
         history: time before a window that may warm up a memory, in s.
@@ -54,46 +54,55 @@ class Windows(Config):
     first: Seconds = Field(default=5.0, ge=0)
     history: Seconds = Field(default=5.0, ge=0)
 
-    def windows(self, log: Prepared, number: int, step: float) -> list[Window]:
+    def make_windows(self, log: PreparedLog, log_index: int, dt: float) -> list[Window]:
         """Return the windows of one log; none where it is too short."""
-        return self._laid(log, number, step, self.length)
+        return self._place_windows(log, log_index, dt, self.length)
 
-    def overlapping(
-        self, log: Prepared, number: int, step: float, every: float | None = None
+    def make_overlapping_windows(
+        self, log: PreparedLog, log_index: int, dt: float, interval: float | None = None
     ) -> list[Window]:
         """Return windows of the same length that start every so often, in s.
 
         Every quarter of a length where not given, for choices among models: back-to-back windows of
         a few logs are few; what is left of a log behind the last one tells nothing.
         """
-        every = self.length / 4 if every is None else min(every, self.length)
-        return self._laid(log, number, step, every)
+        interval = self.length / 4 if interval is None else min(interval, self.length)
+        return self._place_windows(log, log_index, dt, interval)
 
-    def _laid(self, log: Prepared, number: int, step: float, every: float) -> list[Window]:
-        steps, start, out = round(self.length / step), round(self.first / step), []
-        apart = max(round(every / step), 1)
-        _, end = stretch_bounds(log.piece)
-        while start + steps < len(log):
+    def _place_windows(
+        self, log: PreparedLog, log_index: int, dt: float, interval: float
+    ) -> list[Window]:
+        n_steps, start, windows = round(self.length / dt), round(self.first / dt), []
+        start_stride = max(round(interval / dt), 1)
+        _, segment_ends = find_run_bounds(log.segment)
+        while start + n_steps < len(log):
             while start < len(log) and not log.usable[start]:
                 start += 1
-            if start + steps >= len(log):
+            if start + n_steps >= len(log):
                 break
-            if end[start] <= start + steps:
+            if segment_ends[start] <= start + n_steps:
                 # a break inside: nothing can be simulated across it
-                start = int(end[start])
+                start = int(segment_ends[start])
                 continue
             # a break ends the past that may warm up a memory
-            past = max(start - round(self.history / step), int(np.searchsorted(end, end[start])))
-            out.append(
+            history_start = max(
+                start - round(self.history / dt),
+                int(np.searchsorted(segment_ends, segment_ends[start])),
+            )
+            windows.append(
                 Window(
-                    number, start, start + steps + 1, past, log.y[start, log.live.columns].copy()
+                    log_index,
+                    start,
+                    start + n_steps + 1,
+                    history_start,
+                    log.y[start, log.dof.dynamic_columns].copy(),
                 )
             )
-            start += apart
-        return out
+            start += start_stride
+        return windows
 
 
-class WholeManoeuvre(Config):
+class ManoeuvreProtocol(Config):
     """A protocol that takes every uninterrupted stretch of a log as one free run.
 
     The initial velocities are the mean of the first seconds, which also warm up a memory; scoring
@@ -109,76 +118,84 @@ class WholeManoeuvre(Config):
     initial: Seconds = Field(default=0.5, gt=0)
     shortest: Seconds = Field(default=5.0, gt=0)
 
-    def windows(self, log: Prepared, number: int, step: float) -> list[Window]:
+    def make_windows(self, log: PreparedLog, log_index: int, dt: float) -> list[Window]:
         """Return one window per stretch."""
-        lead, out = max(round(self.initial / step), 1), []
-        _, end = stretch_bounds(log.piece)
-        begin = 0
-        while begin < len(log):
-            if log.piece[begin] < 0:
-                begin += 1
+        n_initial, windows = max(round(self.initial / dt), 1), []
+        _, segment_ends = find_run_bounds(log.segment)
+        segment_start = 0
+        while segment_start < len(log):
+            if log.segment[segment_start] < 0:
+                segment_start += 1
                 continue
-            stop = int(end[begin])
+            segment_stop = int(segment_ends[segment_start])
             if (
-                stop - begin > max(lead + 1, round(self.shortest / step))
-                and log.usable[begin + lead : stop].any()
+                segment_stop - segment_start > max(n_initial + 1, round(self.shortest / dt))
+                and log.usable[segment_start + n_initial : segment_stop].any()
             ):
-                out.append(
+                windows.append(
                     Window(
-                        number,
-                        begin + lead,
-                        stop,
-                        begin,
-                        log.y[begin : begin + lead, log.live.columns].mean(0),
+                        log_index,
+                        segment_start + n_initial,
+                        segment_stop,
+                        segment_start,
+                        log.y[
+                            segment_start : segment_start + n_initial, log.dof.dynamic_columns
+                        ].mean(0),
                     )
                 )
-            begin = stop
-        return out
+            segment_start = segment_stop
+        return windows
 
-    def overlapping(
-        self, log: Prepared, number: int, step: float, every: float | None = None
+    def make_overlapping_windows(
+        self, log: PreparedLog, log_index: int, dt: float, interval: float | None = None
     ) -> list[Window]:
         """Return the windows themselves: a manoeuvre is one free run from its beginning."""
-        return self.windows(log, number, step)
+        return self.make_windows(log, log_index, dt)
 
 
-ProtocolConfig = Annotated[Windows | WholeManoeuvre, Field(discriminator="kind")]
+ProtocolConfig = Annotated[WindowProtocol | ManoeuvreProtocol, Field(discriminator="kind")]
 
 
-def longest_stretch(log: Prepared) -> int:
+def longest_segment_length(log: PreparedLog) -> int:
     """Return the samples of the longest stretch without a gap, which no free run goes across."""
-    return int((stretch_bounds(log.piece)[1] - np.arange(len(log))).max())
+    return int((find_run_bounds(log.segment)[1] - np.arange(len(log))).max())
 
 
-def all_windows(
-    protocol: Windows | WholeManoeuvre,
-    logs: Sequence[Prepared],
-    step: float,
-    name: str,
+def make_windows(
+    protocol: WindowProtocol | ManoeuvreProtocol,
+    logs: Sequence[PreparedLog],
+    dt: float,
+    protocol_name: str,
     *,
-    dense: bool = False,
+    is_overlapping: bool = False,
 ) -> list[Window]:
     """Return the windows of a protocol over several logs.
 
     Args:
-        name: of the protocol.
-        dense: whether they overlap, see `Windows.overlapping`.
+        protocol_name: of the protocol.
+        is_overlapping: whether they overlap, see `Windows.overlapping`.
 
     Raises:
         DataError: where no log is long enough for a single one.
     """
-    laid = protocol.overlapping if dense else protocol.windows
-    out = [window for number, log in enumerate(logs) for window in laid(log, number, step)]
-    if not out:
-        longest = max(logs, key=len)
-        whole = max(map(longest_stretch, logs))
+    make_log_windows = (
+        protocol.make_overlapping_windows if is_overlapping else protocol.make_windows
+    )
+    windows = [
+        window
+        for log_index, log in enumerate(logs)
+        for window in make_log_windows(log, log_index, dt)
+    ]
+    if not windows:
+        longest_log = max(logs, key=len)
+        longest_segment = max(map(longest_segment_length, logs))
         raise DataError(
-            f"protocol {name}: none of {len(logs)} '{logs[0].split}' logs holds a window; the"
-            f" longest, {longest.log.name}, lasts {len(longest) * step:.1f} s, and the longest"
-            f" stretch without a gap {whole * step:.1f} s; give longer logs, fill gaps that may be"
+            f"protocol {protocol_name}: none of {len(logs)} '{logs[0].split}' logs holds a window; the"
+            f" longest, {longest_log.log.name}, lasts {len(longest_log) * dt:.1f} s, and the longest"
+            f" stretch without a gap {longest_segment * dt:.1f} s; give longer logs, fill gaps that may be"
             " interpolated, or shorten the protocol"
         )
-    return out
+    return windows
 
 
 class Scales(Config):
@@ -209,15 +226,21 @@ class Scales(Config):
     z: Annotated[Metres, Field(gt=0)] | None = None
     theta: Annotated[Radians, Field(gt=0)] | None = None
 
-    def array(self) -> np.ndarray:
+    def to_array(self) -> np.ndarray:
         """Return the scales of what moves as one array [n], SI; 1 without a scale."""
-        layout = SIX if self.w is not None else PLANAR if self.p is None else ROLL
-        return np.array([self.named().get(name, 1.0) for name in layout.moving])
+        layout = (
+            SIX_DOF_LAYOUT
+            if self.w is not None
+            else PLANAR_LAYOUT
+            if self.p is None
+            else ROLL_LAYOUT
+        )
+        return np.array([self.to_dict().get(name, 1.0) for name in layout.dynamic_states])
 
-    def named(self) -> dict[str, float]:
+    def to_dict(self) -> dict[str, float]:
         """Return the scales by the name of what moves."""
-        found = {name: getattr(self, name) for name in SIX.moving}
-        return {name: float(value) for name, value in found.items() if value is not None}
+        scales_by_name = {name: getattr(self, name) for name in SIX_DOF_LAYOUT.dynamic_states}
+        return {name: float(value) for name, value in scales_by_name.items() if value is not None}
 
 
 class EvaluationConfig(Config):
@@ -242,11 +265,11 @@ class EvaluationConfig(Config):
     splits: tuple[Literal["train", "validation", "test"], ...] = ("train", "validation", "test")
 
     @model_validator(mode="after")
-    def _names(self) -> EvaluationConfig:
+    def check_names(self) -> EvaluationConfig:
         if self.selection not in self.protocols:
             raise ValueError(
                 f"selection '{self.selection}' is not a"
-                f" protocol{nearest(self.selection, self.protocols)}"
+                f" protocol{suggest_name(self.selection, self.protocols)}"
             )
         if "validation" not in self.splits:
             raise ValueError("splits must contain 'validation': models are selected on it")

@@ -7,59 +7,71 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from residnet.core.format import interval, listed, number, plural, shown_unit
-from residnet.core.names import END_UNITS
+from residnet.core.format import (
+    display_unit,
+    format_count,
+    format_interval,
+    format_number,
+    join_list,
+)
+from residnet.core.names import POSE_ERROR_UNITS
 
-Content = Mapping[str, Any]
+JsonObject = Mapping[str, Any]
 """What a JSON object holds."""
 
-ZERO = "zero"
-UNSEEN = ("test", "external")
+CONSTANT_VELOCITY = "zero"
+UNSEEN_SPLITS = ("test", "external")
 """Splits that no fit has seen."""
 
 
-def by_windows(rows: Sequence[Content], split: str, deciding: str) -> list[str]:
+def order_protocols(rows: Sequence[JsonObject], split: str, selection_protocol: str) -> list[str]:
     """Return the protocols of some rows, that by which a split is judged first.
 
     It is the one that chose between the models, unless the split is too short for it.
 
     Args:
-        deciding: protocol that chose; empty where nothing was chosen.
+        selection_protocol: protocol that chose; empty where nothing was chosen.
     """
-    names = dict.fromkeys(row["protocol"] for row in rows)
-    held = {row["protocol"] for row in rows if row["split"] == split}
-    return sorted(names, key=lambda name: (name not in held, name != deciding))
+    protocol_names = dict.fromkeys(row["protocol"] for row in rows)
+    protocols_of_split = {row["protocol"] for row in rows if row["split"] == split}
+    return sorted(
+        protocol_names,
+        key=lambda protocol_name: (
+            protocol_name not in protocols_of_split,
+            protocol_name != selection_protocol,
+        ),
+    )
 
 
 @dataclass(frozen=True)
-class Evidence:
+class VerdictEvidence:
     """What a verdict is passed on.
 
     Attributes:
         selected: name of the selected model.
         split: whose free runs count.
-        rows: of metrics.json under one protocol over all manoeuvres of that split, by model.
+        rows_by_model: of metrics.json under one protocol over all manoeuvres of that split, by model.
         baseline: name of the first baseline; empty where there is none.
         selection: contents of selection.json; empty where a run has none.
-        limits: contents of limits.json for that split by protocol; empty where a run has none.
-        doctor: one sentence on what the data doctor found; empty where nobody looked.
+        limits_by_protocol: contents of limits.json for that split by protocol; empty where a run has none.
+        data_quality_text: one sentence on what the data doctor found; empty where nobody looked.
         protocol: by which those runs were made.
-        one_sided: what the doctor said of logs that turn to one side, or to none; free runs on such
+        one_sided_text: what the doctor said of logs that turn to one side, or to none; free runs on such
             logs cannot tell how the model turns.
     """
 
     selected: str
     split: str
-    rows: Mapping[str, Content]
+    rows_by_model: Mapping[str, JsonObject]
     baseline: str = ""
-    selection: Content = field(default_factory=dict)
-    limits: Content = field(default_factory=dict)
-    doctor: str = ""
+    selection: JsonObject = field(default_factory=dict)
+    limits_by_protocol: JsonObject = field(default_factory=dict)
+    data_quality_text: str = ""
     protocol: str = ""
-    one_sided: str = ""
+    one_sided_text: str = ""
 
 
-LEVELS = {
+LEVEL_TEXTS = {
     "good": "✓ Good",
     "limited": "! Limited",
     "do not use": "✗ Do not use",
@@ -67,328 +79,441 @@ LEVELS = {
 }
 """How far the selected model may be used, and the words for it, the best first; the last says that
 nobody can know. What they look like stands in the page's styles."""
-GOOD, LIMITED, USELESS, UNKNOWN = LEVELS
-_FEWEST = 5
+GOOD_LEVEL, LIMITED_LEVEL, DO_NOT_USE, TOO_FEW_WINDOWS = LEVEL_TEXTS
+_MIN_WINDOWS = 5
 """Windows below which nothing is said of how good a model is."""
-FEW_LOGS = 3
+MIN_LOGS_FOR_INTERVAL = 3
 """Logs below which there is no interval, and so nothing is said either."""
-_SHARE, _TURN = 0.10, math.radians(10.0)
+_MAX_DISTANCE_SHARE, _MAX_ANGLE_ERROR = 0.10, math.radians(10.0)
 """What a good model is off at most: this share of the way sailed and so many radians of heading,
 at the upper end of the interval, or twice the noise floor. It is residnet's choice, and stands in
 the verdict, so that a reader with other needs can choose another."""
-_WORDS = {"depth": " of depth", "attitude": " of attitude"}
+_POSE_ERROR_SUFFIXES = {"depth": " of depth", "attitude": " of attitude"}
 """What stands behind an error of the pose that is no distance over ground and no heading."""
-_OF_BEST = 1.5
+_MAX_RATIO_TO_BEST = 1.5
 """A good model errs at most so many times as much as the best one of the run, floor aside."""
 
 
-def verdict(evidence: Evidence) -> list[str]:
+def write_verdict(evidence: VerdictEvidence) -> list[str]:
     """Return the verdict sentence by sentence, the most important first.
 
     It says how far off the selected model is in metres and degrees after the times that matter,
-    what the doctor found in the data, how it fares beside `zero`, the baseline and the noise floor,
+    what the doctor found in the data, how it fares beside `constant_velocity_row`, the baseline and the noise floor,
     for how many windows and which speeds that holds, how its velocities compare, what speaks
     against it and why it was selected, and how much of the data lies outside the training range.
     What the files do not hold is left out.
     """
-    first, *rest = [compared(evidence)] if useless(evidence) else ahead(evidence)
+    lead_sentence, *horizon_sentences = (
+        [compare_velocity_errors(evidence)] if is_useless(evidence) else describe_horizons(evidence)
+    )
     sentences = [
-        first,
-        f"That is no more than limited, for {evidence.one_sided}." * bool(evidence.one_sided),
-        evidence.doctor,
-        *rest,
-        soundness(evidence),
+        lead_sentence,
+        f"That is no more than limited, for {evidence.one_sided_text}."
+        * bool(evidence.one_sided_text),
+        evidence.data_quality_text,
+        *horizon_sentences,
+        describe_soundness(evidence),
         str(evidence.selection.get("reason", "")),
-        outside(evidence),
+        describe_extrapolation(evidence),
     ]
     return [sentence for sentence in sentences if sentence]
 
 
-def level(evidence: Evidence) -> str:
-    """Return a key of `LEVELS`; empty where the selected model has no free runs."""
-    if useless(evidence):
-        return USELESS
-    if evidence.selected not in evidence.rows:
+def rate_model(evidence: VerdictEvidence) -> str:
+    """Return a key of `LEVEL_TEXTS`; empty where the selected model has no free runs."""
+    if is_useless(evidence):
+        return DO_NOT_USE
+    if evidence.selected not in evidence.rows_by_model:
         return ""
-    entries = horizons(evidence)
-    if entries and not any(_enough(evidence, entry) for entry in entries):
-        return UNKNOWN
-    return GOOD if good_until(evidence) and not evidence.one_sided else LIMITED
+    horizon_entries = known_horizons(evidence)
+    if horizon_entries and not any(_has_enough_data(evidence, entry) for entry in horizon_entries):
+        return TOO_FEW_WINDOWS
+    return (
+        GOOD_LEVEL
+        if longest_good_horizon(evidence) and not evidence.one_sided_text
+        else LIMITED_LEVEL
+    )
 
 
-def horizons(evidence: Evidence) -> list[Content]:
+def known_horizons(evidence: VerdictEvidence) -> list[JsonObject]:
     """Return the horizons at which the errors of the selected model are known, the nearest first.
 
     They are those of the protocol of the rows, each by the protocol of which most windows last so
     long, named as its `protocol`.
     """
-    most: dict[float, dict[str, Any]] = {}
-    for protocol in sorted(evidence.limits, key=lambda name: name != evidence.protocol):
-        for entry in evidence.limits[protocol].get("horizons") or []:
-            seconds, known = entry["seconds"], evidence.selected in entry["models"]
-            if seconds in most:
-                known &= entry["windows"] > most[seconds]["windows"]
+    entry_by_time: dict[float, dict[str, Any]] = {}
+    for protocol in sorted(evidence.limits_by_protocol, key=lambda name: name != evidence.protocol):
+        for horizon_entry in evidence.limits_by_protocol[protocol].get("horizons") or []:
+            seconds, has_selected_model = (
+                horizon_entry["seconds"],
+                evidence.selected in horizon_entry["models"],
+            )
+            if seconds in entry_by_time:
+                has_selected_model &= horizon_entry["windows"] > entry_by_time[seconds]["windows"]
             elif protocol != evidence.protocol:
-                known = False
-            if known:
-                most[seconds] = {**entry, "protocol": protocol}
-    return [most[seconds] for seconds in sorted(most)]
+                has_selected_model = False
+            if has_selected_model:
+                entry_by_time[seconds] = {**horizon_entry, "protocol": protocol}
+    return [entry_by_time[seconds] for seconds in sorted(entry_by_time)]
 
 
-def _enough(evidence: Evidence, entry: Content) -> bool:
+def _has_enough_data(evidence: VerdictEvidence, horizon_entry: JsonObject) -> bool:
     """Return whether a horizon has windows, and logs for an interval, by which to judge a model."""
-    known = all(entry["models"][evidence.selected]["intervals"].values())
-    return known and entry["windows"] >= _FEWEST
+    has_intervals = all(horizon_entry["models"][evidence.selected]["intervals"].values())
+    return has_intervals and horizon_entry["windows"] >= _MIN_WINDOWS
 
 
-def _own(evidence: Evidence) -> Content:
+def _protocol_limits(evidence: VerdictEvidence) -> JsonObject:
     """Return what limits.json says under the protocol of the rows."""
-    found: Content = evidence.limits.get(evidence.protocol) or {}
-    return found
+    limits: JsonObject = evidence.limits_by_protocol.get(evidence.protocol) or {}
+    return limits
 
 
-def good_until(evidence: Evidence) -> float:
+def longest_good_horizon(evidence: VerdictEvidence) -> float:
     """Return the time in s up to which the selected model is good; 0 where it never is."""
-    row, until = evidence.rows[evidence.selected], 0.0
-    if row.get("diverged") and evidence.split in UNSEEN:
+    row, longest_horizon = evidence.rows_by_model[evidence.selected], 0.0
+    if row.get("diverged") and evidence.split in UNSEEN_SPLITS:
         return 0.0
-    plants = {name for name, row in evidence.rows.items() if row.get("kind") == "truth"}
-    for entry in horizons(evidence):
-        if not _enough(evidence, entry):
-            return until
-        models = entry["models"]
-        own, ends = models[evidence.selected], models[evidence.selected]["intervals"]
-        # what the plant itself leaves, started from measured states, is noise too
-        floors = [entry["floor"], *(models[name] for name in plants & set(models))]
-        rivals = set(models) - {evidence.selected} - plants
-        for of in ends:
-            least = _TURN if END_UNITS[of] == "rad" else _SHARE * entry["sailed"]
-            others = [models[name][of] for name in rivals]
-            twice = 2.0 * max(floor[of] for floor in floors)
-            near = own[of] <= max(twice, _OF_BEST * min(others, default=own[of]))
-            beats = ZERO not in models or own[of] <= max(twice, models[ZERO][of])
-            if not (near and beats and ends[of][1] <= max(least, twice)):
-                return until
-        until = float(entry["seconds"])
-    return until
-
-
-def ahead(evidence: Evidence) -> list[str]:
-    """Return how far off the selected model is after the times that matter, beside others."""
-    entries = horizons(evidence)
-    if not entries:
-        return [compared(evidence)]
-    ends = [of for of in END_UNITS if of in entries[0]["floor"]]
-    enough = [entry for entry in entries if _enough(evidence, entry)]
-    until = good_until(evidence) if enough else 0.0
-    chosen = next((e for e in entries if e["seconds"] == until), (enough or entries)[-1])
-    off = _off(chosen, evidence.selected, chosen["sailed"])
-    after, wanted = f"{number(chosen['seconds'], 2)} s ahead", []
-    if not enough:
-        start = (
-            f"{plural(chosen['windows'], 'window')} of {plural(chosen['logs'], 'log')} on"
-            f" {evidence.split} data cannot say how good {evidence.selected} is ({_FEWEST} of"
-            f" {FEW_LOGS} logs are needed); {after} it is off by {off}."
+    plant_models = {
+        name for name, row in evidence.rows_by_model.items() if row.get("kind") == "truth"
+    }
+    for horizon_entry in known_horizons(evidence):
+        if not _has_enough_data(evidence, horizon_entry):
+            return longest_horizon
+        models = horizon_entry["models"]
+        selected_errors, error_intervals = (
+            models[evidence.selected],
+            models[evidence.selected]["intervals"],
         )
-    elif until:
-        start = f"Up to {after}, where {evidence.selected} is off by {off}."
+        # what the plant itself leaves, started from measured states, is noise too
+        noise_floors = [
+            horizon_entry["floor"],
+            *(models[name] for name in plant_models & set(models)),
+        ]
+        rival_models = set(models) - {evidence.selected} - plant_models
+        for error_name in error_intervals:
+            error_limit = (
+                _MAX_ANGLE_ERROR
+                if POSE_ERROR_UNITS[error_name] == "rad"
+                else _MAX_DISTANCE_SHARE * horizon_entry["sailed"]
+            )
+            rival_errors = [models[name][error_name] for name in rival_models]
+            twice_noise_floor = 2.0 * max(noise_floor[error_name] for noise_floor in noise_floors)
+            is_near_best = selected_errors[error_name] <= max(
+                twice_noise_floor,
+                _MAX_RATIO_TO_BEST * min(rival_errors, default=selected_errors[error_name]),
+            )
+            beats_constant_velocity = CONSTANT_VELOCITY not in models or selected_errors[
+                error_name
+            ] <= max(twice_noise_floor, models[CONSTANT_VELOCITY][error_name])
+            if not (
+                is_near_best
+                and beats_constant_velocity
+                and error_intervals[error_name][1] <= max(error_limit, twice_noise_floor)
+            ):
+                return longest_horizon
+        longest_horizon = float(horizon_entry["seconds"])
+    return longest_horizon
+
+
+def describe_horizons(evidence: VerdictEvidence) -> list[str]:
+    """Return how far off the selected model is after the times that matter, beside others."""
+    horizon_entries = known_horizons(evidence)
+    if not horizon_entries:
+        return [compare_velocity_errors(evidence)]
+    error_names = [
+        error_name for error_name in POSE_ERROR_UNITS if error_name in horizon_entries[0]["floor"]
+    ]
+    sufficient_entries = [
+        horizon_entry
+        for horizon_entry in horizon_entries
+        if _has_enough_data(evidence, horizon_entry)
+    ]
+    longest_horizon = longest_good_horizon(evidence) if sufficient_entries else 0.0
+    main_entry = next(
+        (
+            candidate_entry
+            for candidate_entry in horizon_entries
+            if candidate_entry["seconds"] == longest_horizon
+        ),
+        (sufficient_entries or horizon_entries)[-1],
+    )
+    error_text = _format_errors_with_intervals(main_entry, evidence.selected, main_entry["sailed"])
+    horizon_text, criterion_sentences = f"{format_number(main_entry['seconds'], 2)} s ahead", []
+    if not sufficient_entries:
+        lead_sentence = (
+            f"{format_count(main_entry['windows'], 'window')} of {format_count(main_entry['logs'], 'log')} on"
+            f" {evidence.split} data cannot say how good {evidence.selected} is ({_MIN_WINDOWS} of"
+            f" {MIN_LOGS_FOR_INTERVAL} logs are needed); {horizon_text} it is off by {error_text}."
+        )
+    elif longest_horizon:
+        lead_sentence = f"Up to {horizon_text}, where {evidence.selected} is off by {error_text}."
     else:
-        start = f"{after[0].upper()}{after[1:]} {evidence.selected} is off by {off}."
-        limits = {
-            "m": f"{100.0 * _SHARE:.0f} % of the way",
-            "rad": f"{math.degrees(_TURN):.0f} deg",
+        lead_sentence = f"{horizon_text[0].upper()}{horizon_text[1:]} {evidence.selected} is off by {error_text}."
+        limits_by_unit = {
+            "m": f"{100.0 * _MAX_DISTANCE_SHARE:.0f} % of the way",
+            "rad": f"{math.degrees(_MAX_ANGLE_ERROR):.0f} deg",
         }
-        good = listed(list(dict.fromkeys(limits[END_UNITS[of]] for of in ends)))
-        wanted = [
-            f"Good would be within {good} up to the upper end of the interval, or twice the noise"
+        good_limits_text = join_list(
+            list(
+                dict.fromkeys(
+                    limits_by_unit[POSE_ERROR_UNITS[error_name]] for error_name in error_names
+                )
+            )
+        )
+        criterion_sentences = [
+            f"Good would be within {good_limits_text} up to the upper end of the interval, or twice the noise"
             " floor, without a diverged window and near the best model of the run."
         ]
-    named = {ZERO: ZERO, evidence.baseline: "the baseline"}
-    beside = [
-        f"{word} {_off(chosen, name)}"
-        for name, word in named.items()
-        if name in chosen["models"] and name != evidence.selected
+    reference_labels = {CONSTANT_VELOCITY: CONSTANT_VELOCITY, evidence.baseline: "the baseline"}
+    reference_texts = [
+        f"{label} {_format_errors_with_intervals(main_entry, name)}"
+        for name, label in reference_labels.items()
+        if name in main_entry["models"] and name != evidence.selected
     ]
     # a pose that was integrated from the velocities has no floor but rounding
-    known = any(chosen["floor"][of] > 1e-9 for of in ends)
-    floor = f"the noise floor (measured velocities, integrated) {_pair(chosen['floor'])}"
-    rest = [
-        f"{_pair(entry['models'][evidence.selected])} after {entry['seconds']:.4g} s"
-        for entry in entries
-        if entry is not chosen
+    has_noise_floor = any(main_entry["floor"][error_name] > 1e-9 for error_name in error_names)
+    noise_floor_text = f"the noise floor (measured velocities, integrated) {_format_pose_errors(main_entry['floor'])}"
+    other_horizons = [
+        f"{_format_pose_errors(horizon_entry['models'][evidence.selected])} after {horizon_entry['seconds']:.4g} s"
+        for horizon_entry in horizon_entries
+        if horizon_entry is not main_entry
     ]
-    moves = "position" in ends
-    holds = (
-        f"It holds for {plural(chosen['windows'], 'free run')} ({chosen['protocol']}) of"
-        f" {plural(chosen['logs'], 'log')}"
-        + f" at mean speeds of {number(chosen['slowest'], 2)} to"
-        f" {number(chosen['fastest'], 2)} m/s" * moves + "."
+    has_position = "position" in error_names
+    scope_sentence = (
+        f"It holds for {format_count(main_entry['windows'], 'free run')} ({main_entry['protocol']}) of"
+        f" {format_count(main_entry['logs'], 'log')}"
+        + f" at mean speeds of {format_number(main_entry['slowest'], 2)} to"
+        f" {format_number(main_entry['fastest'], 2)} m/s" * has_position + "."
     )
     return [
-        start,
-        f"Beside it: {'; '.join([*beside, *([floor] if known else [])])}.",
-        *wanted,
-        *([f"At other times of these free runs: {'; '.join(rest)}."] if rest else []),
-        holds,
-        compared(evidence),
+        lead_sentence,
+        f"Beside it: {'; '.join([*reference_texts, *([noise_floor_text] if has_noise_floor else [])])}.",
+        *criterion_sentences,
+        *(
+            [f"At other times of these free runs: {'; '.join(other_horizons)}."]
+            if other_horizons
+            else []
+        ),
+        scope_sentence,
+        compare_velocity_errors(evidence),
     ]
 
 
-def sized(of: str, error: float) -> str:
+def format_pose_error(error_name: str, error: float) -> str:
     """Return an error of the pose (`END_UNITS`) with its unit."""
-    unit, factor = shown_unit(END_UNITS[of])
-    return f"{number(factor * error, 2)} {unit}{_WORDS.get(of, '')}"
+    unit, unit_factor = display_unit(POSE_ERROR_UNITS[error_name])
+    return (
+        f"{format_number(unit_factor * error, 2)} {unit}{_POSE_ERROR_SUFFIXES.get(error_name, '')}"
+    )
 
 
-def _pair(errors: Content) -> str:
-    return listed([sized(of, errors[of]) for of in END_UNITS if of in errors])
+def _format_pose_errors(errors: JsonObject) -> str:
+    return join_list(
+        [
+            format_pose_error(error_name, errors[error_name])
+            for error_name in POSE_ERROR_UNITS
+            if error_name in errors
+        ]
+    )
 
 
-def _off(entry: Content, name: str, sailed: float = 0.0) -> str:
+def _format_errors_with_intervals(
+    horizon_entry: JsonObject, model_name: str, distance_travelled: float = 0.0
+) -> str:
     """Return errors of position and heading with their intervals as text."""
-    own, out = entry["models"][name], []
-    for of in (of for of in END_UNITS if of in own):
-        ends, text = own["intervals"][of], sized(of, own[of])
-        details = [interval(ends, shown_unit(END_UNITS[of])[1], 2)] if ends else []
-        if of == "position" and sailed > 0.0:
+    model_errors, texts = horizon_entry["models"][model_name], []
+    for error_name in (error_name for error_name in POSE_ERROR_UNITS if error_name in model_errors):
+        interval_limits, error_text = (
+            model_errors["intervals"][error_name],
+            format_pose_error(error_name, model_errors[error_name]),
+        )
+        details = (
+            [format_interval(interval_limits, display_unit(POSE_ERROR_UNITS[error_name])[1], 2)]
+            if interval_limits
+            else []
+        )
+        if error_name == "position" and distance_travelled > 0.0:
             details.append(
-                f"{number(100.0 * own[of] / sailed, 2)} % of the {number(sailed, 2)} m sailed"
+                f"{format_number(100.0 * model_errors[error_name] / distance_travelled, 2)} % of the {format_number(distance_travelled, 2)} m sailed"
             )
-        out.append(text + (f" ({', '.join(details)})" if details else ""))
-    known = all(own["intervals"].values()) or sailed == 0.0
-    return listed(out) + ("" if known else ", from too few logs for an interval")
+        texts.append(error_text + (f" ({', '.join(details)})" if details else ""))
+    has_intervals = all(model_errors["intervals"].values()) or distance_travelled == 0.0
+    return join_list(texts) + ("" if has_intervals else ", from too few logs for an interval")
 
 
-def objections(evidence: Evidence) -> list[str]:
+def list_model_objections(evidence: VerdictEvidence) -> list[str]:
     """Return what speaks against using the model at all, as `residnet.export.base.released` asks.
 
-    A model is to be better than `zero`, and than the model that it was built on.
+    A model is to be better than `constant_velocity_row`, and than the model that it was built on.
     """
-    own = evidence.rows.get(evidence.selected)
-    if own is None:
+    selected_row = evidence.rows_by_model.get(evidence.selected)
+    if selected_row is None:
         return []
     return [
-        f"on {evidence.split} data its NRMSE is {number(_nrmse(own))}, that of {other}"
-        f" {number(_nrmse(row))}"
-        for other in dict.fromkeys((ZERO, evidence.baseline))
-        if (row := evidence.rows.get(other)) is not None and _nrmse(own) > _nrmse(row)
+        f"on {evidence.split} data its NRMSE is {format_number(_mean_nrmse(selected_row))}, that of {reference_name}"
+        f" {format_number(_mean_nrmse(reference_row))}"
+        for reference_name in dict.fromkeys((CONSTANT_VELOCITY, evidence.baseline))
+        if (reference_row := evidence.rows_by_model.get(reference_name)) is not None
+        and _mean_nrmse(selected_row) > _mean_nrmse(reference_row)
     ]
 
 
-def useless(evidence: Evidence) -> bool:
-    """Return whether the selected model is `zero`, or is not shown to be better.
+def is_useless(evidence: VerdictEvidence) -> bool:
+    """Return whether the selected model is `constant_velocity_row`, or is not shown to be better.
 
     Then no range is to be trusted.
     """
-    own, zero = evidence.rows.get(evidence.selected), evidence.rows.get(ZERO)
-    if evidence.selected == ZERO:
+    selected_row, constant_velocity_row = (
+        evidence.rows_by_model.get(evidence.selected),
+        evidence.rows_by_model.get(CONSTANT_VELOCITY),
+    )
+    if evidence.selected == CONSTANT_VELOCITY:
         return True
-    if own is None or zero is None:
+    if selected_row is None or constant_velocity_row is None:
         return False
-    return _nrmse(own) >= _nrmse(zero) or _alike(evidence, ZERO)
+    return _mean_nrmse(selected_row) >= _mean_nrmse(constant_velocity_row) or _is_indistinguishable(
+        evidence, CONSTANT_VELOCITY
+    )
 
 
-def compared(evidence: Evidence) -> str:
-    """Return how the velocities of the selected model compare with `zero` and the baseline."""
-    name, split = evidence.selected, evidence.split
-    if name == ZERO:
+def compare_velocity_errors(evidence: VerdictEvidence) -> str:
+    """Return how the velocities of the selected model compare with `constant_velocity_row` and the baseline."""
+    model_name, split = evidence.selected, evidence.split
+    if model_name == CONSTANT_VELOCITY:
         return (
             "NOTHING BEATS ZERO, which only holds the velocities that a run starts from: no model"
             " of this run is of use for prediction."
         )
-    own, zero = evidence.rows.get(name), evidence.rows.get(ZERO)
-    if own is None:
+    selected_row, constant_velocity_row = (
+        evidence.rows_by_model.get(model_name),
+        evidence.rows_by_model.get(CONSTANT_VELOCITY),
+    )
+    if selected_row is None:
         return f"The run holds no free runs of its selected model on {split} data."
-    error = _nrmse(own)
-    if zero is not None and useless(evidence):
-        than = "NO BETTER" if _nrmse(own) <= _nrmse(zero) else "WORSE"
+    selected_nrmse = _mean_nrmse(selected_row)
+    if constant_velocity_row is not None and is_useless(evidence):
+        comparison_text = (
+            "NO BETTER"
+            if _mean_nrmse(selected_row) <= _mean_nrmse(constant_velocity_row)
+            else "WORSE"
+        )
         return (
-            f"{than} THAN ZERO: on {split} data the selected model {name} has an NRMSE of"
-            f" {number(error)}{_lost(own)}, and zero, which only holds the velocities that a run"
-            f" starts from, {number(_nrmse(zero))}{_paired(evidence, ZERO)}. DO NOT USE it for"
+            f"{comparison_text} THAN ZERO: on {split} data the selected model {model_name} has an NRMSE of"
+            f" {format_number(selected_nrmse)}{_diverged_suffix(selected_row)}, and zero, which only holds the velocities that a run"
+            f" starts from, {format_number(_mean_nrmse(constant_velocity_row))}{_format_paired_interval(evidence, CONSTANT_VELOCITY)}. DO NOT USE it for"
             " prediction."
         )
-    parts = []
-    for other, row in ((ZERO, zero), (evidence.baseline, evidence.rows.get(evidence.baseline))):
-        if row is None or other == name:
+    comparisons = []
+    for reference_name, reference_row in (
+        (CONSTANT_VELOCITY, constant_velocity_row),
+        (evidence.baseline, evidence.rows_by_model.get(evidence.baseline)),
+    ):
+        if reference_row is None or reference_name == model_name:
             continue
-        change = 100.0 * (1.0 - error / _nrmse(row)) if _nrmse(row) > 0 else 0.0
-        word = "better" if change >= 0 else "WORSE"
-        shown = f"the {other}" if other == "baseline" else other
-        parts.append(f"{abs(change):.0f} % {word} than {shown}{_paired(evidence, other)}")
-    better = f" is {' and '.join(parts)};" if parts else ""
-    return f"On {split} data model {name}{better} its NRMSE is {number(error)}{_lost(own)}."
+        percent_change = (
+            100.0 * (1.0 - selected_nrmse / _mean_nrmse(reference_row))
+            if _mean_nrmse(reference_row) > 0
+            else 0.0
+        )
+        comparison = "better" if percent_change >= 0 else "WORSE"
+        reference_label = (
+            f"the {reference_name}" if reference_name == "baseline" else reference_name
+        )
+        comparisons.append(
+            f"{abs(percent_change):.0f} % {comparison} than {reference_label}{_format_paired_interval(evidence, reference_name)}"
+        )
+    comparison_clause = f" is {' and '.join(comparisons)};" if comparisons else ""
+    return f"On {split} data model {model_name}{comparison_clause} its NRMSE is {format_number(selected_nrmse)}{_diverged_suffix(selected_row)}."
 
 
-def soundness(evidence: Evidence) -> str:
+def describe_soundness(evidence: VerdictEvidence) -> str:
     """Return whether the selected model is sound, empty where nobody looked."""
-    known = {row["model"]: row for row in evidence.selection.get("models", [])}
-    entry = known.get(evidence.selected)
-    if entry is None or evidence.selected == ZERO:
+    selection_rows = {
+        selected_row["model"]: selected_row for selected_row in evidence.selection.get("models", [])
+    }
+    selection_row = selection_rows.get(evidence.selected)
+    if selection_row is None or evidence.selected == CONSTANT_VELOCITY:
         return ""
-    row = evidence.rows.get(evidence.selected)
-    lost = int(row["diverged"]) if row is not None else 0
-    faults = list(entry["faults"])
-    if lost and row is not None and evidence.split in UNSEEN:
-        faults.append(f"{lost} of its {row['windows']} {evidence.split} windows diverged")
+    selected_row = evidence.rows_by_model.get(evidence.selected)
+    n_diverged = int(selected_row["diverged"]) if selected_row is not None else 0
+    faults = list(selection_row["faults"])
+    if n_diverged and selected_row is not None and evidence.split in UNSEEN_SPLITS:
+        faults.append(
+            f"{n_diverged} of its {selected_row['windows']} {evidence.split} windows diverged"
+        )
     if faults:
         return f"It is UNSOUND: {'; '.join(faults)}."
     return "No window diverged, and no check of its physics speaks against it."
 
 
-def outside(evidence: Evidence) -> str:
+def describe_extrapolation(evidence: VerdictEvidence) -> str:
     """Return how much of the data lies outside the training range, empty where nobody looked."""
-    found = _own(evidence).get("outside") or {}
-    if not found:
+    range_summary = _protocol_limits(evidence).get("outside") or {}
+    if not range_summary:
         return ""
-    share = float(found["share"])
-    if share == 0:
+    outside_share = float(range_summary["share"])
+    if outside_share == 0:
         return f"All {evidence.split} data lie inside the range of the training data."
-    channels = sorted(found["channels"].items(), key=lambda pair: -pair[1])[:3]
-    named = ", ".join(f"{name} {_percent(part)}" for name, part in channels)
+    channels = sorted(range_summary["channels"].items(), key=lambda pair: -pair[1])[:3]
+    channel_texts = ", ".join(
+        f"{name} {_format_percent(channel_share)}" for name, channel_share in channels
+    )
     return (
-        f"Of the {evidence.split} data, {_percent(share)} lies outside the range of the training"
-        f" data ({named}); nothing is known of the model there but these runs."
+        f"Of the {evidence.split} data, {_format_percent(outside_share)} lies outside the range of the training"
+        f" data ({channel_texts}); nothing is known of the model there but these runs."
     )
 
 
-def diverged_note(row: Content) -> str:
+def describe_divergence(metrics_row: JsonObject) -> str:
     """Return what stands beside the score of a row with divergences, else an empty text."""
-    return f"{row['diverged']}/{row['windows']} diverged" if row.get("diverged") else ""
+    return (
+        f"{metrics_row['diverged']}/{metrics_row['windows']} diverged"
+        if metrics_row.get("diverged")
+        else ""
+    )
 
 
-def _nrmse(row: Content) -> float:
+def _mean_nrmse(row: JsonObject) -> float:
     return float(row["nrmse"]["mean"])
 
 
-def _lost(row: Content) -> str:
-    note = diverged_note(row)
-    return f" ({note}, which count with the error of zero)" if note else ""
+def _diverged_suffix(row: JsonObject) -> str:
+    divergence_note = describe_divergence(row)
+    return f" ({divergence_note}, which count with the error of zero)" if divergence_note else ""
 
 
-def _difference(evidence: Evidence, other: str) -> Content:
+def _difference_to(evidence: VerdictEvidence, reference_name: str) -> JsonObject:
     """Return the difference to another model, empty where nobody looked."""
-    compared = (_own(evidence).get("compared") or {}).get(evidence.selected) or {}
-    return compared.get(other) or {}
+    differences = (_protocol_limits(evidence).get("compared") or {}).get(evidence.selected) or {}
+    return differences.get(reference_name) or {}
 
 
-def _alike(evidence: Evidence, other: str) -> bool:
+def _is_indistinguishable(evidence: VerdictEvidence, reference_name: str) -> bool:
     """Return whether there is an interval of the difference to another model that holds zero."""
-    found = _difference(evidence, other)
-    return bool(found) and found["ci95"] is not None and not found["excludes_zero"]
+    paired_difference = _difference_to(evidence, reference_name)
+    return (
+        bool(paired_difference)
+        and paired_difference["ci95"] is not None
+        and not paired_difference["excludes_zero"]
+    )
 
 
-def _paired(evidence: Evidence, other: str) -> str:
+def _format_paired_interval(evidence: VerdictEvidence, reference_name: str) -> str:
     """The paired interval of the difference to another model in brackets, where there is one."""
-    found = _difference(evidence, other)
-    if not found:
+    paired_difference = _difference_to(evidence, reference_name)
+    if not paired_difference:
         return ""
-    if found["ci95"] is None:
+    if paired_difference["ci95"] is None:
         return " (too few logs for an interval)"
-    low, high = found["ci95"]
-    doubt = "" if found["excludes_zero"] else ", which holds zero: the data cannot tell them apart"
-    return f" (paired 95 % interval of the difference {low:+.3g} to {high:+.3g}{doubt})"
+    lower, upper = paired_difference["ci95"]
+    suffix = (
+        ""
+        if paired_difference["excludes_zero"]
+        else ", which holds zero: the data cannot tell them apart"
+    )
+    return f" (paired 95 % interval of the difference {lower:+.3g} to {upper:+.3g}{suffix})"
 
 
-def _percent(share: float) -> str:
-    return f"{number(100.0 * share, 2)} %" if share >= 0.001 else "less than 0.1 %"
+def _format_percent(share: float) -> str:
+    return f"{format_number(100.0 * share, 2)} %" if share >= 0.001 else "less than 0.1 %"

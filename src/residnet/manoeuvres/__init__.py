@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
-from residnet.core.registry import Kinds
+from residnet.core.registry import PluginUnion
 
 if TYPE_CHECKING:
     from residnet.manoeuvres.base import Manoeuvre
@@ -42,7 +42,7 @@ else:
     )
     ManoeuvreConfig = Annotated[
         Any,
-        Kinds(
+        PluginUnion(
             "residnet.manoeuvres",
             "residnet.manoeuvres.base:Manoeuvre",
             {
@@ -66,7 +66,7 @@ else:
     ]
     FamilyConfig = Annotated[
         Any,
-        Kinds(
+        PluginUnion(
             "residnet.families",
             "residnet.core.config:Config",
             {

@@ -25,12 +25,12 @@ from residnet.dynamics.rollout import Source
 from residnet.physics.actuators import ForceActuators, ForceCommands
 from residnet.physics.plant import HullPlant, Plant
 
-Demand = Callable[[Tensor, Tensor], Tensor]
+DemandFunction = Callable[[Tensor, Tensor], Tensor]
 """Turns drive [...] and steer [...] into commands [..., c], the first c columns of the inputs."""
 
 Range = tuple[float, float]
 
-RUDDERS = ("cmd_delta", "delta")
+RUDDER_INPUTS = ("cmd_delta", "delta")
 """Names of the input that is a rudder angle."""
 
 
@@ -46,17 +46,17 @@ class Helm:
             vessel that cannot make all three.
         side_force: largest commanded sway force in N; None for a vessel whose commands are no
             forces.
-        diving: commands [c] that make the vessel dive with all its force; None where it cannot.
+        dive_commands: commands [c] that make the vessel dive with all its force; None where it cannot.
     """
 
-    demand: Demand
+    demand: DemandFunction
     state: tuple[str, ...]
     inputs: tuple[str, ...] = ()
     forces: Callable[[Tensor], Tensor] | None = None
     side_force: float | None = None
-    diving: Tensor | None = None
+    dive_commands: Tensor | None = None
 
-    def commanded(self, drive: Tensor, steer: Tensor, *dive: Tensor) -> Tensor:
+    def commands_for(self, drive: Tensor, steer: Tensor, *dive: Tensor) -> Tensor:
         """Return the commands [..., c] for shares of drive and steer, and of diving if any [...].
 
         Raises:
@@ -64,12 +64,12 @@ class Helm:
         """
         commands = self.demand(drive, steer)
         for share in dive:
-            if self.diving is None:
+            if self.dive_commands is None:
                 raise UsageError(
                     "the manoeuvre dives, and the vessel does not; give a vessel with all six"
                     " degrees of freedom, or a manoeuvre without dive"
                 )
-            commands = commands + share.unsqueeze(-1) * self.diving.to(commands.dtype)
+            commands = commands + share.unsqueeze(-1) * self.dive_commands.to(commands.dtype)
         return commands
 
     @classmethod
@@ -79,13 +79,20 @@ class Helm:
         side_force: float | None = None
         if isinstance(plant, HullPlant) and isinstance(plant.actuators, ForceCommands):
             side_force = float(plant.actuators.limit[1])
-        if plant.inputs[: plant.commands] == ForceCommands.commands:
+        if plant.input_names[: plant.n_commands] == ForceCommands.command_names:
             forces = torch.Tensor.clone
         elif isinstance(plant, HullPlant) and isinstance(plant.actuators, ForceActuators):
             forces = plant.actuators.allocate
-        return cls(plant.demand, plant.state, plant.inputs, forces, side_force, plant.diving)
+        return cls(
+            plant.commands_for_demand,
+            plant.state_names,
+            plant.input_names,
+            forces,
+            side_force,
+            plant.dive_commands,
+        )
 
-    def column(self, name: str) -> int:
+    def state_column(self, name: str) -> int:
         """Return the column of a state.
 
         Raises:
@@ -99,16 +106,18 @@ class Helm:
         return self.state.index(name)
 
     @property
-    def hard_over(self) -> float | None:
+    def max_rudder(self) -> float | None:
         """Rudder angle of full steer in rad; None where the vessel has no rudder."""
-        name = next((name for name in RUDDERS if name in self.inputs), None)
+        name = next((name for name in RUDDER_INPUTS if name in self.inputs), None)
         if name is None:
             return None
-        full = self.demand(torch.zeros(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64))
-        return float(full[0, self.inputs.index(name)])
+        full_commands = self.demand(
+            torch.zeros(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+        )
+        return float(full_commands[0, self.inputs.index(name)])
 
 
-def commanded(command: Tensor, w: Tensor) -> Tensor:
+def replace_commands(command: Tensor, w: Tensor) -> Tensor:
     """Return the inputs [B, m] with commands [B, c] in the place of their first columns."""
     return torch.cat((command, w[:, command.shape[-1] :]), dim=-1)
 
@@ -123,51 +132,54 @@ class ScheduleSource(Source):
         self.commands = commands
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        return commanded(self.commands[:, k].to(w.dtype), w), memory
+        return replace_commands(self.commands[:, k].to(w.dtype), w), memory
 
 
-Numbers = dict[str, Tensor]
+BatchParameters = dict[str, Tensor]
 """What rows of a batch are told by their manoeuvres, each [B] or [B, n]."""
 
 
 @final
-class LawSource(Source):
+class ClosedLoopSource(Source):
     """Manoeuvres of one kind that steer by the motion, side by side."""
 
-    def __init__(self, manoeuvres: Sequence[ClosedLoop], helm: Helm, t: Tensor) -> None:
+    def __init__(self, manoeuvres: Sequence[ClosedLoopManoeuvre], helm: Helm, t: Tensor) -> None:
         super().__init__()
-        self.kind = type(manoeuvres[0])
-        rows = [manoeuvre.numbers(helm) for manoeuvre in manoeuvres]
-        self.numbers: Numbers = {
+        self.manoeuvre_type = type(manoeuvres[0])
+        manoeuvre_parameters = [manoeuvre.law_parameters(helm) for manoeuvre in manoeuvres]
+        self.parameters: BatchParameters = {
             name: torch.nn.utils.rnn.pad_sequence(
-                [torch.tensor(row[name], dtype=torch.float64) for row in rows], batch_first=True
+                [torch.tensor(row[name], dtype=torch.float64) for row in manoeuvre_parameters],
+                batch_first=True,
             )
-            if isinstance(rows[0][name], list)
-            else torch.tensor([row[name] for row in rows], dtype=torch.float64)
-            for name in rows[0]
+            if isinstance(manoeuvre_parameters[0][name], list)
+            else torch.tensor([row[name] for row in manoeuvre_parameters], dtype=torch.float64)
+            for name in manoeuvre_parameters[0]
         }
-        self.numbers["dt"] = t[1] - t[0]
-        self.columns = {name: helm.column(name) for name in self.kind.watches}
-        self.commands = helm.commanded
+        self.parameters["dt"] = t[1] - t[0]
+        self.state_columns = {
+            name: helm.state_column(name) for name in self.manoeuvre_type.observed_states
+        }
+        self.demand_commands = helm.commands_for
         self.times = t.tolist()
-        self.may_stop = any(manoeuvre.goal is not None for manoeuvre in manoeuvres)
+        self.may_stop = any(manoeuvre.end_condition is not None for manoeuvre in manoeuvres)
 
     def initial(self, x: Tensor) -> Tensor:
-        return self.kind.memory(*self._seen(x))
+        return self.manoeuvre_type.initial_memory(*self._observe(x))
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the inputs [B, m]; what the motion says is tested at the start of the step."""
-        seen, numbers = self._seen(x)
-        *demands, memory = self.kind.law(seen, numbers, self.times[k], memory)
-        return commanded(self.commands(*demands), w), memory
+        motion, parameters = self._observe(x)
+        *demands, memory = self.manoeuvre_type.step_law(motion, parameters, self.times[k], memory)
+        return replace_commands(self.demand_commands(*demands), w), memory
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """Return the rows [B] whose manoeuvre has come to its end."""
-        return self.kind.ended(*self._seen(x), self.times[k], memory)
+        return self.manoeuvre_type.has_ended(*self._observe(x), self.times[k], memory)
 
-    def _seen(self, x: Tensor) -> tuple[Numbers, Numbers]:
-        seen = {name: x[:, column] for name, column in self.columns.items()}
-        return seen, {name: value.to(x.dtype) for name, value in self.numbers.items()}
+    def _observe(self, x: Tensor) -> tuple[BatchParameters, BatchParameters]:
+        motion = {name: x[:, column] for name, column in self.state_columns.items()}
+        return motion, {name: value.to(x.dtype) for name, value in self.parameters.items()}
 
 
 @final
@@ -177,72 +189,78 @@ class StackedSource(Source):
     def __init__(self, sources: Sequence[Source], rows: Sequence[int]) -> None:
         super().__init__()
         self.sources: Sequence[Source] = torch.nn.ModuleList(sources)  # type: ignore[assignment]
-        self.rows = list(rows)
-        self.widths = [0] * len(self.rows)
+        self.row_counts = list(rows)
+        self.widths = [0] * len(self.row_counts)
         self.may_stop = any(source.may_stop for source in sources)
 
     def initial(self, x: Tensor) -> Tensor:
         """Return the memories of all sources, padded to the widest, [B, k]."""
-        parts = zip(self.sources, x.split(self.rows), strict=True)
-        memories = [source.initial(part) for source, part in parts]
+        blocks = zip(self.sources, x.split(self.row_counts), strict=True)
+        memories = [source.initial(block) for source, block in blocks]
         self.widths = [memory.shape[1] for memory in memories]
-        return torch.cat([self._padded(memory, max(self.widths)) for memory in memories])
+        return torch.cat([self._pad_memory(memory, max(self.widths)) for memory in memories])
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the inputs [B, m], each block of rows from its source."""
         inputs, memories = [], []
         for source, xs, ws, ms in zip(
-            self.sources, x.split(self.rows), w.split(self.rows), self._split(memory), strict=True
+            self.sources,
+            x.split(self.row_counts),
+            w.split(self.row_counts),
+            self._split_memory(memory),
+            strict=True,
         ):
-            acting, after = source(xs, ws, k, ms)
-            inputs.append(acting)
-            memories.append(self._padded(after, memory.shape[1]))
+            source_inputs, next_memory = source(xs, ws, k, ms)
+            inputs.append(source_inputs)
+            memories.append(self._pad_memory(next_memory, memory.shape[1]))
         return torch.cat(inputs), torch.cat(memories)
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """Return which rows [B] have finished, each block of rows by its source."""
-        parts = zip(self.sources, x.split(self.rows), self._split(memory), strict=True)
-        return torch.cat([source.finished(xs, k, ms) for source, xs, ms in parts])
+        blocks = zip(
+            self.sources, x.split(self.row_counts), self._split_memory(memory), strict=True
+        )
+        return torch.cat([source.finished(xs, k, ms) for source, xs, ms in blocks])
 
     @staticmethod
-    def _padded(memory: Tensor, width: int) -> Tensor:
+    def _pad_memory(memory: Tensor, width: int) -> Tensor:
         return torch.nn.functional.pad(memory, (0, width - memory.shape[1]))
 
-    def _split(self, memory: Tensor) -> list[Tensor]:
-        parts = zip(memory.split(self.rows), self.widths, strict=True)
-        return [part[:, :width] for part, width in parts]
+    def _split_memory(self, memory: Tensor) -> list[Tensor]:
+        blocks = zip(memory.split(self.row_counts), self.widths, strict=True)
+        return [block[:, :width] for block, width in blocks]
 
 
 @final
-class Watched(Source):
+class StopRecorder(Source):
     """A source that remembers when its rows stopped.
 
-    `stopped` [B] is the sample at which each did, -1 where it did not.
+    `stop_step` [B] is the sample at which each did, -1 where it did not.
     """
 
     def __init__(self, source: Source, rows: int) -> None:
         super().__init__()
         self.source = source
         self.may_stop = source.may_stop
-        self.stopped = torch.full((rows,), -1)
+        self.stop_step = torch.full((rows,), -1)
 
     def initial(self, x: Tensor) -> Tensor:
-        self.stopped = torch.full((x.shape[0],), -1)
+        self.stop_step = torch.full((x.shape[0],), -1)
         return self.source.initial(x)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        out: tuple[Tensor, Tensor] = self.source(x, w, k, memory)
-        return out
+        inputs_and_memory: tuple[Tensor, Tensor] = self.source(x, w, k, memory)
+        return inputs_and_memory
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """Return the rows that have stopped now or before."""
-        now = self.source.finished(x, k, memory) & (self.stopped < 0)
-        self.stopped = torch.where(now, k, self.stopped)
-        return self.stopped >= 0
+        stops_now = self.source.finished(x, k, memory) & (self.stop_step < 0)
+        self.stop_step = torch.where(stops_now, k, self.stop_step)
+        return self.stop_step >= 0
 
 
 class Manoeuvre(Config, ABC):
-    """One manoeuvre of normalised demands; `kind` names it in logs and metrics.
+    """One manoeuvre of normalised demands; `manoeuvre_type` names it in logs and metrics.
 
     Attributes:
         name: of its log; the kind with a number where None.
@@ -257,7 +275,7 @@ class Manoeuvre(Config, ABC):
 
     @classmethod
     @abstractmethod
-    def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+    def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         """Build the source that flies several manoeuvres of this kind side by side.
 
         Args:
@@ -266,15 +284,15 @@ class Manoeuvre(Config, ABC):
         """
 
     @property
-    def goal(self) -> str | None:
+    def end_condition(self) -> str | None:
         """What the manoeuvre ends at, in words; None where it lasts as long as it is given time."""
         return None
 
-    def lasts(self, duration: float) -> float:
+    def duration_within(self, duration: float) -> float:
         """Return the seconds that the manoeuvre is given, in a programme of `duration`."""
         return duration if self.duration is None else self.duration
 
-    def begin(self, x: Tensor, state: tuple[str, ...]) -> Tensor:
+    def initial_state(self, x: Tensor, state: tuple[str, ...]) -> Tensor:
         """Return the state [nx] that the manoeuvre starts from.
 
         Args:
@@ -282,7 +300,7 @@ class Manoeuvre(Config, ABC):
         """
         return x
 
-    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+    def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
         """Return the manoeuvring indices by name, SI and rad (units in `indices.UNITS`).
 
         Those that the log is too short for are left out.
@@ -293,7 +311,7 @@ class Manoeuvre(Config, ABC):
         """
         return {}
 
-    def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
+    def imo_limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
         """Return the largest values of indices that IMO resolution MSC.137(76) allows, by index.
 
         Args:
@@ -303,45 +321,47 @@ class Manoeuvre(Config, ABC):
         return {}
 
 
-class Scheduled(Manoeuvre):
+class ScheduledManoeuvre(Manoeuvre):
     """An open-loop manoeuvre: its demands are known in advance."""
 
     @abstractmethod
-    def demands(self, t: Tensor) -> tuple[Tensor, ...]:
+    def demands_at(self, t: Tensor) -> tuple[Tensor, ...]:
         """Return drive and steer, and dive where it dives, [T] at times t [T] in s."""
 
     @classmethod
-    def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        pairs = [
-            manoeuvre.demands(t) for manoeuvre in manoeuvres if isinstance(manoeuvre, Scheduled)
+    def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+        demands = [
+            manoeuvre.demands_at(t)
+            for manoeuvre in manoeuvres
+            if isinstance(manoeuvre, ScheduledManoeuvre)
         ]
-        return ScheduleSource(helm.commanded(*map(torch.stack, zip(*pairs, strict=True))))
+        return ScheduleSource(helm.commands_for(*map(torch.stack, zip(*demands, strict=True))))
 
 
-class ClosedLoop(Manoeuvre):
+class ClosedLoopManoeuvre(Manoeuvre):
     """A manoeuvre that demands drive and steer by the motion that it sees.
 
-    Its class methods work on all rows of a batch at once. `seen` holds the states that the kind
-    `watches`, [B] each; `numbers` what the rows' manoeuvres say, and the step `dt` in s.
+    Its class methods work on all rows of a batch at once. `motion` holds the states that the kind
+    `observed_states`, [B] each; `numbers` what the rows' manoeuvres say, and the step `dt` in s.
     """
 
-    watches: ClassVar[tuple[str, ...]]
-    told: ClassVar[tuple[str, ...]] = ("drive", "start")
+    observed_states: ClassVar[tuple[str, ...]]
+    parameter_names: ClassVar[tuple[str, ...]] = ("drive", "start")
     """Settings that the law needs to know as they are."""
 
-    def numbers(self, helm: Helm) -> dict[str, Any]:
+    def law_parameters(self, helm: Helm) -> dict[str, Any]:
         """Return what the law needs to know of this manoeuvre, numbers or lists of them."""
-        return {name: getattr(self, name) for name in self.told}
+        return {name: getattr(self, name) for name in self.parameter_names}
 
     @classmethod
     @abstractmethod
-    def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
+    def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
         """Return the memory [B, k] at the start."""
 
     @classmethod
     @abstractmethod
-    def law(
-        cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor
+    def step_law(
+        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, ...]:
         """Return drive [B], steer [B] and the memory [B, k] for the step that begins at `time`.
 
@@ -349,16 +369,20 @@ class ClosedLoop(Manoeuvre):
         """
 
     @classmethod
-    def ended(cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor) -> Tensor:
+    def has_ended(
+        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+    ) -> Tensor:
         """Return the rows [B] that have reached their goal."""
         return torch.zeros(len(memory), dtype=torch.bool)
 
     @classmethod
-    def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        return LawSource([m for m in manoeuvres if isinstance(m, ClosedLoop)], helm, t)
+    def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+        return ClosedLoopSource(
+            [m for m in manoeuvres if isinstance(m, ClosedLoopManoeuvre)], helm, t
+        )
 
 
-class Family(Config, ABC):
+class ManoeuvreFamily(Config, ABC):
     """Manoeuvres of one kind that are drawn at random.
 
     Attributes:
@@ -368,20 +392,20 @@ class Family(Config, ABC):
     count: int = Field(ge=1, le=10_000)
 
     @abstractmethod
-    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
+    def sample_one(self, generator: np.random.Generator, duration: float) -> Manoeuvre:
         """Draw a manoeuvre of at most `duration` seconds with a random generator."""
 
-    def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
+    def sample_all(self, generator: np.random.Generator, duration: float) -> list[Manoeuvre]:
         """Draw `count` manoeuvres of `duration` seconds with a random generator."""
-        return [self.one(random, duration) for _ in range(self.count)]
+        return [self.sample_one(generator, duration) for _ in range(self.count)]
 
 
-def drawn(random: np.random.Generator, span: Range) -> float:
+def sample_uniform(generator: np.random.Generator, limits: Range) -> float:
     """Return a number that is uniform in a range."""
-    return float(random.uniform(*span))
+    return float(generator.uniform(*limits))
 
 
-class RudderSteering(Config):
+class SteeringConfig(Config):
     """The part that manoeuvres share which a vessel with a rudder may fly by its angle.
 
     Attributes:
@@ -397,7 +421,7 @@ class RudderSteering(Config):
     start: Seconds = Field(default=5.0, ge=0)
 
     @model_validator(mode="after")
-    def _steer_or_rudder(self) -> RudderSteering:
+    def _steer_or_rudder(self) -> SteeringConfig:
         if (self.steer is None) == (self.rudder is None):
             raise ValueError(
                 "give either steer (share of full steer, -1 to 1) or rudder (an angle such as '10"
@@ -410,7 +434,7 @@ class RudderSteering(Config):
         """The side of the demand: +1 where it is positive, -1 where it is negative."""
         return -1.0 if (self.steer if self.steer is not None else self.rudder or 0.0) < 0 else 1.0
 
-    def share(self, helm: Helm) -> float:
+    def steer_share(self, helm: Helm) -> float:
         """Return the share of full steer on a vessel.
 
         Raises:
@@ -426,16 +450,16 @@ def rudder_share(angle: float, helm: Helm) -> float:
     Raises:
         UsageError: where the vessel has no rudder or one that does not go so far.
     """
-    most = helm.hard_over
-    if most is None:
+    max_rudder = helm.max_rudder
+    if max_rudder is None:
         raise UsageError(
             "the manoeuvre gives a rudder angle, but the vessel has no rudder; give steer, a share"
             " of full steer from -1 to 1"
         )
-    share = angle / most
+    share = angle / max_rudder
     if abs(share) > 1.0 + 1e-9:
         raise UsageError(
             f"the manoeuvre asks for {abs(angle) * 57.29578:.4g} deg of rudder, the vessel's goes"
-            f" to {most * 57.29578:.4g} deg"
+            f" to {max_rudder * 57.29578:.4g} deg"
         )
     return share

@@ -14,28 +14,28 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.core.config import Config, Metres, Radians, Seconds
-from residnet.core.frames import upright
+from residnet.core.frames import to_level_axes
 from residnet.core.log import Log
 from residnet.manoeuvres import indices
 from residnet.manoeuvres.base import (
-    ClosedLoop,
-    Family,
+    BatchParameters,
+    ClosedLoopManoeuvre,
     Helm,
     Manoeuvre,
-    Numbers,
+    ManoeuvreFamily,
     Range,
-    RudderSteering,
-    Scheduled,
-    drawn,
+    ScheduledManoeuvre,
+    SteeringConfig,
     rudder_share,
+    sample_uniform,
 )
 
-_FULL_RUDDER, _NEAR = 34.9, 0.05
+_FULL_RUDDER_DEG, _ANGLE_TOLERANCE = 34.9, 0.05
 """Rudder in deg from which IMO's limits of a turning circle hold (35 deg or as much as it goes),
 and the share by which a zigzag may differ from 10/10 or 20/20."""
 
 
-class Zigzag(RudderSteering, ClosedLoop):
+class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
     """Steering to one side until the heading has changed by `heading`, then to the other, repeated.
 
     Source: document 003 section 4.2.2. The memory is the side of the command (+1 starboard, -1
@@ -48,42 +48,48 @@ class Zigzag(RudderSteering, ClosedLoop):
             None: lasts as long as it is given time.
     """
 
-    watches: ClassVar[tuple[str, ...]] = ("psi",)
+    observed_states: ClassVar[tuple[str, ...]] = ("psi",)
     kind: Literal["zigzag"] = "zigzag"
     heading: Radians = Field(gt=0)
     first: Literal["starboard", "port"] = "starboard"
     reversals: int | None = Field(default=None, ge=1)
 
     @property
-    def goal(self) -> str | None:
+    def end_condition(self) -> str | None:
         if self.reversals is None:
             return None
         angle = f"{math.degrees(self.heading):.4g} deg"
         return f"{self.reversals} reversals at {angle} of heading and the way back"
 
     @property
-    def begins(self) -> float:
+    def first_sign(self) -> float:
         """The side of the first execute, +1 starboard or -1 port."""
         return self.side if self.first == "starboard" else -self.side
 
-    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        return indices.zigzag(log, self.start, self.begins, self.heading, length)
+    def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+        return indices.zigzag_indices(log, self.start, self.first_sign, self.heading, length)
 
-    def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
+    def imo_limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
         """Return IMO's limits of the 10/10 and 20/20 zigzag.
 
         Where there is no rudder the heading alone tells which of them it is.
         """
-        angle = self.heading if helm.hard_over is None else abs(self.share(helm)) * helm.hard_over
-        asked = [math.degrees(self.heading), math.degrees(angle)]
+        angle = (
+            self.heading
+            if helm.max_rudder is None
+            else abs(self.steer_share(helm)) * helm.max_rudder
+        )
+        angles_deg = [math.degrees(self.heading), math.degrees(angle)]
         for nominal in (10.0, 20.0):
-            if all(abs(given - nominal) < _NEAR * nominal for given in asked):
+            if all(
+                abs(angle_deg - nominal) < _ANGLE_TOLERANCE * nominal for angle_deg in angles_deg
+            ):
                 return indices.zigzag_limits(nominal, length, speed)
         return {}
 
-    def numbers(self, helm: Helm) -> dict[str, Any]:
-        return super().numbers(helm) | {
-            "steer": self.share(helm),
+    def law_parameters(self, helm: Helm) -> dict[str, Any]:
+        return super().law_parameters(helm) | {
+            "steer": self.steer_share(helm),
             "bound": self.heading,
             "sense": self.side,
             "first": 1.0 if self.first == "starboard" else -1.0,
@@ -91,32 +97,38 @@ class Zigzag(RudderSteering, ClosedLoop):
         }
 
     @classmethod
-    def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
+    def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
         """Return the first side, the present heading and no reversals, [B, 3]."""
-        psi = seen["psi"]
-        return torch.stack((numbers["first"], psi, torch.zeros_like(psi)), dim=-1)
+        psi = motion["psi"]
+        return torch.stack((parameters["first"], psi, torch.zeros_like(psi)), dim=-1)
 
     @classmethod
-    def law(
-        cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor
+    def step_law(
+        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Reverse the side where the heading has reached its bound."""
-        side, origin, count = memory.unbind(-1)
-        turned = side * numbers["sense"] * (seen["psi"] - origin)
-        reached = turned >= numbers["bound"]
-        side = torch.where(reached, -side, side)
-        steer = torch.where(time >= numbers["start"], side * numbers["steer"], 0.0)
-        return numbers["drive"], steer, torch.stack((side, origin, count + reached.to(side)), -1)
+        command_sign, origin, count = memory.unbind(-1)
+        heading_change = command_sign * parameters["sense"] * (motion["psi"] - origin)
+        has_reached = heading_change >= parameters["bound"]
+        command_sign = torch.where(has_reached, -command_sign, command_sign)
+        steer = torch.where(time >= parameters["start"], command_sign * parameters["steer"], 0.0)
+        return (
+            parameters["drive"],
+            steer,
+            torch.stack((command_sign, origin, count + has_reached.to(command_sign)), -1),
+        )
 
     @classmethod
-    def ended(cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor) -> Tensor:
+    def has_ended(
+        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+    ) -> Tensor:
         """Return the rows whose heading is back after their last reversal."""
-        side, origin, count = memory.unbind(-1)
-        back = side * numbers["sense"] * (seen["psi"] - origin) >= 0
-        return (count >= numbers["most"]) & back
+        command_sign, origin, count = memory.unbind(-1)
+        is_back = command_sign * parameters["sense"] * (motion["psi"] - origin) >= 0
+        return (count >= parameters["most"]) & is_back
 
 
-class SteeringFamily(Family, ABC):
+class SteeringFamily(ManoeuvreFamily, ABC):
     """Manoeuvres of a steer and a drive that are uniform in their ranges.
 
     Attributes:
@@ -140,11 +152,13 @@ class ZigzagFamily(SteeringFamily):
     kind: Literal["zigzag"] = "zigzag"
     heading: tuple[Radians, ...] = Field(min_length=1)
 
-    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
-        heading = float(random.choice(self.heading))
-        steer, drive = drawn(random, self.steer), drawn(random, self.drive)
-        first: Literal["starboard", "port"] = "starboard" if random.random() < 0.5 else "port"
-        return Zigzag(heading=heading, steer=steer, drive=drive, start=self.start, first=first)
+    def sample_one(self, generator: np.random.Generator, duration: float) -> Manoeuvre:
+        heading = float(generator.choice(self.heading))
+        steer, drive = sample_uniform(generator, self.steer), sample_uniform(generator, self.drive)
+        first_side: Literal["starboard", "port"] = (
+            "starboard" if generator.random() < 0.5 else "port"
+        )
+        return Zigzag(heading=heading, steer=steer, drive=drive, start=self.start, first=first_side)
 
 
 class SteadyConfig(Config):
@@ -161,31 +175,35 @@ class SteadyConfig(Config):
     tolerance: float = Field(default=0.005, gt=0)
 
 
-def steady_at(r: Tensor) -> Tensor:
+def initial_steadiness(r: Tensor) -> Tensor:
     """Return the memory [B, 3] of a steady turn: mean of r, largest |r|, and time near the mean."""
     return torch.stack((r, r.abs(), torch.zeros_like(r)), dim=-1)
 
 
-def steadied(r: Tensor, numbers: Numbers, memory: Tensor) -> Tensor:
+def update_steadiness(r: Tensor, parameters: BatchParameters, memory: Tensor) -> Tensor:
     """Return the memory [B, 3] of a steady turn one step later, with yaw rate r [B]."""
-    mean, largest, calm = memory.unbind(-1)
-    mean = mean + (numbers["dt"] / numbers["window"]).clamp(max=1.0) * (r - mean)
-    largest = torch.maximum(largest, r.abs())
-    near = (r - mean).abs() <= numbers["tolerance"] * largest
-    return torch.stack((mean, largest, torch.where(near, calm + numbers["dt"], 0.0)), dim=-1)
+    mean, max_rate, steady_time = memory.unbind(-1)
+    mean = mean + (parameters["dt"] / parameters["window"]).clamp(max=1.0) * (r - mean)
+    max_rate = torch.maximum(max_rate, r.abs())
+    is_near = (r - mean).abs() <= parameters["tolerance"] * max_rate
+    return torch.stack(
+        (mean, max_rate, torch.where(is_near, steady_time + parameters["dt"], 0.0)), dim=-1
+    )
 
 
-def is_steady(numbers: Numbers, memory: Tensor) -> Tensor:
+def is_steady(parameters: BatchParameters, memory: Tensor) -> Tensor:
     """Return which rows [B] have a steady turn."""
-    return memory[:, 2] >= numbers["window"] - 1e-9
+    return memory[:, 2] >= parameters["window"] - 1e-9
 
 
-def restarted(memory: Tensor, where: Tensor) -> Tensor:
+def restart_wait(memory: Tensor, is_restarted: Tensor) -> Tensor:
     """Return the memory of a steady turn with the wait begun anew in rows [B] bool."""
-    return torch.cat((memory[:, :2], memory[:, 2:].masked_fill(where.unsqueeze(-1), 0.0)), dim=-1)
+    return torch.cat(
+        (memory[:, :2], memory[:, 2:].masked_fill(is_restarted.unsqueeze(-1), 0.0)), dim=-1
+    )
 
 
-class TurningCircle(RudderSteering, ClosedLoop):
+class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
     """Straight ahead until `start`, then the helm held until the heading has changed by `until`.
 
     IMO asks for 540 deg and full rudder. The memory is the heading at the helm order; 0 before the
@@ -198,60 +216,72 @@ class TurningCircle(RudderSteering, ClosedLoop):
         steady: when it is.
     """
 
-    watches: ClassVar[tuple[str, ...]] = ("psi", "r")
-    told: ClassVar[tuple[str, ...]] = ("drive", "start", "until", "side")
+    observed_states: ClassVar[tuple[str, ...]] = ("psi", "r")
+    parameter_names: ClassVar[tuple[str, ...]] = ("drive", "start", "until", "side")
     kind: Literal["turning_circle"] = "turning_circle"
     until: Radians = Field(default=3.0 * math.pi, gt=0)
     pull_out: bool = False
     steady: SteadyConfig = SteadyConfig()
 
     @property
-    def goal(self) -> str:
-        turned = f"a heading change of {math.degrees(self.until):.4g} deg"
-        return f"{turned} and a steady pull-out" if self.pull_out else turned
+    def end_condition(self) -> str:
+        turn_text = f"a heading change of {math.degrees(self.until):.4g} deg"
+        return f"{turn_text} and a steady pull-out" if self.pull_out else turn_text
 
-    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        found = indices.turning(log, self.start, self.side, self.until, length)
-        if self.pull_out and "advance" in found:
-            found["pull_out_yaw_rate"] = self.side * float(log["r"][np.isfinite(log["r"])][-1])
-        return found
+    def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+        turning_indices = indices.turning(log, self.start, self.side, self.until, length)
+        if self.pull_out and "advance" in turning_indices:
+            turning_indices["pull_out_yaw_rate"] = self.side * float(
+                log["r"][np.isfinite(log["r"])][-1]
+            )
+        return turning_indices
 
-    def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
+    def imo_limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
         """Return IMO's limits, which hold for 35 deg of rudder or as much as it goes."""
-        share = abs(self.share(helm))
-        angle = math.degrees(share * (helm.hard_over or 0.0))
-        full = share > 0.999 or angle > _FULL_RUDDER
-        return indices.turning_limits(length) if full else {}
+        share = abs(self.steer_share(helm))
+        angle = math.degrees(share * (helm.max_rudder or 0.0))
+        is_full_rudder = share > 0.999 or angle > _FULL_RUDDER_DEG
+        return indices.turning_limits(length) if is_full_rudder else {}
 
-    def numbers(self, helm: Helm) -> dict[str, Any]:
-        own = {"steer": self.share(helm), "after": 1.0 if self.pull_out else 2.0}
-        return super().numbers(helm) | own | dict(self.steady)
+    def law_parameters(self, helm: Helm) -> dict[str, Any]:
+        phase_parameters = {"steer": self.steer_share(helm), "after": 1.0 if self.pull_out else 2.0}
+        return super().law_parameters(helm) | phase_parameters | dict(self.steady)
 
     @classmethod
-    def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
+    def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
         """Return the memory [B, 5] at the present heading, in the approach."""
-        psi = seen["psi"]
-        return torch.cat((torch.stack((psi, psi * 0.0), -1), steady_at(seen["r"])), dim=-1)
+        psi = motion["psi"]
+        return torch.cat(
+            (torch.stack((psi, psi * 0.0), -1), initial_steadiness(motion["r"])), dim=-1
+        )
 
     @classmethod
-    def law(
-        cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor
+    def step_law(
+        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Hold the helm until the heading has changed, then amidships until the turn is steady."""
         origin, phase = memory[:, 0], memory[:, 1]
-        steadiness = steadied(seen["r"], numbers, memory[:, 2:])
-        over = time >= numbers["start"]
-        origin = torch.where(over, origin, seen["psi"])
-        change = numbers["side"] * (seen["psi"] - origin)
-        turned = (phase == 0) & over & (change >= numbers["until"])
-        steadiness = restarted(steadiness, turned)
-        settled = (phase == 1) & is_steady(numbers, steadiness)
-        phase = torch.where(turned, numbers["after"], torch.where(settled, 2.0, phase))
-        steer = torch.where(over & (phase == 0), numbers["steer"], 0.0)
-        return numbers["drive"], steer, torch.cat((torch.stack((origin, phase), -1), steadiness), 1)
+        steadiness = update_steadiness(motion["r"], parameters, memory[:, 2:])
+        is_steering = time >= parameters["start"]
+        origin = torch.where(is_steering, origin, motion["psi"])
+        heading_change = parameters["side"] * (motion["psi"] - origin)
+        turn_completed = (phase == 0) & is_steering & (heading_change >= parameters["until"])
+        steadiness = restart_wait(steadiness, turn_completed)
+        has_settled = (phase == 1) & is_steady(parameters, steadiness)
+        phase = torch.where(
+            turn_completed, parameters["after"], torch.where(has_settled, 2.0, phase)
+        )
+        steer = torch.where(is_steering & (phase == 0), parameters["steer"], 0.0)
+        return (
+            parameters["drive"],
+            steer,
+            torch.cat((torch.stack((origin, phase), -1), steadiness), 1),
+        )
 
     @classmethod
-    def ended(cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor) -> Tensor:
+    def has_ended(
+        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+    ) -> Tensor:
         return memory[:, 1] == 2
 
 
@@ -265,13 +295,16 @@ class TurningCircleFamily(SteeringFamily):
     kind: Literal["turning_circle"] = "turning_circle"
     until: Radians = Field(default=3.0 * math.pi, gt=0)
 
-    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
-        side = 1.0 if random.random() < 0.5 else -1.0
-        steer, drive = side * drawn(random, self.steer), drawn(random, self.drive)
+    def sample_one(self, generator: np.random.Generator, duration: float) -> Manoeuvre:
+        turn_sign = 1.0 if generator.random() < 0.5 else -1.0
+        steer, drive = (
+            turn_sign * sample_uniform(generator, self.steer),
+            sample_uniform(generator, self.drive),
+        )
         return TurningCircle(steer=steer, drive=drive, start=self.start, until=self.until)
 
 
-class Stopping(ClosedLoop):
+class Stopping(ClosedLoopManoeuvre):
     """Stopping: `drive` until `start`, then `astern` until the surge velocity is zero.
 
     The steer is zero; there is no memory.
@@ -282,46 +315,48 @@ class Stopping(ClosedLoop):
         start: time of the order in s.
     """
 
-    watches: ClassVar[tuple[str, ...]] = ("u",)
-    told: ClassVar[tuple[str, ...]] = ("drive", "astern", "start")
+    observed_states: ClassVar[tuple[str, ...]] = ("u",)
+    parameter_names: ClassVar[tuple[str, ...]] = ("drive", "astern", "start")
     kind: Literal["stopping"] = "stopping"
     drive: float = Field(gt=0, le=1)
     astern: float = Field(default=-1.0, ge=-1, le=0)
     start: Seconds = Field(default=5.0, ge=0)
 
     @property
-    def goal(self) -> str:
+    def end_condition(self) -> str:
         return "a surge velocity of zero"
 
-    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        return indices.stopping(log, self.start, length)
+    def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+        return indices.stopping_indices(log, self.start, length)
 
-    def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
+    def imo_limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
         """Return IMO's limit, which holds for full astern."""
         return indices.stopping_limits(length) if self.astern <= -0.999 else {}
 
     @classmethod
-    def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
-        return seen["u"].new_zeros(len(seen["u"]), 0)
+    def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
+        return motion["u"].new_zeros(len(motion["u"]), 0)
 
     @classmethod
-    def law(
-        cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor
+    def step_law(
+        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Go astern from the order on."""
-        drive = torch.where(time >= numbers["start"], numbers["astern"], numbers["drive"])
+        drive = torch.where(time >= parameters["start"], parameters["astern"], parameters["drive"])
         return drive, torch.zeros_like(drive), memory
 
     @classmethod
-    def ended(cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor) -> Tensor:
+    def has_ended(
+        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+    ) -> Tensor:
         """Return which rows [B] make no way any more."""
-        return (time > numbers["start"]) & (seen["u"] <= 0)
+        return (time > parameters["start"]) & (motion["u"] <= 0)
 
 
-_DOWN = (1.0, 0.6, 0.4, 0.2, 0.1, 0.0, -0.1, -0.2, -0.4, -0.6, -1.0)
+_SPIRAL_STEERS = (1.0, 0.6, 0.4, 0.2, 0.1, 0.0, -0.1, -0.2, -0.4, -0.6, -1.0)
 
 
-class Spiral(ClosedLoop):
+class Spiral(ClosedLoopManoeuvre):
     """Dieudonne's spiral: helm angles from one side to the other and back, each until r is steady.
 
     An unstable vessel shows a loop of yaw rate over angle. The memory is the number of the present
@@ -336,7 +371,7 @@ class Spiral(ClosedLoop):
         steady: when the next follows.
     """
 
-    watches: ClassVar[tuple[str, ...]] = ("r",)
+    observed_states: ClassVar[tuple[str, ...]] = ("r",)
     kind: Literal["spiral"] = "spiral"
     drive: float = Field(ge=-1, le=1)
     steers: tuple[float, ...] = ()
@@ -353,65 +388,75 @@ class Spiral(ClosedLoop):
         return self
 
     @property
-    def angles(self) -> tuple[float, ...]:
+    def helm_angles(self) -> tuple[float, ...]:
         """Rudder angles in rad, or shares of full steer."""
-        return self.rudders or self.steers or _DOWN + _DOWN[-2::-1]
+        return self.rudders or self.steers or _SPIRAL_STEERS + _SPIRAL_STEERS[-2::-1]
 
     @property
-    def goal(self) -> str:
-        return f"a steady yaw rate at each of {len(self.angles)} helm angles"
+    def end_condition(self) -> str:
+        return f"a steady yaw rate at each of {len(self.helm_angles)} helm angles"
 
-    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+    def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
         """Return the steady yaw rate of each angle that was finished, and the height of the loop.
 
         The height is the largest difference of the yaw rates that the angle nearest to zero had;
         `steers` are shares of full steer (rad where the log has a rudder).
         """
         commands = [name for name in log.channels if name.startswith("cmd_")]
-        moved = (np.abs(np.diff(log.stack(commands), axis=0)) > 1e-12).any(axis=1)
-        changes = np.flatnonzero(moved & (log.t[1:] - log.t[0] >= self.start - 1e-9))
-        angles = list(self.angles)
+        has_moved = (np.abs(np.diff(log.stack(commands), axis=0)) > 1e-12).any(axis=1)
+        change_samples = np.flatnonzero(has_moved & (log.t[1:] - log.t[0] >= self.start - 1e-9))
+        angles = list(self.helm_angles)
         # the first change is the order of the first angle, unless that is amidships as the approach
         # is
-        held = changes if angles[0] == 0 else changes[1:]
-        ends = [*held.tolist(), len(log) - 1][: len(angles)]
-        rates = [float(log["r"][i]) for i in ends]
+        order_changes = change_samples if angles[0] == 0 else change_samples[1:]
+        end_samples = [*order_changes.tolist(), len(log) - 1][: len(angles)]
+        rates = [float(log["r"][i]) for i in end_samples]
         angles = angles[: len(rates)]
-        middle = min(angles, key=abs)
-        amidships = [rate for angle, rate in zip(angles, rates, strict=True) if angle == middle]
-        found: dict[str, Any] = {"steers": angles, "yaw_rates": rates}
-        if len(amidships) > 1:
-            found["loop_height"] = max(amidships) - min(amidships)
-        return found
+        smallest_angle = min(angles, key=abs)
+        amidships_rates = [
+            rate for angle, rate in zip(angles, rates, strict=True) if angle == smallest_angle
+        ]
+        spiral_indices: dict[str, Any] = {"steers": angles, "yaw_rates": rates}
+        if len(amidships_rates) > 1:
+            spiral_indices["loop_height"] = max(amidships_rates) - min(amidships_rates)
+        return spiral_indices
 
-    def numbers(self, helm: Helm) -> dict[str, Any]:
-        shares = [rudder_share(a, helm) if self.rudders else a for a in self.angles]
-        own = {"shares": [*shares, 0.0], "count": float(len(shares))}
-        return super().numbers(helm) | own | dict(self.steady)
-
-    @classmethod
-    def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
-        return torch.cat((torch.zeros_like(seen["r"])[:, None], steady_at(seen["r"])), dim=-1)
+    def law_parameters(self, helm: Helm) -> dict[str, Any]:
+        shares = [rudder_share(a, helm) if self.rudders else a for a in self.helm_angles]
+        spiral_parameters = {"shares": [*shares, 0.0], "count": float(len(shares))}
+        return super().law_parameters(helm) | spiral_parameters | dict(self.steady)
 
     @classmethod
-    def law(
-        cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor
+    def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
+        return torch.cat(
+            (torch.zeros_like(motion["r"])[:, None], initial_steadiness(motion["r"])), dim=-1
+        )
+
+    @classmethod
+    def step_law(
+        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Go to the next angle where the turn is steady."""
-        over = time >= numbers["start"]
-        steadiness = restarted(steadied(seen["r"], numbers, memory[:, 1:]), ~over)
-        settled = is_steady(numbers, steadiness)
-        number = torch.minimum(memory[:, 0] + settled.to(memory), numbers["count"])
-        share = numbers["shares"].gather(1, number.long().unsqueeze(-1))[:, 0]
-        memory = torch.cat((number.unsqueeze(-1), restarted(steadiness, settled)), dim=-1)
-        return numbers["drive"], torch.where(over, share, 0.0), memory
+        is_steering = time >= parameters["start"]
+        steadiness = restart_wait(
+            update_steadiness(motion["r"], parameters, memory[:, 1:]), ~is_steering
+        )
+        has_settled = is_steady(parameters, steadiness)
+        angle_index = torch.minimum(memory[:, 0] + has_settled.to(memory), parameters["count"])
+        share = parameters["shares"].gather(1, angle_index.long().unsqueeze(-1))[:, 0]
+        memory = torch.cat(
+            (angle_index.unsqueeze(-1), restart_wait(steadiness, has_settled)), dim=-1
+        )
+        return parameters["drive"], torch.where(is_steering, share, 0.0), memory
 
     @classmethod
-    def ended(cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor) -> Tensor:
-        return memory[:, 0] >= numbers["count"]
+    def has_ended(
+        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+    ) -> Tensor:
+        return memory[:, 0] >= parameters["count"]
 
 
-class Helix(Scheduled):
+class Helix(ScheduledManoeuvre):
     """Drive, steer and dive held: a turn in which the vessel descends or climbs.
 
     Attributes:
@@ -427,12 +472,12 @@ class Helix(Scheduled):
     dive: float = Field(ge=-1, le=1)
     start: Seconds = Field(default=5.0, ge=0)
 
-    def demands(self, t: Tensor) -> tuple[Tensor, ...]:
-        over = (t >= self.start - 1e-9).to(t.dtype)
-        return torch.full_like(t, self.drive), self.steer * over, self.dive * over
+    def demands_at(self, t: Tensor) -> tuple[Tensor, ...]:
+        is_steering = (t >= self.start - 1e-9).to(t.dtype)
+        return torch.full_like(t, self.drive), self.steer * is_steering, self.dive * is_steering
 
 
-class DivingFamily(Family, ABC):
+class DivingFamily(ManoeuvreFamily, ABC):
     """Manoeuvres in depth drawn at random, to either side, down or up first.
 
     Attributes:
@@ -445,11 +490,11 @@ class DivingFamily(Family, ABC):
     dive: Range = (0.2, 0.6)
     start: Seconds = 5.0
 
-    def drawn(self, random: np.random.Generator) -> dict[str, Any]:
+    def sample_common(self, generator: np.random.Generator) -> dict[str, Any]:
         """Return drive and start, and the dive to either side."""
-        side = 1.0 if random.random() < 0.5 else -1.0
-        drive, dive = drawn(random, self.drive), drawn(random, self.dive)
-        return {"drive": drive, "dive": side * dive, "start": self.start}
+        dive_sign = 1.0 if generator.random() < 0.5 else -1.0
+        drive, dive = sample_uniform(generator, self.drive), sample_uniform(generator, self.dive)
+        return {"drive": drive, "dive": dive_sign * dive, "start": self.start}
 
 
 class HelixFamily(DivingFamily):
@@ -462,12 +507,14 @@ class HelixFamily(DivingFamily):
     kind: Literal["helix"] = "helix"
     steer: Range = (0.2, 0.8)
 
-    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
-        side = 1.0 if random.random() < 0.5 else -1.0
-        return Helix(steer=side * drawn(random, self.steer), **self.drawn(random))
+    def sample_one(self, generator: np.random.Generator, duration: float) -> Manoeuvre:
+        turn_sign = 1.0 if generator.random() < 0.5 else -1.0
+        return Helix(
+            steer=turn_sign * sample_uniform(generator, self.steer), **self.sample_common(generator)
+        )
 
 
-class VerticalZigzag(ClosedLoop):
+class VerticalZigzag(ClosedLoopManoeuvre):
     """Diving until the depth has changed by `depth`, then climbing as far beyond it, repeated.
 
     The memory is the side of the demand (+1 down) and the depth at the start.
@@ -479,33 +526,35 @@ class VerticalZigzag(ClosedLoop):
         start: when it begins.
     """
 
-    watches: ClassVar[tuple[str, ...]] = ("z",)
+    observed_states: ClassVar[tuple[str, ...]] = ("z",)
     kind: Literal["vertical_zigzag"] = "vertical_zigzag"
     drive: float = Field(ge=-1, le=1)
     dive: float = Field(ge=-1, le=1)
     depth: Metres = Field(gt=0)
     start: Seconds = Field(default=5.0, ge=0)
 
-    def numbers(self, helm: Helm) -> dict[str, Any]:
-        first = -1.0 if self.dive < 0 else 1.0
-        own = {"dive": abs(self.dive), "first": first, "bound": self.depth}
-        return super().numbers(helm) | own
+    def law_parameters(self, helm: Helm) -> dict[str, Any]:
+        first_sign = -1.0 if self.dive < 0 else 1.0
+        dive_parameters = {"dive": abs(self.dive), "first": first_sign, "bound": self.depth}
+        return super().law_parameters(helm) | dive_parameters
 
     @classmethod
-    def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
+    def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
         """Return the first side and the present depth, [B, 2]."""
-        return torch.stack((numbers["first"], seen["z"]), dim=-1)
+        return torch.stack((parameters["first"], motion["z"]), dim=-1)
 
     @classmethod
-    def law(
-        cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor
+    def step_law(
+        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, ...]:
         """Reverse the side where the depth has reached its bound."""
-        side, origin = memory.unbind(-1)
-        side = torch.where(side * (seen["z"] - origin) >= numbers["bound"], -side, side)
-        dive = torch.where(time >= numbers["start"], side * numbers["dive"], 0.0)
-        still = torch.zeros_like(dive)
-        return numbers["drive"], still, dive, torch.stack((side, origin), dim=-1)
+        dive_sign, origin = memory.unbind(-1)
+        dive_sign = torch.where(
+            dive_sign * (motion["z"] - origin) >= parameters["bound"], -dive_sign, dive_sign
+        )
+        dive = torch.where(time >= parameters["start"], dive_sign * parameters["dive"], 0.0)
+        zero_steer = torch.zeros_like(dive)
+        return parameters["drive"], zero_steer, dive, torch.stack((dive_sign, origin), dim=-1)
 
 
 class VerticalZigzagFamily(DivingFamily):
@@ -518,11 +567,13 @@ class VerticalZigzagFamily(DivingFamily):
     kind: Literal["vertical_zigzag"] = "vertical_zigzag"
     depth: tuple[Metres, ...] = Field(min_length=1)
 
-    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
-        return VerticalZigzag(depth=float(random.choice(self.depth)), **self.drawn(random))
+    def sample_one(self, generator: np.random.Generator, duration: float) -> Manoeuvre:
+        return VerticalZigzag(
+            depth=float(generator.choice(self.depth)), **self.sample_common(generator)
+        )
 
 
-class DepthStep(ClosedLoop):
+class DepthStep(ClosedLoopManoeuvre):
     """A new depth, held by a law that sees depth, its rate and the pitch rate; steer is zero.
 
     The memory is the depth at the start.
@@ -537,8 +588,8 @@ class DepthStep(ClosedLoop):
         pitch_damping: dive per rad/s of pitch rate.
     """
 
-    watches: ClassVar[tuple[str, ...]] = ("z", "u", "v", "w", "phi", "theta", "q")
-    told: ClassVar[tuple[str, ...]] = (
+    observed_states: ClassVar[tuple[str, ...]] = ("z", "u", "v", "w", "phi", "theta", "q")
+    parameter_names: ClassVar[tuple[str, ...]] = (
         "drive", "dive", "depth", "start", "gain", "damping", "pitch_damping",
     )  # fmt: skip
     kind: Literal["depth_step"] = "depth_step"
@@ -551,22 +602,22 @@ class DepthStep(ClosedLoop):
     pitch_damping: float = Field(default=1.0, ge=0)
 
     @classmethod
-    def memory(cls, seen: Numbers, numbers: Numbers) -> Tensor:
+    def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
         """Return the present depth, [B, 1]."""
-        return seen["z"].unsqueeze(-1)
+        return motion["z"].unsqueeze(-1)
 
     @classmethod
-    def law(
-        cls, seen: Numbers, numbers: Numbers, time: float, memory: Tensor
+    def step_law(
+        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, ...]:
         """Dive by what lacks of the depth, less its rate."""
-        ordered = torch.where(time >= numbers["start"], numbers["depth"], 0.0)
-        lacking = memory[:, 0] + ordered - seen["z"]
-        descent = upright(*(seen[name] for name in ("u", "v", "w", "phi", "theta")))[2]
-        dive = numbers["gain"] * lacking - numbers["damping"] * descent
-        dive = dive + numbers["pitch_damping"] * seen["q"]
-        dive = torch.minimum(torch.maximum(dive, -numbers["dive"]), numbers["dive"])
-        return numbers["drive"], torch.zeros_like(dive), dive, memory
+        ordered_change = torch.where(time >= parameters["start"], parameters["depth"], 0.0)
+        depth_error = memory[:, 0] + ordered_change - motion["z"]
+        descent = to_level_axes(*(motion[name] for name in ("u", "v", "w", "phi", "theta")))[2]
+        dive = parameters["gain"] * depth_error - parameters["damping"] * descent
+        dive = dive + parameters["pitch_damping"] * motion["q"]
+        dive = torch.minimum(torch.maximum(dive, -parameters["dive"]), parameters["dive"])
+        return parameters["drive"], torch.zeros_like(dive), dive, memory
 
 
 class DepthStepFamily(DivingFamily):
@@ -579,8 +630,8 @@ class DepthStepFamily(DivingFamily):
     kind: Literal["depth_step"] = "depth_step"
     depth: tuple[Metres, ...] = Field(min_length=1)
 
-    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
-        common = self.drawn(random)
-        side = np.sign(common["dive"])
-        depth = float(side * random.choice(self.depth))
-        return DepthStep(depth=depth, **{**common, "dive": abs(common["dive"])})
+    def sample_one(self, generator: np.random.Generator, duration: float) -> Manoeuvre:
+        common_settings = self.sample_common(generator)
+        depth_sign = np.sign(common_settings["dive"])
+        depth = float(depth_sign * generator.choice(self.depth))
+        return DepthStep(depth=depth, **{**common_settings, "dive": abs(common_settings["dive"])})

@@ -12,18 +12,23 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.control.base import ClosedLoop
-from residnet.control.guidance import LookAhead, WaypointGuidance
+from residnet.control.guidance import LookAheadLineOfSight, WaypointGuidance
 from residnet.control.heading.classical import HeadingPD
-from residnet.control.motion import Allocated, MotionPIDConfig, ReferenceFilterConfig, Waypoint
+from residnet.control.motion import (
+    AllocatedPolicy,
+    MotionPIDConfig,
+    ReferenceFilterConfig,
+    Waypoint,
+)
 from residnet.core.config import Metres, RadiansPerSecond, Seconds
 from residnet.core.errors import UsageError
-from residnet.core.frames import wrap_array
-from residnet.core.layout import HEADING, MOTION, PLANAR, POSE
+from residnet.core.frames import wrap_angle_array
+from residnet.core.layout import HEADING, MOTION, PLANAR_LAYOUT, POSE
 from residnet.core.log import Log
 from residnet.dynamics.rollout import Source
 from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
 
-_POSE = PLANAR.pose
+_POSE = PLANAR_LAYOUT.pose
 
 
 class Waypoints(Manoeuvre):
@@ -48,41 +53,43 @@ class Waypoints(Manoeuvre):
     gain: float = Field(default=1.0, gt=0)
     rate_gain: Seconds = Field(default=1.0, ge=0)
 
-    def guidance(self, state: tuple[str, ...]) -> WaypointGuidance:
+    def build_guidance(self, state: tuple[str, ...]) -> WaypointGuidance:
         """Return the guidance over states with these names."""
-        return WaypointGuidance(self.points, self.acceptance, LookAhead(self.lookahead), state)
+        return WaypointGuidance(
+            self.points, self.acceptance, LookAheadLineOfSight(self.lookahead), state
+        )
 
     @classmethod
-    def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+    def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         """Return the closed loop on position and heading; each row has a course of its own."""
         for name in (*_POSE, "r"):
-            helm.column(name)
-        sources = [m._loop(helm) for m in manoeuvres if isinstance(m, Waypoints)]
+            helm.state_column(name)
+        sources = [m._build_loop(helm) for m in manoeuvres if isinstance(m, Waypoints)]
         return StackedSource(sources, [1] * len(sources))
 
-    def _loop(self, helm: Helm) -> ClosedLoop:
+    def _build_loop(self, helm: Helm) -> ClosedLoop:
         autopilot = HeadingPD(helm.state, kp=self.gain, kd=self.rate_gain, limit=1.0)
 
-        def commands(steer: Tensor) -> Tensor:
+        def to_commands(steer: Tensor) -> Tensor:
             return helm.demand(torch.full_like(steer[:, 0], self.drive), steer[:, 0])
 
-        return ClosedLoop(Allocated(autopilot, commands), self.guidance(helm.state))
+        return ClosedLoop(AllocatedPolicy(autopilot, to_commands), self.build_guidance(helm.state))
 
     @property
-    def goal(self) -> str:
+    def end_condition(self) -> str:
         return f"the last of {len(self.points)} way-points"
 
-    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+    def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
         """Return cross-track errors from the leg that was sailed, and the time of the course."""
         x = torch.from_numpy(np.nan_to_num(log.stack(_POSE)))
-        guidance = self.guidance(_POSE)
+        guidance = self.build_guidance(_POSE)
         s = guidance.initial_state(x[:1])
         errors: list[float] = []
         for k in range(len(log)):
             _, s = guidance(x[k : k + 1], k, s)
             if bool(guidance.finished(x[k : k + 1], k, s)):
                 break
-            errors.append(float(guidance.leg(x[k : k + 1], s[:, 0].long(), s)[2]))
+            errors.append(float(guidance.leg_geometry(x[k : k + 1], s[:, 0].long(), s)[2]))
         return {
             "largest_cross_track_error": float(np.abs(errors).max()),
             "rms_cross_track_error": math.sqrt(np.mean(np.square(errors))),
@@ -90,12 +97,12 @@ class Waypoints(Manoeuvre):
         }
 
 
-_H, _D = math.pi / 2, math.pi / 4
+_RIGHT_ANGLE, _HALF_RIGHT_ANGLE = math.pi / 2, math.pi / 4
 # Table 4.1 prints the twelve twice (correction J12); headings are followed as written (J13)
 SEGMENTS: tuple[Waypoint, ...] = (
-    (0.0, -15.0, -_H), (15.0, -15.0, 0.0), (15.0, 0.0, 0.0), (30.0, 0.0, 0.0), (30.0, -15.0, 0.0),
-    (30.0, -15.0, 2 * _H), (15.0, -15.0, 2 * _H), (15.0, 0.0, 3 * _D), (0.0, 0.0, 3 * _D),
-    (0.0, 0.0, -_D), (0.0, -15.0, -_D), (0.0, 0.0, 0.0),
+    (0.0, -15.0, -_RIGHT_ANGLE), (15.0, -15.0, 0.0), (15.0, 0.0, 0.0), (30.0, 0.0, 0.0), (30.0, -15.0, 0.0),
+    (30.0, -15.0, 2 * _RIGHT_ANGLE), (15.0, -15.0, 2 * _RIGHT_ANGLE), (15.0, 0.0, 3 * _HALF_RIGHT_ANGLE), (0.0, 0.0, 3 * _HALF_RIGHT_ANGLE),
+    (0.0, 0.0, -_HALF_RIGHT_ANGLE), (0.0, -15.0, -_HALF_RIGHT_ANGLE), (0.0, 0.0, 0.0),
 )  # fmt: skip
 
 
@@ -121,7 +128,7 @@ class FourCorner(Manoeuvre):
     control: MotionPIDConfig
 
     @property
-    def filter(self) -> ReferenceFilterConfig:
+    def filter_config(self) -> ReferenceFilterConfig:
         """The config of the reference filter."""
         return ReferenceFilterConfig(
             waypoints=self.poses,
@@ -130,41 +137,43 @@ class FourCorner(Manoeuvre):
             damping=self.damping,
         )
 
-    def lasts(self, duration: float) -> float:
+    def duration_within(self, duration: float) -> float:
         """Return one interval for each pose, or `self.duration` where that is less."""
-        return min(self.filter.duration, self.duration or math.inf)
+        return min(self.filter_config.duration, self.duration or math.inf)
 
     @classmethod
-    def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+    def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         """Return the closed loop on the pose; each row has a course and gains of its own.
 
         Raises:
             UsageError: where the vessel has no command for each of the three forces.
         """
-        if helm.forces is None or helm.state[MOTION] != PLANAR.names:
+        if helm.forces is None or helm.state[MOTION] != PLANAR_LAYOUT.state_names:
             raise UsageError(
                 "a four-corner course needs a vessel in surge, sway and yaw that is commanded in"
                 " all three, by forces or azimuth thrusters"
             )
         step = float(t[1] - t[0])
         sources = [
-            ClosedLoop(Allocated(m.control.build(step), helm.forces), m.filter.build(step))
+            ClosedLoop(
+                AllocatedPolicy(m.control.build(step), helm.forces), m.filter_config.build(step)
+            )
             for m in manoeuvres
             if isinstance(m, FourCorner)
         ]
         return StackedSource(sources, [1] * len(sources))
 
-    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+    def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
         """Return the mean distance from the reference, and mean absolute error of the heading."""
-        reference = self.filter.build(float(log.t[1] - log.t[0]))
+        reference = self.filter_config.build(float(log.t[1] - log.t[0]))
         x = torch.from_numpy(log.stack(_POSE))
         s = reference.initial_state(x[:1])
-        desired = []
+        desired_poses = []
         for k in range(len(log)):
             pose, s = reference(x[k : k + 1], k, s)
-            desired.append(pose[0, POSE].numpy())
-        error = x.numpy() - np.stack(desired)
+            desired_poses.append(pose[0, POSE].numpy())
+        error = x.numpy() - np.stack(desired_poses)
         return {
             "mean_position_error": float(np.hypot(*error[:, :HEADING].T).mean()),
-            "mean_heading_error": float(np.abs(wrap_array(error[:, HEADING])).mean()),
+            "mean_heading_error": float(np.abs(wrap_angle_array(error[:, HEADING])).mean()),
         }

@@ -17,7 +17,7 @@ import scipy
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 
-UNITS: dict[str, str] = {
+INDEX_UNITS: dict[str, str] = {
     "approach_speed": "m/s",
     "advance": "m", "transfer": "m", "tactical_diameter": "m", "time_90": "s", "time_180": "s",
     "steady_diameter": "m", "steady_speed": "m/s", "steady_speed_ratio": "-",
@@ -36,15 +36,15 @@ UNITS: dict[str, str] = {
 }  # fmt: skip
 """Unit of each index."""
 
-IN_LENGTHS = {
+LENGTH_INDICES = {
     "advance", "transfer", "tactical_diameter", "steady_diameter", "initial_turning_distance",
     "overshoot_width", "track_reach", "head_reach", "lateral_deviation",
 }  # fmt: skip
 
-_TURN = math.pi / 2
+_QUARTER_TURN = math.pi / 2
 
 
-class Track:
+class SmoothTrack:
     """The motion of a log as smooth functions of its time.
 
     Samples at which a channel is empty are left out.
@@ -55,53 +55,69 @@ class Track:
 
     def __init__(self, log: Log) -> None:
         motion = log.stack(("x", "y", "psi", "u", "v", "r"))
-        whole = np.isfinite(motion).all(axis=1)
-        if whole.sum() < 4:
+        is_complete = np.isfinite(motion).all(axis=1)
+        if is_complete.sum() < 4:
             raise DataError(
-                f"log {log.name}: {int(whole.sum())} samples hold x, y, psi, u, v and r together;"
+                f"log {log.name}: {int(is_complete.sum())} samples hold x, y, psi, u, v and r together;"
                 " indices need at least 4"
             )
-        self.t: np.ndarray = log.t[whole] - log.t[0]
-        x, y, self.heading, self.u, self.v, self.r = motion[whole].T
+        self.t: np.ndarray = log.t[is_complete] - log.t[0]
+        x, y, self.heading, self.u, self.v, self.r = motion[is_complete].T
         self.speed = np.hypot(self.u, self.v)
-        self._roll = log["phi"][whole] if "phi" in log.channels else np.zeros(0)
-        path = np.concatenate(([0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))))
-        self.psi, self.x, self.y, self.travelled = (
-            scipy.interpolate.CubicSpline(self.t, values) for values in (self.heading, x, y, path)
+        self._roll = log["phi"][is_complete] if "phi" in log.channels else np.zeros(0)
+        cumulative_distance = np.concatenate(([0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))))
+        self.psi, self.x, self.y, self.distance_travelled = (
+            scipy.interpolate.CubicSpline(self.t, values)
+            for values in (self.heading, x, y, cumulative_distance)
         )
 
     @property
-    def end(self) -> float:
+    def end_time(self) -> float:
         """The last time in s."""
         return float(self.t[-1])
 
-    def approach(self, start: float) -> float:
+    def approach_speed(self, start: float) -> float:
         """Return the speed at the last sample before or at the order at `start`."""
         return float(self.speed[max(int(np.searchsorted(self.t, start + 1e-9)) - 1, 0)])
 
-    def heel(self, start: float) -> dict[str, float]:
+    def max_roll_angle(self, start: float) -> dict[str, float]:
         """Return the largest roll angle from `start` on to either side; empty without one."""
-        rolled = np.abs(self._roll[self.t >= start]) if self._roll.size else self._roll
-        known = rolled[np.isfinite(rolled)]
-        return {"largest_roll_angle": float(known.max())} if known.size else {}
+        roll_magnitude = np.abs(self._roll[self.t >= start]) if self._roll.size else self._roll
+        finite_roll = roll_magnitude[np.isfinite(roll_magnitude)]
+        return {"largest_roll_angle": float(finite_roll.max())} if finite_roll.size else {}
 
-    def crossing(self, level: float, after: float, sign: float = 1.0) -> float | None:
-        """Return the first time after `after` at which sign * heading rises to sign * `level`.
+    def first_heading_crossing(
+        self, level: float, start_time: float, sign: float = 1.0
+    ) -> float | None:
+        """Return the first time after `start_time` at which sign * heading rises to sign * `level`.
 
         None where it does not.
         """
-        return first_crossing(lambda t: sign * (self.psi(t) - level), self.t, after)
+        return first_crossing(lambda t: sign * (self.psi(t) - level), self.t, start_time)
 
-    def peak(self, begin: float, end: float, sign: float) -> tuple[float, float]:
+    def heading_peak(
+        self, interval_start: float, interval_end: float, sign: float
+    ) -> tuple[float, float]:
         """Return the time and value of the largest sign * heading within begin .. end."""
-        inside = self.t[(self.t > begin) & (self.t < end)]
-        times = np.concatenate(([begin], inside, [end]))
-        best = int(np.argmax(sign * self.psi(times)))
-        low, high = times[max(best - 1, 0)], times[min(best + 1, times.size - 1)]
-        rate = self.psi.derivative()
-        if best in (0, times.size - 1) or sign * rate(low) <= 0 or sign * rate(high) >= 0:
-            return float(times[best]), float(sign * self.psi(times[best]))
-        time = float(scipy.optimize.brentq(lambda at: float(rate(at)), low, high, xtol=1e-12))
+        sample_times = self.t[(self.t > interval_start) & (self.t < interval_end)]
+        times = np.concatenate(([interval_start], sample_times, [interval_end]))
+        peak_index = int(np.argmax(sign * self.psi(times)))
+        lower_time, upper_time = (
+            times[max(peak_index - 1, 0)],
+            times[min(peak_index + 1, times.size - 1)],
+        )
+        derivative = self.psi.derivative()
+        if (
+            peak_index in (0, times.size - 1)
+            or sign * derivative(lower_time) <= 0
+            or sign * derivative(upper_time) >= 0
+        ):
+            return float(times[peak_index]), float(sign * self.psi(times[peak_index]))
+        time = float(
+            scipy.optimize.brentq(
+                lambda at: float(derivative(at)), lower_time, upper_time, xtol=1e-12
+            )
+        )
         return time, float(sign * self.psi(time))
 
     def relative_position(self, time: float, origin: float) -> tuple[float, float]:
@@ -114,33 +130,37 @@ class Track:
         return north * c + east * s, east * c - north * s
 
 
-def first_crossing(function: Callable[[Any], Any], t: np.ndarray, after: float) -> float | None:
-    """Return the first time after `after` at which a function rises through zero.
+def first_crossing(
+    function: Callable[[Any], Any], t: np.ndarray, start_time: float
+) -> float | None:
+    """Return the first time after `start_time` at which a function rises through zero.
 
     The time lies between samples at t [T]; None where the function does not rise through zero.
     """
-    times = np.concatenate(([after], t[t > after]))
+    times = np.concatenate(([start_time], t[t > start_time]))
     values = function(times)
-    rising = np.flatnonzero((values[:-1] < 0) & (values[1:] >= 0))
-    if rising.size == 0:
+    rising_indices = np.flatnonzero((values[:-1] < 0) & (values[1:] >= 0))
+    if rising_indices.size == 0:
         return None
-    i = int(rising[0])
+    i = int(rising_indices[0])
     if values[i + 1] == 0:
         return float(times[i + 1])
     return float(scipy.optimize.brentq(function, times[i], times[i + 1], xtol=1e-12))
 
 
-def in_lengths(indices: dict[str, Any], length: float | None) -> dict[str, Any]:
+def add_values_in_lengths(indices: dict[str, Any], length: float | None) -> dict[str, Any]:
     """Return the indices with their distances in hull lengths as well, `<index>_lengths`."""
     if length is None:
         return indices
     return indices | {
-        f"{name}_lengths": value / length for name, value in indices.items() if name in IN_LENGTHS
+        f"{name}_lengths": value / length
+        for name, value in indices.items()
+        if name in LENGTH_INDICES
     }
 
 
 def turning(
-    log: Log, start: float, side: float, until: float, length: float | None
+    log: Log, start: float, turn_sign: float, until: float, length: float | None
 ) -> dict[str, Any]:
     """Return the indices of a turning circle.
 
@@ -151,35 +171,46 @@ def turning(
     Args:
         log: t, x, y, psi, u, v, r.
         start: time of the helm order in s.
-        side: +1 to starboard, -1 to port.
+        turn_sign: +1 to starboard, -1 to port.
         until: heading change that ends the steady turn, rad.
         length: of the hull in m.
     """
-    track = Track(log)
-    if track.end <= start:
+    track = SmoothTrack(log)
+    if track.end_time <= start:
         return {}
     origin = float(track.psi(start))
-    indices: dict[str, Any] = {"approach_speed": track.approach(start), **track.heel(start)}
-    quarter, half = (
-        track.crossing(origin + side * angle, start, side) for angle in (_TURN, 2 * _TURN)
+    indices: dict[str, Any] = {
+        "approach_speed": track.approach_speed(start),
+        **track.max_roll_angle(start),
+    }
+    quarter_time, half_time = (
+        track.first_heading_crossing(origin + turn_sign * angle, start, turn_sign)
+        for angle in (_QUARTER_TURN, 2 * _QUARTER_TURN)
     )
-    if quarter is not None:
-        ahead, across = track.relative_position(quarter, start)
-        indices |= {"advance": ahead, "transfer": side * across, "time_90": quarter - start}
-    if half is not None:
+    if quarter_time is not None:
+        advance, transfer = track.relative_position(quarter_time, start)
         indices |= {
-            "tactical_diameter": side * track.relative_position(half, start)[1],
-            "time_180": half - start,
+            "advance": advance,
+            "transfer": turn_sign * transfer,
+            "time_90": quarter_time - start,
         }
-    begin, end = (
-        track.crossing(origin + side * angle, start, side) for angle in (until - math.pi, until)
+    if half_time is not None:
+        indices |= {
+            "tactical_diameter": turn_sign * track.relative_position(half_time, start)[1],
+            "time_180": half_time - start,
+        }
+    steady_start, steady_end = (
+        track.first_heading_crossing(origin + turn_sign * angle, start, turn_sign)
+        for angle in (until - math.pi, until)
     )
-    if until < 2 * math.pi - 1e-9 or begin is None:
-        return in_lengths(indices, length)
-    inside = (track.t >= begin) & (track.t <= (track.end if end is None else end))
-    if inside.any():
-        speed, rate = float(track.speed[inside].mean()), float(np.abs(track.r[inside].mean()))
-        drift = np.arctan2(-side * track.v[inside], track.u[inside])
+    if until < 2 * math.pi - 1e-9 or steady_start is None:
+        return add_values_in_lengths(indices, length)
+    is_steady = (track.t >= steady_start) & (
+        track.t <= (track.end_time if steady_end is None else steady_end)
+    )
+    if is_steady.any():
+        speed, rate = float(track.speed[is_steady].mean()), float(np.abs(track.r[is_steady].mean()))
+        drift = np.arctan2(-turn_sign * track.v[is_steady], track.u[is_steady])
         indices |= {
             "steady_diameter": 2 * speed / rate,
             "steady_speed": speed,
@@ -188,11 +219,11 @@ def turning(
         }
         if indices["approach_speed"] > 0:
             indices["steady_speed_ratio"] = speed / indices["approach_speed"]
-    return in_lengths(indices, length)
+    return add_values_in_lengths(indices, length)
 
 
-def zigzag(
-    log: Log, start: float, side: float, heading: float, length: float | None
+def zigzag_indices(
+    log: Log, start: float, turn_sign: float, heading: float, length: float | None
 ) -> dict[str, Any]:
     """Return the indices of a zigzag.
 
@@ -206,51 +237,61 @@ def zigzag(
     Args:
         log: t, x, y, psi, u, v, r.
         start: time of the first execute in s.
-        side: of the first execute, +1 starboard, -1 port.
+        turn_sign: of the first execute, +1 starboard, -1 port.
         heading: change of heading at which the steering is reversed, rad.
         length: of the hull in m.
     """
-    track = Track(log)
-    if track.end <= start:
+    track = SmoothTrack(log)
+    if track.end_time <= start:
         return {}
     origin = float(track.heading[0])
     reversals: list[float] = []
     overshoots: list[tuple[float, float]] = []
-    now, towards = start, side
-    while (reversal := track.crossing(origin + towards * heading, now, towards)) is not None:
+    current_time, current_sign = start, turn_sign
+    while (
+        reversal := track.first_heading_crossing(
+            origin + current_sign * heading, current_time, current_sign
+        )
+    ) is not None:
         reversals.append(reversal)
-        back = track.crossing(origin + towards * heading, reversal + 1e-9, -towards)
-        if back is not None:
-            time, value = track.peak(reversal, back, towards)
-            overshoots.append((time, value - towards * origin - heading))
-        now, towards = reversal, -towards
+        return_time = track.first_heading_crossing(
+            origin + current_sign * heading, reversal + 1e-9, -current_sign
+        )
+        if return_time is not None:
+            time, value = track.heading_peak(reversal, return_time, current_sign)
+            overshoots.append((time, value - current_sign * origin - heading))
+        current_time, current_sign = reversal, -current_sign
     indices: dict[str, Any] = {
-        "approach_speed": track.approach(start),
+        "approach_speed": track.approach_speed(start),
         "largest_yaw_rate": float(np.abs(track.r[track.t >= start]).max()),
-        **track.heel(start),
+        **track.max_roll_angle(start),
     }
     if reversals:
-        turned = track.travelled(reversals[0]) - track.travelled(start)
+        distance_to_reversal = track.distance_travelled(reversals[0]) - track.distance_travelled(
+            start
+        )
         indices |= {
             "initial_turning_time": reversals[0] - start,
-            "initial_turning_distance": float(turned),
+            "initial_turning_distance": float(distance_to_reversal),
         }
-        back = track.crossing(origin, reversals[0], -side)
-        indices |= {} if back is None else {"reach": back - start}
+        return_time = track.first_heading_crossing(origin, reversals[0], -turn_sign)
+        indices |= {} if return_time is None else {"reach": return_time - start}
     names = ("first_overshoot", "second_overshoot")
     indices |= {name: value for name, (_, value) in zip(names, overshoots, strict=False)}
     if overshoots:
         indices["time_to_check_yaw"] = overshoots[0][0] - reversals[0]
     if len(reversals) > 1:
-        times = np.linspace(reversals[0], reversals[1], 500)
-        aside = np.array([side * track.relative_position(time, start)[1] for time in times])
-        indices["overshoot_width"] = float(aside.max() - aside[0])
+        sample_times = np.linspace(reversals[0], reversals[1], 500)
+        lateral_offset = np.array(
+            [turn_sign * track.relative_position(time, start)[1] for time in sample_times]
+        )
+        indices["overshoot_width"] = float(lateral_offset.max() - lateral_offset[0])
     if len(reversals) > 2:
         indices["period"] = float(np.mean(np.array(reversals[2:]) - np.array(reversals[:-2])))
-    return in_lengths(indices, length)
+    return add_values_in_lengths(indices, length)
 
 
-def stopping(log: Log, start: float, length: float | None) -> dict[str, Any]:
+def stopping_indices(log: Log, start: float, length: float | None) -> dict[str, Any]:
     """Return the indices of a stopping trial: distances along the track, ahead and across.
 
     Args:
@@ -258,19 +299,19 @@ def stopping(log: Log, start: float, length: float | None) -> dict[str, Any]:
         start: time of the order astern in s; the trial ends where the surge velocity is zero.
         length: of the hull in m.
     """
-    track = Track(log)
+    track = SmoothTrack(log)
     surge = scipy.interpolate.CubicSpline(track.t, track.u)
-    indices: dict[str, Any] = {"approach_speed": track.approach(start)}
-    stop = first_crossing(lambda t: -surge(t), track.t, start)
-    if stop is None:
+    indices: dict[str, Any] = {"approach_speed": track.approach_speed(start)}
+    stop_time = first_crossing(lambda t: -surge(t), track.t, start)
+    if stop_time is None:
         return indices
-    ahead, across = track.relative_position(stop, start)
+    head_reach, lateral_offset = track.relative_position(stop_time, start)
     indices |= {
-        "track_reach": float(track.travelled(stop) - track.travelled(start)),
-        "head_reach": ahead,
-        "lateral_deviation": abs(across),
+        "track_reach": float(track.distance_travelled(stop_time) - track.distance_travelled(start)),
+        "head_reach": head_reach,
+        "lateral_deviation": abs(lateral_offset),
     }
-    return in_lengths(indices | {"stopping_time": stop - start}, length)
+    return add_values_in_lengths(indices | {"stopping_time": stop_time - start}, length)
 
 
 def turning_limits(length: float) -> dict[str, float]:
@@ -299,7 +340,7 @@ def stopping_limits(length: float) -> dict[str, float]:
     return {"track_reach": 15.0 * length}
 
 
-_MOVING, _OVER = 0.1, 0.5
+_MOVING_RATE_SHARE, _SIDE_ANGLE_SHARE = 0.1, 0.5
 """Share of the largest rudder rate from which the rudder moves, and share of the angle held from
 which it is on a side."""
 
@@ -309,24 +350,24 @@ class SteeredZigzag(NamedTuple):
 
     Attributes:
         start: time of the first execute in s, from the log's first sample.
-        side: of the first execute, +1 starboard, -1 port.
+        first_sign: of the first execute, +1 starboard, -1 port.
         angle: rudder angle held, mean over both sides, rad.
         heading: change of heading at which the rudder was ordered back, mean over the reversals,
             rad.
-        leaves: change of heading at which the rudder left its side, rad; beyond `heading` by what
+        departure_heading: change of heading at which the rudder left its side, rad; beyond `heading` by what
             the vessel turned while the order took effect.
-        turning: rate of turn when it left, mean over the reversals, rad/s.
+        departure_rate: rate of turn when it left, mean over the reversals, rad/s.
     """
 
     start: float
-    side: float
+    first_sign: float
     angle: float
     heading: float
-    leaves: float
-    turning: float
+    departure_heading: float
+    departure_rate: float
 
 
-def steered_zigzag(log: Log, rudder: str) -> SteeredZigzag:
+def identify_zigzag(log: Log, rudder: str) -> SteeredZigzag:
     """Return the zigzag of a log that holds t, psi and a rudder angle.
 
     An order is given at the last sample before the rudder moves, at a tenth of its largest rate.
@@ -337,42 +378,57 @@ def steered_zigzag(log: Log, rudder: str) -> SteeredZigzag:
         DataError: where the rudder does not change sides with the heading at least twice.
     """
     delta, psi = log[rudder], log["psi"] - log["psi"][0]
-    low, high = (float(level) for level in np.quantile(delta, (0.05, 0.95)))
-    middle, angle = 0.5 * (low + high), 0.5 * (high - low)
+    lower, upper = (float(level) for level in np.quantile(delta, (0.05, 0.95)))
+    mid_angle, angle = 0.5 * (lower + upper), 0.5 * (upper - lower)
     rate = np.abs(np.gradient(delta, log.t))
-    moving = rate > _MOVING * rate.max()
+    is_moving = rate > _MOVING_RATE_SHARE * rate.max()
     # -1, 0 or +1: the side that the rudder is held on, 0 between them
-    held = np.where(np.abs(delta - middle) > _OVER * angle, np.sign(delta - middle), 0.0)
-    over = np.flatnonzero(held)
-    changed = held[over[1:]] != held[over[:-1]]
+    rudder_side = np.where(
+        np.abs(delta - mid_angle) > _SIDE_ANGLE_SHARE * angle, np.sign(delta - mid_angle), 0.0
+    )
+    held_samples = np.flatnonzero(rudder_side)
+    has_changed = rudder_side[held_samples[1:]] != rudder_side[held_samples[:-1]]
     # the rudder may rest beside the middle before the first order
-    begun = int(np.argmax(moving))
-    arrived = int(np.argmax(~moving & (np.arange(delta.size) > begun)))
-    pairs = zip(over[:-1][changed].tolist(), over[1:][changed].tolist(), strict=True)
-    reversals = [(a, b) for a, b in pairs if b > arrived]
+    first_moving = int(np.argmax(is_moving))
+    first_arrival = int(np.argmax(~is_moving & (np.arange(delta.size) > first_moving)))
+    side_changes = zip(
+        held_samples[:-1][has_changed].tolist(), held_samples[1:][has_changed].tolist(), strict=True
+    )
+    reversals = [(a, b) for a, b in side_changes if b > first_arrival]
     if angle == 0.0 or len(reversals) < 2:
         raise DataError(
             f"log {log.name}: the rudder is reversed {len(reversals)} times; a zigzag needs at"
             " least 2"
         )
-    side = float(np.sign(delta[arrived] - delta[begun]))
-    towards = side * (-1.0) ** np.arange(len(reversals))
-    orders = [int(np.flatnonzero(~moving[:b])[-1]) for _, b in reversals]
-    crossed = []
+    first_sign = float(np.sign(delta[first_arrival] - delta[first_moving]))
+    turn_signs = first_sign * (-1.0) ** np.arange(len(reversals))
+    order_samples = [int(np.flatnonzero(~is_moving[:b])[-1]) for _, b in reversals]
+    departure_times = []
     for a, b in reversals:
-        travel = np.maximum.accumulate(held[b] * (delta[a : b + 1] - middle) / angle)
+        rudder_travel = np.maximum.accumulate(
+            rudder_side[b] * (delta[a : b + 1] - mid_angle) / angle
+        )
         # the rudder crosses from -1/2 to +1/2, at a rate that takes it back to where it left -1
-        below, above = np.interp((-_OVER, _OVER), travel, log.t[a : b + 1])
-        crossed.append(float(below - (1.0 - _OVER) / (2.0 * _OVER) * (above - below)))
-    heading = float(np.mean(towards * psi[orders]))
+        start_crossing, end_crossing = np.interp(
+            (-_SIDE_ANGLE_SHARE, _SIDE_ANGLE_SHARE), rudder_travel, log.t[a : b + 1]
+        )
+        departure_times.append(
+            float(
+                start_crossing
+                - (1.0 - _SIDE_ANGLE_SHARE)
+                / (2.0 * _SIDE_ANGLE_SHARE)
+                * (end_crossing - start_crossing)
+            )
+        )
+    heading = float(np.mean(turn_signs * psi[order_samples]))
     if heading <= 0.0:
         raise DataError(
             f"log {log.name}: the heading does not follow the rudder at the reversals; check the"
             f" sign of {rudder}"
         )
-    leaves, turning = (
-        float(np.mean(towards * np.interp(crossed, log.t, values)))
+    departure_heading, departure_rate = (
+        float(np.mean(turn_signs * np.interp(departure_times, log.t, values)))
         for values in (psi, np.gradient(psi, log.t))
     )
-    start = float(log.t[max(begun - 1, 0)] - log.t[0])
-    return SteeredZigzag(start, side, angle, heading, leaves, turning)
+    start = float(log.t[max(first_moving - 1, 0)] - log.t[0])
+    return SteeredZigzag(start, first_sign, angle, heading, departure_heading, departure_rate)

@@ -19,20 +19,20 @@ from torch import Tensor
 from residnet.core.config import Config, ExistingPath, Hertz, Seconds
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
-from residnet.core.names import STATE, VELOCITY, nearest
+from residnet.core.names import STATE_NAMES, VELOCITY_NAMES, suggest_name
 from residnet.dynamics.rollout import Source
 from residnet.manoeuvres.base import (
-    Family,
     Helm,
     Manoeuvre,
+    ManoeuvreFamily,
     Range,
-    Scheduled,
+    ScheduledManoeuvre,
     ScheduleSource,
-    drawn,
+    sample_uniform,
 )
 
 
-class ConstantInput(Scheduled):
+class ConstantInput(ScheduledManoeuvre):
     """Drive and steer held from the start: from rest to the steady state of a speed or a turn.
 
     Attributes:
@@ -44,7 +44,7 @@ class ConstantInput(Scheduled):
     drive: float = Field(ge=-1, le=1)
     steer: float = Field(ge=-1, le=1)
 
-    def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
+    def demands_at(self, t: Tensor) -> tuple[Tensor, Tensor]:
         return torch.full_like(t, self.drive), torch.full_like(t, self.steer)
 
 
@@ -60,12 +60,12 @@ class ConstantFamily(Config):
     drive: tuple[float, ...] = Field(min_length=1)
     steer: tuple[float, ...] = Field(min_length=1)
 
-    def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
+    def sample_all(self, generator: np.random.Generator, duration: float) -> list[Manoeuvre]:
         """Return one manoeuvre per combination; nothing is random."""
         return [ConstantInput(drive=d, steer=s) for d, s in product(self.drive, self.steer)]
 
 
-class AccelerationDeceleration(Scheduled):
+class AccelerationDeceleration(ScheduledManoeuvre):
     """Speed steps straight ahead: drive levels, each held from its time on; the steer is zero.
 
     Attributes:
@@ -78,18 +78,18 @@ class AccelerationDeceleration(Scheduled):
     levels: tuple[float, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _pairs(self) -> AccelerationDeceleration:
+    def _check_levels(self) -> AccelerationDeceleration:
         if len(self.times) != len(self.levels) or list(self.times) != sorted(self.times):
             raise ValueError("times and levels need the same number of entries, times ascending")
         return self
 
-    def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
+    def demands_at(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Return the stepped drive [T], zero before the first time; zero steer [T]."""
         index = torch.searchsorted(torch.tensor(self.times, dtype=t.dtype), t, right=True)
         return torch.tensor((0.0, *self.levels), dtype=t.dtype)[index], torch.zeros_like(t)
 
 
-class AccelerationDecelerationFamily(Family):
+class AccelerationDecelerationFamily(ManoeuvreFamily):
     """Steps between a high and a low level, drawn at random.
 
     The high level is lowered by a quarter and by half in turn; all is uniform in its range.
@@ -105,23 +105,26 @@ class AccelerationDecelerationFamily(Family):
     low: Range = (0.0, 0.3)
     hold: tuple[Seconds, Seconds] = (6.0, 12.0)
 
-    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
-        number = np.arange(int(duration / self.hold[0]) + 2)
-        high, low = drawn(random, self.high), drawn(random, self.low)
-        holds = random.uniform(*self.hold, size=number.size)
-        times = np.concatenate(([0.0], np.cumsum(holds)[:-1]))
-        peaks = high * np.array([1.0, 0.75, 0.5])[(number // 2) % 3]
-        levels = np.where(number % 2 == 0, peaks, low)
-        inside = times < duration
+    def sample_one(self, generator: np.random.Generator, duration: float) -> Manoeuvre:
+        level_index = np.arange(int(duration / self.hold[0]) + 2)
+        high_level, low_level = (
+            sample_uniform(generator, self.high),
+            sample_uniform(generator, self.low),
+        )
+        hold_times = generator.uniform(*self.hold, size=level_index.size)
+        times = np.concatenate(([0.0], np.cumsum(hold_times)[:-1]))
+        peaks = high_level * np.array([1.0, 0.75, 0.5])[(level_index // 2) % 3]
+        levels = np.where(level_index % 2 == 0, peaks, low_level)
+        is_within = times < duration
         return AccelerationDeceleration(
-            times=tuple(times[inside].tolist()), levels=tuple(levels[inside].tolist())
+            times=tuple(times[is_within].tolist()), levels=tuple(levels[is_within].tolist())
         )
 
 
-_PATTERN = (1.0, 1.0, 1.0, -1.0, -1.0, 1.0, -1.0)
+_STEP_PATTERN = (1.0, 1.0, 1.0, -1.0, -1.0, 1.0, -1.0)
 
 
-class ThreeTwoOneOne(Scheduled):
+class ThreeTwoOneOne(ScheduledManoeuvre):
     """The 3-2-1-1 pattern: steering steps of 3, 2, 1 and 1 units to alternating sides.
 
     It excites a broad band. The steer is zero after it.
@@ -141,16 +144,16 @@ class ThreeTwoOneOne(Scheduled):
     unit: Seconds = Field(gt=0)
     repeat: bool = True
 
-    def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
+    def demands_at(self, t: Tensor) -> tuple[Tensor, Tensor]:
         # times on the grid must not fall short of their unit by rounding
-        units = torch.floor((t - self.start) / self.unit + 1e-9).long()
-        pattern = torch.tensor(_PATTERN, dtype=t.dtype)
-        steer = self.steer * pattern[units.clamp(min=0) % len(_PATTERN)]
-        active = (units >= 0) & (self.repeat | (units < len(_PATTERN)))
-        return torch.full_like(t, self.drive), torch.where(active, steer, torch.zeros_like(t))
+        unit_index = torch.floor((t - self.start) / self.unit + 1e-9).long()
+        pattern = torch.tensor(_STEP_PATTERN, dtype=t.dtype)
+        steer = self.steer * pattern[unit_index.clamp(min=0) % len(_STEP_PATTERN)]
+        is_active = (unit_index >= 0) & (self.repeat | (unit_index < len(_STEP_PATTERN)))
+        return torch.full_like(t, self.drive), torch.where(is_active, steer, torch.zeros_like(t))
 
 
-class ThreeTwoOneOneFamily(Family):
+class ThreeTwoOneOneFamily(ManoeuvreFamily):
     """3-2-1-1 manoeuvres with unit, steer and drive uniform in their ranges, repeated.
 
     Attributes:
@@ -166,12 +169,14 @@ class ThreeTwoOneOneFamily(Family):
     drive: Range = (0.1, 0.9)
     start: Seconds = 5.0
 
-    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
-        unit, steer, drive = (drawn(random, span) for span in (self.unit, self.steer, self.drive))
+    def sample_one(self, generator: np.random.Generator, duration: float) -> Manoeuvre:
+        unit, steer, drive = (
+            sample_uniform(generator, limits) for limits in (self.unit, self.steer, self.drive)
+        )
         return ThreeTwoOneOne(unit=unit, steer=steer, drive=drive, start=self.start)
 
 
-def _ordered(band: tuple[float, float]) -> tuple[float, float]:
+def _check_band(band: tuple[float, float]) -> tuple[float, float]:
     if not 0 < band[0] < band[1]:
         raise ValueError(
             f"a band goes from a low to a higher frequency above zero, given {band[0]:g} Hz to"
@@ -180,12 +185,12 @@ def _ordered(band: tuple[float, float]) -> tuple[float, float]:
     return band
 
 
-Band = Annotated[tuple[Hertz, Hertz], AfterValidator(_ordered)]
+FrequencyBand = Annotated[tuple[Hertz, Hertz], AfterValidator(_check_band)]
 """Lowest and highest frequency."""
-_DRIVE, _STEER, _SWAY, _DIVE, _OWN = range(5)
+_DRIVE, _STEER, _SWAY, _DIVE, _FIRST_OWN_WAVE = range(5)
 
 
-class Excitation(Scheduled, ABC):
+class Excitation(ScheduledManoeuvre, ABC):
     """Random demands over a band of frequencies.
 
     Attributes:
@@ -208,49 +213,53 @@ class Excitation(Scheduled, ABC):
     sway_amplitude: float = Field(default=0.0, ge=0, le=1)
     dive_amplitude: float = Field(default=0.0, ge=0, le=1)
     own_amplitude: float = Field(default=0.0, ge=0, le=1)
-    band: Band
+    band: FrequencyBand
     seed: int = Field(default=0, ge=0)
     start: Seconds = Field(default=5.0, ge=0)
 
     @abstractmethod
-    def _wave(self, t: Tensor, which: int) -> Tensor:
+    def _demand_wave(self, t: Tensor, wave_index: int) -> Tensor:
         """Return the wave [T] within +-1 of a demand at times t [T] since the start in s."""
 
-    def _after_start(self, t: Tensor, which: int) -> Tensor:
-        wave = self._wave((t - self.start).clamp(min=0.0), which)
+    def _delayed_wave(self, t: Tensor, wave_index: int) -> Tensor:
+        wave = self._demand_wave((t - self.start).clamp(min=0.0), wave_index)
         return torch.where(t >= self.start - 1e-9, wave, torch.zeros_like(t))
 
-    def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        drive = self.drive + self.drive_amplitude * self._after_start(t, _DRIVE)
-        return drive.clamp(-1.0, 1.0), self.steer_amplitude * self._after_start(t, _STEER)
+    def demands_at(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        drive = self.drive + self.drive_amplitude * self._delayed_wave(t, _DRIVE)
+        return drive.clamp(-1.0, 1.0), self.steer_amplitude * self._delayed_wave(t, _STEER)
 
     @classmethod
-    def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+    def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         """Return the playback of the demands, with the sway forces where there are any.
 
         Raises:
             UsageError: where a sway force is asked of a vessel whose commands are no forces.
         """
-        own = [manoeuvre for manoeuvre in manoeuvres if isinstance(manoeuvre, Excitation)]
-        drive, steer = map(torch.stack, zip(*(m.demands(t) for m in own), strict=True))
-        dive = torch.stack([m.dive_amplitude * m._after_start(t, _DIVE) for m in own])
-        commands = helm.commanded(drive, steer, *([dive] if bool(dive.any()) else []))
-        sway = torch.stack([m.sway_amplitude * m._after_start(t, _SWAY) for m in own])
+        excitations = [manoeuvre for manoeuvre in manoeuvres if isinstance(manoeuvre, Excitation)]
+        drive, steer = map(torch.stack, zip(*(m.demands_at(t) for m in excitations), strict=True))
+        dive = torch.stack([m.dive_amplitude * m._delayed_wave(t, _DIVE) for m in excitations])
+        commands = helm.commands_for(drive, steer, *([dive] if bool(dive.any()) else []))
+        sway = torch.stack([m.sway_amplitude * m._delayed_wave(t, _SWAY) for m in excitations])
         if bool(sway.any()):
-            limit = helm.side_force
-            if limit is None or "tau_y" not in helm.inputs:
+            max_side_force = helm.side_force
+            if max_side_force is None or "tau_y" not in helm.inputs:
                 raise UsageError(
                     "sway_amplitude: a manoeuvre asks for a sway force, but the vessel's commands"
                     f" are {', '.join(helm.inputs[:2])} and no forces; leave it out"
                 )
-            commands[..., helm.inputs.index("tau_y")] += limit * sway
-        if any(m.own_amplitude for m in own):
-            full = helm.demand(torch.zeros_like(steer[0, :1]), torch.ones_like(steer[0, :1])).abs()
-            if helm.diving is not None:
-                full = torch.maximum(full, helm.diving.abs())
+            commands[..., helm.inputs.index("tau_y")] += max_side_force * sway
+        if any(m.own_amplitude for m in excitations):
+            full_commands = helm.demand(
+                torch.zeros_like(steer[0, :1]), torch.ones_like(steer[0, :1])
+            ).abs()
+            if helm.dive_commands is not None:
+                full_commands = torch.maximum(full_commands, helm.dive_commands.abs())
             for i in range(commands.shape[-1]):
-                waves = [m.own_amplitude * m._after_start(t, _OWN + i) for m in own]
-                commands[..., i] += full[0, i] * torch.stack(waves)
+                waves = [
+                    m.own_amplitude * m._delayed_wave(t, _FIRST_OWN_WAVE + i) for m in excitations
+                ]
+                commands[..., i] += full_commands[0, i] * torch.stack(waves)
         return ScheduleSource(commands)
 
 
@@ -263,12 +272,12 @@ class RandomSteps(Excitation):
 
     kind: Literal["random_steps"] = "random_steps"
 
-    def _wave(self, t: Tensor, which: int) -> Tensor:
-        random = np.random.default_rng([self.seed, which])
-        span, times, levels = float(t[-1]), [0.0], [random.uniform(-1.0, 1.0)]
-        while times[-1] <= span:
-            times.append(times[-1] + 0.5 / random.uniform(*self.band))
-            levels.append(random.uniform(-1.0, 1.0))
+    def _demand_wave(self, t: Tensor, wave_index: int) -> Tensor:
+        generator = np.random.default_rng([self.seed, wave_index])
+        duration, times, levels = float(t[-1]), [0.0], [generator.uniform(-1.0, 1.0)]
+        while times[-1] <= duration:
+            times.append(times[-1] + 0.5 / generator.uniform(*self.band))
+            levels.append(generator.uniform(-1.0, 1.0))
         index = torch.searchsorted(torch.tensor(times, dtype=t.dtype), t + 1e-9, right=True) - 1
         return torch.tensor(levels, dtype=t.dtype)[index]
 
@@ -287,25 +296,31 @@ class MultiSine(Excitation):
     kind: Literal["multi_sine"] = "multi_sine"
     tones: int = Field(default=8, ge=2, le=200)
 
-    def _wave(self, t: Tensor, which: int) -> Tensor:
-        demands = 3 if self.sway_amplitude else 2
-        demands = max(demands, which + 1)
-        frequencies = np.geomspace(*self.band, demands * self.tones)[which % demands :: demands]
-        random = np.random.default_rng([self.seed, which])
-        trial = np.arange(0.0, 10.0 / self.band[0], min(0.05 / self.band[1], 0.005 / self.band[0]))
-        angle = 2.0 * math.pi * trial[:, None] * frequencies
-        best, least = np.zeros(self.tones), math.inf
+    def _demand_wave(self, t: Tensor, wave_index: int) -> Tensor:
+        n_demands = 3 if self.sway_amplitude else 2
+        n_demands = max(n_demands, wave_index + 1)
+        frequencies = np.geomspace(*self.band, n_demands * self.tones)[
+            wave_index % n_demands :: n_demands
+        ]
+        generator = np.random.default_rng([self.seed, wave_index])
+        trial_times = np.arange(
+            0.0, 10.0 / self.band[0], min(0.05 / self.band[1], 0.005 / self.band[0])
+        )
+        angle = 2.0 * math.pi * trial_times[:, None] * frequencies
+        best_phases, lowest_peak = np.zeros(self.tones), math.inf
         for _ in range(20):
-            phases = random.uniform(0.0, 2.0 * math.pi, self.tones)
+            phases = generator.uniform(0.0, 2.0 * math.pi, self.tones)
             peak = float(np.abs(np.sin(angle + phases).sum(axis=1)).max())
-            if peak < least:
-                best, least = phases, peak
-        turned, begun = (torch.from_numpy(part).to(t.dtype) for part in (frequencies, best))
-        argument = 2.0 * math.pi * t.unsqueeze(-1) * turned + begun
-        return (torch.sin(argument).sum(-1) / least).clamp(-1.0, 1.0)
+            if peak < lowest_peak:
+                best_phases, lowest_peak = phases, peak
+        frequency_tensor, phase_tensor = (
+            torch.from_numpy(part).to(t.dtype) for part in (frequencies, best_phases)
+        )
+        argument = 2.0 * math.pi * t.unsqueeze(-1) * frequency_tensor + phase_tensor
+        return (torch.sin(argument).sum(-1) / lowest_peak).clamp(-1.0, 1.0)
 
 
-class ExcitationFamily(Family):
+class ExcitationFamily(ManoeuvreFamily):
     """Random excitation: everything uniform in its range, the band as given.
 
     Attributes:
@@ -326,19 +341,19 @@ class ExcitationFamily(Family):
     sway_amplitude: Range = (0.0, 0.0)
     dive_amplitude: Range = (0.0, 0.0)
     own_amplitude: Range = (0.0, 0.0)
-    band: Band = (0.02, 0.2)
+    band: FrequencyBand = (0.02, 0.2)
     start: Seconds = 5.0
 
-    def _common(self, random: np.random.Generator) -> dict[str, Any]:
-        out: dict[str, Any] = {
-            name: drawn(random, getattr(self, name))
+    def _sample_common(self, generator: np.random.Generator) -> dict[str, Any]:
+        settings: dict[str, Any] = {
+            name: sample_uniform(generator, getattr(self, name))
             for name in ("drive", "drive_amplitude", "steer_amplitude")
         }
-        out |= {"band": self.band, "seed": int(random.integers(2**31)), "start": self.start}
+        settings |= {"band": self.band, "seed": int(generator.integers(2**31)), "start": self.start}
         for name in ("sway_amplitude", "dive_amplitude", "own_amplitude"):
             if getattr(self, name)[1] > 0:
-                out[name] = drawn(random, getattr(self, name))
-        return out
+                settings[name] = sample_uniform(generator, getattr(self, name))
+        return settings
 
 
 class RandomStepsFamily(ExcitationFamily):
@@ -346,8 +361,8 @@ class RandomStepsFamily(ExcitationFamily):
 
     kind: Literal["random_steps"] = "random_steps"
 
-    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
-        return RandomSteps.model_validate(self._common(random))
+    def sample_one(self, generator: np.random.Generator, duration: float) -> Manoeuvre:
+        return RandomSteps.model_validate(self._sample_common(generator))
 
 
 class MultiSineFamily(ExcitationFamily):
@@ -360,8 +375,8 @@ class MultiSineFamily(ExcitationFamily):
     kind: Literal["multi_sine"] = "multi_sine"
     tones: int = Field(default=8, ge=2, le=200)
 
-    def one(self, random: np.random.Generator, duration: float) -> Manoeuvre:
-        return MultiSine.model_validate(self._common(random) | {"tones": self.tones})
+    def sample_one(self, generator: np.random.Generator, duration: float) -> Manoeuvre:
+        return MultiSine.model_validate(self._sample_common(generator) | {"tones": self.tones})
 
 
 class Replay(Manoeuvre):
@@ -381,7 +396,7 @@ class Replay(Manoeuvre):
     channels: dict[str, str] = Field(default_factory=dict)
     _recorded: Log | None = PrivateAttr(default=None)
 
-    def take(self, log: Log) -> None:
+    def use_log(self, log: Log) -> None:
         """Take a log that was read already."""
         self._recorded = log
 
@@ -396,7 +411,7 @@ class Replay(Manoeuvre):
             self._recorded = Log.load(self.log)
         return self._recorded
 
-    def channel(self, name: str) -> np.ndarray | None:
+    def recorded_values(self, name: str) -> np.ndarray | None:
         """Return what the log has for an input or state of the vessel, [T].
 
         None where it has nothing.
@@ -410,16 +425,16 @@ class Replay(Manoeuvre):
         if name in self.channels:
             raise UsageError(
                 f"replay.channels: log {self.recorded.name} has no channel"
-                f" '{channel}'{nearest(channel, self.recorded.channels)}"
+                f" '{channel}'{suggest_name(channel, self.recorded.channels)}"
             )
         return None
 
-    def lasts(self, duration: float) -> float:
+    def duration_within(self, duration: float) -> float:
         """Return the seconds that the log lasts, or `self.duration` where that is less."""
-        span = float(self.recorded.t[-1] - self.recorded.t[0])
-        return span if self.duration is None else min(span, self.duration)
+        log_duration = float(self.recorded.t[-1] - self.recorded.t[0])
+        return log_duration if self.duration is None else min(log_duration, self.duration)
 
-    def begin(self, x: Tensor, state: tuple[str, ...]) -> Tensor:
+    def initial_state(self, x: Tensor, state: tuple[str, ...]) -> Tensor:
         """Return the state [nx] at the log's first sample.
 
         What the log does not have stays as it is in x [nx].
@@ -428,25 +443,25 @@ class Replay(Manoeuvre):
             UsageError: where the log lacks position, heading or a velocity.
             DataError: where the first sample of one is empty.
         """
-        out = x.clone()
+        initial_state = x.clone()
         for i, name in enumerate(state):
-            values = self.channel(name)
+            values = self.recorded_values(name)
             if values is not None:
-                filled = np.flatnonzero(np.isfinite(values))
-                if filled.size == 0:
+                finite_samples = np.flatnonzero(np.isfinite(values))
+                if finite_samples.size == 0:
                     raise DataError(
                         f"log {self.recorded.name}: channel '{name}' is empty; a replay starts from"
                         " its first value"
                     )
-                out[i] = float(values[filled[0]])
-            elif name in STATE:
+                initial_state[i] = float(values[finite_samples[0]])
+            elif name in STATE_NAMES:
                 raise UsageError(
                     f"log {self.recorded.name}: no channel '{name}', which a replay starts"
-                    f" from{nearest(name, self.recorded.channels)}"
+                    f" from{suggest_name(name, self.recorded.channels)}"
                 )
-        return out
+        return initial_state
 
-    def inputs(self, helm: Helm, t: Tensor) -> Tensor:
+    def recorded_inputs(self, helm: Helm, t: Tensor) -> Tensor:
         """Return the inputs [T, m] at times t [T].
 
         Exogenous columns that the log does not have are NaN.
@@ -455,49 +470,53 @@ class Replay(Manoeuvre):
             UsageError: where the log lacks a command.
         """
         no_demand = torch.zeros(1, dtype=torch.float64)
-        commands = helm.demand(no_demand, no_demand).shape[-1]
-        clock = self.recorded.t - self.recorded.t[0]
-        out = np.full((t.numel(), len(helm.inputs)), np.nan)
+        n_commands = helm.demand(no_demand, no_demand).shape[-1]
+        log_time = self.recorded.t - self.recorded.t[0]
+        input_values = np.full((t.numel(), len(helm.inputs)), np.nan)
         for i, name in enumerate(helm.inputs):
-            values = self.channel(name)
-            if values is None and i < commands:
+            values = self.recorded_values(name)
+            if values is None and i < n_commands:
                 raise UsageError(
                     f"log {self.recorded.name}: no channel '{name}', which the vessel is commanded"
                     " with; name one that it has in replay.channels; it has"
                     f" {', '.join(self.recorded.channels)}"
                 )
             if values is not None and np.isfinite(values).any():
-                known = np.isfinite(values)
-                at = np.searchsorted(clock[known], t.numpy() + 1e-9, side="right") - 1
-                out[:, i] = values[known][at.clip(min=0)]
-        return torch.from_numpy(out)
+                is_known = np.isfinite(values)
+                sample_index = (
+                    np.searchsorted(log_time[is_known], t.numpy() + 1e-9, side="right") - 1
+                )
+                input_values[:, i] = values[is_known][sample_index.clip(min=0)]
+        return torch.from_numpy(input_values)
 
-    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+    def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
         """Return how far the motion is from the recorded one.
 
         These are root mean square errors of u, v, r, and the errors of position and heading at the
         end.
         """
-        clock = self.recorded.t - self.recorded.t[0]
+        log_time = self.recorded.t - self.recorded.t[0]
         errors: dict[str, np.ndarray] = {}
-        for name in STATE:
-            values = self.channel(name)
+        for name in STATE_NAMES:
+            values = self.recorded_values(name)
             assert values is not None, "a replay does not begin without it"
-            known = np.isfinite(values)
-            errors[name] = log[name] - np.interp(log.t - log.t[0], clock[known], values[known])
-        found: dict[str, Any] = {
-            f"rmse_{name}": float(np.sqrt(np.mean(errors[name] ** 2))) for name in VELOCITY
+            is_known = np.isfinite(values)
+            errors[name] = log[name] - np.interp(
+                log.t - log.t[0], log_time[is_known], values[is_known]
+            )
+        velocity_errors: dict[str, Any] = {
+            f"rmse_{name}": float(np.sqrt(np.mean(errors[name] ** 2))) for name in VELOCITY_NAMES
         }
         distance = float(np.hypot(errors["x"][-1], errors["y"][-1]))
-        return found | {
+        return velocity_errors | {
             "position_error_end": distance,
             "heading_error_end": float(abs((errors["psi"][-1] + np.pi) % (2 * np.pi) - np.pi)),
         }
 
     @classmethod
-    def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+    def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         return RecordedSource(
-            torch.stack([m.inputs(helm, t) for m in manoeuvres if isinstance(m, Replay)])
+            torch.stack([m.recorded_inputs(helm, t) for m in manoeuvres if isinstance(m, Replay)])
         )
 
 
@@ -510,5 +529,5 @@ class RecordedSource(Source):
         self.values = values
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        given = self.values[:, k].to(w.dtype)
-        return torch.where(torch.isnan(given), w, given), memory
+        recorded_inputs = self.values[:, k].to(w.dtype)
+        return torch.where(torch.isnan(recorded_inputs), w, recorded_inputs), memory

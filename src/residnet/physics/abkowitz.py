@@ -13,25 +13,25 @@ from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor, nn
 
 from residnet.core.config import Config, MetresPerSecond, RevsPerSecond
-from residnet.core.names import VELOCITY
+from residnet.core.names import VELOCITY_NAMES
 from residnet.physics.actuators.base import (
-    Actuators,
-    Command,
+    ActuatorSystem,
+    CommandSpec,
     ShaftConfig,
     SteeringGearConfig,
-    demanded,
+    commands_from_demand,
 )
 from residnet.physics.environment import WindLoadsConfig
 from residnet.physics.parameters import Density
 from residnet.physics.plant import Hull, HullPlant
-from residnet.physics.terms import TermLibrary, read_rows
+from residnet.physics.terms import TermLibrary, parse_axis_terms
 from residnet.physics.vessel_file import VesselFile
 
-SERIES = ("du", "v", "r", "delta", "dn")
+SERIES_VARIABLES = ("du", "v", "r", "delta", "dn")
 """What the terms are made of: u - U0, sway, yaw rate, rudder angle, n - n0."""
 
 
-class SeriesShaftConfig(ShaftConfig):
+class AbkowitzShaftConfig(ShaftConfig):
     """The propeller's shaft, for series with terms in dn.
 
     Attributes:
@@ -41,7 +41,7 @@ class SeriesShaftConfig(ShaftConfig):
     n_0: RevsPerSecond = Field(gt=0)
 
 
-class SeriesMass(Config):
+class AbkowitzMassConfig(Config):
     """Rigid body and added mass, in the units of the series.
 
     Attributes:
@@ -65,13 +65,15 @@ class SeriesMass(Config):
     N_rdot: float
 
 
-def _readable(rows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+def _validate_terms(rows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
     """Return the terms of each axis, after a look at all of them; an empty row where none is."""
-    read_rows(rows, SERIES)
+    parse_axis_terms(rows, SERIES_VARIABLES)
     return {axis: rows.get(axis, {}) for axis in "XYN"}
 
 
-Derivatives = Annotated[dict[Literal["X", "Y", "N"], dict[str, float]], AfterValidator(_readable)]
+HydrodynamicDerivatives = Annotated[
+    dict[Literal["X", "Y", "N"], dict[str, float]], AfterValidator(_validate_terms)
+]
 
 
 class AbkowitzConfig(VesselFile):
@@ -81,7 +83,7 @@ class AbkowitzConfig(VesselFile):
 
     Attributes:
         length: L, between perpendiculars.
-        units: `prime` for dimensionless coefficients (SNAME's prime system: forces over 0.5 rho L^2
+        units: `is_prime_system` for dimensionless coefficients (SNAME's prime system: forces over 0.5 rho L^2
             U^2, moments over 0.5 rho L^3 U^2, masses over 0.5 rho L^3, with U the present speed
             through the water; du/U, v/U, r L/U, dn/n_0), `si` for coefficients in SI.
         speed: U0, the service speed that the series is taken about. In the prime system the present
@@ -107,23 +109,25 @@ class AbkowitzConfig(VesselFile):
     density: Density = Field(default=1025.0, gt=0)
     coriolis: Literal["included", "rigid_body"]
     delta_sign: Literal[-1, 1]
-    mass: SeriesMass
-    coefficients: Derivatives
+    mass: AbkowitzMassConfig
+    coefficients: HydrodynamicDerivatives
     source: str = Field(min_length=1)
     rudder: SteeringGearConfig
-    shaft: SeriesShaftConfig | None = None
+    shaft: AbkowitzShaftConfig | None = None
     wind: WindLoadsConfig | None = None
 
     @model_validator(mode="after")
-    def _consistent(self) -> AbkowitzConfig:
-        rows = read_rows(self.coefficients, SERIES)
-        if any(f.name == "dn" for *_, factors in rows for f in factors) != (self.shaft is not None):
+    def _validate_series(self) -> AbkowitzConfig:
+        parsed_terms = parse_axis_terms(self.coefficients, SERIES_VARIABLES)
+        if any(factor.name == "dn" for *_, factors in parsed_terms for factor in factors) != (
+            self.shaft is not None
+        ):
             raise ValueError(
                 "terms in dn and the section 'shaft' belong together: the series needs both or"
                 " neither"
             )
-        turning = self.delta_sign * self.coefficients["N"].get("delta", 0.0)
-        if turning < 0:
+        turning_derivative = self.delta_sign * self.coefficients["N"].get("delta", 0.0)
+        if turning_derivative < 0:
             raise ValueError(
                 "N.delta times delta_sign must be positive: a rudder to starboard turns to"
                 " starboard; check delta_sign"
@@ -136,76 +140,105 @@ class AbkowitzConfig(VesselFile):
         Raises:
             ConfigError: where the mass matrix is not positive definite or is singular.
         """
-        start = {"u": self.speed, "n": self.shaft.n_0 if self.shaft is not None else 0.0}
-        return HullPlant(self.hull(), SeriesForces(self), self.wind, start)
+        initial_values = {"u": self.speed, "n": self.shaft.n_0 if self.shaft is not None else 0.0}
+        return HullPlant(self.build_hull(), AbkowitzForces(self), self.wind, initial_values)
 
-    def hull(self) -> Hull:
+    def build_hull(self) -> Hull:
         """Build the inertia in SI, with the rigid body's Coriolis force where the series lacks it.
 
-        The forces of the water are those of `SeriesForces`.
+        The forces of the water are those of `AbkowitzForces`.
         """
-        body, length = self.mass, self.length.value
-        prime = self.units == "prime"
-        unit, arm = (0.5 * self.density * length**3, length) if prime else (1.0, 1.0)
-        moment = body.m * body.x_G
-        m, m_x = body.m * unit, moment * unit * arm
+        mass_terms, length = self.mass, self.length.value
+        is_prime_system = self.units == "prime"
+        mass_unit, length_unit = (
+            (0.5 * self.density * length**3, length) if is_prime_system else (1.0, 1.0)
+        )
+        moment = mass_terms.m * mass_terms.x_G
+        mass_si, moment_si = mass_terms.m * mass_unit, moment * mass_unit * length_unit
         mass = [
-            [unit * (body.m - body.X_udot), 0.0, 0.0],
-            [0.0, unit * (body.m - body.Y_vdot), unit * arm * (moment - body.Y_rdot)],
-            [0.0, unit * arm * (moment - body.N_vdot), unit * arm**2 * (body.I_z - body.N_rdot)],
+            [mass_unit * (mass_terms.m - mass_terms.X_udot), 0.0, 0.0],
+            [
+                0.0,
+                mass_unit * (mass_terms.m - mass_terms.Y_vdot),
+                mass_unit * length_unit * (moment - mass_terms.Y_rdot),
+            ],
+            [
+                0.0,
+                mass_unit * length_unit * (moment - mass_terms.N_vdot),
+                mass_unit * length_unit**2 * (mass_terms.I_z - mass_terms.N_rdot),
+            ],
         ]
-        rows: tuple[Mapping[str, float], ...] = ({}, {}, {})
+        coriolis_rows: tuple[Mapping[str, float], ...] = ({}, {}, {})
         if self.coriolis == "rigid_body":
-            rows = ({"v r": m, "r^2": m_x}, {"u r": -m}, {"u r": -m_x})
-        return Hull(mass, rows, VELOCITY, self.name)
+            coriolis_rows = (
+                {"v r": mass_si, "r^2": moment_si},
+                {"u r": -mass_si},
+                {"u r": -moment_si},
+            )
+        return Hull(mass, coriolis_rows, VELOCITY_NAMES, self.name)
 
 
 @final
-class SeriesForces(Actuators):
+class AbkowitzForces(ActuatorSystem):
     """The whole series as forces of rudder, propeller and motion: tau [..., 3] in N, N, N m."""
 
     def __init__(self, config: AbkowitzConfig) -> None:
         rudder, shaft = config.rudder, config.shaft
-        servos, asked = [rudder.servo("delta")], [Command("cmd_delta", "steer", rudder.limit)]
+        servos, command_specs = (
+            [rudder.build_servo("delta")],
+            [CommandSpec("cmd_delta", "steer", rudder.limit)],
+        )
         if shaft is not None:
-            servos.append(shaft.servo("n"))
-            asked.append(Command("cmd_n", "drive", shaft.n_max))
+            servos.append(shaft.build_servo("n"))
+            command_specs.append(CommandSpec("cmd_n", "drive", shaft.n_max))
         super().__init__(*servos)
-        self.asked = tuple(asked)
-        self.turns, self.n_0 = shaft is not None, shaft.n_0 if shaft is not None else 1.0
-        self.commands = tuple(command.name for command in asked)
-        self.prime = config.units == "prime"
+        self.command_specs = tuple(command_specs)
+        self.has_shaft, self.n_0 = shaft is not None, shaft.n_0 if shaft is not None else 1.0
+        self.command_names = tuple(command.name for command in command_specs)
+        self.is_prime_system = config.units == "prime"
         self.length, self.speed = config.length.value, config.speed
-        self.sign = float(config.delta_sign)
-        self.dynamic = 0.5 * config.density * self.length**2
-        rows = list(config.coefficients.values())
-        self.terms = TermLibrary(sorted({term for row in rows for term in row}), SERIES)
-        values = [[row.get(term, 0.0) for row in rows] for term in self.terms.terms]
-        self.coefficients = nn.Buffer(torch.tensor(values, dtype=torch.float64), persistent=False)
+        self.delta_sign = float(config.delta_sign)
+        self.pressure_area = 0.5 * config.density * self.length**2
+        coefficient_rows = list(config.coefficients.values())
+        self.terms = TermLibrary(
+            sorted({term for axis_coefficients in coefficient_rows for term in axis_coefficients}),
+            SERIES_VARIABLES,
+        )
+        coefficient_values = [
+            [axis_coefficients.get(term, 0.0) for axis_coefficients in coefficient_rows]
+            for term in self.terms.terms
+        ]
+        self.coefficients = nn.Buffer(
+            torch.tensor(coefficient_values, dtype=torch.float64), persistent=False
+        )
         # moments carry one length more than forces
-        lengths = torch.tensor([1.0, 1.0, self.length], dtype=torch.float64)
-        self.lengths = nn.Buffer(lengths, persistent=False)
+        moment_arms = torch.tensor([1.0, 1.0, self.length], dtype=torch.float64)
+        self.moment_arms = nn.Buffer(moment_arms, persistent=False)
 
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+    def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the rudder angle from steer.
 
         Revolutions from drive where the series knows them (else it keeps its service power).
         """
-        return demanded(self.asked, drive, steer)
+        return commands_from_demand(self.command_specs, drive, steer)
 
-    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        position = self.positions(a, command)
-        u, v, r, delta = nu[..., 0], nu[..., 1], nu[..., 2], self.sign * position[..., 0]
-        dn = position[..., 1] - self.n_0 if self.turns else torch.zeros_like(u)
+    def force(self, states: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        position = self.servo_positions(states, command)
+        u, v, r, delta = nu[..., 0], nu[..., 1], nu[..., 2], self.delta_sign * position[..., 0]
+        dn = position[..., 1] - self.n_0 if self.has_shaft else torch.zeros_like(u)
         coefficients = self.coefficients.to(nu.dtype)
-        if not self.prime:
-            motion = torch.stack((u - self.speed, v, r, delta, dn), dim=-1)
-            force: Tensor = self.terms(motion) @ coefficients
+        if not self.is_prime_system:
+            series_variables = torch.stack((u - self.speed, v, r, delta, dn), dim=-1)
+            force: Tensor = self.terms(series_variables) @ coefficients
             return force
         speed = torch.sqrt((u * u + v * v).clamp(min=(0.1 * self.speed) ** 2))
-        motion = torch.stack(
+        series_variables = torch.stack(
             ((u - self.speed) / speed, v / speed, r * self.length / speed, delta, dn / self.n_0),
             dim=-1,
         )
-        force = self.dynamic * (speed * speed).unsqueeze(-1) * (self.terms(motion) @ coefficients)
-        return force * self.lengths.to(nu.dtype)
+        force = (
+            self.pressure_area
+            * (speed * speed).unsqueeze(-1)
+            * (self.terms(series_variables) @ coefficients)
+        )
+        return force * self.moment_arms.to(nu.dtype)

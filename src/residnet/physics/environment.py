@@ -41,12 +41,12 @@ class WindLoadConfig(Config, ABC):
     source: str = Field(min_length=1)
 
     @abstractmethod
-    def loads(self, along: Tensor, across: Tensor) -> Tensor:
+    def wind_forces(self, relative_x: Tensor, relative_y: Tensor) -> Tensor:
         """Return X, Y [N], K, N [N m], stacked [..., 4], in a relative wind.
 
         Args:
-            along: velocity of the air relative to the vessel along body x [...] in m/s.
-            across: the same along body y [...] in m/s.
+            relative_x: velocity of the air relative to the vessel along body x [...] in m/s.
+            relative_y: the same along body y [...] in m/s.
         """
 
 
@@ -68,13 +68,16 @@ class SymmetricWindConfig(WindLoadConfig):
     c_y: float = Field(ge=0, le=2)
     c_n: float = Field(ge=0, le=1)
 
-    def loads(self, along: Tensor, across: Tensor) -> Tensor:
+    def wind_forces(self, relative_x: Tensor, relative_y: Tensor) -> Tensor:
         """Return the forces [..., 4], in components: no angle, and smooth in a calm."""
-        front, side = 0.5 * self.density * self.frontal_area, 0.5 * self.density * self.lateral_area
-        speed = torch.sqrt(along * along + across * across + 1e-12)
-        y = side * self.c_y * across * speed
-        n = -2.0 * side * self.length * self.c_n * along * across
-        x = front * self.c_x * along * speed
+        frontal_factor, lateral_factor = (
+            0.5 * self.density * self.frontal_area,
+            0.5 * self.density * self.lateral_area,
+        )
+        speed = torch.sqrt(relative_x * relative_x + relative_y * relative_y + 1e-12)
+        y = lateral_factor * self.c_y * relative_y * speed
+        n = -2.0 * lateral_factor * self.length * self.c_n * relative_x * relative_y
+        x = frontal_factor * self.c_x * relative_x * speed
         return torch.stack((x, y, self.centre_height * y, n), dim=-1)
 
 
@@ -102,9 +105,9 @@ class TabulatedWindConfig(WindLoadConfig):
     C_N: tuple[float, ...]
 
     @model_validator(mode="after")
-    def _table(self) -> TabulatedWindConfig:
-        rising = all(a < b for a, b in zip(self.angle, self.angle[1:], strict=False))
-        if not rising or self.angle[0] != 0 or abs(self.angle[-1] - torch.pi) > 1e-6:
+    def _validate_table(self) -> TabulatedWindConfig:
+        is_increasing = all(a < b for a, b in zip(self.angle, self.angle[1:], strict=False))
+        if not is_increasing or self.angle[0] != 0 or abs(self.angle[-1] - torch.pi) > 1e-6:
             raise ValueError("angle must rise from 0 deg (head wind) to 180 deg (following wind)")
         for name, values in (("C_X", self.C_X), ("C_Y", self.C_Y), ("C_N", self.C_N)):
             if len(values) != len(self.angle):
@@ -127,27 +130,36 @@ class TabulatedWindConfig(WindLoadConfig):
     @cached_property
     def forces_by_angle(self) -> tuple[Tensor, Tensor]:
         """Return angles [A] and forces X, Y, N per squared speed [A, 3], float64."""
-        sizes = [self.frontal_area, self.lateral_area, self.lateral_area * self.length]
-        values = torch.tensor([self.C_X, self.C_Y, self.C_N], dtype=torch.float64).T
-        areas = torch.tensor(sizes, dtype=torch.float64)
+        reference_areas = [self.frontal_area, self.lateral_area, self.lateral_area * self.length]
+        coefficients = torch.tensor([self.C_X, self.C_Y, self.C_N], dtype=torch.float64).T
+        areas = torch.tensor(reference_areas, dtype=torch.float64)
         angle = torch.tensor(self.angle, dtype=torch.float64)
-        return angle, values * areas * (0.5 * self.density)
+        return angle, coefficients * areas * (0.5 * self.density)
 
-    def loads(self, along: Tensor, across: Tensor) -> Tensor:
+    def wind_forces(self, relative_x: Tensor, relative_y: Tensor) -> Tensor:
         """Return the forces [..., 4], linear between the angles."""
-        turn, table = (part.to(along.dtype) for part in self.forces_by_angle)
-        square = along * along + across * across
-        # the angle of a calm is any; a fixed one keeps the gradient finite
-        ahead = torch.where(square < 1e-12, torch.ones_like(along), -along)
-        angle = torch.atan2(-across, ahead)
-        upper = torch.searchsorted(turn, angle.abs().detach().contiguous(), right=True).clamp(
-            1, turn.shape[0] - 1
+        table_angles, table_forces = (
+            values.to(relative_x.dtype) for values in self.forces_by_angle
         )
-        share = ((angle.abs() - turn[upper - 1]) / (turn[upper] - turn[upper - 1])).unsqueeze(-1)
-        force = (table[upper - 1] * (1.0 - share) + table[upper] * share) * square.unsqueeze(-1)
-        side = torch.where(angle < 0, -torch.ones_like(angle), torch.ones_like(angle))
-        y = side * force[..., 1]
-        return torch.stack((force[..., 0], y, self.centre_height * y, side * force[..., 2]), dim=-1)
+        speed_squared = relative_x * relative_x + relative_y * relative_y
+        # the angle of a calm is any; a fixed one keeps the gradient finite
+        head_wind = torch.where(speed_squared < 1e-12, torch.ones_like(relative_x), -relative_x)
+        angle = torch.atan2(-relative_y, head_wind)
+        upper_index = torch.searchsorted(
+            table_angles, angle.abs().detach().contiguous(), right=True
+        ).clamp(1, table_angles.shape[0] - 1)
+        fraction = (
+            (angle.abs() - table_angles[upper_index - 1])
+            / (table_angles[upper_index] - table_angles[upper_index - 1])
+        ).unsqueeze(-1)
+        force = (
+            table_forces[upper_index - 1] * (1.0 - fraction) + table_forces[upper_index] * fraction
+        ) * speed_squared.unsqueeze(-1)
+        side_sign = torch.where(angle < 0, -torch.ones_like(angle), torch.ones_like(angle))
+        y = side_sign * force[..., 1]
+        return torch.stack(
+            (force[..., 0], y, self.centre_height * y, side_sign * force[..., 2]), dim=-1
+        )
 
 
 WindLoadsConfig = Annotated[SymmetricWindConfig | TabulatedWindConfig, Field(discriminator="kind")]
@@ -158,7 +170,7 @@ GRAVITY = 9.81
 """Acceleration of free fall in m/s^2."""
 
 
-class JonswapSpectrum(Config):
+class JonswapSpectrumConfig(Config):
     """The spectrum of a fetch-limited sea (JONSWAP, Hasselmann et al. 1973).
 
     It is the ITTC form with its peak raised by gamma, scaled back to the significant height. With a
@@ -172,7 +184,7 @@ class JonswapSpectrum(Config):
     kind: Literal["jonswap"] = "jonswap"
     gamma: float = Field(default=3.3, ge=1, le=7)
 
-    def density(self, omega: np.ndarray, height: float, period: float) -> np.ndarray:
+    def spectral_density(self, omega: np.ndarray, height: float, period: float) -> np.ndarray:
         """Return S(omega) [m^2 s] at omega [rad/s], up to the peakedness' own area.
 
         Args:
@@ -180,16 +192,23 @@ class JonswapSpectrum(Config):
             height: significant wave height in m, 4 sqrt(m0).
             period: peak period in s.
         """
-        peak = 2 * np.pi / period
-        ratio = omega / peak
-        form = 5 / 16 * height**2 / peak * ratio**-5.0 * np.exp(-1.25 * ratio**-4.0)
+        peak_frequency = 2 * np.pi / period
+        frequency_ratio = omega / peak_frequency
+        pierson_moskowitz = (
+            5
+            / 16
+            * height**2
+            / peak_frequency
+            * frequency_ratio**-5.0
+            * np.exp(-1.25 * frequency_ratio**-4.0)
+        )
         # narrower below the peak than above
-        width = np.where(ratio <= 1, 0.07, 0.09)
-        peaked = self.gamma ** np.exp(-((ratio - 1) ** 2) / (2 * width**2))
-        return np.asarray(form * peaked)
+        peak_width = np.where(frequency_ratio <= 1, 0.07, 0.09)
+        peak_enhancement = self.gamma ** np.exp(-((frequency_ratio - 1) ** 2) / (2 * peak_width**2))
+        return np.asarray(pierson_moskowitz * peak_enhancement)
 
 
-class Box(Config):
+class HullBoxConfig(Config):
     """The underwater hull as a box, which the wave force is computed for.
 
     Attributes:
@@ -219,22 +238,22 @@ class WavesConfig(Config):
         water_density: of the water.
     """
 
-    spectrum: JonswapSpectrum = JonswapSpectrum()
+    spectrum: JonswapSpectrumConfig = JonswapSpectrumConfig()
     significant_height: Metres = Field(gt=0)
     peak_period: Seconds = Field(gt=0)
     direction: Radians
-    hull: Box
+    hull: HullBoxConfig
     frequencies: int = Field(default=60, ge=10, le=2000)
     directions: int = Field(default=1, ge=1, le=72)
     water_density: Density = Field(default=1025.0, gt=0)
 
-    def build(self, rows: int, random: np.random.Generator) -> Waves:
+    def build(self, n_rows: int, random: np.random.Generator) -> IrregularWaves:
         """Return one realisation of the seaway for each of several rows."""
-        return Waves(self, rows, random)
+        return IrregularWaves(self, n_rows, random)
 
 
 @final
-class Waves(nn.Module):
+class IrregularWaves(nn.Module):
     """A seaway of N x M sines in deep water, a realisation per row, and its force on the hull.
 
     Frequencies and directions are drawn within their intervals (5.34) and used throughout, also
@@ -247,37 +266,44 @@ class Waves(nn.Module):
     Diffraction, radiation and drift are left out.
     """
 
-    def __init__(self, config: WavesConfig, rows: int, random: np.random.Generator) -> None:
+    def __init__(self, config: WavesConfig, n_rows: int, random: np.random.Generator) -> None:
         super().__init__()
-        n, m, peak = config.frequencies, config.directions, 2 * np.pi / config.peak_period
-        edges = np.linspace(0.5, 4.0, n + 1) * peak
-        omega = edges[:-1, None] + np.diff(edges)[:, None] * random.random((rows, n, m))
-        spread = np.linspace(-np.pi / 2, np.pi / 2, m + 1)
-        offset = (
-            spread[:-1] + np.diff(spread) * random.random((rows, n, m))
-            if m > 1
-            else np.zeros((rows, n, m))
+        n_frequencies, n_directions, peak_frequency = (
+            config.frequencies,
+            config.directions,
+            2 * np.pi / config.peak_period,
+        )
+        frequency_edges = np.linspace(0.5, 4.0, n_frequencies + 1) * peak_frequency
+        omega = frequency_edges[:-1, None] + np.diff(frequency_edges)[:, None] * random.random(
+            (n_rows, n_frequencies, n_directions)
+        )
+        direction_edges = np.linspace(-np.pi / 2, np.pi / 2, n_directions + 1)
+        direction_offset = (
+            direction_edges[:-1]
+            + np.diff(direction_edges) * random.random((n_rows, n_frequencies, n_directions))
+            if n_directions > 1
+            else np.zeros((n_rows, n_frequencies, n_directions))
         )
         energy = (
-            config.spectrum.density(omega, config.significant_height, config.peak_period)
-            * np.cos(offset) ** 2
+            config.spectrum.spectral_density(omega, config.significant_height, config.peak_period)
+            * np.cos(direction_offset) ** 2
         )
         energy *= config.significant_height**2 / 16 / energy.sum(axis=(1, 2), keepdims=True)
-        phase = 2 * np.pi * random.random((rows, n, m))
-        flat = [
-            torch.from_numpy(part.reshape(rows, n * m))
-            for part in (omega, config.direction + offset, np.sqrt(2 * energy), phase)
+        phase = 2 * np.pi * random.random((n_rows, n_frequencies, n_directions))
+        components = [
+            torch.from_numpy(values.reshape(n_rows, n_frequencies * n_directions))
+            for values in (omega, config.direction + direction_offset, np.sqrt(2 * energy), phase)
         ]
-        self.omega, self.direction, self.amplitude, self.phase = flat
-        self.number = self.omega**2 / GRAVITY
-        self.weight = config.water_density * GRAVITY
+        self.omega, self.direction, self.amplitude, self.phase = components
+        self.wave_number = self.omega**2 / GRAVITY
+        self.specific_weight = config.water_density * GRAVITY
         self.length, self.breadth, self.draught = (
             config.hull.length,
             config.hull.breadth,
             config.hull.draught,
         )
 
-    def phases(self, north: Tensor, east: Tensor, t: float) -> Tensor:
+    def component_phases(self, north: Tensor, east: Tensor, t: float) -> Tensor:
         """Return the phase [B, K] in rad of every component at a place and time.
 
         Args:
@@ -285,12 +311,12 @@ class Waves(nn.Module):
             east: place [B] in m.
             t: time in s.
         """
-        along = north.unsqueeze(-1) * torch.cos(self.direction) + east.unsqueeze(-1) * torch.sin(
+        distance = north.unsqueeze(-1) * torch.cos(self.direction) + east.unsqueeze(-1) * torch.sin(
             self.direction
         )
-        return self.omega * t - self.number * along + self.phase
+        return self.omega * t - self.wave_number * distance + self.phase
 
-    def response(self, psi: Tensor) -> tuple[Tensor, Tensor]:
+    def force_response(self, psi: Tensor) -> tuple[Tensor, Tensor]:
         """Return the force per wave amplitude in quadrature [B, K, 3] and in phase [B, K].
 
         In quadrature (factors of sin) are X, Y, K; in phase (factor of cos) is N.
@@ -299,18 +325,28 @@ class Waves(nn.Module):
         following seas.
         """
         chi = self.direction - psi.unsqueeze(-1)
-        c, s, k = torch.cos(chi), torch.sin(chi), self.number
+        cos_chi, sin_chi, wave_number = torch.cos(chi), torch.sin(chi), self.wave_number
         length, breadth = self.length, self.breadth
-        deep = torch.exp(-k * self.draught)
-        along = torch.sinc(0.5 * k * c * length / torch.pi)
-        across = torch.sinc(0.5 * k * s * breadth / torch.pi)
-        pressure = self.weight * (1.0 - deep)
-        even = length * breadth * along * across
-        tilt_x, tilt_y = _first_moment(k * c, length), _first_moment(k * s, breadth)
-        arm = (1.0 - deep * (1.0 + k * self.draught)) / k
-        roll = self.weight * (s * arm * even - deep * length * along * tilt_y)
-        quadrature = torch.stack((-pressure * c * even, -pressure * s * even, roll), dim=-1)
-        return quadrature, pressure * (s * breadth * across * tilt_x - c * length * along * tilt_y)
+        bottom_decay = torch.exp(-wave_number * self.draught)
+        sinc_length = torch.sinc(0.5 * wave_number * cos_chi * length / torch.pi)
+        sinc_breadth = torch.sinc(0.5 * wave_number * sin_chi * breadth / torch.pi)
+        pressure = self.specific_weight * (1.0 - bottom_decay)
+        area_factor = length * breadth * sinc_length * sinc_breadth
+        moment_x, moment_y = (
+            _sine_first_moment(wave_number * cos_chi, length),
+            _sine_first_moment(wave_number * sin_chi, breadth),
+        )
+        pressure_arm = (1.0 - bottom_decay * (1.0 + wave_number * self.draught)) / wave_number
+        roll_response = self.specific_weight * (
+            sin_chi * pressure_arm * area_factor - bottom_decay * length * sinc_length * moment_y
+        )
+        quadrature = torch.stack(
+            (-pressure * cos_chi * area_factor, -pressure * sin_chi * area_factor, roll_response),
+            dim=-1,
+        )
+        return quadrature, pressure * (
+            sin_chi * breadth * sinc_breadth * moment_x - cos_chi * length * sinc_length * moment_y
+        )
 
     def forward(self, north: Tensor, east: Tensor, psi: Tensor, t: float) -> Tensor:
         """Return the force X, Y [N], K, N [N m], stacked [B, 4], on the hull at a place and time.
@@ -321,21 +357,28 @@ class Waves(nn.Module):
             psi: heading [B] in rad.
             t: time in s.
         """
-        phase = self.phases(north, east, t)
-        quadrature, yaw = self.response(psi)
-        side = (quadrature * (self.amplitude * torch.sin(phase)).unsqueeze(-1)).sum(-2)
-        turn = (yaw * self.amplitude * torch.cos(phase)).sum(-1, keepdim=True)
-        return torch.cat((side, turn), dim=-1)
+        phase = self.component_phases(north, east, t)
+        quadrature, yaw = self.force_response(psi)
+        in_quadrature = (quadrature * (self.amplitude * torch.sin(phase)).unsqueeze(-1)).sum(-2)
+        yaw_moment = (yaw * self.amplitude * torch.cos(phase)).sum(-1, keepdim=True)
+        return torch.cat((in_quadrature, yaw_moment), dim=-1)
 
 
-def _first_moment(kappa: Tensor, width: float) -> Tensor:
+def _sine_first_moment(kappa: Tensor, width: float) -> Tensor:
     """Return the integral of x sin(kappa x) over +-width / 2.
 
     Its series near zero, where the closed form cancels.
     """
-    half = 0.5 * width
-    small = kappa.abs() * half < 1e-2
-    safe = torch.where(small, torch.ones_like(kappa), kappa)
-    closed = 2.0 * (torch.sin(safe * half) / safe - half * torch.cos(safe * half)) / safe
-    series = 2.0 * kappa * half**3 / 3.0 * (1.0 - (kappa * half) ** 2 / 10.0)
-    return torch.where(small, series, closed)
+    half_width = 0.5 * width
+    is_small = kappa.abs() * half_width < 1e-2
+    safe_kappa = torch.where(is_small, torch.ones_like(kappa), kappa)
+    closed_form = (
+        2.0
+        * (
+            torch.sin(safe_kappa * half_width) / safe_kappa
+            - half_width * torch.cos(safe_kappa * half_width)
+        )
+        / safe_kappa
+    )
+    series = 2.0 * kappa * half_width**3 / 3.0 * (1.0 - (kappa * half_width) ** 2 / 10.0)
+    return torch.where(is_small, series, closed_form)

@@ -13,14 +13,14 @@ from torch import Tensor, nn
 
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.frames import to_body
-from residnet.core.names import ACCELERATION, VELOCITY
+from residnet.core.names import ACCELERATION_NAMES, VELOCITY_NAMES
 from residnet.physics.plant import Hull
 from residnet.physics.terms import TermLibrary, parse_term
 
-MOTION = (*ACCELERATION, *VELOCITY)
+MOTION_CHANNELS = (*ACCELERATION_NAMES, *VELOCITY_NAMES)
 """Channels of a force-space model: u_dot, v_dot, r_dot, u, v, r."""
 
-_CROSS = (
+_CROSS_TERMS = (
     "u v",
     "u r",
     "v r",
@@ -35,31 +35,31 @@ _CROSS = (
     "|v||r|",
 )
 FERRY_TERMS: tuple[str, ...] = (
-    *MOTION,
-    *(f"{name}|{name}|" for name in VELOCITY),
-    *(f"{name}^3" for name in VELOCITY),
-    *(f"|{name}|" for name in VELOCITY),
-    *(f"{name}^2" for name in VELOCITY),
-    *_CROSS,
+    *MOTION_CHANNELS,
+    *(f"{name}|{name}|" for name in VELOCITY_NAMES),
+    *(f"{name}^3" for name in VELOCITY_NAMES),
+    *(f"|{name}|" for name in VELOCITY_NAMES),
+    *(f"{name}^2" for name in VELOCITY_NAMES),
+    *_CROSS_TERMS,
 )
 """The 30 basis functions of document 002, (4.10)-(4.12)."""
 
 
-_WORST_CONDITION = 100.0
+_MAX_CONDITION = 100.0
 """Of a mass in units of the believed one: beyond it an axis has a hundredth of the mass that
 another has, and none in truth.
 """
 
 
-def order_of(term: str) -> int:
+def term_order(term: str) -> int:
     """Return the order of a basis function: how many channels are multiplied in it.
 
     It is called beta in document 002 section 4.3.4.
     """
-    return max(sum(abs(factor.power) for factor in parse_term(term, MOTION)), 1)
+    return max(sum(abs(factor.power) for factor in parse_term(term, MOTION_CHANNELS)), 1)
 
 
-def column_scale(terms: Sequence[str], x: Tensor) -> Tensor:
+def weighted_column_std(terms: Sequence[str], x: Tensor) -> Tensor:
     """Return what the columns x [N, J] of basis functions are divided by: beta std(x) [J].
 
     Higher orders weigh less by it; (4.8), (4.9), correction J15.
@@ -68,21 +68,21 @@ def column_scale(terms: Sequence[str], x: Tensor) -> Tensor:
         FitError: where a column is constant.
     """
     std = x.std(0)
-    small = std <= 1e-9 * x.abs().amax(0).clamp(min=1e-300)
-    if bool(small.any()):
+    is_constant = std <= 1e-9 * x.abs().amax(0).clamp(min=1e-300)
+    if bool(is_constant.any()):
         raise FitError(
-            f"basis function '{terms[int(small.nonzero()[0, 0])]}' is constant over the samples;"
+            f"basis function '{terms[int(is_constant.nonzero()[0, 0])]}' is constant over the samples;"
             " leave it out or give data that excite it"
         )
-    return std * torch.tensor([order_of(term) for term in terms], dtype=x.dtype)
+    return std * torch.tensor([term_order(term) for term in terms], dtype=x.dtype)
 
 
-class Correction(nn.Module):
+class ForceCorrection(nn.Module):
     """A force [..., 3] that is linear in basis functions: theta_0 + Theta' phi(nu_dot, nu)."""
 
     def __init__(self, terms: Sequence[str], coefficients: Tensor, intercept: Tensor) -> None:
         super().__init__()
-        self.library = TermLibrary(terms, MOTION)
+        self.library = TermLibrary(terms, MOTION_CHANNELS)
         self.coefficients = nn.Buffer(coefficients.to(torch.float64))
         self.intercept = nn.Buffer(intercept.to(torch.float64))
 
@@ -94,7 +94,7 @@ class Correction(nn.Module):
 
 
 @final
-class Corrections(nn.Module):
+class ForceCorrectionSum(nn.Module):
     """The sum of corrections [..., 3] to a believed force."""
 
     def __init__(self, corrections: Sequence[nn.Module] | nn.ModuleList) -> None:
@@ -114,55 +114,66 @@ class ForceModel(nn.Module):
     """A believed hull with a list of corrections: F_k = F_(k-1) + Theta phi, the chain of (3.26).
 
     Attributes:
-        earth: a force constant in earth axes [2] (north, east) in N that acts on the vessel beside
+        earth_force: a force constant in earth axes [2] (north, east) in N that acts on the vessel beside
             the thrusters.
     """
 
     def __init__(
-        self, hull: Hull, corrections: Sequence[Correction] = (), earth: Tensor | None = None
+        self,
+        hull: Hull,
+        corrections: Sequence[ForceCorrection] = (),
+        earth_force: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.hull = hull
         self.corrections = nn.ModuleList(corrections)
-        self.earth = nn.Buffer(torch.zeros(2, dtype=torch.float64) if earth is None else earth)
+        self.earth_force = nn.Buffer(
+            torch.zeros(2, dtype=torch.float64) if earth_force is None else earth_force
+        )
 
-    def extended(self, correction: Correction, earth: Tensor | None = None) -> ForceModel:
+    def with_correction(
+        self, correction: ForceCorrection, earth_force: Tensor | None = None
+    ) -> ForceModel:
         """Return the next model of the chain."""
-        more = self.earth if earth is None else self.earth + earth
-        return ForceModel(self.hull, [*self.corrections, correction], more)
+        total_earth_force = (
+            self.earth_force if earth_force is None else self.earth_force + earth_force
+        )
+        return ForceModel(self.hull, [*self.corrections, correction], total_earth_force)
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
         """Return tau [..., 3] in N, N, N m that the motion needs in water at rest."""
-        tau: Tensor = self.hull.required(nu_dot, nu)
+        tau: Tensor = self.hull.required_force(nu_dot, nu)
         for correction in self.corrections:
             tau = tau + correction(nu_dot, nu)
         return tau
 
-    def parts(self) -> tuple[ForceModel, Corrections]:
+    def split_corrections(self) -> tuple[ForceModel, ForceCorrectionSum]:
         """Return the believed hull and the sum of its corrections, as modules of their own."""
-        return ForceModel(self.hull), Corrections(self.corrections)
+        return ForceModel(self.hull), ForceCorrectionSum(self.corrections)
 
-    def at_heading(self, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
+    def thruster_force(self, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
         """Return tau [..., 3] that the thrusters have to give at heading psi [...] rad.
 
         The force that is constant in earth axes acts beside them.
         """
-        earth = self.earth.to(nu.dtype)
-        along, across = to_body(earth[0], earth[1], psi)
-        residual: Tensor = self(nu_dot, nu) - torch.stack(
-            (along, across, torch.zeros_like(along)), dim=-1
+        earth_force = self.earth_force.to(nu.dtype)
+        body_x, body_y = to_body(earth_force[0], earth_force[1], psi)
+        required_force: Tensor = self(nu_dot, nu) - torch.stack(
+            (body_x, body_y, torch.zeros_like(body_x)), dim=-1
         )
-        return residual
+        return required_force
 
-    def residual(self, tau: Tensor, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
+    def force_residual(self, tau: Tensor, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
         """Return eps = tau - F(nu_dot, nu) [..., 3], which the model leaves unexplained.
 
         Source: document 002 eqs. (3.20), (3.25).
         """
-        return tau - self.at_heading(nu_dot, nu, psi)
+        return tau - self.thruster_force(nu_dot, nu, psi)
 
 
-def accelerating(terms: Sequence[str], names: Sequence[str] = MOTION) -> dict[int, int]:
+def find_acceleration_terms(
+    terms: Sequence[str], names: Sequence[str] = MOTION_CHANNELS
+) -> dict[int, int]:
     """Return the numbers of the terms that are an acceleration, each with its axis.
 
     The other terms are free of accelerations.
@@ -170,27 +181,32 @@ def accelerating(terms: Sequence[str], names: Sequence[str] = MOTION) -> dict[in
     Raises:
         ConfigError: where a term is not affine in nu_dot with a constant factor.
     """
-    out: dict[int, int] = {}
+    axis_of_term: dict[int, int] = {}
     for j, term in enumerate(terms):
         factors = parse_term(term, names)
-        moving = [factor for factor in factors if factor.name in ACCELERATION]
-        if not moving:
+        acceleration_factors = [factor for factor in factors if factor.name in ACCELERATION_NAMES]
+        if not acceleration_factors:
             continue
-        if len(factors) > 1 or moving[0].magnitude or moving[0].power != 1 or moving[0].function:
+        if (
+            len(factors) > 1
+            or acceleration_factors[0].magnitude
+            or acceleration_factors[0].power != 1
+            or acceleration_factors[0].function
+        ):
             raise ConfigError(
                 f"term '{term}': a force-space model that runs forward names accelerations only by"
                 " themselves (u_dot, v_dot, r_dot)"
             )
-        out[j] = ACCELERATION.index(moving[0].name)
-    return out
+        axis_of_term[j] = ACCELERATION_NAMES.index(acceleration_factors[0].name)
+    return axis_of_term
 
 
-def augmented(
+def augment_mass(
     mass: Tensor,
     terms: Sequence[str],
     coefficients: Tensor,
-    who: str,
-    names: Sequence[str] = MOTION,
+    subject: str,
+    names: Sequence[str] = MOTION_CHANNELS,
 ) -> tuple[Tensor, list[int]]:
     """Return M + A [3, 3] of eps = A nu_dot + b(nu), and the numbers of the terms that make b.
 
@@ -199,21 +215,24 @@ def augmented(
         FitError: where M + A has an eigenvalue whose real part is not positive, or is
             ill-conditioned: the model cannot run forward.
     """
-    moving = accelerating(terms, names)
-    total, rest = mass.clone(), [j for j in range(len(terms)) if j not in moving]
-    for j, axis in moving.items():
-        total[:, axis] += coefficients[j]
+    axis_of_term = find_acceleration_terms(terms, names)
+    augmented_mass, other_terms = (
+        mass.clone(),
+        [j for j in range(len(terms)) if j not in axis_of_term],
+    )
+    for j, axis in axis_of_term.items():
+        augmented_mass[:, axis] += coefficients[j]
     # in units of the believed masses, so that an axis that has lost its mass shows
     scale = mass.diagonal().abs().sqrt()
-    values, condition = (
-        torch.linalg.eigvals(total).real,
-        float(torch.linalg.cond(total / torch.outer(scale, scale))),
+    eigenvalues, condition = (
+        torch.linalg.eigvals(augmented_mass).real,
+        float(torch.linalg.cond(augmented_mass / torch.outer(scale, scale))),
     )
-    if bool((values <= 0).any()) or not condition < _WORST_CONDITION:
+    if bool((eigenvalues <= 0).any()) or not condition < _MAX_CONDITION:
         raise FitError(
-            f"{who}: its mass matrix with the fitted accelerations has eigenvalues"
-            f" {[round(float(v), 1) for v in values]} and condition {condition:.1e}, it cannot run"
+            f"{subject}: its mass matrix with the fitted accelerations has eigenvalues"
+            f" {[round(float(v), 1) for v in eigenvalues]} and condition {condition:.1e}, it cannot run"
             " forward; give data with more acceleration, fewer terms, or a higher penalty or lower"
             " order"
         )
-    return total, rest
+    return augmented_mass, other_terms

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, Field
 from torch import Tensor
 
 from residnet.core.config import Config, MetresPerSecond
-from residnet.core.names import VELOCITY
+from residnet.core.names import VELOCITY_NAMES
 from residnet.physics.actuators import (
     ActuatorConfig,
     ActuatorsConfig,
@@ -33,15 +33,15 @@ from residnet.physics.parameters import (
     Parameter,
     Positive,
     Volume,
-    dimension,
-    of_dimension,
-    unit_text,
+    format_unit,
+    parse_dimension,
+    require_dimension,
 )
-from residnet.physics.plant import ROLLING, SUBMERGED, Hull, HullPlant
-from residnet.physics.terms import read_rows
+from residnet.physics.plant import ROLLING_LAYOUT, SUBMERGED_LAYOUT, Hull, HullPlant
+from residnet.physics.terms import parse_axis_terms
 from residnet.physics.vessel_file import VesselFile
 
-_METRES = {"X": 1, "Y": 1, "Z": 1, "K": 2, "M": 2, "N": 2, "u": 1, "v": 1, "r": 0}
+_METRE_POWER = {"X": 1, "Y": 1, "Z": 1, "K": 2, "M": 2, "N": 2, "u": 1, "v": 1, "r": 0}
 """Power of metre in the unit of the force or acceleration of each axis."""
 
 
@@ -77,50 +77,66 @@ class AddedMass(Config):
     N_rdot: Inertia
 
 
-Row = dict[str, Parameter]
+AxisTerms = dict[str, Parameter]
 """The terms of one axis by name, each coefficient in the SI unit that its term asks for."""
 
 
-def _by_axis(axes: str, channels: tuple[str, ...], mass: int = 1) -> AfterValidator:
+def _axis_terms_validator(
+    axes: str, channels: tuple[str, ...], mass_power: int = 1
+) -> AfterValidator:
     """Return what checks the units of terms, and gives an axis that has none an empty row.
 
     Args:
         axes: their names, in the order of the velocities.
         channels: that terms are made of.
-        mass: power of mass in the units, 1 for forces and 0 for accelerations.
+        mass_power: power of mass in the units, 1 for forces and 0 for accelerations.
     """
 
-    def checked(rows: dict[str, Row]) -> dict[str, Row]:
-        for axis, term, factors in read_rows(rows, channels, functions=False):
-            metres = _METRES[axis] - sum(f.power for f in factors if f.name in ("u", "v", "w"))
-            seconds = -2 + sum(f.power for f in factors if f.name != "phi")
-            unit = rows[axis][term].unit
-            if dimension(unit, mass) != (metres, seconds):
+    def validate_units(axis_terms: dict[str, AxisTerms]) -> dict[str, AxisTerms]:
+        for axis, term, factors in parse_axis_terms(axis_terms, channels, functions=False):
+            metre_power = _METRE_POWER[axis] - sum(
+                factor.power for factor in factors if factor.name in ("u", "v", "w")
+            )
+            second_power = -2 + sum(factor.power for factor in factors if factor.name != "phi")
+            unit = axis_terms[axis][term].unit
+            if parse_dimension(unit, mass_power) != (metre_power, second_power):
                 raise ValueError(
-                    f"{axis}.{term}: its unit must be {unit_text(metres, seconds, mass)}, given"
+                    f"{axis}.{term}: its unit must be {format_unit(metre_power, second_power, mass_power)}, given"
                     f" '{unit}'"
                 )
-        return {axis: rows.get(axis, {}) for axis in axes}
+        return {axis: axis_terms.get(axis, {}) for axis in axes}
 
-    return AfterValidator(checked)
+    return AfterValidator(validate_units)
 
 
-PlanarRows = Annotated[dict[Literal["X", "Y", "N"], Row], _by_axis("XYN", VELOCITY)]
+PlanarRows = Annotated[
+    dict[Literal["X", "Y", "N"], AxisTerms], _axis_terms_validator("XYN", VELOCITY_NAMES)
+]
 """Terms of (u, v, r), for example `X: {u: ..., "u|u|": ...}`."""
-AccelerationRows = Annotated[dict[Literal["u", "v", "r"], Row], _by_axis("uvr", VELOCITY, 0)]
+AccelerationRows = Annotated[
+    dict[Literal["u", "v", "r"], AxisTerms], _axis_terms_validator("uvr", VELOCITY_NAMES, 0)
+]
 """Accelerations as terms of (u, v, r)."""
-ROLLING_CHANNELS = (*ROLLING.velocities, "phi")
-RollingRows = Annotated[dict[Literal["X", "Y", "K", "N"], Row], _by_axis("XYKN", ROLLING_CHANNELS)]
+ROLLING_CHANNELS = (*ROLLING_LAYOUT.velocities, "phi")
+RollingRows = Annotated[
+    dict[Literal["X", "Y", "K", "N"], AxisTerms], _axis_terms_validator("XYKN", ROLLING_CHANNELS)
+]
 """Forces as terms of (u, v, p, r, phi)."""
 SubmergedRows = Annotated[
-    dict[Literal["X", "Y", "Z", "K", "M", "N"], Row], _by_axis("XYZKMN", SUBMERGED.velocities)
+    dict[Literal["X", "Y", "Z", "K", "M", "N"], AxisTerms],
+    _axis_terms_validator("XYZKMN", SUBMERGED_LAYOUT.velocities),
 ]
 """Forces as terms of (u, v, w, p, q, r)."""
 
 
-def values(rows: Mapping[Any, Row], factor: float = 1.0) -> list[dict[str, float]]:
+def coefficient_rows(
+    terms_by_axis: Mapping[Any, AxisTerms], factor: float = 1.0
+) -> list[dict[str, float]]:
     """Return the coefficients of each axis, times a factor."""
-    return [{term: factor * p.value for term, p in row.items()} for row in rows.values()]
+    return [
+        {term: factor * parameter.value for term, parameter in axis_terms.items()}
+        for axis_terms in terms_by_axis.values()
+    ]
 
 
 class HullVessel(VesselFile, ABC):
@@ -137,20 +153,22 @@ class HullVessel(VesselFile, ABC):
     wind: WindLoadsConfig | None = None
 
     @abstractmethod
-    def hull(self) -> Hull:
+    def build_hull(self) -> Hull:
         """Build the hull.
 
         Raises:
             ConfigError: where the mass matrix is not positive definite or is singular.
         """
 
-    def start(self) -> Mapping[str, float]:
+    def initial_speeds(self) -> Mapping[str, float]:
         """Return the states that trials start from, where not at rest."""
         return {}
 
     @final
     def build(self) -> HullPlant:
-        return HullPlant(self.hull(), self.actuators.build(), self.wind, self.start())
+        return HullPlant(
+            self.build_hull(), self.actuators.build(), self.wind, self.initial_speeds()
+        )
 
 
 class HullConfig(HullVessel, ABC):
@@ -173,26 +191,33 @@ class HullConfig(HullVessel, ABC):
         """Return M [3, 3], without the scale."""
 
     @abstractmethod
-    def coupling(self) -> float:
+    def sway_yaw_coupling(self) -> float:
         """Return the factor of r in the sway momentum of C(nu), in kg m, without the scale."""
 
     @final
-    def hull(self) -> Hull:
+    def build_hull(self) -> Hull:
         """Build the hull, with the Coriolis matrix in Fossen's skew form of the mass matrix.
 
         Inertia does no work where that is symmetric.
         """
-        mass = [[self.scale * value for value in row] for row in self.mass_matrix()]
-        (surge, sway), cross = (mass[0][0], mass[1][1]), self.scale * self.coupling()
-        rows = values(self.damping, -self.scale)
-        for row, coriolis in zip(
-            rows,
-            ({"v r": sway, "r^2": cross}, {"u r": -surge}, {"u v": surge - sway, "u r": -cross}),
+        mass = [
+            [self.scale * value for value in axis_coefficients]
+            for axis_coefficients in self.mass_matrix()
+        ]
+        (surge, sway), coupling = (mass[0][0], mass[1][1]), self.scale * self.sway_yaw_coupling()
+        coefficients = coefficient_rows(self.damping, -self.scale)
+        for axis_coefficients, coriolis in zip(
+            coefficients,
+            (
+                {"v r": sway, "r^2": coupling},
+                {"u r": -surge},
+                {"u v": surge - sway, "u r": -coupling},
+            ),
             strict=True,
         ):
             for term, value in coriolis.items():
-                row[term] = row.get(term, 0.0) + value
-        return Hull(mass, rows, VELOCITY, self.name)
+                axis_coefficients[term] = axis_coefficients.get(term, 0.0) + value
+        return Hull(mass, coefficients, VELOCITY_NAMES, self.name)
 
 
 @final
@@ -210,15 +235,19 @@ class FossenConfig(HullConfig):
 
     def mass_matrix(self) -> list[list[float]]:
         """Return rigid body and added mass, [3, 3]."""
-        body, added = self.rigid_body, self.added_mass
-        m, arm = body.m.value, body.m.value * body.x_G.value
+        rigid_body, added_mass = self.rigid_body, self.added_mass
+        m, mass_moment = rigid_body.m.value, rigid_body.m.value * rigid_body.x_G.value
         return [
-            [m - added.X_udot.value, 0.0, 0.0],
-            [0.0, m - added.Y_vdot.value, arm - added.Y_rdot.value],
-            [0.0, arm - added.N_vdot.value, body.I_z.value - added.N_rdot.value],
+            [m - added_mass.X_udot.value, 0.0, 0.0],
+            [0.0, m - added_mass.Y_vdot.value, mass_moment - added_mass.Y_rdot.value],
+            [
+                0.0,
+                mass_moment - added_mass.N_vdot.value,
+                rigid_body.I_z.value - added_mass.N_rdot.value,
+            ],
         ]
 
-    def coupling(self) -> float:
+    def sway_yaw_coupling(self) -> float:
         """Return the mean of m23 and m32, which makes C that of the symmetric part of M.
 
         Source: Fossen 2011, section 6.3.
@@ -260,19 +289,19 @@ class MassMatrixConfig(HullConfig):
 
     def mass_matrix(self) -> list[list[float]]:
         """Return the mass matrix [3, 3] of the file; it need not be symmetric."""
-        m = self.mass
+        entries = self.mass
         return [
-            [m.m11.value, 0.0, 0.0],
-            [0.0, m.m22.value, m.m23.value],
-            [0.0, m.m32.value, m.m33.value],
+            [entries.m11.value, 0.0, 0.0],
+            [0.0, entries.m22.value, entries.m23.value],
+            [0.0, entries.m32.value, entries.m33.value],
         ]
 
-    def coupling(self) -> float:
+    def sway_yaw_coupling(self) -> float:
         """Return m23 alone, as (2.5) has it (correction J4)."""
         return self.mass.m23.value
 
 
-class Gains(Config):
+class InverseMass(Config):
     """The acceleration per force or moment on each axis.
 
     Attributes:
@@ -281,13 +310,13 @@ class Gains(Config):
         n: yaw in 1/(kg m^2).
     """
 
-    x: Annotated[Parameter, AfterValidator(of_dimension(-1, 0, 0)), Positive]
-    y: Annotated[Parameter, AfterValidator(of_dimension(-1, 0, 0)), Positive]
-    n: Annotated[Parameter, AfterValidator(of_dimension(-1, -2, 0)), Positive]
+    x: Annotated[Parameter, AfterValidator(require_dimension(-1, 0, 0)), Positive]
+    y: Annotated[Parameter, AfterValidator(require_dimension(-1, 0, 0)), Positive]
+    n: Annotated[Parameter, AfterValidator(require_dimension(-1, -2, 0)), Positive]
 
 
 @final
-class OdinConfig(HullVessel):
+class AccelerationHullConfig(HullVessel):
     """A 3-DOF vessel known by its accelerations, nu_dot = gain tau + terms of the velocities.
 
     A file may name another one as `base` and give only what differs.
@@ -298,19 +327,22 @@ class OdinConfig(HullVessel):
     """
 
     kind: Literal["odin"]
-    gains: Gains
+    gains: InverseMass
     terms: AccelerationRows
     actuators: ActuatorsConfig
 
-    def hull(self) -> Hull:
+    def build_hull(self) -> Hull:
         """Build the hull, whose masses are one over the gains."""
         mass = [1.0 / gain.value for gain in (self.gains.x, self.gains.y, self.gains.n)]
-        rows = [
-            {term: m * value for term, value in row.items()}
-            for m, row in zip(mass, values(self.terms), strict=True)
+        force_rows = [
+            {term: m * value for term, value in acceleration_row.items()}
+            for m, acceleration_row in zip(mass, coefficient_rows(self.terms), strict=True)
         ]
         return Hull(
-            torch.diag(torch.tensor(mass, dtype=torch.float64)).tolist(), rows, VELOCITY, self.name
+            torch.diag(torch.tensor(mass, dtype=torch.float64)).tolist(),
+            force_rows,
+            VELOCITY_NAMES,
+            self.name,
         )
 
 
@@ -358,13 +390,13 @@ class Hydrostatics(Config):
     GM: Annotated[Length, Positive]
 
     @property
-    def stiffness(self) -> float:
+    def roll_stiffness(self) -> float:
         """rho g V GM in N m per rad."""
         return self.density.value * GRAVITY * self.volume.value * self.GM.value
 
 
 @final
-class PatrolConfig(HullVessel):
+class RollingHullConfig(HullVessel):
     """A vessel in surge, sway, roll and yaw, given by its derivatives.
 
     Attributes:
@@ -384,43 +416,51 @@ class PatrolConfig(HullVessel):
     forces: RollingRows
     actuators: RollingActuatorsConfig
 
-    def start(self) -> Mapping[str, float]:
+    def initial_speeds(self) -> Mapping[str, float]:
         """Return the service speed, at which the source's thrust compensates the resistance."""
         return {"u": self.speed}
 
-    def hull(self) -> Hull:
+    def build_hull(self) -> Hull:
         """Build the hull, with the inertia of the rigid body about the origin (eq. (5.12)).
 
         The water's Coriolis forces are among the terms, as far as the source has them (X_vr).
         """
-        body, added = self.rigid_body, self.added_mass
-        m = body.m.value
-        along, down = m * body.x_G.value, m * body.z_G.value
-        roll_row = [-(down + added.K_vdot.value), body.I_x.value - added.K_pdot.value]
+        rigid_body, added_mass = self.rigid_body, self.added_mass
+        m = rigid_body.m.value
+        moment_x, moment_z = m * rigid_body.x_G.value, m * rigid_body.z_G.value
+        roll_row = [
+            -(moment_z + added_mass.K_vdot.value),
+            rigid_body.I_x.value - added_mass.K_pdot.value,
+        ]
         mass = [
-            [m - added.X_udot.value, 0.0, 0.0, 0.0],
-            [0.0, m - added.Y_vdot.value, -(down + added.Y_pdot.value), along - added.Y_rdot.value],
-            [0.0, *roll_row, -added.K_rdot.value],
+            [m - added_mass.X_udot.value, 0.0, 0.0, 0.0],
             [
                 0.0,
-                along - added.N_vdot.value,
-                -added.N_pdot.value,
-                body.I_z.value - added.N_rdot.value,
+                m - added_mass.Y_vdot.value,
+                -(moment_z + added_mass.Y_pdot.value),
+                moment_x - added_mass.Y_rdot.value,
+            ],
+            [0.0, *roll_row, -added_mass.K_rdot.value],
+            [
+                0.0,
+                moment_x - added_mass.N_vdot.value,
+                -added_mass.N_pdot.value,
+                rigid_body.I_z.value - added_mass.N_rdot.value,
             ],
         ]
         # centripetal terms of the rigid body, (5.12), and the restoring moment, which (5.17) leaves
         # out
-        inertia: tuple[dict[str, float], ...] = (
-            {"v r": m, "r r": along, "p r": -down},
+        inertial_terms: tuple[dict[str, float], ...] = (
+            {"v r": m, "r r": moment_x, "p r": -moment_z},
             {"u r": -m},
-            {"u r": down, "phi": -self.hydrostatics.stiffness},
-            {"u r": -along},
+            {"u r": moment_z, "phi": -self.hydrostatics.roll_stiffness},
+            {"u r": -moment_x},
         )
-        rows = values(self.forces)
-        for row, more in zip(rows, inertia, strict=True):
-            for term, value in more.items():
-                row[term] = row.get(term, 0.0) + value
-        return Hull(mass, rows, ROLLING_CHANNELS, self.name)
+        coefficients = coefficient_rows(self.forces)
+        for axis_coefficients, added_terms in zip(coefficients, inertial_terms, strict=True):
+            for term, value in added_terms.items():
+                axis_coefficients[term] = axis_coefficients.get(term, 0.0) + value
+        return Hull(mass, coefficients, ROLLING_CHANNELS, self.name)
 
 
 class SubmergedBody(RollingBody):
@@ -470,7 +510,7 @@ class Buoyancy(Config):
 
 
 @final
-class SubmergedConfig(HullVessel):
+class SubmergedHullConfig(HullVessel):
     """A vessel under water in six degrees of freedom.
 
     Attributes:
@@ -491,70 +531,79 @@ class SubmergedConfig(HullVessel):
     forces: SubmergedRows
     actuators: SubmergedActuatorsConfig
 
-    def start(self) -> Mapping[str, float]:
+    def initial_speeds(self) -> Mapping[str, float]:
         return {"u": self.speed}
 
-    def hull(self) -> Hull:
+    def build_hull(self) -> Hull:
         """Build the hull: mass, Coriolis forces of the whole of it, weight and buoyancy.
 
         With the momenta l of translation and h of rotation the rotating axes make the force -w x l
         and the moment -v x l - w x h (Kirchhoff; Fossen 2021, section 6.3). Weight and buoyancy
         act along the vertical in body axes (Fossen 2021, eq. (4.6)).
         """
-        body, added, water = self.rigid_body, self.added_mass, self.buoyancy
-        m, x, z = (one.value for one in (body.m, body.x_G, body.z_G))
+        rigid_body, added_mass, buoyancy = self.rigid_body, self.added_mass, self.buoyancy
+        m, x, z = (parameter.value for parameter in (rigid_body.m, rigid_body.x_G, rigid_body.z_G))
         mass = torch.diag(
             torch.tensor(
-                [m, m, m, body.I_x.value, body.I_y.value, body.I_z.value], dtype=torch.float64
+                [m, m, m, rigid_body.I_x.value, rigid_body.I_y.value, rigid_body.I_z.value],
+                dtype=torch.float64,
             )
-            - torch.tensor([one.value for one in dict(added).values()], dtype=torch.float64)
+            - torch.tensor(
+                [parameter.value for parameter in dict(added_mass).values()], dtype=torch.float64
+            )
         )
-        for force, moment, arm in ((0, 4, z), (1, 3, -z), (1, 5, x), (2, 4, -x)):
-            mass[force, moment] = mass[moment, force] = m * arm
-        rows = values(self.forces)
+        for force, moment, lever in ((0, 4, z), (1, 3, -z), (1, 5, x), (2, 4, -x)):
+            mass[force, moment] = mass[moment, force] = m * lever
+        coefficients = coefficient_rows(self.forces)
 
-        def add(axis: int, term: str, value: float) -> None:
+        def add_term(axis: int, term: str, value: float) -> None:
             if value:
-                rows[axis][term] = rows[axis].get(term, 0.0) + value
+                coefficients[axis][term] = coefficients[axis].get(term, 0.0) + value
 
-        turns = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
-        for k, name in enumerate(SUBMERGED.velocities):
-            straight, turning = mass[:3, k].tolist(), mass[3:, k].tolist()
-            v, w = SUBMERGED.velocities[:3], SUBMERGED.velocities[3:]
-            for axis, a, b in turns:
+        axis_cycles = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+        for k, name in enumerate(SUBMERGED_LAYOUT.velocities):
+            momentum, angular_momentum = mass[:3, k].tolist(), mass[3:, k].tolist()
+            v, w = SUBMERGED_LAYOUT.velocities[:3], SUBMERGED_LAYOUT.velocities[3:]
+            for axis, a, b in axis_cycles:
                 for sign, i, j in ((-1.0, a, b), (1.0, b, a)):
-                    add(axis, _pair(w[i], name), sign * straight[j])
-                    add(3 + axis, _pair(v[i], name), sign * straight[j])
-                    add(3 + axis, _pair(w[i], name), sign * turning[j])
+                    add_term(axis, _format_velocity_product(w[i], name), sign * momentum[j])
+                    add_term(3 + axis, _format_velocity_product(v[i], name), sign * momentum[j])
+                    add_term(
+                        3 + axis, _format_velocity_product(w[i], name), sign * angular_momentum[j]
+                    )
         weight = m * GRAVITY
-        lift = water.density.value * GRAVITY * water.volume.value
+        buoyancy_force = buoyancy.density.value * GRAVITY * buoyancy.volume.value
         # the vertical along the body axes
-        down = ("sin(theta)", "cos(theta) sin(phi)", "cos(theta) cos(phi)")
-        signs, net = (-1.0, 1.0, 1.0), weight - lift
-        levers = (weight * x - lift * water.x_B.value, 0.0, weight * z - lift * water.z_B.value)
-        for axis, a, b in turns:
-            add(axis, down[axis], signs[axis] * net)
-            add(3 + axis, down[b], signs[b] * levers[a])
-            add(3 + axis, down[a], -signs[a] * levers[b])
-        channels = (*SUBMERGED.velocities, "phi", "theta")
-        return Hull(mass.tolist(), rows, channels, self.name)
+        vertical_direction = ("sin(theta)", "cos(theta) sin(phi)", "cos(theta) cos(phi)")
+        signs, net_weight = (-1.0, 1.0, 1.0), weight - buoyancy_force
+        levers = (
+            weight * x - buoyancy_force * buoyancy.x_B.value,
+            0.0,
+            weight * z - buoyancy_force * buoyancy.z_B.value,
+        )
+        for axis, a, b in axis_cycles:
+            add_term(axis, vertical_direction[axis], signs[axis] * net_weight)
+            add_term(3 + axis, vertical_direction[b], signs[b] * levers[a])
+            add_term(3 + axis, vertical_direction[a], -signs[a] * levers[b])
+        channels = (*SUBMERGED_LAYOUT.velocities, "phi", "theta")
+        return Hull(mass.tolist(), coefficients, channels, self.name)
 
 
-def _pair(a: str, b: str) -> str:
+def _format_velocity_product(a: str, b: str) -> str:
     """Return the product of two velocities, the same whichever stands first."""
-    return f"{a}^2" if a == b else " ".join(sorted((a, b), key=SUBMERGED.velocities.index))
+    return f"{a}^2" if a == b else " ".join(sorted((a, b), key=SUBMERGED_LAYOUT.velocities.index))
 
 
-Phase = Literal["displacement", "semi_displacement", "planing"]
-PHASES: tuple[Phase, ...] = ("displacement", "semi_displacement", "planing")
-BOUNDARIES = (0.4, 1.0)
+SpeedRegime = Literal["displacement", "semi_displacement", "planing"]
+SPEED_REGIMES: tuple[SpeedRegime, ...] = ("displacement", "semi_displacement", "planing")
+REGIME_BOUNDARIES = (0.4, 1.0)
 """Froude numbers at which the phases meet (document 000, appendix D).
 
 The document puts the beginning of planing between 1.0 and 1.2.
 """
 
 
-def froude_number(u: Tensor, v: Tensor, length: float) -> Tensor:
+def compute_froude_number(u: Tensor, v: Tensor, length: float) -> Tensor:
     """Return the fn = sqrt(u^2 + v^2) / sqrt(g L) (9.10), any shape, for a hull of `length` in m.
 
     Raises:
@@ -565,10 +614,10 @@ def froude_number(u: Tensor, v: Tensor, length: float) -> Tensor:
     return torch.hypot(u, v) / math.sqrt(GRAVITY * length)
 
 
-def phase_of(froude: Tensor) -> Tensor:
-    """Return the number of the phase in `PHASES` at each Froude number, integers of the same shape.
+def classify_speed_regime(froude: Tensor) -> Tensor:
+    """Return the number of the phase in `SPEED_REGIMES` at each Froude number, integers of the same shape.
 
     A boundary belongs to the phase above it.
     """
-    edges = torch.tensor(BOUNDARIES, dtype=froude.dtype, device=froude.device)
+    edges = torch.tensor(REGIME_BOUNDARIES, dtype=froude.dtype, device=froude.device)
     return torch.bucketize(froude, edges, right=True)

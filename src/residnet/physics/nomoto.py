@@ -18,27 +18,27 @@ from residnet.core.config import MetresPerSecond
 from residnet.core.frames import to_earth
 from residnet.core.layout import SURGE, SWAY
 from residnet.physics.actuators.base import SteeringGearConfig
-from residnet.physics.parameters import Parameter, measured_in
+from residnet.physics.parameters import Parameter, convert_to_unit
 from residnet.physics.plant import Plant
 from residnet.physics.vessel_file import VesselFile
 
-Gain = Annotated[Parameter, AfterValidator(measured_in("1/s"))]
-TimeConstant = Annotated[Parameter, AfterValidator(measured_in("s"))]
-SwayGain = Annotated[Parameter, AfterValidator(measured_in("m/s"))]
+Gain = Annotated[Parameter, AfterValidator(convert_to_unit("1/s"))]
+TimeConstant = Annotated[Parameter, AfterValidator(convert_to_unit("s"))]
+SwayGain = Annotated[Parameter, AfterValidator(convert_to_unit("m/s"))]
 
 
-class LinearSteering(NamedTuple):
-    """A state-space model z_dot = A z + b delta with z = (v, r, then `extra` internal states).
+class SteeringStateSpace(NamedTuple):
+    """A state-space model z_dot = A z + b delta with z = (v, r, then `internal_states` internal states).
 
     A is [k, k], b [k].
     """
 
     a: np.ndarray
     b: np.ndarray
-    extra: tuple[str, ...] = ()
+    internal_states: tuple[str, ...] = ()
 
 
-class SteeringConfig(VesselFile, ABC):
+class NomotoVesselConfig(VesselFile, ABC):
     """The part that all steering models share.
 
     Attributes:
@@ -48,25 +48,25 @@ class SteeringConfig(VesselFile, ABC):
         rudder: largest angle, rate and lag.
     """
 
-    poles: ClassVar[tuple[str, ...]]
+    pole_names: ClassVar[tuple[str, ...]]
     """Names of the time constants of the poles."""
     speed: MetresPerSecond = Field(gt=0)
     K: Gain
     rudder: SteeringGearConfig
 
     @abstractmethod
-    def steering(self) -> LinearSteering:
+    def state_space(self) -> SteeringStateSpace:
         """Return the model in state space."""
 
     @model_validator(mode="after")
-    def _sense(self) -> SteeringConfig:
-        product = self.K.value
-        for name in self.poles:
-            time = getattr(self, name).value
-            if time == 0:
+    def _validate_turning_sense(self) -> NomotoVesselConfig:
+        gain_ratio = self.K.value
+        for name in self.pole_names:
+            time_constant = getattr(self, name).value
+            if time_constant == 0:
                 raise ValueError(f"{name} must not be zero")
-            product /= time
-        if product <= 0:
+            gain_ratio /= time_constant
+        if gain_ratio <= 0:
             raise ValueError(
                 "K over the time constants must be positive: a rudder to starboard turns to"
                 " starboard (an unstable ship has K and a T negative)"
@@ -74,28 +74,28 @@ class SteeringConfig(VesselFile, ABC):
         return self
 
     @final
-    def build(self) -> SteeringVessel:
-        return SteeringVessel(self)
+    def build(self) -> NomotoVessel:
+        return NomotoVessel(self)
 
 
-class NomotoConfig(SteeringConfig):
+class NomotoConfig(NomotoVesselConfig):
     """The first-order model T r_dot + r = K delta (document 004 eq. (5.9)); no sideslip.
 
     Attributes:
         T: time constant in s.
     """
 
-    poles = ("T",)
+    pole_names = ("T",)
     kind: Literal["nomoto"]
     T: TimeConstant
 
-    def steering(self) -> LinearSteering:
+    def state_space(self) -> SteeringStateSpace:
         """Return the model of r alone; v stays as it is."""
-        k, t = self.K.value, self.T.value
-        return LinearSteering(np.diag([0.0, -1.0 / t]), np.array([0.0, k / t]))
+        k, T = self.K.value, self.T.value
+        return SteeringStateSpace(np.diag([0.0, -1.0 / T]), np.array([0.0, k / T]))
 
 
-class SecondOrderConfig(SteeringConfig, ABC):
+class SecondOrderSteeringConfig(NomotoVesselConfig, ABC):
     """The time constants of r/delta = K (1 + T3 s) / ((1 + T1 s)(1 + T2 s)).
 
     Attributes:
@@ -106,18 +106,18 @@ class SecondOrderConfig(SteeringConfig, ABC):
     Source: document 004 eq. (5.3).
     """
 
-    poles = ("T1", "T2")
+    pole_names = ("T1", "T2")
     T1: TimeConstant
     T2: TimeConstant
     T3: TimeConstant
 
-    def companion(self) -> np.ndarray:
+    def companion_matrix(self) -> np.ndarray:
         """Return the companion form [2, 2] of the denominator."""
-        product, total = self.T1.value * self.T2.value, self.T1.value + self.T2.value
-        return np.array([[0.0, 1.0], [-1.0 / product, -total / product]])
+        time_product, time_sum = self.T1.value * self.T2.value, self.T1.value + self.T2.value
+        return np.array([[0.0, 1.0], [-1.0 / time_product, -time_sum / time_product]])
 
 
-class SecondOrderNomotoConfig(SecondOrderConfig):
+class SecondOrderNomotoConfig(SecondOrderSteeringConfig):
     """The second-order model of the yaw rate; no sideslip.
 
     T1 T2 r_ddot + (T1 + T2) r_dot + r = K (delta + T3 delta_dot): document 004 eq. (5.5) by
@@ -129,16 +129,19 @@ class SecondOrderNomotoConfig(SecondOrderConfig):
 
     kind: Literal["nomoto_second_order"]
 
-    def steering(self) -> LinearSteering:
+    def state_space(self) -> SteeringStateSpace:
         """Return v, r and q."""
-        k, yaw = self.K.value, self.companion()
-        direct = -k * self.T3.value * yaw[1, 0]
-        a, b = np.zeros((3, 3)), np.array([0.0, direct, -k * yaw[1, 0] + yaw[1, 1] * direct])
-        a[1:, 1:] = yaw
-        return LinearSteering(a, b, ("_yaw_lag",))
+        k, companion = self.K.value, self.companion_matrix()
+        direct_gain = -k * self.T3.value * companion[1, 0]
+        a, b = (
+            np.zeros((3, 3)),
+            np.array([0.0, direct_gain, -k * companion[1, 0] + companion[1, 1] * direct_gain]),
+        )
+        a[1:, 1:] = companion
+        return SteeringStateSpace(a, b, ("_yaw_lag",))
 
 
-class SideslipNomotoConfig(SecondOrderConfig):
+class SideslipNomotoConfig(SecondOrderSteeringConfig):
     """The second-order model in yaw and sway, given by its transfer functions.
 
     M nu_dot + N(u) nu = b delta with nu = (v, r) (document 004 eq. (5.1)) has the transfer
@@ -156,7 +159,7 @@ class SideslipNomotoConfig(SecondOrderConfig):
     T_v: TimeConstant
 
     @model_validator(mode="after")
-    def _two_states(self) -> SideslipNomotoConfig:
+    def _validate_distinct_zeros(self) -> SideslipNomotoConfig:
         if self.K_v.value == 0 or self.T_v.value == self.T3.value:
             raise ValueError(
                 "K_v must not be zero and T_v must differ from T3: sway would be no state of its"
@@ -164,61 +167,76 @@ class SideslipNomotoConfig(SecondOrderConfig):
             )
         return self
 
-    def steering(self) -> LinearSteering:
+    def state_space(self) -> SteeringStateSpace:
         """Return v and r, from the companion form of the common denominator."""
-        k, k_v, companion = self.K.value, self.K_v.value, self.companion()
-        out = np.array([[k_v, k_v * self.T_v.value], [k, k * self.T3.value]])
-        return LinearSteering(
-            out @ companion @ np.linalg.inv(out), out @ np.array([0.0, -companion[1, 0]])
+        k, k_v, companion = self.K.value, self.K_v.value, self.companion_matrix()
+        output_matrix = np.array([[k_v, k_v * self.T_v.value], [k, k * self.T3.value]])
+        return SteeringStateSpace(
+            output_matrix @ companion @ np.linalg.inv(output_matrix),
+            output_matrix @ np.array([0.0, -companion[1, 0]]),
         )
 
 
 @final
-class SteeringVessel(Plant):
+class NomotoVessel(Plant):
     """A vessel that turns as its steering model says and keeps its speed.
 
     State x [B, 6 + k]: x, y [m], psi [rad], u, v [m/s], r [rad/s], internal states of the model,
     then the rudder where it has a rate or lag. Input: cmd_delta [rad].
     """
 
-    def __init__(self, config: SteeringConfig) -> None:
+    def __init__(self, config: NomotoVesselConfig) -> None:
         super().__init__()
-        a, b, extra = config.steering()
+        a, b, internal_states = config.state_space()
         self.speed, self.delta_max = config.speed, config.rudder.limit
-        self.servo = config.rudder.servo("delta")
-        self.free = 2 + len(extra)
-        self.turning_columns = slice(SWAY, SWAY + self.free)
-        self.rudder_columns = slice(SWAY + self.free, None)
-        self.state = ("x", "y", "psi", "u", "v", "r", *extra, *self.servo.state)
-        self.inputs = ("cmd_delta",)
-        self.commands = 1
+        self.servo = config.rudder.build_servo("delta")
+        self.n_steering_states = 2 + len(internal_states)
+        self.steering_columns = slice(SWAY, SWAY + self.n_steering_states)
+        self.rudder_columns = slice(SWAY + self.n_steering_states, None)
+        self.state_names = (
+            "x",
+            "y",
+            "psi",
+            "u",
+            "v",
+            "r",
+            *internal_states,
+            *self.servo.state_names,
+        )
+        self.input_names = ("cmd_delta",)
+        self.n_commands = 1
         self.a = nn.Buffer(torch.from_numpy(a), persistent=False)
         self.b = nn.Buffer(torch.from_numpy(b), persistent=False)
 
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+    def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the rudder angle [..., 1] for a steer [...] as a share of the limit.
 
         The speed is constant whatever the drive.
         """
         return (steer.clamp(-1.0, 1.0) * self.delta_max).unsqueeze(-1)
 
-    def delta(self, x: Tensor, w: Tensor) -> Tensor:
+    def rudder_angle(self, x: Tensor, w: Tensor) -> Tensor:
         """Return the rudder angle [B] in rad."""
-        return self.servo.value(x[:, self.rudder_columns], w[:, :1])[:, 0]
+        return self.servo.position(x[:, self.rudder_columns], w[:, :1])[:, 0]
 
-    def rate(self, x: Tensor, w: Tensor) -> Tensor:
-        z, rudder = x[:, self.turning_columns], x[:, self.rudder_columns]
-        turning = z @ self.a.to(x.dtype).T + self.delta(x, w).unsqueeze(-1) * self.b.to(x.dtype)
+    def derivative(self, x: Tensor, w: Tensor) -> Tensor:
+        z, rudder_states = x[:, self.steering_columns], x[:, self.rudder_columns]
+        steering_derivative = z @ self.a.to(x.dtype).T + self.rudder_angle(x, w).unsqueeze(
+            -1
+        ) * self.b.to(x.dtype)
         north, east = to_earth(surge(x), sway(x), heading(x))
-        pose = torch.stack((north, east, yaw_rate(x), torch.zeros_like(north)), dim=-1)
-        return torch.cat((pose, turning, self.servo.rate(rudder, w[:, :1])), dim=-1)
+        pose_derivative = torch.stack((north, east, yaw_rate(x), torch.zeros_like(north)), dim=-1)
+        return torch.cat(
+            (pose_derivative, steering_derivative, self.servo.derivative(rudder_states, w[:, :1])),
+            dim=-1,
+        )
 
-    def end_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
-        rudder = self.servo.advance(x[:, self.rudder_columns], w[:, :1], dt)
-        return torch.cat((x[:, : self.rudder_columns.start], rudder), dim=-1)
+    def finish_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
+        rudder_states = self.servo.advance_step(x[:, self.rudder_columns], w[:, :1], dt)
+        return torch.cat((x[:, : self.rudder_columns.start], rudder_states), dim=-1)
 
-    def approach(self, rows: int) -> Tensor:
+    def make_initial_state(self, rows: int) -> Tensor:
         """Return the state straight ahead at the model's speed, [rows, nx]."""
-        x = super().approach(rows)
+        x = super().make_initial_state(rows)
         x[:, SURGE] = self.speed
         return x

@@ -31,7 +31,7 @@ class Parameter(Config):
 
     @field_validator("source")
     @classmethod
-    def _source(cls, source: str) -> str:
+    def _validate_source(cls, source: str) -> str:
         if not source.strip():
             raise ValueError(
                 "a parameter needs its source (a document and equation, or 'measured by ...')"
@@ -39,7 +39,7 @@ class Parameter(Config):
         return source
 
 
-def measured_in(unit: str) -> Callable[[Parameter], Parameter]:
+def convert_to_unit(unit: str) -> Callable[[Parameter], Parameter]:
     """Return a validator of a parameter whose unit must measure `unit`.
 
     The validator converts the value to `unit`.
@@ -55,23 +55,23 @@ def measured_in(unit: str) -> Callable[[Parameter], Parameter]:
     return convert
 
 
-Mass = Annotated[Parameter, AfterValidator(measured_in("kg"))]
-MassArm = Annotated[Parameter, AfterValidator(measured_in("kg m"))]
-Inertia = Annotated[Parameter, AfterValidator(measured_in("kg m^2"))]
-Length = Annotated[Parameter, AfterValidator(measured_in("m"))]
-Volume = Annotated[Parameter, AfterValidator(measured_in("m^3"))]
-MassDensity = Annotated[Parameter, AfterValidator(measured_in("kg/m^3"))]
+Mass = Annotated[Parameter, AfterValidator(convert_to_unit("kg"))]
+MassArm = Annotated[Parameter, AfterValidator(convert_to_unit("kg m"))]
+Inertia = Annotated[Parameter, AfterValidator(convert_to_unit("kg m^2"))]
+Length = Annotated[Parameter, AfterValidator(convert_to_unit("m"))]
+Volume = Annotated[Parameter, AfterValidator(convert_to_unit("m^3"))]
+MassDensity = Annotated[Parameter, AfterValidator(convert_to_unit("kg/m^3"))]
 
 
-def above_zero(parameter: Parameter) -> Parameter:
+def require_positive(parameter: Parameter) -> Parameter:
     """Return a validator of a parameter that must be positive."""
     if not parameter.value > 0:
         raise ValueError(f"must be positive, given {parameter.value:g}")
     return parameter
 
 
-Positive = AfterValidator(above_zero)
-_BASE = {
+Positive = AfterValidator(require_positive)
+_BASE_DIMENSIONS = {
     "kg": (0, 0),
     "m": (1, 0),
     "s": (0, 1),
@@ -82,46 +82,49 @@ _BASE = {
 }
 
 
-def dimension(unit: str, mass: int = 1) -> tuple[int, int] | None:
+def parse_dimension(unit: str, mass: int = 1) -> tuple[int, int] | None:
     """Return the powers of metre and second in an SI unit with `mass` times mass.
 
     For example (2, -1) for `kg m^2/s` or `N m s/rad`; None for any other unit.
     """
-    metres = seconds = masses = 0
+    metre_power = second_power = mass_power = 0
     for sign, name, power in re.findall(r"([/ ]?)([^/ ^]*)(?:\^([1-9]))?", unit.strip()):
         if not name:
             continue
-        if name not in _BASE:
+        if name not in _BASE_DIMENSIONS:
             return None
-        count = int(power or 1) * (-1 if sign == "/" else 1)
-        metres, seconds = metres + count * _BASE[name][0], seconds + count * _BASE[name][1]
-        masses += count * (name in ("kg", "N"))
-    return (metres, seconds) if masses == mass else None
+        exponent = int(power or 1) * (-1 if sign == "/" else 1)
+        metre_power, second_power = (
+            metre_power + exponent * _BASE_DIMENSIONS[name][0],
+            second_power + exponent * _BASE_DIMENSIONS[name][1],
+        )
+        mass_power += exponent * (name in ("kg", "N"))
+    return (metre_power, second_power) if mass_power == mass else None
 
 
-def of_dimension(mass: int, metres: int, seconds: int) -> Callable[[Parameter], Parameter]:
+def require_dimension(mass: int, metres: int, seconds: int) -> Callable[[Parameter], Parameter]:
     """Return a validator of a parameter in kilogram, metre and second to these powers."""
 
     def check(parameter: Parameter) -> Parameter:
-        if dimension(parameter.unit, mass) != (metres, seconds):
+        if parse_dimension(parameter.unit, mass) != (metres, seconds):
             raise ValueError(
-                f"its unit must be {unit_text(metres, seconds, mass)}, given '{parameter.unit}'"
+                f"its unit must be {format_unit(metres, seconds, mass)}, given '{parameter.unit}'"
             )
         return parameter
 
     return check
 
 
-def unit_text(metres: int, seconds: int, mass: int = 1) -> str:
+def format_unit(metres: int, seconds: int, mass: int = 1) -> str:
     """Return SI unit `kg^c m^a s^b` as text."""
 
-    def powers(sign: int) -> list[str]:
+    def format_powers(sign: int) -> list[str]:
         dimensions = (("kg", mass), ("m", metres), ("s", seconds))
         return [
-            name + (f"^{sign * p}" if sign * p > 1 else "")
-            for name, p in dimensions
-            if sign * p > 0
+            name + (f"^{sign * exponent}" if sign * exponent > 1 else "")
+            for name, exponent in dimensions
+            if sign * exponent > 0
         ]
 
-    above = powers(1) or (["1"] if powers(-1) else ["-"])
-    return " ".join(above) + "".join(f"/{name}" for name in powers(-1))
+    numerator = format_powers(1) or (["1"] if format_powers(-1) else ["-"])
+    return " ".join(numerator) + "".join(f"/{name}" for name in format_powers(-1))

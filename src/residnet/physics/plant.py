@@ -10,22 +10,24 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ConfigError
-from residnet.core.frames import along_axes, cross, to_body, to_earth, upright
-from residnet.core.layout import PLANAR, StateLayout
+from residnet.core.frames import cross_product, horizontal_to_body, to_body, to_earth, to_level_axes
+from residnet.core.layout import PLANAR_LAYOUT, StateLayout
 from residnet.core.names import WIND_INPUTS
-from residnet.physics.actuators import Actuators
+from residnet.physics.actuators import ActuatorSystem
 from residnet.physics.environment import WindLoadConfig
 from residnet.physics.terms import TermLibrary
 
-ROLLING = StateLayout(("x", "y", "phi", "psi"), ("u", "v", "p", "r"))
+ROLLING_LAYOUT = StateLayout(("x", "y", "phi", "psi"), ("u", "v", "p", "r"))
 """Surge, sway, roll and yaw, without heave and pitch (document 004 and its corrections)."""
-SUBMERGED = StateLayout(("x", "y", "z", "phi", "theta", "psi"), ("u", "v", "w", "p", "q", "r"))
+SUBMERGED_LAYOUT = StateLayout(
+    ("x", "y", "z", "phi", "theta", "psi"), ("u", "v", "w", "p", "q", "r")
+)
 """All six degrees of freedom, z the depth."""
-_LAYOUTS = {one.dof: one for one in (PLANAR, ROLLING, SUBMERGED)}
-_AXES = {
-    PLANAR.dof: ("x", "y", "n"),
-    ROLLING.dof: ("x", "y", "k", "n"),
-    SUBMERGED.dof: ("x", "y", "z", "k", "m", "n"),
+_LAYOUT_OF_DOF = {one.n_dof: one for one in (PLANAR_LAYOUT, ROLLING_LAYOUT, SUBMERGED_LAYOUT)}
+_FORCE_AXES_OF_DOF = {
+    PLANAR_LAYOUT.n_dof: ("x", "y", "n"),
+    ROLLING_LAYOUT.n_dof: ("x", "y", "k", "n"),
+    SUBMERGED_LAYOUT.n_dof: ("x", "y", "z", "k", "m", "n"),
 }
 
 
@@ -33,27 +35,27 @@ class Plant(nn.Module, ABC):
     """The true vessel of a simulation.
 
     Attributes:
-        state: names of the columns of x [B, nx]: pose, velocities, then states of the actuators.
-        inputs: names of the columns of w [B, m]: commands, then exogenous inputs.
-        commands: how many of the inputs are commands.
-        attitude: columns of roll, pitch and heading, where the vessel turns about all axes. The
+        state_names: names of the columns of x [B, nx]: pose, velocities, then states of the actuators.
+        input_names: names of the columns of w [B, m]: commands, then exogenous inputs.
+        n_commands: how many of the inputs are commands.
+        attitude_columns: columns of roll, pitch and heading, where the vessel turns about all axes. The
             rates that stand there are those about the body axes: whoever integrates them composes
             rotations. Empty where angles add up.
-        diving: commands [c] that make the vessel dive with all its force; None where it cannot.
+        dive_commands: commands [c] that make the vessel dive with all its force; None where it cannot.
     """
 
-    state: tuple[str, ...]
-    inputs: tuple[str, ...]
-    commands: int
-    attitude: tuple[int, ...] = ()
-    diving: Tensor | None = None
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    n_commands: int
+    attitude_columns: tuple[int, ...] = ()
+    dive_commands: Tensor | None = None
 
     @abstractmethod
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+    def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
 
     @abstractmethod
-    def rate(self, x: Tensor, w: Tensor) -> Tensor:
+    def derivative(self, x: Tensor, w: Tensor) -> Tensor:
         """Return x_dot [B, nx] under inputs w [B, m]."""
 
     def prepare(self, x: Tensor, w: Tensor) -> Tensor:
@@ -65,26 +67,26 @@ class Plant(nn.Module, ABC):
         """
         return w
 
-    def held_rate(self, x: Tensor, p: Tensor) -> Tensor:
+    def derivative_prepared(self, x: Tensor, p: Tensor) -> Tensor:
         """Return x_dot [B, nx] within a step that holds p = prepare(x, w).
 
-        It equals `rate` under the same inputs.
+        It equals `derivative` under the same inputs.
         """
-        return self.rate(x, p)
+        return self.derivative(x, p)
 
-    def approach(self, rows: int) -> Tensor:
+    def make_initial_state(self, n_rows: int) -> Tensor:
         """Return the state [rows, nx] that trials start from, float64.
 
         It is at rest; a model that only holds near its service speed starts there.
         """
-        return torch.zeros(rows, len(self.state), dtype=torch.float64)
+        return torch.zeros(n_rows, len(self.state_names), dtype=torch.float64)
 
-    def end_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
+    def finish_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
         """Return the state [B, nx] after what moves once per step of dt seconds has moved."""
         return x
 
 
-def inverse_mass(mass: Tensor, vessel: str) -> Tensor:
+def invert_mass(mass: Tensor, vessel: str) -> Tensor:
     """Return the inverse [n, n] of a mass matrix [n, n] in float64.
 
     Raises:
@@ -115,7 +117,7 @@ class Hull(nn.Module):
 
     Args:
         mass: M with added mass, [n][n].
-        rows: for each axis the coefficients C of its force by term; terms that brake are negative.
+        force_rows: for each axis the coefficients C of its force by term; terms that brake are negative.
         channels: of the motion: the velocities through the water, then phi where the hull rolls,
             and theta where it pitches.
 
@@ -126,42 +128,54 @@ class Hull(nn.Module):
     def __init__(
         self,
         mass: Sequence[Sequence[float]],
-        rows: Sequence[Mapping[str, float]],
+        force_rows: Sequence[Mapping[str, float]],
         channels: Sequence[str],
         vessel: str,
     ) -> None:
         super().__init__()
-        self.terms = TermLibrary(list(dict.fromkeys(t for row in rows for t in row)), channels)
-        coefficients = [[row.get(term, 0.0) for row in rows] for term in self.terms.terms]
-        table = torch.tensor(coefficients, dtype=torch.float64).view(-1, len(rows))
+        self.terms = TermLibrary(
+            list(
+                dict.fromkeys(
+                    term_name for axis_coefficients in force_rows for term_name in axis_coefficients
+                )
+            ),
+            channels,
+        )
+        coefficients = [
+            [axis_coefficients.get(term, 0.0) for axis_coefficients in force_rows]
+            for term in self.terms.terms
+        ]
+        coefficient_table = torch.tensor(coefficients, dtype=torch.float64).view(
+            -1, len(force_rows)
+        )
         self.mass: Tensor = nn.Buffer(torch.tensor(mass, dtype=torch.float64), persistent=False)
-        self.coefficients = nn.Buffer(table, persistent=False)
-        self.inverse = nn.Buffer(inverse_mass(self.mass, vessel), persistent=False)
+        self.coefficients = nn.Buffer(coefficient_table, persistent=False)
+        self.inverse_mass = nn.Buffer(invert_mass(self.mass, vessel), persistent=False)
 
-    def load(self, motion: Tensor) -> Tensor:
+    def hydrodynamic_force(self, motion: Tensor) -> Tensor:
         """Return the forces [..., n] in N and N m of water, weight and rotation."""
         force: Tensor = self.terms(motion) @ self.coefficients.to(motion.dtype)
         return force
 
     def forward(self, motion: Tensor, tau: Tensor) -> Tensor:
         """Return the acceleration nu_dot [..., n] under the further forces tau [..., n]."""
-        if self.terms.count:
-            tau = tau + self.load(motion)
-        return tau @ self.inverse.to(tau.dtype).T
+        if self.terms.n_terms:
+            tau = tau + self.hydrodynamic_force(motion)
+        return tau @ self.inverse_mass.to(tau.dtype).T
 
-    def required(self, nu_dot: Tensor, motion: Tensor) -> Tensor:
+    def required_force(self, nu_dot: Tensor, motion: Tensor) -> Tensor:
         """Return the forces [..., n] that accelerate the vessel by nu_dot [..., n].
 
         Source: document 002 eq. (2.10).
         """
-        return nu_dot @ self.mass.to(motion.dtype).T - self.load(motion)
+        return nu_dot @ self.mass.to(motion.dtype).T - self.hydrodynamic_force(motion)
 
-    def equations(self) -> tuple[tuple[str, ...], list[list[float]]]:
+    def acceleration_equations(self) -> tuple[tuple[str, ...], list[list[float]]]:
         """Return nu_dot as J terms of the motion, and coefficients [n][J + n] on each axis.
 
         The coefficients of tau stand behind those of the terms.
         """
-        response = torch.cat((self.inverse @ self.coefficients.T, self.inverse), dim=1)
+        response = torch.cat((self.inverse_mass @ self.coefficients.T, self.inverse_mass), dim=1)
         return self.terms.terms, response.tolist()
 
 
@@ -171,7 +185,7 @@ class HullPlant(Plant):
 
     State x [B, 2 n + k]: pose, velocities over ground, then the actuators' states. In 3 degrees of
     freedom these are x, y, psi and u, v, r; in 4 x, y, phi, psi and u, v, p, r; in 6 those of
-    `SUBMERGED`.
+    `SUBMERGED_LAYOUT`.
 
     Inputs: commands; force_x, force_y, (force_z, force_k, force_m,) force_n in body axes [N, N m];
     current_north, current_east [m/s]; force_north, force_east [N], constant in earth axes; where
@@ -181,52 +195,61 @@ class HullPlant(Plant):
     Args:
         hull: of 3, 4 or 6 degrees of freedom.
         wind: loads of the air; None where it feels none.
-        start: states that trials start from, where not at rest, by name.
+        initial_values: states that trials start from, where not at rest, by name.
     """
 
     def __init__(
         self,
         hull: Hull,
-        actuators: Actuators,
+        actuators: ActuatorSystem,
         wind: WindLoadConfig | None = None,
-        start: Mapping[str, float] | None = None,
+        initial_values: Mapping[str, float] | None = None,
     ) -> None:
         super().__init__()
         self.hull, self.actuators, self.wind = hull, actuators, wind
-        self.n = len(hull.mass)
-        self.rolls, self.dives = self.n == ROLLING.dof, self.n == SUBMERGED.dof
-        self.weather = True
-        self.state = (*_LAYOUTS[self.n].names, *actuators.state)
-        self.attitude = tuple(map(self.state.index, ("phi", "theta", "psi"))) if self.dives else ()
-        self.diving = actuators.diving
-        self.parts = [self.n, self.n, len(actuators.state)]
-        self.commands = len(actuators.commands)
-        self.inputs = (
-            *actuators.commands,
-            *(f"force_{axis}" for axis in _AXES[self.n]),
+        self.n_dof = len(hull.mass)
+        self.has_roll, self.is_submerged = (
+            self.n_dof == ROLLING_LAYOUT.n_dof,
+            self.n_dof == SUBMERGED_LAYOUT.n_dof,
+        )
+        self.has_environment = True
+        self.state_names = (*_LAYOUT_OF_DOF[self.n_dof].state_names, *actuators.state_names)
+        self.attitude_columns = (
+            tuple(map(self.state_names.index, ("phi", "theta", "psi"))) if self.is_submerged else ()
+        )
+        self.dive_commands = actuators.dive_commands
+        self.state_sizes = [self.n_dof, self.n_dof, len(actuators.state_names)]
+        self.n_commands = len(actuators.command_names)
+        self.input_names = (
+            *actuators.command_names,
+            *(f"force_{axis}" for axis in _FORCE_AXES_OF_DOF[self.n_dof]),
             "current_north",
             "current_east",
             "force_north",
             "force_east",
             *(WIND_INPUTS if wind is not None else ()),
         )
-        self.start = {self.state.index(n): v for n, v in (start or {}).items() if n in self.state}
+        self.initial_values = {
+            self.state_names.index(n): value
+            for n, value in (initial_values or {}).items()
+            if n in self.state_names
+        }
 
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        return self.actuators.demand(drive, steer)
+    def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        return self.actuators.commands_for_demand(drive, steer)
 
-    def in_calm_water(self) -> Self:
+    def without_environment(self) -> Self:
         """Return this plant without its exogenous inputs, which is faster.
 
         There are no body or earth-fixed forces, current, wind or air resistance.
         """
-        self.weather = False
-        self.inputs = self.actuators.commands
+        self.has_environment = False
+        self.input_names = self.actuators.command_names
         return self
 
-    def approach(self, rows: int) -> Tensor:
-        x = super().approach(rows)
-        for column, value in self.start.items():
+    def make_initial_state(self, n_rows: int) -> Tensor:
+        x = super().make_initial_state(n_rows)
+        for column, value in self.initial_values.items():
             x[:, column] = value
         return x
 
@@ -236,105 +259,132 @@ class HullPlant(Plant):
         This holds where these forces stay the same over a step; elsewhere it returns w itself. A
         recorded step of wam_v_cal takes 162 us so, 221 us without.
         """
-        if not self.actuators.held:
+        if not self.actuators.is_force_constant_in_step:
             return w
-        n, c = self.n, self.commands
+        n, c = self.n_dof, self.n_commands
         force = self.actuators.force(x[:, 2 * n :], w[:, :c], x[:, n : 2 * n])
-        if self.weather:
+        if self.has_environment:
             force = force + w[:, c : c + n]
         return torch.cat((w[:, :c], force, w[:, c + n :]), dim=-1)
 
-    def held_rate(self, x: Tensor, p: Tensor) -> Tensor:
-        return self._rate(x, p, self.actuators.held)
+    def derivative_prepared(self, x: Tensor, p: Tensor) -> Tensor:
+        return self._compute_derivative(x, p, self.actuators.is_force_constant_in_step)
 
-    def rate(self, x: Tensor, w: Tensor) -> Tensor:
-        return self._rate(x, w, False)
+    def derivative(self, x: Tensor, w: Tensor) -> Tensor:
+        return self._compute_derivative(x, w, False)
 
-    def _rate(self, x: Tensor, w: Tensor, held: bool) -> Tensor:
+    def _compute_derivative(self, x: Tensor, w: Tensor, is_force_included: bool) -> Tensor:
         """Return x_dot [B, nx].
 
-        `held`: the actuators' forces are among the body forces already, and their states stand
+        `is_force_included`: the actuators' forces are among the body forces already, and their states stand
         still.
         """
-        n, c = self.n, self.commands
-        pose, nu, a = torch.split(x, self.parts, dim=-1)
+        n, c = self.n_dof, self.n_commands
+        pose, nu, actuator_states = torch.split(x, self.state_sizes, dim=-1)
         command = w.narrow(-1, 0, c)
-        moving = torch.zeros_like(a) if held else self.actuators.rate(a, command)
-        moved = self._pose_rate(pose, nu)
-        if not self.weather:
-            tau = w.narrow(-1, c, n) if held else self.actuators.force(a, command, nu)
-            return torch.cat((moved, self.hull(self._motion(pose, nu), tau), moving), dim=-1)
-        water, turned = self._water(w[:, c + n], w[:, c + n + 1], pose, nu)
-        relative, tau = nu - water, w[:, c : c + n]
-        if not held:
-            tau = tau + self.actuators.force(a, command, relative)
-        tau = tau + self._body(w[:, c + n + 2], w[:, c + n + 3], pose)
+        actuator_derivative = (
+            torch.zeros_like(actuator_states)
+            if is_force_included
+            else self.actuators.derivative(actuator_states, command)
+        )
+        pose_derivative = self._pose_derivative(pose, nu)
+        if not self.has_environment:
+            tau = (
+                w.narrow(-1, c, n)
+                if is_force_included
+                else self.actuators.force(actuator_states, command, nu)
+            )
+            return torch.cat(
+                (
+                    pose_derivative,
+                    self.hull(self._hull_channels(pose, nu), tau),
+                    actuator_derivative,
+                ),
+                dim=-1,
+            )
+        current, current_derivative = self._current_in_body_axes(
+            w[:, c + n], w[:, c + n + 1], pose, nu
+        )
+        relative_velocity, tau = nu - current, w[:, c : c + n]
+        if not is_force_included:
+            tau = tau + self.actuators.force(actuator_states, command, relative_velocity)
+        tau = tau + self._to_body_axes(w[:, c + n + 2], w[:, c + n + 3], pose)
         if self.wind is not None:
-            tau = tau + self._wind(w[:, c + n + 4], w[:, c + n + 5], pose, nu)
-        nu_dot = self.hull(self._motion(pose, relative), tau) + turned
-        return torch.cat((moved, nu_dot, moving), dim=-1)
+            tau = tau + self._wind_force(w[:, c + n + 4], w[:, c + n + 5], pose, nu)
+        nu_dot = self.hull(self._hull_channels(pose, relative_velocity), tau) + current_derivative
+        return torch.cat((pose_derivative, nu_dot, actuator_derivative), dim=-1)
 
-    def _motion(self, pose: Tensor, nu: Tensor) -> Tensor:
-        if self.dives:
+    def _hull_channels(self, pose: Tensor, nu: Tensor) -> Tensor:
+        if self.is_submerged:
             return torch.cat((nu, pose[..., 3:5]), dim=-1)
-        return torch.cat((nu, pose[..., 2:3]), dim=-1) if self.rolls else nu
+        return torch.cat((nu, pose[..., 2:3]), dim=-1) if self.has_roll else nu
 
-    def _pose_rate(self, pose: Tensor, nu: Tensor) -> Tensor:
+    def _pose_derivative(self, pose: Tensor, nu: Tensor) -> Tensor:
         """Return the derivative [B, n] of the pose (document 003 eq. (1), document 004).
 
         Where the vessel turns about all axes, what its angles have is p, q and r.
         """
         u, v = nu[..., 0], nu[..., 1]
-        if self.dives:
-            forward, starboard, down = upright(u, v, nu[..., 2], pose[..., 3], pose[..., 4])
-            north, east = to_earth(forward, starboard, pose[..., 5])
-            return torch.cat((torch.stack((north, east, down), dim=-1), nu[..., 3:]), dim=-1)
-        if not self.rolls:
+        if self.is_submerged:
+            velocity_forward, velocity_starboard, velocity_down = to_level_axes(
+                u, v, nu[..., 2], pose[..., 3], pose[..., 4]
+            )
+            north, east = to_earth(velocity_forward, velocity_starboard, pose[..., 5])
+            return torch.cat(
+                (torch.stack((north, east, velocity_down), dim=-1), nu[..., 3:]), dim=-1
+            )
+        if not self.has_roll:
             return torch.stack((*to_earth(u, v, pose[..., 2]), nu[..., 2]), dim=-1)
         cos_phi = torch.cos(pose[..., 2])
         north, east = to_earth(u, v * cos_phi, pose[..., 3])
         return torch.stack((north, east, nu[..., 2], nu[..., 3] * cos_phi), dim=-1)
 
-    def _body(self, north: Tensor, east: Tensor, pose: Tensor) -> Tensor:
+    def _to_body_axes(self, north: Tensor, east: Tensor, pose: Tensor) -> Tensor:
         """Return an earth-fixed horizontal vector along the (rolled) body axes, [B, n]."""
         zero = torch.zeros_like(pose[..., -1])
-        if self.dives:
-            return torch.stack((*along_axes(north, east, pose[..., 3:]), zero, zero, zero), dim=-1)
-        along, across = to_body(north, east, pose[..., -1])
-        if self.rolls:
-            return torch.stack((along, across * torch.cos(pose[..., 2]), zero, zero), dim=-1)
-        return torch.stack((along, across, zero), dim=-1)
+        if self.is_submerged:
+            return torch.stack(
+                (*horizontal_to_body(north, east, pose[..., 3:]), zero, zero, zero), dim=-1
+            )
+        body_x, body_y = to_body(north, east, pose[..., -1])
+        if self.has_roll:
+            return torch.stack((body_x, body_y * torch.cos(pose[..., 2]), zero, zero), dim=-1)
+        return torch.stack((body_x, body_y, zero), dim=-1)
 
-    def _water(
+    def _current_in_body_axes(
         self, north: Tensor, east: Tensor, pose: Tensor, nu: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the current in body axes and its derivative while the body turns, each [B, n]."""
-        if self.dives:
-            body = self._body(north, east, pose)
-            turned = cross(body[..., :3], nu[..., 3:])
-            return body, torch.cat((turned, torch.zeros_like(turned)), dim=-1)
-        along, across = to_body(north, east, pose[..., -1])
-        zero, r = torch.zeros_like(along), nu[..., -1]
-        if not self.rolls:
-            body = torch.stack((along, across, zero), dim=-1)
-            return body, torch.stack((r * across, -r * along, zero), dim=-1)
+        if self.is_submerged:
+            current = self._to_body_axes(north, east, pose)
+            rotation = cross_product(current[..., :3], nu[..., 3:])
+            return current, torch.cat((rotation, torch.zeros_like(rotation)), dim=-1)
+        body_x, body_y = to_body(north, east, pose[..., -1])
+        zero, r = torch.zeros_like(body_x), nu[..., -1]
+        if not self.has_roll:
+            current = torch.stack((body_x, body_y, zero), dim=-1)
+            return current, torch.stack((r * body_y, -r * body_x, zero), dim=-1)
         cos_phi, sin_phi = torch.cos(pose[..., 2]), torch.sin(pose[..., 2])
-        turning, p = r * cos_phi, nu[..., 2]
-        sideways = -turning * along * cos_phi - p * across * sin_phi
-        body = torch.stack((along, across * cos_phi, zero, zero), dim=-1)
-        return body, torch.stack((turning * across, sideways, zero, zero), dim=-1)
+        heading_rate, p = r * cos_phi, nu[..., 2]
+        sway_derivative = -heading_rate * body_x * cos_phi - p * body_y * sin_phi
+        current = torch.stack((body_x, body_y * cos_phi, zero, zero), dim=-1)
+        return current, torch.stack((heading_rate * body_y, sway_derivative, zero, zero), dim=-1)
 
-    def _wind(self, speed: Tensor, direction: Tensor, pose: Tensor, nu: Tensor) -> Tensor:
+    def _wind_force(self, speed: Tensor, direction: Tensor, pose: Tensor, nu: Tensor) -> Tensor:
         """Return the forces [B, n] of the true wind on a vessel with velocities over ground nu."""
         assert self.wind is not None
-        air = self._body(-speed * torch.cos(direction), -speed * torch.sin(direction), pose)
-        force = self.wind.loads(air[:, 0] - nu[:, 0], air[:, 1] - nu[:, 1])
-        return force if self.rolls else torch.cat((force[:, :2], force[:, 3:]), dim=-1)
+        air_velocity = self._to_body_axes(
+            -speed * torch.cos(direction), -speed * torch.sin(direction), pose
+        )
+        force = self.wind.wind_forces(air_velocity[:, 0] - nu[:, 0], air_velocity[:, 1] - nu[:, 1])
+        return force if self.has_roll else torch.cat((force[:, :2], force[:, 3:]), dim=-1)
 
-    def end_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
+    def finish_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
         """Return the state [B, nx] with the actuators moved on by a step of dt seconds.
 
         They are held while the hull moves.
         """
-        after = self.actuators.advance(x[:, 2 * self.n :], w[:, : self.commands], dt)
-        return torch.cat((x[:, : 2 * self.n], after), dim=-1)
+        actuator_states = self.actuators.advance_step(
+            x[:, 2 * self.n_dof :], w[:, : self.n_commands], dt
+        )
+        return torch.cat((x[:, : 2 * self.n_dof], actuator_states), dim=-1)

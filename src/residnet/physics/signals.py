@@ -13,12 +13,18 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from residnet.core.columns import velocities
+from residnet.core.columns import dynamic_states
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
-from residnet.core.layout import PLANAR, ROLL, SIX, VERTICAL, Live
-from residnet.core.names import WIND_INPUTS, nearest, require_plain_name, si_of
+from residnet.core.layout import (
+    PLANAR_LAYOUT,
+    ROLL_LAYOUT,
+    SIX_DOF_LAYOUT,
+    VERTICAL_PLANE_VELOCITIES,
+    DegreesOfFreedom,
+)
+from residnet.core.names import WIND_INPUTS, get_si_unit, require_plain_name, suggest_name
 from residnet.core.samples import Samples
 from residnet.physics.actuators import DifferentialThrustConfig
 from residnet.physics.hull import FossenConfig
@@ -54,30 +60,32 @@ class SignalsConfig(Config):
     exogenous: tuple[str, ...] = ()
     forces: str | DifferentialThrustConfig | None = None
     pairs: tuple[tuple[str, str], ...] = ()
-    velocities: tuple[Literal["u", "v", "r", "w", "p", "q"], ...] = Field(
+    dynamic_states: tuple[Literal["u", "v", "r", "w", "p", "q"], ...] = Field(
         default=("u", "v", "r"), min_length=1
     )
 
     @model_validator(mode="after")
-    def _combination(self) -> SignalsConfig:
+    def _validate_combination(self) -> SignalsConfig:
         for name in self.inputs:
             require_plain_name(name)
         for name in self.exogenous:
             if name not in WIND_INPUTS:
                 raise ValueError(
-                    f"exogenous channel '{name}' is not understood{nearest(name, WIND_INPUTS)}"
+                    f"exogenous channel '{name}' is not understood{suggest_name(name, WIND_INPUTS)}"
                 )
         if self.exogenous and set(self.exogenous) != set(WIND_INPUTS):
             raise ValueError(
                 f"true wind needs both {' and '.join(WIND_INPUTS)}; given {list(self.exogenous)}"
             )
-        if self.resolved().forces is not None and len(self.inputs) != 2:
+        if self.with_thrusters().forces is not None and len(self.inputs) != 2:
             raise ValueError(
                 f"forces are made by two thrusters, but inputs are {list(self.inputs)}"
             )
-        if self.live.spatial:
-            plane = tuple(name for name in VERTICAL if name in self.velocities)
-            if self.velocities not in (SIX.velocities, plane):
+        if self.dof.is_six_dof:
+            vertical_plane = tuple(
+                name for name in VERTICAL_PLANE_VELOCITIES if name in self.velocities
+            )
+            if self.velocities not in (SIX_DOF_LAYOUT.velocities, vertical_plane):
                 raise ValueError(
                     "velocities: heave and pitch go with surge alone (u, w, q and what of these"
                     " moves) or need all six, u, v, r, w, p, q, in this order; given"
@@ -88,51 +96,53 @@ class SignalsConfig(Config):
                     "velocities: a model of six degrees of freedom knows neither wind nor forces"
                     " of two thrusters; leave exogenous and forces out"
                 )
-        elif list(self.velocities) != [n for n in ROLL.velocities if n in self.velocities]:
+        elif list(self.velocities) != [
+            velocity for velocity in ROLL_LAYOUT.velocities if velocity in self.velocities
+        ]:
             raise ValueError(
                 f"velocities are named once each, in the order u, v, r, p; given {self.velocities}"
             )
-        if not self.live.spatial and not set(self.velocities) & set(PLANAR.velocities):
+        if not self.dof.is_six_dof and not set(self.velocities) & set(PLANAR_LAYOUT.velocities):
             raise ValueError("velocities: a model moves at least one of u, v, r; [p] has none")
-        if self.exogenous and self.live.dead:
+        if self.exogenous and self.dof.fixed_states:
             raise ValueError(
                 "exogenous: the loads of a wind need u, v and r and a heading; leave it out, or"
                 " give logs with all of these"
             )
-        repeated = {
+        duplicates = {
             name for name in self.inputs if name in self.exogenous or self.inputs.count(name) > 1
         }
-        if repeated:
-            raise ValueError(f"inputs {sorted(repeated)} are named twice")
-        paired = [name for pair in self.pairs for name in pair]
-        for name in paired:
+        if duplicates:
+            raise ValueError(f"inputs {sorted(duplicates)} are named twice")
+        paired_names = [name for pair in self.pairs for name in pair]
+        for name in paired_names:
             if name not in self.inputs:
-                raise ValueError(f"pairs: no input '{name}'{nearest(name, self.inputs)}")
-            if paired.count(name) > 1:
+                raise ValueError(f"pairs: no input '{name}'{suggest_name(name, self.inputs)}")
+            if paired_names.count(name) > 1:
                 raise ValueError(f"pairs: '{name}' is named twice")
         computed = (
-            self.live.states
+            self.dof.state_names
             + (FORCE_CHANNELS if self.forces is not None else ())
             + (WIND_CHANNELS if self.exogenous else ())
         )
-        if taken := [name for name in self.inputs if name in computed]:
+        if conflicting := [name for name in self.inputs if name in computed]:
             raise ValueError(
-                f"input '{taken[0]}' is a channel that the model has or makes itself; leave it out"
+                f"input '{conflicting[0]}' is a channel that the model has or makes itself; leave it out"
                 " or rename it in the channel map"
             )
         return self
 
     @property
-    def columns(self) -> tuple[str, ...]:
+    def input_columns(self) -> tuple[str, ...]:
         """Names of the columns of w [B, m]: inputs, then exogenous channels."""
         return self.inputs + self.exogenous
 
     @property
-    def live(self) -> Live:
+    def dof(self) -> DegreesOfFreedom:
         """The velocities that live."""
-        return Live(self.velocities)
+        return DegreesOfFreedom(self.velocities)
 
-    def resolved(self) -> SignalsConfig:
+    def with_thrusters(self) -> SignalsConfig:
         """Return the same config with the vessel's name replaced by its thrusters.
 
         A saved model then needs no vessel file.
@@ -154,13 +164,15 @@ class SignalsConfig(Config):
             )
         return self.model_copy(update={"forces": actuators})
 
-    def units(self) -> dict[str, str]:
+    def channel_units(self) -> dict[str, str]:
         """Return SI unit of each state and input."""
-        return {name: si_of(name) or "-" for name in self.live.states + self.columns}
+        return {
+            name: get_si_unit(name) or "-" for name in self.dof.state_names + self.input_columns
+        }
 
     def build(self) -> Signals:
         """Build the module that computes the channels."""
-        return Signals(self.resolved())
+        return Signals(self.with_thrusters())
 
 
 class Signals(nn.Module):
@@ -174,39 +186,43 @@ class Signals(nn.Module):
 
     def __init__(self, config: SignalsConfig) -> None:
         super().__init__()
-        self.inputs = len(config.inputs)
-        self.wind = len(config.exogenous) > 0
+        self.n_inputs = len(config.inputs)
+        self.has_wind = len(config.exogenous) > 0
         thrusters = config.forces if isinstance(config.forces, DifferentialThrustConfig) else None
-        self.forces = thrusters is not None
-        columns = config.columns
-        self.speed_column = columns.index("wind_speed") if self.wind else 0
-        self.direction_column = columns.index("wind_dir") if self.wind else 0
-        self.thrusters: nn.Module = nn.Identity() if thrusters is None else thrusters.build().forces
-        names = config.live.moving + config.inputs
-        self.dof = config.live.size
-        self.spatial = config.live.spatial
-        seen = torch.tensor([name not in config.live.hidden for name in config.live.moving])
-        self.seen = nn.Buffer(seen.double(), persistent=False)
-        names += FORCE_CHANNELS if self.forces else ()
-        names += WIND_CHANNELS if self.wind else ()
-        self.names: tuple[str, ...] = ChannelNames(names, config.pairs, config.live)
-        self.count = len(names)
+        self.has_forces = thrusters is not None
+        input_columns = config.input_columns
+        self.speed_column = input_columns.index("wind_speed") if self.has_wind else 0
+        self.direction_column = input_columns.index("wind_dir") if self.has_wind else 0
+        self.thrusters: nn.Module = (
+            nn.Identity() if thrusters is None else thrusters.build().thruster_forces
+        )
+        names = config.dof.dynamic_states + config.inputs
+        self.n_dof = config.dof.n_dynamic
+        self.is_six_dof = config.dof.is_six_dof
+        is_used = torch.tensor(
+            [name not in config.dof.unmodelled_states for name in config.dof.dynamic_states]
+        )
+        self.used_velocities = nn.Buffer(is_used.double(), persistent=False)
+        names += FORCE_CHANNELS if self.has_forces else ()
+        names += WIND_CHANNELS if self.has_wind else ()
+        self.names: tuple[str, ...] = ChannelNames(names, config.pairs, config.dof)
+        self.n_channels = len(names)
 
     def prepare(self, w: Tensor) -> Tensor:
         """Return what a step holds fixed, [..., k], from inputs w [..., m].
 
         These are inputs, forces and the air's velocity over ground (north, east).
         """
-        parts = [w[..., : self.inputs]]
-        if self.forces:
-            parts.append(self.thrusters(w[..., : self.inputs]))
-        if self.wind:
+        columns = [w[..., : self.n_inputs]]
+        if self.has_forces:
+            columns.append(self.thrusters(w[..., : self.n_inputs]))
+        if self.has_wind:
             speed, direction = w[..., self.speed_column], w[..., self.direction_column]
-            parts.append(
+            columns.append(
                 torch.stack((-speed * torch.cos(direction), -speed * torch.sin(direction)), dim=-1)
             )
         # joining a single part would copy it
-        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
+        return columns[0] if len(columns) == 1 else torch.cat(columns, dim=-1)
 
     def forward(self, x: Tensor, p: Tensor) -> Tensor:
         """Return the channels z [..., nz].
@@ -215,36 +231,38 @@ class Signals(nn.Module):
             x: state [..., nx] (pose, then what moves).
             p: what `prepare` returned for the step's inputs.
         """
-        if self.spatial:
+        if self.is_six_dof:
             # nothing depends on the depth
-            return torch.cat((velocities(x, self.dof) * self.seen.to(x.dtype), p), dim=-1)
-        if not self.wind:
-            return torch.cat((velocities(x, self.dof), p), dim=-1)
-        known = p.shape[-1] - 2
-        along, across = to_body(p[..., known], p[..., known + 1], x[..., 2])
-        along, across = along - x[..., 3], across - x[..., 4]
+            return torch.cat(
+                (dynamic_states(x, self.n_dof) * self.used_velocities.to(x.dtype), p), dim=-1
+            )
+        if not self.has_wind:
+            return torch.cat((dynamic_states(x, self.n_dof), p), dim=-1)
+        n_known = p.shape[-1] - 2
+        relative_x, relative_y = to_body(p[..., n_known], p[..., n_known + 1], x[..., 2])
+        relative_x, relative_y = relative_x - x[..., 3], relative_y - x[..., 4]
         # the offset keeps the gradient finite in a calm
-        magnitude = torch.sqrt(along * along + across * across + 1e-8)
+        magnitude = torch.sqrt(relative_x * relative_x + relative_y * relative_y + 1e-8)
         return torch.cat(
             (
-                velocities(x, self.dof),
-                p[..., :known],
-                torch.stack((along, across, magnitude), dim=-1),
+                dynamic_states(x, self.n_dof),
+                p[..., :n_known],
+                torch.stack((relative_x, relative_y, magnitude), dim=-1),
             ),
             dim=-1,
         )
 
 
-_STRONG = 10.0
+_MAX_ACCELERATION_STD = 10.0
 """Accelerations, in standard deviations, that are balanced half a range beyond the edge."""
-_SLOWEST, _FASTEST = 0.05, 2.0
+_MIN_RATE, _MAX_RATE = 0.05, 2.0
 """Limits of the rate in 1/s at which velocities are pulled back."""
-_LEAST = 1e-9
+_MIN_RANGE = 1e-9
 """Least width of a range, for channels that do not vary."""
 
 
 @final
-class VelocityBound(nn.Module):
+class RestoringAcceleration(nn.Module):
     """An acceleration [..., n] that pulls velocities back which left their range, else zero.
 
     Beyond the range of the training data a fitted model knows nothing: with nothing to damp it,
@@ -252,44 +270,52 @@ class VelocityBound(nn.Module):
 
     Args:
         margin: share of the training range by which it is widened on either side.
-        channels: number of channels, the velocities first, that `held` keeps in their range: what
+        n_channels: number of channels, the velocities first, that `held` keeps in their range: what
             an input does far beyond it is as little known.
     """
 
     def __init__(
-        self, margin: float = 0.0, channels: int = PLANAR.dof, dof: int = PLANAR.dof
+        self,
+        margin: float = 0.0,
+        n_channels: int = PLANAR_LAYOUT.n_dof,
+        n_dof: int = PLANAR_LAYOUT.n_dof,
     ) -> None:
         super().__init__()
         self.margin = margin
-        self.channels, self.dof = channels, dof
-        self.low = nn.Buffer(torch.zeros(channels, dtype=torch.float64))
-        self.high = nn.Buffer(torch.zeros(channels, dtype=torch.float64))
-        self.rate = nn.Buffer(torch.zeros(dof, dtype=torch.float64))
+        self.n_channels, self.n_dof = n_channels, n_dof
+        self.low = nn.Buffer(torch.zeros(n_channels, dtype=torch.float64))
+        self.high = nn.Buffer(torch.zeros(n_channels, dtype=torch.float64))
+        self.restoring_rate = nn.Buffer(torch.zeros(n_dof, dtype=torch.float64))
 
     def calibrate(self, samples: Samples) -> None:
         """Take the ranges of the channels, and the rate from the accelerations."""
-        seen, target = samples.tally()
-        low, high = seen.low[: self.channels], seen.high[: self.channels]
-        wide = (high - low).clamp(min=_LEAST)
-        self.low.copy_(low - self.margin * wide)
-        self.high.copy_(high + self.margin * wide)
-        spread = target.std()
-        self.rate.copy_(
-            (_STRONG * spread / (0.5 * wide[: self.dof])).clamp(min=_SLOWEST, max=_FASTEST)
+        channel_moments, target_moments = samples.running_moments()
+        lower, upper = (
+            channel_moments.minimum[: self.n_channels],
+            channel_moments.maximum[: self.n_channels],
+        )
+        width = (upper - lower).clamp(min=_MIN_RANGE)
+        self.low.copy_(lower - self.margin * width)
+        self.high.copy_(upper + self.margin * width)
+        acceleration_std = target_moments.std()
+        self.restoring_rate.copy_(
+            (_MAX_ACCELERATION_STD * acceleration_std / (0.5 * width[: self.n_dof])).clamp(
+                min=_MIN_RATE, max=_MAX_RATE
+            )
         )
 
-    def held(self, z: Tensor) -> Tensor:
+    def clamp(self, z: Tensor) -> Tensor:
         """Return channels z [..., nz], where those that left their range stand at its edge."""
-        low, high = self.low.to(z.dtype), self.high.to(z.dtype)
-        near = z[..., : self.channels]
+        lower, upper = self.low.to(z.dtype), self.high.to(z.dtype)
+        clamped = z[..., : self.n_channels]
         # a refit differentiates this, and derivatives of minimum and maximum are slow
-        near = torch.where(near > high, high, torch.where(near < low, low, near))
-        return torch.cat((near, z[..., self.channels :]), dim=-1)
+        clamped = torch.where(clamped > upper, upper, torch.where(clamped < lower, lower, clamped))
+        return torch.cat((clamped, z[..., self.n_channels :]), dim=-1)
 
-    def back(self, held: Tensor, z: Tensor) -> Tensor:
+    def restoring_acceleration(self, clamped: Tensor, z: Tensor) -> Tensor:
         """Return the acceleration at channels z [..., nz] whose held ones are known."""
-        return self.rate.to(z.dtype) * (held[..., : self.dof] - z[..., : self.dof])
+        return self.restoring_rate.to(z.dtype) * (clamped[..., : self.n_dof] - z[..., : self.n_dof])
 
     def forward(self, z: Tensor) -> Tensor:
         """Return the acceleration at channels z [..., nz]."""
-        return self.back(self.held(z), z)
+        return self.restoring_acceleration(self.clamp(z), z)

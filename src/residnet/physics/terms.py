@@ -18,9 +18,9 @@ from torch import Tensor, nn
 
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
-from residnet.core.names import VELOCITY, nearest
+from residnet.core.names import VELOCITY_NAMES, suggest_name
 
-FUNCTIONS = ("sin", "cos", "sqrt", "ssqrt", "inv")
+TERM_FUNCTIONS = ("sin", "cos", "sqrt", "ssqrt", "inv")
 """Functions of one channel: sine, cosine, the protected square root sqrt|x|, the sign-preserving
 one sign(x) sqrt|x|, and the protected inverse, 1/x and 0 at x = 0 (document 001, section 2.4:
 protected division and square root).
@@ -49,7 +49,7 @@ class Factor(NamedTuple):
         return f"{self.function}({self.name})" if self.function else self.name
 
     @property
-    def text(self) -> str:
+    def term_text(self) -> str:
         """The factor as a term has it."""
         base = f"|{self.name}|" if self.magnitude else self.symbol
         return base if self.power == 1 else f"{base}^{self.power}"
@@ -61,7 +61,7 @@ def parse_term(term: str, names: Sequence[str], *, functions: bool = True) -> tu
     Args:
         term: product of channels; factors stand apart by spaces, `*` or the bars of a magnitude;
             `^2` is a power; `1` the constant; `^-1` divides, for channels that stay away from zero,
-            such as `wind_mag`; `sin(delta)` is one of `FUNCTIONS`.
+            such as `wind_mag`; `sin(delta)` is one of `TERM_FUNCTIONS`.
         functions: whether functions may appear.
 
     Raises:
@@ -83,15 +83,15 @@ def parse_term(term: str, names: Sequence[str], *, functions: bool = True) -> tu
             continue
         name = match["magnitude"] or match["inner"] or match["name"]
         function, power = match["function"] or "", int(match["power"] or 1)
-        if function and (not functions or function not in FUNCTIONS):
+        if function and (not functions or function not in TERM_FUNCTIONS):
             hint = (
-                nearest(function, FUNCTIONS)
+                suggest_name(function, TERM_FUNCTIONS)
                 if functions
                 else "; only products of channels have a place here"
             )
             raise ConfigError(f"term '{term}': no function '{function}'{hint}")
         if name not in names:
-            raise ConfigError(f"term '{term}': no channel '{name}'{nearest(name, names)}")
+            raise ConfigError(f"term '{term}': no channel '{name}'{suggest_name(name, names)}")
         if function and power < 0:
             raise ConfigError(
                 f"term '{term}': cannot divide by {function}({name}), which may be zero"
@@ -100,38 +100,40 @@ def parse_term(term: str, names: Sequence[str], *, functions: bool = True) -> tu
     return tuple(factors)
 
 
-def read_rows(
-    rows: Mapping[Any, Iterable[str]], names: Sequence[str], *, functions: bool = True
+def parse_axis_terms(
+    terms_by_axis: Mapping[Any, Iterable[str]], names: Sequence[str], *, functions: bool = True
 ) -> list[tuple[str, str, tuple[Factor, ...]]]:
     """Return (axis, term, its factors) of all terms of all axes, as a config gives them.
 
     Raises:
         ValueError: where a term cannot be read, names an unknown channel or divides.
     """
-    out = []
-    for axis, row in rows.items():
-        for term in row:
+    parsed_terms = []
+    for axis, axis_terms in terms_by_axis.items():
+        for term in axis_terms:
             try:
                 factors = parse_term(term, names, functions=functions)
             except ConfigError as error:
                 raise ValueError(f"{axis}: {error}") from None
             if any(factor.power < 0 for factor in factors):
                 raise ValueError(f"{axis}: term '{term}' divides by what may be zero")
-            out.append((axis, term, factors))
-    return out
+            parsed_terms.append((axis, term, factors))
+    return parsed_terms
 
 
-def polynomial_terms(
+def make_polynomial_terms(
     names: Sequence[str], degree: int, *, magnitudes: Sequence[str] = ()
 ) -> tuple[str, ...]:
     """Return all products of `names` up to `degree`, without the constant.
 
     Behind them stands x|x| of every name in `magnitudes`.
     """
-    out = [
-        " ".join(c) for d in range(1, degree + 1) for c in combinations_with_replacement(names, d)
+    products = [
+        " ".join(factors)
+        for product_degree in range(1, degree + 1)
+        for factors in combinations_with_replacement(names, product_degree)
     ]
-    return tuple(out + [f"{name}|{name}|" for name in magnitudes])
+    return tuple(products + [f"{name}|{name}|" for name in magnitudes])
 
 
 class TermLibrary(nn.Module):
@@ -145,55 +147,67 @@ class TermLibrary(nn.Module):
     def __init__(self, terms: Sequence[str], names: Sequence[str]) -> None:
         super().__init__()
         self.terms = tuple(terms)
-        parsed = [parse_term(term, names) for term in terms]
-        plain = [(name, bars, "") for bars in (False, True) for name in names]
-        further = {
-            (f.name, f.function or "1/")
-            for factors in parsed
-            for f in factors
-            if f.function or f.power < 0
-        }
-        base = {key: i + 1 for i, key in enumerate(plain)}
-        # the first one stands for nothing: TorchScript takes no empty list
-        self.further = [("", 0)]
-        for name, function in sorted(further):
-            base[name, False, function] = len(base) + 1
-            self.further.append((function, names.index(name)))
-        columns = [
-            [index for factor in factors for index in _columns(factor, base)] for factors in parsed
+        parsed_terms = [parse_term(term, names) for term in terms]
+        channel_keys = [
+            (name, is_magnitude, "") for is_magnitude in (False, True) for name in names
         ]
-        self.count, self.depth = len(columns), max([len(column) for column in columns], default=0)
-        padded = [column + [0] * (self.depth - len(column)) for column in columns]
-        gather = torch.tensor(padded, dtype=torch.long).reshape(self.count, self.depth).T
-        self.index = nn.Buffer(gather.contiguous(), persistent=False)
-        # a linear model has the channels alone for terms
-        self.linear = self.count > 0 and all(
-            len(column) == 1 and 0 < column[0] <= len(names) for column in columns
+        function_keys = {
+            (parsed_factor.name, parsed_factor.function or "1/")
+            for factors in parsed_terms
+            for parsed_factor in factors
+            if parsed_factor.function or parsed_factor.power < 0
+        }
+        column_of_key = {key: i + 1 for i, key in enumerate(channel_keys)}
+        # the first one stands for nothing: TorchScript takes no empty list
+        self.function_columns = [("", 0)]
+        for name, function in sorted(function_keys):
+            column_of_key[name, False, function] = len(column_of_key) + 1
+            self.function_columns.append((function, names.index(name)))
+        columns = [
+            [index for factor in factors for index in _factor_columns(factor, column_of_key)]
+            for factors in parsed_terms
+        ]
+        self.n_terms, self.max_factors = (
+            len(columns),
+            max([len(factor_columns) for factor_columns in columns], default=0),
         )
-        channel = gather[0] - 1 if self.linear else gather.new_zeros(0)
-        self.channel = nn.Buffer(channel, persistent=False)
-        self.same = self.linear and channel.tolist() == list(range(len(names)))
+        padded_columns = [
+            factor_columns + [0] * (self.max_factors - len(factor_columns))
+            for factor_columns in columns
+        ]
+        factor_index = (
+            torch.tensor(padded_columns, dtype=torch.long).reshape(self.n_terms, self.max_factors).T
+        )
+        self.factor_index = nn.Buffer(factor_index.contiguous(), persistent=False)
+        # a linear model has the channels alone for terms
+        self.is_linear = self.n_terms > 0 and all(
+            len(factor_columns) == 1 and 0 < factor_columns[0] <= len(names)
+            for factor_columns in columns
+        )
+        channel_index = factor_index[0] - 1 if self.is_linear else factor_index.new_zeros(0)
+        self.channel_index = nn.Buffer(channel_index, persistent=False)
+        self.is_identity = self.is_linear and channel_index.tolist() == list(range(len(names)))
 
     def forward(self, z: Tensor) -> Tensor:
         """Return the terms [..., J] of channels z [..., nz]."""
-        if self.linear:
-            return z if self.same else z.index_select(-1, self.channel)
-        if self.depth == 0:
+        if self.is_linear:
+            return z if self.is_identity else z.index_select(-1, self.channel_index)
+        if self.max_factors == 0:
             # constants need no channel
-            return z.new_ones(z.shape[:-1] + (self.count,))  # noqa: RUF005 (TorchScript)
-        parts = [torch.ones_like(z[..., :1]), z, z.abs()]
-        for function, channel in self.further:
+            return z.new_ones(z.shape[:-1] + (self.n_terms,))  # noqa: RUF005 (TorchScript)
+        columns = [torch.ones_like(z[..., :1]), z, z.abs()]
+        for function, channel in self.function_columns:
             if function != "":
-                parts.append(_function(function, z.narrow(-1, channel, 1)))
-        base = torch.cat(parts, dim=-1)
-        out = base.index_select(-1, self.index[0])
-        for d in range(1, self.depth):
-            out = out * base.index_select(-1, self.index[d])
-        return out
+                columns.append(_evaluate_function(function, z.narrow(-1, channel, 1)))
+        column_values = torch.cat(columns, dim=-1)
+        values = column_values.index_select(-1, self.factor_index[0])
+        for d in range(1, self.max_factors):
+            values = values * column_values.index_select(-1, self.factor_index[d])
+        return values
 
 
-def _function(name: str, x: Tensor) -> Tensor:
-    """Return one of `FUNCTIONS` of x, or 1/x, any shape."""
+def _evaluate_function(name: str, x: Tensor) -> Tensor:
+    """Return one of `TERM_FUNCTIONS` of x, or 1/x, any shape."""
     if name == "sin":
         return torch.sin(x)
     if name == "cos":
@@ -209,17 +223,21 @@ def _function(name: str, x: Tensor) -> Tensor:
     return x.reciprocal()
 
 
-def _columns(factor: Factor, base: Mapping[tuple[str, bool, str], int]) -> list[int]:
+def _factor_columns(
+    factor: Factor, column_of_key: Mapping[tuple[str, bool, str], int]
+) -> list[int]:
     """Return the columns whose product is the factor."""
     if factor.power > 0:
-        return [base[factor.name, factor.magnitude, factor.function]] * factor.power
-    inverse = base[factor.name, False, "1/"]
+        return [column_of_key[factor.name, factor.magnitude, factor.function]] * factor.power
+    inverse_column = column_of_key[factor.name, False, "1/"]
     # 1/|z| = |z| / z^2
-    bars = [base[factor.name, True, ""], inverse] if factor.magnitude else []
-    return [*bars, inverse] * -factor.power
+    magnitude_columns = (
+        [column_of_key[factor.name, True, ""], inverse_column] if factor.magnitude else []
+    )
+    return [*magnitude_columns, inverse_column] * -factor.power
 
 
-class Candidate(NamedTuple):
+class CandidateTerm(NamedTuple):
     """A candidate term with its degree and how complicated it is among those of its degree.
 
     A function counts as one degree.
@@ -227,7 +245,7 @@ class Candidate(NamedTuple):
 
     term: str
     degree: int
-    effort: float
+    complexity: float
 
 
 class CandidatesConfig(Config):
@@ -248,14 +266,14 @@ class CandidatesConfig(Config):
             magnitudes as in `n|n|`, times u and |u|, those of one input also times u^2 and `u|u|`
             as in `u^2 delta`, and squares of one times another as in `n|n| delta`. There are ratios
             too, products of motions over an input and one input over another; a head takes those
-            whose divisor stays `clear` of zero in its data.
+            whose divisor stays `find_nonsingular_terms` of zero in its data.
         angles: inputs that enter as sine and cosine.
         coupling: motions that products of inputs are multiplied by.
         coupling_degree: highest degree of these factors.
         extra: further terms by name.
     """
 
-    motions: tuple[str, ...] = VELOCITY
+    motions: tuple[str, ...] = VELOCITY_NAMES
     motion_degree: int = Field(default=2, ge=0, le=4)
     magnitudes: bool = True
     inputs: tuple[str, ...] | None = None
@@ -265,7 +283,7 @@ class CandidatesConfig(Config):
     coupling_degree: int = Field(default=1, ge=1, le=4)
     extra: tuple[str, ...] = ()
 
-    def candidates(self, names: Sequence[str]) -> tuple[Candidate, ...]:
+    def generate_candidates(self, names: Sequence[str]) -> tuple[CandidateTerm, ...]:
         """Return the candidates for a model with channels `names`, simplest first in each degree.
 
         Raises:
@@ -281,96 +299,132 @@ class CandidatesConfig(Config):
         for name in (*angles, *inputs, *self.coupling):
             if name not in names:
                 raise ConfigError(
-                    f"candidates: '{name}' is not a channel of the model{nearest(name, names)}"
+                    f"candidates: '{name}' is not a channel of the model{suggest_name(name, names)}"
                 )
-        flows = _products(motions, self.motion_degree, magnitudes=self.magnitudes)
-        turns = ["", *(f"{function}({angle})" for angle in angles for function in ("sin", "cos"))]
-        texts = [*flows, *_joined(self._driven(motions, inputs), turns), *self.extra]
-        return rated(dict.fromkeys(text or "1" for text in texts), names)
+        motion_products = _products_up_to(motions, self.motion_degree, magnitudes=self.magnitudes)
+        angle_functions = [
+            "",
+            *(f"{function}({angle})" for angle in angles for function in ("sin", "cos")),
+        ]
+        term_texts = [
+            *motion_products,
+            *_combine_products(self._input_products(motions, inputs), angle_functions),
+            *self.extra,
+        ]
+        return rank_candidates(dict.fromkeys(term_text or "1" for term_text in term_texts), names)
 
-    def _driven(self, motions: Sequence[str], inputs: Sequence[str]) -> list[str]:
+    def _input_products(self, motions: Sequence[str], inputs: Sequence[str]) -> list[str]:
         """Return the products of inputs and coupled motions."""
         if self.input_degree is None and not self.coupling:
-            return _of_ships(motions, inputs, magnitudes=self.magnitudes)
+            return _ship_input_products(motions, inputs, magnitudes=self.magnitudes)
         degree = 1 if self.input_degree is None else self.input_degree
-        coupled = _products(self.coupling, self.coupling_degree if self.coupling else 0)
-        return _joined(coupled, _products(inputs, degree))
+        coupling_products = _products_up_to(
+            self.coupling, self.coupling_degree if self.coupling else 0
+        )
+        return _combine_products(coupling_products, _products_up_to(inputs, degree))
 
-    def clear(self, terms: Sequence[str], names: Sequence[str], z: Tensor) -> Tensor:
+    def find_nonsingular_terms(
+        self, terms: Sequence[str], names: Sequence[str], z: Tensor
+    ) -> Tensor:
         """Return which terms [J] divide by nothing near zero, or are named under `extra`.
 
         Args:
             z: channels in the data [N, nz].
         """
-        far = z.amin(0) * z.amax(0) > 0
-        far &= z.abs().amin(0) >= _CLEAR * z.abs().amax(0)
-        near = {name for name, good in zip(names, far.tolist(), strict=True) if not good}
+        is_nonzero = z.amin(0) * z.amax(0) > 0
+        is_nonzero &= z.abs().amin(0) >= _MIN_DIVISOR_SHARE * z.abs().amax(0)
+        near_zero_channels = {
+            name for name, is_clear in zip(names, is_nonzero.tolist(), strict=True) if not is_clear
+        }
         return torch.tensor(
             [
                 term in self.extra
-                or not any(f.function == "inv" and f.name in near for f in parse_term(term, names))
+                or not any(
+                    factor.function == "inv" and factor.name in near_zero_channels
+                    for factor in parse_term(term, names)
+                )
                 for term in terms
             ]
         )
 
 
-_CLEAR = 0.1
+_MIN_DIVISOR_SHARE = 0.1
 """Least share of a channel's largest value that a divisor keeps: noise of a hundredth of that value
 then changes the quotient by a tenth at most.
 """
 
 
-def _of_ships(motions: Sequence[str], inputs: Sequence[str], *, magnitudes: bool) -> list[str]:
+def _ship_input_products(
+    motions: Sequence[str], inputs: Sequence[str], *, magnitudes: bool
+) -> list[str]:
     """Return what propellers and rudders add to an equation: thrust, lift in their flow, ratios."""
-    speed = [name for name in motions if name == "u"]
-    first, second = (_products(speed, degree, magnitudes=magnitudes) for degree in (1, 2))
-    one = [t for name in inputs for t in _products([name], 2, magnitudes=magnitudes)[1:]]
-    pairs = [
-        t
-        for a, b in combinations(inputs, 2)
-        for t in _joined(
-            _products([a], 1, magnitudes=magnitudes)[1:],
-            _products([b], 1, magnitudes=magnitudes)[1:],
+    surge = [name for name in motions if name == "u"]
+    speed_products, speed_squares = (
+        _products_up_to(surge, degree, magnitudes=magnitudes) for degree in (1, 2)
+    )
+    single_input_products = [
+        product_text
+        for name in inputs
+        for product_text in _products_up_to([name], 2, magnitudes=magnitudes)[1:]
+    ]
+    input_pairs = [
+        product_text
+        for first_input, second_input in combinations(inputs, 2)
+        for product_text in _combine_products(
+            _products_up_to([first_input], 1, magnitudes=magnitudes)[1:],
+            _products_up_to([second_input], 1, magnitudes=magnitudes)[1:],
         )
     ]
     squares = [
-        f"{square} {other}"
+        f"{squared_input} {other_input}"
         for name in inputs
-        for square in ([f"{name}^2", f"{name} |{name}|"] if magnitudes else [f"{name}^2"])
-        for other in inputs
-        if other != name
+        for squared_input in ([f"{name}^2", f"{name} |{name}|"] if magnitudes else [f"{name}^2"])
+        for other_input in inputs
+        if other_input != name
     ]
     ratios = [
-        f"{above} inv({name})".strip()
+        f"{numerator} inv({name})".strip()
         for name in inputs
-        for above in (*_products(motions, 2), *(other for other in inputs if other != name))
+        for numerator in (
+            *_products_up_to(motions, 2),
+            *(other_input for other_input in inputs if other_input != name),
+        )
     ]
-    return ["", *_joined(second, one), *_joined(first, pairs), *squares, *ratios]
+    return [
+        "",
+        *_combine_products(speed_squares, single_input_products),
+        *_combine_products(speed_products, input_pairs),
+        *squares,
+        *ratios,
+    ]
 
 
-def _joined(*choices: Sequence[str]) -> list[str]:
+def _combine_products(*choices: Sequence[str]) -> list[str]:
     """Return the products of one text out of each list."""
-    return [" ".join(part for part in parts if part) for parts in product(*choices)]
+    return [" ".join(factor for factor in factors if factor) for factors in product(*choices)]
 
 
-def rated(terms: Iterable[str], names: Sequence[str]) -> tuple[Candidate, ...]:
+def rank_candidates(terms: Iterable[str], names: Sequence[str]) -> tuple[CandidateTerm, ...]:
     """Return the terms with degree and effort, by degree and then by effort.
 
     Raises:
         ConfigError: where a term cannot be read.
     """
-    out = []
+    ranked = []
     for term in terms:
         factors = parse_term(term, names)
         degree = sum(abs(factor.power) for factor in factors)
-        effort = len({factor.name for factor in factors}) + sum(
-            0.5 * f.magnitude + 0.75 * bool(f.function) + (f.power < 0) for f in factors
+        complexity = len({factor.name for factor in factors}) + sum(
+            0.5 * parsed_factor.magnitude
+            + 0.75 * bool(parsed_factor.function)
+            + (parsed_factor.power < 0)
+            for parsed_factor in factors
         )
-        out.append(Candidate(term, degree, effort))
-    return tuple(sorted(out, key=lambda candidate: candidate[1:]))
+        ranked.append(CandidateTerm(term, degree, complexity))
+    return tuple(sorted(ranked, key=lambda candidate: candidate[1:]))
 
 
-def _products(names: Sequence[str], degree: int, *, magnitudes: bool = False) -> list[str]:
+def _products_up_to(names: Sequence[str], degree: int, *, magnitudes: bool = False) -> list[str]:
     """Return the products up to a degree, the empty one first.
 
     Of one channel's factors at most one stands as a magnitude, since |x|^2 is x^2.
@@ -378,14 +432,16 @@ def _products(names: Sequence[str], degree: int, *, magnitudes: bool = False) ->
     symbols = [(name, False) for name in names] + (
         [(name, True) for name in names] if magnitudes else []
     )
-    out = []
-    for d in range(degree + 1):
-        for chosen in combinations_with_replacement(symbols, d):
-            if all(chosen.count((name, True)) <= 1 for name in names):
-                out.append(
+    products = []
+    for product_degree in range(degree + 1):
+        for combination in combinations_with_replacement(symbols, product_degree):
+            if all(combination.count((name, True)) <= 1 for name in names):
+                products.append(
                     " ".join(
-                        Factor(name, bars, chosen.count((name, bars))).text
-                        for name, bars in dict.fromkeys(chosen)
+                        Factor(
+                            name, is_magnitude, combination.count((name, is_magnitude))
+                        ).term_text
+                        for name, is_magnitude in dict.fromkeys(combination)
                     )
                 )
-    return out
+    return products

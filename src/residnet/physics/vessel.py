@@ -9,27 +9,27 @@ from pydantic import AfterValidator, Field
 
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
-from residnet.core.names import nearest
-from residnet.core.registry import vessel_files
+from residnet.core.names import suggest_name
+from residnet.core.registry import find_vessel_files
 from residnet.physics.abkowitz import AbkowitzConfig
 from residnet.physics.hull import (
+    AccelerationHullConfig,
     FossenConfig,
     MassMatrixConfig,
-    OdinConfig,
-    PatrolConfig,
-    SubmergedConfig,
+    RollingHullConfig,
+    SubmergedHullConfig,
 )
 from residnet.physics.nomoto import NomotoConfig, SecondOrderNomotoConfig, SideslipNomotoConfig
 
-__all__ = ["AnyVessel", "VesselConfig", "VesselName", "load_vessel", "vessel_files"]
+__all__ = ["AnyVessel", "VesselConfig", "VesselName", "find_vessel_files", "load_vessel"]
 
 AnyVessel = (
     FossenConfig
     | MassMatrixConfig
     | AbkowitzConfig
-    | OdinConfig
-    | PatrolConfig
-    | SubmergedConfig
+    | AccelerationHullConfig
+    | RollingHullConfig
+    | SubmergedHullConfig
     | NomotoConfig
     | SecondOrderNomotoConfig
     | SideslipNomotoConfig
@@ -43,21 +43,21 @@ def load_vessel(name: str) -> AnyVessel:
     Raises:
         ConfigError: where there is no such vessel or its file is wrong.
     """
-    files = vessel_files()
+    files = find_vessel_files()
     if name in files:
         path = files[name]
     else:
         path = Path(name)
         if path.suffix not in {".yaml", ".yml"}:
             raise ConfigError(
-                f"no vessel '{name}'{nearest(name, files)};"
+                f"no vessel '{name}'{suggest_name(name, files)};"
                 " or give the path of a vessel's yaml file"
             )
     vessel: AnyVessel = load_config(path, [], VesselConfig)
     return vessel
 
 
-def _loadable(name: str) -> str:
+def _validate_vessel_name(name: str) -> str:
     try:
         load_vessel(name)
     except ConfigError as error:
@@ -65,5 +65,5 @@ def _loadable(name: str) -> str:
     return name
 
 
-VesselName = Annotated[str, AfterValidator(_loadable)]
+VesselName = Annotated[str, AfterValidator(_validate_vessel_name)]
 """In a config: name or path of a vessel file, read once to see that it is right."""

@@ -10,8 +10,8 @@ from pydantic import ValidationInfo, model_validator
 
 from residnet.core.config import Config, load_mapping
 from residnet.core.errors import ConfigError
-from residnet.core.names import nearest
-from residnet.core.registry import vessel_files
+from residnet.core.names import suggest_name
+from residnet.core.registry import find_vessel_files
 from residnet.physics.parameters import Length, Positive
 from residnet.physics.plant import Plant
 
@@ -33,8 +33,8 @@ class VesselFile(Config, ABC):
 
     @model_validator(mode="before")
     @classmethod
-    def _base(cls, data: Any, info: ValidationInfo) -> Any:
-        return with_base(data, (info.context or {}).get("folder"))
+    def _apply_base(cls, data: Any, info: ValidationInfo) -> Any:
+        return merge_with_base(data, (info.context or {}).get("folder"))
 
     @abstractmethod
     def build(self) -> Plant:
@@ -45,7 +45,7 @@ class VesselFile(Config, ABC):
         """
 
 
-def with_base(data: Any, folder: Path | None) -> Any:
+def merge_with_base(data: Any, folder: Path | None) -> Any:
     """Return the content of a vessel file laid over that of its `base`.
 
     Sections are merged key by key; a section of another `kind` takes the place of the base's.
@@ -56,62 +56,64 @@ def with_base(data: Any, folder: Path | None) -> Any:
         ValueError: where there is no such file, it cannot be read, or files name each other in a
             circle.
     """
-    seen: list[Path] = []
-    layers = [_frozen(data)]
+    visited: list[Path] = []
+    layers = [_lists_to_tuples(data)]
     while isinstance(layers[-1], dict) and "base" in layers[-1]:
-        path = _file(layers[-1]["base"], folder)
-        if path in seen:
+        path = _resolve_base_path(layers[-1]["base"], folder)
+        if path in visited:
             raise ValueError(
-                f"base: {' and '.join(p.name for p in seen)} name each other in a circle"
+                f"base: {' and '.join(p.name for p in visited)} name each other in a circle"
             )
-        seen.append(path)
+        visited.append(path)
         folder = path.parent
         try:
-            layers.append(_frozen(load_mapping(path)))
+            layers.append(_lists_to_tuples(load_mapping(path)))
         except ConfigError as error:
             raise ValueError(f"base: {error}") from None
     merged = layers[-1]
     for layer in reversed(layers[:-1]):
-        merged = _laid_over({key: value for key, value in layer.items() if key != "base"}, merged)
+        merged = _merge_sections(
+            {key: value for key, value in layer.items() if key != "base"}, merged
+        )
     return merged
 
 
-def _file(name: object, folder: Path | None) -> Path:
-    files = vessel_files()
+def _resolve_base_path(name: object, folder: Path | None) -> Path:
+    files = find_vessel_files()
     if not isinstance(name, str):
         raise ValueError(f"base: expected the name of a vessel or of its yaml file, given {name!r}")
     if name in files:
         return files[name].resolve()
     path = Path(name)
-    beside = (folder / path) if folder is not None else path
-    for candidate in (beside, path):
+    relative_path = (folder / path) if folder is not None else path
+    for candidate in (relative_path, path):
         if candidate.suffix in {".yaml", ".yml"} and candidate.is_file():
             return candidate.resolve()
     raise ValueError(
-        f"base: no vessel '{name}'{nearest(name, files)}; or give the path of a vessel's yaml file"
+        f"base: no vessel '{name}'{suggest_name(name, files)}; or give the path of a vessel's yaml file"
     )
 
 
-def _frozen(data: Any) -> Any:
+def _lists_to_tuples(data: Any) -> Any:
     """Return the same content with tuples for lists.
 
     What a validator of a whole model hands on is taken for Python, not for YAML, and lists are no
     tuples.
     """
     if isinstance(data, dict):
-        return {key: _frozen(value) for key, value in data.items()}
-    return tuple(_frozen(value) for value in data) if isinstance(data, list) else data
+        return {key: _lists_to_tuples(value) for key, value in data.items()}
+    return tuple(_lists_to_tuples(value) for value in data) if isinstance(data, list) else data
 
 
-def _laid_over(upper: dict[str, Any], lower: dict[str, Any]) -> dict[str, Any]:
-    out = dict(lower)
-    for key, value in upper.items():
-        below = lower.get(key)
+def _merge_sections(override: dict[str, Any], base: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in override.items():
+        lower_value = base.get(key)
         if (
             isinstance(value, dict)
-            and isinstance(below, dict)
-            and value.get("kind", below.get("kind")) == below.get("kind")
+            and isinstance(lower_value, dict)
+            and value.get("kind", lower_value.get("kind")) == lower_value.get("kind")
         ):
-            value = _laid_over(value, below)
-        out[key] = value
-    return out
+            value = _merge_sections(value, lower_value)
+        merged[key] = value
+    return merged

@@ -18,15 +18,15 @@ from pydantic import Field
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError, FitError
-from residnet.core.stretches import stretch_bounds
+from residnet.core.stretches import find_run_bounds
 
-_BLOCK = 8_000_000
+_MAX_BLOCK_NUMBERS = 8_000_000
 """Numbers of windows held at a time."""
-_TINY = 1e-300
+_MIN_VARIANCE = 1e-300
 """Least variance or size that is divided by."""
 
 
-class Rows(NamedTuple):
+class RegressionRows(NamedTuple):
     """The terms [N, J], targets [N, K] and stretches [N] of a regression.
 
     A stretch of unbroken samples has a number, ascending.
@@ -34,7 +34,7 @@ class Rows(NamedTuple):
 
     x: np.ndarray
     y: np.ndarray
-    stretch: np.ndarray
+    segment: np.ndarray
 
 
 class RowBuilder(Config, ABC):
@@ -47,12 +47,12 @@ class RowBuilder(Config, ABC):
     sequential: ClassVar[bool] = True
 
     @abstractmethod
-    def rows(self, sampled: Rows, step: float) -> Rows:
+    def build_rows(self, samples: RegressionRows, time_step: float) -> RegressionRows:
         """Return the rows of the regression.
 
         Args:
-            sampled: terms and targets at samples `step` seconds apart within each stretch.
-            step: time between samples, s.
+            samples: terms and targets at samples `time_step` seconds apart within each stretch.
+            time_step: time between samples, s.
 
         Raises:
             ConfigError: where a window holds too few samples.
@@ -67,8 +67,8 @@ class SampleRows(RowBuilder):
     sequential: ClassVar[bool] = False
     kind: Literal["least_squares"] = "least_squares"
 
-    def rows(self, sampled: Rows, step: float) -> Rows:
-        return sampled
+    def build_rows(self, samples: RegressionRows, time_step: float) -> RegressionRows:
+        return samples
 
 
 @final
@@ -86,15 +86,17 @@ class WeakRows(RowBuilder):
     window: Seconds = Field(default=2.0, gt=0.0)
     every: float = Field(default=0.05, gt=0.0, le=1.0)
 
-    def rows(self, sampled: Rows, step: float) -> Rows:
-        return integrated(sampled, step, self.window, self.every)
+    def build_rows(self, samples: RegressionRows, time_step: float) -> RegressionRows:
+        return integrate_windows(samples, time_step, self.window, self.every)
 
 
 RowsConfig = Annotated[SampleRows | WeakRows, Field(discriminator="kind")]
 """Any way to make rows; its `kind` says which."""
 
 
-def integrated(sampled: Rows, step: float, window: float, every: float) -> Rows:
+def integrate_windows(
+    samples: RegressionRows, time_step: float, window: float, stride_share: float
+) -> RegressionRows:
     """Return weighted sums over windows of `window` seconds within each stretch.
 
     They are scaled so that a constant keeps its value.
@@ -103,61 +105,73 @@ def integrated(sampled: Rows, step: float, window: float, every: float) -> Rows:
         ConfigError: where a window holds fewer than three samples.
         FitError: where no stretch is as long as a window.
     """
-    size = round(window / step)
-    if size < 3:
+    window_samples = round(window / time_step)
+    if window_samples < 3:
         raise ConfigError(
-            f"weak form: a window of {window:g} s holds {size} samples of {step:g} s; set it to"
-            f" {3 * step:g} s or longer"
+            f"weak form: a window of {window:g} s holds {window_samples} samples of {time_step:g} s; set it to"
+            f" {3 * time_step:g} s or longer"
         )
-    place = np.linspace(-1.0, 1.0, size + 2)[1:-1]
-    weight = np.square(1.0 - np.square(place))
-    weight /= weight.sum()
-    begins, ends = stretch_bounds(sampled.stretch)
-    first = np.flatnonzero(np.arange(size, len(ends) + size) <= ends)
-    if not first.size:
+    window_coordinate = np.linspace(-1.0, 1.0, window_samples + 2)[1:-1]
+    test_function = np.square(1.0 - np.square(window_coordinate))
+    test_function /= test_function.sum()
+    segment_starts, segment_ends = find_run_bounds(samples.segment)
+    window_starts = np.flatnonzero(
+        np.arange(window_samples, len(segment_ends) + window_samples) <= segment_ends
+    )
+    if not window_starts.size:
         raise FitError(
             f"weak form: no unbroken stretch of samples is {window:g} s long; shorten the window or"
             " give logs with fewer gaps"
         )
     # windows every so many samples, counted from the start of each stretch
-    first = first[(first - begins[first]) % max(round(every * size), 1) == 0]
-    joined = np.concatenate((sampled.x, sampled.y), axis=1)
-    size_of_block = max(_BLOCK // (size * joined.shape[1]), 1)
-    parts = []
-    view = np.lib.stride_tricks.sliding_window_view(joined, size, axis=0)
-    for begin in range(0, first.size, size_of_block):
-        parts.append(view[first[begin : begin + size_of_block]] @ weight)
-    out = np.concatenate(parts)
-    return Rows(out[:, : sampled.x.shape[1]], out[:, sampled.x.shape[1] :], sampled.stretch[first])
+    window_starts = window_starts[
+        (window_starts - segment_starts[window_starts])
+        % max(round(stride_share * window_samples), 1)
+        == 0
+    ]
+    columns = np.concatenate((samples.x, samples.y), axis=1)
+    windows_per_block = max(_MAX_BLOCK_NUMBERS // (window_samples * columns.shape[1]), 1)
+    block_sums = []
+    windows = np.lib.stride_tricks.sliding_window_view(columns, window_samples, axis=0)
+    for block_start in range(0, window_starts.size, windows_per_block):
+        block_sums.append(
+            windows[window_starts[block_start : block_start + windows_per_block]] @ test_function
+        )
+    window_sums = np.concatenate(block_sums)
+    return RegressionRows(
+        window_sums[:, : samples.x.shape[1]],
+        window_sums[:, samples.x.shape[1] :],
+        samples.segment[window_starts],
+    )
 
 
-def unbroken_stretches(group: np.ndarray, t: np.ndarray, step: float) -> np.ndarray:
+def number_regular_segments(group: np.ndarray, t: np.ndarray, time_step: float) -> np.ndarray:
     """Return the number of the unbroken stretch of each sample [N], ascending from 0.
 
     Args:
         group: manoeuvre of each sample [N], ascending.
         t: time of each sample within its manoeuvre [N], s.
-        step: time between neighbouring samples, s.
+        time_step: time between neighbouring samples, s.
     """
-    broken = (np.diff(group) != 0) | (np.abs(np.diff(t) - step) > 0.01 * step)
-    return np.concatenate(([0], np.cumsum(broken)))
+    is_break = (np.diff(group) != 0) | (np.abs(np.diff(t) - time_step) > 0.01 * time_step)
+    return np.concatenate(([0], np.cumsum(is_break)))
 
 
-def step_of(group: np.ndarray, t: np.ndarray) -> float:
+def median_time_step(group: np.ndarray, t: np.ndarray) -> float:
     """Return the time between samples: the median distance of neighbours in one manoeuvre, s.
 
     Raises:
         FitError: where no manoeuvre has two samples.
     """
-    apart = np.diff(t)[np.diff(group) == 0]
-    if not apart.size or float(np.median(apart)) <= 0:
+    time_differences = np.diff(t)[np.diff(group) == 0]
+    if not time_differences.size or float(np.median(time_differences)) <= 0:
         raise FitError(
             "no manoeuvre has two samples at different times; the step between samples is not known"
         )
-    return float(np.median(apart))
+    return float(np.median(time_differences))
 
 
-def correlation_time(residual: np.ndarray) -> np.ndarray:
+def effective_correlation_length(residual: np.ndarray) -> np.ndarray:
     """Return how many neighbouring rows tell as much as one independent row, [K], at least 1.
 
     1 + 2 sum rho over the first lags until rho is negative (initial positive sequence).
@@ -166,7 +180,7 @@ def correlation_time(residual: np.ndarray) -> np.ndarray:
     centred = residual - residual.mean(axis=0)
     spectrum = np.abs(np.fft.rfft(centred, 2 * n, axis=0)) ** 2
     covariance = np.fft.irfft(spectrum, axis=0)[:n]
-    rho = covariance / np.maximum(covariance[0], _TINY)
+    rho = covariance / np.maximum(covariance[0], _MIN_VARIANCE)
     # noise of an estimate of zero: what is less than two of its deviations ends the sum
     positive = np.cumprod(rho > 2.0 / np.sqrt(n), axis=0).astype(bool)
     return np.asarray(np.maximum(2.0 * np.where(positive, rho, 0.0).sum(axis=0) - 1.0, 1.0))

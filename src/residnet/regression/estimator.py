@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.arrays import paged
-from residnet.core.arrays.paged import forget, row_pieces
+from residnet.core.arrays.paged import iterate_row_chunks, release_pages
 from residnet.core.errors import FitError
 
 
@@ -31,10 +31,10 @@ class Ratio(NamedTuple):
     numerator: str | None
     denominator: str
 
-    def of(self, coefficients: Mapping[str, float]) -> float:
+    def evaluate(self, coefficients: Mapping[str, float]) -> float:
         """Return the parameter, from the coefficients of its output by term."""
-        above = 1.0 if self.numerator is None else coefficients[self.numerator]
-        return self.sign * above / coefficients[self.denominator]
+        numerator_value = 1.0 if self.numerator is None else coefficients[self.numerator]
+        return self.sign * numerator_value / coefficients[self.denominator]
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,14 @@ class Coefficient:
         axis: name of the output, such as u_dot.
         term: regressor of that output, or the name of a parameter that follows from coefficients.
         value: value of the coefficient of `term`, or of the parameter.
-        error: its standard error.
+        standard_error: its standard error.
         ratio: how a parameter follows from coefficients; None for a coefficient.
     """
 
     axis: str
     term: str
     value: float
-    error: float
+    standard_error: float
     ratio: Ratio | None = None
 
 
@@ -61,7 +61,7 @@ class Solution:
     """One solution of a fit; a fit with a complexity to choose has several.
 
     Attributes:
-        choice: what sets it apart, for example {"ridge": 1e-4}; empty where there is nothing to
+        hyperparameters: what sets it apart, for example {"ridge": 1e-4}; empty where there is nothing to
             choose.
         state: arrays by name. A linear solution y = x coefficients + intercept has `coefficients`
             [J, n] and, where it has one, `intercept` [n]; other kinds say what they have. Fitted to
@@ -73,7 +73,7 @@ class Solution:
         covariance: covariance of the coefficients of each output [n, J, J], where the fit knows it.
     """
 
-    choice: dict[str, Any]
+    hyperparameters: dict[str, Any]
     state: dict[str, Tensor]
     table: tuple[Coefficient, ...] = ()
     notes: dict[str, Any] = field(default_factory=dict)
@@ -92,7 +92,7 @@ class Solution:
         return self.state.get("intercept", zero)
 
     @property
-    def errors(self) -> Tensor:
+    def standard_errors(self) -> Tensor:
         """Return the standard errors of the coefficients [J, n].
 
         Raises:
@@ -108,70 +108,70 @@ class Solution:
 
 
 @final
-class Pieces:
+class ChunkedRegressors:
     """A matrix of regressors [N, J] whose rows are computed where they are needed.
 
     Args:
-        of: gives regressors [M, J] at channels [M, nz].
-        source: channels [N, nz].
+        evaluate: gives regressors [M, J] at channels [M, nz].
+        channels: channels [N, nz].
         columns: which of the regressors are meant, J of them.
     """
 
     def __init__(
-        self, of: Callable[[Tensor], Tensor], source: Tensor, columns: Sequence[int]
+        self, evaluate: Callable[[Tensor], Tensor], channels: Tensor, columns: Sequence[int]
     ) -> None:
-        self.of = of
-        self.source = source
+        self.evaluate = evaluate
+        self.channels = channels
         self.columns = list(columns)
-        self.shape = (source.shape[0], len(self.columns))
+        self.shape = (channels.shape[0], len(self.columns))
 
     def __len__(self) -> int:
         return self.shape[0]
 
-    def take(self, columns: Sequence[int]) -> Pieces:
+    def select_columns(self, columns: Sequence[int]) -> ChunkedRegressors:
         """Return some of the regressors, by their place among these."""
-        return Pieces(self.of, self.source, [self.columns[j] for j in columns])
+        return ChunkedRegressors(self.evaluate, self.channels, [self.columns[j] for j in columns])
 
     def __iter__(self) -> Iterator[tuple[slice, Tensor]]:
         """Yield rows and the regressors there."""
-        for part in row_pieces(len(self)):
-            yield part, self.of(self.source[part])[:, self.columns]
-            forget()
+        for rows in iterate_row_chunks(len(self)):
+            yield rows, self.evaluate(self.channels[rows])[:, self.columns]
+            release_pages()
 
 
-Regressors = Tensor | Pieces
+Regressors = Tensor | ChunkedRegressors
 
 
-def regressors(
-    of: Callable[[Tensor], Tensor], source: Tensor, columns: Sequence[int]
+def evaluate_regressors(
+    evaluate: Callable[[Tensor], Tensor], channels: Tensor, columns: Sequence[int]
 ) -> Regressors:
     """Return regressors at channels [N, nz]: a tensor, or pieces where there are many samples."""
-    if len(source) > paged.LARGE:
-        return Pieces(of, source, columns)
-    values = of(source)
+    if len(channels) > paged.MAX_SAMPLES_IN_MEMORY:
+        return ChunkedRegressors(evaluate, channels, columns)
+    values = evaluate(channels)
     return values if list(columns) == list(range(values.shape[1])) else values[:, list(columns)]
 
 
-def pieces(x: Regressors) -> Iterator[tuple[slice, Tensor]]:
+def iterate_chunks(x: Regressors) -> Iterator[tuple[slice, Tensor]]:
     """Yield rows and the regressors there."""
-    if isinstance(x, Pieces):
+    if isinstance(x, ChunkedRegressors):
         yield from x
     else:
-        for part in row_pieces(len(x)):
-            yield part, x[part]
+        for rows in iterate_row_chunks(len(x)):
+            yield rows, x[rows]
 
 
-def chosen(x: Regressors, columns: Sequence[int]) -> Regressors:
+def select_columns(x: Regressors, columns: Sequence[int]) -> Regressors:
     """Return some columns of regressors."""
-    return x.take(columns) if isinstance(x, Pieces) else x[:, list(columns)]
+    return x.select_columns(columns) if isinstance(x, ChunkedRegressors) else x[:, list(columns)]
 
 
-def whole(x: Regressors) -> Tensor:
+def to_dense(x: Regressors) -> Tensor:
     """Return all regressors [N, J] in memory, for methods that need them at once."""
-    return torch.cat([part for _, part in x]) if isinstance(x, Pieces) else x
+    return torch.cat([chunk for _, chunk in x]) if isinstance(x, ChunkedRegressors) else x
 
 
-class Data(NamedTuple):
+class EstimatorData(NamedTuple):
     """What an estimator learns from; finite, with names for every column.
 
     Attributes:
@@ -219,36 +219,38 @@ class Estimator(ABC):
         Raises:
             FitError: where the data are not finite, or do not determine the coefficients.
         """
-        known = column_names(x, names, "x"), column_names(y, outputs, "y")
-        require_data(x, y, *known)
-        return self.solve(Data(x, y, groups, *known))
+        column_labels = default_column_names(x, names, "x"), default_column_names(y, outputs, "y")
+        validate_data(x, y, *column_labels)
+        return self._solve(EstimatorData(x, y, groups, *column_labels))
 
     @abstractmethod
-    def solve(self, data: Data) -> list[Solution]:
+    def _solve(self, data: EstimatorData) -> list[Solution]:
         """Return the solutions of checked data, as `fit` does."""
 
 
-def column_names(values: Regressors, names: Sequence[str], letter: str) -> tuple[str, ...]:
+def default_column_names(values: Regressors, names: Sequence[str], prefix: str) -> tuple[str, ...]:
     """Return the names of columns, numbered ones where none are given."""
-    return tuple(names) or tuple(f"{letter}{j}" for j in range(values.shape[1]))
+    return tuple(names) or tuple(f"{prefix}{j}" for j in range(values.shape[1]))
 
 
-def require_finite(values: Tensor, names: Sequence[str], what: str, first: int = 0) -> None:
-    """Check that all values [N, J] are finite; `first` is the number of the first sample.
+def require_finite(
+    values: Tensor, names: Sequence[str], subject: str, first_sample: int = 0
+) -> None:
+    """Check that all values [N, J] are finite; `first_sample` is the number of the first sample.
 
     Raises:
         FitError: naming the column and the first sample that is not.
     """
-    bad = ~torch.isfinite(values)
-    if bool(bad.any()):
-        row, column = (int(part[0]) for part in bad.nonzero(as_tuple=True))
+    is_invalid = ~torch.isfinite(values)
+    if bool(is_invalid.any()):
+        row, column = (int(index[0]) for index in is_invalid.nonzero(as_tuple=True))
         raise FitError(
-            f"{what} '{names[column]}' is not finite at sample {first + row}; mask or repair the"
+            f"{subject} '{names[column]}' is not finite at sample {first_sample + row}; mask or repair the"
             " log"
         )
 
 
-def require_data(x: Regressors, y: Tensor, names: Sequence[str], outputs: Sequence[str]) -> None:
+def validate_data(x: Regressors, y: Tensor, names: Sequence[str], outputs: Sequence[str]) -> None:
     """Check that inputs [N, J] and outputs [N, n] are finite and that there are any.
 
     Raises:
@@ -261,50 +263,50 @@ def require_data(x: Regressors, y: Tensor, names: Sequence[str], outputs: Sequen
             f"a regression needs samples and regressors, given {len(x)} samples of"
             f" {x.shape[1]} regressors"
         )
-    names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
-    for rows, part in pieces(x):
-        require_finite(part, names, "basis function", rows.start)
-    for rows in row_pieces(len(y)):
+    names, outputs = default_column_names(x, names, "x"), default_column_names(y, outputs, "y")
+    for rows, chunk in iterate_chunks(x):
+        require_finite(chunk, names, "basis function", rows.start)
+    for rows in iterate_row_chunks(len(y)):
         require_finite(y[rows], outputs, "output", rows.start)
 
 
-def require_more(x: Regressors, what: str) -> None:
-    """Check that there are more samples than columns, which are `what`.
+def require_overdetermined(x: Regressors, subject: str) -> None:
+    """Check that there are more samples than columns, which are `subject`.
 
     Raises:
         FitError: where there are not.
     """
     if len(x) <= x.shape[1]:
         raise FitError(
-            f"{len(x)} samples do not determine {x.shape[1]} {what}; give more data or fewer terms"
+            f"{len(x)} samples do not determine {x.shape[1]} {subject}; give more data or fewer terms"
         )
 
 
-USUAL_FOLDS = 5
+DEFAULT_FOLDS = 5
 """Folds of a cross-validation where nobody asks for another number."""
 
 
-def usual_folds(groups: Tensor) -> int | None:
+def default_fold_count(groups: Tensor) -> int | None:
     """Return five, or the number of groups [N] where there are fewer; None for a single group."""
-    count = torch.unique(groups).numel()
-    return min(USUAL_FOLDS, count) if count > 1 else None
+    n_groups = torch.unique(groups).numel()
+    return min(DEFAULT_FOLDS, n_groups) if n_groups > 1 else None
 
 
-def fold_numbers(groups: Tensor | None, folds: int | None) -> Tensor:
+def assign_group_folds(groups: Tensor | None, n_folds: int | None) -> Tensor:
     """Return the fold of each sample [N], groups dealt out in turn; every group is a fold for None.
 
     Raises:
         FitError: with fewer groups than folds, or fewer than two.
     """
-    present = torch.unique(groups) if groups is not None else torch.zeros(0)
-    if groups is None or (folds is None and present.numel() < 2):
+    unique_groups = torch.unique(groups) if groups is not None else torch.zeros(0)
+    if groups is None or (n_folds is None and unique_groups.numel() < 2):
         raise FitError(
             "one run or segment only: nothing is left to cross-validate on; give more runs, or a"
             " fixed order or penalty"
         )
-    if folds is not None and present.numel() < folds:
+    if n_folds is not None and unique_groups.numel() < n_folds:
         raise FitError(
-            f"{folds} folds need as many manoeuvres, the training data have {present.numel()};"
-            " lower `folds`"
+            f"{n_folds} folds need as many manoeuvres, the training data have {unique_groups.numel()};"
+            " lower `n_folds`"
         )
-    return torch.searchsorted(present, groups) % (folds or present.numel())
+    return torch.searchsorted(unique_groups, groups) % (n_folds or unique_groups.numel())

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import sympy
 
 
-_ROOT_FLOOR = 1e-24
+_MIN_ROOT_ARGUMENT = 1e-24
 """What a root is taken of where its argument is less: its slope stays finite."""
 
 Function = Literal["sum", "abs", "sin", "cos", "sqrt", "inv"]
@@ -33,10 +33,10 @@ Product = tuple[int, ...]
 """Numbers of atoms, ascending, as often as their power; () is 1."""
 Sum = dict[Product, float]
 """Products and what they are multiplied by."""
-ONE: Product = ()
+CONSTANT_PRODUCT: Product = ()
 
 
-class Limits(NamedTuple):
+class ExpressionLimits(NamedTuple):
     """The limits of an expression.
 
     Terms of a sum, factors of a product, functions inside functions, and whether sums are
@@ -68,14 +68,14 @@ class Algebra:
     |a|^2 = a^2, |a b| = |a| |b|, cos(-a) = cos a, sin(-a) = -sin a.
     """
 
-    def __init__(self, channels: Sequence[str], limits: Limits | None = None) -> None:
+    def __init__(self, channels: Sequence[str], limits: ExpressionLimits | None = None) -> None:
         self.channels = tuple(channels)
-        self.limits = limits or Limits()
+        self.limits = limits or ExpressionLimits()
         self.atoms: list[Atom] = [Atom(name) for name in channels]
-        self._number: dict[Atom, int] = {atom: i for i, atom in enumerate(self.atoms)}
-        self._products: dict[tuple[Product, Product], Product] = {}
+        self._atom_numbers: dict[Atom, int] = {atom: i for i, atom in enumerate(self.atoms)}
+        self._product_cache: dict[tuple[Product, Product], Product] = {}
 
-    def channel(self, name: str) -> Sum:
+    def make_channel(self, name: str) -> Sum:
         """Return a channel alone."""
         return {(self.channels.index(name),): 1.0}
 
@@ -85,14 +85,14 @@ class Algebra:
         Raises:
             TooLargeError: beyond the limits.
         """
-        out = dict(a)
+        result = dict(a)
         for product, weight in b.items():
-            total = out.get(product, 0.0) + sign * weight
-            if total == 0.0:
-                out.pop(product, None)
+            new_weight = result.get(product, 0.0) + sign * weight
+            if new_weight == 0.0:
+                result.pop(product, None)
             else:
-                out[product] = total
-        return self._bounded(out)
+                result[product] = new_weight
+        return self._require_within_limits(result)
 
     def multiply(self, a: Sum, b: Sum) -> Sum:
         """Return a b, multiplied out or as a product of brackets.
@@ -101,189 +101,211 @@ class Algebra:
             TooLargeError: beyond the limits.
         """
         if not self.limits.expand:
-            a, b = self.bracket(a), self.bracket(b)
+            a, b = self.bracket_sum(a), self.bracket_sum(b)
         if len(a) * len(b) > 4 * self.limits.terms:
             raise TooLargeError
-        out: Sum = {}
+        result: Sum = {}
         for p, weight in a.items():
-            for q, other in b.items():
+            for q, other_weight in b.items():
                 key = (p, q)
-                if key not in self._products:
-                    self._products[key] = self._normal([*p, *q])
-                product = self._products[key]
-                out[product] = out.get(product, 0.0) + weight * other
-        return self._bounded({product: weight for product, weight in out.items() if weight != 0.0})
+                if key not in self._product_cache:
+                    self._product_cache[key] = self._normalise_product([*p, *q])
+                product = self._product_cache[key]
+                result[product] = result.get(product, 0.0) + weight * other_weight
+        return self._require_within_limits(
+            {product: weight for product, weight in result.items() if weight != 0.0}
+        )
 
-    def apply(self, function: Function, a: Sum) -> Sum:
+    def apply_function(self, function: Function, a: Sum) -> Sum:
         """Return a function of a sum.
 
         Raises:
             TooLargeError: beyond the limits.
         """
-        if all(product == ONE for product in a):
-            value = float(values_of(function, np.array([a.get(ONE, 0.0)]))[0])
-            return {ONE: value} if value else {}
+        if all(product == CONSTANT_PRODUCT for product in a):
+            value = float(apply_function(function, np.array([a.get(CONSTANT_PRODUCT, 0.0)]))[0])
+            return {CONSTANT_PRODUCT: value} if value else {}
         if len(a) == 1 and function in ("abs", "sqrt", "inv"):
             ((product, weight),) = a.items()
-            factor = float(values_of(function, np.array([weight]))[0])
-            parts = [self._function(function, {(atom,): 1.0}) for atom in product]
-            return {self._normal([atom for part in parts for atom in part]): factor}
+            factor = float(apply_function(function, np.array([weight]))[0])
+            factor_products = [
+                self._normalise_function(function, {(atom,): 1.0}) for atom in product
+            ]
+            return {
+                self._normalise_product(
+                    [atom for factor_product in factor_products for atom in factor_product]
+                ): factor
+            }
         if a[min(a)] > 0:
-            return {self._function(function, a): 1.0}
-        turned = {product: -weight for product, weight in a.items()}
-        odd = function in ("sin", "inv")
-        return {self._function(function, turned): -1.0 if odd else 1.0}
+            return {self._normalise_function(function, a): 1.0}
+        negated = {product: -weight for product, weight in a.items()}
+        is_odd = function in ("sin", "inv")
+        return {self._normalise_function(function, negated): -1.0 if is_odd else 1.0}
 
-    def bracket(self, a: Sum) -> Sum:
+    def bracket_sum(self, a: Sum) -> Sum:
         """Return a sum of several terms as one factor."""
         if len(a) <= 1:
             return a
-        lead = a[min(a)]
+        leading_weight = a[min(a)]
         return {
-            self._function("sum", {product: weight / lead for product, weight in a.items()}): lead
+            self._normalise_function(
+                "sum", {product: weight / leading_weight for product, weight in a.items()}
+            ): leading_weight
         }
 
-    def product(self, factors: Iterable[tuple[str, str, int]]) -> Product:
+    def make_product(self, factors: Iterable[tuple[str, str, int]]) -> Product:
         """Return a product of (function, channel, power); a function may be empty.
 
         Raises:
             TooLargeError: beyond the limits.
         """
-        out: Sum = {ONE: 1.0}
+        result: Sum = {CONSTANT_PRODUCT: 1.0}
         for function, name, power in factors:
-            part = self.channel(name)
-            for one in (function, "inv" if power < 0 else ""):
-                part = self.apply(cast("Function", one), part) if one else part
+            factor = self.make_channel(name)
+            for function_name in (function, "inv" if power < 0 else ""):
+                factor = (
+                    self.apply_function(cast("Function", function_name), factor)
+                    if function_name
+                    else factor
+                )
             for _ in range(abs(power)):
-                out = self.multiply(out, part)
-        return next(iter(out))
+                result = self.multiply(result, factor)
+        return next(iter(result))
 
-    def atom(self, function: Function, a: Sum) -> int:
+    def register_atom(self, function: Function, a: Sum) -> int:
         """Return the number of a function of a sum in normal form."""
         nesting = 1 + max([self.atoms[i].nesting for product in a for i in product], default=0)
         atom = Atom("", function, tuple(sorted(a.items())), nesting)
-        if atom not in self._number:
-            self._number[atom] = len(self.atoms)
+        if atom not in self._atom_numbers:
+            self._atom_numbers[atom] = len(self.atoms)
             self.atoms.append(atom)
-        return self._number[atom]
+        return self._atom_numbers[atom]
 
-    def degree(self, product: Product) -> int:
+    def count_factors(self, product: Product) -> int:
         """Return the number of factors of a product, with those inside its functions."""
         return sum(
-            max([self.degree(p) for p, _ in self.atoms[i].inner], default=1)
+            max([self.count_factors(p) for p, _ in self.atoms[i].inner], default=1)
             + bool(self.atoms[i].nesting)
             for i in product
         )
 
-    def effort(self, product: Product) -> float:
+    def complexity(self, product: Product) -> float:
         """Return how complicated a product is among those of its degree."""
         return len(set(product)) + sum(
-            0.5 + 0.1 * len(self.atoms[i].inner) for i in product if self.atoms[i].inner
+            0.5 + 0.1 * len(self.atoms[atom_number].inner)
+            for atom_number in product
+            if self.atoms[atom_number].inner
         )
 
-    def _function(self, function: Function, a: Sum) -> Product:
+    def _normalise_function(self, function: Function, a: Sum) -> Product:
         """Return the product that a function of a sum is, a simpler one for a single atom."""
-        ((first, weight),) = list(a.items())[:1]
+        ((first_product, weight),) = list(a.items())[:1]
         if (
             len(a) == 1
-            and len(first) == 1
+            and len(first_product) == 1
             and weight == 1.0
-            and (inner := self.atoms[first[0]]).inner
+            and (inner_atom := self.atoms[first_product[0]]).inner
         ):
-            if function == "abs" and inner.function in ("abs", "sqrt"):
-                return first
-            if function == "sqrt" and inner.function == "abs":
-                return self._function("sqrt", dict(inner.inner))
-            if function == "inv" and inner.function == "inv":
+            if function == "abs" and inner_atom.function in ("abs", "sqrt"):
+                return first_product
+            if function == "sqrt" and inner_atom.function == "abs":
+                return self._normalise_function("sqrt", dict(inner_atom.inner))
+            if function == "inv" and inner_atom.function == "inv":
                 return (
-                    self._function("sum", dict(inner.inner))
-                    if len(inner.inner) > 1
-                    else inner.inner[0][0]
+                    self._normalise_function("sum", dict(inner_atom.inner))
+                    if len(inner_atom.inner) > 1
+                    else inner_atom.inner[0][0]
                 )
         nesting = 1 + max([self.atoms[i].nesting for product in a for i in product], default=0)
         if nesting > self.limits.nesting:
             raise TooLargeError
-        return (self.atom(function, a),)
+        return (self.register_atom(function, a),)
 
-    def _normal(self, factors: list[int]) -> Product:
+    def _normalise_product(self, factors: list[int]) -> Product:
         """Return the product in ascending order, with squares of magnitudes as squares."""
-        out = sorted(factors)
-        for i in {i for i in out if self.atoms[i].function == "abs" and out.count(i) > 1}:
-            inner = self.atoms[i].inner
-            plain = (
-                inner[0][0]
-                if len(inner) == 1 and inner[0][1] == 1.0
-                else self._function("sum", dict(inner))
+        atoms = sorted(factors)
+        for i in {i for i in atoms if self.atoms[i].function == "abs" and atoms.count(i) > 1}:
+            inner_terms = self.atoms[i].inner
+            squared_argument = (
+                inner_terms[0][0]
+                if len(inner_terms) == 1 and inner_terms[0][1] == 1.0
+                else self._normalise_function("sum", dict(inner_terms))
             )
-            pairs = out.count(i) // 2
-            out = [k for k in out if k != i] + [i] * (out.count(i) % 2) + list(plain) * (2 * pairs)
-        if len(out) > self.limits.degree:
+            n_pairs = atoms.count(i) // 2
+            atoms = (
+                [k for k in atoms if k != i]
+                + [i] * (atoms.count(i) % 2)
+                + list(squared_argument) * (2 * n_pairs)
+            )
+        if len(atoms) > self.limits.degree:
             raise TooLargeError
-        return tuple(sorted(out))
+        return tuple(sorted(atoms))
 
-    def _bounded(self, a: Sum) -> Sum:
+    def _require_within_limits(self, a: Sum) -> Sum:
         if len(a) > self.limits.terms:
             raise TooLargeError
         return a
 
-    def values(self, products: Sequence[Product], data: Mapping[str, np.ndarray]) -> np.ndarray:
+    def evaluate_products(
+        self, products: Sequence[Product], data: Mapping[str, np.ndarray]
+    ) -> np.ndarray:
         """Return the values [P, N] of products at channels [N] each.
 
         They are infinite or not a number where they cannot be had.
         """
-        columns = Columns(self, data)
-        return columns.of(products)
+        columns = ProductEvaluator(self, data)
+        return columns.evaluate(products)
 
 
-class Columns:
+class ProductEvaluator:
     """Atoms along data, each worked out once."""
 
     def __init__(self, algebra: Algebra, data: Mapping[str, np.ndarray]) -> None:
         self.algebra = algebra
         rows = [np.asarray(data[name], dtype=np.float64) for name in algebra.channels]
-        self._table = np.concatenate((np.ones((1, len(rows[0]))), np.stack(rows)))
-        self._row = {i: i + 1 for i in range(len(rows))}
+        self._atom_values = np.concatenate((np.ones((1, len(rows[0]))), np.stack(rows)))
+        self._row_of_atom = {i: i + 1 for i in range(len(rows))}
 
-    def of(self, products: Sequence[Product]) -> np.ndarray:
+    def evaluate(self, products: Sequence[Product]) -> np.ndarray:
         """Return the values [P, N] of products."""
-        self._prepare({i for product in products for i in product})
-        depth = max([len(product) for product in products], default=0)
+        self._evaluate_atoms({i for product in products for i in product})
+        max_factors = max([len(product) for product in products], default=0)
         index = np.array(
             [
-                [self._row[i] for i in product] + [0] * (depth - len(product))
+                [self._row_of_atom[i] for i in product] + [0] * (max_factors - len(product))
                 for product in products
             ],
             dtype=np.intp,
         )
-        out = np.ones((len(products), self._table.shape[1]))
+        values = np.ones((len(products), self._atom_values.shape[1]))
         with np.errstate(over="ignore", invalid="ignore"):
-            for d in range(depth):
-                out *= self._table[index[:, d]]
-        return out
+            for d in range(max_factors):
+                values *= self._atom_values[index[:, d]]
+        return values
 
-    def _prepare(self, wanted: set[int]) -> None:
-        missing = sorted(i for i in wanted if i not in self._row)
+    def _evaluate_atoms(self, required: set[int]) -> None:
+        missing = sorted(i for i in required if i not in self._row_of_atom)
         if not missing:
             return
         rows = []
         for i in missing:
             atom = self.algebra.atoms[i]
             with np.errstate(over="ignore", invalid="ignore"):
-                inner = np.array([weight for _, weight in atom.inner]) @ self.of(
+                inner_values = np.array([weight for _, weight in atom.inner]) @ self.evaluate(
                     [product for product, _ in atom.inner]
                 )
-                rows.append(values_of(atom.function, inner))
+                rows.append(apply_function(atom.function, inner_values))
         for i, row in zip(missing, rows, strict=True):
-            self._row[i] = len(self._table)
-            self._table = np.concatenate((self._table, row[None]))
+            self._row_of_atom[i] = len(self._atom_values)
+            self._atom_values = np.concatenate((self._atom_values, row[None]))
 
 
-def values_of(function: Function, x: np.ndarray) -> np.ndarray:
+def apply_function(function: Function, x: np.ndarray) -> np.ndarray:
     """Return a function of values."""
-    return np.asarray(_VALUES[function](x))
+    return np.asarray(_NUMPY_FUNCTIONS[function](x))
 
 
-_VALUES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+_NUMPY_FUNCTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "sum": lambda x: x,
     "abs": np.abs,
     "sin": np.sin,
@@ -293,21 +315,25 @@ _VALUES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-class Table(nn.Module):
+class ResizableModule(nn.Module):
     """A module whose buffers take the shapes of what is loaded.
 
     How many terms an equation has, or samples a kernel, is known only from the data.
     """
 
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        for name, own in list(self.named_buffers(recurse=False)):
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Tensor], prefix: str, *other_arguments: Any
+    ) -> None:
+        for name, buffer in list(self.named_buffers(recurse=False)):
             stored = state_dict.get(prefix + name)
             if stored is not None:
-                setattr(self, name, torch.zeros(stored.shape, dtype=own.dtype, device=own.device))
-        super()._load_from_state_dict(state_dict, prefix, *rest)
+                setattr(
+                    self, name, torch.zeros(stored.shape, dtype=buffer.dtype, device=buffer.device)
+                )
+        super()._load_from_state_dict(state_dict, prefix, *other_arguments)
 
 
-class Products(Table):
+class ProductLayer(ResizableModule):
     """The products of columns: [..., C] -> [..., P], gathered by index [D, P]; column 0 is one."""
 
     def __init__(self) -> None:
@@ -315,40 +341,54 @@ class Products(Table):
         self.index = nn.Buffer(torch.zeros(1, 0, dtype=torch.long))
 
     @torch.jit.unused
-    def products(self, place: Mapping[int, int]) -> list[Product]:
+    def decode_products(self, atom_of_column: Mapping[int, int]) -> list[Product]:
         """Return the atoms of each product, from those of the columns."""
-        return [tuple(sorted(place[i] for i in column if i)) for column in self.index.T.tolist()]
+        return [
+            tuple(sorted(atom_of_column[i] for i in column if i))
+            for column in self.index.T.tolist()
+        ]
 
     def forward(self, columns: Tensor) -> Tensor:
         """Return the products [..., P]."""
-        out = columns.index_select(-1, self.index[0])
+        values = columns.index_select(-1, self.index[0])
         for d in range(1, self.index.shape[0]):
-            out = out * columns.index_select(-1, self.index[d])
-        return out
+            values = values * columns.index_select(-1, self.index[d])
+        return values
 
 
-class Functions(Table):
+class FunctionLayer(ResizableModule):
     """The columns with K functions of sums beside them: f_k(sum_m weight_km product_km)."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.products = Products()
+        self.products = ProductLayer()
         self.weight = nn.Buffer(torch.zeros(0, 1, dtype=torch.float64))
         self.pick = nn.Buffer(torch.zeros(0, len(FUNCTIONS), dtype=torch.float64))
-        self.root_floor = _ROOT_FLOOR
+        self.root_floor = _MIN_ROOT_ARGUMENT
 
     def forward(self, columns: Tensor) -> Tensor:
         """Return [..., C + K] for columns [..., C]."""
         if self.weight.shape[0] == 0:
             return columns
-        s = (
+        inner_sums = (
             self.products(columns).unflatten(-1, self.weight.shape) * self.weight.to(columns.dtype)
         ).sum(-1)
-        zero = s == 0
-        inverse = torch.where(zero, s, torch.where(zero, torch.ones_like(s), s).reciprocal())
+        is_zero = inner_sums == 0
+        inverse = torch.where(
+            is_zero,
+            inner_sums,
+            torch.where(is_zero, torch.ones_like(inner_sums), inner_sums).reciprocal(),
+        )
         # in the order of FUNCTIONS
         values = torch.stack(
-            (s, s.abs(), s.sin(), s.cos(), s.abs().clamp(min=self.root_floor).sqrt(), inverse),
+            (
+                inner_sums,
+                inner_sums.abs(),
+                inner_sums.sin(),
+                inner_sums.cos(),
+                inner_sums.abs().clamp(min=self.root_floor).sqrt(),
+                inverse,
+            ),
             dim=-1,
         )
         return torch.cat(
@@ -364,30 +404,36 @@ class ExpressionLibrary(nn.Module):
 
     def __init__(self, nesting: int) -> None:
         super().__init__()
-        self.levels = nn.ModuleList([Functions() for _ in range(nesting)])
-        self.terms = Products()
+        self.levels = nn.ModuleList([FunctionLayer() for _ in range(nesting)])
+        self.terms = ProductLayer()
 
     @torch.jit.unused
-    def read(self, channels: Sequence[str]) -> tuple[Algebra, list[Product]]:
-        """Return the terms again, for channels by name: `tables` backwards."""
-        algebra = Algebra(channels, Limits(nesting=len(self.levels)))
-        place: dict[int, int] = {i + 1: i for i in range(len(channels))}
+    def decode_terms(self, channels: Sequence[str]) -> tuple[Algebra, list[Product]]:
+        """Return the terms again, for channels by name: `build_library_state` backwards."""
+        algebra = Algebra(channels, ExpressionLimits(nesting=len(self.levels)))
+        atom_of_column: dict[int, int] = {i + 1: i for i in range(len(channels))}
         for level in self.levels:
-            assert isinstance(level, Functions)
-            inner = level.products.products(place)
-            width = level.weight.shape[1]
-            found = []
-            for k, (weights, pick) in enumerate(
+            assert isinstance(level, FunctionLayer)
+            inner_products = level.products.decode_products(atom_of_column)
+            terms_per_function = level.weight.shape[1]
+            level_atoms = []
+            for k, (weights, function_selector) in enumerate(
                 zip(level.weight.tolist(), level.pick.tolist(), strict=True)
             ):
-                a = {
-                    p: w
-                    for p, w in zip(inner[k * width : (k + 1) * width], weights, strict=True)
-                    if w != 0.0
+                inner_sum = {
+                    product: weight
+                    for product, weight in zip(
+                        inner_products[k * terms_per_function : (k + 1) * terms_per_function],
+                        weights,
+                        strict=True,
+                    )
+                    if weight != 0.0
                 }
-                found.append(algebra.atom(FUNCTIONS[pick.index(1.0)], a))
-            place |= {len(place) + 1 + k: i for k, i in enumerate(found)}
-        return algebra, self.terms.products(place)
+                level_atoms.append(
+                    algebra.register_atom(FUNCTIONS[function_selector.index(1.0)], inner_sum)
+                )
+            atom_of_column |= {len(atom_of_column) + 1 + k: i for k, i in enumerate(level_atoms)}
+        return algebra, self.terms.decode_products(atom_of_column)
 
     def forward(self, z: Tensor) -> Tensor:
         """Return the terms [..., J] at channels [..., F]."""
@@ -398,7 +444,7 @@ class ExpressionLibrary(nn.Module):
         return values
 
 
-class Weights(Table):
+class CoefficientTable(ResizableModule):
     """The coefficients [J, n] of the terms on each axis."""
 
     def __init__(self, outputs: int) -> None:
@@ -406,115 +452,138 @@ class Weights(Table):
         self.values = nn.Buffer(torch.zeros(0, outputs, dtype=torch.float64))
 
 
-def tables(algebra: Algebra, terms: Sequence[Product], nesting: int) -> dict[str, Tensor]:
+def build_library_state(
+    algebra: Algebra, terms: Sequence[Product], nesting: int
+) -> dict[str, Tensor]:
     """Return the state of an `ExpressionLibrary` of these terms.
 
     It has all functions that they need, innermost first.
     """
-    found: set[int] = set()
-    left = {i for product in terms for i in product}
-    while left:
-        found |= left
-        left = {i for k in left for product, _ in algebra.atoms[k].inner for i in product} - found
-    used = sorted(i for i in found if algebra.atoms[i].nesting)
-    place = {i: i + 1 for i in range(len(algebra.channels))}
+    required_atoms: set[int] = set()
+    new_atoms = {i for product in terms for i in product}
+    while new_atoms:
+        required_atoms |= new_atoms
+        new_atoms = {
+            i for k in new_atoms for product, _ in algebra.atoms[k].inner for i in product
+        } - required_atoms
+    function_atoms = sorted(i for i in required_atoms if algebra.atoms[i].nesting)
+    column_of_atom = {i: i + 1 for i in range(len(algebra.channels))}
     state: dict[str, Tensor] = {}
     for level in range(nesting):
-        level_atoms = [i for i in used if algebra.atoms[i].nesting == level + 1]
+        level_atoms = [i for i in function_atoms if algebra.atoms[i].nesting == level + 1]
         atoms = [algebra.atoms[i] for i in level_atoms]
-        width = max([len(atom.inner) for atom in atoms], default=1)
-        inner = [
+        max_terms = max([len(atom.inner) for atom in atoms], default=1)
+        inner_products = [
             product
             for atom in atoms
-            for product in [*(p for p, _ in atom.inner), *[()] * (width - len(atom.inner))]
+            for product in [*(p for p, _ in atom.inner), *[()] * (max_terms - len(atom.inner))]
         ]
-        state[f"levels.{level}.products.index"] = _index(inner, place)
+        state[f"levels.{level}.products.index"] = _product_index(inner_products, column_of_atom)
         state[f"levels.{level}.weight"] = torch.tensor(
             [
-                [weight for _, weight in atom.inner] + [0.0] * (width - len(atom.inner))
+                [weight for _, weight in atom.inner] + [0.0] * (max_terms - len(atom.inner))
                 for atom in atoms
             ],
             dtype=torch.float64,
-        ).reshape(len(atoms), width)
-        pick = [[float(atom.function == function) for function in FUNCTIONS] for atom in atoms]
-        state[f"levels.{level}.pick"] = torch.tensor(pick, dtype=torch.float64).reshape(
-            len(atoms), len(FUNCTIONS)
-        )
-        place |= {i: len(place) + 1 + k for k, i in enumerate(level_atoms)}
-    return state | {"terms.index": _index(terms, place)}
+        ).reshape(len(atoms), max_terms)
+        function_selectors = [
+            [float(atom.function == function) for function in FUNCTIONS] for atom in atoms
+        ]
+        state[f"levels.{level}.pick"] = torch.tensor(
+            function_selectors, dtype=torch.float64
+        ).reshape(len(atoms), len(FUNCTIONS))
+        column_of_atom |= {i: len(column_of_atom) + 1 + k for k, i in enumerate(level_atoms)}
+    return state | {"terms.index": _product_index(terms, column_of_atom)}
 
 
-def _index(products: Sequence[Product], place: dict[int, int]) -> Tensor:
-    depth = max([1, *(len(product) for product in products)])
-    rows = [[place[i] for i in product] + [0] * (depth - len(product)) for product in products]
-    return torch.tensor(rows, dtype=torch.long).reshape(len(products), depth).T.contiguous()
+def _product_index(products: Sequence[Product], column_of_atom: dict[int, int]) -> Tensor:
+    max_factors = max([1, *(len(product) for product in products)])
+    rows = [
+        [column_of_atom[i] for i in product] + [0] * (max_factors - len(product))
+        for product in products
+    ]
+    return torch.tensor(rows, dtype=torch.long).reshape(len(products), max_factors).T.contiguous()
 
 
-PLAIN = {
+TEXT_FORMATS = {
     "sum": "({})",
     "abs": "|{}|",
     **{name: name + "({})" for name in ("sin", "cos", "sqrt", "ssqrt", "inv")},
 }
 """How functions are written in the term language."""
-Term = Sequence[tuple[str, str, int]]
+Factors = Sequence[tuple[str, str, int]]
 """A product of (function, channel, power); no function stands for the channel itself."""
 
 
-def term(algebra: Algebra, product: Product) -> str:
+def format_product(algebra: Algebra, product: Product) -> str:
     """Return a product in plain text, channels before functions; `1` where it is empty.
 
     It does not depend on the order in which atoms were found.
     """
-    written = [(_atom(algebra, i), algebra.atoms[i].nesting, i) for i in set(product)]
+    formatted_atoms = [
+        (_format_atom(algebra, i), algebra.atoms[i].nesting, i) for i in set(product)
+    ]
     # channels in their own order, functions by what is written
-    written.sort(key=lambda one: (one[1], one[2] if not one[1] else 0, one[0]))
-    powers = [(text, product.count(i)) for text, _, i in written]
-    return " ".join(text if power == 1 else f"{text}^{power}" for text, power in powers) or "1"
+    formatted_atoms.sort(key=lambda entry: (entry[1], entry[2] if not entry[1] else 0, entry[0]))
+    atom_powers = [(text, product.count(i)) for text, _, i in formatted_atoms]
+    return " ".join(text if power == 1 else f"{text}^{power}" for text, power in atom_powers) or "1"
 
 
-def total(terms: Sequence[str], weights: Sequence[float]) -> str:
+def format_sum(terms: Sequence[str], weights: Sequence[float]) -> str:
     """Return a weighted sum of terms in plain text, six digits; weights of 1 are not written."""
-    out = ""
+    text_sum = ""
     for text, weight in zip(terms, weights, strict=True):
         number = f"{abs(weight):.6g}"
-        part = number if text == "1" else text if number == "1" else f"{number} {text}"
-        out += (" - " if weight < 0 else " + ") + part
-    return ("-" if out.startswith(" - ") else "") + out[3:] or "0"
+        term_text = number if text == "1" else text if number == "1" else f"{number} {text}"
+        text_sum += (" - " if weight < 0 else " + ") + term_text
+    return ("-" if text_sum.startswith(" - ") else "") + text_sum[3:] or "0"
 
 
-def _atom(algebra: Algebra, i: int) -> str:
+def _format_atom(algebra: Algebra, i: int) -> str:
     atom = algebra.atoms[i]
     if not atom.inner:
         return atom.channel
-    inner = sorted((len(p), term(algebra, p), weight) for p, weight in atom.inner)
-    return PLAIN[atom.function].format(total([t for _, t, _ in inner], [w for *_, w in inner]))
+    inner_terms = sorted((len(p), format_product(algebra, p), weight) for p, weight in atom.inner)
+    return TEXT_FORMATS[atom.function].format(
+        format_sum(
+            [term_text for _, term_text, _ in inner_terms],
+            [term_weight for *_, term_weight in inner_terms],
+        )
+    )
 
 
-def symbolic(terms: Sequence[Term], weights: Sequence[float]) -> sympy.Expr:
+def terms_to_sympy(terms: Sequence[Factors], weights: Sequence[float]) -> sympy.Expr:
     """Return a weighted sum of products of functions of channels as a SymPy expression."""
     import sympy
 
-    out = []
+    summands = []
     for factors, weight in zip(terms, weights, strict=True):
-        parts = [_of(function, sympy.Symbol(name)) ** power for function, name, power in factors]
-        out.append(sympy.Mul(sympy.Float(weight, 17), *parts))
-    return sympy.Add(*out)
+        sympy_factors = [
+            _apply_sympy_function(function, sympy.Symbol(name)) ** power
+            for function, name, power in factors
+        ]
+        summands.append(sympy.Mul(sympy.Float(weight, 17), *sympy_factors))
+    return sympy.Add(*summands)
 
 
-def symbolic_sum(algebra: Algebra, products: Sequence[tuple[Product, float]]) -> sympy.Expr:
+def products_to_sympy(algebra: Algebra, products: Sequence[tuple[Product, float]]) -> sympy.Expr:
     """Return a weighted sum of products of an algebra as a SymPy expression."""
     import sympy
 
     def atom(i: int) -> Any:
-        found = algebra.atoms[i]
-        if not found.inner:
-            return sympy.Symbol(found.channel)
-        return _of(found.function, symbolic_sum(algebra, found.inner))
+        atom_definition = algebra.atoms[i]
+        if not atom_definition.inner:
+            return sympy.Symbol(atom_definition.channel)
+        return _apply_sympy_function(
+            atom_definition.function, products_to_sympy(algebra, atom_definition.inner)
+        )
 
-    return sympy.Add(*(sympy.Mul(sympy.Float(w, 17), *map(atom, p)) for p, w in products))
+    return sympy.Add(
+        *(sympy.Mul(sympy.Float(weight, 17), *map(atom, product)) for product, weight in products)
+    )
 
 
-def _of(function: str, x: Any) -> Any:
+def _apply_sympy_function(function: str, x: Any) -> Any:
     import sympy
 
     if function == "inv":
@@ -525,8 +594,12 @@ def _of(function: str, x: Any) -> Any:
     return {"abs": sympy.Abs, "sin": sympy.sin, "cos": sympy.cos}.get(function, lambda y: y)(x)
 
 
-def equation(
-    name: str, text: str, value: sympy.Expr, channels: Sequence[str], comment: str = ""
+def format_equation(
+    name: str,
+    right_hand_side: str,
+    expression: sympy.Expr,
+    channels: Sequence[str],
+    comment: str = "",
 ) -> dict[str, str]:
     """Return one equation in writing.
 
@@ -536,22 +609,26 @@ def equation(
         comment: what stands above the function in C.
 
     Returns:
-        `text`, plain with six digits; `latex`, with six digits; `sympy`, the right side with all
+        `right_hand_side`, plain with six digits; `latex`, with six digits; `sympy`, the right side with all
         digits, for `sympy.sympify`; and `c`, a C99 function `double <name>(double <channel>, ...)`
         with all digits, which has all channels as arguments and needs <math.h>.
     """
     import sympy
 
-    short = value.xreplace({x: sympy.Float(x, 6) for x in value.atoms(sympy.Float)})
-    left = sympy.Symbol(name.replace("_dot", "dot"))
-    used = {symbol.name for symbol in value.free_symbols}
-    unused = "".join(f"    (void){channel};\n" for channel in channels if channel not in used)
+    rounded_expression = expression.xreplace(
+        {x: sympy.Float(x, 6) for x in expression.atoms(sympy.Float)}
+    )
+    lhs_symbol = sympy.Symbol(name.replace("_dot", "dot"))
+    used_channels = {symbol.name for symbol in expression.free_symbols}
+    unused_arguments = "".join(
+        f"    (void){channel};\n" for channel in channels if channel not in used_channels
+    )
     arguments = ", ".join(f"double {channel}" for channel in channels)
-    note = f"/* {comment} */\n" if comment else ""
-    body = f"{unused}    return {sympy.ccode(value)};"
+    comment_line = f"/* {comment} */\n" if comment else ""
+    body = f"{unused_arguments}    return {sympy.ccode(expression)};"
     return {
-        "text": f"{name} = {text}",
-        "latex": f"{sympy.latex(left)} = {sympy.latex(short, full_prec=False)}",
-        "sympy": sympy.sstr(value, full_prec=True),
-        "c": f"{note}double {name}({arguments})\n{{\n{body}\n}}\n",
+        "text": f"{name} = {right_hand_side}",
+        "latex": f"{sympy.latex(lhs_symbol)} = {sympy.latex(rounded_expression, full_prec=False)}",
+        "sympy": sympy.sstr(expression, full_prec=True),
+        "c": f"{comment_line}double {name}({arguments})\n{{\n{body}\n}}\n",
     }

@@ -22,41 +22,47 @@ from pydantic import Field, model_validator
 
 from residnet.core.config import Config
 from residnet.core.errors import FitError, require_package
-from residnet.regression.estimator import Coefficient, Data, Estimator, Solution, whole
+from residnet.regression.estimator import Coefficient, Estimator, EstimatorData, Solution, to_dense
 from residnet.regression.expressions import (
-    ONE,
+    CONSTANT_PRODUCT,
     Algebra,
-    Columns,
+    ExpressionLimits,
+    Factors,
     Function,
-    Limits,
     Product,
+    ProductEvaluator,
     Sum,
-    Term,
     TooLargeError,
-    equation,
-    symbolic_sum,
-    tables,
-    term,
-    total,
+    build_library_state,
+    format_equation,
+    format_product,
+    format_sum,
+    products_to_sympy,
 )
-from residnet.regression.sparse import SearchConfig, coefficient_row, everything, find, reduce
+from residnet.regression.sparse import (
+    SparseSearchConfig,
+    coefficient_to_dict,
+    find_equation,
+    fit_all_candidates,
+    reduce_problem,
+)
 
 Operator = Literal["+", "-", "*", "/", "abs", "sin", "cos", "sqrt"]
 BINARY = {"+": "add", "-": "subtract", "*": "multiply", "/": "divide"}
-BLOCKS = 8
+VALIDATION_BLOCKS = 8
 """Blocks of the record that validation takes turns on where there are too few groups."""
 Terms = tuple[Product, ...]
-_SINGULAR = 1e-13
+_SINGULARITY_TOLERANCE = 1e-13
 """Share of a term's energy that must be left beside the terms before it; below it the Gram matrix
 counts as singular (section 5.1.2).
 """
-_TINY = 1e-300
+_MIN_MEAN_SQUARE = 1e-300
 """Least mean square of a target that errors are divided by."""
-_LEAST_SCALE = 1e-100
+_MIN_TERM_RMS = 1e-100
 """Root mean square of a term below which it is not used."""
-_ROWS = 40_000_000
+_MAX_CACHE_NUMBERS = 40_000_000
 """Numbers in the cache of columns before it is emptied."""
-_CHUNK = 3_000_000
+_MAX_BATCH_NUMBERS = 3_000_000
 """Numbers in one batch of columns."""
 
 
@@ -116,7 +122,7 @@ class EvolutionConfig(Config):
     rows: int = Field(default=600, ge=20, le=10_000_000)
 
     @model_validator(mode="after")
-    def _possible(self) -> EvolutionConfig:
+    def _validate_settings(self) -> EvolutionConfig:
         if self.crossover + self.mutation > 1:
             raise ValueError(
                 "crossover and mutation are shares of the offspring; together at most 1, given"
@@ -142,9 +148,11 @@ class EvolutionConfig(Config):
         return self
 
 
-def limits_of(config: EvolutionConfig) -> Limits:
+def expression_limits(config: EvolutionConfig) -> ExpressionLimits:
     """Return the limits of the terms of a search."""
-    return Limits(config.max_terms, config.max_degree, config.nesting, config.split == "expand")
+    return ExpressionLimits(
+        config.max_terms, config.max_degree, config.nesting, config.split == "expand"
+    )
 
 
 class EquationSearchConfig(Config):
@@ -162,12 +170,12 @@ class EquationSearchConfig(Config):
     """
 
     evolution: EvolutionConfig = Field(default_factory=EvolutionConfig)
-    final: SearchConfig | None = Field(default_factory=SearchConfig)
-    validate_every: int = Field(default=4, ge=2, le=BLOCKS)
+    final: SparseSearchConfig | None = Field(default_factory=SparseSearchConfig)
+    validate_every: int = Field(default=4, ge=2, le=VALIDATION_BLOCKS)
     seed: int = Field(default=0, ge=0)
 
 
-class Fitness:
+class FitnessEvaluator:
     """The errors of individuals on training and validation samples.
 
     They are mean square errors over the target's mean square on each.
@@ -182,94 +190,115 @@ class Fitness:
         algebra: Algebra,
         data: Mapping[str, np.ndarray],
         target: np.ndarray,
-        train: np.ndarray,
+        is_training: np.ndarray,
     ) -> None:
         """From channels [N], the target [N], and which samples [N] train."""
-        order = np.argsort(~train, kind="stable")
-        self.columns = Columns(
+        order = np.argsort(~is_training, kind="stable")
+        self._evaluator = ProductEvaluator(
             algebra,
             {name: np.asarray(data[name], dtype=np.float64)[order] for name in algebra.channels},
         )
-        self.count = int(train.sum())
+        self.n_train = int(is_training.sum())
         y = torch.from_numpy(np.asarray(target, dtype=np.float64)[order])
-        self.y, self.y_validation = y[: self.count], y[self.count :]
-        self.energy = [
-            max(float(part.square().mean()), _TINY) for part in (self.y, self.y_validation)
+        self.y, self.y_validation = y[: self.n_train], y[self.n_train :]
+        self.target_mean_square = [
+            max(float(values.square().mean()), _MIN_MEAN_SQUARE)
+            for values in (self.y, self.y_validation)
         ]
-        self.fitted = 0
-        self._known: dict[Terms, tuple[float, float, Terms]] = {}
-        self._empty()
+        self.n_fitted = 0
+        self._results: dict[Terms, tuple[float, float, Terms]] = {}
+        self._clear_cache()
 
-    def of(self, individuals: Sequence[Terms | None]) -> list[tuple[float, float, Terms]]:
+    def evaluate(self, individuals: Sequence[Terms | None]) -> list[tuple[float, float, Terms]]:
         """Return (training error, validation error, terms that are left) of each.
 
         Errors are infinite where there are no terms, or they are not independent.
         """
-        new = [
+        new_term_sets = [
             terms
             for terms in dict.fromkeys(individuals)
-            if terms is not None and terms not in self._known
+            if terms is not None and terms not in self._results
         ]
-        if new:
-            self._cache({product for terms in new for product in terms})
+        if new_term_sets:
+            self._cache_columns({product for terms in new_term_sets for product in terms})
             by_width: dict[int, list[Terms]] = {}
-            for terms in new:
-                if not terms or not bool(self._usable[[self._rows[p] for p in terms]].all()):
-                    self._known[terms] = (np.inf, np.inf, ())
+            for terms in new_term_sets:
+                if not terms or not bool(
+                    self._is_usable[[self._cache_rows[p] for p in terms]].all()
+                ):
+                    self._results[terms] = (np.inf, np.inf, ())
                 else:
                     by_width.setdefault(len(terms), []).append(terms)
-            for width, group in by_width.items():
-                step = max(1, _CHUNK // (width * self._values.shape[1]))
-                for start in range(0, len(group), step):
-                    self._batch(group[start : start + step])
-            self.fitted += len(new)
-        nothing = (np.inf, np.inf, ())
-        return [nothing if terms is None else self._known[terms] for terms in individuals]
+            for n_terms, same_size_sets in by_width.items():
+                batch_size = max(1, _MAX_BATCH_NUMBERS // (n_terms * self._cached_columns.shape[1]))
+                for start in range(0, len(same_size_sets), batch_size):
+                    self._fit_batch(same_size_sets[start : start + batch_size])
+            self.n_fitted += len(new_term_sets)
+        failed_result = (np.inf, np.inf, ())
+        return [failed_result if terms is None else self._results[terms] for terms in individuals]
 
-    def _empty(self) -> None:
-        self._rows: dict[Product, int] = {}
-        self._values = torch.zeros(0, len(self.y) + len(self.y_validation), dtype=torch.float64)
-        self._usable = torch.zeros(0, dtype=torch.bool)
-
-    def _cache(self, wanted: set[Product]) -> None:
-        """Keep columns of unit mean square over the training samples."""
-        if (len(self._rows) + len(wanted)) * self._values.shape[1] > _ROWS:
-            self._empty()
-        new = sorted(wanted - self._rows.keys())
-        if not new:
-            return
-        values = self.columns.of(new)
-        with np.errstate(over="ignore", invalid="ignore"):
-            scale = np.sqrt(np.square(values[:, : self.count]).mean(axis=1))
-        good = np.isfinite(scale) & (scale > _LEAST_SCALE) & np.isfinite(values).all(axis=1)
-        values = np.where(good[:, None], values, 0.0) / np.where(good, scale, 1.0)[:, None]
-        self._rows |= {product: len(self._rows) + i for i, product in enumerate(new)}
-        self._values = torch.cat((self._values, torch.from_numpy(values)))
-        self._usable = torch.cat((self._usable, torch.from_numpy(good)))
-
-    def _batch(self, group: Sequence[Terms]) -> None:
-        columns = self._values[torch.tensor([[self._rows[p] for p in terms] for terms in group])]
-        x, x_validation = columns[..., : self.count], columns[..., self.count :]
-        gram = x @ x.transpose(1, 2) / self.count
-        factor, info = torch.linalg.cholesky_ex(gram)
-        right = (x @ self.y / self.count)[..., None]
-        good = (info == 0) & (factor.diagonal(dim1=1, dim2=2).square().amin(dim=1) > _SINGULAR)
-        factor = torch.where(
-            good[:, None, None], factor, torch.eye(gram.shape[1], dtype=gram.dtype)
+    def _clear_cache(self) -> None:
+        self._cache_rows: dict[Product, int] = {}
+        self._cached_columns = torch.zeros(
+            0, len(self.y) + len(self.y_validation), dtype=torch.float64
         )
-        coefficients = torch.cholesky_solve(right, factor).transpose(1, 2)
-        train = (self.y - (coefficients @ x)[:, 0]).square().mean(dim=1) / self.energy[0]
-        validation = (self.y_validation - (coefficients @ x_validation)[:, 0]).square().mean(
+        self._is_usable = torch.zeros(0, dtype=torch.bool)
+
+    def _cache_columns(self, products: set[Product]) -> None:
+        """Keep columns of unit mean square over the training samples."""
+        if (len(self._cache_rows) + len(products)) * self._cached_columns.shape[
+            1
+        ] > _MAX_CACHE_NUMBERS:
+            self._clear_cache()
+        missing = sorted(products - self._cache_rows.keys())
+        if not missing:
+            return
+        values = self._evaluator.evaluate(missing)
+        with np.errstate(over="ignore", invalid="ignore"):
+            rms = np.sqrt(np.square(values[:, : self.n_train]).mean(axis=1))
+        is_usable = np.isfinite(rms) & (rms > _MIN_TERM_RMS) & np.isfinite(values).all(axis=1)
+        values = np.where(is_usable[:, None], values, 0.0) / np.where(is_usable, rms, 1.0)[:, None]
+        self._cache_rows |= {
+            product: len(self._cache_rows) + i for i, product in enumerate(missing)
+        }
+        self._cached_columns = torch.cat((self._cached_columns, torch.from_numpy(values)))
+        self._is_usable = torch.cat((self._is_usable, torch.from_numpy(is_usable)))
+
+    def _fit_batch(self, term_sets: Sequence[Terms]) -> None:
+        columns = self._cached_columns[
+            torch.tensor([[self._cache_rows[p] for p in terms] for terms in term_sets])
+        ]
+        x, x_validation = columns[..., : self.n_train], columns[..., self.n_train :]
+        gram = x @ x.transpose(1, 2) / self.n_train
+        cholesky_factor, info = torch.linalg.cholesky_ex(gram)
+        right_hand_side = (x @ self.y / self.n_train)[..., None]
+        is_solvable = (info == 0) & (
+            cholesky_factor.diagonal(dim1=1, dim2=2).square().amin(dim=1) > _SINGULARITY_TOLERANCE
+        )
+        cholesky_factor = torch.where(
+            is_solvable[:, None, None], cholesky_factor, torch.eye(gram.shape[1], dtype=gram.dtype)
+        )
+        coefficients = torch.cholesky_solve(right_hand_side, cholesky_factor).transpose(1, 2)
+        train_error = (self.y - (coefficients @ x)[:, 0]).square().mean(
             dim=1
-        ) / self.energy[1]
-        for terms, fine, a, b in zip(
-            group, good.tolist(), train.tolist(), validation.tolist(), strict=True
+        ) / self.target_mean_square[0]
+        validation_error = (self.y_validation - (coefficients @ x_validation)[:, 0]).square().mean(
+            dim=1
+        ) / self.target_mean_square[1]
+        for terms, is_fitted, train_value, validation_value in zip(
+            term_sets,
+            is_solvable.tolist(),
+            train_error.tolist(),
+            validation_error.tolist(),
+            strict=True,
         ):
-            self._known[terms] = (a, b, terms) if fine else (np.inf, np.inf, ())
+            self._results[terms] = (
+                (train_value, validation_value, terms) if is_fitted else (np.inf, np.inf, ())
+            )
 
 
 @dataclass(frozen=True)
-class Generation:
+class GenerationRecord:
     """The best individual of a generation: relative mean square errors and number of terms."""
 
     train: float
@@ -278,7 +307,7 @@ class Generation:
 
 
 @dataclass(frozen=True)
-class Found:
+class EvolutionResult:
     """What a search found.
 
     Attributes:
@@ -287,18 +316,18 @@ class Found:
             search looked at.
         validation: the same on all validation samples.
         generation: when it appeared; 0 is the first population.
-        reached: whether both errors came below the goal.
+        is_goal_reached: whether both errors came below the goal.
         history: the best individual of each generation.
-        fitted: how many different sets of terms were fitted.
+        n_fitted: how many different sets of terms were fitted.
     """
 
     terms: Terms
     train: float
     validation: float
     generation: int
-    reached: bool
-    history: tuple[Generation, ...]
-    fitted: int
+    is_goal_reached: bool
+    history: tuple[GenerationRecord, ...]
+    n_fitted: int
 
 
 class Individual:
@@ -321,17 +350,17 @@ def evolve(
     algebra: Algebra,
     data: Mapping[str, np.ndarray],
     target: np.ndarray,
-    train: np.ndarray,
+    is_training: np.ndarray,
     config: EvolutionConfig,
     seed: int,
-) -> Found:
+) -> EvolutionResult:
     """Search the equation of one target.
 
     Args:
-        algebra: of the channels, within `limits_of` the config.
+        algebra: of the channels, within `expression_limits` the config.
         data: channels [N] by name.
         target: what the equation is to give, [N].
-        train: which samples [N] train; the others validate.
+        is_training: which samples [N] train; the others validate.
         seed: of all random choices.
 
     Raises:
@@ -346,188 +375,212 @@ def evolve(
     ]:
         if not np.isfinite(values).all():
             raise FitError(f"genetic programming: {name} is not finite in all samples; mask those")
-    if not 0 < train.sum() < len(train):
+    if not 0 < is_training.sum() < len(is_training):
         raise FitError(
-            f"genetic programming: needs samples to train and to validate, given {int(train.sum())}"
-            f" of {len(train)} to train"
+            f"genetic programming: needs samples to train and to validate, given {int(is_training.sum())}"
+            f" of {len(is_training)} to train"
         )
-    rows = np.flatnonzero(train)
-    thinned = np.linspace(0, len(rows) - 1, min(config.rows, len(rows))).round().astype(int)
-    chosen = np.sort(np.concatenate((rows[np.unique(thinned)], np.flatnonzero(~train))))
-    fitness = Fitness(
+    training_rows = np.flatnonzero(is_training)
+    thinned_index = (
+        np.linspace(0, len(training_rows) - 1, min(config.rows, len(training_rows)))
+        .round()
+        .astype(int)
+    )
+    selected_rows = np.sort(
+        np.concatenate((training_rows[np.unique(thinned_index)], np.flatnonzero(~is_training)))
+    )
+    fitness = FitnessEvaluator(
         algebra,
-        {name: data[name][chosen] for name in algebra.channels},
-        target[chosen],
-        train[chosen],
+        {name: data[name][selected_rows] for name in algebra.channels},
+        target[selected_rows],
+        is_training[selected_rows],
     )
     # DEAP draws from Python's own generator
-    state = random.getstate()
+    random_state = random.getstate()
     random.seed(seed)
     try:
-        return _Breeding(algebra, fitness, config).run()
+        return _Evolution(algebra, fitness, config).run_evolution()
     finally:
-        random.setstate(state)
+        random.setstate(random_state)
 
 
-class _Breeding:
+class _Evolution:
     """One search."""
 
-    def __init__(self, algebra: Algebra, fitness: Fitness, config: EvolutionConfig) -> None:
+    def __init__(
+        self, algebra: Algebra, fitness: FitnessEvaluator, config: EvolutionConfig
+    ) -> None:
         from deap import gp
 
         self.gp = gp
         self.algebra, self.fitness, self.config = algebra, fitness, config
-        made = self.gp.PrimitiveSet("main", 0)
+        primitive_set = self.gp.PrimitiveSet("main", 0)
         for operator in self.config.operators:
             arity = 2 if operator in BINARY else 1
-            made.addPrimitive(None, arity, name=BINARY.get(operator, operator))
+            primitive_set.addPrimitive(None, arity, name=BINARY.get(operator, operator))
         for name in self.algebra.channels:
-            made.addTerminal(None, name=f"channel {name}")
+            primitive_set.addTerminal(None, name=f"channel {name}")
         if self.config.constants is not None:
-            made.addEphemeralConstant(
+            primitive_set.addEphemeralConstant(
                 f"constant {self.config.constants}", partial(random.uniform, *self.config.constants)
             )
-        self.set = made
-        out: dict[str, Callable[..., Sum]] = {
+        self.primitive_set = primitive_set
+        binary_functions: dict[str, Callable[..., Sum]] = {
             "add": algebra.add,
             "subtract": partial(algebra.add, sign=-1.0),
             "multiply": algebra.multiply,
-            "divide": lambda a, b: algebra.multiply(a, algebra.apply("inv", b)),
+            "divide": lambda a, b: algebra.multiply(a, algebra.apply_function("inv", b)),
         }
         functions: tuple[Function, ...] = ("abs", "sin", "cos", "sqrt")
-        self.meaning = out | {function: partial(algebra.apply, function) for function in functions}
-        limit = self.gp.staticLimit(key=lambda tree: tree.height, max_value=config.depth)
-        self.mate = limit(self.gp.cxOnePoint)
-        self.mutate = limit(
+        self.operator_functions = binary_functions | {
+            function: partial(algebra.apply_function, function) for function in functions
+        }
+        limit_height = self.gp.staticLimit(key=lambda tree: tree.height, max_value=config.depth)
+        self.mate = limit_height(self.gp.cxOnePoint)
+        self.mutate = limit_height(
             partial(
-                self.gp.mutUniform, expr=partial(self.gp.genFull, min_=0, max_=2), pset=self.set
+                self.gp.mutUniform,
+                expr=partial(self.gp.genFull, min_=0, max_=2),
+                pset=self.primitive_set,
             )
         )
 
-    def run(self) -> Found:
+    def run_evolution(self) -> EvolutionResult:
         """Breed generations until the goal, the patience's end or the last one."""
-        low, high = self.config.first_depth
-        tree = partial(self.gp.genHalfAndHalf, self.set, low, high)
-        first = [
-            Individual([self.gp.PrimitiveTree(tree()) for _ in range(self.config.genes)])
+        min_depth, max_depth = self.config.first_depth
+        generate_tree = partial(self.gp.genHalfAndHalf, self.primitive_set, min_depth, max_depth)
+        initial_population = [
+            Individual([self.gp.PrimitiveTree(generate_tree()) for _ in range(self.config.genes)])
             for _ in range(self.config.population)
         ]
-        population = self._rated(first)
+        population = self._evaluate_and_sort(initial_population)
 
-        def described(best: Individual) -> Generation:
-            return Generation(-best.fitness, best.validation, len(best.terms))
+        def record_generation(best: Individual) -> GenerationRecord:
+            return GenerationRecord(-best.fitness, best.validation, len(best.terms))
 
-        best, when, history, reached = population[0], 0, [described(population[0])], False
+        best_individual, best_generation, history, is_goal_reached = (
+            population[0],
+            0,
+            [record_generation(population[0])],
+            False,
+        )
         for generation in range(self.config.generations + 1):
-            reached = max(-best.fitness, best.validation) <= self.config.goal
+            is_goal_reached = (
+                max(-best_individual.fitness, best_individual.validation) <= self.config.goal
+            )
             if (
-                reached
+                is_goal_reached
                 or generation == self.config.generations
-                or generation - when >= self.config.patience
+                or generation - best_generation >= self.config.patience
             ):
                 break
-            population = self._rated(
-                [*population[: self.config.elite], *self._offspring(population)]
+            population = self._evaluate_and_sort(
+                [*population[: self.config.elite], *self._make_offspring(population)]
             )
-            history.append(described(population[0]))
-            if population[0].validation < best.validation:
-                best, when = population[0], generation + 1
-        if not best.terms:
+            history.append(record_generation(population[0]))
+            if population[0].validation < best_individual.validation:
+                best_individual, best_generation = population[0], generation + 1
+        if not best_individual.terms:
             raise FitError(
                 "genetic programming: no individual has terms that the data tell apart; give a"
                 " larger population or other operators"
             )
-        return Found(
-            best.terms,
-            -best.fitness,
-            best.validation,
-            when,
-            reached,
+        return EvolutionResult(
+            best_individual.terms,
+            -best_individual.fitness,
+            best_individual.validation,
+            best_generation,
+            is_goal_reached,
             tuple(history),
-            self.fitness.fitted,
+            self.fitness.n_fitted,
         )
 
-    def _offspring(self, population: Sequence[Individual]) -> list[Individual]:
+    def _make_offspring(self, population: Sequence[Individual]) -> list[Individual]:
         """Return children of parents by tournament: crossover, mutation or a copy."""
         from deap import tools
 
-        wanted = self.config.population - self.config.elite
-        parents = tools.selTournament(population, 2 * wanted, self.config.tournament)
-        out = []
-        for first, second in zip(parents[::2], parents[1::2], strict=True):
-            draw = random.random()
-            child = first.copy()
-            if draw < self.config.crossover:
-                self._cross(child, second.copy())
-            elif draw < self.config.crossover + self.config.mutation:
-                place = random.randrange(len(child.trees))
-                (child.trees[place],) = self.mutate(child.trees[place])
-            out.append(child)
-        return out
+        n_offspring = self.config.population - self.config.elite
+        parents = tools.selTournament(population, 2 * n_offspring, self.config.tournament)
+        offspring = []
+        for first_parent, second_parent in zip(parents[::2], parents[1::2], strict=True):
+            random_draw = random.random()
+            child = first_parent.copy()
+            if random_draw < self.config.crossover:
+                self._crossover(child, second_parent.copy())
+            elif random_draw < self.config.crossover + self.config.mutation:
+                tree_index = random.randrange(len(child.trees))
+                (child.trees[tree_index],) = self.mutate(child.trees[tree_index])
+            offspring.append(child)
+        return offspring
 
-    def _cross(self, child: Individual, other: Individual) -> None:
+    def _crossover(self, child: Individual, other_parent: Individual) -> None:
         """Cross a tree of each at one point.
 
         With several genes every other time whole ones are exchanged.
         """
-        here, there = random.randrange(len(child.trees)), random.randrange(len(other.trees))
+        child_index, other_index = (
+            random.randrange(len(child.trees)),
+            random.randrange(len(other_parent.trees)),
+        )
         if len(child.trees) > 1 and random.random() < 0.5:
-            child.trees[here] = other.trees[there]
+            child.trees[child_index] = other_parent.trees[other_index]
         else:
-            child.trees[here], _ = self.mate(child.trees[here], other.trees[there])
+            child.trees[child_index], _ = self.mate(
+                child.trees[child_index], other_parent.trees[other_index]
+            )
 
-    def _rated(self, individuals: list[Individual]) -> list[Individual]:
+    def _evaluate_and_sort(self, individuals: list[Individual]) -> list[Individual]:
         """Return the individuals with fitness, best first; of equals the one of fewer terms."""
-        results = self.fitness.of([self._terms(individual) for individual in individuals])
+        results = self.fitness.evaluate([self._to_terms(individual) for individual in individuals])
         for individual, (train, validation, terms) in zip(individuals, results, strict=True):
             individual.fitness, individual.validation, individual.terms = -train, validation, terms
         return sorted(individuals, key=lambda i: (-i.fitness, len(i.terms)))
 
-    def _terms(self, individual: Individual) -> Terms | None:
+    def _to_terms(self, individual: Individual) -> Terms | None:
         """Return the terms of an individual; None beyond the limits or without any."""
         products: set[Product] = set()
         try:
             for tree in individual.trees:
-                if self.config.equal_terms == "reject" and self._repeats(tree):
+                if self.config.equal_terms == "reject" and self._has_repeated_term(tree):
                     return None
-                meant = self._sum(tree)
+                tree_sum = self._tree_to_sum(tree)
                 products.update(
-                    self.algebra.bracket(meant) if self.config.split == "gene" else meant
+                    self.algebra.bracket_sum(tree_sum) if self.config.split == "gene" else tree_sum
                 )
         except TooLargeError:
             return None
         return tuple(sorted(products)) if 0 < len(products) <= self.config.max_terms else None
 
-    def _repeats(self, tree: Any) -> bool:
+    def _has_repeated_term(self, tree: Any) -> bool:
         """Return whether a term stands twice among the branches at + and - from the root down."""
-        seen: set[Product] = set()
-        starts = [0]
-        while starts:
-            start = starts.pop()
-            branch = tree.searchSubtree(start)
-            if tree[start].name in ("add", "subtract"):
-                starts += [start + 1, tree.searchSubtree(start + 1).stop]
+        seen_products: set[Product] = set()
+        pending = [0]
+        while pending:
+            node_index = pending.pop()
+            branch = tree.searchSubtree(node_index)
+            if tree[node_index].name in ("add", "subtract"):
+                pending += [node_index + 1, tree.searchSubtree(node_index + 1).stop]
                 continue
-            meant = self._sum(tree[branch])
-            if not seen.isdisjoint(meant):
+            branch_sum = self._tree_to_sum(tree[branch])
+            if not seen_products.isdisjoint(branch_sum):
                 return True
-            seen.update(meant)
+            seen_products.update(branch_sum)
         return False
 
-    def _sum(self, tree: Sequence[Any]) -> Sum:
+    def _tree_to_sum(self, tree: Sequence[Any]) -> Sum:
         """Return the sum that a tree in prefix order comes to."""
         stack: list[Sum] = []
         for node in reversed(tree):
             if node.arity == 2:
-                stack.append(self.meaning[node.name](stack.pop(), stack.pop()))
+                stack.append(self.operator_functions[node.name](stack.pop(), stack.pop()))
             elif node.arity == 1:
-                stack.append(self.meaning[node.name](stack.pop()))
+                stack.append(self.operator_functions[node.name](stack.pop()))
             else:
                 name = node.value
                 stack.append(
-                    self.algebra.channel(name.removeprefix("channel "))
+                    self.algebra.make_channel(name.removeprefix("channel "))
                     if isinstance(name, str)
-                    else {ONE: float(name)}
+                    else {CONSTANT_PRODUCT: float(name)}
                 )
         return stack[0]
 
@@ -540,49 +593,63 @@ class GeneticEquations(Estimator):
     coefficients of its terms [P, n], `weights.values`.
 
     Args:
-        known: factors (function, channel, power) of terms that the final choice has beside those
+        extra_terms: factors (function, channel, power) of terms that the final choice has beside those
             that are bred, by output; none where empty.
     """
 
-    def __init__(self, config: EquationSearchConfig, known: Sequence[Sequence[Term]] = ()) -> None:
-        self.config, self.known = config, known
+    def __init__(
+        self, config: EquationSearchConfig, extra_terms: Sequence[Sequence[Factors]] = ()
+    ) -> None:
+        self.config, self.extra_terms = config, extra_terms
 
-    def solve(self, data: Data) -> list[Solution]:
-        x, (_, y, groups, names, outputs) = whole(data.x), data
-        config, n = self.config, y.shape[1]
-        algebra = Algebra(names, limits_of(config.evolution))
+    def _solve(self, data: EstimatorData) -> list[Solution]:
+        x, (_, y, groups, names, outputs) = to_dense(data.x), data
+        config, n_outputs = self.config, y.shape[1]
+        algebra = Algebra(names, expression_limits(config.evolution))
         values, target = x.numpy(), y.numpy()
         columns = {name: values[:, j] for j, name in enumerate(names)}
         groups = torch.zeros(len(x)) if groups is None else groups
-        train = ~validating(groups.numpy(), config.validate_every)
-        known = [_within(algebra, row) for row in self.known] or [()] * n
-        bred = [
-            breed(algebra, columns, target[:, k], train, config, n * config.seed + k, known[k])
-            for k in range(n)
+        is_training = ~validation_mask(groups.numpy(), config.validate_every)
+        extra_products = [
+            _products_within_limits(algebra, factors) for factors in self.extra_terms
+        ] or [()] * n_outputs
+        equations = [
+            evolve_equation(
+                algebra,
+                columns,
+                target[:, k],
+                is_training,
+                config,
+                n_outputs * config.seed + k,
+                extra_products[k],
+            )
+            for k in range(n_outputs)
         ]
-        products = sorted({product for found in bred for product in found.products})
-        weights = torch.zeros(len(products), n, dtype=torch.float64)
+        products = sorted({product for evolved in equations for product in evolved.products})
+        weights = torch.zeros(len(products), n_outputs, dtype=torch.float64)
         table: list[Coefficient] = []
-        for k, (output, found) in enumerate(zip(outputs, bred, strict=True)):
-            for product, value, error in zip(
-                found.products, found.values, found.errors, strict=True
+        for k, (output, evolved) in enumerate(zip(outputs, equations, strict=True)):
+            for product, value, standard_error in zip(
+                evolved.products, evolved.values, evolved.standard_errors, strict=True
             ):
                 weights[products.index(product), k] = value
-                table.append(Coefficient(output, term(algebra, product), value, error))
+                table.append(
+                    Coefficient(output, format_product(algebra, product), value, standard_error)
+                )
         notes = {
             "parameters": len(table),
-            "coefficients": [coefficient_row(entry) for entry in table],
+            "coefficients": [coefficient_to_dict(coefficient) for coefficient in table],
             "unexcited": [],
             "equations": {
-                output: _written(algebra, output, found)
-                for output, found in zip(outputs, bred, strict=True)
+                output: _equation_notes(algebra, output, evolved)
+                for output, evolved in zip(outputs, equations, strict=True)
             },
         }
-        library = tables(algebra, products, config.evolution.nesting)
+        library = build_library_state(algebra, products, config.evolution.nesting)
         state = {f"library.{name}": value for name, value in library.items()}
         return [
             Solution(
-                {"kept": [len(found.products) for found in bred]},
+                {"kept": [len(evolved.products) for evolved in equations]},
                 state | {"weights.values": weights},
                 tuple(table),
                 notes,
@@ -590,101 +657,110 @@ class GeneticEquations(Estimator):
         ]
 
 
-def _within(algebra: Algebra, terms: Sequence[Term]) -> tuple[Product, ...]:
+def _products_within_limits(algebra: Algebra, terms: Sequence[Factors]) -> tuple[Product, ...]:
     """Return the terms of these factors that are within the limits of the algebra."""
-    out = []
+    products = []
     for factors in terms:
         with suppress(TooLargeError):
-            out.append(algebra.product(factors))
-    return tuple(out)
+            products.append(algebra.make_product(factors))
+    return tuple(products)
 
 
-class Bred(NamedTuple):
+class EvolvedEquation(NamedTuple):
     """The equation of one output.
 
     Attributes:
-        found: what the search found.
+        search_result: what the search found.
         products: terms of the equation.
         values: coefficients of the terms.
-        errors: standard errors of the coefficients.
+        standard_errors: standard errors of the coefficients.
         summary: what the data say about the equation.
     """
 
-    found: Found
+    search_result: EvolutionResult
     products: tuple[Product, ...]
     values: tuple[float, ...]
-    errors: tuple[float, ...]
+    standard_errors: tuple[float, ...]
     summary: dict[str, Any]
 
 
-def breed(
+def evolve_equation(
     algebra: Algebra,
     data: Mapping[str, np.ndarray],
     target: np.ndarray,
-    train: np.ndarray,
+    is_training: np.ndarray,
     config: EquationSearchConfig,
     seed: int,
-    known: Sequence[Product] = (),
-) -> Bred:
+    extra_products: Sequence[Product] = (),
+) -> EvolvedEquation:
     """Search an equation and fit it to all samples.
 
     Args:
         algebra: of the channels, within the limits of the search.
         data: channels [N] by name.
         target: [N].
-        train: which samples train the search; the others validate.
-        known: terms that the final choice has beside those that are bred.
+        is_training: which samples train the search; the others validate.
+        extra_products: terms that the final choice has beside those that are bred.
 
     Raises:
         FitError: where the data do not determine an equation.
         UsageError: where DEAP is not installed.
     """
-    found = evolve(algebra, data, target, train, config.evolution, seed)
-    pool = found.terms
+    search_result = evolve(algebra, data, target, is_training, config.evolution, seed)
+    candidate_terms = search_result.terms
     if config.final is not None:
-        pool = tuple(sorted({*pool, *known}))
-    values = algebra.values(pool, data).T
-    names = [term(algebra, product) for product in pool]
-    reduced = reduce(
+        candidate_terms = tuple(sorted({*candidate_terms, *extra_products}))
+    values = algebra.evaluate_products(candidate_terms, data).T
+    names = [format_product(algebra, product) for product in candidate_terms]
+    all_candidates = reduce_problem(
         values,
         target[:, None],
         names,
-        [algebra.degree(p) for p in pool],
-        [algebra.effort(p) for p in pool],
+        [algebra.count_factors(p) for p in candidate_terms],
+        [algebra.complexity(p) for p in candidate_terms],
     )
-    kept, within = (
-        (everything(reduced, 0), reduced)
+    equation_fit, problem = (
+        (fit_all_candidates(all_candidates, 0), all_candidates)
         if config.final is None
-        else find(reduced, 0, config.final)
+        else find_equation(all_candidates, 0, config.final)
     )
-    products = tuple(pool[names.index(name)] for name in kept.terms)
-    numbers, errors = tuple(kept.values.tolist()), tuple(kept.errors.tolist())
-    return Bred(found, products, numbers, errors, kept.summary(within))
+    products = tuple(candidate_terms[names.index(name)] for name in equation_fit.terms)
+    coefficient_values, standard_errors = (
+        tuple(equation_fit.values.tolist()),
+        tuple(equation_fit.standard_errors.tolist()),
+    )
+    return EvolvedEquation(
+        search_result, products, coefficient_values, standard_errors, equation_fit.summary(problem)
+    )
 
 
-def validating(group: np.ndarray, every: int) -> np.ndarray:
+def validation_mask(group: np.ndarray, group_interval: int) -> np.ndarray:
     """Return which samples [N] validate, from the numbers of their groups.
 
     Every n-th group does where there are enough, else blocks of the record.
     """
-    numbers = np.unique(group, return_inverse=True)[1]
-    if numbers.max(initial=0) + 1 < every:
-        numbers = np.arange(len(group)) * BLOCKS // max(len(group), 1)
-    return np.asarray(numbers % every == every - 1)
+    group_index = np.unique(group, return_inverse=True)[1]
+    if group_index.max(initial=0) + 1 < group_interval:
+        group_index = np.arange(len(group)) * VALIDATION_BLOCKS // max(len(group), 1)
+    return np.asarray(group_index % group_interval == group_interval - 1)
 
 
-def _written(algebra: Algebra, name: str, bred: Bred) -> dict[str, Any]:
-    text = total([term(algebra, product) for product in bred.products], bred.values)
-    value = symbolic_sum(algebra, list(zip(bred.products, bred.values, strict=True)))
+def _equation_notes(algebra: Algebra, name: str, evolved: EvolvedEquation) -> dict[str, Any]:
+    text = format_sum(
+        [format_product(algebra, product) for product in evolved.products], evolved.values
+    )
+    sympy_sum = products_to_sympy(algebra, list(zip(evolved.products, evolved.values, strict=True)))
     return {
-        **equation(name, text, value, algebra.channels),
-        **bred.summary,
-        "bred_terms": len(bred.found.terms),
+        **format_equation(name, text, sympy_sum, algebra.channels),
+        **evolved.summary,
+        "bred_terms": len(evolved.search_result.terms),
         "by_sparse_search": [
-            term(algebra, product) for product in bred.products if product not in bred.found.terms
+            format_product(algebra, product)
+            for product in evolved.products
+            if product not in evolved.search_result.terms
         ],
-        "generation": bred.found.generation,
-        "reached_goal": bred.found.reached,
-        "sets_fitted": bred.found.fitted,
-        "history": [asdict(generation) for generation in bred.found.history],
+        "generation": evolved.search_result.generation,
+        "reached_goal": evolved.search_result.is_goal_reached,
+        "sets_fitted": evolved.search_result.n_fitted,
+        "history": [asdict(generation) for generation in evolved.search_result.history],
     }

@@ -16,39 +16,45 @@ from torch import Tensor, nn
 
 from residnet.core.config import Config
 from residnet.core.errors import FitError
-from residnet.regression.estimator import Data, Estimator, Solution, fold_numbers, whole
-from residnet.regression.expressions import Table
+from residnet.regression.estimator import (
+    Estimator,
+    EstimatorData,
+    Solution,
+    assign_group_folds,
+    to_dense,
+)
+from residnet.regression.expressions import ResizableModule
 
-_RANK = 1e-12
+_RANK_TOLERANCE = 1e-12
 """Eigenvalues of the landmarks' kernel below this share of the largest are rounding."""
-_ROWS = 8192
+_CHUNK_ROWS = 8192
 """Most rows of features that are held at a time."""
-_FAR = 10.0
+_DIVERGENCE_LIMIT_STD = 10.0
 """Standard deviations of a state beyond which it has run away, and its error stays what it is."""
 
 
 @dataclass(frozen=True)
-class Path:
+class RegularizationPath:
     """The fits with each of C penalties.
 
     Attributes:
         coefficients: of the raw features, [C, P, 3].
         errors: mean squared cross-validated errors [C, 3].
-        effective: effective number of parameters, the trace of the smoother, [C].
+        effective_parameters: effective number of parameters, the trace of the smoother, [C].
         sigma: of the kernel, where it has one.
-        points: samples that carry the function [P, F], where it has such.
+        support_points: samples that carry the function [P, F], where it has such.
     """
 
     coefficients: Tensor
     errors: Tensor
-    effective: Tensor
+    effective_parameters: Tensor
     sigma: float = 0.0
-    points: Tensor = field(default_factory=lambda: torch.zeros(0))
+    support_points: Tensor = field(default_factory=lambda: torch.zeros(0))
 
 
-def dual_path(
-    kernel: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]
-) -> Path:
+def fit_dual_path(
+    kernel: Tensor, y: Tensor, fold_index: Tensor, n_folds: int, penalties: Sequence[float]
+) -> RegularizationPath:
     """Return kernel ridge regressions alpha = (K + lambda I)^-1 Y for every penalty lambda.
 
     See document 001 section 3.2, correction M4.
@@ -59,98 +65,117 @@ def dual_path(
     Args:
         kernel: K of all samples with each other, [N, N].
         y: targets [N, 3].
-        fold: number of each sample's fold [N].
+        fold_index: number of each sample's fold [N].
         penalties: lambda, absolute, positive.
     """
-    values, vectors = torch.linalg.eigh(kernel)
-    values = values.clamp(min=0.0)
-    projected = vectors.T @ y
-    members = [torch.nonzero(fold == f).squeeze(1) for f in range(folds)]
-    coefficients, errors, effective = [], [], []
+    eigenvalues, eigenvectors = torch.linalg.eigh(kernel)
+    eigenvalues = eigenvalues.clamp(min=0.0)
+    projected = eigenvectors.T @ y
+    fold_members = [torch.nonzero(fold_index == f).squeeze(1) for f in range(n_folds)]
+    coefficients, errors_by_penalty, effective_parameters = [], [], []
     for penalty in penalties:
-        alpha = vectors @ (projected / (values + penalty)[:, None])
-        total = torch.zeros(y.shape[1], dtype=y.dtype)
-        for rows in members:
-            rows_of_fold = vectors[rows]
+        alpha = eigenvectors @ (projected / (eigenvalues + penalty)[:, None])
+        squared_error = torch.zeros(y.shape[1], dtype=y.dtype)
+        for rows in fold_members:
+            rows_of_fold = eigenvectors[rows]
             # I - H = lambda (K + lambda I)^-1, so the penalty cancels
-            left = torch.linalg.solve(
-                (rows_of_fold / (values + penalty)) @ rows_of_fold.T, alpha[rows]
+            left_out_errors = torch.linalg.solve(
+                (rows_of_fold / (eigenvalues + penalty)) @ rows_of_fold.T, alpha[rows]
             )
-            total += left.square().sum(0)
+            squared_error += left_out_errors.square().sum(0)
         coefficients.append(alpha)
-        errors.append(total / len(y))
-        effective.append((values / (values + penalty)).sum())
-    return Path(torch.stack(coefficients), torch.stack(errors), torch.stack(effective))
+        errors_by_penalty.append(squared_error / len(y))
+        effective_parameters.append((eigenvalues / (eigenvalues + penalty)).sum())
+    return RegularizationPath(
+        torch.stack(coefficients), torch.stack(errors_by_penalty), torch.stack(effective_parameters)
+    )
 
 
-def primal_path(
+def fit_primal_path(
     features: Callable[[Tensor], Tensor],
-    whiten: Tensor,
+    whitening: Tensor,
     x: Tensor,
     y: Tensor,
-    fold: Tensor,
-    folds: int,
+    fold_index: Tensor,
+    n_folds: int,
     penalties: Sequence[float],
-) -> Path:
+) -> RegularizationPath:
     """Return ridge regressions min |Y - Phi W w|^2 + lambda |w|^2 for every penalty lambda.
 
     They come from R factors of the folds.
 
     Args:
         features: raw features [n, P] of inputs [n, F].
-        whiten: W [P, Q], which makes the kernel the inner product of Phi W.
+        whitening: W [P, Q], which makes the kernel the inner product of Phi W.
         x: inputs [N, F].
         y: targets [N, 3].
-        fold: number of each sample's fold [N].
+        fold_index: number of each sample's fold [N].
         penalties: lambda, absolute, positive.
 
     Returns:
         The path; its coefficients are W w.
     """
-    factors = [_factor(features, whiten, x[fold == f], y[fold == f]) for f in range(folds)]
+    fold_factors = [
+        _accumulate_r_factor(features, whitening, x[fold_index == f], y[fold_index == f])
+        for f in range(n_folds)
+    ]
     errors = torch.zeros(len(penalties), y.shape[1], dtype=y.dtype)
-    for f, factor in enumerate(factors):
-        weights, _ = _weights(
-            _triangle(torch.cat([other for g, other in enumerate(factors) if g != f])),
+    for f, fold_factor in enumerate(fold_factors):
+        weights, _ = _ridge_weights(
+            _qr_factor(
+                torch.cat([other_factor for g, other_factor in enumerate(fold_factors) if g != f])
+            ),
             y.shape[1],
             penalties,
         )
-        joined = torch.cat(
+        weights_and_targets = torch.cat(
             (weights, -torch.eye(y.shape[1], dtype=y.dtype).expand(len(penalties), -1, -1)), dim=1
         )
-        errors += (factor @ joined).square().sum(1)
-    weights, effective = _weights(_triangle(torch.cat(factors)), y.shape[1], penalties)
-    return Path(whiten @ weights, errors / len(y), effective)
+        errors += (fold_factor @ weights_and_targets).square().sum(1)
+    weights, effective_parameters = _ridge_weights(
+        _qr_factor(torch.cat(fold_factors)), y.shape[1], penalties
+    )
+    return RegularizationPath(whitening @ weights, errors / len(y), effective_parameters)
 
 
-def _factor(features: Callable[[Tensor], Tensor], whiten: Tensor, x: Tensor, y: Tensor) -> Tensor:
+def _accumulate_r_factor(
+    features: Callable[[Tensor], Tensor], whitening: Tensor, x: Tensor, y: Tensor
+) -> Tensor:
     """Return the R factor of [Phi W, Y], gathered in chunks."""
-    kept = torch.zeros(0, whiten.shape[1] + y.shape[1], dtype=y.dtype)
-    for begin in range(0, len(x), _ROWS):
-        rows = slice(begin, begin + _ROWS)
-        kept = _triangle(torch.cat((kept, torch.cat((features(x[rows]) @ whiten, y[rows]), dim=1))))
-    return kept
+    r_factor = torch.zeros(0, whitening.shape[1] + y.shape[1], dtype=y.dtype)
+    for chunk_start in range(0, len(x), _CHUNK_ROWS):
+        rows = slice(chunk_start, chunk_start + _CHUNK_ROWS)
+        r_factor = _qr_factor(
+            torch.cat((r_factor, torch.cat((features(x[rows]) @ whitening, y[rows]), dim=1)))
+        )
+    return r_factor
 
 
-def _triangle(rows: Tensor) -> Tensor:
-    factor: Tensor = torch.linalg.qr(rows, mode="r")[1]
+def _qr_factor(matrix: Tensor) -> Tensor:
+    factor: Tensor = torch.linalg.qr(matrix, mode="r")[1]
     return factor
 
 
-def _weights(factor: Tensor, outputs: int, penalties: Sequence[float]) -> tuple[Tensor, Tensor]:
+def _ridge_weights(
+    r_factor: Tensor, n_outputs: int, penalties: Sequence[float]
+) -> tuple[Tensor, Tensor]:
     """Return coefficients [C, Q, outputs] and effective numbers of parameters [C].
 
     They come from the R factor of [Phi W, Y].
     """
-    count = factor.shape[1] - outputs
-    left, values, right = torch.linalg.svd(factor[:, :count], full_matrices=False)
-    projected = left.T @ factor[:, count:]
-    shrunk = [values / (values.square() + penalty) for penalty in penalties]
-    weights = torch.stack([right.T @ (share[:, None] * projected) for share in shrunk])
-    return weights, torch.stack([(values * share).sum() for share in shrunk])
+    n_features = r_factor.shape[1] - n_outputs
+    left_vectors, singular_values, right_vectors = torch.linalg.svd(
+        r_factor[:, :n_features], full_matrices=False
+    )
+    projected = left_vectors.T @ r_factor[:, n_features:]
+    shrunk = [singular_values / (singular_values.square() + penalty) for penalty in penalties]
+    weights = torch.stack(
+        [right_vectors.T @ (shrinkage[:, None] * projected) for shrinkage in shrunk]
+    )
+    return weights, torch.stack([(singular_values * shrinkage).sum() for shrinkage in shrunk])
 
 
-class Kernel(Table, ABC):
+class Kernel(ResizableModule, ABC):
     """A function f(x) [..., n] of inputs [..., F]: features of a kernel times coefficients."""
 
     @abstractmethod
@@ -158,25 +183,25 @@ class Kernel(Table, ABC):
         """Return f [..., n] at inputs x [..., F]."""
 
     @abstractmethod
-    def paths(
-        self, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]
-    ) -> list[Path]:
+    def fit_paths(
+        self, x: Tensor, y: Tensor, fold_index: Tensor, n_folds: int, penalties: Sequence[float]
+    ) -> list[RegularizationPath]:
         """Return fits with absolute penalties, one path for each setting of the kernel.
 
         Args:
             x: inputs [N, F].
             y: outputs [N, n].
-            fold: number of each sample's fold [N].
+            fold_index: number of each sample's fold [N].
             penalties: lambda, absolute, positive.
         """
 
     @abstractmethod
-    def features(self, path: Path, x: Tensor) -> Tensor:
+    def evaluate_features(self, path: RegularizationPath, x: Tensor) -> Tensor:
         """Return the features [..., P] that the coefficients of a path belong to."""
 
     @abstractmethod
-    def selected(
-        self, paths: Sequence[Path], coefficients: Tensor
+    def build_state(
+        self, output_paths: Sequence[RegularizationPath], coefficients: Tensor
     ) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """Return the settings of each output's path, and the state with coefficients [P, n]."""
 
@@ -192,73 +217,82 @@ class RbfKernel(Kernel):
     gamma = 1 / (2 sigma) (document 001 section 3.2, correction M5: sigma is a squared length).
     """
 
-    def __init__(self, config: Rbf, count: int, outputs: int = 3) -> None:
+    def __init__(self, config: RbfConfig, n_features: int, n_outputs: int = 3) -> None:
         super().__init__()
-        self.config, self.outputs = config, outputs
-        self.points = nn.Buffer(torch.zeros(0, count, dtype=torch.float64))
-        self.gamma = nn.Buffer(torch.ones(outputs, dtype=torch.float64))
-        self.coefficients = nn.Buffer(torch.zeros(0, outputs, dtype=torch.float64))
+        self.config, self.n_outputs = config, n_outputs
+        self.points = nn.Buffer(torch.zeros(0, n_features, dtype=torch.float64))
+        self.gamma = nn.Buffer(torch.ones(n_outputs, dtype=torch.float64))
+        self.coefficients = nn.Buffer(torch.zeros(0, n_outputs, dtype=torch.float64))
 
     def forward(self, x: Tensor) -> Tensor:
-        apart = squared_distances(x, self.points.to(x.dtype))
-        out: list[Tensor] = []
-        for output in range(self.outputs):
-            out.append(
-                torch.exp(-self.gamma[output].to(x.dtype) * apart)
+        distances = squared_distances(x, self.points.to(x.dtype))
+        outputs: list[Tensor] = []
+        for output in range(self.n_outputs):
+            outputs.append(
+                torch.exp(-self.gamma[output].to(x.dtype) * distances)
                 @ self.coefficients[:, output].to(x.dtype)
             )
-        return torch.stack(out, dim=-1)
+        return torch.stack(outputs, dim=-1)
 
-    def paths(
-        self, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]
-    ) -> list[Path]:
+    def fit_paths(
+        self, x: Tensor, y: Tensor, fold_index: Tensor, n_folds: int, penalties: Sequence[float]
+    ) -> list[RegularizationPath]:
         """Return one path for each sigma; see `Kernel.paths`.
 
-        It is exact where there are no more than `exact` samples, else by Nystroem's method on
+        It is exact where there are no more than `exact_paths` samples, else by Nystroem's method on
         landmarks.
         """
         if len(x) <= self.config.exact:
-            apart = squared_distances(x, x)
-            exact = [
-                (sigma, dual_path(torch.exp(-apart / (2 * sigma)), y, fold, folds, penalties))
+            distances = squared_distances(x, x)
+            exact_paths = [
+                (
+                    sigma,
+                    fit_dual_path(
+                        torch.exp(-distances / (2 * sigma)), y, fold_index, n_folds, penalties
+                    ),
+                )
                 for sigma in self.config.sigma
             ]
-            return [replace(path, sigma=sigma, points=x) for sigma, path in exact]
-        points = x[spread_out(x, self.config.landmarks, self.config.seed)]
-        out = []
+            return [replace(path, sigma=sigma, support_points=x) for sigma, path in exact_paths]
+        points = x[kmeans_plus_plus_indices(x, self.config.landmarks, self.config.seed)]
+        paths = []
         for sigma in self.config.sigma:
-            values, vectors = torch.linalg.eigh(
+            eigenvalues, eigenvectors = torch.linalg.eigh(
                 torch.exp(-squared_distances(points, points) / (2 * sigma))
             )
-            kept = values > _RANK * values[-1]
-            whiten = vectors[:, kept] / values[kept].sqrt()
+            is_significant = eigenvalues > _RANK_TOLERANCE * eigenvalues[-1]
+            whitening = eigenvectors[:, is_significant] / eigenvalues[is_significant].sqrt()
 
-            def features(part: Tensor, sigma: float = sigma) -> Tensor:
-                return torch.exp(-squared_distances(part, points) / (2 * sigma))
+            def features(inputs: Tensor, sigma: float = sigma) -> Tensor:
+                return torch.exp(-squared_distances(inputs, points) / (2 * sigma))
 
-            path = primal_path(features, whiten, x, y, fold, folds, penalties)
-            out.append(replace(path, sigma=sigma, points=points))
-        return out
+            path = fit_primal_path(features, whitening, x, y, fold_index, n_folds, penalties)
+            paths.append(replace(path, sigma=sigma, support_points=points))
+        return paths
 
-    def features(self, path: Path, x: Tensor) -> Tensor:
+    def evaluate_features(self, path: RegularizationPath, x: Tensor) -> Tensor:
         """Return the kernel between x and the points that carry the function."""
-        return torch.exp(-squared_distances(x, path.points) / (2 * path.sigma))
+        return torch.exp(-squared_distances(x, path.support_points) / (2 * path.sigma))
 
-    def selected(
-        self, paths: Sequence[Path], coefficients: Tensor
+    def build_state(
+        self, output_paths: Sequence[RegularizationPath], coefficients: Tensor
     ) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """Return sigma of each output, and the points, gamma and coefficients."""
-        sigma = [path.sigma for path in paths]
+        sigma = [path.sigma for path in output_paths]
         gamma = torch.tensor([0.5 / value for value in sigma], dtype=torch.float64)
-        state = {"points": paths[0].points, "gamma": gamma, "coefficients": coefficients}
+        state = {
+            "points": output_paths[0].support_points,
+            "gamma": gamma,
+            "coefficients": coefficients,
+        }
         return {"sigma": sigma}, state
 
     def zero_state(self) -> dict[str, Tensor]:
-        count = self.points.shape[1]
+        n_features = self.points.shape[1]
         return {
-            "points": torch.zeros(0, count, dtype=torch.float64),
-            "gamma": torch.ones(self.outputs, dtype=torch.float64),
-            "coefficients": torch.zeros(0, self.outputs, dtype=torch.float64),
+            "points": torch.zeros(0, n_features, dtype=torch.float64),
+            "gamma": torch.ones(self.n_outputs, dtype=torch.float64),
+            "coefficients": torch.zeros(0, self.n_outputs, dtype=torch.float64),
         }
 
 
@@ -270,43 +304,49 @@ class PolynomialKernel(Kernel):
     finitely many, so that any number of samples is fitted exactly.
     """
 
-    def __init__(self, config: Polynomial, count: int, outputs: int = 3) -> None:
+    def __init__(self, config: PolynomialConfig, n_features: int, n_outputs: int = 3) -> None:
         super().__init__()
         self.degree = config.degree
-        chosen = list(combinations_with_replacement(range(count + 1), config.degree))
+        index_tuples = list(combinations_with_replacement(range(n_features + 1), config.degree))
         # multinomial coefficients
-        repeats = [prod(map(factorial, Counter(numbers).values())) for numbers in chosen]
-        weights = [factorial(config.degree) // count for count in repeats]
+        repeat_counts = [
+            prod(map(factorial, Counter(index_tuple).values())) for index_tuple in index_tuples
+        ]
+        weights = [factorial(config.degree) // n_features for n_features in repeat_counts]
         self.index = nn.Buffer(
-            torch.tensor(chosen, dtype=torch.long).T.contiguous(), persistent=False
+            torch.tensor(index_tuples, dtype=torch.long).T.contiguous(), persistent=False
         )
         self.weight = nn.Buffer(torch.tensor(weights, dtype=torch.float64).sqrt(), persistent=False)
-        self.coefficients = nn.Buffer(torch.zeros(len(chosen), outputs, dtype=torch.float64))
+        self.coefficients = nn.Buffer(
+            torch.zeros(len(index_tuples), n_outputs, dtype=torch.float64)
+        )
         self.slope, self.constant = config.slope**0.5, config.constant**0.5
 
-    def products(self, x: Tensor) -> Tensor:
+    def weighted_products(self, x: Tensor) -> Tensor:
         """Return the weighted products [..., P] of inputs [..., F], whose inner product it is."""
-        joined = torch.cat((torch.full_like(x[..., :1], self.constant), x * self.slope), dim=-1)
-        out = self.weight.to(x.dtype) * joined.index_select(-1, self.index[0])
+        augmented = torch.cat((torch.full_like(x[..., :1], self.constant), x * self.slope), dim=-1)
+        values = self.weight.to(x.dtype) * augmented.index_select(-1, self.index[0])
         for i in range(1, self.degree):
-            out = out * joined.index_select(-1, self.index[i])
-        return out
+            values = values * augmented.index_select(-1, self.index[i])
+        return values
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.products(x) @ self.coefficients.to(x.dtype)
+        return self.weighted_products(x) @ self.coefficients.to(x.dtype)
 
-    def paths(
-        self, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]
-    ) -> list[Path]:
+    def fit_paths(
+        self, x: Tensor, y: Tensor, fold_index: Tensor, n_folds: int, penalties: Sequence[float]
+    ) -> list[RegularizationPath]:
         identity = torch.eye(len(self.coefficients), dtype=torch.float64)
-        return [primal_path(self.products, identity, x, y, fold, folds, penalties)]
+        return [
+            fit_primal_path(self.weighted_products, identity, x, y, fold_index, n_folds, penalties)
+        ]
 
-    def features(self, path: Path, x: Tensor) -> Tensor:
+    def evaluate_features(self, path: RegularizationPath, x: Tensor) -> Tensor:
         """Return the products [N, J] of inputs x [N, F]; they are the same for every path."""
-        return self.products(x)
+        return self.weighted_products(x)
 
-    def selected(
-        self, paths: Sequence[Path], coefficients: Tensor
+    def build_state(
+        self, output_paths: Sequence[RegularizationPath], coefficients: Tensor
     ) -> tuple[dict[str, Any], dict[str, Tensor]]:
         return {}, {"coefficients": coefficients}
 
@@ -314,7 +354,7 @@ class PolynomialKernel(Kernel):
         return {"coefficients": torch.zeros_like(self.coefficients)}
 
 
-class Rbf(Config):
+class RbfConfig(Config):
     """The radial basis functions exp(-|x - x'|^2 / (2 sigma)) of standardised features.
 
     Attributes:
@@ -322,7 +362,7 @@ class Rbf(Config):
         sigma: candidates, in squared standard deviations of a feature (correction M5).
         exact: number of samples up to which all of them carry the function, as in kernel ridge
             regression; with more, landmarks do.
-        landmarks: number of samples that carry the function where there are more than `exact`
+        landmarks: number of samples that carry the function where there are more than `exact_paths`
             (Nystroem's method), spread out by k-means++ seeding.
         seed: seed of the choice of landmarks.
     """
@@ -335,12 +375,12 @@ class Rbf(Config):
     landmarks: int = Field(default=300, ge=2, le=5000)
     seed: int = Field(default=0, ge=0)
 
-    def build(self, count: int, outputs: int = 3) -> RbfKernel:
+    def build(self, n_features: int, n_outputs: int = 3) -> RbfKernel:
         """Return the module for `count` features and a number of outputs."""
-        return RbfKernel(self, count, outputs)
+        return RbfKernel(self, n_features, n_outputs)
 
 
-class Polynomial(Config):
+class PolynomialConfig(Config):
     """The polynomial kernel (slope x'x' + constant)^degree of standardised features.
 
     Degree 1 is ridge regression.
@@ -357,37 +397,39 @@ class Polynomial(Config):
     slope: float = Field(default=1.0, gt=0)
     constant: float = Field(default=1.0, ge=0)
 
-    def build(self, count: int, outputs: int = 3) -> PolynomialKernel:
+    def build(self, n_features: int, n_outputs: int = 3) -> PolynomialKernel:
         """Return the module for `count` features and a number of outputs."""
-        return PolynomialKernel(self, count, outputs)
+        return PolynomialKernel(self, n_features, n_outputs)
 
 
 def squared_distances(x: Tensor, points: Tensor) -> Tensor:
     """Return |x - x_i|^2 [..., M] between inputs [..., F] and points [M, F]."""
-    square = (x * x).sum(-1, keepdim=True) + (points * points).sum(-1)
-    return (square - 2.0 * (x @ points.T)).clamp(min=0.0)
+    squared_norms = (x * x).sum(-1, keepdim=True) + (points * points).sum(-1)
+    return (squared_norms - 2.0 * (x @ points.T)).clamp(min=0.0)
 
 
-def spread_out(x: Tensor, count: int, seed: int) -> Tensor:
+def kmeans_plus_plus_indices(x: Tensor, n_points: int, seed: int) -> Tensor:
     """Return the indices [count] of samples that lie apart (k-means++).
 
     Each is drawn with a chance that grows with its squared distance to those before. There are
     fewer than `count` where the samples have no more different values.
     """
-    random = torch.Generator().manual_seed(seed)
-    first = int(torch.randint(len(x), (1,), generator=random))
-    nearest = (x - x[first]).square().sum(-1)
-    found = [first]
-    while len(found) < count and float(nearest.max()) > 0:
+    generator = torch.Generator().manual_seed(seed)
+    first_index = int(torch.randint(len(x), (1,), generator=generator))
+    squared_distance = (x - x[first_index]).square().sum(-1)
+    indices = [first_index]
+    while len(indices) < n_points and float(squared_distance.max()) > 0:
         # by its cumulated sum: multinomial takes no more than 2^24 samples
-        total = nearest.cumsum(0)
-        draw = torch.rand(1, generator=random, dtype=x.dtype) * total[-1]
-        found.append(min(int(torch.searchsorted(total, draw, right=True)), len(x) - 1))
-        nearest = torch.minimum(nearest, (x - x[found[-1]]).square().sum(-1))
-    return torch.tensor(found)
+        cumulative_distance = squared_distance.cumsum(0)
+        random_draw = torch.rand(1, generator=generator, dtype=x.dtype) * cumulative_distance[-1]
+        indices.append(
+            min(int(torch.searchsorted(cumulative_distance, random_draw, right=True)), len(x) - 1)
+        )
+        squared_distance = torch.minimum(squared_distance, (x - x[indices[-1]]).square().sum(-1))
+    return torch.tensor(indices)
 
 
-class Recursion:
+class RecursiveErrors:
     """Errors of a fit whose output integrates into one of its inputs, the others as measured.
 
     This is the first approach of document 001, section 4. Tuned so, each model looks good for
@@ -397,8 +439,8 @@ class Recursion:
     Args:
         z: inputs of the fit [N, nz].
         target: outputs of the fit [N, n].
-        stretch: number of the unbroken stretch of each sample, ascending [N].
-        step: time between neighbouring samples, s.
+        segment: number of the unbroken stretch of each sample, ascending [N].
+        time_step: time between neighbouring samples, s.
         states: column of z that each output is the derivative of, [n].
 
     Raises:
@@ -406,53 +448,59 @@ class Recursion:
     """
 
     def __init__(
-        self, z: Tensor, target: Tensor, stretch: Tensor, step: float, states: Sequence[int]
+        self, z: Tensor, target: Tensor, segment: Tensor, time_step: float, states: Sequence[int]
     ) -> None:
-        lengths = torch.unique_consecutive(stretch, return_counts=True)[1].tolist()
+        lengths = torch.unique_consecutive(segment, return_counts=True)[1].tolist()
         if max(lengths, default=0) < 2:
             raise FitError(
                 "choosing by recursion needs samples that follow each other; the masks leave none"
             )
-        pad = torch.nn.utils.rnn.pad_sequence
-        inside = [torch.ones(length, dtype=torch.bool) for length in lengths]
-        self.inside = pad(inside, batch_first=True)
-        self.z = pad(list(z.split(lengths)), batch_first=True)
-        self.target = pad(list(target.split(lengths)), batch_first=True)
-        self.step = step
+        pad_sequence = torch.nn.utils.rnn.pad_sequence
+        valid_masks = [torch.ones(length, dtype=torch.bool) for length in lengths]
+        self.is_valid = pad_sequence(valid_masks, batch_first=True)
+        self.z = pad_sequence(list(z.split(lengths)), batch_first=True)
+        self.target = pad_sequence(list(target.split(lengths)), batch_first=True)
+        self.time_step = time_step
         self.states = tuple(states)
 
-    def errors(self, output: int, predicted: Callable[[Tensor], Tensor], count: int) -> Tensor:
+    def state_errors(self, output: int, predict: Callable[[Tensor], Tensor], n_fits: int) -> Tensor:
         """Return mean square errors [C] of one state along all stretches, for C fits at once.
 
         What the state's measured derivative holds beside the output, such as the part of a
         baseline, is taken as it was.
 
         Args:
-            predicted: from inputs [C, G, nz] to each fit's output [C, G].
-            count: number of fits C.
+            predict: from inputs [C, G, nz] to each fit's output [C, G].
+            n_fits: number of fits C.
         """
         column = self.states[output]
         measured = self.z[..., column]
-        known = (measured[:, 1:] - measured[:, :-1]) / self.step - self.target[:, :-1, output]
-        middle = float(measured[self.inside].mean())
-        far = _FAR * float(measured[self.inside].std(correction=0))
-        x = measured[:, 0].expand(count, -1).clone()
-        total = torch.zeros(count, dtype=measured.dtype)
+        remaining_derivative = (measured[:, 1:] - measured[:, :-1]) / self.time_step - self.target[
+            :, :-1, output
+        ]
+        state_mean = float(measured[self.is_valid].mean())
+        state_limit = _DIVERGENCE_LIMIT_STD * float(measured[self.is_valid].std(correction=0))
+        x = measured[:, 0].expand(n_fits, -1).clone()
+        squared_error = torch.zeros(n_fits, dtype=measured.dtype)
         for k in range(measured.shape[1] - 1):
-            z = self.z[:, k].expand(count, -1, -1).clone()
+            z = self.z[:, k].expand(n_fits, -1, -1).clone()
             z[..., column] = x
-            x = x + self.step * (known[:, k] + predicted(z))
-            x = middle + (x - middle).nan_to_num(far, far, -far).clamp(-far, far)
+            x = x + self.time_step * (remaining_derivative[:, k] + predict(z))
+            x = state_mean + (x - state_mean).nan_to_num(
+                state_limit, state_limit, -state_limit
+            ).clamp(-state_limit, state_limit)
             error = (x - measured[:, k + 1]).square()
-            total += torch.where(self.inside[:, k + 1], error, torch.zeros_like(x)).sum(-1)
-        return total / int(self.inside[:, 1:].sum())
+            squared_error += torch.where(self.is_valid[:, k + 1], error, torch.zeros_like(x)).sum(
+                -1
+            )
+        return squared_error / int(self.is_valid[:, 1:].sum())
 
 
-Scoring = Callable[[Sequence[Path]], Tensor]
+ScoringFunction = Callable[[Sequence[RegularizationPath]], Tensor]
 """Errors [settings, penalties, n] of fits, one path for each setting of the kernel."""
 
 
-class _Pick(NamedTuple):
+class _SettingIndices(NamedTuple):
     """The kernel's setting and the penalty of each output, by number."""
 
     settings: tuple[int, ...]
@@ -463,7 +511,7 @@ class _Pick(NamedTuple):
 class KernelRidge(Estimator):
     """Kernel ridge regression of every output, without intercept.
 
-    A solution's state is that of the kernel module, and `effective` [n], the effective number of
+    A solution's state is that of the kernel module, and `effective_parameters` [n], the effective number of
     parameters of each output, which is the trace of the smoother.
 
     Args:
@@ -473,7 +521,7 @@ class KernelRidge(Estimator):
         folds: folds of the cross-validation; None for one fold for each group.
         scoring: errors by which each output chooses its setting and penalty; None for the
             cross-validated ones.
-        alternatives: whether `fit` offers every setting and penalty for all outputs together, with
+        has_alternatives: whether `fit` offers every setting and penalty for all outputs together, with
             the neighbours of each, and no function at all, beside its own choice.
     """
 
@@ -483,63 +531,97 @@ class KernelRidge(Estimator):
         penalties: Sequence[float],
         *,
         folds: int | None = 5,
-        scoring: Scoring | None = None,
-        alternatives: bool = False,
+        scoring: ScoringFunction | None = None,
+        has_alternatives: bool = False,
     ) -> None:
         self.kernel = kernel
         self.penalties = tuple(sorted(penalties))
         self.folds = folds
         self.scoring = scoring
-        self.alternatives = alternatives
+        self.has_alternatives = has_alternatives
 
-    def solve(self, data: Data) -> list[Solution]:
-        x, y = whole(data.x), data.y
-        fold = fold_numbers(data.groups, self.folds)
-        folds, count = int(fold.max()) + 1, len(self.penalties)
-        absolute = [penalty * len(x) for penalty in self.penalties]
+    def _solve(self, data: EstimatorData) -> list[Solution]:
+        x, y = to_dense(data.x), data.y
+        fold_index = assign_group_folds(data.groups, self.folds)
+        n_folds, n_penalties = int(fold_index.max()) + 1, len(self.penalties)
+        absolute_penalties = [penalty * len(x) for penalty in self.penalties]
         with torch.no_grad():
-            paths = self.kernel.paths(x, y, fold, folds, absolute)
+            paths = self.kernel.fit_paths(x, y, fold_index, n_folds, absolute_penalties)
         errors = torch.stack([path.errors for path in paths])
         notes: dict[str, Any] = {"cross_validated_error": errors.tolist(), "samples": len(x)}
-        judged = errors
+        selection_errors = errors
         if self.scoring is not None:
-            judged = self.scoring(paths)
-            notes["recursion_error"] = judged.tolist()
-        least, best = torch.nan_to_num(judged, nan=torch.inf).flatten(0, 1).min(0)
-        if not bool(torch.isfinite(least).all()):
+            selection_errors = self.scoring(paths)
+            notes["recursion_error"] = selection_errors.tolist()
+        min_errors, best_indices = (
+            torch.nan_to_num(selection_errors, nan=torch.inf).flatten(0, 1).min(0)
+        )
+        if not bool(torch.isfinite(min_errors).all()):
             raise FitError(
                 "kernel ridge regression: no setting has finite errors; give larger `penalties`"
             )
-        preferred = _Pick(tuple((best // count).tolist()), tuple((best % count).tolist()))
-        if not self.alternatives:
-            return [self._solution(paths, preferred, notes)]
-        n = y.shape[1]
-        picks = [preferred]
-        picks += [_Pick((i,) * n, (j,) * n) for i in range(len(paths)) for j in range(count)]
-        zero = self.kernel.zero_state() | {"effective": y.new_zeros(n)}
-        nothing = Solution({"penalty": []}, zero, notes=notes)
-        return [*(self._solution(paths, pick, notes) for pick in picks), nothing]
+        preferred = _SettingIndices(
+            tuple((best_indices // n_penalties).tolist()),
+            tuple((best_indices % n_penalties).tolist()),
+        )
+        if not self.has_alternatives:
+            return [self._build_solution(paths, preferred, notes)]
+        n_outputs = y.shape[1]
+        candidates = [preferred]
+        candidates += [
+            _SettingIndices((i,) * n_outputs, (j,) * n_outputs)
+            for i in range(len(paths))
+            for j in range(n_penalties)
+        ]
+        zero_state = self.kernel.zero_state() | {"effective": y.new_zeros(n_outputs)}
+        empty_solution = Solution({"penalty": []}, zero_state, notes=notes)
+        return [
+            *(
+                self._build_solution(paths, setting_indices, notes)
+                for setting_indices in candidates
+            ),
+            empty_solution,
+        ]
 
-    def _solution(self, paths: Sequence[Path], pick: _Pick, notes: dict[str, Any]) -> Solution:
-        parts = list(enumerate(zip(pick.settings, pick.penalties, strict=True)))
-        columns = [paths[i].coefficients[j, :, output] for output, (i, j) in parts]
-        effective = torch.stack([paths[i].effective[j] for _, (i, j) in parts])
-        setting, state = self.kernel.selected(
-            [paths[i] for i in pick.settings], torch.stack(columns, dim=1)
+    def _build_solution(
+        self,
+        paths: Sequence[RegularizationPath],
+        setting_indices: _SettingIndices,
+        notes: dict[str, Any],
+    ) -> Solution:
+        output_settings = list(
+            enumerate(zip(setting_indices.settings, setting_indices.penalties, strict=True))
+        )
+        columns = [paths[i].coefficients[j, :, output] for output, (i, j) in output_settings]
+        effective_parameters = torch.stack(
+            [paths[i].effective_parameters[j] for _, (i, j) in output_settings]
+        )
+        kernel_settings, state = self.kernel.build_state(
+            [paths[i] for i in setting_indices.settings], torch.stack(columns, dim=1)
         )
 
         def neighbours() -> list[Solution]:
-            near = []
-            for output, (_, j) in parts:
-                for other in (j - 1, j + 1):
-                    if 0 <= other < len(self.penalties):
-                        before, after = pick.penalties[:output], pick.penalties[output + 1 :]
-                        near.append(pick._replace(penalties=(*before, other, *after)))
-            return [self._solution(paths, other, notes) for other in near]
+            neighbour_indices = []
+            for output, (_, j) in output_settings:
+                for penalty_index in (j - 1, j + 1):
+                    if 0 <= penalty_index < len(self.penalties):
+                        preceding, following = (
+                            setting_indices.penalties[:output],
+                            setting_indices.penalties[output + 1 :],
+                        )
+                        neighbour_indices.append(
+                            setting_indices._replace(
+                                penalties=(*preceding, penalty_index, *following)
+                            )
+                        )
+            return [
+                self._build_solution(paths, penalty_index, notes)
+                for penalty_index in neighbour_indices
+            ]
 
         return Solution(
-            setting | {"penalty": [self.penalties[j] for j in pick.penalties]},
-            state | {"effective": effective},
-            notes=notes | {"effective_parameters": effective.tolist()},
-            neighbours=neighbours if self.alternatives else None,
+            kernel_settings | {"penalty": [self.penalties[j] for j in setting_indices.penalties]},
+            state | {"effective": effective_parameters},
+            notes=notes | {"effective_parameters": effective_parameters.tolist()},
+            neighbours=neighbours if self.has_alternatives else None,
         )

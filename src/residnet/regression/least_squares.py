@@ -14,31 +14,31 @@ from torch import Tensor
 from residnet.core.errors import FitError
 from residnet.regression.estimator import (
     Coefficient,
-    Data,
     Estimator,
+    EstimatorData,
     Regressors,
     Solution,
-    fold_numbers,
-    pieces,
-    require_more,
-    whole,
+    assign_group_folds,
+    iterate_chunks,
+    require_overdetermined,
+    to_dense,
 )
 
-_COLLINEAR = 1e-9
+_COLLINEARITY_TOLERANCE = 1e-9
 """Share of the largest singular value below which centred columns count as collinear."""
-_NAMED = 0.1
+_MIN_COLLINEAR_LOAD = 0.1
 """Share of the largest load from which a column is named among collinear ones."""
-_ROUNDING = 10
+_ROUNDING_FACTOR = 10
 """What rounding leaves of a zero eigenvalue, in units of columns times machine precision."""
-_TINY = 1e-300
+_MIN_EIGENVALUE = 1e-300
 """Least eigenvalue that a condition number is divided by."""
-_PENALTIES = 40
+_N_PENALTIES = 40
 """Number of penalties on scikit-learn's own path of the elastic net."""
-_ITERATIONS = 3000
+_MAX_ITERATIONS = 3000
 """Most rounds of coordinate descent for one penalty."""
 _TOLERANCE = 1e-4
 """Gap to the optimum at which coordinate descent ends."""
-_LEAST_DAMPING, _ATTEMPTS = 1e-8, 8
+_MIN_DAMPING, _MAX_DAMPING_TRIALS = 1e-8, 8
 """Damping that changes no digit of a step that matters, and dampings tried before a point counts as
 the minimum."""
 
@@ -62,47 +62,60 @@ class LeastSquares(Estimator):
     def __init__(self, penalties: Sequence[float] = (0.0,)) -> None:
         self.penalties = tuple(penalties)
 
-    def solve(self, data: Data) -> list[Solution]:
+    def _solve(self, data: EstimatorData) -> list[Solution]:
         x, y, groups, names, outputs = data
-        n, j = x.shape
-        require_more(x, f"coefficients ({', '.join(names)})")
-        scale = _sum(x, lambda _, part: part.square().sum(0)).div(n).sqrt()
+        n_samples, n_columns = x.shape
+        require_overdetermined(x, f"coefficients ({', '.join(names)})")
+        scale = _sum_over_chunks(x, lambda _, chunk: chunk.square().sum(0)).div(n_samples).sqrt()
         if bool((scale <= 0).any()):
-            dead = [name for name, s in zip(names, scale.tolist(), strict=True) if s <= 0]
+            zero_columns = [
+                name
+                for name, column_scale in zip(names, scale.tolist(), strict=True)
+                if column_scale <= 0
+            ]
             raise FitError(
-                f"regressor '{dead[0]}' is zero in all {n} samples; the data do not excite it:"
+                f"regressor '{zero_columns[0]}' is zero in all {n_samples} samples; the data do not excite it:"
                 " leave it out or log it"
             )
-        gram = _sum(x, lambda _, part: (part / scale).T @ (part / scale)) / n
-        cross = _sum(x, lambda rows, part: (part / scale).T @ y[rows]) / n
-        values, vectors = torch.linalg.eigh(gram)
-        condition = float(torch.sqrt(values[-1] / values[0].clamp(min=_TINY)))
-        rounding = _ROUNDING * len(names) * torch.finfo(gram.dtype).eps * float(values[-1])
-        if float(values[0]) + min(self.penalties) < rounding:
-            worst = [names[i] for i in vectors[:, 0].abs().argsort(descending=True)[:2].tolist()]
+        gram = _sum_over_chunks(x, lambda _, chunk: (chunk / scale).T @ (chunk / scale)) / n_samples
+        cross = _sum_over_chunks(x, lambda rows, chunk: (chunk / scale).T @ y[rows]) / n_samples
+        eigenvalues, eigenvectors = torch.linalg.eigh(gram)
+        condition = float(torch.sqrt(eigenvalues[-1] / eigenvalues[0].clamp(min=_MIN_EIGENVALUE)))
+        rounding_error = (
+            _ROUNDING_FACTOR * len(names) * torch.finfo(gram.dtype).eps * float(eigenvalues[-1])
+        )
+        if float(eigenvalues[0]) + min(self.penalties) < rounding_error:
+            collinear_names = [
+                names[i] for i in eigenvectors[:, 0].abs().argsort(descending=True)[:2].tolist()
+            ]
             raise FitError(
-                f"the data cannot tell apart regressors '{worst[0]}' and '{worst[1]}' (condition"
+                f"the data cannot tell apart regressors '{collinear_names[0]}' and '{collinear_names[1]}' (condition"
                 f" {condition:.1e}); leave one out, excite them separately, or give a ridge penalty"
             )
         solutions = []
         for penalty in self.penalties:
-            inverse = torch.linalg.inv(gram + penalty * torch.eye(j, dtype=y.dtype))
+            inverse = torch.linalg.inv(gram + penalty * torch.eye(n_columns, dtype=y.dtype))
             coefficients = inverse @ cross
-            score = _score_spreads(x, y, scale, coefficients, gram, groups)
-            covariance = inverse @ score @ inverse / n**2 / torch.outer(scale, scale)
-            found = Solution(
+            score_covariance = _score_covariance(x, y, scale, coefficients, gram, groups)
+            covariance = (
+                inverse @ score_covariance @ inverse / n_samples**2 / torch.outer(scale, scale)
+            )
+            solution = Solution(
                 {"ridge": penalty} if len(self.penalties) > 1 else {},
                 {"coefficients": coefficients / scale[:, None]},
                 notes={"condition": condition},
                 covariance=covariance,
             )
-            estimates, errors = found.coefficients.tolist(), found.errors.tolist()
-            table = tuple(
-                Coefficient(output, name, estimates[j][k], errors[j][k])
-                for k, output in enumerate(outputs)
-                for j, name in enumerate(names)
+            estimates, standard_errors = (
+                solution.coefficients.tolist(),
+                solution.standard_errors.tolist(),
             )
-            solutions.append(replace(found, table=table))
+            table = tuple(
+                Coefficient(output, name, estimates[n_columns][k], standard_errors[n_columns][k])
+                for k, output in enumerate(outputs)
+                for n_columns, name in enumerate(names)
+            )
+            solutions.append(replace(solution, table=table))
         return solutions
 
 
@@ -113,22 +126,28 @@ class CentredLeastSquares(Estimator):
     A QR factor keeps the digits of nearly collinear columns that a Gram matrix loses.
     """
 
-    def solve(self, data: Data) -> list[Solution]:
-        x, y, names = whole(data.x), data.y, data.names
-        require_more(x, "basis functions")
+    def _solve(self, data: EstimatorData) -> list[Solution]:
+        x, y, names = to_dense(data.x), data.y, data.names
+        require_overdetermined(x, "basis functions")
         mean_x, mean_y = x.mean(0), y.mean(0)
-        e, f = x - mean_x, y - mean_y
-        _, singular, right = torch.linalg.svd(e, full_matrices=False)
-        if float(singular[-1]) <= _COLLINEAR * float(singular[0]):
-            loads = right[-1].abs()
-            which = (loads > _NAMED * loads.max()).nonzero()[:, 0].tolist()
+        x_centred, y_centred = x - mean_x, y - mean_y
+        _, singular_values, right_vectors = torch.linalg.svd(x_centred, full_matrices=False)
+        if float(singular_values[-1]) <= _COLLINEARITY_TOLERANCE * float(singular_values[0]):
+            column_loads = right_vectors[-1].abs()
+            collinear_columns = (
+                (column_loads > _MIN_COLLINEAR_LOAD * column_loads.max()).nonzero()[:, 0].tolist()
+            )
             raise FitError(
-                f"basis functions {', '.join(names[j] for j in which)} are collinear over these"
+                f"basis functions {', '.join(names[j] for j in collinear_columns)} are collinear over these"
                 " samples; leave one out, or use ridge or plsr"
             )
-        coefficients = torch.linalg.lstsq(e, f).solution
+        coefficients = torch.linalg.lstsq(x_centred, y_centred).solution
         state = {"coefficients": coefficients, "intercept": mean_y - mean_x @ coefficients}
-        return [Solution({}, state, notes={"condition": float(singular[0] / singular[-1])})]
+        return [
+            Solution(
+                {}, state, notes={"condition": float(singular_values[0] / singular_values[-1])}
+            )
+        ]
 
 
 @final
@@ -146,34 +165,34 @@ class ElasticNet(Estimator):
         self.l1_ratio = l1_ratio
         self.folds = folds
 
-    def solve(self, data: Data) -> list[Solution]:
+    def _solve(self, data: EstimatorData) -> list[Solution]:
         # scikit-learn takes a second to import
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.linear_model import ElasticNetCV
 
-        x, y = whole(data.x), data.y
-        fold = fold_numbers(data.groups, self.folds)
-        parts = [
-            ((fold != k).nonzero()[:, 0].numpy(), (fold == k).nonzero()[:, 0].numpy())
-            for k in range(int(fold.max()) + 1)
+        x, y = to_dense(data.x), data.y
+        fold_index = assign_group_folds(data.groups, self.folds)
+        cv_splits = [
+            ((fold_index != k).nonzero()[:, 0].numpy(), (fold_index == k).nonzero()[:, 0].numpy())
+            for k in range(int(fold_index.max()) + 1)
         ]
         coefficients, intercepts, penalties = [], [], []
         for output in range(y.shape[1]):
-            model = ElasticNetCV(
+            elastic_net = ElasticNetCV(
                 l1_ratio=self.l1_ratio,
-                cv=parts,
-                alphas=_PENALTIES,
-                max_iter=_ITERATIONS,
+                cv=cv_splits,
+                alphas=_N_PENALTIES,
+                max_iter=_MAX_ITERATIONS,
                 tol=_TOLERANCE,
             )
             with warnings.catch_warnings():
                 # the smallest penalties of the path need not converge: cross-validation leaves
                 # them behind
                 warnings.simplefilter("ignore", ConvergenceWarning)
-                model.fit(x.numpy(), y[:, output].numpy())
-            coefficients.append(torch.from_numpy(model.coef_))
-            intercepts.append(float(model.intercept_))
-            penalties.append(float(model.alpha_))
+                elastic_net.fit(x.numpy(), y[:, output].numpy())
+            coefficients.append(torch.from_numpy(elastic_net.coef_))
+            intercepts.append(float(elastic_net.intercept_))
+            penalties.append(float(elastic_net.alpha_))
         state = {
             "coefficients": torch.stack(coefficients, dim=1),
             "intercept": torch.tensor(intercepts, dtype=y.dtype),
@@ -181,7 +200,7 @@ class ElasticNet(Estimator):
         return [Solution({"alpha": penalties}, state)]
 
 
-def _score_spreads(
+def _score_covariance(
     x: Regressors,
     y: Tensor,
     scale: Tensor,
@@ -193,72 +212,78 @@ def _score_spreads(
 
     It is taken over groups where there are at least two, else as of independent residuals.
     """
-    samples, j = x.shape
-    outputs = y.shape[1]
-    present, index = (
+    n_samples, n_columns = x.shape
+    n_outputs = y.shape[1]
+    unique_groups, group_index = (
         torch.unique(groups, return_inverse=True) if groups is not None else (y[:0, 0], None)
     )
-    count = int(present.numel())
-    if index is None or count < 2:
-        left = _sum(x, lambda rows, part: (y[rows] - part / scale @ coefficients).square().sum(0))
-        return gram * (left / (samples - j) * samples)[:, None, None]
-    total = torch.zeros(outputs, count, j, dtype=y.dtype)
-    for rows, part in pieces(x):
-        a = part / scale
-        residual = y[rows] - a @ coefficients
-        for k in range(outputs):
-            total[k].index_add_(0, index[rows], a * residual[:, [k]])
-    return total.transpose(1, 2) @ total * count / (count - 1)
+    n_groups = int(unique_groups.numel())
+    if group_index is None or n_groups < 2:
+        residual_sum_of_squares = _sum_over_chunks(
+            x, lambda rows, part: (y[rows] - part / scale @ coefficients).square().sum(0)
+        )
+        return gram * (residual_sum_of_squares / (n_samples - n_columns) * n_samples)[:, None, None]
+    group_scores = torch.zeros(n_outputs, n_groups, n_columns, dtype=y.dtype)
+    for rows, chunk in iterate_chunks(x):
+        scaled_columns = chunk / scale
+        residual = y[rows] - scaled_columns @ coefficients
+        for k in range(n_outputs):
+            group_scores[k].index_add_(0, group_index[rows], scaled_columns * residual[:, [k]])
+    return group_scores.transpose(1, 2) @ group_scores * n_groups / (n_groups - 1)
 
 
-def _sum(x: Regressors, of: Callable[[slice, Tensor], Tensor]) -> Tensor:
+def _sum_over_chunks(x: Regressors, contribution: Callable[[slice, Tensor], Tensor]) -> Tensor:
     """Return the sum of what each piece of regressors gives."""
-    parts = iter(pieces(x))
-    rows, part = next(parts)
-    total = of(rows, part)
-    for rows, part in parts:
-        total = total + of(rows, part)
+    chunks = iter(iterate_chunks(x))
+    rows, chunk = next(chunks)
+    total = contribution(rows, chunk)
+    for rows, chunk in chunks:
+        total = total + contribution(rows, chunk)
     return total
 
 
 @dataclass(frozen=True)
-class Descent(Generic[Point]):
+class DescentResult(Generic[Point]):
     """Where a descent ended, and how many steps it took."""
 
-    point: Point
-    steps: int
+    minimizer: Point
+    n_steps: int
 
 
-def descend(
-    begin: Point,
-    near: Callable[[Point], tuple[float, Callable[[float], tuple[float, Point]]]],
-    iterations: int,
+def minimize_levenberg_marquardt(
+    initial_point: Point,
+    linearize: Callable[[Point], tuple[float, Callable[[float], tuple[float, Point]]]],
+    max_iterations: int,
     *,
-    gain: float,
+    min_relative_decrease: float,
     damping: float = 1e-3,
-) -> Descent[Point]:
+) -> DescentResult[Point]:
     """Descend to a minimum by Levenberg's and Marquardt's method.
 
     Args:
-        begin: where the descent begins, whatever a point is.
-        near: linearises the problem at a point. It gives the cost there, and what a step with a
+        initial_point: where the descent begins, whatever a point is.
+        linearize: linearises the problem at a point. It gives the cost there, and what a step with a
             damping leads to: the cost at its end, and the point itself.
-        iterations: most steps.
-        gain: share of the cost that a step must gain for another one.
+        max_iterations: most steps.
+        min_relative_decrease: share of the cost that a step must gain for another one.
         damping: of the first step, in units of the Hessian's diagonal; a tenth after a step that
             gains, ten times after one that does not. 0 for Gauss-Newton as long as that gains.
     """
-    point, steps = begin, 0
-    while steps < iterations:
-        cost, trial = near(point)
-        for _ in range(_ATTEMPTS):
-            reached, moved = trial(damping)
-            if math.isfinite(reached) and reached < cost:
+    point, n_steps = initial_point, 0
+    while n_steps < max_iterations:
+        cost, try_step = linearize(point)
+        for _ in range(_MAX_DAMPING_TRIALS):
+            trial_cost, trial_point = try_step(damping)
+            if math.isfinite(trial_cost) and trial_cost < cost:
                 break
-            damping = max(10.0 * damping, _LEAST_DAMPING)
+            damping = max(10.0 * damping, _MIN_DAMPING)
         else:
             break
-        point, steps, damping = moved, steps + 1, max(damping / 10.0, min(damping, _LEAST_DAMPING))
-        if cost - reached < gain * abs(cost):
+        point, n_steps, damping = (
+            trial_point,
+            n_steps + 1,
+            max(damping / 10.0, min(damping, _MIN_DAMPING)),
+        )
+        if cost - trial_cost < min_relative_decrease * abs(cost):
             break
-    return Descent(point, steps)
+    return DescentResult(point, n_steps)

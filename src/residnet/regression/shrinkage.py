@@ -14,43 +14,43 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import FitError
-from residnet.core.samples import Tally
+from residnet.core.samples import RunningMoments
 from residnet.regression.estimator import (
-    Data,
     Estimator,
+    EstimatorData,
     Regressors,
     Solution,
-    fold_numbers,
-    pieces,
-    require_more,
+    assign_group_folds,
+    iterate_chunks,
+    require_overdetermined,
 )
 
-CONSTANT = 1e-9
+CONSTANT_TOLERANCE = 1e-9
 """Standard deviation below which, in units of its largest value, a column counts as constant."""
-_LEAST_ENERGY = 1e-13
+_MIN_LATENT_ENERGY = 1e-13
 """Least energy of a latent variable in units of a column's: below it are rounding and columns that
 are sums of others, without a meaning.
 """
-_EXPLAINED = 1e-13
+_EXPLAINED_TOLERANCE = 1e-13
 """Share of the covariance up to which nothing is left to explain."""
-_TINY = 1e-300
+_MIN_NORM = 1e-300
 """Least length that a vector is divided by."""
-_EACH_ORDER = 8
+_MAX_CONSECUTIVE_ORDER = 8
 """Order up to which every order is offered as an alternative; above, steps of a quarter."""
 
 
-class Centred(NamedTuple):
+class CentredMoments(NamedTuple):
     """Moments about the means of a part of the samples.
 
     Attributes:
-        samples: number of samples.
+        n_samples: number of samples.
         mean_x: mean of x [J], less the shift of the moments.
         mean_y: mean of y [n], less the shift of the moments.
         xx: X'X about the means [J, J].
         xy: X'Y about the means [J, n].
     """
 
-    samples: float
+    n_samples: float
     mean_x: Tensor
     mean_y: Tensor
     xx: Tensor
@@ -73,92 +73,118 @@ class FoldMoments:
         self.sums = sums
         self.shift_x = shift_x
         self.shift_y = shift_y
-        self.folds = sums.shape[0]
-        self.regressors = shift_x.numel()
+        self.n_folds = sums.shape[0]
+        self.n_regressors = shift_x.numel()
 
     @classmethod
-    def gather(cls, x: Regressors, y: Tensor, fold: Tensor, folds: int) -> FoldMoments:
+    def from_samples(
+        cls, x: Regressors, y: Tensor, fold_index: Tensor, n_folds: int
+    ) -> FoldMoments:
         """Return the moments of x [N, J] and y [N, n], with the fold of each sample [N].
 
         A column that varies by rounding alone counts as zero, so that it gets no coefficient
         instead of a huge one.
         """
-        tally = Tally(x.shape[1])
-        for _, part in pieces(x):
-            tally.add(part)
-        largest = torch.maximum(tally.low.abs(), tally.high.abs())
-        constant = tally.std(correction=1) <= CONSTANT * largest
-        shift_x, shift_y = tally.mean.masked_fill(constant, 0.0), y.mean(0)
+        column_moments = RunningMoments(x.shape[1])
+        for _, chunk in iterate_chunks(x):
+            column_moments.add_rows(chunk)
+        max_abs = torch.maximum(column_moments.minimum.abs(), column_moments.maximum.abs())
+        is_constant = column_moments.std(correction=1) <= CONSTANT_TOLERANCE * max_abs
+        shift_x, shift_y = column_moments.mean.masked_fill(is_constant, 0.0), y.mean(0)
         width = 1 + shift_x.numel() + shift_y.numel()
-        sums = torch.zeros(folds, width, width, dtype=y.dtype)
-        for rows, part in pieces(x):
-            there, of = y[rows], fold[rows]
-            part = part.masked_fill(constant, 0.0)
-            joined = torch.cat((torch.ones_like(there[:, :1]), part - shift_x, there - shift_y), 1)
-            sums += torch.stack([joined[of == f].T @ joined[of == f] for f in range(folds)])
+        sums = torch.zeros(n_folds, width, width, dtype=y.dtype)
+        for rows, chunk in iterate_chunks(x):
+            outputs_chunk, fold_chunk = y[rows], fold_index[rows]
+            chunk = chunk.masked_fill(is_constant, 0.0)
+            augmented = torch.cat(
+                (torch.ones_like(outputs_chunk[:, :1]), chunk - shift_x, outputs_chunk - shift_y), 1
+            )
+            sums += torch.stack(
+                [augmented[fold_chunk == f].T @ augmented[fold_chunk == f] for f in range(n_folds)]
+            )
         return cls(sums, shift_x, shift_y)
 
     @classmethod
-    def checked(
-        cls, x: Regressors, y: Tensor, groups: Tensor | None, folds: int | None
+    def from_grouped_samples(
+        cls, x: Regressors, y: Tensor, groups: Tensor | None, n_folds: int | None
     ) -> FoldMoments:
         """Return the moments for an estimator, in one fold where `groups` is None.
 
         Raises:
             FitError: with too few groups, or no more samples than columns.
         """
-        fold = fold_numbers(groups, folds) if groups is not None else y.new_zeros(len(x))
-        require_more(x, "basis functions")
-        return cls.gather(x, y, fold, int(fold.max()) + 1)
+        fold_index = (
+            assign_group_folds(groups, n_folds) if groups is not None else y.new_zeros(len(x))
+        )
+        require_overdetermined(x, "basis functions")
+        return cls.from_samples(x, y, fold_index, int(fold_index.max()) + 1)
 
-    def centred(self, total: Tensor) -> Centred:
+    def centre(self, summed_moments: Tensor) -> CentredMoments:
         """Return the moments about the means, from summed moments."""
-        j = self.regressors
-        n = float(total[0, 0])
-        mean = total[0, 1:] / n
-        cross = total[1:, 1:] - n * torch.outer(mean, mean)
-        return Centred(n, mean[:j], mean[j:], cross[:j, :j], cross[:j, j:])
+        n_regressors = self.n_regressors
+        n_samples = float(summed_moments[0, 0])
+        mean = summed_moments[0, 1:] / n_samples
+        cross = summed_moments[1:, 1:] - n_samples * torch.outer(mean, mean)
+        return CentredMoments(
+            n_samples,
+            mean[:n_regressors],
+            mean[n_regressors:],
+            cross[:n_regressors, :n_regressors],
+            cross[:n_regressors, n_regressors:],
+        )
 
-    def squared_error(self, fold: int, coefficients: Tensor, part: Centred) -> Tensor:
+    def fold_squared_error(
+        self, fold: int, coefficients: Tensor, training_moments: CentredMoments
+    ) -> Tensor:
         """Return the sums of squared errors on one fold [C, n] of models about a part's means.
 
         Their coefficients are [C, J, n].
         """
-        j = self.regressors
-        s = self.sums[fold]
-        intercept = part.mean_y - torch.einsum("j,cjk->ck", part.mean_x, coefficients)
+        n_regressors = self.n_regressors
+        fold_sums = self.sums[fold]
+        intercept = training_moments.mean_y - torch.einsum(
+            "j,cjk->ck", training_moments.mean_x, coefficients
+        )
         weights = torch.cat((intercept[:, None, :], coefficients), dim=1)
-        xx, xy, yy = s[: j + 1, : j + 1], s[: j + 1, j + 1 :], s[j + 1 :, j + 1 :].diagonal()
-        quadratic = torch.einsum("cik,ij,cjk->ck", weights, xx, weights)
-        return yy - 2 * torch.einsum("cik,ik->ck", weights, xy) + quadratic
+        xx, xy, yy = (
+            fold_sums[: n_regressors + 1, : n_regressors + 1],
+            fold_sums[: n_regressors + 1, n_regressors + 1 :],
+            fold_sums[n_regressors + 1 :, n_regressors + 1 :].diagonal(),
+        )
+        quadratic_form = torch.einsum("cik,ij,cjk->ck", weights, xx, weights)
+        return yy - 2 * torch.einsum("cik,ik->ck", weights, xy) + quadratic_form
 
-    def variance(self) -> Tensor:
+    def output_variance(self) -> Tensor:
         """Return the variance of each output over all samples [n]."""
-        j, total = self.regressors, self.sums.sum(0)
-        return total[j + 1 :, j + 1 :].diagonal() / total[0, 0]
+        n_regressors, summed_moments = self.n_regressors, self.sums.sum(0)
+        return (
+            summed_moments[n_regressors + 1 :, n_regressors + 1 :].diagonal() / summed_moments[0, 0]
+        )
 
 
-class _PathEstimator(Estimator):
+class _RegularizationPathEstimator(Estimator):
     """An estimator whose models of all complexities come from moments, with an intercept.
 
     Args:
         folds: folds of the cross-validation; None for one fold for each group.
-        scale: whether columns are scaled to unit variance; else they are only centred.
-        alternatives: whether `fit` offers other complexities, and no coefficients at all, beside
+        is_scaled: whether columns are scaled to unit variance; else they are only centred.
+        has_alternatives: whether `fit` offers other complexities, and no coefficients at all, beside
             its own choice.
     """
 
-    def __init__(self, *, folds: int | None, scale: bool, alternatives: bool) -> None:
+    def __init__(self, *, folds: int | None, is_scaled: bool, has_alternatives: bool) -> None:
         self.folds = folds
-        self.scale = scale
-        self.alternatives = alternatives
+        self.is_scaled = is_scaled
+        self.has_alternatives = has_alternatives
 
     @abstractmethod
-    def path(self, xx: Tensor, xy: Tensor, samples: float) -> Tensor:
+    def compute_path(self, xx: Tensor, xy: Tensor, n_samples: float) -> Tensor:
         """Return the coefficients [C, J, n] of C complexities, from moments of scaled columns."""
 
     @abstractmethod
-    def choices(self, errors: Tensor | None, variance: Tensor, count: int) -> list[list[int]]:
+    def select_complexities(
+        self, errors: Tensor | None, variance: Tensor, n_complexities: int
+    ) -> list[list[int]]:
         """Return the complexity of each output [n], the preferred ones first.
 
         Args:
@@ -167,64 +193,79 @@ class _PathEstimator(Estimator):
         """
 
     @abstractmethod
-    def named(self, pick: Sequence[int]) -> dict[str, Any]:
+    def describe_complexity(self, complexities: Sequence[int]) -> dict[str, Any]:
         """Return what sets the complexities of the outputs apart; none for an empty list."""
 
-    def notes(self, errors: Tensor, variance: Tensor) -> dict[str, Any]:
+    def fit_notes(self, errors: Tensor, variance: Tensor) -> dict[str, Any]:
         """Return what there is to say about cross-validated errors [C, n]."""
         return {"cross_validated_error": errors.tolist()}
 
     @final
-    def solve(self, data: Data) -> list[Solution]:
+    def _solve(self, data: EstimatorData) -> list[Solution]:
         """Return the solution of the least cross-validated error, then the alternatives.
 
         Without groups there is no cross-validation, and nothing may be left to choose.
         """
         x, y, groups, _, _ = data
-        moments = FoldMoments.checked(x, y, groups, self.folds)
-        variance = moments.variance()
-        varies = variance > (CONSTANT * moments.shift_y).square()
-        variance = torch.where(varies, variance, torch.inf)
+        moments = FoldMoments.from_grouped_samples(x, y, groups, self.folds)
+        variance = moments.output_variance()
+        is_varying = variance > (CONSTANT_TOLERANCE * moments.shift_y).square()
+        variance = torch.where(is_varying, variance, torch.inf)
         notes: dict[str, Any] = {"terms": x.shape[1]}
-        n = y.shape[1]
-        zero = {"coefficients": y.new_zeros(x.shape[1], n), "intercept": y.new_zeros(n)}
-        total = moments.sums.sum(0)
-        whole = moments.centred(total)
-        found, errors = self._models(whole), None
+        n_outputs = y.shape[1]
+        zero_state = {
+            "coefficients": y.new_zeros(x.shape[1], n_outputs),
+            "intercept": y.new_zeros(n_outputs),
+        }
+        summed_moments = moments.sums.sum(0)
+        all_moments = moments.centre(summed_moments)
+        path, errors = self._fit_path(all_moments), None
         if groups is not None:
-            parts = [moments.centred(total - one) for one in moments.sums]
-            models = [self._models(part) for part in parts]
-            count = min(len(model) for model in models)
-            squares = [
-                moments.squared_error(f, model[:count], part)
-                for f, (model, part) in enumerate(zip(models, parts, strict=True))
+            training_moments = [
+                moments.centre(summed_moments - fold_sums) for fold_sums in moments.sums
             ]
-            errors = torch.stack(squares).sum(0) / moments.sums[:, 0, 0].sum()
-            found = found[:count]
-            notes = self.notes(errors, variance) | notes if count else notes
-        nothing = Solution(self.named([]), zero, notes=notes)
-        if len(found) == 0:
-            return [nothing]
+            fold_paths = [
+                self._fit_path(fold_training_moments) for fold_training_moments in training_moments
+            ]
+            n_complexities = min(len(fold_path) for fold_path in fold_paths)
+            squared_errors = [
+                moments.fold_squared_error(f, fold_path[:n_complexities], fold_training_moments)
+                for f, (fold_path, fold_training_moments) in enumerate(
+                    zip(fold_paths, training_moments, strict=True)
+                )
+            ]
+            errors = torch.stack(squared_errors).sum(0) / moments.sums[:, 0, 0].sum()
+            path = path[:n_complexities]
+            notes = self.fit_notes(errors, variance) | notes if n_complexities else notes
+        empty_solution = Solution(self.describe_complexity([]), zero_state, notes=notes)
+        if len(path) == 0:
+            return [empty_solution]
         solutions = []
-        for pick in self.choices(errors, variance, len(found)):
-            columns = torch.stack([found[i, :, output] for output, i in enumerate(pick)], dim=1)
-            intercept = whole.mean_y + moments.shift_y - (whole.mean_x + moments.shift_x) @ columns
+        for complexities in self.select_complexities(errors, variance, len(path)):
+            columns = torch.stack(
+                [path[i, :, output] for output, i in enumerate(complexities)], dim=1
+            )
+            intercept = (
+                all_moments.mean_y
+                + moments.shift_y
+                - (all_moments.mean_x + moments.shift_x) @ columns
+            )
             state = {"coefficients": columns, "intercept": intercept}
-            solutions.append(Solution(self.named(pick), state, notes=notes))
-        return [*solutions, nothing] if self.alternatives else solutions
+            solutions.append(Solution(self.describe_complexity(complexities), state, notes=notes))
+        return [*solutions, empty_solution] if self.has_alternatives else solutions
 
-    def _models(self, part: Centred) -> Tensor:
+    def _fit_path(self, moments: CentredMoments) -> Tensor:
         """Return the coefficients [C, J, n] of all complexities."""
-        scale = torch.ones_like(part.mean_x)
-        if self.scale:
-            scale = (part.xx.diagonal() / part.samples).sqrt()
+        scale = torch.ones_like(moments.mean_x)
+        if self.is_scaled:
+            scale = (moments.xx.diagonal() / moments.n_samples).sqrt()
             scale = torch.where(scale > 0, scale, torch.ones_like(scale))
-        xx, xy = part.xx / torch.outer(scale, scale), part.xy / scale[:, None]
-        return self.path(xx, xy, part.samples) / scale[None, :, None]
+        xx, xy = moments.xx / torch.outer(scale, scale), moments.xy / scale[:, None]
+        return self.compute_path(xx, xy, moments.n_samples) / scale[None, :, None]
 
 
 @final
-class Ridge(_PathEstimator):
+class Ridge(_RegularizationPathEstimator):
     """Ridge regression of every output, with an intercept that is not penalised.
 
     The choice of no coefficients has an empty list of penalties.
@@ -233,10 +274,10 @@ class Ridge(_PathEstimator):
         penalties: candidates, in units of a standardised column's energy: alpha = penalty N in
             scikit-learn's terms.
         folds: folds of the cross-validation that chooses; None for one fold for each group.
-        scale: whether columns are scaled to unit variance; else they are only centred.
-        shared: whether all outputs share one penalty, that of the least sum of errors; else each
+        is_scaled: whether columns are scaled to unit variance; else they are only centred.
+        is_shared: whether all outputs share one penalty, that of the least sum of errors; else each
             output takes its own.
-        alternatives: whether `fit` offers every penalty for all outputs, and no coefficients at
+        has_alternatives: whether `fit` offers every penalty for all outputs, and no coefficients at
             all, beside its own choice.
     """
 
@@ -245,37 +286,46 @@ class Ridge(_PathEstimator):
         penalties: Sequence[float],
         *,
         folds: int | None = 5,
-        scale: bool = True,
-        shared: bool = False,
-        alternatives: bool = False,
+        is_scaled: bool = True,
+        is_shared: bool = False,
+        has_alternatives: bool = False,
     ) -> None:
-        super().__init__(folds=folds, scale=scale, alternatives=alternatives)
+        super().__init__(folds=folds, is_scaled=is_scaled, has_alternatives=has_alternatives)
         self.penalties = tuple(sorted(penalties))
-        self.shared = shared
+        self.is_shared = is_shared
 
-    def path(self, xx: Tensor, xy: Tensor, samples: float) -> Tensor:
-        values, vectors = torch.linalg.eigh(xx / samples)
-        projected = vectors.T @ xy / samples
+    def compute_path(self, xx: Tensor, xy: Tensor, n_samples: float) -> Tensor:
+        eigenvalues, eigenvectors = torch.linalg.eigh(xx / n_samples)
+        projected = eigenvectors.T @ xy / n_samples
         penalties = torch.tensor(self.penalties, dtype=xy.dtype)
-        shrunk = projected / (values.clamp(min=0.0) + penalties[:, None])[..., None]
-        path: Tensor = vectors @ shrunk
+        shrunk = projected / (eigenvalues.clamp(min=0.0) + penalties[:, None])[..., None]
+        path: Tensor = eigenvectors @ shrunk
         return path
 
-    def choices(self, errors: Tensor | None, variance: Tensor, count: int) -> list[list[int]]:
+    def select_complexities(
+        self, errors: Tensor | None, variance: Tensor, n_complexities: int
+    ) -> list[list[int]]:
         """Return the penalties of the least error, then each for all outputs."""
-        n = variance.numel()
-        if errors is None and count > 1:
+        n_outputs = variance.numel()
+        if errors is None and n_complexities > 1:
             raise FitError("several penalties, and without groups nothing can choose between them")
-        errors = variance.new_zeros(1, n) if errors is None else errors
-        best = [int(errors.sum(1).argmin())] * n if self.shared else errors.argmin(0).tolist()
-        return [best, *([i] * n for i in range(count) if self.alternatives)]
+        errors = variance.new_zeros(1, n_outputs) if errors is None else errors
+        best_indices = (
+            [int(errors.sum(1).argmin())] * n_outputs
+            if self.is_shared
+            else errors.argmin(0).tolist()
+        )
+        return [
+            best_indices,
+            *([i] * n_outputs for i in range(n_complexities) if self.has_alternatives),
+        ]
 
-    def named(self, pick: Sequence[int]) -> dict[str, Any]:
-        return {"penalty": [self.penalties[i] for i in pick]}
+    def describe_complexity(self, complexities: Sequence[int]) -> dict[str, Any]:
+        return {"penalty": [self.penalties[i] for i in complexities]}
 
 
 @final
-class PLSR(_PathEstimator):
+class PLSR(_RegularizationPathEstimator):
     """Partial least squares of all outputs together, with an intercept.
 
     Outputs that nothing explains get the solution of order 0, without coefficients.
@@ -285,8 +335,8 @@ class PLSR(_PathEstimator):
             the outputs in units of their variances.
         max_order: highest order tried; None for the number of columns.
         folds: folds of the cross-validation; None for one fold for each group.
-        scale: whether columns are scaled to unit variance; else they are only centred.
-        alternatives: whether `fit` offers other orders, and none, beside its own choice.
+        is_scaled: whether columns are scaled to unit variance; else they are only centred.
+        has_alternatives: whether `fit` offers other orders, and none, beside its own choice.
     """
 
     def __init__(
@@ -295,45 +345,56 @@ class PLSR(_PathEstimator):
         *,
         max_order: int | None = 40,
         folds: int | None = 5,
-        scale: bool = True,
-        alternatives: bool = False,
+        is_scaled: bool = True,
+        has_alternatives: bool = False,
     ) -> None:
-        super().__init__(folds=folds, scale=scale, alternatives=alternatives)
+        super().__init__(folds=folds, is_scaled=is_scaled, has_alternatives=has_alternatives)
         self.order = order
         self.max_order = max_order
 
-    def path(self, xx: Tensor, xy: Tensor, samples: float) -> Tensor:
+    def compute_path(self, xx: Tensor, xy: Tensor, n_samples: float) -> Tensor:
         return pls_path(xx, xy, min(self.order or self.max_order or len(xx), len(xx)))
 
-    def choices(self, errors: Tensor | None, variance: Tensor, count: int) -> list[list[int]]:
+    def select_complexities(
+        self, errors: Tensor | None, variance: Tensor, n_complexities: int
+    ) -> list[list[int]]:
         """Return the order given or of the least error, then those worth trying."""
-        n, order = variance.numel(), count
+        n_outputs, order = variance.numel(), n_complexities
         if self.order is not None:
-            order = min(self.order, count)
+            order = min(self.order, n_complexities)
         elif errors is None:
             raise FitError("the order is not given, and without groups nothing can choose it")
         else:
             order = int((errors / variance).mean(1).argmin()) + 1
         orders = [order]
-        if self.alternatives:
+        if self.has_alternatives:
             # each of the first few, then steps of a quarter
-            tried = [1]
-            while tried[-1] < count:
-                step = tried[-1] * 5 // 4 if tried[-1] >= _EACH_ORDER else tried[-1] + 1
-                tried.append(min(step, count))
-            orders += tried
-        return [[k - 1] * n for k in orders]
+            alternative_orders = [1]
+            while alternative_orders[-1] < n_complexities:
+                step = (
+                    alternative_orders[-1] * 5 // 4
+                    if alternative_orders[-1] >= _MAX_CONSECUTIVE_ORDER
+                    else alternative_orders[-1] + 1
+                )
+                alternative_orders.append(min(step, n_complexities))
+            orders += alternative_orders
+        return [[k - 1] * n_outputs for k in orders]
 
-    def named(self, pick: Sequence[int]) -> dict[str, Any]:
-        return {"order": pick[0] + 1 if pick else 0}
+    def describe_complexity(self, complexities: Sequence[int]) -> dict[str, Any]:
+        return {"order": complexities[0] + 1 if complexities else 0}
 
-    def notes(self, errors: Tensor, variance: Tensor) -> dict[str, Any]:
+    def fit_notes(self, errors: Tensor, variance: Tensor) -> dict[str, Any]:
         """Return the error by order, mean over outputs in units of their variances."""
         return {"cross_validated_share": (errors / variance).mean(1).tolist()}
 
 
 def pls_path(
-    xx: Tensor, xy: Tensor, orders: int | Tensor, *, joint: bool = True, mask: Tensor | None = None
+    xx: Tensor,
+    xy: Tensor,
+    orders: int | Tensor,
+    *,
+    is_joint: bool = True,
+    mask: Tensor | None = None,
 ) -> Tensor:
     """Return coefficients of partial least squares for every order, [A, ..., J, K].
 
@@ -345,41 +406,60 @@ def pls_path(
         xy: X'Y [..., J, K].
         orders: number of latent variables; or that of each column of xy, ascending, [K]: a column
             is left alone once its order is reached.
-        joint: whether the columns of xy are outputs of one model (PLS2); else each has a model of
+        is_joint: whether the columns of xy are outputs of one model (PLS2); else each has a model of
             its own (PLS1).
         mask: 1 where a model has a regressor, 0 elsewhere, [J, K].
     """
-    rest = xy if mask is None else xy * mask
-    least = _EXPLAINED * torch.linalg.vector_norm(rest, dim=(-2, -1) if joint else -2)
-    least_energy = _LEAST_ENERGY * float(xx.diagonal(dim1=-2, dim2=-1).max())
+    residual_covariance = xy if mask is None else xy * mask
+    min_covariance = _EXPLAINED_TOLERANCE * torch.linalg.vector_norm(
+        residual_covariance, dim=(-2, -1) if is_joint else -2
+    )
+    min_energy = _MIN_LATENT_ENERGY * float(xx.diagonal(dim1=-2, dim2=-1).max())
     loadings: list[Tensor] = []
     rotations: list[Tensor] = []
-    total, path = torch.zeros_like(xy), []
+    path_coefficients, path = torch.zeros_like(xy), []
     for step in range(orders if isinstance(orders, int) else int(orders.max())):
-        first = 0 if isinstance(orders, int) else int((orders <= step).sum())
-        part = rest[..., first:]
-        if joint:
-            left, singular, _ = torch.linalg.svd(part, full_matrices=False)
-            r = w = left[..., :1]
-            alive = singular[..., :1] > least
+        first_active = 0 if isinstance(orders, int) else int((orders <= step).sum())
+        active_covariance = residual_covariance[..., first_active:]
+        if is_joint:
+            left_vectors, singular_values, _ = torch.linalg.svd(
+                active_covariance, full_matrices=False
+            )
+            r = w = left_vectors[..., :1]
+            is_active = singular_values[..., :1] > min_covariance
         else:
-            norm = torch.linalg.vector_norm(part, dim=-2, keepdim=True)
-            r = w = part / norm.clamp(min=_TINY)
-            alive = norm > least[..., None, first:]
-        for p_old, r_old in zip(loadings, rotations, strict=True):
-            r = r - (p_old[..., first:] * w).sum(-2, keepdim=True) * r_old[..., first:]
-        image = xx @ r if mask is None else (xx @ r) * mask[..., first:]
-        energy = (r * image).sum(-2, keepdim=True)
-        alive = alive & (energy > least_energy)
-        if not bool(alive.any()):
+            norm = torch.linalg.vector_norm(active_covariance, dim=-2, keepdim=True)
+            r = w = active_covariance / norm.clamp(min=_MIN_NORM)
+            is_active = norm > min_covariance[..., None, first_active:]
+        for previous_loading, previous_rotation in zip(loadings, rotations, strict=True):
+            r = (
+                r
+                - (previous_loading[..., first_active:] * w).sum(-2, keepdim=True)
+                * previous_rotation[..., first_active:]
+            )
+        gram_rotation = xx @ r if mask is None else (xx @ r) * mask[..., first_active:]
+        energy = (r * gram_rotation).sum(-2, keepdim=True)
+        is_active = is_active & (energy > min_energy)
+        if not bool(is_active.any()):
             break
-        safe = torch.where(alive, energy, 1.0)
-        share = torch.where(alive, (r * part).sum(-2, keepdim=True) / safe, 0.0)
-        p = torch.where(alive, image / safe, 0.0)
-        total = torch.cat((total[..., :first], total[..., first:] + r * share), dim=-1)
-        rest = torch.cat((rest[..., :first], part - p * (share * energy)), dim=-1)
-        fill = torch.zeros_like(xy[..., : 0 if joint else first])
-        loadings.append(torch.cat((fill, p), dim=-1))
-        rotations.append(torch.cat((fill, r), dim=-1))
-        path.append(total)
+        safe_energy = torch.where(is_active, energy, 1.0)
+        y_loading = torch.where(
+            is_active, (r * active_covariance).sum(-2, keepdim=True) / safe_energy, 0.0
+        )
+        p = torch.where(is_active, gram_rotation / safe_energy, 0.0)
+        path_coefficients = torch.cat(
+            (
+                path_coefficients[..., :first_active],
+                path_coefficients[..., first_active:] + r * y_loading,
+            ),
+            dim=-1,
+        )
+        residual_covariance = torch.cat(
+            (residual_covariance[..., :first_active], active_covariance - p * (y_loading * energy)),
+            dim=-1,
+        )
+        padding = torch.zeros_like(xy[..., : 0 if is_joint else first_active])
+        loadings.append(torch.cat((padding, p), dim=-1))
+        rotations.append(torch.cat((padding, r), dim=-1))
+        path.append(path_coefficients)
     return torch.stack(path) if path else xy.new_zeros(0, *xy.shape)

@@ -13,12 +13,18 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import FitError
-from residnet.regression.estimator import Data, Estimator, Solution, fold_numbers, whole
-from residnet.regression.shrinkage import CONSTANT, FoldMoments, pls_path
+from residnet.regression.estimator import (
+    Estimator,
+    EstimatorData,
+    Solution,
+    assign_group_folds,
+    to_dense,
+)
+from residnet.regression.shrinkage import CONSTANT_TOLERANCE, FoldMoments, pls_path
 
 
 @dataclass(frozen=True)
-class Surface:
+class ErrorSurface:
     """The errors over orders and numbers of basis functions, for each output by itself.
 
     Attributes:
@@ -34,21 +40,21 @@ class Surface:
     standard_error: Tensor
     removal: Tensor
 
-    def kept(self, output: int, order: int, count: int) -> list[int]:
-        """Return the `count` basis functions left for an output at model order `order` (from 1)."""
-        gone = self.removal[output, order - 1, : self.removal.shape[2] - count].tolist()
-        return [j for j in range(self.removal.shape[2]) if j not in gone]
+    def retained_columns(self, output: int, order: int, n_terms: int) -> list[int]:
+        """Return the `count` basis functions left for an output at model order `order_of_model` (from 1)."""
+        removed = self.removal[output, order - 1, : self.removal.shape[2] - n_terms].tolist()
+        return [j for j in range(self.removal.shape[2]) if j not in removed]
 
-    def least(self, output: int) -> tuple[int, int]:
+    def minimum_error_model(self, output: int) -> tuple[int, int]:
         """Return (order, count) of the least error of one output: the document's choice.
 
         It is optimistic where its folds also judge the result.
         """
-        flat = torch.nan_to_num(self.error[output], nan=torch.inf).flatten()
-        a, j = divmod(int(flat.argmin()), self.error.shape[2])
-        return a + 1, j
+        errors = torch.nan_to_num(self.error[output], nan=torch.inf).flatten()
+        order_index, n_terms = divmod(int(errors.argmin()), self.error.shape[2])
+        return order_index + 1, n_terms
 
-    def simplest(self, output: int) -> tuple[int, int]:
+    def one_standard_error_model(self, output: int) -> tuple[int, int]:
         """Return the lowest (order, count) within one standard error of the least.
 
         Of the lowest order it has the most basis functions.
@@ -57,16 +63,18 @@ class Surface:
         near-collinear columns explode elsewhere (Breiman's one-standard-error rule; a low order
         shrinks, removing basis functions does not).
         """
-        order, count = self.least(output)
-        limit = self.error[output, order - 1, count] + torch.nan_to_num(
-            self.standard_error[output, order - 1, count]
+        order, n_terms = self.minimum_error_model(output)
+        error_limit = self.error[output, order - 1, n_terms] + torch.nan_to_num(
+            self.standard_error[output, order - 1, n_terms]
         )
-        fine = torch.nan_to_num(self.error[output], nan=torch.inf) <= limit
-        lowest = int(fine.any(1).nonzero()[0, 0])
-        return lowest + 1, int(fine[lowest].nonzero()[-1, 0])
+        is_within_limit = torch.nan_to_num(self.error[output], nan=torch.inf) <= error_limit
+        order_index = int(is_within_limit.any(1).nonzero()[0, 0])
+        return order_index + 1, int(is_within_limit[order_index].nonzero()[-1, 0])
 
 
-def surface(moments: FoldMoments, test: Sequence[int] = (), orders: int | None = None) -> Surface:
+def compute_error_surface(
+    moments: FoldMoments, test_folds: Sequence[int] = (), max_order: int | None = None
+) -> ErrorSurface:
     """Return all models of the surface from moments alone, in one batch.
 
     At every model order the basis function with the least |coefficient| on standardised columns is
@@ -74,58 +82,61 @@ def surface(moments: FoldMoments, test: Sequence[int] = (), orders: int | None =
 
     Args:
         moments: sums by fold of basis functions [N, J] and outputs [N, K].
-        test: folds that judge the models; these are fitted, and choose what to remove, on the
+        test_folds: folds that judge the models; these are fitted, and choose what to remove, on the
             others. Empty: cross-validation over all folds.
-        orders: highest model order; None for the number of basis functions.
+        max_order: highest model order; None for the number of basis functions.
 
     Raises:
         FitError: where a basis function is constant, or fewer than two are given.
     """
-    problems = _Problems.gather(moments, test)
-    k, j = problems.covariance.shape[2], problems.gram.shape[1]
-    a = min(orders or j, j)
-    axis = torch.arange(k).repeat(a)
-    order = torch.arange(1, a + 1).repeat_interleave(k)
-    mask = torch.ones(j, a * k, dtype=torch.float64)
-    error, standard_error = (
-        torch.full((j + 1, a * k), torch.nan, dtype=torch.float64) for _ in range(2)
+    equations = _NormalEquations.gather(moments, test_folds)
+    n_outputs, n_columns = equations.covariance.shape[2], equations.gram.shape[1]
+    n_orders = min(max_order or n_columns, n_columns)
+    output_index = torch.arange(n_outputs).repeat(n_orders)
+    order_of_model = torch.arange(1, n_orders + 1).repeat_interleave(n_outputs)
+    mask = torch.ones(n_columns, n_orders * n_outputs, dtype=torch.float64)
+    mean_squared_error, standard_error = (
+        torch.full((n_columns + 1, n_orders * n_outputs), torch.nan, dtype=torch.float64)
+        for _ in range(2)
     )
-    removal = torch.full((j, a * k), -1, dtype=torch.long)
-    for count in range(j, 1, -1):
+    removal = torch.full((n_columns, n_orders * n_outputs), -1, dtype=torch.long)
+    for n_terms in range(n_columns, 1, -1):
         # columns are sorted by order: those that may still have `count` basis functions come first
-        active = int((order <= count).sum())
+        n_active = int((order_of_model <= n_terms).sum())
         path = pls_path(
-            problems.gram,
-            problems.covariance[:, :, axis[:active]],
-            order[:active],
-            joint=False,
-            mask=mask[:, :active],
+            equations.gram,
+            equations.covariance[:, :, output_index[:n_active]],
+            order_of_model[:n_active],
+            is_joint=False,
+            mask=mask[:, :n_active],
         )
-        coefficients = path[-1] if len(path) else torch.zeros_like(problems.covariance[:, :, axis])
-        error[count, :active], standard_error[count, :active] = problems.errors(
-            coefficients, axis[:active]
+        coefficients = (
+            path[-1] if len(path) else torch.zeros_like(equations.covariance[:, :, output_index])
         )
-        size = coefficients[0].abs().masked_fill(mask[:, :active] == 0, torch.inf)
-        weakest = size.argmin(0)
-        further = torch.arange(active)[order[:active].clamp(min=2) < count]
-        removal[j - count, further] = weakest[further]
-        mask[weakest[further], further] = 0.0
-    return Surface(
+        mean_squared_error[n_terms, :n_active], standard_error[n_terms, :n_active] = (
+            equations.test_errors(coefficients, output_index[:n_active])
+        )
+        coefficient_size = coefficients[0].abs().masked_fill(mask[:, :n_active] == 0, torch.inf)
+        weakest_column = coefficient_size.argmin(0)
+        continues = torch.arange(n_active)[order_of_model[:n_active].clamp(min=2) < n_terms]
+        removal[n_columns - n_terms, continues] = weakest_column[continues]
+        mask[weakest_column[continues], continues] = 0.0
+    return ErrorSurface(
         *(
-            part.reshape(-1, a, k).permute(2, 1, 0).contiguous()
-            for part in (error, standard_error, removal)
+            values.reshape(-1, n_orders, n_outputs).permute(2, 1, 0).contiguous()
+            for values in (mean_squared_error, standard_error, removal)
         )
     )
 
 
 @dataclass(frozen=True)
-class _Problems:
+class _NormalEquations:
     """The standardised normal equations.
 
     The first is fitted on all that may be used, the others on that less one fold each.
 
     gram [P, J, J], covariance [P, J, K], scale and mean of the columns [P, J], mean of the outputs
-    [P, K]; `judged` are the sums [P', 1 + J + K, 1 + J + K] that the last P' problems are judged
+    [P, K]; `test_moments` are the sums [P', 1 + J + K, 1 + J + K] that the last P' problems are judged
     on.
     """
 
@@ -134,66 +145,71 @@ class _Problems:
     scale: Tensor
     mean_x: Tensor
     mean_y: Tensor
-    judged: Tensor
+    test_moments: Tensor
 
     @classmethod
-    def gather(cls, moments: FoldMoments, test: Sequence[int]) -> _Problems:
+    def gather(cls, moments: FoldMoments, test_folds: Sequence[int]) -> _NormalEquations:
         """Return the problems of moments by fold, judged on the folds `test` or on each in turn."""
-        total = moments.sums.sum(0)
-        apart = moments.sums[list(test)].sum(0) if test else total * 0.0
-        used = [total - apart] + (
-            [] if test else [total - moments.sums[f] for f in range(moments.folds)]
+        summed_moments = moments.sums.sum(0)
+        test_sums = moments.sums[list(test_folds)].sum(0) if test_folds else summed_moments * 0.0
+        training_sums = [summed_moments - test_sums] + (
+            [] if test_folds else [summed_moments - moments.sums[f] for f in range(moments.n_folds)]
         )
-        judged = apart.unsqueeze(0) if test else moments.sums
-        centred = [moments.centred(part) for part in used]
+        test_moments = test_sums.unsqueeze(0) if test_folds else moments.sums
+        centred = [moments.centre(moments_part) for moments_part in training_sums]
         if centred[0][3].shape[0] < 2:
             raise FitError("a surface needs at least two basis functions")
-        n = torch.tensor([part[0] for part in centred], dtype=torch.float64)
-        xx, xy = (
-            torch.stack([part[3] for part in centred]),
-            torch.stack([part[4] for part in centred]),
+        n_samples = torch.tensor([moments_part[0] for moments_part in centred], dtype=torch.float64)
+        covariance_xx, covariance_xy = (
+            torch.stack([moments_part[3] for moments_part in centred]),
+            torch.stack([moments_part[4] for moments_part in centred]),
         )
-        scale = (xx.diagonal(dim1=1, dim2=2) / (n[:, None] - 1)).clamp(min=0).sqrt()
-        size = (
-            total[1 : 1 + moments.regressors, 1 : 1 + moments.regressors].diagonal() / total[0, 0]
+        scale = (
+            (covariance_xx.diagonal(dim1=1, dim2=2) / (n_samples[:, None] - 1)).clamp(min=0).sqrt()
+        )
+        column_size = (
+            summed_moments[1 : 1 + moments.n_regressors, 1 : 1 + moments.n_regressors].diagonal()
+            / summed_moments[0, 0]
         ).sqrt() + moments.shift_x.abs()
-        if bool((constant := scale <= CONSTANT * size).any()):
+        if bool((is_constant := scale <= CONSTANT_TOLERANCE * column_size).any()):
             raise FitError(
-                f"basis function number {int(constant.any(0).nonzero()[0, 0])} is constant; leave"
+                f"basis function number {int(is_constant.any(0).nonzero()[0, 0])} is constant; leave"
                 " it out (the intercept is there)"
             )
-        gram = xx / (scale[:, :, None] * scale[:, None, :])
+        gram = covariance_xx / (scale[:, :, None] * scale[:, None, :])
         return cls(
             gram,
-            xy / scale[:, :, None],
+            covariance_xy / scale[:, :, None],
             scale,
-            torch.stack([p[1] for p in centred]),
-            torch.stack([p[2] for p in centred]),
-            judged,
+            torch.stack([moments_part[1] for moments_part in centred]),
+            torch.stack([moments_part[2] for moments_part in centred]),
+            test_moments,
         )
 
-    def errors(self, coefficients: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
+    def test_errors(self, coefficients: Tensor, output_index: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean squared error [C] where judged, and its standard error over folds [C]."""
-        count, j = len(self.judged), self.gram.shape[1]
-        slope = coefficients[-count:] / self.scale[-count:, :, None]
-        intercept = self.mean_y[-count:][:, axis] - (self.mean_x[-count:, :, None] * slope).sum(1)
-        weights = torch.cat((intercept[:, None], slope), dim=1)
+        n_folds, n_columns = len(self.test_moments), self.gram.shape[1]
+        slopes = coefficients[-n_folds:] / self.scale[-n_folds:, :, None]
+        intercept = self.mean_y[-n_folds:][:, output_index] - (
+            self.mean_x[-n_folds:, :, None] * slopes
+        ).sum(1)
+        weights = torch.cat((intercept[:, None], slopes), dim=1)
         xx, xy, yy = (
-            self.judged[:, : j + 1, : j + 1],
-            self.judged[:, : j + 1, j + 1 :],
-            self.judged[:, j + 1 :, j + 1 :],
+            self.test_moments[:, : n_columns + 1, : n_columns + 1],
+            self.test_moments[:, : n_columns + 1, n_columns + 1 :],
+            self.test_moments[:, n_columns + 1 :, n_columns + 1 :],
         )
         squares = (
             (weights * (xx @ weights)).sum(1)
-            - 2 * (weights * xy[:, :, axis]).sum(1)
-            + yy.diagonal(dim1=1, dim2=2)[:, axis]
+            - 2 * (weights * xy[:, :, output_index]).sum(1)
+            + yy.diagonal(dim1=1, dim2=2)[:, output_index]
         )
-        n = self.judged[:, 0, 0]
-        by_fold = squares / n[:, None]
+        n_samples = self.test_moments[:, 0, 0]
+        by_fold = squares / n_samples[:, None]
         standard_error = (
-            by_fold.std(0) / count**0.5 if count > 1 else torch.full_like(by_fold[0], torch.nan)
+            by_fold.std(0) / n_folds**0.5 if n_folds > 1 else torch.full_like(by_fold[0], torch.nan)
         )
-        return squares.sum(0) / n.sum(), standard_error
+        return squares.sum(0) / n_samples.sum(), standard_error
 
 
 @final
@@ -201,53 +217,69 @@ class SurfacePLSR(Estimator):
     """PLSR of each output by itself, chosen by surface analysis (document 002 section 4.5.1).
 
     Args:
-        choose: `simplest`, the one-standard-error rule; or `least`, the bare minimum of the error.
-        test: groups whose samples judge the models and fit none, as the document has it; empty for
+        selection_rule: `one_standard_error_model`, the one-standard-error rule; or `minimum_error_model`, the bare minimum of the error.
+        test_groups: groups whose samples judge the models and fit none, as the document has it; empty for
             cross-validation over all groups.
     """
 
     def __init__(
-        self, choose: Literal["simplest", "least"] = "simplest", *, test: Sequence[int] = ()
+        self,
+        selection_rule: Literal["simplest", "least"] = "simplest",
+        *,
+        test_groups: Sequence[int] = (),
     ) -> None:
-        self.choose = choose
-        self.test = tuple(test)
+        self.selection_rule = selection_rule
+        self.test_groups = tuple(test_groups)
 
-    def solve(self, data: Data) -> list[Solution]:
-        """Return the chosen solution; its `choice` has the order and the number of terms kept."""
-        x = whole(data.x)
-        found = self.surface(x, data.y, data.groups)
-        return [self.chosen(found, x, data.y, data.groups)]
+    def _solve(self, data: EstimatorData) -> list[Solution]:
+        """Return the chosen solution; its `hyperparameters` has the order and the number of terms kept."""
+        x = to_dense(data.x)
+        error_surface = self.error_surface(x, data.y, data.groups)
+        return [self.solution_at_selection(error_surface, x, data.y, data.groups)]
 
-    def surface(self, x: Tensor, y: Tensor, groups: Tensor | None) -> Surface:
+    def error_surface(self, x: Tensor, y: Tensor, groups: Tensor | None) -> ErrorSurface:
         """Return the errors of all models.
 
         Raises:
             FitError: with fewer than two groups or basis functions, or one that is constant.
         """
-        fold_numbers(groups, None)
-        moments = FoldMoments.checked(x, y, groups, None)
-        return surface(moments, test=self.test)
+        assign_group_folds(groups, None)
+        moments = FoldMoments.from_grouped_samples(x, y, groups, None)
+        return compute_error_surface(moments, test_folds=self.test_groups)
 
-    def chosen(self, found: Surface, x: Tensor, y: Tensor, groups: Tensor | None) -> Solution:
+    def solution_at_selection(
+        self, error_surface: ErrorSurface, x: Tensor, y: Tensor, groups: Tensor | None
+    ) -> Solution:
         """Return the solution that the surface of `x` and `y` leads to."""
-        if groups is not None and self.test:
-            train = ~torch.isin(groups, torch.tensor(self.test))
-            x, y = x[train], y[train]
+        if groups is not None and self.test_groups:
+            is_training = ~torch.isin(groups, torch.tensor(self.test_groups))
+            x, y = x[is_training], y[is_training]
         outputs = range(y.shape[1])
-        pick = found.simplest if self.choose == "simplest" else found.least
+        select_model = (
+            error_surface.one_standard_error_model
+            if self.selection_rule == "simplest"
+            else error_surface.minimum_error_model
+        )
         std_x, std_y = x.std(0), y.std(0)
-        varies = (std_y > CONSTANT * y.abs().amax(0)).tolist()
+        is_varying = (std_y > CONSTANT_TOLERANCE * y.abs().amax(0)).tolist()
         # an output that is constant but for rounding needs no basis function
-        picks = [pick(output) if varies[output] else (0, 0) for output in outputs]
+        selected_models = [
+            select_model(output) if is_varying[output] else (0, 0) for output in outputs
+        ]
         coefficients = y.new_zeros(x.shape[1], y.shape[1])
-        for output, (order, count) in zip(outputs, picks, strict=True):
+        for output, (order, n_terms) in zip(outputs, selected_models, strict=True):
             if order == 0:
                 continue
-            kept = found.kept(output, order, count)
-            e = (x[:, kept] - x[:, kept].mean(0)) / std_x[kept]
-            f = (y[:, [output]] - y[:, output].mean()) / std_y[output]
-            best = pls_path(e.T @ e, e.T @ f, order)[-1, :, 0]
-            coefficients[kept, output] = best / std_x[kept] * std_y[output]
-        choice = {"order": [order for order, _ in picks], "terms": [count for _, count in picks]}
+            retained = error_surface.retained_columns(output, order, n_terms)
+            x_scaled = (x[:, retained] - x[:, retained].mean(0)) / std_x[retained]
+            y_scaled = (y[:, [output]] - y[:, output].mean()) / std_y[output]
+            pls_coefficients = pls_path(x_scaled.T @ x_scaled, x_scaled.T @ y_scaled, order)[
+                -1, :, 0
+            ]
+            coefficients[retained, output] = pls_coefficients / std_x[retained] * std_y[output]
+        hyperparameters = {
+            "order": [order for order, _ in selected_models],
+            "terms": [n_terms for _, n_terms in selected_models],
+        }
         state = {"coefficients": coefficients, "intercept": y.mean(0) - x.mean(0) @ coefficients}
-        return Solution(choice, state)
+        return Solution(hyperparameters, state)

@@ -12,18 +12,18 @@ from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from typing import Any, ClassVar, Literal, Protocol, TypeAlias
 
-from residnet.core.format import DASH, fixed, signed
+from residnet.core.format import DASH, format_fixed, format_signed
 
 EXPORTS = "exports.json"
 """File of a run folder that says what came of each export."""
-Mark: TypeAlias = Literal["", "bad", "best", "weak", "text"]
+CellMark: TypeAlias = Literal["", "bad", "best", "weak", "text"]
 
 
-_SHEET, _LETTER, _PADDING = 700.0, 5.8, 6.0
+_PAGE_WIDTH, _LETTER_WIDTH, _CELL_PADDING = 700.0, 5.8, 6.0
 """Pixels of a sheet of A4 between its margins, of a bold letter of a table, and beside a cell."""
 
 
-_WIDE = 6
+_MIN_WIDE_COLUMNS = 6
 """Columns of a table that half of a page, 34 rem, no longer holds at 5 to 6 rem each."""
 
 
@@ -39,18 +39,18 @@ class Text:
 
     Attributes:
         paragraphs: one string or several.
-        quiet: printed in grey, for explanations that most readers skip.
+        is_secondary: printed in grey, for explanations that most readers skip.
     """
 
     kind: ClassVar[str] = "text"
     paragraphs: str | Sequence[str]
-    quiet: bool = False
+    is_secondary: bool = False
 
     @property
-    def lines(self) -> list[str]:
+    def nonempty_paragraphs(self) -> list[str]:
         """Return the paragraphs that are not empty."""
-        given = [self.paragraphs] if isinstance(self.paragraphs, str) else self.paragraphs
-        return [paragraph for paragraph in given if paragraph]
+        paragraphs = [self.paragraphs] if isinstance(self.paragraphs, str) else self.paragraphs
+        return [paragraph for paragraph in paragraphs if paragraph]
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,12 @@ class Bullets:
 
     Attributes:
         items: one string for each entry.
-        warning: set off by colour, for what a reader must know before using a result.
+        is_warning: set off by colour, for what a reader must know before using a result.
     """
 
     kind: ClassVar[str] = "bullets"
     items: Sequence[str]
-    warning: bool = False
+    is_warning: bool = False
 
 
 @dataclass(frozen=True)
@@ -74,13 +74,13 @@ class Facts:
     Attributes:
         pairs: (name, text); the text of a check may be marked as failed by `failed`.
         failed: names that are set off by colour.
-        code: names and texts are printed as code (file names and checksums).
+        is_code: names and texts are printed as code (file names and checksums).
     """
 
     kind: ClassVar[str] = "facts"
     pairs: Sequence[tuple[str, str]]
     failed: Sequence[str] = ()
-    code: bool = False
+    is_code: bool = False
 
 
 @dataclass(frozen=True)
@@ -89,12 +89,12 @@ class Code:
 
     Attributes:
         text: with its line breaks.
-        wrap: long lines break at spaces instead of scrolling sideways.
+        wraps_lines: long lines break at spaces instead of scrolling sideways.
     """
 
     kind: ClassVar[str] = "code"
     text: str
-    wrap: bool = False
+    wraps_lines: bool = False
 
 
 @dataclass(frozen=True)
@@ -104,13 +104,13 @@ class Cell:
     Attributes:
         text: a formatted number or a few words.
         note: small print below it.
-        mark: `bad`, `best` or `weak` set it off; `text` is aligned to the left and may wrap.
+        mark: `is_flagged`, `best` or `weak` set it off; `to_text` is aligned to the left and may wrap.
         si: the number in its SI unit where it stands in another, shown under the pointer.
     """
 
     text: str
     note: str = ""
-    mark: Mark = ""
+    mark: CellMark = ""
     si: str = ""
 
 
@@ -121,14 +121,14 @@ class Row:
     Attributes:
         label: its first cell.
         cells: the others, in the order of the columns.
-        rule: a line is drawn above it, where a group of rows begins.
-        selected: it is set off as the one that was chosen.
+        has_rule: a line is drawn above it, where a group of rows begins.
+        is_selected: it is set off as the one that was chosen.
     """
 
     label: str
     cells: Sequence[Cell]
-    rule: bool = False
-    selected: bool = False
+    has_rule: bool = False
+    is_selected: bool = False
 
 
 class Table:
@@ -147,43 +147,52 @@ class Table:
             groups: titles that span several columns after the first, with how many they span.
         """
         self.columns, self.caption, self.groups = list(columns), caption, list(groups)
-        left = len(self.columns) - 1 - sum(count for _, count in self.groups)
-        if self.groups and left:
+        n_ungrouped = len(self.columns) - 1 - sum(count for _, count in self.groups)
+        if self.groups and n_ungrouped:
             # the line of groups is as long as that of columns
-            self.groups.append(("", left))
+            self.groups.append(("", n_ungrouped))
         self.rows: list[Row] = []
 
-    def add(
-        self, label: str, cells: Iterable[Cell | str], *, rule: bool = False, selected: bool = False
+    def add_row(
+        self,
+        label: str,
+        cells: Iterable[Cell | str],
+        *,
+        has_rule: bool = False,
+        is_selected: bool = False,
     ) -> None:
         """Add a row; plain strings become cells."""
-        made = [cell if isinstance(cell, Cell) else Cell(cell) for cell in cells]
-        if len(made) != len(self.columns) - 1:
+        row_cells = [cell if isinstance(cell, Cell) else Cell(cell) for cell in cells]
+        if len(row_cells) != len(self.columns) - 1:
             raise ValueError(
-                f"row '{label}': {len(made)} cells for {len(self.columns) - 1} columns"
+                f"row '{label}': {len(row_cells)} cells for {len(self.columns) - 1} columns"
             )
-        self.rows.append(Row(label, made, rule, selected))
+        self.rows.append(Row(label, row_cells, has_rule, is_selected))
 
     @property
-    def aligned_left(self) -> list[bool]:
+    def text_columns(self) -> list[bool]:
         """Return for each column whether it holds words rather than numbers."""
         marks = zip(*([cell.mark for cell in row.cells] for row in self.rows), strict=True)
-        words = [all(mark == "text" for mark in column) for column in marks]
-        return [True, *(words or [False] * (len(self.columns) - 1))]
+        is_text = [all(mark == "text" for mark in column) for column in marks]
+        return [True, *(is_text or [False] * (len(self.columns) - 1))]
 
-    def part(self, first: int, last: int) -> Table:
-        """Return the table with the columns from `first` up to `last`, those of labels aside."""
-        groups, at = [], 0
+    def select_columns(self, first_column: int, last_column: int) -> Table:
+        """Return the table with the columns from `first_column` up to `last`, those of labels aside."""
+        groups, column = [], 0
         for title, count in self.groups:
-            held = min(at + count, last) - max(at, first)
-            at += count
-            groups += [(title, held)] if held > 0 else []
-        part = Table([self.columns[0], *self.columns[1 + first : 1 + last]], "", groups)
-        part.rows = [replace(row, cells=row.cells[first:last]) for row in self.rows]
-        return part
+            n_overlap = min(column + count, last_column) - max(column, first_column)
+            column += count
+            groups += [(title, n_overlap)] if n_overlap > 0 else []
+        selection = Table(
+            [self.columns[0], *self.columns[1 + first_column : 1 + last_column]], "", groups
+        )
+        selection.rows = [
+            replace(row, cells=row.cells[first_column:last_column]) for row in self.rows
+        ]
+        return selection
 
     @property
-    def pieces(self) -> list[Table]:
+    def split_to_width(self) -> list[Table]:
         """Return the table in pieces that each fit a sheet of A4, itself where it fits whole.
 
         Each piece has the labels of the rows; columns of one group stay together where they fit.
@@ -191,46 +200,51 @@ class Table:
         lines = [self.columns]
         lines += [[row.label, *(f"{c.text} {c.note}" for c in row.cells)] for row in self.rows]
         # names break after underscores and slashes
-        words = [re.split(r"[\s_/]", " ".join(column)) for column in zip(*lines, strict=True)]
-        widths = [_PADDING + _LETTER * max(map(len, column)) for column in words]
-        ends = [*accumulate(count for _, count in self.groups)] or [*range(1, len(self.columns))]
-        stretches, at = [[0, 0]], 0
-        for end in ends:
-            first = stretches[-1][0]
-            if first < at and widths[0] + sum(widths[1 + first : 1 + end]) > _SHEET:
-                stretches.append([at, at])
-            stretches[-1][1] = at = end
-        if len(stretches) < 2:
+        cell_words = [re.split(r"[\s_/]", " ".join(column)) for column in zip(*lines, strict=True)]
+        widths = [_CELL_PADDING + _LETTER_WIDTH * max(map(len, column)) for column in cell_words]
+        break_columns = [*accumulate(count for _, count in self.groups)] or [
+            *range(1, len(self.columns))
+        ]
+        column_ranges, previous_end = [[0, 0]], 0
+        for end in break_columns:
+            first_column = column_ranges[-1][0]
+            if (
+                first_column < previous_end
+                and widths[0] + sum(widths[1 + first_column : 1 + end]) > _PAGE_WIDTH
+            ):
+                column_ranges.append([previous_end, previous_end])
+            column_ranges[-1][1] = previous_end = end
+        if len(column_ranges) < 2:
             return [self]
-        out: list[Table] = []
-        for first, last in stretches:
-            piece = self.part(first, last)
-            piece.caption = "" if out else self.caption
-            out.append(piece)
-        return out
+        tables: list[Table] = []
+        for first_column, last_column in column_ranges:
+            table = self.select_columns(first_column, last_column)
+            table.caption = "" if tables else self.caption
+            tables.append(table)
+        return tables
 
-    def text(self) -> str:
+    def to_text(self) -> str:
         """Return the table for a terminal: columns aligned, notes in brackets, groups above."""
         lines = [self.columns]
-        lines += [[row.label, *(_plain(cell) for cell in row.cells)] for row in self.rows]
+        lines += [[row.label, *(_cell_text(cell) for cell in row.cells)] for row in self.rows]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        spans, start = [" " * widths[0]], 1
+        group_titles, start = [" " * widths[0]], 1
         for title, count in self.groups:
             # a group is as wide as its columns and the gaps between them
             width = sum(widths[start : start + count]) + 2 * (count - 1)
             widths[start] += max(len(title) - width, 0)
-            spans.append(f"{title:^{width}}")
+            group_titles.append(f"{title:^{width}}")
             start += count
-        out = [self.caption] if self.caption else []
-        out += ["  ".join(spans)] if self.groups else []
-        out += [
+        text_lines = [self.caption] if self.caption else []
+        text_lines += ["  ".join(group_titles)] if self.groups else []
+        text_lines += [
             "  ".join(
-                f"{text:<{width}}" if left else f"{text:>{width}}"
-                for text, width, left in zip(line, widths, self.aligned_left, strict=True)
+                f"{text:<{width}}" if is_left else f"{text:>{width}}"
+                for text, width, is_left in zip(line, widths, self.text_columns, strict=True)
             )
             for line in lines
         ]
-        return "\n".join(line.rstrip() for line in out)
+        return "\n".join(line.rstrip() for line in text_lines)
 
 
 Column: TypeAlias = tuple[Any, ...]
@@ -242,14 +256,14 @@ it is, and anything else is written as words.
 """
 
 
-def table_of(
+def build_table(
     rows: Iterable[Any],
     columns: Sequence[Column],
     *,
     groups: Sequence[tuple[str, int]] = (),
     caption: str = "",
-    selected: Callable[[Any], bool] = lambda row: False,
-    rule: Callable[[Any], Any] | None = None,
+    is_selected: Callable[[Any], bool] = lambda row: False,
+    group_key: Callable[[Any], Any] | None = None,
 ) -> Table:
     """Return a table with a row for each of the given ones.
 
@@ -258,57 +272,59 @@ def table_of(
         columns: the first is that of the labels.
         groups: titles that span several columns, see `Table`.
         caption: a sentence above the table.
-        selected: whether a row is set off as the one that was chosen.
-        rule: a line is drawn above a row for which this is another than for the row before.
+        is_selected: whether a row is set off as the one that was chosen.
+        group_key: a line is drawn above a row for which this is another than for the row before.
 
     Example:
         table_of(rows, [("model", "model"), ("time [s]", "time.mean", 2), ("rms", "rms", 1, DEG)])
     """
     table = Table([title for title, *_ in columns], groups=groups, caption=caption)
-    last: Any = None
+    previous_group: Any = None
     for row in rows:
-        label, *cells = [_cell(row, *rest) for _, *rest in columns]
-        group = rule(row) if rule else None
-        table.add(label.text, cells, rule=group != last, selected=selected(row))
-        last = group
+        label, *cells = [_build_cell(row, *column_format) for _, *column_format in columns]
+        group = group_key(row) if group_key else None
+        table.add_row(
+            label.text, cells, has_rule=group != previous_group, is_selected=is_selected(row)
+        )
+        previous_group = group
     return table
 
 
-def _cell(
+def _build_cell(
     row: Any,
-    what: str | Callable[[Any], Any],
-    how: int | Callable[[Any], str | Cell] | None = None,
+    key: str | Callable[[Any], Any],
+    formatter: int | Callable[[Any], str | Cell] | None = None,
     factor: float = 1.0,
 ) -> Cell:
-    value = what(row) if callable(what) else _at(row, what)
-    if how is None:
+    value = key(row) if callable(key) else _get_nested(row, key)
+    if formatter is None:
         return value if isinstance(value, Cell) else Cell(str(value), mark="text")
     if value is not None and factor != 1.0:
         value = factor * value
-    shown = fixed(value, how) if isinstance(how, int) else how(value)
-    return shown if isinstance(shown, Cell) else Cell(shown)
+    formatted = format_fixed(value, formatter) if isinstance(formatter, int) else formatter(value)
+    return formatted if isinstance(formatted, Cell) else Cell(formatted)
 
 
-def _at(row: Any, keys: str) -> Any:
+def _get_nested(row: Any, keys: str) -> Any:
     for key in keys.split("."):
         row = row.get(key) if isinstance(row, Mapping) else None
     return row
 
 
-def paired_interval(bounds: Sequence[float] | None, absent: str = DASH) -> Cell:
+def format_paired_interval(bounds: Sequence[float] | None, absent_text: str = DASH) -> Cell:
     """Return the interval of a difference, set off where it excludes zero."""
     if not bounds:
-        return Cell(absent)
-    text = " to ".join(map(signed, bounds))
+        return Cell(absent_text)
+    text = " to ".join(map(format_signed, bounds))
     return Cell(text, mark="best" if bounds[0] > 0 or bounds[1] < 0 else "")
 
 
-def bad_where(text: object, bad: object) -> Cell:
+def flag_cell(text: object, is_flagged: object) -> Cell:
     """Return a cell that is set off where something is wrong."""
-    return Cell(str(text), mark="bad" if bad else "")
+    return Cell(str(text), mark="bad" if is_flagged else "")
 
 
-def _plain(cell: Cell) -> str:
+def _cell_text(cell: Cell) -> str:
     text = f"{cell.text} ({cell.note})" if cell.note else cell.text
     return f"{text} !" if cell.mark == "bad" else text
 
@@ -320,21 +336,23 @@ class Section:
     Attributes:
         title: a few words; empty for the rest of a page's first screen.
         blocks: what it shows, from top to bottom.
-        folded: closed at first, for what most readers skip.
+        is_folded: closed at first, for what most readers skip.
     """
 
     kind: ClassVar[str] = "section"
     title: str
     blocks: Sequence[Block | None] = field(default_factory=tuple)
-    folded: bool = False
+    is_folded: bool = False
 
     @property
-    def shown(self) -> list[Block]:
+    def present_blocks(self) -> list[Block]:
         """Return the blocks that are there; a section may be handed None for an absent part."""
         return [block for block in self.blocks if block is not None]
 
     @property
-    def beside(self) -> bool:
+    def is_side_by_side(self) -> bool:
         """Return whether its parts stand beside each other, each in half of the page."""
-        tables = [block for block in self.shown if isinstance(block, Table)]
-        return len(self.shown) > 1 and all(len(table.columns) < _WIDE for table in tables)
+        tables = [block for block in self.present_blocks if isinstance(block, Table)]
+        return len(self.present_blocks) > 1 and all(
+            len(table.columns) < _MIN_WIDE_COLUMNS for table in tables
+        )

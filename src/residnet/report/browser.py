@@ -10,23 +10,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from residnet.core.format import powers
-from residnet.report.figure import INK, Case, Figure, Look
-from residnet.report.figure_files import packed
+from residnet.core.format import format_exponents
+from residnet.report.figure import TEXT_COLOR, Case, Figure, GlyphStyle
+from residnet.report.figure_files import pack_columns
 
 if TYPE_CHECKING:
     from bokeh.models import ColumnDataSource
     from bokeh.plotting import figure as Canvas
 
 _FONT = "12px"
-_LETTER, _NARROW = 6.5, 260.0
+_LETTER_WIDTH, _MIN_PANEL_WIDTH = 6.5, 260.0
 """Pixels of a letter of that font, and between the axes of a panel on a phone."""
 _DASHES: dict[str, Any] = {"long": [10, 4], "short": [4, 3], "dense": [8, 3, 2, 3, 2, 3]}
 _MARKERS = {"o": "circle", "s": "square", "x": "x", "^": "triangle"}
 
 
 @dataclass(frozen=True)
-class Drawn:
+class InteractiveFigures:
     """What a page holds of its interactive figures.
 
     Attributes:
@@ -38,44 +38,48 @@ class Drawn:
     library: str
 
 
-def draw(figures: Sequence[Figure]) -> Drawn | None:
+def render_bokeh(figures: Sequence[Figure]) -> InteractiveFigures | None:
     """Draw figures; None where there are none. The page's own script lays them out when seen."""
     if not figures:
         return None
     from bokeh.resources import Resources
 
     library = Resources(mode="inline", components=["bokeh"], minified=True).js_raw
-    return Drawn({one.key: _json(one) for one in figures}, "\n".join(library))
+    return InteractiveFigures(
+        {figure.key: _figure_json(figure) for figure in figures}, "\n".join(library)
+    )
 
 
-def _panels(figure: Figure) -> list[Canvas]:
+def _build_canvases(figure: Figure) -> list[Canvas]:
     """Return the panels; those of curves share their horizontal axis and a cursor."""
     from bokeh import models
     from bokeh.models.annotations import Span
 
     groups: dict[str, Any] = {}
     cursor = Span(dimension="height", line_dash="dotted", line_width=1)
-    out = []
+    canvases = []
     for number, panel in enumerate(figure.panels):
         # the page's own script fills in the first case: its values are there once
-        columns: dict[str, Any] = {name: [] for name in _columns(figure, figure.cases[0], number)}
+        columns: dict[str, Any] = {
+            name: [] for name in _panel_columns(figure, figure.cases[0], number)
+        }
         group = panel.group if panel.kind == "curves" else f"{number} alone"
-        shared = groups.setdefault(group, _range(panel.x_limits))
-        canvas = _canvas(figure, number, shared, models.ColumnDataSource(columns))
+        shared_range = groups.setdefault(group, _axis_range(panel.x_limits))
+        canvas = _build_canvas(figure, number, shared_range, models.ColumnDataSource(columns))
         if panel.kind == "curves":
             canvas.add_tools(models.CrosshairTool(dimensions="height", overlay=cursor))
-        out.append(canvas)
-    return out
+        canvases.append(canvas)
+    return canvases
 
 
-def _range(limits: Sequence[float]) -> Any:
+def _axis_range(limits: Sequence[float]) -> Any:
     """Return what an axis shows: given limits, else all that is switched on."""
     from bokeh.models import DataRange1d, Range1d
 
     return Range1d(start=limits[0], end=limits[1]) if limits else DataRange1d(only_visible=True)
 
 
-def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource) -> Canvas:
+def _build_canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource) -> Canvas:
     from bokeh import models
     from bokeh.models.annotations import Title
     from bokeh.plotting import figure as new_canvas
@@ -83,7 +87,7 @@ def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource)
     panel = figure.panels[number]
     canvas = new_canvas(
         name=f"{figure.key}-{number}",
-        title=Title(text=panel.words, text_font_size=_FONT),
+        title=Title(text=panel.heading, text_font_size=_FONT),
         height=panel.height,
         sizing_mode="stretch_width",
         toolbar_location=None,
@@ -93,35 +97,41 @@ def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource)
         min_border_right=12,
         output_backend="canvas",
         x_range=x_range,
-        y_range=_range(panel.y_limits),
+        y_range=_axis_range(panel.y_limits),
         match_aspect=panel.kind == "map",
         x_axis_type="log" if panel.x_log else "linear",
         y_axis_type="log" if panel.y_log else "linear",
     )
     # the page scrolls under a finger; dragging zooms only after a button was pressed
     canvas.stylesheets = [":host .bk-events { touch-action: pan-y pinch-zoom; }"]
-    over = [_mark(name, figure.looks[name], source) for name in figure.names(number)]
-    canvas.renderers.extend(over)
+    renderers = [
+        _build_renderer(name, figure.styles[name], source) for name in figure.panel_names(number)
+    ]
+    canvas.renderers.extend(renderers)
     # where places bear names, the name alone says what a mark is
-    told = panel.kind == "curves" and not panel.y_names
-    tips: Any = [("$name", "@$name{0.000 a}")] if told else [("", "$name")]
+    shows_values = panel.kind == "curves" and not panel.y_names
+    tooltips: Any = [("$name", "@$name{0.000 a}")] if shows_values else [("", "$name")]
     hover = models.HoverTool(
-        renderers=[one for one in over if figure.looks[one.name].kind in ("line", "points")],
-        mode="vline" if told else "mouse",
-        tooltips=tips,
+        renderers=[
+            renderer
+            for renderer in renderers
+            if figure.styles[renderer.name].kind in ("line", "points")
+        ],
+        mode="vline" if shows_values else "mouse",
+        tooltips=tooltips,
         point_policy="follow_mouse",
     )
-    if told and panel.si:
-        unit, factor = panel.si
-        both = models.CustomJSHover(
+    if shows_values and panel.si_unit:
+        unit, factor = panel.si_unit
+        unit_formatter = models.CustomJSHover(
             args={"unit": unit, "factor": factor},
             code="return `${+value.toPrecision(4)} (${+(value / factor).toPrecision(4)} ${unit})`",
         )
         hover.tooltips = [("$name", "@$name{custom}")]
-        hover.formatters = {f"@{{{name}}}": both for name in figure.names(number)}
+        hover.formatters = {f"@{{{name}}}": unit_formatter for name in figure.panel_names(number)}
     canvas.add_tools(hover, models.BoxZoomTool(match_aspect=panel.kind == "map"))
     canvas.toolbar.active_drag = None
-    canvas.xaxis.axis_label = powers(panel.x_label) or None
+    canvas.xaxis.axis_label = format_exponents(panel.x_label) or None
     for axis, names, log, count in (
         (canvas.yaxis[0], panel.y_names, panel.y_log, 4),
         (canvas.xaxis[0], panel.x_names, panel.x_log, 5),
@@ -132,75 +142,75 @@ def _canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource)
             axis_label_text_font_style="normal",
         )
         if names:
-            axis.ticker = models.FixedTicker(ticks=[float(place) for place in names])
-            axis.major_label_overrides = {float(place): text for place, text in names.items()}
+            axis.ticker = models.FixedTicker(ticks=[float(tick) for tick in names])
+            axis.major_label_overrides = {float(tick): text for tick, text in names.items()}
         elif not log:
-            step = 1.0 if count == 5 and figure.counts(number) else 0.0
+            step = 1.0 if count == 5 and figure.has_integer_axis(number) else 0.0
             axis.ticker = models.BasicTicker(desired_num_ticks=count, min_interval=step)
     lines = [line for name in panel.x_names.values() for line in name.splitlines() or [""]]
-    if _LETTER * max(map(len, lines), default=0) * len(panel.x_names) > _NARROW:
+    if _LETTER_WIDTH * max(map(len, lines), default=0) * len(panel.x_names) > _MIN_PANEL_WIDTH:
         # long names stand upright, and on a phone those that have room
         policy = models.NoOverlap(min_distance=2)
         canvas.xaxis[0].update(major_label_orientation="vertical", major_label_policy=policy)
     return canvas
 
 
-def _mark(name: str, look: Look, source: ColumnDataSource) -> Any:
+def _build_renderer(name: str, style: GlyphStyle, source: ColumnDataSource) -> Any:
     """Return the renderer of what bears a name, added to nothing yet."""
     from bokeh import models
     from bokeh.models.renderers import GlyphRenderer
 
-    color, x = "#808080" if look.color == INK else look.color, f"x of {name}"
+    color, x = "#808080" if style.color == TEXT_COLOR else style.color, f"x of {name}"
     # what is faint on paper stays to be seen on a screen
-    alpha = max(look.alpha, 0.25)
+    alpha = max(style.alpha, 0.25)
     fill: dict[str, Any] = {"fill_color": color, "fill_alpha": alpha, "line_color": None}
     line: dict[str, Any] = {
         "line_color": color,
         "line_alpha": alpha,
-        "line_dash": _DASHES.get(look.dash, look.dash),
-        "line_width": min(max(1.2 * look.width, 0.8), 2.4),
+        "line_dash": _DASHES.get(style.dash, style.dash),
+        "line_width": min(max(1.2 * style.width, 0.8), 2.4),
     }
     glyph: Any
-    if look.kind == "points":
-        marker: dict[str, Any] = {"marker": _MARKERS[look.marker], "size": max(look.size, 4)}
-        if look.hollow or look.marker == "x":
+    if style.kind == "points":
+        marker: dict[str, Any] = {"marker": _MARKERS[style.marker], "size": max(style.size, 4)}
+        if style.is_hollow or style.marker == "x":
             marker |= {"fill_color": None, "line_color": color}
         else:
             marker |= {"fill_color": color, "line_color": None, "fill_alpha": alpha}
         glyph = models.Scatter(x=x, y=name, **marker)
-    elif look.kind == "fill":
+    elif style.kind == "fill":
         glyph = models.Patch(x=x, y=name, **fill)
-    elif look.kind == "strip":
+    elif style.kind == "strip":
         glyph = models.VStrip(x0=x, x1=name, **fill)
-    elif look.kind == "across":
+    elif style.kind == "across":
         glyph = models.HSpan(y=name, **line)
-    elif look.kind == "upright":
+    elif style.kind == "upright":
         glyph = models.VSpan(x=x, **line)
     else:
         glyph = models.Line(x=x, y=name, **line)
-    return GlyphRenderer(data_source=source, glyph=glyph, name=name, visible=look.shown)
+    return GlyphRenderer(data_source=source, glyph=glyph, name=name, visible=style.is_visible)
 
 
-def _columns(figure: Figure, case: Case, panel: int) -> dict[str, np.ndarray]:
+def _panel_columns(figure: Figure, case: Case, panel: int) -> dict[str, np.ndarray]:
     """Return the columns of a panel's source; shorter curves are filled with gaps."""
-    curves = case.curves[panel]
-    longest = max((len(x) for x, _ in curves.values()), default=0)
+    traces = case.curves[panel]
+    max_length = max((len(x) for x, _ in traces.values()), default=0)
     columns: dict[str, np.ndarray] = {}
-    for name in figure.names(panel):
-        x, y = curves.get(name, (np.empty(0), np.empty(0)))
+    for name in figure.panel_names(panel):
+        x, y = traces.get(name, (np.empty(0), np.empty(0)))
         columns |= {f"x of {name}": x, name: y}
     for name, values in columns.items():
-        columns[name] = np.full(longest, np.nan)
+        columns[name] = np.full(max_length, np.nan)
         columns[name][: len(values)] = values
     return columns
 
 
-def _json(figure: Figure) -> str:
+def _figure_json(figure: Figure) -> str:
     """Return a figure as the page's script takes it."""
     from bokeh.document import Document
 
     # models are numbered in their order, so that the same run has the same page
-    document, panels = Document(), _panels(figure)
+    document, panels = Document(), _build_canvases(figure)
     for panel in panels:
         document.add_root(panel)
     names: dict[str, str] = {}
@@ -209,15 +219,18 @@ def _json(figure: Figure) -> str:
         names[panel.id] = f"{figure.key}-root-{number}"
     text = re.sub(
         r"(?<=\")p\d{4,}(?=\")",
-        lambda found: names.setdefault(found[0], f"{figure.key}-{len(names)}"),
+        lambda match: names.setdefault(match[0], f"{figure.key}-{len(names)}"),
         text,
     )
-    places = {f"{figure.key}-root-{i}": f"{figure.key}-{i}-panel" for i in range(len(panels))}
-    item = {"docid": figure.key, "roots": places, "root_ids": list(places)}
+    root_elements = {
+        f"{figure.key}-root-{i}": f"{figure.key}-{i}-panel" for i in range(len(panels))
+    }
+    item = {"docid": figure.key, "roots": root_elements, "root_ids": list(root_elements)}
     content = {
         **{"documents": {figure.key: json.loads(text)}, "items": [item]},
         "looks": {
-            name: {"color": look.color, "shown": look.shown} for name, look in figure.looks.items()
+            name: {"color": style.color, "shown": style.is_visible}
+            for name, style in figure.styles.items()
         },
         "panels": len(figure.panels),
         "cases": [
@@ -225,7 +238,8 @@ def _json(figure: Figure) -> str:
                 "title": case.title,
                 "note": case.note,
                 "panels": [
-                    packed(_columns(figure, case, number)) for number in range(len(figure.panels))
+                    pack_columns(_panel_columns(figure, case, number))
+                    for number in range(len(figure.panels))
                 ],
             }
             for case in figure.cases

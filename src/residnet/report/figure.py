@@ -14,17 +14,17 @@ from typing import Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 
-from residnet.core.format import powers
-from residnet.core.stretches import stretches
+from residnet.core.format import format_exponents
+from residnet.core.stretches import find_runs
 
-INK = "ink"
+TEXT_COLOR = "ink"
 """The colour of text: black on paper, light on a dark screen."""
 Curve: TypeAlias = tuple[np.ndarray, np.ndarray]
 """Horizontal and vertical values [T], NaN where there is a gap."""
-Kind: TypeAlias = Literal["line", "points", "fill", "across", "upright", "strip"]
+GlyphKind: TypeAlias = Literal["line", "points", "fill", "across", "upright", "strip"]
 
 # Okabe and Ito's palette, which stays distinct under the common colour-vision deficiencies
-BLUE, ORANGE, VERMILLION, PURPLE, GREEN, SKY, GREY = (
+BLUE, ORANGE, VERMILLION, PURPLE, GREEN, SKY_BLUE, GREY = (
     "#0072B2",
     "#E69F00",
     "#D55E00",
@@ -33,63 +33,65 @@ BLUE, ORANGE, VERMILLION, PURPLE, GREEN, SKY, GREY = (
     "#56B4E9",
     "#7F7F7F",
 )
-COLORS = (BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE, GREY)
+COLORS = (BLUE, VERMILLION, GREEN, PURPLE, SKY_BLUE, ORANGE, GREY)
 DASHES = ("solid", "long", "dashdot", "short", "dense", "dashed", "dotted")
 
 
 @dataclass(frozen=True)
-class Look:
+class GlyphStyle:
     """How what bears one name looks in every panel.
 
     Attributes:
         label: in the legend, and beside its switch.
-        color: as CSS has it, or `INK`.
+        color: as CSS has it, or `TEXT_COLOR`.
         dash: `solid`, `dashed`, `dotted`, `dashdot`, `long`, `short` or `dense`.
         width: of its line in points.
         kind: a `line`, `points`, a `fill` of outlines that gaps part; lines `across` at vertical
             values or `upright` at horizontal ones; `strip`s from one horizontal value to another.
-        shown: it is switched on at first, and drawn in still pictures.
+        is_visible: it is switched on at first, and drawn in still pictures.
         alpha: opacity.
         marker: of points: `o`, `s`, `x` or `^`.
         size: of points, in points.
-        hollow: points are rings.
-        order: what has a higher one lies on top.
+        is_hollow: points are rings.
+        z_order: what has a higher one lies on top.
     """
 
     label: str
-    color: str = INK
+    color: str = TEXT_COLOR
     dash: str = "solid"
     width: float = 1.4
-    kind: Kind = "line"
-    shown: bool = True
+    kind: GlyphKind = "line"
+    is_visible: bool = True
     alpha: float = 1.0
     marker: str = "o"
     size: float = 4.0
-    hollow: bool = False
-    order: float = 3
+    is_hollow: bool = False
+    z_order: float = 3
 
 
-GLANCE = 280
+MAX_PREVIEW_HEIGHT = 280
 """Most pixels of a panel on a first screen, which on a phone holds rows of a table as well."""
-MEASURED = Look("measured", width=0.7, order=2)
-SOLID = Look("", BLUE, width=1.6)
-DASHED = Look("", ORANGE, "dashed", 1.6, order=4)
+MEASURED_STYLE = GlyphStyle("measured", width=0.7, z_order=2)
+SOLID_STYLE = GlyphStyle("", BLUE, width=1.6)
+DASHED_STYLE = GlyphStyle("", ORANGE, "dashed", 1.6, z_order=4)
 """Two curves of equal rank, told apart by colour and by line."""
-MASKED = Look("masked", "#E0E0E0", kind="strip", alpha=0.8, order=0)
-START = Look("start", kind="points", size=6, hollow=True, order=6)
-ZERO = Look("", "#666666", width=0.8, kind="across", order=1)
+MASKED_STYLE = GlyphStyle("masked", "#E0E0E0", kind="strip", alpha=0.8, z_order=0)
+START_STYLE = GlyphStyle("start", kind="points", size=6, is_hollow=True, z_order=6)
+ZERO_LINE_STYLE = GlyphStyle("", "#666666", width=0.8, kind="across", z_order=1)
 
 
-def family(names: Iterable[str], **given: Any) -> dict[str, Look]:
+def style_family(names: Iterable[str], **attributes: Any) -> dict[str, GlyphStyle]:
     """Return looks of equal rank by name, told apart by colour and by line.
 
     Args:
-        given: further attributes of all looks.
+        attributes: further attributes of all looks.
     """
-    most = len(COLORS)
+    n_colors = len(COLORS)
     return {
-        name: Look(
-            name, **{"color": COLORS[i % most], "dash": DASHES[(i + i // most) % most]} | given
+        name: GlyphStyle(
+            name,
+            **{"color": COLORS[i % n_colors], "dash": DASHES[(i + i // n_colors) % n_colors]}
+            | attributes,
         )
         for i, name in enumerate(names)
     }
@@ -108,7 +110,7 @@ class Panel:
         x_log, y_log: whether an axis is logarithmic.
         group: of panels that share their horizontal axis.
         x_names, y_names: what stands at an axis in place of numbers, by place.
-        si: SI unit of the vertical values, and their factor from it; empty where they are in it.
+        si_unit: SI unit of the vertical values, and their factor from it; empty where they are in it.
         x_limits, y_limits: where an axis begins and ends at first; empty for all that is shown.
     """
 
@@ -124,12 +126,14 @@ class Panel:
     y_names: Mapping[str, str] = field(default_factory=dict)
     x_limits: Sequence[float] = ()
     y_limits: Sequence[float] = ()
-    si: tuple[str, float] | tuple[()] = ()
+    si_unit: tuple[str, float] | tuple[()] = ()
 
     @property
-    def words(self) -> str:
+    def heading(self) -> str:
         """What stands above the panel on a page."""
-        return powers(" ".join(": ".join(one for one in (self.title, self.y_label) if one).split()))
+        return format_exponents(
+            " ".join(": ".join(part for part in (self.title, self.y_label) if part).split())
+        )
 
 
 @dataclass(frozen=True)
@@ -160,24 +164,24 @@ class Figure:
         name: of its files and of its parts on the page.
         title: a few words.
         caption: whole sentences that say what to look for.
-        looks: by name, in the order of the legend.
+        styles: by name, in the order of the legend.
         panels: from top to bottom, line by line where there are columns.
         cases: at least one.
         chooser: what the cases are, beside the list to choose from.
         columns: of panels beside each other.
-        stills: pictures that were written of it.
+        static_images: pictures that were written of it.
     """
 
     kind: ClassVar[str] = "figure"
     name: str
     title: str
     caption: str
-    looks: Mapping[str, Look]
+    styles: Mapping[str, GlyphStyle]
     panels: Sequence[Panel]
     cases: Sequence[Case]
     chooser: str = ""
     columns: int = 1
-    stills: Sequence[Path] = ()
+    static_images: Sequence[Path] = ()
 
     @property
     def key(self) -> str:
@@ -185,11 +189,11 @@ class Figure:
         return "figure-" + re.sub(r"[^a-z0-9]+", "-", self.name.lower())
 
     @property
-    def pictured(self) -> list[Case]:
+    def static_cases(self) -> list[Case]:
         """Cases in the order of the stills."""
         return [case for case in self.cases if case.still]
 
-    def part(self, panels: int = 1) -> Figure:
+    def preview(self, panels: int = 1) -> Figure:
         """Return the first panels without words: a glance, for the first screen of a page.
 
         It has no stills, since the whole figure stands further down.
@@ -197,96 +201,114 @@ class Figure:
         # panels beneath each other share the name of their horizontal axis
         last = self.panels[-1]
         cases = [replace(case, curves=case.curves[:panels], texts=()) for case in self.cases]
-        shown = [
-            replace(one, height=min(one.height, GLANCE), x_label=one.x_label or last.x_label)
-            for one in self.panels[:panels]
+        preview_panels = [
+            replace(
+                panel,
+                height=min(panel.height, MAX_PREVIEW_HEIGHT),
+                x_label=panel.x_label or last.x_label,
+            )
+            for panel in self.panels[:panels]
         ]
-        seen = {name for case in cases for curves in case.curves for name in curves}
+        present_names = {
+            name for case in cases for case_curves in case.curves for name in case_curves
+        }
         return replace(
             self,
             name=f"{self.name} first",
             caption="",
-            looks={name: look for name, look in self.looks.items() if name in seen and look.shown},
-            panels=shown,
+            styles={
+                name: style
+                for name, style in self.styles.items()
+                if name in present_names and style.is_visible
+            },
+            panels=preview_panels,
             cases=cases,
-            stills=(),
+            static_images=(),
         )
 
-    def names(self, panel: int) -> list[str]:
+    def panel_names(self, panel: int) -> list[str]:
         """Return the names of what a panel shows in any case, in order."""
         present = {name for case in self.cases for name in case.curves[panel]}
-        return [name for name in self.looks if name in present]
+        return [name for name in self.styles if name in present]
 
-    def counts(self, panel: int) -> bool:
+    def has_integer_axis(self, panel: int) -> bool:
         """Return whether the horizontal values of a panel are whole, those of a count."""
-        curves = [x for case in self.cases for x, _ in case.curves[panel].values()]
-        known = [x[np.isfinite(x)] for x in curves]
+        x_values = [x for case in self.cases for x, _ in case.curves[panel].values()]
+        finite_values = [x[np.isfinite(x)] for x in x_values]
         # values of a file are packed in 16 bits
-        fine = 2e-5 * max((float(np.ptp(x)) for x in known if x.size), default=0.0)
-        return any(x.size for x in known) and all((abs(x - x.round()) <= fine).all() for x in known)
+        tolerance = 2e-5 * max((float(np.ptp(x)) for x in finite_values if x.size), default=0.0)
+        return any(x.size for x in finite_values) and all(
+            (abs(x - x.round()) <= tolerance).all() for x in finite_values
+        )
 
 
-def parts(x: Any, y: Any) -> list[Curve]:
+def split_at_gaps(x: Any, y: Any) -> list[Curve]:
     """Return a curve in the pieces that its gaps leave."""
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    good = np.isfinite(x) & np.isfinite(y)
-    return [(x[a:b], y[a:b]) for a, b in zip(*stretches(good), strict=True)]
+    is_finite = np.isfinite(x) & np.isfinite(y)
+    return [(x[a:b], y[a:b]) for a, b in zip(*find_runs(is_finite), strict=True)]
 
 
-def joined(curves: Iterable[tuple[Any, Any]]) -> Curve:
+def join_with_gaps(xy_pairs: Iterable[tuple[Any, Any]]) -> Curve:
     """Return several curves as one with gaps between them."""
     gap = [np.nan]
-    pieces = [
+    padded_curves = [
         (np.append(np.asarray(x, dtype=float), gap), np.append(np.asarray(y, dtype=float), gap))
-        for x, y in curves
+        for x, y in xy_pairs
     ]
     x, y = (
-        np.concatenate([piece[axis] for piece in pieces] or [np.empty(1)])[:-1] for axis in (0, 1)
+        np.concatenate([padded_curve[axis] for padded_curve in padded_curves] or [np.empty(1)])[:-1]
+        for axis in (0, 1)
     )
     return x, y
 
 
-def thinned(length: int, most: int) -> np.ndarray:
+def subsample_indices(length: int, max_count: int) -> np.ndarray:
     """Return the numbers of evenly spaced samples, at most so many, the first and last included."""
-    if length <= most:
+    if length <= max_count:
         return np.arange(length)
-    return np.unique(np.linspace(0, length - 1, most).round().astype(int))
+    return np.unique(np.linspace(0, length - 1, max_count).round().astype(int))
 
 
-def band(x: Any, low: Any, high: Any) -> Curve:
+def band_outline(x: Any, lower: Any, upper: Any) -> Curve:
     """Return the outline of what lies between two curves [T] over x [T], a `fill`."""
-    low, high = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
-    good = np.isfinite(low) & np.isfinite(high)
+    lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
+    is_finite = np.isfinite(lower) & np.isfinite(upper)
     x = np.asarray(x, dtype=float)
-    return joined(
-        (np.append(x[a:b], x[a:b][::-1]), np.append(low[a:b], high[a:b][::-1]))
-        for a, b in zip(*stretches(good), strict=True)
+    return join_with_gaps(
+        (np.append(x[a:b], x[a:b][::-1]), np.append(lower[a:b], upper[a:b][::-1]))
+        for a, b in zip(*find_runs(is_finite), strict=True)
     )
 
 
-def bars(at: Any, values: Any, thick: float = 0.8) -> Curve:
+def bar_outlines(positions: Any, values: Any, thickness: float = 0.8) -> Curve:
     """Return the outlines of upright bars from zero, a `fill`; swap its parts for lying ones."""
-    corners = thick * np.array([-0.5, -0.5, 0.5, 0.5])
-    return joined(
+    corners = thickness * np.array([-0.5, -0.5, 0.5, 0.5])
+    return join_with_gaps(
         [
-            (place + corners, value * np.array([0.0, 1.0, 1.0, 0.0]))
-            for place, value in zip(at, values, strict=True)
+            (position + corners, value * np.array([0.0, 1.0, 1.0, 0.0]))
+            for position, value in zip(positions, values, strict=True)
         ]
     )
 
 
-def whiskers(at: Any, low: Any, high: Any) -> Curve:
+def error_bars(positions: Any, lower: Any, upper: Any) -> Curve:
     """Return upright lines from low to high values, swap its parts for lying ones."""
-    return joined([([place] * 2, ends) for place, *ends in zip(at, low, high, strict=True)])
+    return join_with_gaps(
+        [
+            ([position] * 2, limits)
+            for position, *limits in zip(positions, lower, upper, strict=True)
+        ]
+    )
 
 
-def steps(x: Any, y: Any) -> Curve:
+def step_curve(x: Any, y: Any) -> Curve:
     """Return a curve that keeps each value up to the next one."""
     return np.repeat(np.asarray(x, dtype=float), 2)[1:], np.repeat(np.asarray(y, dtype=float), 2)[
         :-1
     ]
 
 
-def names_of(texts: Iterable[str]) -> dict[str, str]:
+def tick_labels(texts: Iterable[str]) -> dict[str, str]:
     """Return what stands at the whole numbers of an axis."""
-    return {str(place): text for place, text in enumerate(texts)}
+    return {str(index): text for index, text in enumerate(texts)}

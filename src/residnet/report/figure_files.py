@@ -13,40 +13,55 @@ from typing import Any
 import numpy as np
 
 from residnet.core.errors import UsageError
-from residnet.core.files import file_stem, read_json, whole
-from residnet.core.ownership import require_inside, resolve_name, run_manifest_above
-from residnet.core.progress import begin
+from residnet.core.files import atomic_write, make_file_stem, read_json
+from residnet.core.ownership import find_run_manifest, require_inside, resolve_name
+from residnet.core.progress import begin_stage
 from residnet.report.blocks import Section
-from residnet.report.figure import Case, Curve, Figure, Look, Panel, joined, parts, thinned
-from residnet.report.still import save, still
+from residnet.report.figure import (
+    Case,
+    Curve,
+    Figure,
+    GlyphStyle,
+    Panel,
+    join_with_gaps,
+    split_at_gaps,
+    subsample_indices,
+)
+from residnet.report.still import render_matplotlib, save_png
 
 
-def packed(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def pack_columns(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Return columns as 16-bit numbers with offset and step; equal columns are stored once."""
-    out: dict[str, Any] = {}
+    packed_columns: dict[str, Any] = {}
     stored: dict[bytes, str] = {}
     for name, values in columns.items():
-        before = stored.setdefault(values.tobytes(), name)
-        if before != name:
-            out[name] = before
+        first_name = stored.setdefault(values.tobytes(), name)
+        if first_name != name:
+            packed_columns[name] = first_name
             continue
         finite = np.isfinite(values)
-        known = values[finite]
-        low, span = (float(known.min()), float(np.ptp(known))) if known.size else (0.0, 0.0)
+        finite_values = values[finite]
+        minimum, span = (
+            (float(finite_values.min()), float(np.ptp(finite_values)))
+            if finite_values.size
+            else (0.0, 0.0)
+        )
         # finer than any screen; the largest number is a gap
         step = span / 65_000 if span > 0 else 1.0
         levels = np.full(len(values), 65_535, dtype="<u2")
-        levels[finite] = np.round((known - low) / step)
-        out[name] = [low, step, base64.b64encode(levels.tobytes()).decode("ascii")]
-    return out
+        levels[finite] = np.round((finite_values - minimum) / step)
+        packed_columns[name] = [minimum, step, base64.b64encode(levels.tobytes()).decode("ascii")]
+    return packed_columns
 
 
-def unpacked(columns: Mapping[str, Any], name: str) -> np.ndarray:
-    """Return one of the columns that `packed` gave, as numbers [T]."""
-    stored = columns[name]
-    low, step, text = columns[stored] if isinstance(stored, str) else stored
+def unpack_column(columns: Mapping[str, Any], name: str) -> np.ndarray:
+    """Return one of the columns that `pack_columns` gave, as numbers [T]."""
+    packed_column = columns[name]
+    minimum, step, text = (
+        columns[packed_column] if isinstance(packed_column, str) else packed_column
+    )
     levels = np.frombuffer(base64.b64decode(text), dtype="<u2")
-    values: np.ndarray = np.where(levels == 65_535, np.nan, low + step * levels)
+    values: np.ndarray = np.where(levels == 65_535, np.nan, minimum + step * levels)
     return values
 
 
@@ -56,40 +71,43 @@ def write_figure(folder: Path, figure: Figure, name: str = "") -> Figure:
     Args:
         name: of the files, that of the figure where empty.
     """
-    name = file_stem(name or figure.name)
-    stills, several = [], len(figure.pictured) > 1
-    for number, case in enumerate(figure.pictured, start=1):
-        path = folder / (f"{name}_{number}.png" if several else f"{name}.png")
-        title = figure.title + (f": {case.title}" if several else "")
-        save(still(figure, case), path, title, figure.caption)
-        stills.append(path)
-    content = {name: getattr(figure, name) for name in _PLAIN} | {
-        "looks": {name: asdict(look) for name, look in figure.looks.items()},
+    name = make_file_stem(name or figure.name)
+    image_paths, has_several = [], len(figure.static_cases) > 1
+    for number, case in enumerate(figure.static_cases, start=1):
+        path = folder / (f"{name}_{number}.png" if has_several else f"{name}.png")
+        title = figure.title + (f": {case.title}" if has_several else "")
+        save_png(render_matplotlib(figure, case), path, title, figure.caption)
+        image_paths.append(path)
+    content = {name: getattr(figure, name) for name in _STORED_FIELDS} | {
+        "looks": {name: asdict(style) for name, style in figure.styles.items()},
         "panels": [asdict(panel) for panel in figure.panels],
-        "stills": [path.name for path in stills],
+        "stills": [path.name for path in image_paths],
         "cases": [
             {"title": case.title, "note": case.note, "still": case.still}
-            | {"curves": [_stored(curves) for curves in case.curves]}
+            | {"curves": [_pack_curves(panel_curves) for panel_curves in case.curves]}
             for case in figure.cases
         ],
     }
-    with whole(folder / f"{name}.json") as file:
+    with atomic_write(folder / f"{name}.json") as file:
         file.write_text(json.dumps(content, separators=(",", ":")), encoding="utf-8")
-    return replace(figure, stills=stills)
+    return replace(figure, static_images=image_paths)
 
 
-_PLAIN = ("name", "title", "caption", "chooser", "columns")
+_STORED_FIELDS = ("name", "title", "caption", "chooser", "columns")
 
 
-def _stored(curves: Mapping[str, Curve]) -> dict[str, Any]:
+def _pack_curves(panel_curves: Mapping[str, Curve]) -> dict[str, Any]:
     """Return the curves of a panel with no more samples than a screen shows, packed."""
     columns: dict[str, np.ndarray] = {}
-    for name, (x, y) in curves.items():
-        pieces = parts(x, y)
-        most = max(20, min(600, 6_000 // max(len(pieces), 1)))
-        light = joined(tuple(axis[thinned(len(axis), most)] for axis in piece) for piece in pieces)
-        columns |= {f"x{name}": light[0], f"y{name}": light[1]}
-    return packed(columns)
+    for name, (x, y) in panel_curves.items():
+        curve_parts = split_at_gaps(x, y)
+        max_points = max(20, min(600, 6_000 // max(len(curve_parts), 1)))
+        subsampled = join_with_gaps(
+            tuple(axis[subsample_indices(len(axis), max_points)] for axis in curve_part)
+            for curve_part in curve_parts
+        )
+        columns |= {f"x{name}": subsampled[0], f"y{name}": subsampled[1]}
+    return pack_columns(columns)
 
 
 def write_figures(folder: Path, figures: Iterable[Figure]) -> list[Figure]:
@@ -97,17 +115,18 @@ def write_figures(folder: Path, figures: Iterable[Figure]) -> list[Figure]:
 
     Other pictures of the folder stay, and so do figures that somebody edited.
     """
-    manifest = run_manifest_above(folder / "figure.json")
+    manifest = find_run_manifest(folder / "figure.json")
     if manifest is not None:
         require_inside(manifest.folder, folder)
         for path in folder.glob("*.json"):
-            before = _read(path)
-            for file in (path, *before.stills) if before else ():
+            previous_figure = _read_figure(path)
+            for file in (path, *previous_figure.static_images) if previous_figure else ():
                 manifest.remove_if_owned(file)
-    begin("drawing figures")
+    begin_stage("drawing figures")
     # the number keeps the order for whoever lists the folder
     return [
-        write_figure(folder, one, f"{i:02d}_{one.name}") for i, one in enumerate(figures, start=1)
+        write_figure(folder, figure, f"{i:02d}_{figure.name}")
+        for i, figure in enumerate(figures, start=1)
     ]
 
 
@@ -118,8 +137,8 @@ def read_figures(folder: Path, names: str = ".*") -> list[Figure]:
         folder: as `write_figures` left it.
         names: regular expression of the names of those that are wanted.
     """
-    found = (_read(path) for path in sorted(folder.glob("*.json")))
-    return [figure for figure in found if figure and re.fullmatch(names, figure.name)]
+    read = (_read_figure(path) for path in sorted(folder.glob("*.json")))
+    return [figure for figure in read if figure and re.fullmatch(names, figure.name)]
 
 
 def figures_section(folder: Path) -> list[Section]:
@@ -128,24 +147,27 @@ def figures_section(folder: Path) -> list[Section]:
     return [Section("Figures", figures)] if figures else []
 
 
-def _read(path: Path) -> Figure | None:
+def _read_figure(path: Path) -> Figure | None:
     try:
         content = read_json(path)
         for case in content["cases"]:
             case["curves"] = [
                 {
-                    name[1:]: (unpacked(of, name), unpacked(of, f"y{name[1:]}"))
-                    for name in of
+                    name[1:]: (
+                        unpack_column(packed_panel, name),
+                        unpack_column(packed_panel, f"y{name[1:]}"),
+                    )
+                    for name in packed_panel
                     if name[0] == "x"
                 }
-                for of in case["curves"]
+                for packed_panel in case["curves"]
             ]
         return Figure(
-            **{name: content[name] for name in _PLAIN},
-            looks={name: Look(**look) for name, look in content["looks"].items()},
+            **{name: content[name] for name in _STORED_FIELDS},
+            styles={name: GlyphStyle(**style) for name, style in content["looks"].items()},
             panels=[Panel(**panel) for panel in content["panels"]],
             cases=[Case(**case) for case in content["cases"]],
-            stills=[_still_path(path, name) for name in content["stills"]],
+            static_images=[_still_path(path, name) for name in content["stills"]],
         )
     except (UsageError, OSError, ValueError, TypeError, KeyError, AttributeError):
         # damaged: it is drawn again, or is not one of residnet

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from residnet.judge.soundness import read_findings
+from residnet.judge.soundness import read_sanity_findings
 from residnet.report.blocks import Section
 from residnet.report.figure import Figure
 from residnet.report.figure_files import read_figures, write_figures
@@ -14,47 +14,47 @@ from residnet.report.run_reader import RunFiles
 from residnet.report.sections import data, free_runs, manoeuvres, models, runs, verdict
 
 
-def _sections(run: RunFiles) -> Iterator[Section | None]:
+def _iterate_fit_sections(run: RunFiles) -> Iterator[Section | None]:
     """Yield the sections of the page in their order; None is left out.
 
     A section is added here, and its figures below. What most readers look for stands open.
     """
-    folder, findings = run.path / "figures", read_findings(run.path)
-    yield verdict.opening(run, read_figures(folder, "track"))
-    yield verdict.cautions(run, findings)
-    yield _figures_as("Error against horizon", folder, "horizon")
-    yield free_runs.worst(run, read_figures(folder, "free_runs"))
-    yield data.doctor(run)
-    yield manoeuvres.booklet(run)
-    for found in (
-        free_runs.errors(run),
-        free_runs.limits(run),
-        data.fitted_on_what(run),
-        models.models(run),
-        free_runs.bands(run),
-        models.goodness(run),
-        _figures_as("Figures", folder, "(?!(track|horizon|free_runs)$).*"),
-        verdict.sanity(run, findings),
+    folder, findings = run.path / "figures", read_sanity_findings(run.path)
+    yield verdict.opening_section(run, read_figures(folder, "track"))
+    yield verdict.cautions_section(run, findings)
+    yield _figures_section("Error against horizon", folder, "horizon")
+    yield free_runs.worst_runs_section(run, read_figures(folder, "free_runs"))
+    yield data.quality_section(run)
+    yield manoeuvres.booklet_section(run)
+    for folded_section in (
+        free_runs.errors_section(run),
+        free_runs.limits_section(run),
+        data.fit_data_section(run),
+        models.models_section(run),
+        free_runs.bands_section(run),
+        models.goodness_section(run),
+        _figures_section("Figures", folder, "(?!(track|horizon|free_runs)$).*"),
+        verdict.sanity_section(run, findings),
     ):
-        yield found and replace(found, folded=True)
+        yield folded_section and replace(folded_section, is_folded=True)
 
 
-def _figures_as(title: str, folder: Path, names: str) -> Section | None:
-    found = read_figures(folder, names)
-    return Section(title, found) if found else None
+def _figures_section(title: str, folder: Path, names: str) -> Section | None:
+    figures = read_figures(folder, names)
+    return Section(title, figures) if figures else None
 
 
-def _figures(run: RunFiles) -> Iterator[Figure | None]:
-    windows = run.windows(run.focus)
-    yield runs.track(run, windows)
-    yield runs.free_runs(run, windows)
-    yield runs.horizon(run, windows)
-    yield runs.residuals(run)
-    yield runs.bands(run, windows)
+def _iterate_fit_figures(run: RunFiles) -> Iterator[Figure | None]:
+    windows = run.read_split_windows(run.report_split)
+    yield runs.track_figure(run, windows)
+    yield runs.free_run_figure(run, windows)
+    yield runs.horizon_figure(run, windows)
+    yield runs.residual_figure(run)
+    yield runs.band_figure(run, windows)
     yield from manoeuvres.booklet_figures(run)
-    yield from models.terms(run)
-    yield from models.breeding(run)
-    yield models.learning(run)
+    yield from models.term_figures(run)
+    yield from models.evolution_figures(run)
+    yield models.learning_figure(run)
 
 
 def write_fit_figures(run: RunFiles) -> list[Figure]:
@@ -63,7 +63,9 @@ def write_fit_figures(run: RunFiles) -> list[Figure]:
     Raises:
         UsageError: where the folder holds no metrics.json.
     """
-    return write_figures(run.path / "figures", (one for one in _figures(run) if one is not None))
+    return write_figures(
+        run.path / "figures", (figure for figure in _iterate_fit_figures(run) if figure is not None)
+    )
 
 
 def fit_sections(run: RunFiles) -> list[Section]:
@@ -73,4 +75,4 @@ def fit_sections(run: RunFiles) -> list[Section]:
         UsageError: where the folder holds no metrics.json.
         DataError: where a file in it cannot be read.
     """
-    return [section for section in _sections(run) if section is not None]
+    return [section for section in _iterate_fit_sections(run) if section is not None]

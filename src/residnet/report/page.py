@@ -12,9 +12,9 @@ from typing import Any, final
 
 from markupsafe import Markup, escape
 
-from residnet.core.files import whole
-from residnet.core.format import powers
-from residnet.judge.verdict import LEVELS
+from residnet.core.files import atomic_write
+from residnet.core.format import format_exponents
+from residnet.judge.verdict import LEVEL_TEXTS
 from residnet.report.blocks import (
     EXPORTS,
     Block,
@@ -23,14 +23,14 @@ from residnet.report.blocks import (
     Code,
     Facts,
     Section,
-    bad_where,
-    table_of,
+    build_table,
+    flag_cell,
 )
-from residnet.report.browser import Drawn, draw
+from residnet.report.browser import InteractiveFigures, render_bokeh
 from residnet.report.figure import Figure
 from residnet.report.run_reader import RunFiles
 
-_FACTS = {
+_PROVENANCE_TITLES = {
     **{"residnet": "residnet", "git": "git revision", "seed": "seed", "python": "Python"},
     **{"machine": "machine", "started": "started (UTC)", "seconds": "duration"},
     **{"packages": "packages", "config": "configuration", "overrides": "overrides"},
@@ -38,18 +38,18 @@ _FACTS = {
 """What is told of provenance.json, and its title."""
 
 
-_UNIT = re.compile(r"(?<=\d) (?=(?:%|m|s|deg|m/s|deg/s|1/s|N|kN)(?![\w/]))")
+_UNIT_SPACE = re.compile(r"(?<=\d) (?=(?:%|m|s|deg|m/s|deg/s|1/s|N|kN)(?![\w/]))")
 """The space between a number and its unit."""
-_LONG = 20
+_MIN_BREAKABLE_LENGTH = 20
 """Least number of characters of a name that may break in the middle."""
 
 
-def draw_sections(sections: Sequence[Section]) -> Drawn | None:
+def render_figures(sections: Sequence[Section]) -> InteractiveFigures | None:
     """Return the interactive figures of a page's sections; None where there are none.
 
     Drawing them takes most of the time of a page: one that is written twice needs them once.
     """
-    return draw(_figures(sections))
+    return render_bokeh(_collect_figures(sections))
 
 
 def write_page(
@@ -58,7 +58,7 @@ def write_page(
     description: str,
     verdict: Sequence[str],
     sections: Sequence[Section],
-    drawn: Drawn | None = None,
+    rendered: InteractiveFigures | None = None,
     level: str = "",
 ) -> Path:
     """Write `report.html` of a run folder, whole or not at all.
@@ -75,7 +75,7 @@ def write_page(
         verdict: sentences that stand first, the first of them in bold.
         sections: from top to bottom. One without a title is the rest of the first screen: its
             first block stands beside the others where there is room.
-        drawn: what `draw_sections` returned for the sections; None to draw them now.
+        rendered: what `render_figures` returned for the sections; None to draw them now.
         level: of the verdict, a key of `LEVELS`; empty where none was passed.
 
     Returns:
@@ -98,41 +98,41 @@ def write_page(
     )
     glossary = Glossary()
     environment.filters |= {
-        "breakable": _breakable,
+        "breakable": _break_long_names,
         "embedded": lambda path: base64.b64encode(path.read_bytes()).decode("ascii"),
-        "pixels": _pixels,
+        "pixels": _image_size_attributes,
         "deflated": lambda text: base64.b64encode(zlib.compress(text.encode(), 9)).decode("ascii"),
         "anchor": lambda title: re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-"),
-        "linked": lambda text: glossary.linked(_breakable(str(text))),
+        "linked": lambda text: glossary.link_words(_break_long_names(str(text))),
     }
-    parts = [*sections, *_made_of(run, record)]
+    all_sections = [*sections, *_provenance_sections(run, record)]
     text = environment.get_template("page.html.j2").render(
         title=title or files.title,
         description=description or files.description,
         version=str(record.get("residnet") or ""),
         date=str(record.get("started") or "")[:10],
         verdict=[sentence for sentence in verdict if sentence],
-        level=level and (level.replace(" ", "-"), LEVELS[level]),
-        opening=[part for part in sections if not part.title],
-        sections=[part for part in parts if part.title],
+        level=level and (level.replace(" ", "-"), LEVEL_TEXTS[level]),
+        opening=[section for section in sections if not section.title],
+        sections=[section for section in all_sections if section.title],
         glossary=glossary,
-        interactive=drawn or draw_sections(sections),
+        interactive=rendered or render_figures(sections),
     )
     path = run / "report.html"
-    with whole(path) as file:
+    with atomic_write(path) as file:
         file.write_text(text, encoding="utf-8")
     return path
 
 
-def _figures(blocks: Sequence[Block]) -> list[Figure]:
+def _collect_figures(blocks: Sequence[Block]) -> list[Figure]:
     """Return the figures among blocks and the sections that they hold."""
-    found: list[Figure] = []
+    figures: list[Figure] = []
     for block in blocks:
         if isinstance(block, Figure):
-            found.append(block)
+            figures.append(block)
         elif isinstance(block, Section):
-            found += _figures(block.shown)
-    return found
+            figures += _collect_figures(block.present_blocks)
+    return figures
 
 
 def exports_section(run: Path) -> Section | None:
@@ -141,63 +141,65 @@ def exports_section(run: Path) -> Section | None:
     Raises:
         DataError: where exports.json is not readable.
     """
-    rows = RunFiles(run).json(EXPORTS).get("exports") or []
+    rows = RunFiles(run).read_json(EXPORTS).get("exports") or []
     if not rows:
         return None
     faults = [f"Not exported: {row['fault']}." for row in rows if row["fault"]]
 
     def result(row: Mapping[str, Any]) -> Cell:
         if row["fault"]:
-            return bad_where("not exported", True)
+            return flag_cell("not exported", True)
         return Cell("the file gives the model's own answers", mark="text")
 
     columns = [("model", "model"), ("file", lambda row: row["file"] or ""), ("result", result)]
-    blocks: list[Block] = [Bullets(faults, warning=True)] if faults else []
-    return Section("Exports for controllers", [*blocks, table_of(rows, columns)])
+    blocks: list[Block] = [Bullets(faults, is_warning=True)] if faults else []
+    return Section("Exports for controllers", [*blocks, build_table(rows, columns)])
 
 
-def _made_of(run: Path, record: Mapping[str, Any]) -> list[Section]:
+def _provenance_sections(run: Path, record: Mapping[str, Any]) -> list[Section]:
     """Return the section on provenance and configuration, none where the folder holds neither."""
     blocks: list[Block] = []
     if facts := provenance_facts(record):
-        blocks.append(Section("How this run was made", [Facts(facts)], folded=True))
+        blocks.append(Section("How this run was made", [Facts(facts)], is_folded=True))
     if inputs := record.get("inputs"):
         pairs = [(str(name), str(checksum)) for name, checksum in inputs.items()]
         title = f"SHA-256 of {len(inputs)} input file{'' if len(inputs) == 1 else 's'}"
-        blocks.append(Section(title, [Facts(pairs, code=True)], folded=True))
+        blocks.append(Section(title, [Facts(pairs, is_code=True)], is_folded=True))
     resolved = run / "resolved.yaml"
     if resolved.is_file():
         text = resolved.read_text(encoding="utf-8")
-        blocks.append(Section("Resolved configuration", [Code(text)], folded=True))
+        blocks.append(Section("Resolved configuration", [Code(text)], is_folded=True))
     return [Section("Provenance", blocks)] if blocks else []
 
 
 def provenance_facts(record: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return name and text of each fact of `provenance.json` that a reader may want."""
     packages = (record.get("packages") or {}).items()
-    told = {**record, "overrides": " ".join(record.get("overrides") or ())}
+    values = {**record, "overrides": " ".join(record.get("overrides") or ())}
     if (seconds := record.get("seconds")) is not None:
-        told["seconds"] = f"{seconds:.0f} s"
-    told["packages"] = ", ".join(f"{name} {version}" for name, version in packages if version)
-    known = {title: told.get(key) for key, title in _FACTS.items()}
-    return [(title, str(value)) for title, value in known.items() if value not in (None, "")]
+        values["seconds"] = f"{seconds:.0f} s"
+    values["packages"] = ", ".join(f"{name} {version}" for name, version in packages if version)
+    titled_values = {title: values.get(key) for key, title in _PROVENANCE_TITLES.items()}
+    return [
+        (title, str(value)) for title, value in titled_values.items() if value not in (None, "")
+    ]
 
 
-def _breakable(text: str) -> Markup:
+def _break_long_names(text: str) -> Markup:
     """Return escaped text whose long names and paths may break after underscores and slashes.
 
     A number and its unit stay in one line, powers are raised, and what stands in backticks is code.
     """
 
-    def broken(found: re.Match[str]) -> str:
-        return re.sub(r"([_/])", r"\1<wbr>", found[0])
+    def add_breaks(match: re.Match[str]) -> str:
+        return re.sub(r"([_/])", r"\1<wbr>", match[0])
 
-    together = powers(_UNIT.sub("\u00a0", str(escape(text))))
-    coded = re.sub(r"`([^`]+)`", r"<code>\1</code>", together)
-    return Markup(re.sub(rf"[^\s<>]{{{_LONG},}}", broken, coded))
+    with_unit_spaces = format_exponents(_UNIT_SPACE.sub("\u00a0", str(escape(text))))
+    with_code = re.sub(r"`([^`]+)`", r"<code>\1</code>", with_unit_spaces)
+    return Markup(re.sub(rf"[^\s<>]{{{_MIN_BREAKABLE_LENGTH},}}", add_breaks, with_code))
 
 
-def _pixels(path: Path) -> Markup:
+def _image_size_attributes(path: Path) -> Markup:
     """Return width and height of a picture, so that its place is kept until it is drawn."""
     from PIL import Image
 
@@ -206,19 +208,19 @@ def _pixels(path: Path) -> Markup:
     return Markup(f' width="{width}" height="{height}"')
 
 
-_ENTRY = re.compile(r"^(?P<terms>\S.*)\n:\s+(?P<text>.*)$", re.MULTILINE)
-_CODE = re.compile(r"`([^`]*)`|\*([^*]*)\*")
+_GLOSSARY_ENTRY = re.compile(r"^(?P<terms>\S.*)\n:\s+(?P<text>.*)$", re.MULTILINE)
+_MARKUP = re.compile(r"`([^`]*)`|\*([^*]*)\*")
 
 
-def entries() -> Mapping[str, str]:
+def read_glossary() -> Mapping[str, str]:
     """Return terms, several of one meaning with commas between, and what they mean."""
     file = resources.files("residnet.report") / "templates" / "glossary.md"
-    found = _ENTRY.finditer(file.read_text(encoding="utf-8"))
-    return {_plain(entry["terms"]): _plain(entry["text"]) for entry in found}
+    matches = _GLOSSARY_ENTRY.finditer(file.read_text(encoding="utf-8"))
+    return {_strip_markup(entry["terms"]): _strip_markup(entry["text"]) for entry in matches}
 
 
-def _plain(text: str) -> str:
-    return _CODE.sub(lambda found: found[1] or found[2], text)
+def _strip_markup(text: str) -> str:
+    return _MARKUP.sub(lambda found: found[1] or found[2], text)
 
 
 @final
@@ -226,38 +228,50 @@ class Glossary:
     """The words of one page: links to them, and what they mean for its end."""
 
     def __init__(self) -> None:
-        self._meant = entries()
-        self._of = {word.lower(): key for key in self._meant for word in key.split(", ")}
-        words = sorted(self._of, key=len, reverse=True)
-        several = "|".join(re.escape(word).replace(r"\ ", r"[ \u00a0]") for word in words)
-        self._words = re.compile(rf"(?<![\w/.-])(?:{several})(?=s?(?![\w/-]|\.\w))", re.IGNORECASE)
-        self._here: set[str] = set()
-        self._used: set[str] = set()
+        self._meanings = read_glossary()
+        self._key_of_word = {
+            term.lower(): key for key in self._meanings for term in key.split(", ")
+        }
+        sorted_words = sorted(self._key_of_word, key=len, reverse=True)
+        alternatives = "|".join(
+            re.escape(term).replace(r"\ ", r"[ \u00a0]") for term in sorted_words
+        )
+        self._word_pattern = re.compile(
+            rf"(?<![\w/.-])(?:{alternatives})(?=s?(?![\w/-]|\.\w))", re.IGNORECASE
+        )
+        self._linked_in_section: set[str] = set()
+        self._linked_keys: set[str] = set()
 
-    def fresh(self) -> str:
+    def start_section(self) -> str:
         """Begin a section, whose words are linked anew; returns nothing to print."""
-        self._here.clear()
+        self._linked_in_section.clear()
         return ""
 
-    def linked(self, text: Markup) -> Markup:
+    def link_words(self, text: Markup) -> Markup:
         """Return escaped text with links at the first use of each word in the section."""
 
-        def link(found: re.Match[str]) -> str:
-            key = self._of[found[0].lower().replace("\u00a0", " ")]
-            if key in self._here:
-                return found[0]
-            self._here.add(key)
-            self._used.add(key)
-            meant = escape(self._meant[key])
-            return f'<a class="term" href="#{name_of(key)}" title="{meant}">{found[0]}</a>'
+        def link_match(match: re.Match[str]) -> str:
+            key = self._key_of_word[match[0].lower().replace("\u00a0", " ")]
+            if key in self._linked_in_section:
+                return match[0]
+            self._linked_in_section.add(key)
+            self._linked_keys.add(key)
+            meaning = escape(self._meanings[key])
+            return (
+                f'<a class="term" href="#{glossary_anchor(key)}" title="{meaning}">{match[0]}</a>'
+            )
 
-        return Markup(self._words.sub(link, str(text)))
+        return Markup(self._word_pattern.sub(link_match, str(text)))
 
-    def used(self) -> list[tuple[str, str, str]]:
+    def linked_terms(self) -> list[tuple[str, str, str]]:
         """Return name, terms and meaning of each word that was linked, in alphabetical order."""
-        return [(name_of(key), key, self._meant[key]) for key in self._meant if key in self._used]
+        return [
+            (glossary_anchor(key), key, self._meanings[key])
+            for key in self._meanings
+            if key in self._linked_keys
+        ]
 
 
-def name_of(key: str) -> str:
+def glossary_anchor(key: str) -> str:
     """Return the name by which a word is linked."""
     return "word-" + re.sub(r"[^a-z0-9]+", "-", key.lower()).strip("-")

@@ -13,23 +13,23 @@ import numpy as np
 
 from residnet.core.config import load_mapping
 from residnet.core.errors import DataError, UsageError
-from residnet.core.files import file_stem, read_table
-from residnet.core.format import SHOWN_UNITS, shown_unit
-from residnet.core.frames import wrap_array
-from residnet.core.layout import ALIVE, SIX, Live
-from residnet.core.names import CHANNEL_UNITS, END_UNITS, to_si
+from residnet.core.files import make_file_stem, read_table
+from residnet.core.format import DISPLAY_UNITS, display_unit
+from residnet.core.frames import wrap_angle_array
+from residnet.core.layout import SIX_DOF_LAYOUT, SURGE_SWAY_YAW, DegreesOfFreedom
+from residnet.core.names import CHANNEL_UNITS, POSE_ERROR_UNITS, to_si
 from residnet.core.run_loader import read_json_value, require_listed
-from residnet.core.units import known_unit
+from residnet.core.units import canonical_unit
 from residnet.judge.assessment import Assessment
-from residnet.judge.metrics import INPUT, columns_of
-from residnet.judge.verdict import by_windows
+from residnet.judge.metrics import INPUT_PREFIX, state_column_names
+from residnet.judge.verdict import order_protocols
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Content = Mapping[str, Any]
+JsonObject = Mapping[str, Any]
 """What a JSON object holds."""
-_FOCUS = ("test", "external", "validation", "train")
+_SPLIT_PRIORITY = ("test", "external", "validation", "train")
 """Splits by how much they say about data that no fit has seen."""
 
 _FINDING_KEYS = ("level", "code", "text", "action")
@@ -51,9 +51,9 @@ class StoredWindow:
         predicted: the same by model.
         diverged: by model.
         inputs: values [T] by name, SI and rad; empty where the run has stored none.
-        low: lower limits of the band [T, 3 + n] by model; empty where no model has one.
-        high: upper limits likewise.
-        live: velocities that the logs tell; the others are zero.
+        band_lower: lower limits of the band [T, 3 + n] by model; empty where no model has one.
+        band_upper: upper limits likewise.
+        dof: velocities that the logs tell; the others are zero.
     """
 
     log: str
@@ -66,11 +66,11 @@ class StoredWindow:
     predicted: dict[str, np.ndarray]
     diverged: dict[str, bool]
     inputs: dict[str, np.ndarray] = field(default_factory=dict)
-    low: dict[str, np.ndarray] = field(default_factory=dict)
-    high: dict[str, np.ndarray] = field(default_factory=dict)
-    live: Live = ALIVE
+    band_lower: dict[str, np.ndarray] = field(default_factory=dict)
+    band_upper: dict[str, np.ndarray] = field(default_factory=dict)
+    dof: DegreesOfFreedom = SURGE_SWAY_YAW
 
-    def errors(self, model: str) -> pd.DataFrame:
+    def free_run_errors(self, model: str) -> pd.DataFrame:
         """Return what a model is off by [T] in SI and rad, `x` standing for the distance in place.
 
         u, v and the position are NaN where they are not scored; of angles, whole turns do not
@@ -78,29 +78,29 @@ class StoredWindow:
         """
         import pandas as pd
 
-        names = columns_of(self.live)
+        names = state_column_names(self.dof)
         error = pd.DataFrame(self.predicted[model] - self.measured, columns=names)
         for angle in {"psi", "phi"}.intersection(names):
-            error[angle] = wrap_array(error[angle].to_numpy())
+            error[angle] = wrap_angle_array(error[angle].to_numpy())
         error["x"] = np.hypot(error["x"], error.pop("y"))
         error.loc[~self.usable, ["u", "v", "x"]] = np.nan
         return error
 
-    def rmse(self, model: str) -> np.ndarray:
+    def rmse_by_channel(self, model: str) -> np.ndarray:
         """Return the root mean square errors [n] of what moves, over the samples that count."""
-        found = self.errors(model)[list(self.live.moving)].pow(2).mean().pow(0.5)
-        return found.to_numpy()
+        rmse = self.free_run_errors(model)[list(self.dof.dynamic_states)].pow(2).mean().pow(0.5)
+        return rmse.to_numpy()
 
-    def nrmse(self, model: str, scales: Mapping[str, float]) -> float:
+    def mean_nrmse(self, model: str, scales: Mapping[str, float]) -> float:
         """Return the mean over the channels of `scales` of the error over the scale."""
-        columns = [self.live.moving.index(name) for name in scales]
-        return float((self.rmse(model)[columns] / [*scales.values()]).mean())
+        columns = [self.dof.dynamic_states.index(name) for name in scales]
+        return float((self.rmse_by_channel(model)[columns] / [*scales.values()]).mean())
 
 
 class RunFiles:
     """The contents of a run folder of any task, or of what `residnet evaluate` writes.
 
-    Parts that a folder does not have are empty. What belongs to a fit (`rows`, `kinds`, `row` and
+    Parts that a folder does not have are empty. What belongs to a fit (`rows`, `kinds`, `find_row` and
     so on) needs its metrics.json.
     """
 
@@ -114,7 +114,7 @@ class RunFiles:
             raise UsageError(f"{path}: no such folder; give the folder of a run")
         self.path = path
 
-    def json(self, name: str) -> Any:
+    def read_json(self, name: str) -> Any:
         """Return what a JSON file of the folder holds, an empty object where there is none.
 
         Raises:
@@ -126,7 +126,7 @@ class RunFiles:
         require_listed(self.path, name)
         return read_json_value(path, self.path)
 
-    def frame(self, name: str) -> Any:
+    def read_parquet(self, name: str) -> Any:
         """Return a parquet file of the folder as a pandas table, None where there is none."""
         path = self.path / name
         if not os.path.lexists(path):
@@ -143,7 +143,7 @@ class RunFiles:
         Raises:
             DataError: where a file of the run cannot be read.
         """
-        summary, inspection = self.json("summary.json"), self.json("doctor.json")
+        summary, inspection = self.read_json("summary.json"), self.read_json("doctor.json")
         level, verdict = judged or (summary.get("level") or "", summary.get("verdict") or [])
         findings = None
         if inspection:
@@ -161,7 +161,7 @@ class RunFiles:
         return Assessment(level, tuple(verdict), findings, split or None)
 
     @cached_property
-    def metrics(self) -> Content:
+    def metrics(self) -> JsonObject:
         """The contents of metrics.json.
 
         Raises:
@@ -173,68 +173,68 @@ class RunFiles:
             raise UsageError(
                 f"{self.path}: no metrics.json here; give the folder of a finished run"
             )
-        content = self.json("metrics.json")
+        content = self.read_json("metrics.json")
         if not isinstance(content, dict) or not content.get("rows"):
             raise DataError(f"{path}: holds no rows")
         return content
 
     @property
-    def rows(self) -> Sequence[Content]:
+    def rows(self) -> Sequence[JsonObject]:
         """The rows of metrics.json."""
-        rows: Sequence[Content] = self.metrics["rows"]
+        rows: Sequence[JsonObject] = self.metrics["rows"]
         return rows
 
     @cached_property
-    def resolved(self) -> Content:
+    def resolved_config(self) -> JsonObject:
         """The configuration of the run."""
         path = self.path / "resolved.yaml"
         return load_mapping(path) if path.is_file() else {}
 
     @cached_property
-    def quality(self) -> Sequence[Content]:
+    def quality(self) -> Sequence[JsonObject]:
         """What each log holds (data_quality.json)."""
-        return self.json("data_quality.json") or []
+        return self.read_json("data_quality.json") or []
 
     @cached_property
-    def provenance(self) -> Content:
+    def provenance(self) -> JsonObject:
         """How the run was made (provenance.json)."""
-        provenance: Content = self.json("provenance.json")
+        provenance: JsonObject = self.read_json("provenance.json")
         return provenance
 
     @cached_property
-    def limits(self) -> Content:
+    def limits(self) -> JsonObject:
         """What limits the models (limits.json)."""
-        limits: Content = self.json("limits.json")
+        limits: JsonObject = self.read_json("limits.json")
         return limits
 
     @property
     def title(self) -> str:
         """The name of the run, else that of its folder."""
-        return str(self.resolved.get("name") or self.path.name)
+        return str(self.resolved_config.get("name") or self.path.name)
 
     @property
     def description(self) -> str:
         """What the run was made for."""
-        return str(self.resolved.get("description") or "")
+        return str(self.resolved_config.get("description") or "")
 
     @cached_property
-    def kinds(self) -> dict[str, str]:
+    def model_kinds(self) -> dict[str, str]:
         """The kind (zero, baseline, head, truth, ...) of each model, in the order of metrics.json.
 
         Reductions refer to the first baseline; the others are `further` models, judged like heads.
         """
         kinds = {row["model"]: row.get("kind", "head") for row in self.rows}
-        first = next((model for model, kind in kinds.items() if kind == "baseline"), None)
+        first_baseline = next((model for model, kind in kinds.items() if kind == "baseline"), None)
         return {
-            model: "further" if kind == "baseline" and model != first else kind
+            model: "further" if kind == "baseline" and model != first_baseline else kind
             for model, kind in kinds.items()
         }
 
     @cached_property
     def selected(self) -> str | None:
         """The model chosen on validation data, None where none was."""
-        chosen = [row["model"] for row in self.rows if row.get("selected")]
-        return self.metrics.get("selected") or (chosen[0] if chosen else None)
+        selected_models = [row["model"] for row in self.rows if row.get("selected")]
+        return self.metrics.get("selected") or (selected_models[0] if selected_models else None)
 
     @cached_property
     def predictor(self) -> str | None:
@@ -244,26 +244,28 @@ class RunFiles:
     @cached_property
     def baseline(self) -> str | None:
         """The model that reductions refer to."""
-        return next((model for model, kind in self.kinds.items() if kind == "baseline"), None)
+        return next((model for model, kind in self.model_kinds.items() if kind == "baseline"), None)
 
     @cached_property
-    def truth(self) -> str | None:
+    def plant(self) -> str | None:
         """The plant that made the data, where they are simulated."""
-        return next((model for model, kind in self.kinds.items() if kind == "truth"), None)
+        return next((model for model, kind in self.model_kinds.items() if kind == "truth"), None)
 
     @cached_property
     def heads(self) -> list[str]:
         """The models that are neither zero, baseline nor truth, the predictor first."""
         heads = [
-            model for model, kind in self.kinds.items() if kind not in ("zero", "baseline", "truth")
+            model
+            for model, kind in self.model_kinds.items()
+            if kind not in ("zero", "baseline", "truth")
         ]
         return sorted(heads, key=lambda model: (model != self.predictor, model != self.selected))
 
     @cached_property
-    def lead(self) -> str:
+    def main_model(self) -> str:
         """The model that a report is on: the predictor, else the first head or the baseline."""
-        names = [self.predictor, *self.heads, self.baseline, *self.kinds]
-        return next(name for name in names if name is not None and name in self.kinds)
+        names = [self.predictor, *self.heads, self.baseline, *self.model_kinds]
+        return next(name for name in names if name is not None and name in self.model_kinds)
 
     @cached_property
     def splits(self) -> list[str]:
@@ -271,47 +273,51 @@ class RunFiles:
         return list(dict.fromkeys(row["split"] for row in self.rows))
 
     @cached_property
-    def focus(self) -> str:
+    def report_split(self) -> str:
         """The split that the report speaks of: test where there is one."""
-        return next((split for split in _FOCUS if split in self.splits), self.splits[0])
+        return next((split for split in _SPLIT_PRIORITY if split in self.splits), self.splits[0])
 
     @cached_property
-    def sides(self) -> list[str]:
+    def report_splits(self) -> list[str]:
         """The splits that stand side by side: train, where there is one, and the focus."""
-        return [split for split in ("train",) if split in self.splits and split != self.focus] + [
-            self.focus
-        ]
+        return [
+            split for split in ("train",) if split in self.splits and split != self.report_split
+        ] + [self.report_split]
 
     @cached_property
     def protocols(self) -> list[str]:
         """The protocols of the rows, the one by which the focus is judged first."""
-        return by_windows(self.rows, self.focus, self.evaluation.get("selection", ""))
+        return order_protocols(self.rows, self.report_split, self.evaluation.get("selection", ""))
 
     @property
-    def deciding(self) -> str:
+    def selection_protocol(self) -> str:
         """The protocol that chose between the models."""
         return str(self.evaluation.get("selection") or self.protocols[0])
 
     @cached_property
-    def main(self) -> str:
+    def main_protocol(self) -> str:
         """The protocol of the first screen: the first whose free runs have one length, if any has.
 
         That which selects comes first.
         """
-        kinds = self.evaluation.get("protocols") or {}
-        timed = [name for name in self.protocols if (kinds.get(name) or {}).get("length")]
-        return (timed or self.protocols)[0]
+        protocol_configs = self.evaluation.get("protocols") or {}
+        fixed_length = [
+            name for name in self.protocols if (protocol_configs.get(name) or {}).get("length")
+        ]
+        return (fixed_length or self.protocols)[0]
 
     @cached_property
-    def horizon(self) -> str:
+    def horizon_text(self) -> str:
         """When the errors of the main protocol are taken: after so many seconds, or at the end."""
-        length = ((self.evaluation.get("protocols") or {}).get(self.main) or {}).get("length")
+        length = ((self.evaluation.get("protocols") or {}).get(self.main_protocol) or {}).get(
+            "length"
+        )
         return f"after {length:g} s" if length else "at the end"
 
     @property
-    def evaluation(self) -> Content:
+    def evaluation(self) -> JsonObject:
         """The section `evaluation` of the configuration."""
-        return self.resolved.get("evaluation") or {}
+        return self.resolved_config.get("evaluation") or {}
 
     @cached_property
     def channels(self) -> list[str]:
@@ -319,40 +325,47 @@ class RunFiles:
         return [name for name in self.rows[0]["rmse"] if name != "mean"]
 
     @cached_property
-    def live(self) -> Live:
+    def dof(self) -> DegreesOfFreedom:
         """The velocities that the logs tell; models leave the others at zero."""
-        return Live(tuple(name for name in SIX.velocities if name in self.channels))
+        return DegreesOfFreedom(
+            tuple(name for name in SIX_DOF_LAYOUT.velocities if name in self.channels)
+        )
 
     @property
-    def place(self) -> str:
+    def position_label(self) -> str:
         """What an error of the position is called: without a heading it is that of a distance."""
-        return "position" if self.live.turns else "distance run"
+        return "position" if self.dof.has_heading else "distance run"
 
     @cached_property
-    def ends(self) -> list[str]:
+    def pose_errors(self) -> list[str]:
         """What of `END_UNITS` is scored at the end of free runs."""
-        return [end for end in END_UNITS if f"{end}_error_end" in self.rows[0]]
+        return [
+            pose_error
+            for pose_error in POSE_ERROR_UNITS
+            if f"{pose_error}_error_end" in self.rows[0]
+        ]
 
-    def end(self, end: str) -> tuple[str, str, float]:
+    def pose_error_unit(self, pose_error: str) -> tuple[str, str, float]:
         """Return name, unit and the factor to it from SI of an error at the end of free runs."""
-        return self.place if end == "position" else end, *shown_unit(END_UNITS[end])
+        return self.position_label if pose_error == "position" else pose_error, *display_unit(
+            POSE_ERROR_UNITS[pose_error]
+        )
 
-    def row(
+    def find_row(
         self, model: str | None, split: str, protocol: str, manoeuvre: str = "all"
-    ) -> Content | None:
+    ) -> JsonObject | None:
         """Return a row of metrics.json, None where there is none."""
-        wanted = (model, split, protocol, manoeuvre)
+        key = (model, split, protocol, manoeuvre)
         return next(
             (
                 row
                 for row in self.rows
-                if (row["model"], row["split"], row["protocol"], row.get("manoeuvre", "all"))
-                == wanted
+                if (row["model"], row["split"], row["protocol"], row.get("manoeuvre", "all")) == key
             ),
             None,
         )
 
-    def manoeuvres(self, split: str, protocol: str) -> list[str]:
+    def manoeuvre_kinds(self, split: str, protocol: str) -> list[str]:
         """Return the kinds and named groups of manoeuvres that have rows, without `all`."""
         names = [
             row.get("manoeuvre", "all")
@@ -361,92 +374,111 @@ class RunFiles:
         ]
         return [name for name in dict.fromkeys(names) if name != "all"]
 
-    def label(self, model: str) -> str:
+    def model_label(self, model: str) -> str:
         """Return the name of a model in tables, with its role where it has a special one."""
-        if self.kinds.get(model) == "truth":
+        if self.model_kinds.get(model) == "truth":
             return f"{model} (plant)"
         if model == self.predictor != self.selected:
             return f"{model} (predictor)"
         return f"{model} (selected)" if model == self.selected else model
 
-    def unit(self, channel: str) -> tuple[str, float]:
+    def display_unit(self, channel: str) -> tuple[str, float]:
         """Return the unit in which a channel is shown and the factor to it from SI.
 
         It is that of the log's channel map, and degrees where that has radians.
         """
-        reader = (self.resolved.get("data") or {}).get("reader") or {}
-        given = (reader.get("channels") or {}).get(channel) or {}
-        if unit := given.get("unit"):
-            known = known_unit(unit, CHANNEL_UNITS.get(channel))
-            return shown_unit(known) if known in SHOWN_UNITS else (known, 1.0 / to_si(known))
-        return shown_unit(self.si(channel))
+        reader = (self.resolved_config.get("data") or {}).get("reader") or {}
+        channel_map = (reader.get("channels") or {}).get(channel) or {}
+        if unit := channel_map.get("unit"):
+            unit_name = canonical_unit(unit, CHANNEL_UNITS.get(channel))
+            return (
+                display_unit(unit_name)
+                if unit_name in DISPLAY_UNITS
+                else (unit_name, 1.0 / to_si(unit_name))
+            )
+        return display_unit(self.si_unit(channel))
 
-    def si(self, channel: str) -> str:
+    def si_unit(self, channel: str) -> str:
         """Return the SI unit of a channel, `-` where it is not known."""
-        known = self.metrics.get("channels") or {}
-        return str(known.get(channel) or CHANNEL_UNITS.get(channel, "-"))
+        channel_units = self.metrics.get("channels") or {}
+        return str(channel_units.get(channel) or CHANNEL_UNITS.get(channel, "-"))
 
-    def card(self, model: str) -> Content:
+    def model_card(self, model: str) -> JsonObject:
         """Return what models/<model>/model.json holds."""
-        card: Content = self.json(f"models/{model}/model.json")
+        card: JsonObject = self.read_json(f"models/{model}/model.json")
         return card
 
-    def fit(self, model: str) -> Content:
+    def fit_notes(self, model: str) -> JsonObject:
         """Return what models/<model>/fit.json holds."""
-        notes: Content = self.json(f"models/{model}/fit.json")
+        notes: JsonObject = self.read_json(f"models/{model}/fit.json")
         return notes
 
-    def windows(self, split: str) -> list[StoredWindow]:
+    def read_split_windows(self, split: str) -> list[StoredWindow]:
         """Return all stored free runs of a split, in the order of the file names."""
-        kinds = {file_stem(entry["log"]): entry.get("manoeuvre") for entry in self.quality}
+        manoeuvre_of_log = {
+            make_file_stem(entry["log"]): entry.get("manoeuvre") for entry in self.quality
+        }
         return [
             window
             for path in sorted((self.path / "rollouts" / split).glob("*.parquet"))
-            for window in windows_of(
-                read_table(path), path.stem, str(kinds.get(path.stem) or "unknown"), self.live
+            for window in read_windows(
+                read_table(path),
+                path.stem,
+                str(manoeuvre_of_log.get(path.stem) or "unknown"),
+                self.dof,
             )
         ]
 
 
-def windows_of(table: pd.DataFrame, log: str, manoeuvre: str, live: Live) -> list[StoredWindow]:
+def read_windows(
+    table: pd.DataFrame, log: str, manoeuvre: str, dof: DegreesOfFreedom
+) -> list[StoredWindow]:
     """Return the free runs of a log by protocol and number, from its stored rollouts."""
-    out: list[StoredWindow] = []
-    names = columns_of(live)
+    windows: list[StoredWindow] = []
+    names = state_column_names(dof)
     for (protocol, number), group in table.groupby(["protocol", "window"], sort=True):
-        parts = {str(model): part for model, part in group.groupby("model", sort=False)}
-        first = next(iter(parts.values()))
-        out.append(
+        tables_by_model = {
+            str(model): table_of_model
+            for model, table_of_model in group.groupby("model", sort=False)
+        }
+        first_table = next(iter(tables_by_model.values()))
+        windows.append(
             StoredWindow(
                 log=log,
                 manoeuvre=manoeuvre,
                 protocol=str(protocol),
                 number=int(str(number)),
-                t=first["t"].to_numpy(float),
-                usable=first["usable"].to_numpy(bool),
-                measured=first[list(names)].to_numpy(float),
+                t=first_table["t"].to_numpy(float),
+                usable=first_table["usable"].to_numpy(bool),
+                measured=first_table[list(names)].to_numpy(float),
                 predicted={
-                    model: part[[f"{name}_hat" for name in names]].to_numpy(float)
-                    for model, part in parts.items()
+                    model: table_of_model[[f"{name}_hat" for name in names]].to_numpy(float)
+                    for model, table_of_model in tables_by_model.items()
                 },
-                diverged={model: bool(part["diverged"].any()) for model, part in parts.items()},
+                diverged={
+                    model: bool(table_of_model["diverged"].any())
+                    for model, table_of_model in tables_by_model.items()
+                },
                 inputs={
-                    name.removeprefix(INPUT): first[name].to_numpy(float)
+                    name.removeprefix(INPUT_PREFIX): first_table[name].to_numpy(float)
                     for name in table.columns
-                    if name.startswith(INPUT)
+                    if name.startswith(INPUT_PREFIX)
                 },
-                low=_limits(parts, names, "low"),
-                high=_limits(parts, names, "high"),
-                live=live,
+                band_lower=_band_limits(tables_by_model, names, "low"),
+                band_upper=_band_limits(tables_by_model, names, "high"),
+                dof=dof,
             )
         )
-    return out
+    return windows
 
 
-def _limits(parts: Mapping[str, Any], columns: Sequence[str], ending: str) -> dict[str, np.ndarray]:
+def _band_limits(
+    tables_by_model: Mapping[str, Any], columns: Sequence[str], suffix: str
+) -> dict[str, np.ndarray]:
     """Return one limit of the bands [T, 3 + n] of those models of a stored window that have any."""
-    names = [f"{name}_{ending}" for name in columns]
+    names = [f"{name}_{suffix}" for name in columns]
     return {
-        model: part[names].to_numpy(float)
-        for model, part in parts.items()
-        if names[0] in part and bool(part[names[0]].notna().all())
+        model: model_table[names].to_numpy(float)
+        for model, model_table in tables_by_model.items()
+        if names[0] in model_table and bool(model_table[names[0]].notna().all())
     }

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from residnet.core.files import whole
-from residnet.core.format import powers
-from residnet.report.figure import INK, Case, Figure, Look, parts
+from residnet.core.files import atomic_write
+from residnet.core.format import format_exponents
+from residnet.report.figure import TEXT_COLOR, Case, Figure, GlyphStyle, split_at_gaps
 
 DPI = 140
 """Dots per inch: pictures are 980 dots wide, nearly as wide as the page."""
-WIDTH = 7.0
+FIGURE_WIDTH = 7.0
 """Width of every picture in inches: the text block of an A4 page, so that 9 pt stay 9 pt."""
-_MAP = 4.2
+_MAP_HEIGHT = 4.2
 """Height of a line of maps in inches."""
 _DASHES: dict[str, Any] = {
     "solid": "-",
@@ -28,7 +28,7 @@ _DASHES: dict[str, Any] = {
     "dense": (0, (4, 1, 1, 1)),
 }
 # Any: matplotlib types the keys as a closed set of literals
-RC: Any = {
+RC_PARAMS: Any = {
     # names of logs may hold a dollar sign
     "text.parse_math": False,
     "font.size": 9,
@@ -52,73 +52,84 @@ RC: Any = {
 }
 
 
-def still(figure: Figure, case: Case | None = None, only: Sequence[int] = ()) -> Any:
+def render_matplotlib(
+    figure: Figure, case: Case | None = None, panel_numbers: Sequence[int] = ()
+) -> Any:
     """Return a matplotlib figure of a case: maps beside each other, other panels below.
 
     Args:
         case: one of the figure's, its first where None.
-        only: numbers of the panels that are drawn, all where empty.
+        panel_numbers: numbers of the panels that are drawn, all where empty.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
 
     case = case or figure.cases[0]
-    shown = list(only) or [i for i, curves in enumerate(case.curves) if curves]
-    maps = [i for i in shown if figure.panels[i].kind == "map"]
-    rest = [i for i in shown if figure.panels[i].kind != "map"]
-    columns = min(figure.columns, max(len(rest), 1))
-    lines = -(-len(rest) // columns)
-    heights = [
-        max(figure.panels[i].height for i in rest[columns * k : columns * (k + 1)]) / 110
-        for k in range(lines)
+    shown_panels = list(panel_numbers) or [
+        i for i, panel_curves in enumerate(case.curves) if panel_curves
     ]
-    across = max(len(maps), 1)
-    map_lines = [_MAP if len(maps) < 3 else 3.0] if maps else []
-    with rc_context(RC):
+    maps = [i for i in shown_panels if figure.panels[i].kind == "map"]
+    other_panels = [i for i in shown_panels if figure.panels[i].kind != "map"]
+    columns = min(figure.columns, max(len(other_panels), 1))
+    n_lines = -(-len(other_panels) // columns)
+    heights = [
+        max(figure.panels[i].height for i in other_panels[columns * k : columns * (k + 1)]) / 110
+        for k in range(n_lines)
+    ]
+    n_map_columns = max(len(maps), 1)
+    map_lines = [_MAP_HEIGHT if len(maps) < 3 else 3.0] if maps else []
+    with rc_context(RC_PARAMS):
         canvas = Canvas(
-            figsize=(WIDTH, 0.5 + sum([*map_lines, *heights])), dpi=DPI, layout="constrained"
+            figsize=(FIGURE_WIDTH, 0.5 + sum([*map_lines, *heights])), dpi=DPI, layout="constrained"
         )
         FigureCanvasAgg(canvas)
         grid = canvas.add_gridspec(
-            len(map_lines) + lines, across * columns, height_ratios=[*map_lines, *heights]
+            len(map_lines) + n_lines, n_map_columns * columns, height_ratios=[*map_lines, *heights]
         )
         handles: dict[str, Any] = {}
-        for place, number in enumerate(maps):
-            cell = grid[0, columns * place : columns * (place + 1)]
-            _draw(canvas.add_subplot(cell), figure, case, number, handles)
+        for position, number in enumerate(maps):
+            cell = grid[0, columns * position : columns * (position + 1)]
+            _draw_panel(canvas.add_subplot(cell), figure, case, number, handles)
         shared: dict[str, Any] = {}
-        for place, number in enumerate(rest):
-            line, column = divmod(place, columns)
-            cell = grid[len(map_lines) + line, across * column : across * (column + 1)]
-            panel, below = figure.panels[number], rest[place + columns : place + columns + 1]
+        for position, number in enumerate(other_panels):
+            line, column = divmod(position, columns)
+            cell = grid[
+                len(map_lines) + line, n_map_columns * column : n_map_columns * (column + 1)
+            ]
+            panel, panel_below = (
+                figure.panels[number],
+                other_panels[position + columns : position + columns + 1],
+            )
             group = f"{panel.group}{column if panel.x_limits else ''}"
             axes = canvas.add_subplot(cell, sharex=shared.get(group))
             shared.setdefault(group, axes)
-            _draw(axes, figure, case, number, handles)
-            if below and figure.panels[below[0]].group == panel.group:
+            _draw_panel(axes, figure, case, number, handles)
+            if panel_below and figure.panels[panel_below[0]].group == panel.group:
                 axes.tick_params(labelbottom=False)
                 axes.set_xlabel("")
         canvas.align_ylabels()
-        labels = dict.fromkeys(look.label for look in figure.looks.values())
+        labels = dict.fromkeys(style.label for style in figure.styles.values())
         _legend_above(canvas, {label: handles[label] for label in labels if label in handles})
         canvas.canvas.draw()
     return canvas
 
 
-def _draw(axes: Any, figure: Figure, case: Case, number: int, handles: dict[str, Any]) -> None:
+def _draw_panel(
+    axes: Any, figure: Figure, case: Case, number: int, handles: dict[str, Any]
+) -> None:
     from matplotlib.ticker import LogFormatter
 
     panel = figure.panels[number]
-    for name in figure.names(number):
-        look = figure.looks[name]
-        if name in case.curves[number] and look.shown:
+    for name in figure.panel_names(number):
+        style = figure.styles[name]
+        if name in case.curves[number] and style.is_visible:
             x, y = (np.asarray(values, dtype=float) for values in case.curves[number][name])
-            handle = _mark(axes, look, x, y)
-            if look.label and handle is not None and np.isfinite(x).any():
-                handles.setdefault(look.label, handle)
+            handle = _draw_curve(axes, style, x, y)
+            if style.label and handle is not None and np.isfinite(x).any():
+                handles.setdefault(style.label, handle)
     axes.set_title(panel.title)
-    axes.set(xlabel=powers(panel.x_label), ylabel=powers(panel.y_label))
+    axes.set(xlabel=format_exponents(panel.x_label), ylabel=format_exponents(panel.y_label))
     if panel.kind == "map":
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.08)
@@ -139,51 +150,59 @@ def _draw(axes: Any, figure: Figure, case: Case, number: int, handles: dict[str,
                 else {}
             )
             getattr(axes, f"set_{direction}ticks")(
-                [float(one) for one in names], list(names.values()), **ticks
+                [float(tick) for tick in names], list(names.values()), **ticks
             )
             axes.grid(visible=False, axis=direction)
         if limits:
             getattr(axes, f"set_{direction}lim")(*limits)
-    if not panel.x_names and not panel.x_log and figure.counts(number):
+    if not panel.x_names and not panel.x_log and figure.has_integer_axis(number):
         axes.xaxis.get_major_locator().set_params(integer=True)
-    for place, at, level, words in case.texts:
-        if place == number:
-            high = not np.isfinite(level)
+    for panel_number, x_position, y_position, text in case.texts:
+        if panel_number == number:
+            is_at_top = not np.isfinite(y_position)
             axes.annotate(
-                words, (at, 1.0 if high else level), (0 if high else 3, 2),
+                text, (x_position, 1.0 if is_at_top else y_position), (0 if is_at_top else 3, 2),
                 fontsize=7.5, color="0.25",
-                xycoords=("data", "axes fraction") if high else "data", textcoords="offset points",
-                ha="center" if high else "left",
+                xycoords=("data", "axes fraction") if is_at_top else "data", textcoords="offset points",
+                ha="center" if is_at_top else "left",
             )  # fmt: skip
 
 
-def _mark(axes: Any, look: Look, x: np.ndarray, y: np.ndarray) -> Any:
+def _draw_curve(axes: Any, style: GlyphStyle, x: np.ndarray, y: np.ndarray) -> Any:
     """Draw what bears one name, and return what stands for it in the legend."""
-    color = "black" if look.color == INK else look.color
-    line = {"color": color, "alpha": look.alpha, "zorder": look.order}
-    stroke = {**line, "linestyle": _DASHES[look.dash], "linewidth": look.width}
-    if look.kind == "points":
-        face = "white" if look.hollow and look.order > 5 else "none" if look.hollow else color
-        return axes.plot(x, y, look.marker, **line, markersize=look.size, markerfacecolor=face)[0]
-    if look.kind == "line":
+    color = "black" if style.color == TEXT_COLOR else style.color
+    line = {"color": color, "alpha": style.alpha, "zorder": style.z_order}
+    stroke = {**line, "linestyle": _DASHES[style.dash], "linewidth": style.width}
+    if style.kind == "points":
+        face_color = (
+            "white"
+            if style.is_hollow and style.z_order > 5
+            else "none"
+            if style.is_hollow
+            else color
+        )
+        return axes.plot(
+            x, y, style.marker, **line, markersize=style.size, markerfacecolor=face_color
+        )[0]
+    if style.kind == "line":
         return axes.plot(x, y, **stroke)[0]
-    drawn = None
-    if look.kind == "fill":
-        for piece in parts(x, y):
-            drawn = axes.fill(*piece, **line, linewidth=0)[0]
-        return drawn
-    low: float
-    high: float
-    for low, high in zip(x, y, strict=True):
-        if look.kind == "strip" and np.isfinite(low):
-            drawn = axes.axvspan(low, high, **line, linewidth=0)
-        elif look.kind != "strip" and np.isfinite(low) and np.isfinite(high):
-            drawn = (
-                axes.axhline(high, **stroke)
-                if look.kind == "across"
-                else axes.axvline(low, **stroke)
+    artist = None
+    if style.kind == "fill":
+        for curve_part in split_at_gaps(x, y):
+            artist = axes.fill(*curve_part, **line, linewidth=0)[0]
+        return artist
+    lower: float
+    upper: float
+    for lower, upper in zip(x, y, strict=True):
+        if style.kind == "strip" and np.isfinite(lower):
+            artist = axes.axvspan(lower, upper, **line, linewidth=0)
+        elif style.kind != "strip" and np.isfinite(lower) and np.isfinite(upper):
+            artist = (
+                axes.axhline(upper, **stroke)
+                if style.kind == "across"
+                else axes.axvline(lower, **stroke)
             )
-    return drawn
+    return artist
 
 
 def _legend_above(canvas: Any, handles: dict[str, Any]) -> None:
@@ -194,14 +213,15 @@ def _legend_above(canvas: Any, handles: dict[str, Any]) -> None:
     # matplotlib fills a legend column by column
     while (
         columns > 1
-        and sum(max(part) for part in np.array_split(np.array(widths), columns)) > 72.0 * WIDTH
+        and sum(max(part) for part in np.array_split(np.array(widths), columns))
+        > 72.0 * FIGURE_WIDTH
     ):
         columns -= 1
     if handles:
         canvas.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=columns)
 
 
-def save(canvas: Any, path: Path, title: str, caption: str) -> None:
+def save_png(canvas: Any, path: Path, title: str, caption: str) -> None:
     """Write a PNG that carries its title and caption as text.
 
     Its palette of 128 colours takes a third of the bytes; chosen by coverage, it keeps the thin
@@ -215,9 +235,9 @@ def save(canvas: Any, path: Path, title: str, caption: str) -> None:
         .convert("RGB")
         .quantize(128, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     )
-    words = PngInfo()
-    words.add_itxt("Title", title)
-    words.add_itxt("Description", caption)
-    with whole(path) as file:
+    metadata = PngInfo()
+    metadata.add_itxt("Title", title)
+    metadata.add_itxt("Description", caption)
+    with atomic_write(path) as file:
         # the highest level takes seven times as long for a tenth of the bytes
-        picture.save(file, format="PNG", compress_level=6, dpi=(DPI, DPI), pnginfo=words)
+        picture.save(file, format="PNG", compress_level=6, dpi=(DPI, DPI), pnginfo=metadata)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from residnet.core.errors import UsageError
-from residnet.core.files import read_json, require_room, sha256, whole
+from residnet.core.files import atomic_write, read_json, require_free_space, sha256
 from residnet.core.ownership import RUN_MANIFEST, Manifest
 from residnet.core.run_loader import require_trustworthy
 from residnet.core.version import __version__
@@ -26,20 +26,26 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-SUMMARY = "residnet.summary/1"
+SUMMARY_SCHEMA = "residnet.summary/1"
 """Schema of summary.json."""
 
-LOG = "log.txt"
+LOG_FILE = "log.txt"
 """File that holds the progress of a run, where that is kept."""
-CHECKSUMS = RUN_MANIFEST
-_RESULTS = {".json", ".yaml", ".parquet", ".safetensors"}
-_ELSEWHERE = {"figures", "exports", "tensorboard", "checkpoints"}
+CHECKSUMS_FILE = RUN_MANIFEST
+_RESULT_SUFFIXES = {".json", ".yaml", ".parquet", ".safetensors"}
+_UNCHECKED_FOLDERS = {"figures", "exports", "tensorboard", "checkpoints"}
 """Folders that have no checksums: nothing reads them back as a result."""
-_BEFORE_RESULTS = {"resolved.yaml", "provenance.json", "doctor.json", "data_quality.json", LOG}
+_PRE_RESULT_FILES = {
+    "resolved.yaml",
+    "provenance.json",
+    "doctor.json",
+    "data_quality.json",
+    LOG_FILE,
+}
 """Files that a run writes before its first result; a folder of these alone may be used again."""
 
 
-_PATIENCE = 20
+_LOCK_RETRIES = 20
 """Tenths of a second that the workers of a killed run have to end."""
 
 
@@ -50,7 +56,7 @@ class RunFolder:
     Attributes:
         path: the folder itself.
         manifest: record of the files that residnet wrote into it.
-        resolved: the complete configuration, with every default and in SI units.
+        resolved_config: the complete configuration, with every default and in SI units.
         provenance: versions, seed, revision and the SHA-256 of every input file.
         summary: task, finished mark, verdict and main figures.
         report: the page for people.
@@ -58,7 +64,7 @@ class RunFolder:
         models: one folder for each model.
         figures: pictures of the report.
         rollouts: stored free runs by split.
-        exports: models for controllers.
+        exported_models: models for controllers.
         data_quality: what each log contributes.
         residuals: residual targets and predictions.
         limits: where models fail, and what limits them.
@@ -72,7 +78,7 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.manifest = Manifest(path)
-        self.resolved = path / "resolved.yaml"
+        self.resolved_config = path / "resolved.yaml"
         self.provenance = path / "provenance.json"
         self.summary = path / "summary.json"
         self.report = path / "report.html"
@@ -80,7 +86,7 @@ class RunFolder:
         self.models = path / "models"
         self.figures = path / "figures"
         self.rollouts = path / "rollouts"
-        self.exports = path / "exports"
+        self.exported_models = path / "exports"
         self.data_quality = path / "data_quality.json"
         self.residuals = path / "residuals.parquet"
         self.limits = path / "limits.json"
@@ -107,19 +113,21 @@ class RunFolder:
                 configuration.
         """
         folder = cls(path)
-        folder.require(resolved, resume=resume, overwrite=overwrite)
-        if resume and folder.resolved.is_file() and folder._has_results():
+        folder.require_usable(resolved, resume=resume, overwrite=overwrite)
+        if resume and folder.resolved_config.is_file() and folder._has_results():
             # what is done again must not look finished meanwhile
             folder.summary.unlink(missing_ok=True)
             return folder
         if folder._has_results():
             # the folder itself stays, since it is locked
             folder.manifest.remove_owned()
-        folder.manifest.begin()
-        folder.write(folder.resolved, resolved)
+        folder.manifest.start_recording()
+        folder.write(folder.resolved_config, resolved)
         return folder
 
-    def require(self, resolved: str, *, resume: bool = False, overwrite: bool = False) -> None:
+    def require_usable(
+        self, resolved: str, *, resume: bool = False, overwrite: bool = False
+    ) -> None:
         """Check that `create` will do what it is asked for; nothing is changed.
 
         Raises:
@@ -127,23 +135,23 @@ class RunFolder:
         """
         if resume and overwrite:
             raise UsageError(f"{self.path}: give --resume or --overwrite, not both")
-        require_room(self.path)
-        if resume and self.resolved.is_file():
+        require_free_space(self.path)
+        if resume and self.resolved_config.is_file():
             require_recorded(self.path)
         if not self._has_results():
             if self.path.is_dir():
                 self.manifest.require_all_owned()
             return
-        if not (resume and self.resolved.is_file()):
+        if not (resume and self.resolved_config.is_file()):
             self._require_replaceable(overwrite)
-        elif _text(self.resolved) != resolved:
+        elif _read_text(self.resolved_config) != resolved:
             raise UsageError(
-                f"{self.path}: was made with another configuration ({self.resolved} differs);"
+                f"{self.path}: was made with another configuration ({self.resolved_config} differs);"
                 " resume with the same one or give another --out"
             )
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def lock(self) -> Iterator[None]:
         """Keep other processes from running into this folder within the context.
 
         Where the system or its disk knows no locks, nothing is held.
@@ -157,14 +165,14 @@ class RunFolder:
         except ImportError:
             yield
             return
-        place = os.open(self.path, os.O_RDONLY)
+        descriptor = os.open(self.path, os.O_RDONLY)
         try:
-            for left in range(_PATIENCE, -1, -1):
+            for retries_left in range(_LOCK_RETRIES, -1, -1):
                 try:
-                    fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     break
                 except BlockingIOError:
-                    if left:
+                    if retries_left:
                         time.sleep(0.1)
                         continue
                     raise UsageError(
@@ -175,7 +183,7 @@ class RunFolder:
                     break
             yield
         finally:
-            os.close(place)
+            os.close(descriptor)
 
     @classmethod
     def open(cls, path: Path) -> RunFolder:
@@ -186,25 +194,27 @@ class RunFolder:
                 written.
         """
         folder = cls(path)
-        if not stat.S_ISREG(folder.resolved.lstat().st_mode if folder.resolved.exists() else 0):
-            what = "not a run folder (no resolved.yaml)" if path.exists() else "no such folder"
-            raise UsageError(f"{path}: {what}; `residnet runs` lists what there is")
-        if not folder.finished:
+        if not stat.S_ISREG(
+            folder.resolved_config.lstat().st_mode if folder.resolved_config.exists() else 0
+        ):
+            problem = "not a run folder (no resolved.yaml)" if path.exists() else "no such folder"
+            raise UsageError(f"{path}: {problem}; `residnet runs` lists what there is")
+        if not folder.is_finished:
             raise UsageError(
                 f"{path}: the run is not finished (summary.json does not say so); continue it with"
                 f" residnet run CONFIG --out {path} --resume"
             )
-        require_sealed(path)
+        verify_checksums(path)
         return folder
 
     @property
-    def finished(self) -> bool:
+    def is_finished(self) -> bool:
         """Whether the run came to its end."""
         return self.summary.is_file() and bool(self.read_summary().get("finished"))
 
     def write(self, path: Path, text: str) -> None:
         """Write a text file, whole or not at all."""
-        with whole(path) as file:
+        with atomic_write(path) as file:
             file.write_text(text, encoding="utf-8")
 
     def write_json(self, path: Path, content: Any) -> None:
@@ -213,7 +223,7 @@ class RunFolder:
 
     def write_table(self, path: Path, table: pd.DataFrame) -> None:
         """Write a table as Parquet, without its index."""
-        with whole(path) as file:
+        with atomic_write(path) as file:
             table.to_parquet(file, index=False)
 
     def write_summary(
@@ -223,13 +233,13 @@ class RunFolder:
         figures: Mapping[str, Mapping[str, Any]],
         *,
         level: str = "",
-        finished: bool,
+        is_finished: bool,
     ) -> None:
-        """Write summary.json; its `finished` is the mark that the run came to its end."""
+        """Write summary.json; its `is_finished` is the mark that the run came to its end."""
         content = {
-            "schema": SUMMARY,
+            "schema": SUMMARY_SCHEMA,
             "task": task,
-            "finished": finished,
+            "finished": is_finished,
             **({"level": level} if level else {}),
             "verdict": list(verdict),
             "figures": {name: dict(figure) for name, figure in figures.items()},
@@ -256,19 +266,21 @@ class RunFolder:
         """
         return read_json(self.metrics)
 
-    def fit_notes(self, model: str) -> dict[str, Any]:
+    def read_fit_notes(self, model: str) -> dict[str, Any]:
         """Return what models/<model>/fit.json tells of a model's fit; empty where there is none."""
         path = self.models / model / "fit.json"
         return read_json(path) if path.is_file() else {}
 
     def _has_results(self) -> bool:
-        names = {entry.name for entry in self.path.iterdir()} if self.path.is_dir() else set()
-        names -= {self.manifest.path.name, self.manifest.journal.name}
+        entry_names = {entry.name for entry in self.path.iterdir()} if self.path.is_dir() else set()
+        entry_names -= {self.manifest.path.name, self.manifest.journal.name}
         # without a configuration the files are somebody else's
-        return bool(names - _BEFORE_RESULTS) or (bool(names) and not self.resolved.is_file())
+        return bool(entry_names - _PRE_RESULT_FILES) or (
+            bool(entry_names) and not self.resolved_config.is_file()
+        )
 
     def _require_replaceable(self, overwrite: bool) -> None:
-        if not self.resolved.is_file():
+        if not self.resolved_config.is_file():
             raise UsageError(
                 f"{self.path}: exists already and is not the folder of a run; give another --out"
             )
@@ -280,7 +292,7 @@ class RunFolder:
         self.manifest.require_all_owned()
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     """Return the text of a file; what is no text in it shows as escapes."""
     try:
         return path.read_text(encoding="utf-8", errors="backslashreplace")
@@ -294,9 +306,9 @@ def require_recorded(run: Path) -> None:
     Raises:
         UsageError: if there is no manifest, as in the run of an earlier version.
     """
-    if not Manifest(run).exists:
+    if not Manifest(run).is_recorded:
         raise UsageError(
-            f"{run}: has no {CHECKSUMS}, so nothing says which of its files residnet wrote; give"
+            f"{run}: has no {CHECKSUMS_FILE}, so nothing says which of its files residnet wrote; give"
             " another --out"
         )
 
@@ -316,20 +328,20 @@ def require_apart(folder: Path, inputs: Iterable[Path]) -> None:
             )
 
 
-def seal(run: Path) -> None:
+def write_checksums(run: Path) -> None:
     """Bring checksums.json up to date: the SHA-256 of every file that residnet wrote there.
 
     In a folder without a manifest, such as that of a single model, the results that stand there are
     recorded. A run within the folder, such as an evaluation, has checksums of its own.
     """
     manifest = Manifest(run)
-    if not manifest.exists:
-        for file in _results(run, run):
+    if not manifest.is_recorded:
+        for file in _iter_result_files(run, run):
             manifest.record(file, sha256(file))
     manifest.compact()
 
 
-def require_sealed(run: Path) -> None:
+def verify_checksums(run: Path) -> None:
     """Check that the results of a finished run are those that it wrote.
 
     Raises:
@@ -339,16 +351,16 @@ def require_sealed(run: Path) -> None:
     require_trustworthy(run)
 
 
-def _results(folder: Path, run: Path) -> Iterator[Path]:
+def _iter_result_files(folder: Path, run: Path) -> Iterator[Path]:
     for path in sorted(folder.iterdir()):
         if path.is_dir():
-            if path.name not in _ELSEWHERE and not (path / "summary.json").is_file():
-                yield from _results(path, run)
-        elif path.suffix in _RESULTS and path != run / CHECKSUMS:
+            if path.name not in _UNCHECKED_FOLDERS and not (path / "summary.json").is_file():
+                yield from _iter_result_files(path, run)
+        elif path.suffix in _RESULT_SUFFIXES and path != run / CHECKSUMS_FILE:
             yield path
 
 
-_PACKAGES = (
+_RECORDED_PACKAGES = (
     "torch",
     "lightning",
     "numpy",
@@ -366,18 +378,18 @@ class Provenance:
     """What a run is made from.
 
     Attributes:
-        config: the file that describes it; None where Python called.
+        config_path: the file that describes it; None where Python called.
         overrides: of the config's keys.
         seed: of everything random.
-        files: inputs whose contents the run depends on.
-        started: seconds since the epoch.
+        input_paths: inputs whose contents the run depends on.
+        start_time: seconds since the epoch.
     """
 
-    config: Path | None
+    config_path: Path | None
     overrides: Sequence[str]
     seed: int
-    files: Sequence[Path]
-    started: float
+    input_paths: Sequence[Path]
+    start_time: float
 
     def require_same_inputs(self, folder: RunFolder) -> None:
         """Check that no input file has changed since an interrupted run in the folder began.
@@ -387,15 +399,15 @@ class Provenance:
         """
         if not folder.provenance.is_file():
             return
-        before = read_json(folder.provenance).get("inputs")
-        known = before if isinstance(before, dict) else {}
-        for path in self.files:
-            if known.get(str(path), "") != sha256(path):
+        recorded_inputs = read_json(folder.provenance).get("inputs")
+        recorded_checksums = recorded_inputs if isinstance(recorded_inputs, dict) else {}
+        for path in self.input_paths:
+            if recorded_checksums.get(str(path), "") != sha256(path):
                 raise UsageError(
                     f"{path}: is not the file that the run in {folder.path} began with; bring it"
                     " back, or begin anew with --overwrite"
                 )
-        for name in sorted(known.keys() - {str(path) for path in self.files}):
+        for name in sorted(recorded_checksums.keys() - {str(path) for path in self.input_paths}):
             raise UsageError(
                 f"{name}: the run in {folder.path} began with this file, which is not among the"
                 " inputs now; name it, too, or begin anew with --overwrite"
@@ -406,39 +418,44 @@ class Provenance:
         content = {
             "residnet": __version__,
             "command": sys.argv,
-            "config": None if self.config is None else str(self.config),
+            "config": None if self.config_path is None else str(self.config_path),
             "overrides": list(self.overrides),
             "seed": self.seed,
-            "git": git_revision(),
+            "git": read_git_revision(),
             "python": platform.python_version(),
             "machine": f"{platform.system()} {platform.machine()}",
-            "packages": {name: _version(name) for name in _PACKAGES},
-            "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self.started)),
-            "seconds": round(time.time() - self.started, 1),
-            "inputs": {str(path): sha256(path) for path in self.files},
+            "packages": {name: _package_version(name) for name in _RECORDED_PACKAGES},
+            "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self.start_time)),
+            "seconds": round(time.time() - self.start_time, 1),
+            "inputs": {str(path): sha256(path) for path in self.input_paths},
         }
         folder.write_json(folder.provenance, content)
 
 
-def git_revision() -> str | None:
+def read_git_revision() -> str | None:
     """Return the revision of the checkout that residnet runs from; None outside a checkout.
 
     It ends in `+changes` where the checkout is not clean.
     """
-    here = Path(__file__).parent
+    package_folder = Path(__file__).parent
     try:
         revision, changes = (
             subprocess.run(
-                ["git", *words], cwd=here, capture_output=True, text=True, timeout=10, check=True
+                ["git", *arguments],
+                cwd=package_folder,
+                capture_output=True,
+                text=True,
+                timeout=10,
+                check=True,
             ).stdout.strip()
-            for words in (("rev-parse", "HEAD"), ("status", "--porcelain"))
+            for arguments in (("rev-parse", "HEAD"), ("status", "--porcelain"))
         )
     except (OSError, subprocess.SubprocessError):
         return None
     return revision + ("+changes" if changes else "")
 
 
-def _version(name: str) -> str | None:
+def _package_version(name: str) -> str | None:
     try:
         return version(name)
     except PackageNotFoundError:

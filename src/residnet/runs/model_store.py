@@ -11,10 +11,10 @@ from residnet.core.files import read_json
 from residnet.dynamics.store import Stored, load_model, model_names, read_weights, save_model
 from residnet.identification.fitter import FitStore, FittedModel
 from residnet.judge.band import read_bands
-from residnet.runs.folder import RunFolder, require_sealed, seal
+from residnet.runs.folder import RunFolder, verify_checksums, write_checksums
 
 
-class FolderStore(FitStore):
+class RunModelStore(FitStore):
     """Vessel models and policies in `models/<name>` of a run folder.
 
     Attributes:
@@ -29,7 +29,7 @@ class FolderStore(FitStore):
         """Return the names of the models that are there."""
         return list(model_names(self.folder.models))
 
-    def finished(self, name: str) -> FittedModel | None:
+    def load_finished(self, name: str) -> FittedModel | None:
         """Return a model that is there whole; None where it is not."""
         return self.load(name) if (self.folder.models / name / "model.json").is_file() else None
 
@@ -39,24 +39,24 @@ class FolderStore(FitStore):
         Raises:
             UsageError: where there is none of that name, or a file of it has changed since.
         """
-        require_sealed(self.folder.models / name)
+        verify_checksums(self.folder.models / name)
         content = read_json(self.folder.bands) if self.folder.bands.is_file() else {}
         return FittedModel(
             *load_model(self.folder.models / name),
-            notes=self.folder.fit_notes(name),
+            notes=self.folder.read_fit_notes(name),
             bands=read_bands(content).get(name, {}),
         )
 
-    def keep_module(
+    def save_module(
         self, name: str, spec: Stored, module: nn.Module, notes: Mapping[str, Any]
     ) -> None:
         """Write a trained module of any kind, such as a policy, with its notes."""
         folder = self.folder.models / name
         self.folder.write_json(folder / "fit.json", dict(notes))
         save_model(folder, spec, module)
-        seal(folder)
+        write_checksums(folder)
 
-    def finished_module(self, name: str, module: nn.Module) -> dict[str, Any] | None:
+    def restore_module(self, name: str, module: nn.Module) -> dict[str, Any] | None:
         """Fill a module with the weights that an interrupted run had trained, and freeze it.
 
         Returns:
@@ -68,11 +68,13 @@ class FolderStore(FitStore):
         folder = self.folder.models / name
         if not (folder / "model.json").is_file():
             return None
-        require_sealed(folder)
+        verify_checksums(folder)
         read_weights(folder, module)
         module.eval().requires_grad_(False)
-        return self.folder.fit_notes(name)
+        return self.folder.read_fit_notes(name)
 
-    def keep(self, fitted: FittedModel) -> None:
+    def save(self, fitted_model: FittedModel) -> None:
         """Write a model and its notes; the model's description comes last and marks it whole."""
-        self.keep_module(fitted.name, fitted.spec, fitted.model, fitted.notes)
+        self.save_module(
+            fitted_model.name, fitted_model.spec, fitted_model.model, fitted_model.notes
+        )

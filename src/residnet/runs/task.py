@@ -17,20 +17,20 @@ from pydantic import Field
 
 from residnet.core.config import Config, dump_config, load_mapping
 from residnet.core.errors import DataError, ExportError, ResidnetError, UsageError, WithheldError
-from residnet.core.files import staged_files
-from residnet.core.names import nearest
-from residnet.core.processes import keep_freed_memory
+from residnet.core.files import stage_files
+from residnet.core.names import suggest_name
+from residnet.core.processes import retain_freed_memory
 from residnet.report.blocks import EXPORTS
-from residnet.runs.folder import Provenance, RunFolder, require_apart, seal
+from residnet.runs.folder import Provenance, RunFolder, require_apart, write_checksums
 
 if TYPE_CHECKING:
-    from residnet.export.base import Exported
+    from residnet.export.base import Exportable
     from residnet.report.blocks import Section
-    from residnet.report.browser import Drawn
+    from residnet.report.browser import InteractiveFigures
 
 PartName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 """Of a part of a run: a model, a controller, a variant."""
-Exports = Mapping[str, Callable[[], Path]]
+ExportWriters = Mapping[str, Callable[[], Path]]
 """What writes each export and returns its file, by the name of the model."""
 
 
@@ -40,21 +40,21 @@ class ExportRequest(NamedTuple):
     Attributes:
         run: the finished run.
         model: its name; `predictor` and `selected` stand for the one that the run puts first.
-        out: file to write; where None, exports/<model> with the format's suffix, or for formats of
+        output_path: file to write; where None, exports/<model> with the format's suffix, or for formats of
             C exports/<run> for the model that is reported first and exports/<run>_<model> else.
         file_format: one of `residnet list formats`.
-        anyway: whether a model is wanted that is worse than doing without it, too.
+        allows_objections: whether a model is wanted that is worse than doing without it, too.
     """
 
     run: RunFolder
     model: str
-    out: Path | None = None
+    output_path: Path | None = None
     file_format: str = "torchscript"
-    anyway: bool = False
+    allows_objections: bool = False
 
     def write(
         self,
-        exported: Exported,
+        exported: Exportable,
         objections: Sequence[str] = (),
         stem: str = "",
         judged: tuple[str, Sequence[str]] | None = None,
@@ -69,28 +69,34 @@ class ExportRequest(NamedTuple):
 
         Raises:
             ConfigError: where there is no such format.
-            WithheldError: where something speaks against it, but for `anyway`.
+            WithheldError: where something speaks against it, but for `allows_objections`.
             ExportError: where the file does not reproduce it.
         """
-        from residnet.export import exporter
-        from residnet.export.base import released
+        from residnet.export import get_exporter
+        from residnet.export.base import require_releasable
         from residnet.report.run_reader import RunFiles
 
-        chosen = exporter(self.file_format)
+        export_format = get_exporter(self.file_format)
         name = stem or exported.name
-        if chosen.default_name_from_run:
+        if export_format.default_name_from_run:
             # the file's name becomes part of all symbols, and models of two runs have one name
             run = re.sub(r"\W", "_", self.run.path.resolve().name, flags=re.ASCII)
             name = run if self.model == "predictor" else f"{run}_{name}"
-        out = self.out or self.run.exports / f"{name}{chosen.suffix}"
-        file = out if out.suffix else out.with_name(out.name + chosen.suffix)
-        exported = released(exported, objections, anyway=self.anyway)
+        base_path = self.output_path or self.run.exported_models / f"{name}{export_format.suffix}"
+        file = (
+            base_path
+            if base_path.suffix
+            else base_path.with_name(base_path.name + export_format.suffix)
+        )
+        exported = require_releasable(
+            exported, objections, allows_objections=self.allows_objections
+        )
         exported.assessment = RunFiles(self.run.path).assessment(judged)
-        with staged_files(file, file.parent.glob("*.masses.yaml")) as staged:
-            chosen.export(exported, staged)
+        with stage_files(file, file.parent.glob("*.masses.yaml")) as staged:
+            export_format.export(exported, staged)
         return file
 
-    def named(self, names: Collection[str]) -> str:
+    def resolve_model_name(self, names: Collection[str]) -> str:
         """Return the name that is asked for; `predictor` and `selected` are the only one there is.
 
         Raises:
@@ -99,12 +105,16 @@ class ExportRequest(NamedTuple):
         if self.model in ("predictor", "selected") and len(names) == 1:
             return next(iter(names))
         if self.model not in names:
-            known = nearest(self.model, names) or f"; give one with --model: {', '.join(names)}"
-            raise UsageError(f"{self.run.path}: nothing to export is named '{self.model}'{known}")
+            suggestion = (
+                suggest_name(self.model, names) or f"; give one with --model: {', '.join(names)}"
+            )
+            raise UsageError(
+                f"{self.run.path}: nothing to export is named '{self.model}'{suggestion}"
+            )
         return self.model
 
 
-class MainFigure(NamedTuple):
+class SummaryMetric(NamedTuple):
     """A number that sums a run up, in SI units.
 
     Attributes:
@@ -115,19 +125,19 @@ class MainFigure(NamedTuple):
     value: float
     unit: str = "-"
 
-    def as_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return the figure as summary.json holds it; a value that is not finite becomes null."""
         value = float(self.value)
         return {"value": value if math.isfinite(value) else None, "unit": self.unit}
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TaskOutcome:
     """What a run found.
 
     Attributes:
         verdict: whole sentences for a reader who reads nothing else.
-        figures: main figures by name.
+        summary_metrics: main figures by name.
         table: text for the terminal; empty for none.
         failure: a line where a result fails a check; the run is complete, and ends as a `DataError`
             with this line.
@@ -138,15 +148,15 @@ class Outcome:
     """
 
     verdict: Sequence[str] = ()
-    figures: Mapping[str, MainFigure] = field(default_factory=dict)
+    summary_metrics: Mapping[str, SummaryMetric] = field(default_factory=dict)
     table: str = ""
     failure: str = ""
-    exports: Exports = field(default_factory=dict)
+    exports: ExportWriters = field(default_factory=dict)
     level: str = ""
 
 
 @dataclass(frozen=True)
-class Finished:
+class FinishedRun:
     """A run that came to its end.
 
     Attributes:
@@ -156,7 +166,7 @@ class Finished:
     """
 
     folder: RunFolder
-    outcome: Outcome
+    outcome: TaskOutcome
     exports: Sequence[Path] = ()
 
 
@@ -176,11 +186,11 @@ class Task(Config):
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
     description: str = ""
 
-    verbs: ClassVar[tuple[str, ...]] = ("report",)
+    supported_commands: ClassVar[tuple[str, ...]] = ("report",)
     """Commands that a finished run answers to; each but `report` is a method of the task."""
 
     @abstractmethod
-    def carry_out(self, folder: RunFolder) -> Outcome:
+    def execute(self, folder: RunFolder) -> TaskOutcome:
         """Do the work, and write the results into the folder.
 
         What the folder holds already from an interrupted run may be used.
@@ -189,7 +199,7 @@ class Task(Config):
             ResidnetError: where the input does not allow it.
         """
 
-    page: ClassVar[str]
+    section_module: ClassVar[str]
     """Module of `residnet.report.sections` that a run's page is from."""
 
     @classmethod
@@ -200,9 +210,9 @@ class Task(Config):
         """
         from residnet.report.run_reader import RunFiles
 
-        module = importlib.import_module(f"residnet.report.sections.{cls.page}")
-        found: Sequence[Section] = module.sections(RunFiles(run.path))
-        return found
+        module = importlib.import_module(f"residnet.report.sections.{cls.section_module}")
+        sections: Sequence[Section] = module.sections(RunFiles(run.path))
+        return sections
 
     def check(self) -> None:
         """Check what reading the config does not show, without running.
@@ -215,7 +225,7 @@ class Task(Config):
         """Return the files whose contents the run depends on."""
         return ()
 
-    def recorded_seed(self) -> int:
+    def provenance_seed(self) -> int:
         """Return the seed that stands in the provenance."""
         return 0
 
@@ -225,55 +235,60 @@ class Task(Config):
         *,
         source: Path | None = None,
         overrides: Sequence[str] = (),
-        out: Path | None = None,
+        output_folder: Path | None = None,
         resume: bool = False,
         overwrite: bool = False,
         report: bool = True,
-        opened: Callable[[Path], None] | None = None,
-    ) -> Finished:
+        on_open: Callable[[Path], None] | None = None,
+    ) -> FinishedRun:
         """Carry the task out, from an empty folder to the finished mark.
 
         Args:
-            out: run folder; runs/<name> where not given.
+            output_folder: run folder; runs/<name> where not given.
             resume: continue an interrupted run in its folder.
             overwrite: replace an earlier run in its folder.
             report: draw the report and export; without them a run ends after its results.
-            opened: is told the run folder as soon as it stands; None for nobody.
+            on_open: is told the run folder as soon as it stands; None for nobody.
 
         Raises:
             ResidnetError: where the input does not allow it, or a result fails a check.
         """
-        place, resolved = self.place(out), dump_config(self)
+        folder_path, resolved_yaml = self.resolve_folder(output_folder), dump_config(self)
         # before the check, which may read much
-        RunFolder(place).require(resolved, resume=resume, overwrite=overwrite)
+        RunFolder(folder_path).require_usable(resolved_yaml, resume=resume, overwrite=overwrite)
         self.check()
-        made_from = Provenance(
-            source, overrides, self.recorded_seed(), self.input_files(), time.time()
+        provenance = Provenance(
+            source, overrides, self.provenance_seed(), self.input_files(), time.time()
         )
         if resume:
-            made_from.require_same_inputs(RunFolder(place))
+            provenance.require_same_inputs(RunFolder(folder_path))
         if overwrite:
-            require_apart(place, made_from.files if source is None else [source, *made_from.files])
-        with RunFolder(place).held():
-            folder = RunFolder.create(place, resolved, resume=resume, overwrite=overwrite)
-            if opened is not None:
-                opened(folder.path)
-            return self.conduct(folder, made_from, self.carry_out, report=report)
+            require_apart(
+                folder_path,
+                provenance.input_paths if source is None else [source, *provenance.input_paths],
+            )
+        with RunFolder(folder_path).lock():
+            folder = RunFolder.create(
+                folder_path, resolved_yaml, resume=resume, overwrite=overwrite
+            )
+            if on_open is not None:
+                on_open(folder.path)
+            return self.run_in_folder(folder, provenance, self.execute, report=report)
 
     @final
-    def place(self, out: Path | None) -> Path:
+    def resolve_folder(self, output_folder: Path | None) -> Path:
         """Return the run folder: the one that was asked for, else runs/<name>."""
-        return out or Path("runs") / self.name
+        return output_folder or Path("runs") / self.name
 
     @final
-    def conduct(
+    def run_in_folder(
         self,
         folder: RunFolder,
-        made_from: Provenance,
-        work: Callable[[RunFolder], Outcome],
+        provenance: Provenance,
+        work: Callable[[RunFolder], TaskOutcome],
         *,
         report: bool = True,
-    ) -> Finished:
+    ) -> FinishedRun:
         """Carry work out in the one order: provenance, work, report, exports, finished mark.
 
         The report stands before anything is exported, and is written again with what came of it.
@@ -282,38 +297,44 @@ class Task(Config):
             ResidnetError: where the work does, or where its outcome fails a check.
             ExportError: where the run is complete, but a model could not be exported.
         """
-        made_from.write(folder)
+        provenance.write(folder)
         # of an earlier run in this folder
         folder.manifest.remove_if_owned(folder.path / EXPORTS)
-        with self.resources():
+        with self.reserve_resources():
             outcome = work(folder)
-            about: Any = {
-                "figures": {name: figure.as_json() for name, figure in outcome.figures.items()},
+            summary_fields: Any = {
+                "figures": {
+                    name: figure.to_json() for name, figure in outcome.summary_metrics.items()
+                },
                 "level": outcome.level,
             }
-            folder.write_summary(self.task, outcome.verdict, **about, finished=False)
+            folder.write_summary(self.task, outcome.verdict, **summary_fields, is_finished=False)
             # the last time, since the report shows it and must come out the same again
-            made_from.write(folder)
-            verdict, files, faults = list(outcome.verdict), list[Path](), list[ResidnetError]()
+            provenance.write(folder)
+            verdict, files, export_errors = (
+                list(outcome.verdict),
+                list[Path](),
+                list[ResidnetError](),
+            )
             if report:
-                from residnet.report.page import draw_sections
+                from residnet.report.page import render_figures
 
                 sections = self.report_sections(folder)
-                drawn = draw_sections(sections)
-                self._write_page(folder, sections, drawn)
+                interactive_figures = render_figures(sections)
+                self._write_page(folder, sections, interactive_figures)
                 if outcome.exports:
-                    files, faults = _write_exports(folder, outcome.exports)
-                    verdict += [f"Not exported: {fault}." for fault in faults]
-                    folder.write_summary(self.task, verdict, **about, finished=False)
-                    self._write_page(folder, sections, drawn)
-        folder.write_summary(self.task, verdict, **about, finished=True)
-        seal(folder.path)
+                    files, export_errors = _write_exports(folder, outcome.exports)
+                    verdict += [f"Not exported: {export_error}." for export_error in export_errors]
+                    folder.write_summary(self.task, verdict, **summary_fields, is_finished=False)
+                    self._write_page(folder, sections, interactive_figures)
+        folder.write_summary(self.task, verdict, **summary_fields, is_finished=True)
+        write_checksums(folder.path)
         if outcome.failure:
             raise DataError(outcome.failure)
-        for fault in faults:
-            if not isinstance(fault, WithheldError):
-                raise ExportError(f"{fault}; the run itself is complete: {folder.report}")
-        return Finished(folder, outcome, files)
+        for export_error in export_errors:
+            if not isinstance(export_error, WithheldError):
+                raise ExportError(f"{export_error}; the run itself is complete: {folder.report}")
+        return FinishedRun(folder, outcome, files)
 
     @classmethod
     def write_report(cls, run: RunFolder) -> Path:
@@ -322,7 +343,10 @@ class Task(Config):
 
     @classmethod
     def _write_page(
-        cls, run: RunFolder, sections: Sequence[Section], drawn: Drawn | None = None
+        cls,
+        run: RunFolder,
+        sections: Sequence[Section],
+        interactive_figures: InteractiveFigures | None = None,
     ) -> Path:
         from residnet.report.page import exports_section, write_page
 
@@ -333,36 +357,36 @@ class Task(Config):
             "",
             summary["verdict"],
             [*sections, *([] if exports is None else [exports])],
-            drawn,
+            interactive_figures,
             level=str(summary.get("level") or ""),
         )
 
     @contextmanager
-    def resources(self) -> Iterator[None]:
+    def reserve_resources(self) -> Iterator[None]:
         """Hold what the work needs of the machine while it is carried out."""
         yield
 
     @classmethod
-    def lacks_verb(cls, run: RunFolder) -> UsageError:
+    def unsupported_verb_error(cls, run: RunFolder) -> UsageError:
         """Return the error that names the verbs that a run has."""
-        task = load_mapping(run.resolved).get("task")
+        task = load_mapping(run.resolved_config).get("task")
         return UsageError(
-            f"{run.path}: the run is of task '{task}'; it has: {', '.join(cls.verbs)}"
+            f"{run.path}: the run is of task '{task}'; it has: {', '.join(cls.supported_commands)}"
         )
 
 
 @contextmanager
-def computing(threads: int) -> Iterator[None]:
+def torch_threads(threads: int) -> Iterator[None]:
     """Set PyTorch's number of threads, put back in the end, and keep freed memory for tensors."""
     import torch
 
-    keep_freed_memory()
-    before = torch.get_num_threads()
+    retain_freed_memory()
+    previous_threads = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(previous_threads)
 
 
 class ComputingTask(Task):
@@ -376,26 +400,30 @@ class ComputingTask(Task):
     threads: int = Field(default=1, ge=1, le=1_024)
 
     @contextmanager
-    def resources(self) -> Iterator[None]:
-        with computing(self.threads):
+    def reserve_resources(self) -> Iterator[None]:
+        with torch_threads(self.threads):
             yield
 
 
-def _write_exports(folder: RunFolder, exports: Exports) -> tuple[list[Path], list[ResidnetError]]:
+def _write_exports(
+    folder: RunFolder, exports: ExportWriters
+) -> tuple[list[Path], list[ResidnetError]]:
     """Write all exports, and exports.json, which says what came of each; return files and faults.
 
     A model that cannot be exported does not keep the others, or the run, from coming to their end.
     """
-    files, faults, rows = list[Path](), list[ResidnetError](), []
-    for name, write in exports.items():
+    files, errors, rows = list[Path](), list[ResidnetError](), []
+    for name, write_export in exports.items():
         try:
-            file = write()
+            file = write_export()
         except ResidnetError as error:
-            faults.append(error)
+            errors.append(error)
             rows.append({"model": name, "file": None, "fault": str(error)})
         else:
             files.append(file)
-            place = file.relative_to(folder.path) if file.is_relative_to(folder.path) else file
-            rows.append({"model": name, "file": place.as_posix(), "fault": None})
+            relative_path = (
+                file.relative_to(folder.path) if file.is_relative_to(folder.path) else file
+            )
+            rows.append({"model": name, "file": relative_path.as_posix(), "fault": None})
     folder.write_json(folder.path / EXPORTS, {"schema": "residnet.exports/1", "exports": rows})
-    return files, faults
+    return files, errors

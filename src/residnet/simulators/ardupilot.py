@@ -20,16 +20,16 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import UsageError
-from residnet.core.names import nearest
-from residnet.core.progress import say
+from residnet.core.names import suggest_name
+from residnet.core.progress import log_message
 from residnet.simulators.vehicle import Vehicle
 
-_PACKETS = {18458: struct.Struct("<HHI16H"), 29569: struct.Struct("<HHI32H")}
+_PACKET_FORMATS = {18458: struct.Struct("<HHI16H"), 29569: struct.Struct("<HHI32H")}
 _GRAVITY = 9.80665
 """Standard gravity in m/s^2, by which ArduPilot takes its accelerometers."""
-_PULSES = (800, 2200)
+_PULSE_RANGE = (800, 2200)
 """Pulse widths in us that a servo output can have; 0 means none yet."""
-_RATES = (10, 4000)
+_FRAME_RATE_RANGE = (10, 4000)
 """Frame rates in Hz that are accepted."""
 
 
@@ -39,21 +39,21 @@ class Servo:
 
     Attributes:
         channel: number of the output, from 1.
-        low: command at 1000 us, SI.
-        high: command at 2000 us, SI.
+        lower_command: command at 1000 us, SI.
+        upper_command: command at 2000 us, SI.
     """
 
     channel: int
-    low: float
-    high: float
+    lower_command: float
+    upper_command: float
 
-    def command(self, pulse: int) -> float:
+    def command_at(self, pulse: int) -> float:
         """Return the command that a pulse width stands for; the middle where there is none."""
         share = 0.5 if pulse == 0 else min(max((pulse - 1000) / 1000, 0.0), 1.0)
-        return self.low + share * (self.high - self.low)
+        return self.lower_command + share * (self.upper_command - self.lower_command)
 
 
-def servos(vehicle: Vehicle, given: Sequence[str] = ()) -> list[Servo]:
+def assign_servos(vehicle: Vehicle, servo_texts: Sequence[str] = ()) -> list[Servo]:
     """Return the servo output of each command, from texts such as `cmd_delta=1:-0.6:0.6`.
 
     Commands that are not given take the outputs 1, 3, 2, 4, 5 ... in their order (ArduPilot's
@@ -63,32 +63,32 @@ def servos(vehicle: Vehicle, given: Sequence[str] = ()) -> list[Servo]:
     Raises:
         UsageError: where a text cannot be read.
     """
-    names = vehicle.inputs[: vehicle.commands]
+    names = vehicle.inputs[: vehicle.n_commands]
     order = [1, 3, 2, *range(4, 33)]
-    found = {
-        name: Servo(order[i], float(vehicle.low[i]), float(vehicle.high[i]))
+    servo_by_command = {
+        name: Servo(order[i], float(vehicle.lower_commands[i]), float(vehicle.upper_commands[i]))
         for i, name in enumerate(names)
     }
-    for text in given:
-        name, _, rest = text.partition("=")
-        parts = rest.split(":")
+    for text in servo_texts:
+        name, _, assignment = text.partition("=")
+        parts = assignment.split(":")
         try:
-            channel, low, high = int(parts[0]), *(float(part) for part in parts[1:3])
+            channel, lower, upper = int(parts[0]), *(float(number) for number in parts[1:3])
         except ValueError:
             raise UsageError(
                 f"servo '{text}': expected COMMAND=OUTPUT:LOW:HIGH, for example"
-                f" {names[0]}=1:{float(vehicle.low[0]):g}:{float(vehicle.high[0]):g}"
+                f" {names[0]}=1:{float(vehicle.lower_commands[0]):g}:{float(vehicle.upper_commands[0]):g}"
             ) from None
         if name not in names:
-            raise UsageError(f"servo '{text}': no command '{name}'{nearest(name, names)}")
+            raise UsageError(f"servo '{text}': no command '{name}'{suggest_name(name, names)}")
         if not 1 <= channel <= 32:
             raise UsageError(f"servo '{text}': outputs are numbered 1 to 32")
-        found[name] = Servo(channel, low, high)
-    return [found[name] for name in names]
+        servo_by_command[name] = Servo(channel, lower, upper)
+    return [servo_by_command[name] for name in names]
 
 
 @final
-class ArduPilotBackEnd:
+class ArduPilotBackend:
     """Answers ArduPilot's packets with the motion of a vehicle.
 
     Frames advance by the frame rate that ArduPilot asks for. The vehicle has steps of its own, so
@@ -116,25 +116,25 @@ class ArduPilotBackEnd:
                 " name another"
             ) from None
         self.port = int(self.socket.getsockname()[1])
-        self.refused = 0
-        self.missed = 0
-        self._begin()
+        self.n_invalid_packets = 0
+        self.n_lost_frames = 0
+        self._reset()
 
-    def _begin(self) -> None:
+    def _reset(self) -> None:
         """Stand at the start."""
-        self.last = -1
+        self.last_frame = -1
         self.reply = b""
         self.time = 0.0
         self.steps = 0
-        x = self.vehicle.start.unsqueeze(0)
-        self.before = self.after = x
+        x = self.vehicle.initial_state.unsqueeze(0)
+        self.previous_state = self.current_state = x
         self.memory = self.vehicle.dynamics.initial_state(1).to(x.dtype)
 
     def serve(self, packets: int | None = None, timeout: float | None = None) -> None:
         """Answer packets until so many have been answered, or none has come for `timeout` s."""
         self.socket.settimeout(timeout)
-        answered = 0
-        while packets is None or answered < packets:
+        n_answered = 0
+        while packets is None or n_answered < packets:
             try:
                 data, sender = self.socket.recvfrom(4096)
             except TimeoutError:
@@ -142,72 +142,80 @@ class ArduPilotBackEnd:
             except ConnectionError:
                 # the other side has gone; another may come
                 continue
-            reply = self.answer(data)
+            reply = self.reply_to(data)
             if reply is not None:
                 self.socket.sendto(reply, sender)
-                answered += 1
+                n_answered += 1
 
     def close(self) -> None:
         """Give the port back."""
         self.socket.close()
 
-    def answer(self, data: bytes) -> bytes | None:
+    def reply_to(self, data: bytes) -> bytes | None:
         """Return the reply to a packet; None to what is no packet of ArduPilot."""
-        layout = _PACKETS.get(int.from_bytes(data[:2], "little"))
+        layout = _PACKET_FORMATS.get(int.from_bytes(data[:2], "little"))
         if layout is None or len(data) != layout.size:
-            self.refused += 1
+            self.n_invalid_packets += 1
             return None
         _, rate, frame, *pulses = layout.unpack(data)
-        wrong = any(pulse and not _PULSES[0] <= pulse <= _PULSES[1] for pulse in pulses)
-        if wrong or not _RATES[0] <= rate <= _RATES[1]:
-            self.refused += 1
+        is_invalid = any(
+            pulse and not _PULSE_RANGE[0] <= pulse <= _PULSE_RANGE[1] for pulse in pulses
+        )
+        if is_invalid or not _FRAME_RATE_RANGE[0] <= rate <= _FRAME_RATE_RANGE[1]:
+            self.n_invalid_packets += 1
             return None
-        if frame == self.last:
+        if frame == self.last_frame:
             return self.reply
-        if frame < self.last:
-            say("ArduPilot began anew")
-            self._begin()
-        elif self.last >= 0:
-            self.missed += frame - self.last - 1
-        self.last = frame
+        if frame < self.last_frame:
+            log_message("ArduPilot began anew")
+            self._reset()
+        elif self.last_frame >= 0:
+            self.n_lost_frames += frame - self.last_frame - 1
+        self.last_frame = frame
         self.time += 1.0 / rate
         dt = self._dt
         while self.steps * dt < self.time - 1e-9:
             commands = torch.tensor(
-                [[servo.command(pulses[servo.channel - 1]) if servo.channel <= len(pulses) else
-                  servo.command(0) for servo in self.servos]],
-                dtype=self.after.dtype,
+                [[servo.command_at(pulses[servo.channel - 1]) if servo.channel <= len(pulses) else
+                  servo.command_at(0) for servo in self.servos]],
+                dtype=self.current_state.dtype,
             )  # fmt: skip
-            self.before = self.after
+            self.previous_state = self.current_state
             with torch.no_grad():
-                after, memory = self.vehicle.dynamics.step(
-                    self.before, self.vehicle.inputs_at(commands), self.memory
+                next_state, memory = self.vehicle.dynamics.step(
+                    self.previous_state, self.vehicle.inputs_at(commands), self.memory
                 )
-            if bool(torch.isfinite(after).all()) and bool(torch.isfinite(memory).all()):
-                self.after, self.memory = after, memory
+            if bool(torch.isfinite(next_state).all()) and bool(torch.isfinite(memory).all()):
+                self.current_state, self.memory = next_state, memory
             self.steps += 1
-        share = min(max(self.time / self._dt - (self.steps - 1), 0.0), 1.0)
-        state: Tensor = self.before[0] + share * (self.after[0] - self.before[0])
-        change = ((self.after[0] - self.before[0]) / self._dt).tolist()
+        step_fraction = min(max(self.time / self._dt - (self.steps - 1), 0.0), 1.0)
+        state: Tensor = self.previous_state[0] + step_fraction * (
+            self.current_state[0] - self.previous_state[0]
+        )
+        acceleration = ((self.current_state[0] - self.previous_state[0]) / self._dt).tolist()
         north, east, psi, u, v, r = state[:6].tolist()
-        roll = dict(zip(self.vehicle.states, state.tolist(), strict=True))
-        phi, p = roll.get("phi", 0.0), roll.get("p", 0.0)
-        cos, sin, level = math.cos(psi), math.sin(psi), v * math.cos(phi)
-        wrapped = math.remainder(psi, 2 * math.pi)
+        named_states = dict(zip(self.vehicle.states, state.tolist(), strict=True))
+        phi, p = named_states.get("phi", 0.0), named_states.get("p", 0.0)
+        cos_psi, sin_psi, horizontal_sway = math.cos(psi), math.sin(psi), v * math.cos(phi)
+        wrapped_heading = math.remainder(psi, 2 * math.pi)
         reply = {
             "timestamp": self.time,
             "imu": {
                 "gyro": [p, 0.0, r],
                 # what an accelerometer feels: the motion of a turning frame, and not to fall
                 "accel_body": [
-                    change[3] - r * v,
-                    change[4] + r * u - _GRAVITY * math.sin(phi),
+                    acceleration[3] - r * v,
+                    acceleration[4] + r * u - _GRAVITY * math.sin(phi),
                     p * v - _GRAVITY * math.cos(phi),
                 ],
             },
             "position": [north, east, 0.0],
-            "attitude": [phi, 0.0, wrapped],
-            "velocity": [u * cos - level * sin, u * sin + level * cos, 0.0],
+            "attitude": [phi, 0.0, wrapped_heading],
+            "velocity": [
+                u * cos_psi - horizontal_sway * sin_psi,
+                u * sin_psi + horizontal_sway * cos_psi,
+                0.0,
+            ],
         }
         self.reply = b"\n" + json.dumps(reply, separators=(",", ":")).encode() + b"\n"
         return self.reply

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from residnet.core.errors import UsageError
 from residnet.core.layout import SURGE
-from residnet.core.names import STATE
+from residnet.core.names import STATE_NAMES
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import RecordedPlantDynamics
@@ -19,7 +19,7 @@ from residnet.export.guard import GuardedDynamics
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 
-_SETTLING = 600
+_SETTLING_STEPS = 600
 """Steps within which a vessel reaches the speed that its middle drive stands for."""
 
 
@@ -32,11 +32,11 @@ class Vehicle:
         dynamics: its step, defined for whatever it is given.
         states: names of the columns of x; pose and velocities stand first.
         inputs: names of the columns of w: commands, then what nobody commands.
-        commands: how many of the inputs are commands.
-        low: least commands [c], SI.
-        high: largest commands [c], SI.
-        rest: values of the other inputs [m - c] in calm water.
-        start: state [nx] that an episode starts from.
+        n_commands: how many of the inputs are commands.
+        lower_commands: least commands [c], SI.
+        upper_commands: largest commands [c], SI.
+        exogenous_inputs: values of the other inputs [m - c] in calm water.
+        initial_state: state [nx] that an episode starts from.
         cruise: speed in m/s that errors are measured by.
     """
 
@@ -44,20 +44,24 @@ class Vehicle:
     dynamics: Dynamics
     states: tuple[str, ...]
     inputs: tuple[str, ...]
-    commands: int
-    low: Tensor
-    high: Tensor
-    rest: Tensor
-    start: Tensor
+    n_commands: int
+    lower_commands: Tensor
+    upper_commands: Tensor
+    exogenous_inputs: Tensor
+    initial_state: Tensor
     cruise: float
 
     def inputs_at(self, commands: Tensor) -> Tensor:
         """Return the inputs [B, m] of commands [B, c] in calm water, held to their limits."""
-        held = torch.minimum(torch.maximum(commands, self.low), self.high)
-        return torch.cat((held, self.rest.expand(len(held), -1)), dim=-1)
+        clamped_commands = torch.minimum(
+            torch.maximum(commands, self.lower_commands), self.upper_commands
+        )
+        return torch.cat(
+            (clamped_commands, self.exogenous_inputs.expand(len(clamped_commands), -1)), dim=-1
+        )
 
 
-def vehicle(source: str | Path, *, model: str = "selected", dt: float = 0.1) -> Vehicle:
+def load_vehicle(source: str | Path, *, model: str = "selected", dt: float = 0.1) -> Vehicle:
     """Return a learned model of a run's folder, or a vessel by its name or file.
 
     Args:
@@ -69,11 +73,11 @@ def vehicle(source: str | Path, *, model: str = "selected", dt: float = 0.1) -> 
         UsageError: where there is no such vessel, run or model, or it has no planar motion.
     """
     if Path(source).is_dir():
-        return learned_vehicle(Path(source), model)
-    return plant_vehicle(str(source), load_vessel(str(source)).build(), dt)
+        return load_learned_vehicle(Path(source), model)
+    return build_plant_vehicle(str(source), load_vessel(str(source)).build(), dt)
 
 
-def learned_vehicle(run: Path, name: str = "selected") -> Vehicle:
+def load_learned_vehicle(run: Path, name: str = "selected") -> Vehicle:
     """Return a learned model as a vehicle, bad inputs answered as its exports do.
 
     Its commands are its inputs within their training ranges; it feels no wind.
@@ -82,28 +86,30 @@ def learned_vehicle(run: Path, name: str = "selected") -> Vehicle:
         UsageError: where the run has no such model.
     """
     spec, model = load_model(run / "models" / chosen_model(run, name))
-    live = spec.signals.live
-    live.require_on_surface("a simulator")
-    guarded = _Guarded(GuardedDynamics(model.float(), spec).float().eval().requires_grad_(False))
-    driven = slice(live.size, live.size + len(spec.signals.inputs))
-    low, high = torch.tensor(spec.low), torch.tensor(spec.high)
-    return _settled(
+    dof = spec.signals.dof
+    dof.require_on_surface("a simulator")
+    guarded_step = _UnflaggedStep(
+        GuardedDynamics(model.float(), spec).float().eval().requires_grad_(False)
+    )
+    command_columns = slice(dof.n_dynamic, dof.n_dynamic + len(spec.signals.inputs))
+    lower, upper = torch.tensor(spec.low), torch.tensor(spec.high)
+    return _with_cruise_speed(
         Vehicle(
             spec.name,
-            guarded,
-            live.states,
-            spec.signals.columns,
+            guarded_step,
+            dof.state_names,
+            spec.signals.input_columns,
             len(spec.signals.inputs),
-            low[driven],
-            high[driven],
+            lower[command_columns],
+            upper[command_columns],
             torch.zeros(len(spec.signals.exogenous)),
-            torch.zeros(len(live.states)),
-            float(max(abs(low[0]), abs(high[0]))),
+            torch.zeros(len(dof.state_names)),
+            float(max(abs(lower[0]), abs(upper[0]))),
         )
     )
 
 
-class _Guarded(Dynamics):
+class _UnflaggedStep(Dynamics):
     """The guarded step without the flag among the states."""
 
     def __init__(self, guarded: GuardedDynamics) -> None:
@@ -112,11 +118,11 @@ class _Guarded(Dynamics):
         self.n_state = guarded.n_state
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        after, s, _ = self.guarded.flagged_step(x, w, s)
-        return after, s
+        next_state, s, _ = self.guarded.flagged_step(x, w, s)
+        return next_state, s
 
 
-def plant_vehicle(name: str, plant: Plant, dt: float) -> Vehicle:
+def build_plant_vehicle(name: str, plant: Plant, dt: float) -> Vehicle:
     """Return a vessel as a vehicle in calm water.
 
     Its limits are the commands that full drive and full steering of a manoeuvre stand for.
@@ -124,45 +130,54 @@ def plant_vehicle(name: str, plant: Plant, dt: float) -> Vehicle:
     Raises:
         UsageError: where it moves in other degrees of freedom than surge, sway and yaw.
     """
-    if plant.state[: len(STATE)] != STATE:
+    if plant.state_names[: len(STATE_NAMES)] != STATE_NAMES:
         raise UsageError(
-            f"vessel {name}: its states are {', '.join(plant.state)}; simulators take vessels with"
-            f" {', '.join(STATE)} first"
+            f"vessel {name}: its states are {', '.join(plant.state_names)}; simulators take vessels with"
+            f" {', '.join(STATE_NAMES)} first"
         )
     plant = plant.eval().requires_grad_(False)
-    corners = torch.tensor([[a, b] for a in (-1.0, 0.0, 1.0) for b in (-1.0, 0.0, 1.0)])
-    demanded = plant.demand(corners[:, 0].double(), corners[:, 1].double())
-    return _settled(
+    demand_corners = torch.tensor([[a, b] for a in (-1.0, 0.0, 1.0) for b in (-1.0, 0.0, 1.0)])
+    commands = plant.commands_for_demand(
+        demand_corners[:, 0].double(), demand_corners[:, 1].double()
+    )
+    return _with_cruise_speed(
         Vehicle(
             name,
             RecordedPlantDynamics(plant, dt),
-            plant.state,
-            plant.inputs,
-            plant.commands,
-            demanded.amin(0),
-            demanded.amax(0),
-            torch.zeros(len(plant.inputs) - plant.commands, dtype=torch.float64),
-            plant.approach(1)[0],
-            float(plant.approach(1)[0, SURGE]),
+            plant.state_names,
+            plant.input_names,
+            plant.n_commands,
+            commands.amin(0),
+            commands.amax(0),
+            torch.zeros(len(plant.input_names) - plant.n_commands, dtype=torch.float64),
+            plant.make_initial_state(1)[0],
+            float(plant.make_initial_state(1)[0, SURGE]),
         )
     )
 
 
-def _settled(given: Vehicle) -> Vehicle:
+def _with_cruise_speed(base_vehicle: Vehicle) -> Vehicle:
     """Return a vehicle with the speed that commands half way up lead to as its cruise."""
-    wish = given.low + 0.75 * (given.high - given.low)
-    # what steers to both sides stays amidships, and drives of two sides go together
-    balanced = torch.where(
-        (given.low + given.high).abs() < 1e-9 * given.high.abs(), torch.zeros_like(wish), wish
+    partial_drive = base_vehicle.lower_commands + 0.75 * (
+        base_vehicle.upper_commands - base_vehicle.lower_commands
     )
-    candidates = [wish, balanced]
+    # what steers to both sides stays amidships, and drives of two sides go together
+    balanced_drive = torch.where(
+        (base_vehicle.lower_commands + base_vehicle.upper_commands).abs()
+        < 1e-9 * base_vehicle.upper_commands.abs(),
+        torch.zeros_like(partial_drive),
+        partial_drive,
+    )
+    candidates = [partial_drive, balanced_drive]
     speeds = []
     for command in candidates:
-        w = given.inputs_at(command.unsqueeze(0)).unsqueeze(1).expand(1, _SETTLING, -1)
+        w = base_vehicle.inputs_at(command.unsqueeze(0)).unsqueeze(1).expand(1, _SETTLING_STEPS, -1)
         with torch.no_grad():
-            states, _, _ = Rollout(given.dynamics)(
-                given.start.unsqueeze(0), w, given.dynamics.initial_state(1).to(given.start.dtype)
+            states, _, _ = Rollout(base_vehicle.dynamics)(
+                base_vehicle.initial_state.unsqueeze(0),
+                w,
+                base_vehicle.dynamics.initial_state(1).to(base_vehicle.initial_state.dtype),
             )
         speeds.append(float(states[0, -1, SURGE]))
     cruise = max([speed for speed in speeds if speed == speed and speed < 1e3], default=0.0)
-    return Vehicle(**{**given.__dict__, "cruise": max(cruise, given.cruise, 0.1)})
+    return Vehicle(**{**base_vehicle.__dict__, "cruise": max(cruise, base_vehicle.cruise, 0.1)})

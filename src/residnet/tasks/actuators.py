@@ -13,42 +13,51 @@ from pydantic import AfterValidator, Field, model_validator
 
 from residnet.core.config import Config, ExistingPath
 from residnet.core.errors import DataError, UsageError
-from residnet.core.format import DASH, interval, number
-from residnet.core.names import nearest, to_si
-from residnet.data.readers.texts import as_utf8
+from residnet.core.format import DASH, format_interval, format_number
+from residnet.core.names import suggest_name, to_si
+from residnet.data.readers.texts import open_as_utf8
 from residnet.physics.actuators.identify import (
-    Estimate,
-    StepAnswer,
+    IntervalEstimate,
+    StepResponse,
     ThrottleMap,
     ThrustFit,
-    fit_step,
-    fit_throttle,
-    fit_thrust,
-    follow_command,
+    fit_step_response,
+    fit_throttle_map,
+    fit_thrust_curves,
+    simulate_shaft,
 )
-from residnet.report.blocks import Block, Code, Section, Table, Text, table_of
-from residnet.report.figure import GREEN, SOLID, Case, Curve, Figure, Look, Panel, joined
+from residnet.report.blocks import Block, Code, Section, Table, Text, build_table
+from residnet.report.figure import (
+    GREEN,
+    SOLID_STYLE,
+    Case,
+    Curve,
+    Figure,
+    GlyphStyle,
+    Panel,
+    join_with_gaps,
+)
 from residnet.report.figure_files import read_figures, write_figures
-from residnet.report.run_reader import Content, RunFiles
+from residnet.report.run_reader import JsonObject, RunFiles
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import MainFigure, Outcome, Task
+from residnet.runs.task import SummaryMetric, Task, TaskOutcome
 
-_TITLES = {
+_PARAMETER_TITLES = {
     ("throttle", "slope"): "revolutions at full throttle, slope",
     ("throttle", "offset"): "revolutions at zero throttle",
     ("throttle", "n_max"): "largest revolutions",
     ("step", "rate"): "rate of the revolutions",
     ("step", "dead_time"): "dead time",
 }
-_PER_MINUTE = {"1/s": ("rpm", 60.0), "1/s^2": ("rpm/s", 60.0)}
+_DISPLAY_UNITS = {"1/s": ("rpm", 60.0), "1/s^2": ("rpm/s", 60.0)}
 """Units of revolutions as test engineers read them, with the factor from SI."""
 
 
-Step = tuple[np.ndarray, np.ndarray, np.ndarray]
+MeasuredStep = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Time in s, command and measured revolutions in 1/s of one step response, each [N]."""
 
 
-class Column(Config):
+class CsvColumn(Config):
     """A column of a csv file and its unit.
 
     Attributes:
@@ -60,10 +69,10 @@ class Column(Config):
     unit: str
 
 
-def _measures(si: str) -> Callable[[Column], Column]:
-    def check(column: Column) -> Column:
+def _unit_check(expected_unit: str) -> Callable[[CsvColumn], CsvColumn]:
+    def check(column: CsvColumn) -> CsvColumn:
         try:
-            to_si(column.unit, si)
+            to_si(column.unit, expected_unit)
         except UsageError as error:
             raise ValueError(str(error)) from None
         return column
@@ -71,10 +80,10 @@ def _measures(si: str) -> Callable[[Column], Column]:
     return check
 
 
-Share = Annotated[Column, AfterValidator(_measures("-"))]
-Time = Annotated[Column, AfterValidator(_measures("s"))]
-Revolutions = Annotated[Column, AfterValidator(_measures("1/s"))]
-Force = Annotated[Column, AfterValidator(_measures("N"))]
+DimensionlessColumn = Annotated[CsvColumn, AfterValidator(_unit_check("-"))]
+TimeSeriesColumn = Annotated[CsvColumn, AfterValidator(_unit_check("s"))]
+RevolutionsColumn = Annotated[CsvColumn, AfterValidator(_unit_check("1/s"))]
+ForceColumn = Annotated[CsvColumn, AfterValidator(_unit_check("N"))]
 
 
 class ActuatorTest(Config):
@@ -86,7 +95,7 @@ class ActuatorTest(Config):
 
     files: Annotated[tuple[ExistingPath, ...], Field(min_length=1)]
 
-    def read(self) -> list[tuple[np.ndarray, ...]]:
+    def read_columns(self) -> list[tuple[np.ndarray, ...]]:
         """Return the columns [N] of each file in SI, in the order of the keys; rows with an empty
         cell are left out.
 
@@ -95,11 +104,13 @@ class ActuatorTest(Config):
             DataError: where a cell is no number, or no row is complete.
         """
         keys = [key for key in type(self).model_fields if key not in ("files", "thrusters")]
-        return [_read(path, [getattr(self, key) for key in keys]) for path in self.files]
+        return [_read_columns(path, [getattr(self, key) for key in keys]) for path in self.files]
 
-    def together(self) -> tuple[np.ndarray, ...]:
+    def read_concatenated(self) -> tuple[np.ndarray, ...]:
         """Return the columns of all files as one."""
-        return tuple(np.concatenate(parts) for parts in zip(*self.read(), strict=True))
+        return tuple(
+            np.concatenate(file_columns) for file_columns in zip(*self.read_columns(), strict=True)
+        )
 
 
 class ThrottleTest(ActuatorTest):
@@ -110,8 +121,8 @@ class ThrottleTest(ActuatorTest):
         n: column of the revolutions, for example in `rpm`.
     """
 
-    throttle: Share
-    n: Revolutions
+    throttle: DimensionlessColumn
+    n: RevolutionsColumn
 
 
 class StepTest(ActuatorTest):
@@ -123,18 +134,18 @@ class StepTest(ActuatorTest):
         n: column of the measured revolutions, for example in `rpm`.
     """
 
-    t: Time
-    command: Revolutions
-    n: Revolutions
+    t: TimeSeriesColumn
+    command: RevolutionsColumn
+    n: RevolutionsColumn
 
-    def read(self) -> list[tuple[np.ndarray, ...]]:
-        found = super().read()
-        for path, (t, *_) in zip(self.files, found, strict=True):
-            if (bad := np.flatnonzero(np.diff(t) <= 0)).size:
+    def read_columns(self) -> list[tuple[np.ndarray, ...]]:
+        responses = super().read_columns()
+        for path, (t, *_) in zip(self.files, responses, strict=True):
+            if (backward_steps := np.flatnonzero(np.diff(t) <= 0)).size:
                 raise DataError(
-                    f"{path}: time repeats or runs backwards in row {int(bad[0]) + 2} of the data"
+                    f"{path}: time repeats or runs backwards in row {int(backward_steps[0]) + 2} of the data"
                 )
-        return found
+        return responses
 
 
 class BollardTest(ActuatorTest):
@@ -146,8 +157,8 @@ class BollardTest(ActuatorTest):
         thrusters: how many pull together.
     """
 
-    n: Revolutions
-    pull: Force
+    n: RevolutionsColumn
+    pull: ForceColumn
     thrusters: int = Field(default=1, ge=1)
 
 
@@ -166,12 +177,12 @@ class ActuatorsTaskConfig(Task):
     bollard: BollardTest | None = None
 
     @model_validator(mode="after")
-    def _any(self) -> ActuatorsTaskConfig:
-        if not self._tests():
+    def _require_test(self) -> ActuatorsTaskConfig:
+        if not self._configured_tests():
             raise ValueError("no test is named; give at least one of throttle, step, bollard")
         return self
 
-    def _tests(self) -> list[ActuatorTest]:
+    def _configured_tests(self) -> list[ActuatorTest]:
         tests: tuple[ActuatorTest | None, ...] = (self.throttle, self.step, self.bollard)
         return [test for test in tests if test is not None]
 
@@ -181,14 +192,14 @@ class ActuatorsTaskConfig(Task):
         Raises:
             ResidnetError: where a column is missing or holds what is no number.
         """
-        for test in self._tests():
-            test.read()
+        for test in self._configured_tests():
+            test.read_columns()
 
     def input_files(self) -> list[Path]:
         """Return the files of all logs that the task reads."""
-        return [path for test in self._tests() for path in test.files]
+        return [path for test in self._configured_tests() for path in test.files]
 
-    def carry_out(self, folder: RunFolder) -> Outcome:
+    def execute(self, folder: RunFolder) -> TaskOutcome:
         """Identify the actuators, and write actuators.json, actuators.yaml and a figure.
 
         actuators.yaml holds the lines for the section `actuators` of a vessel file.
@@ -196,115 +207,148 @@ class ActuatorsTaskConfig(Task):
         Raises:
             ResidnetError: where the logs cannot be used or do not determine the actuators.
         """
-        throttle = step = pull = None
-        tests, main = [], dict[str, Estimate]()
-        numbers: dict[str, Any] = {"schema": "residnet.actuators/1"}
-        lines: dict[str, Any] = {}
+        throttle_data = step_data = bollard_data = None
+        test_names, main_estimates = [], dict[str, IntervalEstimate]()
+        report_json: dict[str, Any] = {"schema": "residnet.actuators/1"}
+        vessel_lines: dict[str, Any] = {}
         if self.throttle is not None:
-            share, n = self.throttle.together()
-            curve = fit_throttle(share, n)
-            throttle, main["n_max"] = (share, n, curve), curve.n_max
-            numbers["throttle"] = _plain(curve._asdict())
-            lines["n_max"] = f"{curve.n_max.value * 60:.5g} rpm"
-            tests.append("throttle map")
+            throttle_values, n = self.throttle.read_concatenated()
+            throttle_map = fit_throttle_map(throttle_values, n)
+            throttle_data, main_estimates["n_max"] = (
+                (throttle_values, n, throttle_map),
+                throttle_map.n_max,
+            )
+            report_json["throttle"] = _estimates_to_json(throttle_map._asdict())
+            vessel_lines["n_max"] = f"{throttle_map.n_max.value * 60:.5g} rpm"
+            test_names.append("throttle map")
         if self.step is not None:
-            runs = [(t, command, n) for t, command, n in self.step.read()]
-            answer = fit_step(runs)
-            step = (runs, answer)
-            main |= {"n_rate": answer.rate, "dead_time": answer.dead_time}
-            numbers["step"] = _plain(answer._asdict())
-            lines["n_rate"] = f"{answer.rate.value * 60:.5g} rpm/s"
-            tests.append("step response")
+            runs = [(t, command, n) for t, command, n in self.step.read_columns()]
+            step_response = fit_step_response(runs)
+            step_data = (runs, step_response)
+            main_estimates |= {"n_rate": step_response.rate, "dead_time": step_response.dead_time}
+            report_json["step"] = _estimates_to_json(step_response._asdict())
+            vessel_lines["n_rate"] = f"{step_response.rate.value * 60:.5g} rpm/s"
+            test_names.append("step response")
         if self.bollard is not None:
-            n, force = self.bollard.together()
-            thrust = fit_thrust(n, force, self.bollard.thrusters)
-            pull = (n, force / self.bollard.thrusters, thrust)
-            for name, fit in zip(("forward", "reverse"), thrust, strict=True):
-                found = {f"c{i}": c for i, c in enumerate(fit.coefficients)}
-                numbers[name] = _plain({**found, "low": fit.low, "high": fit.high, "rms": fit.rms})
-                lines[name] = [float(f"{c.value:.6g}") for c in fit.coefficients]
-            ends = (thrust[1].low, thrust[0].high)
-            lines["curve_range"] = [f"{end * 60:.5g} rpm" for end in ends]
-            tests.append("thrust curves")
-        lines["source"] = f"identified by residnet, run {self.name}"
-        text = yaml.safe_dump(lines, sort_keys=False, default_flow_style=None)
-        folder.write(folder.path / "actuators.yaml", text)
-        folder.write_json(folder.path / "actuators.json", numbers)
-        write_figures(folder.figures, [actuator_tests(self.name, throttle, step, pull)])
+            n, force = self.bollard.read_concatenated()
+            thrust_fits = fit_thrust_curves(n, force, self.bollard.thrusters)
+            bollard_data = (n, force / self.bollard.thrusters, thrust_fits)
+            for name, thrust_fit in zip(("forward", "reverse"), thrust_fits, strict=True):
+                coefficients = {
+                    f"c{i}": coefficient for i, coefficient in enumerate(thrust_fit.coefficients)
+                }
+                report_json[name] = _estimates_to_json(
+                    {
+                        **coefficients,
+                        "low": thrust_fit.low,
+                        "high": thrust_fit.high,
+                        "rms": thrust_fit.rms,
+                    }
+                )
+                vessel_lines[name] = [
+                    float(f"{coefficient.value:.6g}") for coefficient in thrust_fit.coefficients
+                ]
+            range_limits = (thrust_fits[1].low, thrust_fits[0].high)
+            vessel_lines["curve_range"] = [
+                f"{range_limit * 60:.5g} rpm" for range_limit in range_limits
+            ]
+            test_names.append("thrust curves")
+        vessel_lines["source"] = f"identified by residnet, run {self.name}"
+        vessel_yaml = yaml.safe_dump(vessel_lines, sort_keys=False, default_flow_style=None)
+        folder.write(folder.path / "actuators.yaml", vessel_yaml)
+        folder.write_json(folder.path / "actuators.json", report_json)
+        write_figures(
+            folder.figures, [plot_actuator_tests(self.name, throttle_data, step_data, bollard_data)]
+        )
         sentence = (
-            f"The tests gave {' and '.join(tests)}; actuators.yaml holds the lines for a vessel"
+            f"The tests gave {' and '.join(test_names)}; actuators.yaml holds the lines for a vessel"
             " file."
         )
-        figures = {name: MainFigure(one.value, one.unit) for name, one in main.items()}
-        return Outcome([sentence], figures, f"{parameter_table(numbers).text()}\n\n{text}")
+        summary_metrics = {
+            name: SummaryMetric(estimate.value, estimate.unit)
+            for name, estimate in main_estimates.items()
+        }
+        return TaskOutcome(
+            [sentence],
+            summary_metrics,
+            f"{build_parameter_table(report_json).to_text()}\n\n{vessel_yaml}",
+        )
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        found = RunFiles(run.path).json("actuators.json")
-        drawn = read_figures(run.figures)
-        blocks: list[Block] = [*(one.part() for one in drawn[:1]), parameter_table(found)]
-        throttle = found.get("throttle")
+        actuator_json = RunFiles(run.path).read_json("actuators.json")
+        figures = read_figures(run.figures)
+        blocks: list[Block] = [
+            *(figure.preview() for figure in figures[:1]),
+            build_parameter_table(actuator_json),
+        ]
+        throttle = actuator_json.get("throttle")
         if throttle and not throttle["saturated"]:
             text = (
                 "Nothing saturated in the throttle test. The largest revolutions are measured ones."
             )
             blocks.append(Text(text))
-        out = [Section("", blocks), *([Section("Figures", drawn)] if drawn else [])]
-        lines = run.path / "actuators.yaml"
-        if lines.is_file():
-            about = "These lines belong to the section actuators of a vessel file."
-            out.append(Section("Lines for a vessel file", [Text(about), Code(lines.read_text())]))
-        return out
+        sections = [Section("", blocks), *([Section("Figures", figures)] if figures else [])]
+        vessel_lines_path = run.path / "actuators.yaml"
+        if vessel_lines_path.is_file():
+            explanation = "These lines belong to the section actuators of a vessel file."
+            sections.append(
+                Section(
+                    "Lines for a vessel file",
+                    [Text(explanation), Code(vessel_lines_path.read_text())],
+                )
+            )
+        return sections
 
 
-def _plain(parts: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: v._asdict() if isinstance(v, Estimate) else v for k, v in parts.items()}
+def _estimates_to_json(estimates: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: v._asdict() if isinstance(v, IntervalEstimate) else v for k, v in estimates.items()}
 
 
-def _read(path: Path, columns: Sequence[Column]) -> tuple[np.ndarray, ...]:
+def _read_columns(path: Path, columns: Sequence[CsvColumn]) -> tuple[np.ndarray, ...]:
     import pandas as pd
 
     try:
-        with as_utf8(path) as file:
+        with open_as_utf8(path) as file:
             table = pd.read_csv(file, skipinitialspace=True, encoding="utf-8-sig")
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
         raise DataError(
             f"{path}: not a readable csv table ({' '.join(str(error).split())})"
         ) from error
-    out = []
+    columns_si = []
     for entry in columns:
         if entry.column not in table.columns:
-            near = nearest(entry.column, map(str, table.columns))
-            raise UsageError(f"{path}: no column '{entry.column}'{near}")
+            suggestion = suggest_name(entry.column, map(str, table.columns))
+            raise UsageError(f"{path}: no column '{entry.column}'{suggestion}")
         values = pd.to_numeric(table[entry.column], errors="coerce").to_numpy(dtype=np.float64)
-        bad = np.flatnonzero(~np.isfinite(values) & table[entry.column].notna().to_numpy())
-        if bad.size:
+        invalid_rows = np.flatnonzero(~np.isfinite(values) & table[entry.column].notna().to_numpy())
+        if invalid_rows.size:
             raise DataError(
-                f"{path}: line {int(bad[0]) + 2}, column '{entry.column}':"
-                f" '{table[entry.column].iloc[int(bad[0])]}' is not a finite number"
+                f"{path}: line {int(invalid_rows[0]) + 2}, column '{entry.column}':"
+                f" '{table[entry.column].iloc[int(invalid_rows[0])]}' is not a finite number"
             )
-        out.append(values * to_si(entry.unit))
-    whole = np.isfinite(np.stack(out)).all(axis=0)
-    if not whole.any():
+        columns_si.append(values * to_si(entry.unit))
+    is_complete = np.isfinite(np.stack(columns_si)).all(axis=0)
+    if not is_complete.any():
         names = ", ".join(entry.column for entry in columns)
         raise DataError(f"{path}: no row has a number in all of {names}")
-    return tuple(values[whole] for values in out)
+    return tuple(values[is_complete] for values in columns_si)
 
 
-def parameter_table(found: Mapping[str, Any]) -> Table:
+def build_parameter_table(actuator_json: Mapping[str, Any]) -> Table:
     """Return a row for each parameter of actuators.json with its 95 % interval."""
-    rows: list[Content] = []
-    for test, parts in found.items():
-        estimates = parts.items() if isinstance(parts, Mapping) else ()
+    rows: list[JsonObject] = []
+    for test, test_results in actuator_json.items():
+        estimates = test_results.items() if isinstance(test_results, Mapping) else ()
         for name, estimate in estimates:
             if isinstance(estimate, Mapping):
-                unit, factor = _PER_MINUTE.get(estimate["unit"], (estimate["unit"], 1.0))
+                unit, factor = _DISPLAY_UNITS.get(estimate["unit"], (estimate["unit"], 1.0))
                 rows.append(
                     {
                         "test": test,
-                        "title": _TITLES.get((test, name), f"{test} thrust, {name}"),
-                        "value": number(factor * estimate["value"], 4),
-                        "interval": interval([estimate["low"], estimate["high"]], factor, 4),
+                        "title": _PARAMETER_TITLES.get((test, name), f"{test} thrust, {name}"),
+                        "value": format_number(factor * estimate["value"], 4),
+                        "interval": format_interval([estimate["low"], estimate["high"]], factor, 4),
                         "unit": unit,
                     }
                 )
@@ -312,75 +356,83 @@ def parameter_table(found: Mapping[str, Any]) -> Table:
         {
             "test": "residual",
             "title": f"{test} thrust, rms residual",
-            "value": number(found[test]["rms"]),
+            "value": format_number(actuator_json[test]["rms"]),
             "interval": DASH,
             "unit": "N",
         }
         for test in ("forward", "reverse")
-        if test in found
+        if test in actuator_json
     ]
-    return table_of(
+    return build_table(
         rows,
         [
             ("parameter", "title"),
             ("value", lambda row: f"{row['value']} {row['unit']}", str),
             ("95 % interval", "interval", str),
         ],
-        rule=lambda row: row["test"],
+        group_key=lambda row: row["test"],
     )
 
 
-def actuator_tests(
+def plot_actuator_tests(
     name: str,
-    throttle: tuple[np.ndarray, np.ndarray, ThrottleMap] | None = None,
-    steps: tuple[Sequence[Step], StepAnswer] | None = None,
-    bollard: tuple[np.ndarray, np.ndarray, tuple[ThrustFit, ThrustFit]] | None = None,
+    throttle_data: tuple[np.ndarray, np.ndarray, ThrottleMap] | None = None,
+    step_data: tuple[Sequence[MeasuredStep], StepResponse] | None = None,
+    bollard_data: tuple[np.ndarray, np.ndarray, tuple[ThrustFit, ThrustFit]] | None = None,
 ) -> Figure:
     """Draw measurements as dots and the fits over them, a panel for each test (Figs. 4, 6, 7).
 
     Args:
-        throttle: throttle [N], revolutions [N] in 1/s, and the fitted map.
-        steps: measured step responses, and the fitted one.
-        bollard: revolutions [N] in 1/s, thrust [N] of one thruster in N, and the fitted curves.
+        throttle_data: throttle [N], revolutions [N] in 1/s, and the fitted map.
+        step_data: measured step responses, and the fitted one.
+        bollard_data: revolutions [N] in 1/s, thrust [N] of one thruster in N, and the fitted curves.
     """
-    drawn: list[tuple[Panel, dict[str, Curve]]] = []
-    if throttle is not None:
-        share, n, fitted = throttle
-        grid = np.linspace(share.min(), share.max(), 300)
+    panels_and_curves: list[tuple[Panel, dict[str, Curve]]] = []
+    if throttle_data is not None:
+        throttle_values, n, fitted_map = throttle_data
+        sample_points = np.linspace(throttle_values.min(), throttle_values.max(), 300)
         panel = Panel("revolutions [rpm]", "throttle [%]", "throttle map", height=250, group="map")
-        curves = {"measured": (100 * share, 60 * n), "fit": (100 * grid, 60 * fitted(grid))}
-        drawn.append((panel, curves))
-    if steps is not None:
-        runs, answer = steps
-        rate, dead = answer.rate.value, answer.dead_time.value
+        panel_curves = {
+            "measured": (100 * throttle_values, 60 * n),
+            "fit": (100 * sample_points, 60 * fitted_map(sample_points)),
+        }
+        panels_and_curves.append((panel, panel_curves))
+    if step_data is not None:
+        responses, step_response = step_data
+        rate, dead_time = step_response.rate.value, step_response.dead_time.value
         panel = Panel("revolutions [rpm]", "time [s]", "step response", height=250, group="step")
-        of_runs = {
-            "command": joined((t - t[0], 60 * command) for t, command, _ in runs),
-            "measured": joined((t - t[0], 60 * n) for t, _, n in runs),
-            "fit": joined(
-                (t - t[0], 60 * follow_command(t, command, rate, dead, float(n[:3].mean())))
-                for t, command, n in runs
+        step_curves = {
+            "command": join_with_gaps((t - t[0], 60 * command) for t, command, _ in responses),
+            "measured": join_with_gaps((t - t[0], 60 * n) for t, _, n in responses),
+            "fit": join_with_gaps(
+                (t - t[0], 60 * simulate_shaft(t, command, rate, dead_time, float(n[:3].mean())))
+                for t, command, n in responses
             ),
         }
-        drawn.append((panel, of_runs))
-    if bollard is not None:
-        n, thrust, fits = bollard
-        grids = [np.linspace(fit.low, fit.high, 200) for fit in fits]
+        panels_and_curves.append((panel, step_curves))
+    if bollard_data is not None:
+        n, thrust, thrust_fits = bollard_data
+        sample_grids = [
+            np.linspace(thrust_fit.low, thrust_fit.high, 200) for thrust_fit in thrust_fits
+        ]
         panel = Panel(
             "thrust of one [N]", "revolutions [rpm]", "bollard pull", height=250, group="n"
         )
-        lines = joined((60 * grid, fit(grid)) for grid, fit in zip(grids, fits, strict=True))
-        drawn.append((panel, {"measured": (60 * n, thrust), "fit": lines}))
+        fit_lines = join_with_gaps(
+            (60 * sample_points, thrust_fit(sample_points))
+            for sample_points, thrust_fit in zip(sample_grids, thrust_fits, strict=True)
+        )
+        panels_and_curves.append((panel, {"measured": (60 * n, thrust), "fit": fit_lines}))
     return Figure(
         "actuators",
         f"Actuators of {name}",
         f"Actuator tests of {name}: the measurements, and the fits over them.",
         {
-            "command": Look("command", GREEN, "dashed"),
-            "measured": Look("measured", "#666666", kind="points", size=2.5),
-            "fit": replace(SOLID, label="fit"),
+            "command": GlyphStyle("command", GREEN, "dashed"),
+            "measured": GlyphStyle("measured", "#666666", kind="points", size=2.5),
+            "fit": replace(SOLID_STYLE, label="fit"),
         },
-        [panel for panel, _ in drawn],
-        [Case("", [curves for _, curves in drawn])],
-        columns=len(drawn),
+        [panel for panel, _ in panels_and_curves],
+        [Case("", [panel_curves for _, panel_curves in panels_and_curves])],
+        columns=len(panels_and_curves),
     )

@@ -20,14 +20,14 @@ from residnet.control.heading.controllers import (
     ObservedPolicySpec,
     RecurrentSpec,
     TunableConfig,
-    observed_of,
+    angle_law_of,
 )
-from residnet.control.heading.turning import Turning
+from residnet.control.heading.turning import NomotoModel
 from residnet.control.heading.vessels import SteeredModel, SteeredPlant
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Seconds
 from residnet.core.errors import ConfigError, FitError
-from residnet.core.progress import say
-from residnet.data.simulated import Disturbance, WindField
+from residnet.core.progress import log_message
+from residnet.data.simulated import DisturbanceConfig, WindConfig
 from residnet.documents.gouletas2020.law import DocumentConfig, PredictiveConfig
 from residnet.dynamics.simulated import check_steps
 from residnet.dynamics.steering_variation import DEPTH, HEADING, Axis
@@ -35,13 +35,13 @@ from residnet.dynamics.store import chosen_model, load_model
 from residnet.physics.environment import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, ExportRequest, Outcome, PartName
+from residnet.runs.task import ComputingTask, ExportRequest, PartName, TaskOutcome
 from residnet.training.policies.config import PolicyTraining
 
 AnyController = Annotated[ClassicalController | DocumentConfig, Field(discriminator="kind")]
 
 
-class LearnedConfig(Config):
+class LearnedModelConfig(Config):
     """A model of the vessel that an earlier run (task `fit`) identified from logs.
 
     Attributes:
@@ -69,24 +69,24 @@ class PolicyConfig(Config):
 
     start: PartName | None
     units: int = Field(default=16, ge=0, le=10_000)
-    learned: LearnedConfig | None = None
+    learned: LearnedModelConfig | None = None
     training: PolicyTraining = PolicyTraining()
 
     @property
-    def kind(self) -> str:
+    def role(self) -> str:
         """What the rows of metrics.json call it: policy, network, or constants."""
         if self.start is None:
             return "network"
         return "policy" if self.units else "constants"
 
     @model_validator(mode="after")
-    def _something(self) -> Self:
+    def _require_trainable(self) -> Self:
         if self.start is None and self.units == 0:
             raise ValueError("units: a policy without a law needs a network, at least one unit")
         return self
 
 
-class JudgedConditions(Config):
+class EvaluationConditions(Config):
     """The conditions that all controllers of a run are tuned, trained and judged under.
 
     Attributes:
@@ -103,12 +103,12 @@ class JudgedConditions(Config):
     evolution: TuningConfig = TuningConfig()
 
     @property
-    def flown(self) -> dict[str, ConditionsConfig]:
+    def all_conditions(self) -> dict[str, ConditionsConfig]:
         """All conditions by name, the stated ones first."""
         return {"stated": self.stated, **self.beyond}
 
 
-class DepthStepConfig(Config):
+class DepthStepTestConfig(Config):
     """A step of the depth reference in place of the heading's.
 
     Attributes:
@@ -139,7 +139,7 @@ class StepTestConfig(Config):
         sea_time: how long in s, counted from the end of the step's flight.
     """
 
-    depth: DepthStepConfig | None = None
+    depth: DepthStepTestConfig | None = None
     heading: Radians = Field(default=0.5235987755982988, gt=0, lt=3.1)
     band: Radians = Field(default=0.017453292519943295, gt=0)
     dt: Seconds = Field(default=0.02, gt=0)
@@ -152,13 +152,13 @@ class StepTestConfig(Config):
     sea_time: Seconds = Field(default=120.0, gt=0)
 
     @model_validator(mode="after")
-    def _flown_in_time(self) -> Self:
+    def _check_durations(self) -> Self:
         for name in ("duration", "bias_time", "sea_time"):
             check_steps(getattr(self, name), self.dt, name)
         return self
 
     @property
-    def step(self) -> tuple[float, float]:
+    def step_and_tolerance(self) -> tuple[float, float]:
         """The change and its band in rad, or in m of depth."""
         if self.depth is None:
             return self.heading, self.band
@@ -197,39 +197,39 @@ class AutopilotConfig(ComputingTask):
     turning_time: Seconds = Field(default=100.0, gt=0)
     pace: Literal["vessel"] | Annotated[float, Field(gt=0, le=1_000)] = 1.0
     test: StepTestConfig
-    conditions: JudgedConditions | None = None
+    conditions: EvaluationConditions | None = None
     policies: dict[PartName, PolicyConfig] = Field(default_factory=dict)
     predictive: dict[PartName, PredictiveConfig] = Field(default_factory=dict)
     peers: dict[PartName, AnyController] = Field(default_factory=dict)
     floor: PartName | None = None
     safe: Literal["hold", "amidships"] = "amidships"
 
-    verbs: ClassVar[tuple[str, ...]] = ("report", "export")
-    page: ClassVar[str] = "autopilot"
+    supported_commands: ClassVar[tuple[str, ...]] = ("report", "export")
+    section_module: ClassVar[str] = "autopilot"
 
     @model_validator(mode="after")
-    def _names(self) -> Self:
+    def _validate_names(self) -> Self:
         names = [*self.policies, *self.predictive, *self.peers]
         if not self.policies and not self.predictive:
             raise ValueError("policies: give at least one policy here or under 'predictive'")
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"'{twice[0]}' names two controllers; names are unique in a run")
-        self._of_one_axis()
+        if duplicates := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"'{duplicates[0]}' names two controllers; names are unique in a run")
+        self._validate_axis()
         if self.floor is not None and not isinstance(self.peers.get(self.floor), BangBangConfig):
             raise ValueError(f"floor: '{self.floor}' must name a peer of kind bang_bang")
-        for name, wanted in self.policies.items():
+        for name, policy in self.policies.items():
             if self.conditions is None:
                 raise ValueError(f"policies.{name}: give 'conditions' to train it under")
-            if wanted.start is None:
+            if policy.start is None:
                 continue
-            if not isinstance(observed_of(self.peers.get(wanted.start)), ObservedConfig):
+            if not isinstance(angle_law_of(self.peers.get(policy.start)), ObservedConfig):
                 raise ValueError(
-                    f"policies.{name}.start: '{wanted.start}' must name a peer of kind ptos or"
+                    f"policies.{name}.start: '{policy.start}' must name a peer of kind ptos or"
                     " lqr_observer, or of kind depth with such a pitch"
                 )
         if self.conditions is None:
             for name, peer in self.peers.items():
-                if isinstance(peer, TunableConfig) and None in peer.parameters().values():
+                if isinstance(peer, TunableConfig) and None in peer.parameter_values().values():
                     raise ValueError(
                         f"peers.{name}: give all constants, or 'conditions' to tune them under"
                     )
@@ -238,7 +238,7 @@ class AutopilotConfig(ComputingTask):
             return self
         if self.pace != 1.0 and self.predictive:
             raise ValueError("pace: give the times of 'predictive' as the vessel needs them")
-        for name, conditions in self.conditions.flown.items():
+        for name, conditions in self.conditions.all_conditions.items():
             if conditions.dt != self.test.dt:
                 raise ValueError(
                     f"conditions.{name}: dt must be that of test, {self.test.dt:g} s, given"
@@ -246,53 +246,57 @@ class AutopilotConfig(ComputingTask):
                 )
         return self
 
-    def _of_one_axis(self) -> None:
-        dives = self.test.depth is not None
-        flown = {} if self.conditions is None else self.conditions.flown
-        for name, conditions in flown.items():
-            if (conditions.depth is not None) != dives:
+    def _validate_axis(self) -> None:
+        is_depth = self.test.depth is not None
+        conditions_by_name = {} if self.conditions is None else self.conditions.all_conditions
+        for name, conditions in conditions_by_name.items():
+            if (conditions.depth is not None) != is_depth:
                 raise ValueError(
                     f"conditions.{name}.depth: give it where test.depth is given, and only there"
                 )
         for name, peer in self.peers.items():
-            if isinstance(peer, DepthConfig) != dives:
-                wanted = "depth, with its law under 'pitch'" if dives else "any but depth"
+            if isinstance(peer, DepthConfig) != is_depth:
+                expected_kind = "depth, with its law under 'pitch'" if is_depth else "any but depth"
                 raise ValueError(
-                    f"peers.{name}: test.depth is {'given' if dives else 'not given'}, so its kind"
-                    f" must be {wanted}"
+                    f"peers.{name}: test.depth is {'given' if is_depth else 'not given'}, so its kind"
+                    f" must be {expected_kind}"
                 )
         for name, policy in self.policies.items():
-            if dives and policy.start is None:
+            if is_depth and policy.start is None:
                 raise ValueError(f"policies.{name}: a depth policy begins with a peer (start)")
-        if dives and (self.predictive or self.pace != 1.0):
+        if is_depth and (self.predictive or self.pace != 1.0):
             raise ValueError("test.depth: leave out 'predictive' and 'pace', which turn headings")
 
     @model_validator(mode="after")
-    def _felt(self) -> Self:
+    def _validate_vessel(self) -> Self:
         plant = load_vessel(self.vessel).build()
-        one = torch.ones(1, dtype=torch.float64)
-        if self.axis.command not in plant.inputs[: plant.commands]:
+        unit_command = torch.ones(1, dtype=torch.float64)
+        if self.axis.command not in plant.input_names[: plant.n_commands]:
             raise ValueError(
                 f"vessel: '{self.vessel}' has no command '{self.axis.command}' to steer its"
-                f" {self.axis.name} with; it has {', '.join(plant.inputs[: plant.commands])}"
+                f" {self.axis.name} with; it has {', '.join(plant.input_names[: plant.n_commands])}"
             )
-        place = plant.inputs.index(self.axis.command)
-        most = float(plant.demand(one, one)[0, place])
-        if self.test.depth is not None and plant.diving is not None:
-            most = float(plant.diving[place])
-        if self.rudder > (1.0 + 1e-6) * most:
+        command_index = plant.input_names.index(self.axis.command)
+        max_rudder = float(plant.commands_for_demand(unit_command, unit_command)[0, command_index])
+        if self.test.depth is not None and plant.dive_commands is not None:
+            max_rudder = float(plant.dive_commands[command_index])
+        if self.rudder > (1.0 + 1e-6) * max_rudder:
             raise ValueError(
-                f"rudder: vessel '{self.vessel}' has {most:.4g} rad at most, given"
+                f"rudder: vessel '{self.vessel}' has {max_rudder:.4g} rad at most, given"
                 f" {self.rudder:.4g}"
             )
-        wind = None if self.test.wind is None else WindField(speed=self.test.wind, direction=0.0)
-        Disturbance(wind=wind, waves=self.test.sea).check(plant, self.vessel)
-        flown = {} if self.conditions is None else self.conditions.flown
-        for name in (name for conditions in flown.values() for name in conditions.needs()):
-            if name not in plant.inputs:
+        wind = None if self.test.wind is None else WindConfig(speed=self.test.wind, direction=0.0)
+        DisturbanceConfig(wind=wind, waves=self.test.sea).check_plant(plant, self.vessel)
+        conditions_by_name = {} if self.conditions is None else self.conditions.all_conditions
+        for name in (
+            name
+            for conditions in conditions_by_name.values()
+            for name in conditions.required_inputs()
+        ):
+            if name not in plant.input_names:
                 raise ValueError(
                     f"conditions: vessel '{self.vessel}' has no input '{name}'; it has"
-                    f" {', '.join(plant.inputs)}"
+                    f" {', '.join(plant.input_names)}"
                 )
         return self
 
@@ -302,17 +306,17 @@ class AutopilotConfig(ComputingTask):
         return HEADING if self.test.depth is None else DEPTH
 
     @property
-    def steered(self) -> SteeredPlant:
+    def steered_vessel(self) -> SteeredPlant:
         """The vessel in calm water."""
         return SteeredPlant(load_vessel(self.vessel).build(), axis=self.axis)
 
-    def spec_of(self, name: str) -> type[RecurrentSpec]:
+    def policy_spec_class(self, name: str) -> type[RecurrentSpec]:
         """Return the kind of description that a policy is stored with."""
         if self.test.depth is not None:
             return DepthPolicySpec
         return NetworkPolicySpec if self.policies[name].start is None else ObservedPolicySpec
 
-    def recorded_seed(self) -> int:
+    def provenance_seed(self) -> int:
         """Return the seed of weights, batches and random vessels."""
         return self.seed
 
@@ -326,43 +330,48 @@ class AutopilotConfig(ComputingTask):
                 rudder left to hold its course, or where the inputs of a learned model are not its
                 own.
         """
-        learned = [
-            (self.school_of(name), wanted.training.dt)
-            for name, wanted in self.policies.items()
-            if wanted.learned is not None
+        learned_models = [
+            (self.training_vessel(name), policy.training.dt)
+            for name, policy in self.policies.items()
+            if policy.learned is not None
         ]
-        vessel = self.steered
+        vessel = self.steered_vessel
         try:
-            turning = vessel.turning(self.rudder, self.turning_time)
+            nomoto = vessel.estimate_nomoto(self.rudder, self.turning_time)
         except FitError as error:
             raise ConfigError(f"vessel '{self.vessel}' cannot be steered: {error}") from error
-        config = self.paced()
+        config = self.with_scaled_times()
         # a change of depth takes the time of a dive angle, and its way
-        asked = {} if config.test.depth else {"test": (config.test.heading, config.test.duration)}
+        heading_changes = (
+            {} if config.test.depth else {"test": (config.test.heading, config.test.duration)}
+        )
         if config.conditions is not None:
-            stated = config.conditions.stated
+            main_conditions = config.conditions.stated
             if config.test.depth is None:
-                asked["conditions.stated"] = (stated.heading[0], stated.duration)
-            for name, conditions in config.conditions.flown.items():
-                if conditions.bias + _PUSHED * conditions.push >= config.rudder:
+                heading_changes["conditions.stated"] = (
+                    main_conditions.heading[0],
+                    main_conditions.duration,
+                )
+            for name, conditions in config.conditions.all_conditions.items():
+                if conditions.bias + _PUSH_STD_FACTOR * conditions.push >= config.rudder:
                     raise ConfigError(
                         f"conditions.{name}: a bias of {math.degrees(conditions.bias):.3g} deg and"
                         f" a push of {math.degrees(conditions.push):.3g} deg leave nothing of a"
                         f" rudder of {math.degrees(config.rudder):.3g} deg to steer with; give more"
                         " rudder, or less of them"
                     )
-        for key, (change, duration) in asked.items():
-            least = least_time(turning, config.rudder, vessel.rate, change)
-            if least > duration:
+        for key, (change, duration) in heading_changes.items():
+            minimum_time = minimum_turn_time(nomoto, config.rudder, vessel.rate, change)
+            if minimum_time > duration:
                 raise ConfigError(
                     f"{key}.duration: a change of heading of {math.degrees(change):.3g} deg takes"
-                    f" this vessel {least:.3g} s at least, given {duration:.3g} s; give more time,"
+                    f" this vessel {minimum_time:.3g} s at least, given {duration:.3g} s; give more time,"
                     " or more rudder"
                 )
-        for model, dt in learned:
-            model.turning(self.rudder, self.turning_time, dt)
+        for model, dt in learned_models:
+            model.estimate_nomoto(self.rudder, self.turning_time, dt)
 
-    def school_of(self, name: str) -> SteeredPlant | SteeredModel:
+    def training_vessel(self, name: str) -> SteeredPlant | SteeredModel:
         """Return what a policy is trained on: the vessel under the conditions, or a learned model.
 
         Raises:
@@ -371,20 +380,24 @@ class AutopilotConfig(ComputingTask):
                 weather, which a learned model does not feel.
         """
         assert self.conditions is not None
-        wanted = self.policies[name].learned
-        weather = any(conditions.weather for conditions in self.conditions.flown.values())
-        if wanted is None:
+        learned_config = self.policies[name].learned
+        has_weather = any(
+            conditions.has_weather for conditions in self.conditions.all_conditions.values()
+        )
+        if learned_config is None:
             plant = load_vessel(self.vessel).build()
-            return SteeredPlant(plant, calm=not weather, axis=self.axis)
-        if weather:
+            return SteeredPlant(plant, in_calm_water=not has_weather, axis=self.axis)
+        if has_weather:
             raise ConfigError(
                 f"policies.{name}.learned: a learned model feels no wind or current; leave them out"
                 " of conditions"
             )
-        spec, model = load_model(wanted.run / "models" / chosen_model(wanted.run, wanted.model))
-        return SteeredModel(model, spec.signals.columns, spec.hold, self.steered)
+        spec, model = load_model(
+            learned_config.run / "models" / chosen_model(learned_config.run, learned_config.model)
+        )
+        return SteeredModel(model, spec.signals.input_columns, spec.hold, self.steered_vessel)
 
-    def paced(self) -> AutopilotConfig:
+    def with_scaled_times(self) -> AutopilotConfig:
         """Return the config with its times multiplied by its pace, the pace itself being one.
 
         Delays, which are those of the electronics, stay as they are. What a degree costs grows as
@@ -395,43 +408,52 @@ class AutopilotConfig(ComputingTask):
         """
         pace = self.pace
         if pace == "vessel":
-            vessel = self.steered
-            turning = vessel.turning(self.rudder, self.turning_time)
-            slow = least_time(turning, self.rudder, vessel.rate)
+            vessel = self.steered_vessel
+            nomoto = vessel.estimate_nomoto(self.rudder, self.turning_time)
+            minimum_time = minimum_turn_time(nomoto, self.rudder, vessel.rate)
             # two digits are enough, and steps stay numbers that can be read
-            pace = float(f"{slow / least_time(*REFERENCE, None):.2g}")
-            say(f"  pace {pace:g}: a change of 30 deg takes {slow:.3g} s at least")
+            pace = float(f"{minimum_time / minimum_turn_time(*REFERENCE_STEERING, None):.2g}")
+            log_message(f"  pace {pace:g}: a change of 30 deg takes {minimum_time:.3g} s at least")
         if pace == 1.0 or self.conditions is None:
             return self
 
-        def longer(part: Any, *names: str) -> Any:
-            given = {name: getattr(part, name) for name in names}
-            return part.model_copy(
-                update={n: float(f"{pace * v:.6g}") for n, v in given.items() if v is not None}
+        def scale_fields(config: Any, *names: str) -> Any:
+            values = {name: getattr(config, name) for name in names}
+            return config.model_copy(
+                update={n: float(f"{pace * v:.6g}") for n, v in values.items() if v is not None}
             )
 
-        def slower(conditions: ConditionsConfig) -> ConditionsConfig:
-            times = ("hold", "duration", "push_time", "dt", "overshoot_weight", "travel_weight")
-            changed: ConditionsConfig = longer(conditions, *times)
-            return changed
-
-        flown = {name: slower(one) for name, one in self.conditions.flown.items()}
-        conditions = {"stated": flown.pop("stated"), "beyond": flown}
-        policies = {
-            name: one.model_copy(
-                update={"training": longer(one.training, "dt", "hold", "duration")}
+        def scale_conditions(conditions: ConditionsConfig) -> ConditionsConfig:
+            time_fields = (
+                "hold",
+                "duration",
+                "push_time",
+                "dt",
+                "overshoot_weight",
+                "travel_weight",
             )
-            for name, one in self.policies.items()
+            scaled: ConditionsConfig = scale_fields(conditions, *time_fields)
+            return scaled
+
+        scaled_conditions = {
+            name: scale_conditions(item) for name, item in self.conditions.all_conditions.items()
         }
-        changed = {
+        conditions = {"stated": scaled_conditions.pop("stated"), "beyond": scaled_conditions}
+        policies = {
+            name: item.model_copy(
+                update={"training": scale_fields(item.training, "dt", "hold", "duration")}
+            )
+            for name, item in self.policies.items()
+        }
+        updates = {
             "pace": 1.0,
-            "test": longer(self.test, "dt", "duration", "bias_time"),
+            "test": scale_fields(self.test, "dt", "duration", "bias_time"),
             "conditions": self.conditions.model_copy(update=conditions),
             "policies": policies,
         }
-        return self.model_copy(update=changed)
+        return self.model_copy(update=updates)
 
-    def carry_out(self, folder: RunFolder) -> Outcome:
+    def execute(self, folder: RunFolder) -> TaskOutcome:
         """Train, tune and compare.
 
         Raises:
@@ -441,38 +463,46 @@ class AutopilotConfig(ComputingTask):
 
         return run_autopilot(self, folder)
 
-    def export_model(self, asked: ExportRequest) -> Path:
+    def export_model(self, request: ExportRequest) -> Path:
         """Export a policy of a finished run for controllers; returns the file."""
         from residnet.tasks.autopilot_run import export_policy
 
-        return export_policy(self, asked)
+        return export_policy(self, request)
 
 
-_PUSHED = 2.0
+_PUSH_STD_FACTOR = 2.0
 """Standard deviations of the slow push that the rudder must be able to hold."""
 
 
-_STEP = math.radians(30.0)
-REFERENCE = Turning(3.47, 3.94, 3.2), math.radians(5.0)
+_REFERENCE_STEP = math.radians(30.0)
+REFERENCE_STEERING = NomotoModel(3.47, 3.94, 3.2), math.radians(5.0)
 """K, T and rudder of the vessel of document 004, whose times configs state at a pace of one."""
 
 
-def least_time(turning: Turning, limit: float, rate: float | None, change: float = _STEP) -> float:
+def minimum_turn_time(
+    nomoto: NomotoModel, rudder_limit: float, rate: float | None, change: float = _REFERENCE_STEP
+) -> float:
     """Return the least time in s of a change of heading [rad] by T r_dot + r = K delta.
 
     Full rudder is held until full counter-rudder stops the yaw rate on the new heading; each way of
     the rudder to one side takes its time beside that.
     """
-    steady, time = abs(turning.gain) * limit, turning.time
+    steady_yaw_rate, time_constant = abs(nomoto.gain) * rudder_limit, nomoto.time
 
-    def turned(first: float) -> tuple[float, float]:
-        second = time * math.log1p(1.0 - math.exp(-first / time))
-        return steady * (first - second), first + second
+    def turn_and_time(first_duration: float) -> tuple[float, float]:
+        second_duration = time_constant * math.log1p(
+            1.0 - math.exp(-first_duration / time_constant)
+        )
+        return steady_yaw_rate * (
+            first_duration - second_duration
+        ), first_duration + second_duration
 
-    low, high = 0.0, time
-    while turned(high)[0] < change:
-        high *= 2.0
+    lower, upper = 0.0, time_constant
+    while turn_and_time(upper)[0] < change:
+        upper *= 2.0
     for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if turned(middle)[0] > change else (middle, high)
-    return turned(high)[1] + (0.0 if rate is None else 2.0 * limit / rate)
+        midpoint = 0.5 * (lower + upper)
+        lower, upper = (
+            (lower, midpoint) if turn_and_time(midpoint)[0] > change else (midpoint, upper)
+        )
+    return turn_and_time(upper)[1] + (0.0 if rate is None else 2.0 * rudder_limit / rate)

@@ -12,119 +12,125 @@ import torch
 
 from residnet.control.base import Policy
 from residnet.control.heading.conditions import (
-    ConditionedRun,
+    ClosedLoopSimulation,
     ConditionsConfig,
-    fly,
-    quiet,
-    quiet_after,
-    tune,
+    noise_free,
+    settled_time,
+    simulate_heading_steps,
+    tune_parameters,
 )
 from residnet.control.heading.controllers import (
+    ControlTask,
     DepthConfig,
     ObservedConfig,
     RecurrentPolicy,
-    Steering,
     TunableConfig,
+    angle_law_of,
     load_recurrent,
-    observed_of,
 )
-from residnet.control.heading.policies import SIGHT, DepthPolicy, ObservedPolicy
+from residnet.control.heading.policies import SIGHT_CONSTANTS, DepthPolicy, ObservedPolicy
 from residnet.control.heading.vessels import SteeredPlant
-from residnet.core.progress import begin, report, say
-from residnet.documents.gouletas2020.autopilot import predictive
+from residnet.core.progress import begin_stage, log_message, report_progress
+from residnet.documents.gouletas2020.autopilot import train_or_resume_controller
 from residnet.dynamics.compiled import CompiledRollout
 from residnet.dynamics.store import rebuilt
 from residnet.export.policy import ExportedHeading
 from residnet.judge.autopilots import (
-    QUANTITIES,
-    QUIET_FLIGHTS,
-    corners,
-    cycling,
-    drawn,
-    judged,
-    measure,
-    not_for,
-    objections,
-    random_variations,
-    sea_flights,
-    sea_row,
-    series,
-    step_flights,
-    step_row,
-    swinging,
-    wind_flights,
+    METRIC_UNITS,
+    N_QUIET_RUNS,
+    build_sea_row,
+    build_step_row,
+    build_time_series,
+    build_variation_grid,
+    compute_run_metrics,
+    describe_limit_cycles,
+    draw_heading_changes,
+    draw_variations,
+    evaluate_limit_cycles,
+    evaluate_under_conditions,
+    list_policy_objections,
+    list_unsuitable_conditions,
+    simulate_steps,
+    simulate_steps_in_waves,
+    simulate_steps_in_wind,
 )
 from residnet.judge.metrics import SCHEMA
 from residnet.physics.vessel import load_vessel
 from residnet.report.sections.autopilot import (
-    CONDITIONS,
-    FLIGHTS,
-    PLANTS,
+    CONDITIONS_FILE,
+    RESPONSES_FILE,
+    VESSELS_FILE,
+    axis_words,
+    cost_sentences,
     cost_table,
-    cost_verdict,
     effort_table,
     settling_table,
-    words_of,
 )
 from residnet.runs.folder import RunFolder
-from residnet.runs.model_store import FolderStore
-from residnet.runs.task import ExportRequest, MainFigure, Outcome
+from residnet.runs.model_store import RunModelStore
+from residnet.runs.task import ExportRequest, SummaryMetric, TaskOutcome
 from residnet.training.policies.fit import train_policy
 
 if TYPE_CHECKING:
-    from residnet.tasks.autopilot import AnyController, AutopilotConfig, JudgedConditions
+    from residnet.tasks.autopilot import AnyController, AutopilotConfig, EvaluationConditions
 
 Controllers = dict[str, tuple[str, Policy]]
 """Kind (policy, classical, floor and others) and controller by name."""
 
 
-def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> Outcome:
+def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> TaskOutcome:
     """Tune, train and compare."""
-    config = config.paced()
-    vessel = config.steered
-    turning = vessel.turning(config.rudder, config.turning_time)
-    say(
+    config = config.with_scaled_times()
+    vessel = config.steered_vessel
+    nomoto = vessel.estimate_nomoto(config.rudder, config.turning_time)
+    log_message(
         f"{config.name}: {config.vessel} answers {config.rudder:.3g} rad of rudder with K ="
-        f" {turning.gain:.4g} 1/s, T = {turning.time:.4g} s"
+        f" {nomoto.gain:.4g} 1/s, T = {nomoto.time:.4g} s"
     )
-    steering = Steering(vessel, turning, config.rudder, config.test.dt)
+    steering = ControlTask(vessel, nomoto, config.rudder, config.test.dt)
     controllers: Controllers = {}
     notes: dict[str, Any] = {}
-    complete: dict[str, AnyController] = {}
+    tuned_peers: dict[str, AnyController] = {}
     for name, peer in config.peers.items():
-        complete[name], notes[name] = _complete(name, peer, steering, config)
-        kind = "floor" if name == config.floor else "classical"
-        controllers[name] = (kind, complete[name].build(steering))
+        tuned_peers[name], notes[name] = _tune_peer(name, peer, steering, config)
+        role = "floor" if name == config.floor else "classical"
+        controllers[name] = (role, tuned_peers[name].build(steering))
     for name, settings in config.predictive.items():
-        built, notes[name] = predictive(name, settings, steering, config.seed, folder)
-        controllers[name] = ("predictive", built)
-    judged_too: Controllers = {}
-    for name, wanted in config.policies.items():
-        start = None if wanted.start is None else complete[wanted.start]
-        policy, notes[name], untrained = _policy(name, start, steering, config, folder)
-        controllers = {name: (wanted.kind, policy), **controllers}
+        predictive_policy, notes[name] = train_or_resume_controller(
+            name, settings, steering, config.seed, folder
+        )
+        controllers[name] = ("predictive", predictive_policy)
+    ablations: Controllers = {}
+    for name, policy_config in config.policies.items():
+        base_law = None if policy_config.start is None else tuned_peers[policy_config.start]
+        policy, notes[name], untrained_policy = _train_policy_or_resume(
+            name, base_law, steering, config, folder
+        )
+        controllers = {name: (policy_config.role, policy), **controllers}
         # what it is compared with: itself untrained, and without its network
-        if wanted.units > 0:
-            judged_too[f"{name} untrained"] = ("untrained", untrained)
+        if policy_config.units > 0:
+            ablations[f"{name} untrained"] = ("untrained", untrained_policy)
             if isinstance(policy, ObservedPolicy | DepthPolicy):
-                judged_too[f"{name} network off"] = ("network_off", policy.without_network())
+                ablations[f"{name} network off"] = ("network_off", policy.without_network())
     folder.write_json(
         folder.path / "controllers.json",
-        {"schema": "residnet.controllers/1", "turning": vars(turning), "controllers": notes},
+        {"schema": "residnet.controllers/1", "turning": vars(nomoto), "controllers": notes},
     )
-    rows, flown, plants = _compare(controllers, vessel, config)
+    rows, corner_trajectories, plants = _run_step_tests(controllers, vessel, config)
     if config.conditions is not None:
-        more, conditioned = _judge(judged_too | controllers, config, config.conditions)
-        rows += more
-        folder.write_table(folder.path / CONDITIONS, conditioned)
-    channels = {**QUANTITIES, "cost": "s", "time_outside": "s"} | dict.fromkeys(
+        condition_rows, condition_table = _evaluate_under_conditions(
+            ablations | controllers, config, config.conditions
+        )
+        rows += condition_rows
+        folder.write_table(folder.path / CONDITIONS_FILE, condition_table)
+    channels = {**METRIC_UNITS, "cost": "s", "time_outside": "s"} | dict.fromkeys(
         ("heading_swing", "rudder_swing", "error_end", "heading_rms", "rudder_rms", "heel_rms"),
         "rad",
     )
     # what is of the heading error in rad is of the depth's in m
-    lengths = {"rad": "m", "rad s": "m s"} if config.test.depth else {}
+    depth_units = {"rad": "m", "rad s": "m s"} if config.test.depth else {}
     for name in ("overshoot", "iae", "heading_swing", "error_end"):
-        channels[name] = lengths.get(channels[name], channels[name])
+        channels[name] = depth_units.get(channels[name], channels[name])
     folder.write_json(
         folder.metrics,
         {
@@ -136,15 +142,15 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> Outcome:
             "rows": rows,
         },
     )
-    folder.write_table(folder.path / FLIGHTS, flown)
-    folder.write_table(folder.path / PLANTS, plants)
-    words = words_of(config.test.model_dump())
-    tables = [settling_table(rows, config.floor, words), effort_table(rows, words)]
+    folder.write_table(folder.path / RESPONSES_FILE, corner_trajectories)
+    folder.write_table(folder.path / VESSELS_FILE, plants)
+    axis_labels = axis_words(config.test.model_dump())
+    tables = [settling_table(rows, config.floor, axis_labels), effort_table(rows, axis_labels)]
     if config.conditions is not None:
-        tables.insert(0, cost_table(rows, words))
-    return Outcome(
-        *_told(config, rows),
-        "\n\n".join(table.text() for table in tables),
+        tables.insert(0, cost_table(rows, axis_labels))
+    return TaskOutcome(
+        *_summarize(config, rows),
+        "\n\n".join(table.to_text() for table in tables),
         exports={
             name: partial(export_policy, config, ExportRequest(folder, name))
             for name in config.policies
@@ -152,216 +158,294 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> Outcome:
     )
 
 
-def _complete(
-    name: str, peer: AnyController, steering: Steering, config: AutopilotConfig
+def _tune_peer(
+    name: str, peer: AnyController, steering: ControlTask, config: AutopilotConfig
 ) -> tuple[AnyController, dict[str, Any]]:
     """Return a peer ready to fly, tuned by the cost where it lacks constants, and notes on it."""
-    stated = config.conditions
-    if not isinstance(peer, TunableConfig) or None not in peer.parameters().values():
+    evaluation_conditions = config.conditions
+    if not isinstance(peer, TunableConfig) or None not in peer.parameter_values().values():
         return peer, {"config": peer.model_dump(mode="json")}
-    assert stated is not None
-    started = time.time()
-    steering = steering._replace(vessel=_in_weather(config, stated))
-    found = tune(peer, steering, stated.stated, stated.evolution, config.seed + 11, CompiledRollout)
-    constants = ", ".join(f"{key} {value:.4g}" for key, value in found.parameters.items())
-    say(f"  tuned {name}: {constants}, cost {found.cost:.3f} s")
-    complete = peer.tuned(found.parameters)
-    return complete, {
-        "config": complete.model_dump(mode="json"),
-        "cost": found.cost,
-        "tried": found.tried,
-        "seconds": round(time.time() - started, 1),
+    assert evaluation_conditions is not None
+    start_time = time.time()
+    steering = steering._replace(vessel=_build_vessel_for_conditions(config, evaluation_conditions))
+    tuning = tune_parameters(
+        peer,
+        steering,
+        evaluation_conditions.stated,
+        evaluation_conditions.evolution,
+        config.seed + 11,
+        CompiledRollout,
+    )
+    constants = ", ".join(f"{key} {value:.4g}" for key, value in tuning.parameters.items())
+    log_message(f"  tuned {name}: {constants}, cost {tuning.cost:.3f} s")
+    tuned_peer = peer.with_parameters(tuning.parameters)
+    return tuned_peer, {
+        "config": tuned_peer.model_dump(mode="json"),
+        "cost": tuning.cost,
+        "tried": tuning.n_candidates,
+        "seconds": round(time.time() - start_time, 1),
     }
 
 
-def _in_weather(config: AutopilotConfig, stated: JudgedConditions) -> SteeredPlant:
+def _build_vessel_for_conditions(
+    config: AutopilotConfig, evaluation_conditions: EvaluationConditions
+) -> SteeredPlant:
     """Return the vessel as the conditions need it: in calm water, or in wind and current."""
-    calm = not any(conditions.weather for conditions in stated.flown.values())
-    return SteeredPlant(load_vessel(config.vessel).build(), calm=calm, axis=config.axis)
+    is_calm = not any(
+        conditions.has_weather for conditions in evaluation_conditions.all_conditions.values()
+    )
+    return SteeredPlant(load_vessel(config.vessel).build(), in_calm_water=is_calm, axis=config.axis)
 
 
-def _policy(
+def _train_policy_or_resume(
     name: str,
-    start: AnyController | None,
-    steering: Steering,
+    base_law: AnyController | None,
+    steering: ControlTask,
     config: AutopilotConfig,
     folder: RunFolder,
 ) -> tuple[RecurrentPolicy, dict[str, Any], RecurrentPolicy]:
     """Return a policy trained under the conditions, notes, and the policy as it began.
 
-    `start` is the law that its network stands beside; None for none.
+    `base_law` is the law that its network stands beside; None for none.
     """
-    wanted, stated = config.policies[name], config.conditions
-    assert stated is not None
-    school, turning = config.school_of(name), steering.turning
-    if wanted.learned is not None:
-        turning = school.turning(config.rudder, config.turning_time, wanted.training.dt)
-        say(
-            f"  {name} learns on {wanted.learned.model} of {wanted.learned.run}: K ="
-            f" {turning.gain:.4g} 1/s, T = {turning.time:.4g} s"
+    policy_config, evaluation_conditions = config.policies[name], config.conditions
+    assert evaluation_conditions is not None
+    training_vessel, nomoto = config.training_vessel(name), steering.nomoto
+    if policy_config.learned is not None:
+        nomoto = training_vessel.estimate_nomoto(
+            config.rudder, config.turning_time, policy_config.training.dt
+        )
+        log_message(
+            f"  {name} learns on {policy_config.learned.model} of {policy_config.learned.run}: K ="
+            f" {nomoto.gain:.4g} 1/s, T = {nomoto.time:.4g} s"
         )
     torch.manual_seed(config.seed)
-    law = observed_of(start)
-    described = {
-        "state": school.state,
-        **vars(turning),
+    observed_law = angle_law_of(base_law)
+    spec_fields = {
+        "state": training_vessel.state,
+        **vars(nomoto),
         "limit": steering.limit,
-        "rate": school.rate,
+        "rate": training_vessel.rate,
         "dt": steering.dt,
-        "trained_at": wanted.training.dt,
-        "units": wanted.units,
-        **({"law": law.model_dump()} if isinstance(law, ObservedConfig) else {}),
+        "trained_at": policy_config.training.dt,
+        "units": policy_config.units,
+        **({"law": observed_law.model_dump()} if isinstance(observed_law, ObservedConfig) else {}),
     }
-    if isinstance(start, DepthConfig):
-        sight = {name: start.complete()[name] for name in SIGHT}
-        described = {"law": described, "steepest": start.steepest, "sight": sight}
-    spec = config.spec_of(name).model_validate(described)
-    policy, store = spec.build(), FolderStore(folder)
-    notes, started = store.finished_module(name, policy), (time.time(), time.process_time())
+    if isinstance(base_law, DepthConfig):
+        depth_law_settings = {
+            name: base_law.complete_parameters()[name] for name in SIGHT_CONSTANTS
+        }
+        spec_fields = {
+            "law": spec_fields,
+            "steepest": base_law.steepest,
+            "sight": depth_law_settings,
+        }
+    spec = config.policy_spec_class(name).model_validate(spec_fields)
+    policy, store = spec.build(), RunModelStore(folder)
+    notes, start_times = store.restore_module(name, policy), (time.time(), time.process_time())
     if notes is None:
-        begin(f"training {name}")
-        compiler = partial(CompiledRollout, most=wanted.training.outlying)
+        begin_stage(f"training {name}")
+        compiler = partial(CompiledRollout, most=policy_config.training.outlying)
         notes = train_policy(
             name,
             policy,
-            school,
-            wanted.training,
-            stated.stated,
+            training_vessel,
+            policy_config.training,
+            evaluation_conditions.stated,
             config.seed,
             folder.path,
-            compiler if wanted.training.compiled else None,
+            compiler if policy_config.training.compiled else None,
         )
-        seconds, cpu = time.time() - started[0], time.process_time() - started[1]
+        seconds, cpu = time.time() - start_times[0], time.process_time() - start_times[1]
         notes |= {"seconds": round(seconds, 1), "cpu_seconds": round(cpu, 1)}
-        notes |= {"constants": policy.values()}
-        store.keep_module(name, spec, policy, notes)
+        notes |= {"constants": policy.constant_values()}
+        store.save_module(name, spec, policy, notes)
         # as a resumed run reads it
         policy = rebuilt(spec, policy)
-    untrained = spec.build().eval().requires_grad_(False).double()
-    policy.at(steering.dt)
-    for built in (policy, untrained):
-        built.read_from(steering.vessel.state)
-    say(
+    untrained_policy = spec.build().eval().requires_grad_(False).double()
+    policy.set_step(steering.dt)
+    for built_policy in (policy, untrained_policy):
+        built_policy.set_state_columns(steering.vessel.state)
+    log_message(
         f"  {name}: cost {notes['best_validation']:.3f} s, {notes['start_validation']:.3f} s at the"
         f" start, after {notes['seconds']:.0f} s of training"
     )
     notes = {key: value for key, value in notes.items() if key != "curve"}
-    return policy.double(), notes, untrained
+    return policy.double(), notes, untrained_policy
 
 
-def stored_policy(config: AutopilotConfig, models: Path, name: str, dt: float) -> RecurrentPolicy:
+def load_trained_policy(
+    config: AutopilotConfig, models: Path, name: str, dt: float
+) -> RecurrentPolicy:
     """Return a trained policy of a finished run, at a step of dt seconds.
 
     Raises:
         UsageError: where the run lacks it, or it is not as it was written.
     """
-    policy = load_recurrent(models / name, config.spec_of(name))
-    policy.at(dt)
+    policy = load_recurrent(models / name, config.policy_spec_class(name))
+    policy.set_step(dt)
     return policy
 
 
-def _compare(
+def _run_step_tests(
     controllers: Controllers, vessel: SteeredPlant, config: AutopilotConfig
 ) -> tuple[list[dict[str, Any]], pd.DataFrame, pd.DataFrame]:
     """Return the rows of metrics.json, and two tables: flights of the corners, random vessels."""
-    test, stated = config.test, _stated(config)
-    change, band = test.step
-    ends = corners(stated.effect, stated.time)
-    spread = random_variations(stated.effect, stated.time, test.plants, config.seed + 1)
-    pushed = torch.tensor([[1.0, 1.0, test.bias], [1.0, 1.0, -test.bias]], dtype=torch.float64)
+    test, main_conditions = config.test, _main_conditions(config)
+    reference_change, settling_band = test.step_and_tolerance
+    corner_variations = build_variation_grid(main_conditions.effect, main_conditions.time)
+    random_sample = draw_variations(
+        main_conditions.effect, main_conditions.time, test.plants, config.seed + 1
+    )
+    biased_variations = torch.tensor(
+        [[1.0, 1.0, test.bias], [1.0, 1.0, -test.bias]], dtype=torch.float64
+    )
     plant = load_vessel(config.vessel).build()
     rows: list[dict[str, Any]] = []
-    flown, plants = [], []
-    for name, (kind, policy) in controllers.items():
-        step = partial(step_flights, vessel, policy, change, test.dt, test.duration)
-        tests = {"nominal": step(ends[:1]), "corners": step(ends), "random": step(spread)}
+    corner_tables, random_tables = [], []
+    for name, (role, policy) in controllers.items():
+        run_step_test = partial(
+            simulate_steps, vessel, policy, reference_change, test.dt, test.duration
+        )
+        tests = {
+            "nominal": run_step_test(corner_variations[:1]),
+            "corners": run_step_test(corner_variations),
+            "random": run_step_test(random_sample),
+        }
         rows += [
-            step_row(name, kind, protocol, flights, band) for protocol, flights in tests.items()
+            build_step_row(name, role, protocol, trajectories, settling_band)
+            for protocol, trajectories in tests.items()
         ]
-        flown.append(series(name, tests["corners"], ends))
-        found = {key: value.numpy() for key, value in measure(tests["random"], band).items()}
-        given = {"effect": spread[:, 0].numpy(), "time": spread[:, 1].numpy()}
-        plants.append(pd.DataFrame({"controller": name, **given, **found}))
-        times: dict[str, Any] = {"dt": test.dt, "duration": test.bias_time}
-        disturbed = {"bias": fly(vessel, policy, torch.full((2,), change), pushed, **times)}
+        corner_tables.append(build_time_series(name, tests["corners"], corner_variations))
+        step_metrics = {
+            key: value.numpy()
+            for key, value in compute_run_metrics(tests["random"], settling_band).items()
+        }
+        variation_columns = {
+            "effect": random_sample[:, 0].numpy(),
+            "time": random_sample[:, 1].numpy(),
+        }
+        random_tables.append(
+            pd.DataFrame({"controller": name, **variation_columns, **step_metrics})
+        )
+        timing: dict[str, Any] = {"dt": test.dt, "duration": test.bias_time}
+        disturbed_runs = {
+            "bias": simulate_heading_steps(
+                vessel, policy, torch.full((2,), reference_change), biased_variations, **timing
+            )
+        }
         if test.wind is not None:
-            disturbed["wind"] = wind_flights(plant, policy, test.wind, test.heading, **times)
+            disturbed_runs["wind"] = simulate_steps_in_wind(
+                plant, policy, test.wind, test.heading, **timing
+            )
         rows += [
-            step_row(name, kind, key, flights, band)
-            | {"error_end": float(flights.error[:, -1].abs().max())}
-            for key, flights in disturbed.items()
+            build_step_row(name, role, key, trajectories, settling_band)
+            | {"error_end": float(trajectories.error[:, -1].abs().max())}
+            for key, trajectories in disturbed_runs.items()
         ]
         if test.sea is not None:
             duration = test.duration + test.sea_time
-            kept = sea_flights(
+            sea_runs = simulate_steps_in_waves(
                 plant, policy, test.sea, test.heading, test.dt, duration, config.seed + 2
             )
-            rows.append(sea_row(name, kind, kept, test.duration))
-    return rows, pd.concat(flown, ignore_index=True), pd.concat(plants, ignore_index=True)
+            rows.append(build_sea_row(name, role, sea_runs, test.duration))
+    return (
+        rows,
+        pd.concat(corner_tables, ignore_index=True),
+        pd.concat(random_tables, ignore_index=True),
+    )
 
 
-def _stated(config: AutopilotConfig) -> ConditionsConfig:
+def _main_conditions(config: AutopilotConfig) -> ConditionsConfig:
     return ConditionsConfig() if config.conditions is None else config.conditions.stated
 
 
-def _judge(
-    controllers: Controllers, config: AutopilotConfig, stated: JudgedConditions
+def _evaluate_under_conditions(
+    controllers: Controllers, config: AutopilotConfig, evaluation_conditions: EvaluationConditions
 ) -> tuple[list[dict[str, Any]], pd.DataFrame]:
     """Return the rows of metrics.json and the table of flights under the conditions."""
-    vessel = _in_weather(config, stated)
-    tests = {
+    vessel = _build_vessel_for_conditions(config, evaluation_conditions)
+    conditions_by_protocol = {
         "conditions" if name == "stated" else f"beyond_{name}": conditions
-        for name, conditions in stated.flown.items()
+        for name, conditions in evaluation_conditions.all_conditions.items()
     }
-    flown = {
-        name: (conditions, drawn(conditions, stated.flights, config.seed))
-        for name, conditions in tests.items()
-    }
-    still = drawn(quiet(stated.stated), min(QUIET_FLIGHTS, stated.flights), config.seed)
-    longest = max(1, *(int(changes.delay.max()) for _, changes in flown.values()))
-    rows, tables = [], []
-    for place, (name, (kind, policy)) in enumerate(controllers.items()):
-        report("judging", place, len(controllers))
-        run = ConditionedRun(
-            vessel, policy.double(), stated.stated.dt, compiler=CompiledRollout, longest=longest
+    sampled_conditions = {
+        name: (
+            conditions,
+            draw_heading_changes(conditions, evaluation_conditions.flights, config.seed),
         )
-        for protocol, (conditions, changes) in flown.items():
-            found, table = judged(name, kind, protocol, run, conditions, changes)
-            rows.append(found)
+        for name, conditions in conditions_by_protocol.items()
+    }
+    noise_free_sample = draw_heading_changes(
+        noise_free(evaluation_conditions.stated),
+        min(N_QUIET_RUNS, evaluation_conditions.flights),
+        config.seed,
+    )
+    max_delay = max(
+        1, *(int(changes.delay_steps.max()) for _, changes in sampled_conditions.values())
+    )
+    rows, tables = [], []
+    for number, (name, (role, policy)) in enumerate(controllers.items()):
+        report_progress("judging", number, len(controllers))
+        conditioned_run = ClosedLoopSimulation(
+            vessel,
+            policy.double(),
+            evaluation_conditions.stated.dt,
+            compiler=CompiledRollout,
+            max_delay=max_delay,
+        )
+        for protocol, (conditions, changes) in sampled_conditions.items():
+            condition_row, table = evaluate_under_conditions(
+                name, role, protocol, conditioned_run, conditions, changes
+            )
+            rows.append(condition_row)
             tables.append(table)
-        rows.append(swinging(name, kind, run, still, quiet_after(stated.stated.duration)))
+        rows.append(
+            evaluate_limit_cycles(
+                name,
+                role,
+                conditioned_run,
+                noise_free_sample,
+                settled_time(evaluation_conditions.stated.duration),
+            )
+        )
     return rows, pd.concat(tables, ignore_index=True)
 
 
-def _told(
+def _summarize(
     config: AutopilotConfig, rows: list[dict[str, Any]]
-) -> tuple[list[str], dict[str, MainFigure]]:
+) -> tuple[list[str], dict[str, SummaryMetric]]:
     """Return the verdict and the main figures: settling on the nominal vessel, and worst corner."""
-    found = {(row["model"], row["protocol"]): row["settling"] for row in rows if "settling" in row}
-    sentences, figures = cost_verdict(rows), dict[str, MainFigure]()
-    change, _ = config.test.step
-    words = words_of(config.test.model_dump())
+    settling_by_model = {
+        (row["model"], row["protocol"]): row["settling"] for row in rows if "settling" in row
+    }
+    sentences, summary_metrics = cost_sentences(rows), dict[str, SummaryMetric]()
+    reference_change, _ = config.test.step_and_tolerance
+    axis_labels = axis_words(config.test.model_dump())
     for name in config.policies or config.predictive:
-        nominal, worst = found[name, "nominal"]["max"], found[name, "corners"]["max"]
-        figures[f"{name}_settling_nominal"] = MainFigure(nominal, "s")
-        figures[f"{name}_settling_worst"] = MainFigure(worst, "s")
+        nominal, slowest = (
+            settling_by_model[name, "nominal"]["max"],
+            settling_by_model[name, "corners"]["max"],
+        )
+        summary_metrics[f"{name}_settling_nominal"] = SummaryMetric(nominal, "s")
+        summary_metrics[f"{name}_settling_worst"] = SummaryMetric(slowest, "s")
         sentences.append(
-            f"'{name}' settles on a new {words.value} {words.scale * change:.3g} {words.unit} away"
-            f" in {nominal:.2f} s on the nominal vessel, and in {worst:.2f} s on the slowest vessel"
+            f"'{name}' settles on a new {axis_labels.value} {axis_labels.scale * reference_change:.3g} {axis_labels.unit} away"
+            f" in {nominal:.2f} s on the nominal vessel, and in {slowest:.2f} s on the slowest vessel"
             " at the corners of the spread."
         )
     if config.floor is not None:
         sentences.append(
             f"The fastest possible change of the nominal vessel, by '{config.floor}' that knows it"
-            f" exactly, takes {found[config.floor, 'nominal']['max']:.2f} s."
+            f" exactly, takes {settling_by_model[config.floor, 'nominal']['max']:.2f} s."
         )
     for row in rows:
         if row["protocol"] == "conditions" and row["model"] in config.policies:
-            figures[f"{row['model']}_cost"] = MainFigure(row["cost"]["mean"], "s")
-    return sentences, figures
+            summary_metrics[f"{row['model']}_cost"] = SummaryMetric(row["cost"]["mean"], "s")
+    return sentences, summary_metrics
 
 
-def export_policy(config: AutopilotConfig, asked: ExportRequest) -> Path:
+def export_policy(config: AutopilotConfig, request: ExportRequest) -> Path:
     """Write a policy of a run, with its rows of metrics.json in the card; returns the file.
 
     Raises:
@@ -369,17 +453,22 @@ def export_policy(config: AutopilotConfig, asked: ExportRequest) -> Path:
         WithheldError: where a classical controller costs less, but for `asked.anyway`.
         ExportError: where the file does not reproduce the policy.
     """
-    name, rows = asked.named(config.policies), asked.run.read_metrics()["rows"]
-    flown = config.paced()
-    about = {"vessel": config.vessel, "conditions": _stated(flown).model_dump(mode="json")}
+    name, rows = request.resolve_model_name(config.policies), request.run.read_metrics()["rows"]
+    scaled_config = config.with_scaled_times()
+    card_fields = {
+        "vessel": config.vessel,
+        "conditions": _main_conditions(scaled_config).model_dump(mode="json"),
+    }
     learned = config.policies[name].learned
-    about |= {} if learned is None else {"learned": learned.model_dump(mode="json")}
-    about |= {"not_for": [*not_for(name, rows), *cycling(name, rows)]}
+    card_fields |= {} if learned is None else {"learned": learned.model_dump(mode="json")}
+    card_fields |= {
+        "not_for": [*list_unsuitable_conditions(name, rows), *describe_limit_cycles(name, rows)]
+    }
     exported = ExportedHeading(
         name,
-        stored_policy(config, asked.run.models, name, flown.test.dt),
-        safe=config.safe,
-        about=about,
+        load_trained_policy(config, request.run.models, name, scaled_config.test.dt),
+        fallback=config.safe,
+        description=card_fields,
         metrics=[row for row in rows if row["model"] == name],
     )
-    return asked.write(exported, objections(name, rows))
+    return request.write(exported, list_policy_objections(name, rows))

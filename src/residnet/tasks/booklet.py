@@ -10,28 +10,36 @@ import torch
 
 from residnet.baselines.base import ParametricBaseline
 from residnet.core.errors import ConfigError, DataError
-from residnet.core.layout import ROLL
+from residnet.core.layout import ROLL_LAYOUT
 from residnet.core.log import Log
-from residnet.core.names import STATE, nearest
-from residnet.data.prepare import Prepared
-from residnet.data.simulated import Craft, Disturbance, Flight, Sea, SensorNoise, fly, source_of
+from residnet.core.names import STATE_NAMES, suggest_name
+from residnet.data.prepare import PreparedLog
+from residnet.data.simulated import (
+    DisturbanceConfig,
+    ManoeuvreRun,
+    SensorsConfig,
+    SimulatedVessel,
+    TrialEnvironment,
+    make_manoeuvre_source,
+    simulate_manoeuvres,
+)
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare
 from residnet.dynamics.ensemble import SampledDynamics
 from residnet.identification.fitter import FittedModel
-from residnet.judge.booklet import BookletConfig, Page, contents
+from residnet.judge.booklet import BookletConfig, BookletPage, build_booklet
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import Zigzag
-from residnet.manoeuvres.indices import steered_zigzag
+from residnet.manoeuvres.indices import identify_zigzag
 from residnet.runs.folder import RunFolder
 
-_PARAMETER = "model.baseline.theta"
+_PARAMETER_PATH = "model.baseline.theta"
 
 
 def write_booklet(
     folder: RunFolder,
     config: BookletConfig,
-    fitted: FittedModel,
-    logs: Mapping[str, Sequence[Prepared]],
+    fitted_model: FittedModel,
+    logs: Mapping[str, Sequence[PreparedLog]],
     limit: np.ndarray,
 ) -> str:
     """Fly, and write booklet.json and booklet.parquet; returns a line for the log.
@@ -45,125 +53,159 @@ def write_booklet(
     """
     import pandas as pd
 
-    craft, rudder = _craft(config, fitted, config.inputs), config.rudder()
+    craft, rudder = _build_craft(config, fitted_model, config.inputs), config.steering_input()
     pages = [
-        _page(craft, config, flights, limit)
-        for flights in _flown(craft, config, fitted, config.manoeuvres)
+        _make_page(craft, config, flights, limit)
+        for flights in _simulate_draws(craft, config, fitted_model, config.manoeuvres)
     ]
-    repeated = [
+    measured_zigzags = [
         (prepared.log, split)
         for split in config.repeat
         for prepared in logs.get(split, ())
         if prepared.log.manoeuvre == "zigzag"
         and np.isfinite(prepared.log.stack(("psi", rudder))).all()
     ]
-    if repeated:
-        shares = _shares(config, [log for log, _ in repeated])
-        craft = _craft(config, fitted, shares)
-        craft = replace(craft, start=torch.cat([_began(craft, log) for log, _ in repeated]))
-        zigzags = [_zigzags(log, rudder, shares, craft.dynamics.dt) for log, _ in repeated]
-        flown = _flown(craft, config, fitted, [acted for _, acted in zigzags])
-        for measured, (zigzag, _), flights in zip(repeated, zigzags, flown, strict=True):
-            named = [replace(flight, manoeuvre=zigzag) for flight in flights]
-            pages.append(_page(craft, config, named, limit, *measured))
+    if measured_zigzags:
+        shares = _input_shares_from_logs(config, [log for log, _ in measured_zigzags])
+        craft = _build_craft(config, fitted_model, shares)
+        craft = replace(
+            craft,
+            initial_state=torch.cat(
+                [_initial_state_of_log(craft, log) for log, _ in measured_zigzags]
+            ),
+        )
+        zigzags = [
+            _replicate_zigzag(log, rudder, shares, craft.dynamics.dt) for log, _ in measured_zigzags
+        ]
+        flights_by_zigzag = _simulate_draws(
+            craft, config, fitted_model, [gear_zigzag for _, gear_zigzag in zigzags]
+        )
+        for measured_log, (zigzag, _), flights in zip(
+            measured_zigzags, zigzags, flights_by_zigzag, strict=True
+        ):
+            renamed_flights = [replace(flight, manoeuvre=zigzag) for flight in flights]
+            pages.append(_make_page(craft, config, renamed_flights, limit, *measured_log))
     folder.write_json(
         folder.booklet,
-        contents(config.model, config.length, config.scale, config.draws, config.level, pages),
+        build_booklet(config.model, config.length, config.scale, config.draws, config.level, pages),
     )
     parts = []
     for page in pages:
-        motions = [(-1, page.measured)] if page.measured is not None else []
-        motions += [(i, f.motion) for i, f in enumerate(page.flights) if page.indices[i]]
-        for draw, log in motions:
+        motion_by_draw = [(-1, page.measured_log)] if page.measured_log is not None else []
+        motion_by_draw += [(i, f.true_log) for i, f in enumerate(page.runs) if page.indices[i]]
+        for draw, log in motion_by_draw:
             # of drawn flights every half second or so
-            every = max(round(0.5 / float(log.t[1] - log.t[0])), 1) if draw > 0 else 1
-            columns = {name: log[name][::every] for name in STATE}
-            angle = log[rudder] if rudder in log.channels else log[f"cmd_{rudder}"]
-            about = {"page": page.name, "draw": draw, "t": log.t[::every] - log.t[0]}
-            parts.append(pd.DataFrame({**about, **columns, "rudder": angle[::every]}))
+            stride = max(round(0.5 / float(log.t[1] - log.t[0])), 1) if draw > 0 else 1
+            columns = {name: log[name][::stride] for name in STATE_NAMES}
+            rudder_angle = log[rudder] if rudder in log.channels else log[f"cmd_{rudder}"]
+            page_columns = {"page": page.name, "draw": draw, "t": log.t[::stride] - log.t[0]}
+            parts.append(
+                pd.DataFrame({**page_columns, **columns, "rudder": rudder_angle[::stride]})
+            )
     folder.write_table(folder.booklet.with_suffix(".parquet"), pd.concat(parts))
     return (
-        f"booklet: {len(config.manoeuvres)} manoeuvres, {len(repeated)} measured zigzags repeated,"
+        f"booklet: {len(config.manoeuvres)} manoeuvres, {len(measured_zigzags)} measured zigzags repeated,"
         f" {config.draws} draws each"
     )
 
 
-def require_flyable(config: BookletConfig, fitted: FittedModel) -> None:
+def require_flyable(config: BookletConfig, fitted_model: FittedModel) -> None:
     """Check that a model can be steered through the booklet's manoeuvres; nothing is flown.
 
     Raises:
         ConfigError: where an input or a state is not the model's.
         UsageError: where the model lacks what a manoeuvre needs.
     """
-    craft = _craft(config, fitted, config.inputs)
-    source_of(config.manoeuvres, craft.helm, torch.arange(2, dtype=torch.float64) * fitted.spec.dt)
+    craft = _build_craft(config, fitted_model, config.inputs)
+    make_manoeuvre_source(
+        config.manoeuvres, craft.helm, torch.arange(2, dtype=torch.float64) * fitted_model.spec.dt
+    )
     for manoeuvre in config.manoeuvres:
-        manoeuvre.begin(craft.start[0], craft.helm.state)
+        manoeuvre.initial_state(craft.initial_state[0], craft.helm.state)
 
 
-def _craft(config: BookletConfig, fitted: FittedModel, inputs: Mapping[str, InputShare]) -> Craft:
+def _build_craft(
+    config: BookletConfig, fitted_model: FittedModel, inputs: Mapping[str, InputShare]
+) -> SimulatedVessel:
     """Return the model behind the gear of its inputs; its rows are draws."""
-    spec, model = fitted.spec, fitted.model.double()
+    spec, model = fitted_model.spec, fitted_model.model.double()
     gear = GivenActuators(inputs, spec.signals.exogenous, spec.dt)
-    actuated = ActuatedDynamics(model, spec.signals.columns, spec.hold, gear)
+    actuated = ActuatedDynamics(model, spec.signals.input_columns, spec.hold, gear)
     start = actuated.approach(1)
     for name, value in config.initial.items():
         if name not in actuated.state:
             raise ConfigError(
                 f"booklet.initial: '{config.model}' has no state"
-                f" '{name}'{nearest(name, actuated.state)}"
+                f" '{name}'{suggest_name(name, actuated.state)}"
             )
         start[:, actuated.state.index(name)] = float(value)
     helm = Helm(gear.demand, actuated.state, gear.inputs)
-    return Craft(config.model, actuated, helm, gear.commands, start)
+    return SimulatedVessel(config.model, actuated, helm, gear.commands, start)
 
 
-def _flown(
-    craft: Craft, config: BookletConfig, fitted: FittedModel, manoeuvres: Sequence[Manoeuvre]
-) -> Iterator[list[Flight]]:
+def _simulate_draws(
+    craft: SimulatedVessel,
+    config: BookletConfig,
+    fitted_model: FittedModel,
+    manoeuvres: Sequence[Manoeuvre],
+) -> Iterator[list[ManoeuvreRun]]:
     """Yield the flights of each manoeuvre: fitted parameters first, then the drawn ones."""
-    theta = drawn(fitted, config.draws, config.seed)
-    rows = [manoeuvre for manoeuvre in manoeuvres for _ in range(len(theta))]
-    start = craft.start.repeat_interleave(len(theta), 0) if len(craft.start) > 1 else craft.start
-    many = replace(craft, dynamics=SampledDynamics(craft.dynamics, _PARAMETER, theta), start=start)
-    sea = Sea(None, Disturbance(), SensorNoise(), config.seed)
-    flights = fly(many, rows, sea, config.duration, craft.dynamics.dt)
-    for place in range(0, len(flights), len(theta)):
-        yield flights[place : place + len(theta)]
+    parameter_draws = sample_parameters(fitted_model, config.draws, config.seed)
+    repeated_manoeuvres = [
+        manoeuvre for manoeuvre in manoeuvres for _ in range(len(parameter_draws))
+    ]
+    start = (
+        craft.initial_state.repeat_interleave(len(parameter_draws), 0)
+        if len(craft.initial_state) > 1
+        else craft.initial_state
+    )
+    sampled_craft = replace(
+        craft,
+        dynamics=SampledDynamics(craft.dynamics, _PARAMETER_PATH, parameter_draws),
+        initial_state=start,
+    )
+    sea = TrialEnvironment(None, DisturbanceConfig(), SensorsConfig(), config.seed)
+    flights = simulate_manoeuvres(
+        sampled_craft, repeated_manoeuvres, sea, config.duration, craft.dynamics.dt
+    )
+    for first_flight in range(0, len(flights), len(parameter_draws)):
+        yield flights[first_flight : first_flight + len(parameter_draws)]
 
 
-def _began(craft: Craft, log: Log) -> torch.Tensor:
+def _initial_state_of_log(craft: SimulatedVessel, log: Log) -> torch.Tensor:
     """State [1, nx] that a log began with, as far as it holds the states of a craft."""
-    x = craft.start[:1].clone()
+    x = craft.initial_state[:1].clone()
     for column, name in enumerate(craft.helm.state):
         if name in log.channels and np.isfinite(log[name][0]):
             x[0, column] = float(log[name][0])
     return x
 
 
-def drawn(fitted: FittedModel, draws: int, seed: int) -> torch.Tensor:
+def sample_parameters(fitted_model: FittedModel, draws: int, seed: int) -> torch.Tensor:
     """Parameters of a refitted baseline: as fitted, then `draws` times from their normal
     distribution, [1 + draws, ...].
     """
-    baseline = fitted.model.baseline
+    baseline = fitted_model.model.baseline
     assert isinstance(baseline, ParametricBaseline), "the configuration was validated"
-    assert fitted.covariance is not None, "the configuration was validated"
-    values, vectors = torch.linalg.eigh(fitted.covariance)
-    random = torch.from_numpy(
-        np.random.default_rng([seed, 7]).standard_normal((draws, len(values)))
+    assert fitted_model.covariance is not None, "the configuration was validated"
+    eigenvalues, eigenvectors = torch.linalg.eigh(fitted_model.covariance)
+    normal_draws = torch.from_numpy(
+        np.random.default_rng([seed, 7]).standard_normal((draws, len(eigenvalues)))
     )
     theta = baseline.theta.detach().double().flatten().repeat(1 + draws, 1)
-    theta[1:, baseline.free_indices()] += random * values.clamp(min=0.0).sqrt() @ vectors.T
+    theta[1:, baseline.free_indices()] += (
+        normal_draws * eigenvalues.clamp(min=0.0).sqrt() @ eigenvectors.T
+    )
     return theta.reshape(1 + draws, *baseline.theta.shape)
 
 
-def _shares(config: BookletConfig, logs: Sequence[Log]) -> dict[str, InputShare]:
+def _input_shares_from_logs(config: BookletConfig, logs: Sequence[Log]) -> dict[str, InputShare]:
     """Return the shares of the inputs; full drive and steer are the most that the logs have."""
-    rudder = config.rudder()
-    steer = max(steered_zigzag(log, rudder).angle for log in logs)
+    rudder = config.steering_input()
+    max_rudder = max(identify_zigzag(log, rudder).angle for log in logs)
     return {
         name: share.model_copy(
-            update={"steer": steer, "limit": steer}
+            update={"steer": max_rudder, "limit": max_rudder}
             if name == rudder
             else {"drive": max(float(log[name].mean()) for log in logs), "limit": None}
         )
@@ -171,70 +213,73 @@ def _shares(config: BookletConfig, logs: Sequence[Log]) -> dict[str, InputShare]
     }
 
 
-def _zigzags(
-    log: Log, rudder: str, shares: Mapping[str, InputShare], step: float
+def _replicate_zigzag(
+    log: Log, rudder: str, shares: Mapping[str, InputShare], time_step: float
 ) -> tuple[Zigzag, Zigzag]:
     """Return the zigzag of a log, and the same with reversals where its rudder left its side.
 
     The gear of a model moves at once, the trial's did after its order took effect. A bound on the
-    heading is seen at the next step, on average half a step of `step` seconds late.
+    heading is seen at the next step, on average half a step of `time_step` seconds late.
     """
-    steered = steered_zigzag(log, rudder)
-    drives = [
+    steered_indices = identify_zigzag(log, rudder)
+    drive_shares = [
         float(log[name].mean()) / float(share.drive)
         for name, share in shares.items()
         if name != rudder
     ]
     zigzag = Zigzag(
         name=log.name,
-        drive=min(drives[0], 1.0) if drives else 0.0,
-        steer=steered.angle / float(shares[rudder].steer),
-        heading=steered.heading,
-        first="starboard" if steered.side > 0 else "port",
-        start=steered.start,
+        drive=min(drive_shares[0], 1.0) if drive_shares else 0.0,
+        steer=steered_indices.angle / float(shares[rudder].steer),
+        heading=steered_indices.heading,
+        first="starboard" if steered_indices.first_sign > 0 else "port",
+        start=steered_indices.start,
         duration=float(log.t[-1] - log.t[0]),
     )
-    heading = steered.leaves - 0.5 * step * steered.turning
+    heading = steered_indices.departure_heading - 0.5 * time_step * steered_indices.departure_rate
     return zigzag, zigzag.model_copy(update={"heading": heading})
 
 
-def sound(flight: Flight, limit: np.ndarray) -> bool:
+def is_valid_flight(flight: ManoeuvreRun, limit: np.ndarray) -> bool:
     """Whether a flight ended as it should, with what moves within the limit [n] beyond which a free
     run has diverged.
     """
-    moving = np.abs(flight.motion.stack(ROLL.moving[: len(limit)]))
-    return flight.fault is None and bool((moving <= limit).all())
+    motion_states = np.abs(flight.true_log.stack(ROLL_LAYOUT.dynamic_states[: len(limit)]))
+    return flight.fault_text is None and bool((motion_states <= limit).all())
 
 
-def _page(
-    craft: Craft,
+def _make_page(
+    craft: SimulatedVessel,
     config: BookletConfig,
-    flights: Sequence[Flight],
+    flights: Sequence[ManoeuvreRun],
     limit: np.ndarray,
     log: Log | None = None,
     split: str = "",
-) -> Page:
+) -> BookletPage:
     """One manoeuvre with its indices by flight, beside those of the log that it repeats.
 
     Raises:
         DataError: where the fitted model itself does not end the manoeuvre, or diverges.
     """
-    manoeuvre, name = flights[0].manoeuvre, flights[0].motion.name
-    if flights[0].fault:
+    manoeuvre, name = flights[0].manoeuvre, flights[0].true_log.name
+    if flights[0].fault_text:
         raise DataError(
-            f"booklet: {config.model}, {name}: {flights[0].fault}; give more"
+            f"booklet: {config.model}, {name}: {flights[0].fault_text}; give more"
             " duration, or another model"
         )
-    if not sound(flights[0], limit):
+    if not is_valid_flight(flights[0], limit):
         raise DataError(
             f"booklet: {config.model}, {name}: the model leaves the range of its training data as"
             " far as a free run that diverges; ask for less rudder or drive, or add logs that"
             " cover them"
         )
     indices = [
-        manoeuvre.indices(flight.motion, None) if sound(flight, limit) else {} for flight in flights
+        manoeuvre.compute_indices(flight.true_log, None) if is_valid_flight(flight, limit) else {}
+        for flight in flights
     ]
     speed = indices[0].get("approach_speed", 0.0) * config.scale**0.5
-    limits = manoeuvre.limits(craft.helm, config.length * config.scale, speed)
-    found = {} if log is None else manoeuvre.indices(log.replace(t=log.t - log.t[0]), None)
-    return Page(name, manoeuvre, flights, indices, limits, log, split, found)
+    criteria = manoeuvre.imo_limits(craft.helm, config.length * config.scale, speed)
+    measured_indices = (
+        {} if log is None else manoeuvre.compute_indices(log.replace(t=log.t - log.t[0]), None)
+    )
+    return BookletPage(name, manoeuvre, flights, indices, criteria, log, split, measured_indices)

@@ -11,26 +11,26 @@ import numpy as np
 import pandas as pd
 
 from residnet.core.errors import UsageError
-from residnet.core.format import number, signed
-from residnet.core.ownership import recorded_folder
-from residnet.judge.metrics import blocks, difference
-from residnet.report.blocks import Block, Cell, Section, Table, paired_interval, table_of
-from residnet.report.figure import GLANCE, Case, Figure, Panel, family
+from residnet.core.format import format_number, format_signed
+from residnet.core.ownership import record_folder
+from residnet.judge.metrics import make_resampling_blocks, paired_difference
+from residnet.report.blocks import Block, Cell, Section, Table, build_table, format_paired_interval
+from residnet.report.figure import MAX_PREVIEW_HEIGHT, Case, Figure, Panel, style_family
 from residnet.report.figure_files import write_figure
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles, StoredWindow
 from residnet.report.sections.free_runs import errors_table
-from residnet.report.sections.runs import growth
+from residnet.report.sections.runs import error_growth
 from residnet.runs.folder import RunFolder
 
-_MOST = 60
+_MAX_DIFFERENCES = 60
 """Settings in which runs differ that the page shows."""
 _ABSENT = object()
-Window = tuple[str, str, float]
+WindowKey = tuple[str, str, float]
 """Log, protocol and first time of a window."""
 
 
-class JudgedRun(RunFiles):
+class EvaluatedRun(RunFiles):
     """A finished fit, as far as runs are compared: by its selected model.
 
     Attributes:
@@ -44,13 +44,16 @@ class JudgedRun(RunFiles):
         self.name, self.model = name, str(self.metrics["selected"])
 
     @cached_property
-    def of(self) -> dict[Window, StoredWindow]:
+    def windows_by_key(self) -> dict[WindowKey, StoredWindow]:
         """The free runs that it was judged on."""
-        found = self.windows(self.focus)
-        return {(one.log, one.protocol, round(float(one.t[0]), 3)): one for one in found}
+        stored_windows = self.read_split_windows(self.report_split)
+        return {
+            (window.log, window.protocol, round(float(window.t[0]), 3)): window
+            for window in stored_windows
+        }
 
 
-def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
+def compare_runs(paths: Sequence[Path], output_folder: Path) -> tuple[str, Path]:
     """Compare finished fits; returns the table for the terminal and the page.
 
     Args:
@@ -59,45 +62,53 @@ def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
     Raises:
         UsageError: where a folder holds no finished fit, or the page cannot be written.
     """
-    runs = judged_runs(paths)
-    pairs = paired(runs)
-    of_runs = [errors_table(run, run.focus) for run in runs]
-    for run, table in zip(runs, of_runs, strict=True):
+    runs = open_fit_runs(paths)
+    comparisons = compare_paired(runs)
+    error_tables = [errors_table(run, run.report_split) for run in runs]
+    for run, table in zip(runs, error_tables, strict=True):
         table.caption = f"{run.name}. {table.caption}"
-    found = _differing([run.resolved for run in runs], "")
-    found = [pair for pair in found if pair[0] not in ("name", "description")]
-    more = f" The first {_MOST} of {len(found)} stand here." if len(found) > _MOST else ""
-    told = f"What the runs were asked to do differently; what is alike is left out.{more}"
-    differing = table_of(
-        found[:_MOST],
+    config_differences = _find_config_differences([run.resolved_config for run in runs], "")
+    config_differences = [
+        pair for pair in config_differences if pair[0] not in ("name", "description")
+    ]
+    truncation_note = (
+        f" The first {_MAX_DIFFERENCES} of {len(config_differences)} stand here."
+        if len(config_differences) > _MAX_DIFFERENCES
+        else ""
+    )
+    caption = (
+        f"What the runs were asked to do differently; what is alike is left out.{truncation_note}"
+    )
+    difference_table = build_table(
+        config_differences[:_MAX_DIFFERENCES],
         [
             ("setting", lambda pair: pair[0]),
             *((run.name, lambda pair, i=i: pair[1][i]) for i, run in enumerate(runs)),
         ],
-        caption=told if found else "The runs were asked to do the same.",
+        caption=caption if config_differences else "The runs were asked to do the same.",
     )
-    against = [_paired_table(runs, pairs)] if pairs else []
-    verdict = _sentence(runs, pairs)
-    with recorded_folder(out):
+    paired_tables = [_build_paired_table(runs, comparisons)] if comparisons else []
+    verdict = _write_conclusion(runs, comparisons)
+    with record_folder(output_folder):
         sections = []
-        if pairs:
+        if comparisons:
             # of the first protocol, for the first screen: error, difference, interval
-            main = {protocol: pairs[protocol] for protocol in list(pairs)[:1]}
-            glance = _paired_table(runs, main).part(3, 6)
-            glance.caption = f"Selected models, {next(iter(main))}."
-            sections.append(Section("", [_curves(runs, out), glance]))
-            sections.append(Section("Selected models over common windows", against))
+            first_protocol = {protocol: comparisons[protocol] for protocol in list(comparisons)[:1]}
+            summary_table = _build_paired_table(runs, first_protocol).select_columns(3, 6)
+            summary_table.caption = f"Selected models, {next(iter(first_protocol))}."
+            sections.append(Section("", [_plot_error_growth(runs, output_folder), summary_table]))
+            sections.append(Section("Selected models over common windows", paired_tables))
         sections += [
-            Section("Every model of every run", of_runs),
-            Section("Where the runs differ", [differing]),
+            Section("Every model of every run", error_tables),
+            Section("Where the runs differ", [difference_table]),
         ]
         names = " against ".join(run.name for run in runs)
-        page = write_page(out, "Runs compared", names, [verdict], sections)
-    tables = [table.text() for table in (*of_runs, *against, differing)]
+        page = write_page(output_folder, "Runs compared", names, [verdict], sections)
+    tables = [table.to_text() for table in (*error_tables, *paired_tables, difference_table)]
     return "\n\n".join([*tables, verdict]), page
 
 
-def judged_runs(paths: Sequence[Path]) -> list[JudgedRun]:
+def open_fit_runs(paths: Sequence[Path]) -> list[EvaluatedRun]:
     """Return the runs in folders.
 
     Raises:
@@ -105,118 +116,130 @@ def judged_runs(paths: Sequence[Path]) -> list[JudgedRun]:
     """
     if len(paths) < 2:
         raise UsageError("compare: name at least two runs")
-    short = [path.name or path.resolve().name for path in paths]
-    names = short if len(set(short)) == len(short) else [str(path) for path in paths]
+    folder_names = [path.name or path.resolve().name for path in paths]
+    names = (
+        folder_names
+        if len(set(folder_names)) == len(folder_names)
+        else [str(path) for path in paths]
+    )
     if len(set(names)) < len(names):
         raise UsageError("compare: a run is named twice")
-    runs = [JudgedRun(name, path) for name, path in zip(names, paths, strict=True)]
+    runs = [EvaluatedRun(name, path) for name, path in zip(names, paths, strict=True)]
     for run in runs:
-        if not shared_channels([runs[0], run]):
+        if not common_channels([runs[0], run]):
             raise UsageError(
-                f"compare: {run.name} predicts {', '.join(run.live.channels)}, and"
-                f" {runs[0].name} {', '.join(runs[0].live.channels)}; name runs that share a"
+                f"compare: {run.name} predicts {', '.join(run.dof.active_states)}, and"
+                f" {runs[0].name} {', '.join(runs[0].dof.active_states)}; name runs that share a"
                 " velocity (signals.velocities)"
             )
     return runs
 
 
-def shared_channels(runs: Sequence[JudgedRun]) -> list[str]:
+def common_channels(runs: Sequence[EvaluatedRun]) -> list[str]:
     """Return what moves in all runs, in the order of the first: what they are compared by."""
-    return [name for name in runs[0].live.channels if all(name in r.live.channels for r in runs)]
+    return [
+        name for name in runs[0].dof.active_states if all(name in r.dof.active_states for r in runs)
+    ]
 
 
-def _common(runs: Sequence[JudgedRun]) -> dict[str, list[Window]]:
+def _common_windows(runs: Sequence[EvaluatedRun]) -> dict[str, list[WindowKey]]:
     """Return the windows by protocol that all runs were judged on, of one and the same length."""
-    shared = set.intersection(*(set(run.of) for run in runs))
-    out: dict[str, list[Window]] = {}
-    for window in sorted(shared):
-        if len({len(run.of[window].t) for run in runs}) == 1:
-            out.setdefault(window[1], []).append(window)
-    return out
+    common_keys = set.intersection(*(set(run.windows_by_key) for run in runs))
+    windows_by_protocol: dict[str, list[WindowKey]] = {}
+    for window in sorted(common_keys):
+        if len({len(run.windows_by_key[window].t) for run in runs}) == 1:
+            windows_by_protocol.setdefault(window[1], []).append(window)
+    return windows_by_protocol
 
 
-def paired(runs: Sequence[JudgedRun]) -> dict[str, dict[str, Any]]:
+def compare_paired(runs: Sequence[EvaluatedRun]) -> dict[str, dict[str, Any]]:
     """Return protocol -> run -> difference to the first run over common windows.
 
     Errors are normalised root mean squares, the mean over what moves in all runs, by the first
     run's scales.
     """
-    out: dict[str, dict[str, Any]] = {}
-    scales = {str(name): float(scale) for name, scale in _scales(runs).items()}
-    for protocol, windows in _common(runs).items():
+    comparisons: dict[str, dict[str, Any]] = {}
+    scales = {str(name): float(scale) for name, scale in _reference_scales(runs).items()}
+    for protocol, windows in _common_windows(runs).items():
         errors = [
-            np.array([run.of[window].nrmse(run.model, scales) for window in windows])
+            np.array(
+                [run.windows_by_key[window].mean_nrmse(run.model, scales) for window in windows]
+            )
             for run in runs
         ]
         logs = list(dict.fromkeys(window[0] for window in windows))
-        resampled = blocks([logs.index(window[0]) for window in windows])
-        out[protocol] = {
+        bootstrap_blocks = make_resampling_blocks([logs.index(window[0]) for window in windows])
+        comparisons[protocol] = {
             run.name: {
                 "windows": len(windows),
-                "mean": float(own.mean()),
-                **difference(own, errors[0], runs[0].name, resampled),
+                "mean": float(run_errors.mean()),
+                **paired_difference(run_errors, errors[0], runs[0].name, bootstrap_blocks),
             }
-            for run, own in zip(runs, errors, strict=True)
+            for run, run_errors in zip(runs, errors, strict=True)
         }
-    return out
+    return comparisons
 
 
-def _scales(runs: Sequence[JudgedRun]) -> pd.Series:
+def _reference_scales(runs: Sequence[EvaluatedRun]) -> pd.Series:
     """Return the first run's scales of what moves in all runs."""
-    return pd.Series(runs[0].metrics["scales"], dtype=float)[shared_channels(runs)]
+    return pd.Series(runs[0].metrics["scales"], dtype=float)[common_channels(runs)]
 
 
-def _paired_table(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, Any]]) -> Table:
-    first = runs[0].name
+def _build_paired_table(
+    runs: Sequence[EvaluatedRun], comparisons: Mapping[str, Mapping[str, Any]]
+) -> Table:
+    reference_name = runs[0].name
     rows = [
         {**entries[run.name], "run": run.name, "model": run.model, "protocol": protocol}
-        for protocol, entries in pairs.items()
+        for protocol, entries in comparisons.items()
         for run in runs
     ]
-    least = {
+    lowest_error = {
         protocol: min(entry["mean"] for entry in entries.values())
-        for protocol, entries in pairs.items()
+        for protocol, entries in comparisons.items()
     }
 
-    def apart(row: Mapping[str, Any]) -> str:
-        return "" if row["run"] == first else signed(row["nrmse_mean"])
+    def format_difference(row: Mapping[str, Any]) -> str:
+        return "" if row["run"] == reference_name else format_signed(row["nrmse_mean"])
 
-    def interval(row: Mapping[str, Any]) -> Cell:
-        own = row["run"] == first
-        return Cell("") if own else paired_interval(row["ci95"], "too few logs")
+    def format_interval(row: Mapping[str, Any]) -> Cell:
+        is_reference = row["run"] == reference_name
+        return Cell("") if is_reference else format_paired_interval(row["ci95"], "too few logs")
 
-    return table_of(
+    return build_table(
         rows,
         [
             ("run", "run"),
             ("model", "model"),
             ("protocol", "protocol"),
             ("windows", "windows", str),
-            ("NRMSE [-]", "mean", number),
-            ("difference", apart, str),
-            ("95 % interval", interval),
+            ("NRMSE [-]", "mean", format_number),
+            ("difference", format_difference, str),
+            ("95 % interval", format_interval),
         ],
         caption="Selected models over the windows that all runs were judged on, by the scales of"
-        f" {first}; differences to {first}, negative where the run is better.",
-        selected=lambda row: row["mean"] == least[row["protocol"]],
-        rule=lambda row: row["protocol"],
+        f" {reference_name}; differences to {reference_name}, negative where the run is better.",
+        is_selected=lambda row: row["mean"] == lowest_error[row["protocol"]],
+        group_key=lambda row: row["protocol"],
     )
 
 
-def _differing(values: Sequence[Any], path: str) -> list[tuple[str, list[str]]]:
+def _find_config_differences(values: Sequence[Any], path: str) -> list[tuple[str, list[str]]]:
     """Return the paths below which values differ, with what each says there."""
     if all(value == values[0] for value in values):
         return []
     if not all(isinstance(value, Mapping) for value in values):
-        return [(path, [_short(value) for value in values])]
-    out = []
+        return [(path, [_summarize_value(value) for value in values])]
+    differences_found = []
     for key in dict.fromkeys(key for value in values for key in value):
-        below = [value.get(key, _ABSENT) for value in values]
-        out += _differing(below, f"{path}.{key}" if path else str(key))
-    return out
+        child_values = [value.get(key, _ABSENT) for value in values]
+        differences_found += _find_config_differences(
+            child_values, f"{path}.{key}" if path else str(key)
+        )
+    return differences_found
 
 
-def _short(value: Any) -> str:
+def _summarize_value(value: Any) -> str:
     """Return a value in a few words; of a part with many settings its kind or its first ones."""
     match value:
         case None | [] | ():
@@ -225,48 +248,55 @@ def _short(value: Any) -> str:
             return "yes" if value else "no"
         case float():
             return f"{value:.4g}"
-        case {"kind": kind}:
-            return f"there (kind {kind})"
+        case {"kind": part_kind}:
+            return f"there (kind {part_kind})"
         case Mapping():
-            parts = [f"{key} {_short(part)}" for key, part in value.items()]
-            more = " ..." if len(parts) > 2 else ""
-            return f"there ({', '.join(parts[:2])}{more})" if parts else "there"
+            items = [f"{key} {_summarize_value(part)}" for key, part in value.items()]
+            ellipsis = " ..." if len(items) > 2 else ""
+            return f"there ({', '.join(items[:2])}{ellipsis})" if items else "there"
         case list() | tuple():
-            text = ", ".join(map(_short, value))
+            text = ", ".join(map(_summarize_value, value))
         case _:
             text = "not there" if value is _ABSENT else f"{value}"
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def _sentence(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, Any]]) -> str:
-    if not pairs:
+def _write_conclusion(
+    runs: Sequence[EvaluatedRun], comparisons: Mapping[str, Mapping[str, Any]]
+) -> str:
+    if not comparisons:
         return "The runs have no window of a log in common: their errors stand beside each other."
-    protocol, entries = next(iter(pairs.items()))
-    best = min(runs, key=lambda run: float(entries[run.name]["mean"]))
-    if best is runs[0]:
-        return f"Over the common windows of {protocol}, no run is better than {best.name}."
-    entry = entries[best.name]
-    sure = ", beyond chance." if entry["excludes_zero"] else ", which may be chance."
+    protocol, entries = next(iter(comparisons.items()))
+    best_run = min(runs, key=lambda run: float(entries[run.name]["mean"]))
+    if best_run is runs[0]:
+        return f"Over the common windows of {protocol}, no run is better than {best_run.name}."
+    entry = entries[best_run.name]
+    certainty = ", beyond chance." if entry["excludes_zero"] else ", which may be chance."
     return (
-        f"Over {entry['windows']} common windows of {protocol}, {best.name} ({best.model}) has"
-        f" the least error: {entry['nrmse_mean']:+.3f} against {runs[0].name}{sure}"
+        f"Over {entry['windows']} common windows of {protocol}, {best_run.name} ({best_run.model}) has"
+        f" the least error: {entry['nrmse_mean']:+.3f} against {runs[0].name}{certainty}"
     )
 
 
-def _curves(runs: Sequence[JudgedRun], out: Path) -> Block:
+def _plot_error_growth(runs: Sequence[EvaluatedRun], output_folder: Path) -> Block:
     """Draw how the errors of the selected models grow over the common windows."""
-    protocol, windows = next(iter(_common(runs).items()))
-    scales, curves = _scales(runs), {}
+    protocol, windows = next(iter(_common_windows(runs).items()))
+    scales, error_curves = _reference_scales(runs), {}
     for run in runs:
-        error = growth([run.of[window] for window in windows], run.model)[scales.index] / scales
-        curves[run.name] = (error.index.to_numpy(), error.mean(axis=1).to_numpy())
+        error = (
+            error_growth([run.windows_by_key[window] for window in windows], run.model)[
+                scales.index
+            ]
+            / scales
+        )
+        error_curves[run.name] = (error.index.to_numpy(), error.mean(axis=1).to_numpy())
     figure = Figure(
         "horizon",
         "Error against horizon",
         f"Selected models over {len(windows)} common windows of {protocol}, mean over"
         f" {', '.join(scales.index)}.",
-        family(curves),
-        [Panel("error [-]", "time from the start of a free run [s]", height=GLANCE)],
-        [Case("", [curves])],
+        style_family(error_curves),
+        [Panel("error [-]", "time from the start of a free run [s]", height=MAX_PREVIEW_HEIGHT)],
+        [Case("", [error_curves])],
     )
-    return write_figure(out / "figures", figure)
+    return write_figure(output_folder / "figures", figure)

@@ -22,11 +22,11 @@ from residnet.core.config import (
     load_config,
 )
 from residnet.core.errors import ConfigError
-from residnet.core.names import nearest
+from residnet.core.names import suggest_name
 from residnet.dynamics.simulated import check_steps
 from residnet.dynamics.steering_variation import Vessels
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, ExportRequest, Outcome, PartName
+from residnet.runs.task import ComputingTask, ExportRequest, PartName, TaskOutcome
 from residnet.tasks.autopilot import AnyController, AutopilotConfig
 
 
@@ -54,25 +54,26 @@ class CourseSpreadConfig(Config):
     current: MetresPerSecond = Field(default=0.0, ge=0)
 
     @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        for name, (low, high) in {"effect": self.effect, "time": self.time}.items():
-            if not 0 < low <= high:
+    def _validate_ranges(self) -> Self:
+        for name, (lower, upper) in {"effect": self.effect, "time": self.time}.items():
+            if not 0 < lower <= upper:
                 raise ValueError(
-                    f"{name}: low and high must be positive and in order, given {low:g}, {high:g}"
+                    f"{name}: low and high must be positive and in order, given {lower:g}, {upper:g}"
                 )
         return self
 
-    def draw(self) -> Vessels:
+    def sample_vessels(self) -> Vessels:
         """Draw the vessels, evenly spread over their ranges."""
         generator = np.random.default_rng(self.seed)
         effect, time, bias = (
             generator.uniform(*limits, self.flights)
             for limits in (self.effect, self.time, (-self.bias, self.bias))
         )
-        towards = generator.uniform(-math.pi, math.pi, self.flights)
+        current_direction = generator.uniform(-math.pi, math.pi, self.flights)
         variation, current = (
             np.stack((effect, time, bias), axis=-1),
-            self.current * np.stack((np.cos(towards), np.sin(towards)), axis=-1),
+            self.current
+            * np.stack((np.cos(current_direction), np.sin(current_direction)), axis=-1),
         )
         return Vessels(torch.from_numpy(variation), torch.from_numpy(current))
 
@@ -121,45 +122,53 @@ class CourseTaskConfig(ComputingTask):
     safe: Literal["hold", "amidships"] = "amidships"
 
     @model_validator(mode="after")
-    def _laws_differ(self) -> Self:
+    def _validate_laws(self) -> Self:
         kinds = [law.kind for law in self.line_of_sight]
         if len(set(kinds)) < len(kinds):
             raise ValueError(f"line_of_sight: each kind once, given {', '.join(kinds)}")
         check_steps(self.duration, self.dt)
         return self
 
-    def recorded_seed(self) -> int:
+    def provenance_seed(self) -> int:
         return self.spread.seed if self.spread else 0
 
-    verbs: ClassVar[tuple[str, ...]] = ("report", "export")
-    page: ClassVar[str] = "course"
+    supported_commands: ClassVar[tuple[str, ...]] = ("report", "export")
+    section_module: ClassVar[str] = "course"
 
-    def autopilot_config(self) -> AutopilotConfig:
+    def load_autopilot_config(self) -> AutopilotConfig:
         """Return the config of the autopilot, from its run folder or its file.
 
         Raises:
             UsageError: where the folder is not that of a finished autopilot run.
             ConfigError: where the file is no config of an autopilot, or has no such policy or peer.
         """
-        given = self.autopilot
-        file = RunFolder.open(given).resolved if given.is_dir() else given
-        found = load_config(file, [], AutopilotConfig)
-        if found.test.depth is not None:
+        autopilot_path = self.autopilot
+        file = (
+            RunFolder.open(autopilot_path).resolved_config
+            if autopilot_path.is_dir()
+            else autopilot_path
+        )
+        autopilot_config = load_config(file, [], AutopilotConfig)
+        if autopilot_config.test.depth is not None:
             raise ConfigError(
-                f"autopilot: {given} steers the depth; a course takes policies of the heading"
+                f"autopilot: {autopilot_path} steers the depth; a course takes policies of the heading"
             )
-        if self.policy not in found.policies:
+        if self.policy not in autopilot_config.policies:
             raise ConfigError(
-                f"policy: '{self.policy}' is none of {given}{nearest(self.policy, found.policies)}"
+                f"policy: '{self.policy}' is none of {autopilot_path}{suggest_name(self.policy, autopilot_config.policies)}"
             )
         for name in self.peers:
-            if name not in (known := {**found.peers, **found.predictive}):
-                raise ConfigError(f"peers: '{name}' is none of {given}{nearest(name, known)}")
-        if taken := sorted({self.policy, *self.peers} & set(self.others)):
+            if name not in (
+                peer_configs := {**autopilot_config.peers, **autopilot_config.predictive}
+            ):
+                raise ConfigError(
+                    f"peers: '{name}' is none of {autopilot_path}{suggest_name(name, peer_configs)}"
+                )
+        if duplicates := sorted({self.policy, *self.peers} & set(self.others)):
             raise ConfigError(
-                f"others: '{taken[0]}' is a policy or peer already; names are unique in a run"
+                f"others: '{duplicates[0]}' is a policy or peer already; names are unique in a run"
             )
-        return found
+        return autopilot_config
 
     def check(self) -> None:
         """Check the autopilot's run folder or config, and that the courses can be planned.
@@ -169,17 +178,17 @@ class CourseTaskConfig(ComputingTask):
             ConfigError: where it is no config of an autopilot, or has no such policy or peer, or
                 where no course fits the vessel's turns.
         """
-        autopilot = self.autopilot_config()
-        vessel = autopilot.steered
-        turning = vessel.turning(autopilot.rudder, autopilot.turning_time)
-        steady = smallest_turn(self.course, vessel, turning, autopilot.rudder)
+        autopilot = self.load_autopilot_config()
+        vessel = autopilot.steered_vessel
+        nomoto = vessel.estimate_nomoto(autopilot.rudder, autopilot.turning_time)
+        steady_turn = smallest_turn(self.course, vessel, nomoto, autopilot.rudder)
         for protocol in self.protocols:
             try:
-                plan_course(self.course, protocol, vessel, turning, autopilot.rudder, steady)
+                plan_course(self.course, protocol, vessel, nomoto, autopilot.rudder, steady_turn)
             except ConfigError as error:
                 raise ConfigError(f"course.buoys, protocol {protocol}: {error}") from error
 
-    def carry_out(self, folder: RunFolder) -> Outcome:
+    def execute(self, folder: RunFolder) -> TaskOutcome:
         """Train where there is no trained policy yet, plan, fly and compare.
 
         Raises:
@@ -190,8 +199,8 @@ class CourseTaskConfig(ComputingTask):
 
         return run_course(self, folder)
 
-    def export_model(self, asked: ExportRequest) -> Path:
+    def export_model(self, request: ExportRequest) -> Path:
         """Write a policy with the guidance of a course, named after both; returns the file."""
         from residnet.tasks.course_run import export_course
 
-        return export_course(self, asked)
+        return export_course(self, request)

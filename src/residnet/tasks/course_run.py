@@ -14,7 +14,12 @@ from pydantic import TypeAdapter
 from torch import Tensor
 
 from residnet.control.base import ClosedLoop, Policy, Reference
-from residnet.control.courses.config import PlannedCourse, feasibility, plan_course, smallest_turn
+from residnet.control.courses.config import (
+    PlannedCourse,
+    buoy_feasibility,
+    plan_course,
+    smallest_turn,
+)
 from residnet.control.courses.course_check import Protocol
 from residnet.control.courses.turns import SteadyTurn
 from residnet.control.guidance import (
@@ -25,29 +30,29 @@ from residnet.control.guidance import (
     WaypointGuidance,
     WheelOver,
 )
-from residnet.control.heading.controllers import Steering
+from residnet.control.heading.controllers import ControlTask
 from residnet.control.heading.policies import HeadingPolicy
-from residnet.control.heading.turning import Turning
+from residnet.control.heading.turning import NomotoModel
 from residnet.core.errors import ExportError
 from residnet.core.files import read_json
-from residnet.core.progress import say
-from residnet.documents.gouletas2020.autopilot import load_predictive
+from residnet.core.progress import log_message
+from residnet.documents.gouletas2020.autopilot import load_predictive_controller
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import InAmbientCurrent
 from residnet.dynamics.steering_variation import NOMINAL, Vessels
 from residnet.export.policy import ExportedCoursePolicy
-from residnet.judge.autopilots import CourseFlight, row, spread_row
+from residnet.judge.autopilots import CourseRun, build_course_row, build_ensemble_row
 from residnet.judge.metrics import SCHEMA
-from residnet.report.sections.course import COURSES, SPREAD, TRACKS, text_of
+from residnet.report.sections.course import COURSES_FILE, SPREAD_FILE, TRACKS_FILE, tables_text
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ExportRequest, MainFigure, Outcome
+from residnet.runs.task import ExportRequest, SummaryMetric, TaskOutcome
 from residnet.tasks.autopilot import AnyController, AutopilotConfig
-from residnet.tasks.autopilot_run import stored_policy
+from residnet.tasks.autopilot_run import load_trained_policy
 
 if TYPE_CHECKING:
     from residnet.tasks.course import CourseTaskConfig
 
-_UNITS = {
+_COLUMN_UNITS = {
     "course_time": "s",
     "reference_time": "s",
     "cross_track_rms": "m",
@@ -60,83 +65,103 @@ _UNITS = {
 }
 
 
-def run_course(config: CourseTaskConfig, folder: RunFolder) -> Outcome:
+def run_course(config: CourseTaskConfig, folder: RunFolder) -> TaskOutcome:
     """Train where there is no trained policy yet, plan, fly and compare."""
-    if not config.autopilot.is_dir() and not RunFolder(folder.path / "autopilot").finished:
-        config.autopilot_config().run(
-            source=config.autopilot, out=folder.path / "autopilot", resume=True
+    if not config.autopilot.is_dir() and not RunFolder(folder.path / "autopilot").is_finished:
+        config.load_autopilot_config().run(
+            source=config.autopilot, output_folder=folder.path / "autopilot", resume=True
         )
-    known = ready(config, folder)
-    steering, steady = known.steering, known.steady
-    feasible = feasibility(config.course.buoys, steady.radius)
-    for circle in feasible:
+    autopilot_run = open_autopilot_run(config, folder)
+    steering, steady_turn = autopilot_run.steering, autopilot_run.steady_turn
+    radius_feasibility = buoy_feasibility(config.course.buoys, steady_turn.radius)
+    for circle in radius_feasibility:
         if not circle["possible"]:
-            say(
+            log_message(
                 f"buoy {circle['buoy']}: {circle['radius']:.4g} m cannot be followed; the smallest"
                 f" radius possible is {circle['smallest']:.2f} m"
             )
-    trained = load_policy(known, config.policy)
-    reader: TypeAdapter[AnyController] = TypeAdapter(AnyController)
-    built: dict[str, Policy] = {}
+    trained_policy = load_policy(autopilot_run, config.policy)
+    controller_adapter: TypeAdapter[AnyController] = TypeAdapter(AnyController)
+    policies: dict[str, Policy] = {}
     for name in config.peers:
-        if name in known.autopilot.predictive:
-            built[name] = load_predictive(
-                name, known.autopilot.predictive[name], known.steering, known.run
+        if name in autopilot_run.autopilot.predictive:
+            policies[name] = load_predictive_controller(
+                name,
+                autopilot_run.autopilot.predictive[name],
+                autopilot_run.steering,
+                autopilot_run.run,
             )
         else:
-            built[name] = reader.validate_python(known.controllers[name]["config"]).build(
-                known.steering
-            )
-    built |= {name: law.build(known.steering) for name, law in config.others.items()}
-    controllers = {config.policy: trained, **{name: law.double() for name, law in built.items()}}
-    done = _Flown([], [], [])
+            policies[name] = controller_adapter.validate_python(
+                autopilot_run.peer_notes[name]["config"]
+            ).build(autopilot_run.steering)
+    policies |= {
+        name: policy.build(autopilot_run.steering) for name, policy in config.others.items()
+    }
+    controllers = {
+        config.policy: trained_policy,
+        **{name: policy.double() for name, policy in policies.items()},
+    }
+    results = _CourseResults([], [], [])
     plans: list[pd.DataFrame] = []
     exports: dict[str, Callable[[], Path]] = {}
     for protocol in config.protocols:
-        planned, guidance = plan_for(config, known, protocol)
-        say(
-            f"{protocol}: planned {planned.course.length:.1f} m; the reference of arcs and lines"
-            f" has {planned.reference:.1f} m"
+        planned_course, guidance = plan_with_guidance(config, autopilot_run, protocol)
+        log_message(
+            f"{protocol}: planned {planned_course.course.length:.1f} m; the reference of arcs and lines"
+            f" has {planned_course.reference_length:.1f} m"
         )
-        plans.append(plan_table(planned))
+        plans.append(tabulate_plan(planned_course))
         for name in controllers:
-            for sight in (None, *(config.line_of_sight if protocol == "enter" else ())):
-                _fly(config, planned, steering, name, controllers[name], sight, done)
-        asked = ExportRequest(folder, f"{config.policy}_{protocol}")
-        exports[asked.model] = partial(export_course, config, asked, (planned, guidance))
-    shown = {
+            for line_of_sight in (None, *(config.line_of_sight if protocol == "enter" else ())):
+                _run_controller(
+                    config,
+                    planned_course,
+                    steering,
+                    name,
+                    controllers[name],
+                    line_of_sight,
+                    results,
+                )
+        request = ExportRequest(folder, f"{config.policy}_{protocol}")
+        exports[request.model] = partial(export_course, config, request, (planned_course, guidance))
+    metrics_json = {
         "schema": SCHEMA,
         "run": config.name,
-        "channels": _UNITS,
-        "speed": steering.turning.speed,
+        "channels": _COLUMN_UNITS,
+        "speed": steering.nomoto.speed,
         "rudder": steering.limit,
-        "smallest": vars(steady),
-        "feasibility": feasible,
+        "smallest": vars(steady_turn),
+        "feasibility": radius_feasibility,
     }
-    folder.write_json(folder.metrics, shown | {"rows": done.rows})
-    folder.write_table(folder.path / TRACKS, pd.concat(done.tracks, ignore_index=True))
-    folder.write_table(folder.path / COURSES, pd.concat(plans, ignore_index=True))
-    if done.spread:
-        folder.write_table(folder.path / SPREAD, pd.concat(done.spread, ignore_index=True))
-    verdict, figures = [], dict[str, MainFigure]()
-    for flight in done.rows:
+    folder.write_json(folder.metrics, metrics_json | {"rows": results.rows})
+    folder.write_table(folder.path / TRACKS_FILE, pd.concat(results.tracks, ignore_index=True))
+    folder.write_table(folder.path / COURSES_FILE, pd.concat(plans, ignore_index=True))
+    if results.spread_tables:
+        folder.write_table(
+            folder.path / SPREAD_FILE, pd.concat(results.spread_tables, ignore_index=True)
+        )
+    verdict, summary_metrics = [], dict[str, SummaryMetric]()
+    for result_row in results.rows:
         # the policy on the nominal vessel along the plan
-        nominal = (flight["model"], flight["guidance"], flight["split"])
-        if nominal != (config.policy, "course", "simulated"):
+        row_key = (result_row["model"], result_row["guidance"], result_row["split"])
+        if row_key != (config.policy, "course", "simulated"):
             continue
-        protocol = flight["protocol"]
-        figures[f"{protocol}_course_time"] = MainFigure(flight["course_time"], "s")
-        figures[f"{protocol}_ratio"] = MainFigure(flight["ratio"])
-        figures[f"{protocol}_cross_track_rms"] = MainFigure(flight["cross_track_rms"], "m")
-        passes = "and passes all" if flight["passed"] else "but does NOT pass all"
+        protocol = result_row["protocol"]
+        summary_metrics[f"{protocol}_course_time"] = SummaryMetric(result_row["course_time"], "s")
+        summary_metrics[f"{protocol}_ratio"] = SummaryMetric(result_row["ratio"])
+        summary_metrics[f"{protocol}_cross_track_rms"] = SummaryMetric(
+            result_row["cross_track_rms"], "m"
+        )
+        passing_text = "and passes all" if result_row["passed"] else "but does NOT pass all"
         verdict.append(
-            f"{protocol}: '{config.policy}' needs {flight['course_time']:.1f} s,"
-            f" {flight['ratio']:.3f} times the time of the reference, {passes}"
+            f"{protocol}: '{config.policy}' needs {result_row['course_time']:.1f} s,"
+            f" {result_row['ratio']:.3f} times the time of the reference, {passing_text}"
             f" {len(config.course.buoys)} buoys as the protocol asks."
-            if flight["finished"]
+            if result_row["finished"]
             else f"{protocol}: '{config.policy}' did not come to the end of the course."
         )
-    return Outcome(verdict, figures, text_of(done.rows), exports=exports)
+    return TaskOutcome(verdict, summary_metrics, tables_text(results.rows), exports=exports)
 
 
 class AutopilotRun(NamedTuple):
@@ -146,221 +171,245 @@ class AutopilotRun(NamedTuple):
         autopilot: config of the autopilot run.
         run: its folder.
         steering: vessel, K and T, rudder limit and step.
-        steady: the smallest turn.
-        controllers: configs of its peers as tuned, by name.
+        steady_turn: the smallest turn.
+        peer_notes: configs of its peers as tuned, by name.
     """
 
     autopilot: AutopilotConfig
     run: RunFolder
-    steering: Steering
-    steady: SteadyTurn
-    controllers: dict[str, Any]
+    steering: ControlTask
+    steady_turn: SteadyTurn
+    peer_notes: dict[str, Any]
 
 
-def ready(config: CourseTaskConfig, folder: RunFolder) -> AutopilotRun:
+def open_autopilot_run(config: CourseTaskConfig, folder: RunFolder) -> AutopilotRun:
     """Read the finished autopilot run: the given one, or the one in the folder of the course.
 
     Raises:
         UsageError: where it is not finished.
     """
-    autopilot = config.autopilot_config()
-    run = RunFolder.open(
+    autopilot = config.load_autopilot_config()
+    run_folder = RunFolder.open(
         config.autopilot if config.autopilot.is_dir() else folder.path / "autopilot"
     )
-    notes = read_json(run.path / "controllers.json")
-    steering = Steering(autopilot.steered, Turning(**notes["turning"]), autopilot.rudder, config.dt)
+    notes = read_json(run_folder.path / "controllers.json")
+    steering = ControlTask(
+        autopilot.steered_vessel, NomotoModel(**notes["turning"]), autopilot.rudder, config.dt
+    )
     return AutopilotRun(
         autopilot,
-        run,
+        run_folder,
         steering,
-        smallest_turn(config.course, steering.vessel, steering.turning, steering.limit),
+        smallest_turn(config.course, steering.vessel, steering.nomoto, steering.limit),
         notes["controllers"],
     )
 
 
-def load_policy(known: AutopilotRun, name: str) -> HeadingPolicy:
+def load_policy(autopilot_run: AutopilotRun, name: str) -> HeadingPolicy:
     """Return a trained policy of the autopilot's run, at the step of the course.
 
     Raises:
         UsageError: where the run lacks it, or it is not as it was written.
     """
-    steering = known.steering
-    policy = stored_policy(known.autopilot, known.run.models, name, steering.dt)
-    policy.read_from(steering.vessel.state)
+    steering = autopilot_run.steering
+    policy = load_trained_policy(
+        autopilot_run.autopilot, autopilot_run.run.models, name, steering.dt
+    )
+    policy.set_state_columns(steering.vessel.state)
     return policy
 
 
-def plan_for(
-    config: CourseTaskConfig, known: AutopilotRun, protocol: Protocol
+def plan_with_guidance(
+    config: CourseTaskConfig, autopilot_run: AutopilotRun, protocol: Protocol
 ) -> tuple[PlannedCourse, CourseGuidance]:
     """Return the plan of a protocol, and the guidance along it.
 
     Raises:
         ConfigError: where no course fits the vessel's turns.
     """
-    steering = known.steering
-    planned = plan_course(
-        config.course, protocol, steering.vessel, steering.turning, steering.limit, known.steady
+    steering = autopilot_run.steering
+    planned_course = plan_course(
+        config.course,
+        protocol,
+        steering.vessel,
+        steering.nomoto,
+        steering.limit,
+        autopilot_run.steady_turn,
     )
-    return planned, guidance_along(config, planned, steering)
+    return planned_course, make_course_guidance(config, planned_course, steering)
 
 
-def guidance_along(
-    config: CourseTaskConfig, planned: PlannedCourse, steering: Steering
+def make_course_guidance(
+    config: CourseTaskConfig, planned_course: PlannedCourse, steering: ControlTask
 ) -> CourseGuidance:
     """Return line of sight with the config's lookahead, drift estimated where it integrates."""
     lookahead = config.course.lookahead
     drift = (
         None if config.integral is None else DriftEstimate(lookahead, config.integral, steering.dt)
     )
-    return CourseGuidance(planned.course, lookahead, steering.vessel.state, drift)
+    return CourseGuidance(planned_course.course, lookahead, steering.vessel.state, drift)
 
 
-class _Flown(NamedTuple):
+class _CourseResults(NamedTuple):
     """The rows of metrics.json, tracks of nominal flights, and flights of the spread."""
 
     rows: list[dict[str, Any]]
     tracks: list[pd.DataFrame]
-    spread: list[pd.DataFrame]
+    spread_tables: list[pd.DataFrame]
 
 
-def _fly(
+def _run_controller(
     config: CourseTaskConfig,
-    planned: PlannedCourse,
-    steering: Steering,
+    planned_course: PlannedCourse,
+    steering: ControlTask,
     name: str,
-    law: Policy,
-    sight: AnyLineOfSight | None,
-    done: _Flown,
+    policy: Policy,
+    line_of_sight: AnyLineOfSight | None,
+    results: _CourseResults,
 ) -> None:
     """Fly the nominal vessel, then those of the spread, with one controller and guidance."""
-    kind = "policy" if name == config.policy else "classical"
-    guidance = "course" if sight is None else sight.kind
-    steered = _steered(config, planned, steering, law, sight)
+    role = "policy" if name == config.policy else "classical"
+    guidance = "course" if line_of_sight is None else line_of_sight.kind
+    loop_parts = _build_loop_parts(config, planned_course, steering, policy, line_of_sight)
 
-    def flown(vessels: Vessels) -> tuple[list[CourseFlight], list[dict[str, Any]]]:
-        flights = fly(
-            steering, *steered, planned, config.course.lookahead, config.duration, vessels
+    def simulate_vessels(vessels: Vessels) -> tuple[list[CourseRun], list[dict[str, Any]]]:
+        course_runs = simulate_course(
+            steering, *loop_parts, planned_course, config.course.lookahead, config.duration, vessels
         )
-        return flights, [
-            row(
-                name, kind, guidance, planned, one, config.course.acceptance, steering.turning.speed
+        return course_runs, [
+            build_course_row(
+                name,
+                role,
+                guidance,
+                planned_course,
+                course_run,
+                config.course.acceptance,
+                steering.nomoto.speed,
             )
-            for one in flights
+            for course_run in course_runs
         ]
 
-    flights, rows = flown(NOMINAL)
-    done.rows.extend(rows)
-    flight = flights[0]
-    every = max(round(_KEPT / flight.dt), 1)
-    count = len(flight.track)
+    course_runs, rows = simulate_vessels(NOMINAL)
+    results.rows.extend(rows)
+    course_run = course_runs[0]
+    stride = max(round(_TRACK_INTERVAL / course_run.dt), 1)
+    n_samples = len(course_run.track)
     columns = {
         "controller": name,
         "guidance": guidance,
-        "protocol": planned.protocol,
-        "t": flight.dt * np.arange(count)[::every],
-        "north": flight.track[::every, 0],
-        "east": flight.track[::every, 1],
-        "psi": flight.heading[::every],
-        "rudder": np.resize(flight.rudder, count)[::every],
-        "speed": flight.speed[::every],
-        "cross_track": flight.cross_track[::every],
+        "protocol": planned_course.protocol,
+        "t": course_run.dt * np.arange(n_samples)[::stride],
+        "north": course_run.track[::stride, 0],
+        "east": course_run.track[::stride, 1],
+        "psi": course_run.heading[::stride],
+        "rudder": np.resize(course_run.rudder, n_samples)[::stride],
+        "speed": course_run.speed[::stride],
+        "cross_track": course_run.cross_track[::stride],
     }
-    done.tracks.append(pd.DataFrame(columns))
+    results.tracks.append(pd.DataFrame(columns))
     if config.spread is not None:
-        vessels = config.spread.draw()
-        rows = flown(vessels)[1]
-        done.rows.append(spread_row(rows))
-        done.spread.append(spread_table(rows, vessels))
+        vessels = config.spread.sample_vessels()
+        rows = simulate_vessels(vessels)[1]
+        results.rows.append(build_ensemble_row(rows))
+        results.spread_tables.append(tabulate_spread(rows, vessels))
 
 
-def _steered(
+def _build_loop_parts(
     config: CourseTaskConfig,
-    planned: PlannedCourse,
-    steering: Steering,
-    law: Policy,
-    sight: AnyLineOfSight | None,
+    planned_course: PlannedCourse,
+    steering: ControlTask,
+    policy: Policy,
+    line_of_sight: AnyLineOfSight | None,
 ) -> tuple[Policy, Reference]:
     """Return controller and guidance along the plan, or by line of sight from buoy to buoy."""
     vessel = steering.vessel
-    if sight is None:
+    if line_of_sight is None:
         return TrackKeeping(
-            law, vessel.state, limit=steering.limit, dt=steering.dt, rate=vessel.rate
-        ), guidance_along(config, planned, steering)
+            policy, vessel.state, limit=steering.limit, dt=steering.dt, rate=vessel.rate
+        ), make_course_guidance(config, planned_course, steering)
     points, acceptance = (
-        [(buoy.north, buoy.east) for buoy in planned.buoys],
+        [(buoy.north, buoy.east) for buoy in planned_course.buoys],
         config.course.acceptance,
     )
-    over = (
-        WheelOver(steering.turning, steering.limit, acceptance, rate=vessel.rate)
+    wheel_over = (
+        WheelOver(steering.nomoto, steering.limit, acceptance, rate=vessel.rate)
         if config.legs_change == "wheel_over"
         else None
     )
-    return law, WaypointGuidance(points, acceptance, sight.build(steering.dt), vessel.state, over)
+    return policy, WaypointGuidance(
+        points, acceptance, line_of_sight.build(steering.dt), vessel.state, wheel_over
+    )
 
 
-def fly(
-    steering: Steering,
+def simulate_course(
+    steering: ControlTask,
     policy: Policy,
     reference: Reference,
-    planned: PlannedCourse,
+    planned_course: PlannedCourse,
     lookahead: float,
     duration: float,
     vessels: Vessels,
-) -> list[CourseFlight]:
+) -> list[CourseRun]:
     """Fly each vessel once, from the plan's first point and heading.
 
     Args:
-        planned: course that cross-track errors are measured from.
+        planned_course: course that cross-track errors are measured from.
         lookahead: of the plan's guidance in m.
         duration: in s, after which a flight that has not ended is given up.
         vessels: that fly.
     """
-    vessel, count, steps = steering.vessel, len(vessels.variation), round(duration / steering.dt)
-    place = [vessel.column("x"), vessel.column("y")]
-    x, w = vessel.start(torch.ones(count, dtype=torch.float64))
-    x[:, place] = torch.from_numpy(planned.course.track[0])
-    x[:, vessel.column("psi")] = float(planned.course.heading[0])
+    vessel, n_vessels, steps = (
+        steering.vessel,
+        len(vessels.variation),
+        round(duration / steering.dt),
+    )
+    position_columns = [vessel.state_column("x"), vessel.state_column("y")]
+    x, w = vessel.straight_course(torch.ones(n_vessels, dtype=torch.float64))
+    x[:, position_columns] = torch.from_numpy(planned_course.course.track[0])
+    x[:, vessel.state_column("psi")] = float(planned_course.course.heading[0])
     model = InAmbientCurrent(vessel.model(steering.dt), vessel.state)
-    loop = Rollout(model, ClosedLoop(policy, reference))
+    closed_loop = Rollout(model, ClosedLoop(policy, reference))
     memory = torch.cat((vessels.current, vessel.memory(vessels.variation)), dim=-1)
     with torch.no_grad():
-        states, inputs, _ = loop(x, w.unsqueeze(1).expand(-1, steps, -1), memory)
-        moves = (states.diff(dim=1)[:, :, place].abs().sum(dim=-1) > 0).numpy()
-        ends = [int(np.flatnonzero(row)[-1]) + 1 for row in moves]
-        aside = _aside(
-            CourseGuidance(planned.course, lookahead, vessel.state), states[:, : max(ends) + 1]
+        states, inputs, _ = closed_loop(x, w.unsqueeze(1).expand(-1, steps, -1), memory)
+        is_moving = (states.diff(dim=1)[:, :, position_columns].abs().sum(dim=-1) > 0).numpy()
+        last_steps = [int(np.flatnonzero(row)[-1]) + 1 for row in is_moving]
+        cross_track = _cross_track_errors(
+            CourseGuidance(planned_course.course, lookahead, vessel.state),
+            states[:, : max(last_steps) + 1],
         )
-    speed = torch.hypot(states[:, :, vessel.column("u")], states[:, :, vessel.column("v")])
-    psi = states[:, :, vessel.column("psi")]
+    speed = torch.hypot(
+        states[:, :, vessel.state_column("u")], states[:, :, vessel.state_column("v")]
+    )
+    psi = states[:, :, vessel.state_column("psi")]
     return [
-        CourseFlight(
-            states[row, : end + 1, place].numpy(),
-            psi[row, : end + 1].numpy(),
-            inputs[row, : end + 1, 0].numpy(),
-            speed[row, : end + 1].numpy(),
-            aside[row, : end + 1].numpy(),
+        CourseRun(
+            states[row, : last_step + 1, position_columns].numpy(),
+            psi[row, : last_step + 1].numpy(),
+            inputs[row, : last_step + 1, 0].numpy(),
+            speed[row, : last_step + 1].numpy(),
+            cross_track[row, : last_step + 1].numpy(),
             steering.dt,
-            end < steps,
+            last_step < steps,
         )
-        for row, end in enumerate(ends)
+        for row, last_step in enumerate(last_steps)
     ]
 
 
-def _aside(plan: CourseGuidance, states: Tensor) -> Tensor:
+def _cross_track_errors(course_guidance: CourseGuidance, states: Tensor) -> Tensor:
     """Return the cross-track errors [B, T] in m of states [B, T, nx]."""
-    place, errors = plan.initial_state(states[:, 0]), []
+    guidance_state, errors = course_guidance.initial_state(states[:, 0]), []
     for k in range(states.shape[1]):
-        _, place = plan(states[:, k], k, place)
-        errors.append(plan.error(states[:, k], place[:, 0])[1])
+        _, guidance_state = course_guidance(states[:, k], k, guidance_state)
+        errors.append(course_guidance.track_error(states[:, k], guidance_state[:, 0])[1])
     return torch.stack(errors, dim=1)
 
 
-_KEPT = 0.1
+_TRACK_INTERVAL = 0.1
 """Seconds between the stored samples of a track."""
 
 
-def spread_table(rows: list[dict[str, Any]], vessels: Vessels) -> pd.DataFrame:
+def tabulate_spread(rows: list[dict[str, Any]], vessels: Vessels) -> pd.DataFrame:
     """Return one line for each flight of the spread."""
     columns = (
         "model",
@@ -373,58 +422,70 @@ def spread_table(rows: list[dict[str, Any]], vessels: Vessels) -> pd.DataFrame:
         "margin",
         "cross_track_rms",
     )
-    drawn = {
+    sampled_values = {
         "effect": vessels.variation[:, 0],
         "time": vessels.variation[:, 1],
         "bias": vessels.variation[:, 2],
     }
-    drawn |= {"current_north": vessels.current[:, 0], "current_east": vessels.current[:, 1]}
+    sampled_values |= {
+        "current_north": vessels.current[:, 0],
+        "current_east": vessels.current[:, 1],
+    }
     return pd.DataFrame(
         {name: [row[name] for row in rows] for name in columns}
-        | {name: values.numpy() for name, values in drawn.items()}
+        | {name: values.numpy() for name, values in sampled_values.items()}
     )
 
 
-def plan_table(planned: PlannedCourse) -> pd.DataFrame:
+def tabulate_plan(planned_course: PlannedCourse) -> pd.DataFrame:
     """Return the planned course up to its end: positions in m, heading and rudder in rad."""
-    course = planned.course
-    within = course.step * np.arange(len(course.track)) <= course.length
+    course = planned_course.course
+    is_on_course = course.step * np.arange(len(course.track)) <= course.length
     columns = {
-        "north": course.track[within, 0],
-        "east": course.track[within, 1],
-        "heading": course.heading[within],
-        "rudder": course.rudder[within],
+        "north": course.track[is_on_course, 0],
+        "east": course.track[is_on_course, 1],
+        "heading": course.heading[is_on_course],
+        "rudder": course.rudder[is_on_course],
     }
-    return pd.DataFrame({"protocol": planned.protocol, **columns})
+    return pd.DataFrame({"protocol": planned_course.protocol, **columns})
 
 
-_SAME = 1e-6
+_MAX_PLAN_DEVIATION = 1e-6
 """Turning radii by which a course planned again may differ from the one that was flown."""
 
 
-def _planned_again(
-    config: CourseTaskConfig, known: AutopilotRun, run: RunFolder, protocol: Protocol
+def _replan_and_verify(
+    config: CourseTaskConfig, autopilot_run: AutopilotRun, run: RunFolder, protocol: Protocol
 ) -> tuple[PlannedCourse, CourseGuidance]:
-    planned, guidance = plan_for(config, known, protocol)
-    again, flown = plan_table(planned), pd.read_parquet(run.path / COURSES)
-    place, flown = ["north", "east"], flown[flown["protocol"] == protocol]
+    planned_course, guidance = plan_with_guidance(config, autopilot_run, protocol)
+    new_plan, recorded_plan = (
+        tabulate_plan(planned_course),
+        pd.read_parquet(run.path / COURSES_FILE),
+    )
+    position_columns, recorded_plan = (
+        ["north", "east"],
+        recorded_plan[recorded_plan["protocol"] == protocol],
+    )
     if (
-        len(again) != len(flown)
+        len(new_plan) != len(recorded_plan)
         or not (
-            np.abs(again[place].to_numpy() - flown[place].to_numpy()) <= _SAME * known.steady.radius
+            np.abs(
+                new_plan[position_columns].to_numpy() - recorded_plan[position_columns].to_numpy()
+            )
+            <= _MAX_PLAN_DEVIATION * autopilot_run.steady_turn.radius
         ).all()
     ):
         raise ExportError(
             f"{run.path}: another course is planned for '{protocol}' now than the one that was"
             " flown; carry the run out again with this version"
         )
-    return planned, guidance
+    return planned_course, guidance
 
 
 def export_course(
     config: CourseTaskConfig,
-    asked: ExportRequest,
-    flown: tuple[PlannedCourse, CourseGuidance] | None = None,
+    request: ExportRequest,
+    existing_plan: tuple[PlannedCourse, CourseGuidance] | None = None,
 ) -> Path:
     """Write a policy with the guidance of a course; returns the file.
 
@@ -435,21 +496,27 @@ def export_course(
         ExportError: where another course is planned now than the one that was flown.
     """
     protocols = {f"{config.policy}_{protocol}": protocol for protocol in config.protocols}
-    name = asked.named(protocols)
-    known, run, protocol = ready(config, asked.run), asked.run, protocols[name]
-    planned, guidance = flown or _planned_again(config, known, run, protocol)
+    name = request.resolve_model_name(protocols)
+    autopilot_run, run, protocol = (
+        open_autopilot_run(config, request.run),
+        request.run,
+        protocols[name],
+    )
+    planned_course, guidance = existing_plan or _replan_and_verify(
+        config, autopilot_run, run, protocol
+    )
     rows = [row for row in run.read_metrics()["rows"] if row["model"] == config.policy]
     exported = ExportedCoursePolicy(
         config.policy,
-        load_policy(known, config.policy),
+        load_policy(autopilot_run, config.policy),
         guidance,
-        planned.course,
-        safe=config.safe,
-        about={
-            "vessel": known.autopilot.vessel,
+        planned_course.course,
+        fallback=config.safe,
+        description={
+            "vessel": autopilot_run.autopilot.vessel,
             "course": config.course.model_dump(mode="json"),
             "protocol": protocol,
         },
         metrics=[row for row in rows if row["protocol"] == protocol],
     )
-    return asked.write(exported, stem=name)
+    return request.write(exported, stem=name)

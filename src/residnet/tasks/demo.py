@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import UsageError
-from residnet.core.files import whole
+from residnet.core.files import atomic_write
 from residnet.core.log import Log
-from residnet.core.ownership import Manifest, recorded_folder
-from residnet.core.progress import report
-from residnet.data.simulated import SimulatedTrials, simulate
+from residnet.core.ownership import Manifest, record_folder
+from residnet.core.progress import report_progress
+from residnet.data.simulated import SimulatedTrials, simulate_trial_logs
 
 if TYPE_CHECKING:
     import pandas as pd
 
-TRIALS: dict[str, Any] = {
+DEMO_TRIALS: dict[str, Any] = {
     "vessel": "example_rudder_boat",
     "seed": 11,
     "duration": "80 s",
@@ -52,7 +52,7 @@ TRIALS: dict[str, Any] = {
     "identification": {"zigzag": 6, "constant": 3, "three_two_one_one": 3},
     "validation": {"zigzag": 2, "constant": 1, "three_two_one_one": 1},
 }
-COLUMNS = {
+COLUMN_NAMES = {
     "x": ("north [m]", 1.0),
     "y": ("east [m]", 1.0),
     "psi": ("heading [deg]", 180.0 / np.pi),
@@ -64,9 +64,9 @@ COLUMNS = {
     "wind_speed": ("true wind speed [kn]", 3600.0 / 1852.0),
     "wind_dir": ("true wind direction [deg]", 180.0 / np.pi),
 }
-_GAP = (30.0, 32.5)
+_GAP_SECONDS = (30.0, 32.5)
 """Seconds that every fifth log lacks."""
-_EPOCH = 1_717_000_000
+_START_EPOCH = 1_717_000_000
 """Unix time at which the made recordings begin, in May 2024."""
 
 
@@ -84,94 +84,108 @@ def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:
         layout = folder / name
         if not os.path.lexists(layout):
             continue
-        if not layout.is_dir() or not manifest.exists:
+        if not layout.is_dir() or not manifest.is_recorded:
             raise UsageError(f"{layout}: exists, and residnet did not make it; give another folder")
         manifest.require_all_owned(layout)
         if not overwrite:
             raise UsageError(f"{layout}: exists; give --overwrite, or another folder")
-    config = validate(TRIALS, SimulatedTrials, "demo")
-    logs = [_with_gap(log, number) for number, log in enumerate(simulate(config.draw(), config))]
-    with recorded_folder(folder):
+    config = validate_config(DEMO_TRIALS, SimulatedTrials, "demo")
+    logs = [
+        _cut_gap(log, number)
+        for number, log in enumerate(simulate_trial_logs(config.draw_manoeuvres(), config))
+    ]
+    with record_folder(folder):
         for name in LAYOUTS:
             manifest.remove_owned(folder / name)
         for number, (name, (_, tables)) in enumerate(LAYOUTS.items()):
-            report("writing logs", number, len(LAYOUTS))
+            report_progress("writing logs", number, len(LAYOUTS))
             for log in logs:
-                for word, table in tables(_table(log)).items():
-                    with whole(folder / name / f"{word}{log.name}.csv") as file:
+                for prefix, table in tables(_to_recorder_table(log)).items():
+                    with atomic_write(folder / name / f"{prefix}{log.name}.csv") as file:
                         table.to_csv(file, index=False, float_format="%.4f")
-        report("writing logs", len(LAYOUTS), len(LAYOUTS))
+        report_progress("writing logs", len(LAYOUTS), len(LAYOUTS))
     seconds = sum(float(log.t[-1] - log.t[0]) for log in logs)
     return [
         f"{len(logs)} logs of a simulated boat in wind, {seconds / 60.0:.0f} minutes, as",
-        *(f"{folder}/{name}: {about}" for name, (about, _) in LAYOUTS.items()),
+        *(f"{folder}/{name}: {description}" for name, (description, _) in LAYOUTS.items()),
         "their faults: positions 0.3 s late, a rudder that stands 2 degrees off, gaps, noise",
         f"next: residnet new {folder}/two_files",
     ]
 
 
-def _with_gap(log: Log, number: int) -> Log:
+def _cut_gap(log: Log, number: int) -> Log:
     """Return every fifth log without some seconds."""
-    keep = np.ones(len(log), dtype=bool)
+    is_kept_mask = np.ones(len(log), dtype=bool)
     if number % 5 == 0:
-        keep = (log.t < _GAP[0]) | (log.t >= _GAP[1])
-    channels = {name: log[name][keep] for name in COLUMNS if name in log.channels}
-    return log.replace(t=log.t[keep], channels=channels, masks={})
+        is_kept_mask = (log.t < _GAP_SECONDS[0]) | (log.t >= _GAP_SECONDS[1])
+    channels = {name: log[name][is_kept_mask] for name in COLUMN_NAMES if name in log.channels}
+    return log.replace(t=log.t[is_kept_mask], channels=channels, masks={})
 
 
-def _table(log: Log) -> pd.DataFrame:
+def _to_recorder_table(log: Log) -> pd.DataFrame:
     """Return a log in the units of its recorder, its time first."""
     import pandas as pd
 
     table = {"time [s]": np.round(log.t, 3)}
-    for name, (column, factor) in COLUMNS.items():
+    for name, (column, factor) in COLUMN_NAMES.items():
         values = log[name] * factor
         table[column] = np.remainder(values, 360.0) if name in ("psi", "wind_dir") else values
     return pd.DataFrame(table)
 
 
-_POSE = [COLUMNS[name][0] for name in ("x", "y", "psi")]
-_OWN = [COLUMNS[name][0] for name in ("u", "v", "r")]
-_SURGE = [COLUMNS[name][0] for name in ("u", "n")]
-_ACTS = [COLUMNS[name][0] for name in ("delta", "n")]
+_POSE_COLUMNS = [COLUMN_NAMES[name][0] for name in ("x", "y", "psi")]
+_VELOCITY_COLUMNS = [COLUMN_NAMES[name][0] for name in ("u", "v", "r")]
+_SURGE_COLUMNS = [COLUMN_NAMES[name][0] for name in ("u", "n")]
+_ACTUATOR_COLUMNS = [COLUMN_NAMES[name][0] for name in ("delta", "n")]
 
 
-def _pulses(table: pd.DataFrame) -> pd.DataFrame:
+def _actuators_as_pulses(table: pd.DataFrame) -> pd.DataFrame:
     """Return rudder and propeller as the pulses that drive them, in us: 35 deg, 1500 rpm."""
-    rudder, propeller = (table[name] for name in _ACTS)
-    table = table.drop(columns=_ACTS)
+    rudder, propeller = (table[name] for name in _ACTUATOR_COLUMNS)
+    table = table.drop(columns=_ACTUATOR_COLUMNS)
     table["rudder_pwm"] = (1500.0 + 500.0 / 35.0 * rudder).round().astype(int)
     table["motor_pwm"] = (1500.0 + 500.0 / 1500.0 * propeller).round().astype(int)
     return table
 
 
-def _two_files(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def _split_recorders(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Return what a receiver with compass and anemometer writes, and what the motors do."""
-    acts = _pulses(table)[["time [s]", "rudder_pwm", "motor_pwm"]]
+    actuator_table = _actuators_as_pulses(table)[["time [s]", "rudder_pwm", "motor_pwm"]]
     # the board was switched on seven seconds before the receiver began
-    acts["time [s]"] = (1e3 * acts["time [s]"] + 7e3).round().astype(int)
-    fixes = table.drop(columns=[*_OWN, *_ACTS])[::2]
-    fixes["time [s]"] += _EPOCH
+    actuator_table["time [s]"] = (1e3 * actuator_table["time [s]"] + 7e3).round().astype(int)
+    receiver_table = table.drop(columns=[*_VELOCITY_COLUMNS, *_ACTUATOR_COLUMNS])[::2]
+    receiver_table["time [s]"] += _START_EPOCH
     return {
-        "gnss_": fixes.rename(columns={"time [s]": "utc [s]"}),
-        "motors_": acts.rename(columns={"time [s]": "millis"}),
+        "gnss_": receiver_table.rename(columns={"time [s]": "utc [s]"}),
+        "motors_": actuator_table.rename(columns={"time [s]": "millis"}),
     }
 
 
-def _rates(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def _decimate_columns(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Return positions in each fifth row and wind in each tenth, as one logger of all writes."""
     table = table.copy()
-    for every, names in ((5, ("x", "y")), (10, ("wind_speed", "wind_dir"))):
-        table.loc[np.arange(len(table)) % every > 0, [COLUMNS[name][0] for name in names]] = np.nan
+    for stride, names in ((5, ("x", "y")), (10, ("wind_speed", "wind_dir"))):
+        table.loc[np.arange(len(table)) % stride > 0, [COLUMN_NAMES[name][0] for name in names]] = (
+            np.nan
+        )
     return {"": table}
 
 
 LAYOUTS: dict[str, tuple[str, Callable[[pd.DataFrame], dict[str, pd.DataFrame]]]] = {
     "csv": ("one table a log", lambda table: {"": table}),
-    "two_files": ("a receiver and the motors, each with a file and a clock of its own", _two_files),
-    "rates": ("one table whose columns come at three rates", _rates),
-    "pwm": ("commands as pulses", lambda table: {"": _pulses(table)}),
-    "no_pose": ("velocities and commands alone", lambda table: {"": table.drop(columns=_POSE)}),
-    "surge": ("speed and propeller alone", lambda table: {"": table[["time [s]", *_SURGE]]}),
+    "two_files": (
+        "a receiver and the motors, each with a file and a clock of its own",
+        _split_recorders,
+    ),
+    "rates": ("one table whose columns come at three rates", _decimate_columns),
+    "pwm": ("commands as pulses", lambda table: {"": _actuators_as_pulses(table)}),
+    "no_pose": (
+        "velocities and commands alone",
+        lambda table: {"": table.drop(columns=_POSE_COLUMNS)},
+    ),
+    "surge": (
+        "speed and propeller alone",
+        lambda table: {"": table[["time [s]", *_SURGE_COLUMNS]]},
+    ),
 }
 """Folder -> what it holds, and the tables of a log by the word that its file's name begins with."""

@@ -16,45 +16,66 @@ from typing import Any
 
 import numpy as np
 
-from residnet.core.config import validate
+from residnet.core.config import validate_config
 from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.files import write_owned
-from residnet.core.layout import ALIVE, ROLL, SIX, Live
+from residnet.core.layout import ROLL_LAYOUT, SIX_DOF_LAYOUT, SURGE_SWAY_YAW, DegreesOfFreedom
 from residnet.core.log import Log
-from residnet.core.names import ACCELERATION, BOW_WIND, CHANNEL_UNITS, STATE, WIND_INPUTS
+from residnet.core.names import (
+    ACCELERATION_NAMES,
+    BOW_WIND_CHANNELS,
+    CHANNEL_UNITS,
+    STATE_NAMES,
+    WIND_INPUTS,
+)
 from residnet.core.ownership import require_replaceable
-from residnet.core.progress import say
-from residnet.data.doctor import inspect
-from residnet.data.drafting.channels import CHANNELS
-from residnet.data.drafting.questions import Answer, Marks, commented
-from residnet.data.drafting.reading import INPUTS, log_files, read_drafted
-from residnet.data.drafting.words import PLANES, input_channel, state_channel, words_of
+from residnet.core.progress import log_message
+from residnet.data.doctor import inspect_log
+from residnet.data.drafting.channels import CHANNELS_KEY
+from residnet.data.drafting.questions import AnswerCallback, DraftNotes, dump_commented_yaml
+from residnet.data.drafting.reading import INPUTS_KEY, find_log_files, read_drafted
+from residnet.data.drafting.words import (
+    PLANE_PATTERN,
+    match_input_channel,
+    match_state_channel,
+    parse_name,
+)
 from residnet.data.motion import MotionConfig, complete_motion
-from residnet.data.readers.quantities import COSINE, QUATERNION, SINE
-from residnet.data.split import SPLITS, called_splits, divided, stretch_of, without_copies
+from residnet.data.readers.quantities import COSINE_SUFFIX, QUATERNION, SINE_SUFFIX
+from residnet.data.split import (
+    SPLITS,
+    extract_segment,
+    remove_copies,
+    split_logs,
+    splits_from_names,
+)
 
-_UNTOLD = ("columns that no channel takes", "columns of text", "fields that no channel takes")
-_INSPECTED = 12
+_UNMATCHED_COLUMN_NOTES = (
+    "columns that no channel takes",
+    "columns of text",
+    "fields that no channel takes",
+)
+_MAX_INSPECTED_LOGS = 12
 """Logs that the data doctor looks at."""
-_SHOWN = 12
+_MAX_SHOWN_GUESSES = 12
 """Guesses that the terminal shows."""
 
 
 @dataclass(frozen=True)
-class Draft:
+class ConfigDraft:
     """A config that runs, and what of it is a guess.
 
     Attributes:
         config: the content of the YAML file.
         guesses: key -> why its value is a guess.
         text: the YAML with its comments.
-        unused: what the logs hold and the config does not use, and what would mislead a fit.
+        warnings: what the logs hold and the config does not use, and what would mislead a fit.
     """
 
     config: dict[str, Any]
     guesses: tuple[tuple[str, str], ...]
     text: str
-    unused: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def save(self, file: Path | str) -> Path:
         """Write the config as YAML with its comments; returns the path of the file.
@@ -68,360 +89,455 @@ class Draft:
         return path
 
 
-def new_config(
-    logs: Sequence[Path], out: Path, answer: Answer | None, *, overwrite: bool
+def write_new_config(
+    logs: Sequence[Path],
+    output_file: Path,
+    answer_question: AnswerCallback | None,
+    *,
+    overwrite: bool,
 ) -> list[str]:
     """Write a config for logs; returns what the terminal shows.
 
     Args:
-        answer: asks the user; None takes every default.
+        answer_question: asks the user; None takes every default.
 
     Raises:
         UsageError: where the file exists already, or a path does not.
         DataError: where no log can be used.
     """
-    if out.suffix not in (".yaml", ".yml"):
-        raise UsageError(f"--out {out}: a config is a YAML file; name it {out}.yaml")
-    if out.exists() and not overwrite:
-        raise UsageError(f"--out {out}: exists; give --overwrite, or another name")
-    require_replaceable(out)
-    plain = unicodedata.normalize("NFKD", out.stem).encode("ascii", "ignore").decode()
-    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", plain).strip("_.-") or "my_boat"
-    draft = drafted(logs, out.parent, name, answer)
-    file, count = draft.save(out), len(draft.guesses)
-    lines = [f"{key}: {why}" for key, why in draft.guesses[:_SHOWN]]
-    if count > _SHOWN:
-        lines.append(f"and {count - _SHOWN} more, marked in the file")
-    if count == 1:
-        lines.insert(0, "one value is a guess, marked in the file:")
-    elif count:
-        lines.insert(0, f"{count} values are guesses, each marked in the file:")
+    if output_file.suffix not in (".yaml", ".yml"):
+        raise UsageError(
+            f"--out {output_file}: a config is a YAML file; name it {output_file}.yaml"
+        )
+    if output_file.exists() and not overwrite:
+        raise UsageError(f"--out {output_file}: exists; give --overwrite, or another name")
+    require_replaceable(output_file)
+    ascii_name = unicodedata.normalize("NFKD", output_file.stem).encode("ascii", "ignore").decode()
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", ascii_name).strip("_.-") or "my_boat"
+    draft = draft_fit_config(logs, output_file.parent, name, answer_question)
+    file, n_guesses = draft.save(output_file), len(draft.guesses)
+    messages = [f"{key}: {reason}" for key, reason in draft.guesses[:_MAX_SHOWN_GUESSES]]
+    if n_guesses > _MAX_SHOWN_GUESSES:
+        messages.append(f"and {n_guesses - _MAX_SHOWN_GUESSES} more, marked in the file")
+    if n_guesses == 1:
+        messages.insert(0, "one value is a guess, marked in the file:")
+    elif n_guesses:
+        messages.insert(0, f"{n_guesses} values are guesses, each marked in the file:")
     return [
-        *lines,
-        *draft.unused,
+        *messages,
+        *draft.warnings,
         f"config: {file}",
         f"next: residnet run {shlex.quote(str(file))}",
     ]
 
 
-def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | None = None) -> Draft:
+def draft_fit_config(
+    paths: Sequence[Path], folder: Path, name: str, answer_question: AnswerCallback | None = None
+) -> ConfigDraft:
     """Return a config for logs that the task `fit` runs as it is.
 
     Args:
         folder: where the config will lie; its paths start from there.
-        answer: answers questions; None takes every default and marks it.
+        answer_question: answers questions; None takes every default and marks it.
 
     Raises:
         UsageError: where a path does not exist, or nothing drives the vessel in the logs.
         DataError: where no log can be used.
     """
-    marks = Marks(answer)
-    read = _Read(log_files(paths), marks)
-    inputs = driving(list(read.whole.values()), marks)
+    draft_notes = DraftNotes(answer_question)
+    draft_logs = _DraftLogs(find_log_files(paths), draft_notes)
+    inputs = choose_inputs(list(draft_logs.complete_logs.values()), draft_notes)
     if not inputs:
-        held = ", ".join(next(iter(read.whole.values())).channels)
-        marks.guess(
-            INPUTS,
+        channel_names = ", ".join(next(iter(draft_logs.complete_logs.values())).channels)
+        draft_notes.add_guess(
+            INPUTS_KEY,
             "no channel of the logs is a rudder, a propeller or another command (they hold"
-            f" {held}): a model without them can only predict how the vessel coasts; name the"
+            f" {channel_names}): a model without them can only predict how the vessel coasts; name the"
             " columns that drive it",
         )
-    elif lacking := lacks(inputs, read.live):
-        marks.guess(
-            INPUTS,
-            f"nothing among the inputs {lacking} the vessel; where a column that no channel takes"
+    elif missing := missing_control(inputs, draft_logs.dof):
+        draft_notes.add_guess(
+            INPUTS_KEY,
+            f"nothing among the inputs {missing} the vessel; where a column that no channel takes"
             " does, name it under data.reader.channels",
         )
-    inputs = read.keep(inputs, marks)
-    live = read.live
-    told, doubts = _doubts(list(read.logs.values()), inputs)
+    inputs = draft_logs.keep_inputs(inputs, draft_notes)
+    dof = draft_logs.dof
+    finding_codes, quality_warnings = _data_quality_warnings(list(draft_logs.logs.values()), inputs)
     # torch takes 190 MB, which do not stand beside what the doctor takes of a long log
-    from residnet.identification.recipe import Preparation, integrator, judging
+    from residnet.identification.recipe import (
+        PreparationPlan,
+        choose_integrator,
+        make_evaluation_settings,
+    )
     from residnet.tasks.fit import FitConfig
 
-    chosen = Preparation.of(list(read.whole.values()), inputs, live)
-    signals = {"inputs": list(inputs)}
-    if not live.planar:
-        signals["velocities"] = list(live.velocities)
-        marks.guess(("signals", "velocities"), live.text)
-    signals |= {"exogenous": list(chosen.exogenous)} if chosen.exogenous else {}
-    measured = {name for log in read.logs.values() for name in log.channels}
-    deep = [name for name in SIX.moving if name in measured and name not in ROLL.moving]
-    if deep and not live.spatial:
-        text = f"{', '.join(deep)}: left out: six degrees of freedom need depth, pitch and roll"
-        marks.note(CHANNELS, f"{text} angles, and u and v or a position, that move in all logs")
-    if not chosen.exogenous and all(
-        {*WIND_INPUTS} <= {*log.channels} for log in read.logs.values()
-    ):
-        marks.note(CHANNELS, "the wind is left out: its loads need u, v, r and a measured heading")
-    preparation = chosen.content()
-    for text in doubts:
-        marks.note(("data",), f"data doctor: {text}")
-    if "frozen" in told:
-        where = {"channels": list(live.channels)} if live.dead else {}
-        preparation |= {"masks": [{"kind": "frozen", **where}]}
-    usable = read.usable((*inputs, *chosen.exogenous), preparation)
-    root, parts = _split(read, usable, folder, marks)
-    if not called_splits(list(usable.values())):
-        # a split that the folders tell stays as it is
-        _judge_long_ones(parts, chosen.memory, marks)
-    split = {name: [entry for entry, *_ in members] for name, members in parts.items()}
-    splits = {name: [log for _, log, _ in members] for name, members in parts.items()}
-    lasting = {name: [time for *_, time in members] for name, members in parts.items()}
-    judged = judging(splits, lasting, chosen.memory, live)
-    marks.note(("prepare", "grid"), chosen.reason)
-    marks.note(
-        ("evaluation", "protocols"),
-        f"free runs as long as most logs hold; {judged['selection']} chooses, on validation logs",
+    preparation_recipe = PreparationPlan.from_logs(
+        list(draft_logs.complete_logs.values()), inputs, dof
     )
-    marks.note(("evaluation", "scales"), "standard deviations over training and validation logs")
-    marks.note(("recipe",), "a portfolio of models, whose terms and sizes follow from the logs")
+    signals = {"inputs": list(inputs)}
+    if not dof.is_planar:
+        signals["velocities"] = list(dof.velocities)
+        draft_notes.add_guess(("signals", "velocities"), dof.description)
+    signals |= (
+        {"exogenous": list(preparation_recipe.wind_channels)}
+        if preparation_recipe.wind_channels
+        else {}
+    )
+    measured_channels = {name for log in draft_logs.logs.values() for name in log.channels}
+    depth_channels = [
+        name
+        for name in SIX_DOF_LAYOUT.dynamic_states
+        if name in measured_channels and name not in ROLL_LAYOUT.dynamic_states
+    ]
+    if depth_channels and not dof.is_six_dof:
+        text = f"{', '.join(depth_channels)}: left out: six degrees of freedom need depth, pitch and roll"
+        draft_notes.add_note(
+            CHANNELS_KEY, f"{text} angles, and u and v or a position, that move in all logs"
+        )
+    if not preparation_recipe.wind_channels and all(
+        {*WIND_INPUTS} <= {*log.channels} for log in draft_logs.logs.values()
+    ):
+        draft_notes.add_note(
+            CHANNELS_KEY, "the wind is left out: its loads need u, v, r and a measured heading"
+        )
+    preparation = preparation_recipe.to_config()
+    for text in quality_warnings:
+        draft_notes.add_note(("data",), f"data doctor: {text}")
+    if "frozen" in finding_codes:
+        mask_channels = {"channels": list(dof.active_states)} if dof.fixed_states else {}
+        preparation |= {"masks": [{"kind": "frozen", **mask_channels}]}
+    usable_logs = draft_logs.select_usable(
+        (*inputs, *preparation_recipe.wind_channels), preparation
+    )
+    root, split_entries = _split_logs(draft_logs, usable_logs, folder, draft_notes)
+    if not splits_from_names(list(usable_logs.values())):
+        # a split that the folders tell stays as it is
+        _move_short_logs_to_training(
+            split_entries, preparation_recipe.correlation_time, draft_notes
+        )
+    split = {name: [entry for entry, *_ in members] for name, members in split_entries.items()}
+    splits = {name: [log for _, log, _ in members] for name, members in split_entries.items()}
+    durations = {name: [time for *_, time in members] for name, members in split_entries.items()}
+    evaluation_settings = make_evaluation_settings(
+        splits, durations, preparation_recipe.correlation_time, dof
+    )
+    draft_notes.add_note(("prepare", "grid"), preparation_recipe.reason)
+    draft_notes.add_note(
+        ("evaluation", "protocols"),
+        f"free runs as long as most logs hold; {evaluation_settings['selection']} chooses, on validation logs",
+    )
+    draft_notes.add_note(
+        ("evaluation", "scales"), "standard deviations over training and validation logs"
+    )
+    draft_notes.add_note(
+        ("recipe",), "a portfolio of models, whose terms and sizes follow from the logs"
+    )
     config = {
         "task": "fit",
         "name": name,
-        "description": f"Drafted by residnet new from {len(usable)} logs",
-        "data": {"kind": "measured", "reader": read.reader, "split": {"root": root, **split}},
+        "description": f"Drafted by residnet new from {len(usable_logs)} logs",
+        "data": {"kind": "measured", "reader": draft_logs.reader, "split": {"root": root, **split}},
         "prepare": preparation,
         "signals": signals,
-        "integrator": integrator(live),
+        "integrator": choose_integrator(dof),
         "recipe": "standard",
         "export": {"models": []},
-        "evaluation": judged,
+        "evaluation": evaluation_settings,
     }
-    validate(config, FitConfig, "draft", folder)
-    guesses = tuple((".".join(key), text) for key, text in marks.guesses)
-    unused = [text for key, text in marks.notes if key[-1] == "channels" or key == ("data",)]
-    left_out = [f"left out: {path.name}: {why}" for path, why in read.left_out.items()]
-    text = commented(config, marks.comments, read.head())
-    return Draft(config, guesses, text, (*left_out, *unused))
+    validate_config(config, FitConfig, "draft", folder)
+    guesses = tuple((".".join(key), text) for key, text in draft_notes.guessed_values)
+    unused = [text for key, text in draft_notes.notes if key[-1] == "channels" or key == ("data",)]
+    exclusion_lines = [
+        f"left out: {path.name}: {reason}" for path, reason in draft_logs.exclusion_reasons.items()
+    ]
+    text = dump_commented_yaml(config, draft_notes.comments_at, draft_logs.header_lines())
+    return ConfigDraft(config, guesses, text, (*exclusion_lines, *unused))
 
 
-def _doubts(logs: Sequence[Log], inputs: Sequence[str]) -> tuple[set[str], list[str]]:
+def _data_quality_warnings(
+    logs: Sequence[Log], inputs: Sequence[str]
+) -> tuple[set[str], list[str]]:
     """Return the codes of what the data doctor finds in some of the logs, and its words."""
-    told: dict[str, list[str]] = {}
-    doubts = []
-    for log in logs[:: max(1, len(logs) // _INSPECTED)]:
+    texts_by_code: dict[str, list[str]] = {}
+    warnings = []
+    for log in logs[:: max(1, len(logs) // _MAX_INSPECTED_LOGS)]:
         try:
-            found = inspect(log, [name for name in inputs if name in log.channels])
+            quality_report = inspect_log(log, [name for name in inputs if name in log.channels])
         except ResidnetError as error:
-            doubts.append(f"{log.name}: {error}")
+            warnings.append(f"{log.name}: {error}")
             continue
-        for finding in found.findings:
+        for finding in quality_report.findings:
             if finding.level != "note" or finding.code == "roll":
-                told.setdefault(finding.code, []).append(f"{log.name}: {finding.text}")
-    for texts in told.values():
-        more = f" (and {len(texts) - 1} more logs)" if len(texts) > 1 else ""
-        doubts.append(f"{texts[0][:300]}{more}")
-    return {*told}, doubts
+                texts_by_code.setdefault(finding.code, []).append(f"{log.name}: {finding.text}")
+    for texts in texts_by_code.values():
+        suffix = f" (and {len(texts) - 1} more logs)" if len(texts) > 1 else ""
+        warnings.append(f"{texts[0][:300]}{suffix}")
+    return {*texts_by_code}, warnings
 
 
-class _Read:
+class _DraftLogs:
     """The logs of a draft.
 
     Attributes:
         reader: `data.reader` of the config.
-        live: velocities that most of the logs tell.
+        dof: velocities that most of the logs tell.
         logs: path -> log, in SI, as the reader gives it.
-        whole: path -> the same with the motion at every sample.
-        left_out: path -> why it is not used.
-        lasting: path -> the longest time in s without a gap that preparing leaves of it.
-        longest: returns that of any part of a log, in SI as the reader gives it.
+        complete_logs: path -> the same with the motion at every sample.
+        exclusion_reasons: path -> why it is not used.
+        longest_times: path -> the longest time in s without a gap that preparing leaves of it.
+        longest_gapless_time: returns that of any part of a log, in SI as the reader gives it.
     """
 
-    longest: Callable[[Log], float]
+    longest_gapless_time: Callable[[Log], float]
 
-    def __init__(self, paths: Sequence[Path], marks: Marks) -> None:
-        self.lasting: dict[Path, float] = {}
-        read = read_drafted(paths, marks)
-        self.reader = read.reader
-        self.left_out = {path: str(error) for path, error in read.left_out.items()}
+    def __init__(self, paths: Sequence[Path], draft_notes: DraftNotes) -> None:
+        self.longest_times: dict[Path, float] = {}
+        draft_result = read_drafted(paths, draft_notes)
+        self.reader = draft_result.reader
+        self.exclusion_reasons = {path: str(error) for path, error in draft_result.errors.items()}
         self.logs: dict[Path, Log] = {}
-        self.whole: dict[Path, Log] = {}
+        self.complete_logs: dict[Path, Log] = {}
         # parts that are not sure to be of one moment would teach a wrong answer
-        unsure = {
+        ambiguous_logs = {
             path: finding["text"]
-            for path, log in read.logs.items()
+            for path, log in draft_result.logs.items()
             for finding in log.meta.get("findings", ())
             if finding["code"] == "joined" and finding["level"] == "will mislead"
         }
-        unsure = unsure if len(unsure) < len(read.logs) else {}
-        self.left_out |= unsure
-        told = [Live.told(log.channels) for log in read.logs.values()]
-        self.live = max(told, key=lambda one: (told.count(one), len(one.velocities)))
-        for path, log in read.logs.items():
-            if path in unsure:
+        ambiguous_logs = ambiguous_logs if len(ambiguous_logs) < len(draft_result.logs) else {}
+        self.exclusion_reasons |= ambiguous_logs
+        dof_of_logs = [
+            DegreesOfFreedom.from_channels(log.channels) for log in draft_result.logs.values()
+        ]
+        self.dof = max(dof_of_logs, key=lambda dof: (dof_of_logs.count(dof), len(dof.velocities)))
+        for path, log in draft_result.logs.items():
+            if path in ambiguous_logs:
                 continue
             try:
-                self.whole[path], self.logs[path] = (
-                    complete_motion(log, MotionConfig(), self.live),
+                self.complete_logs[path], self.logs[path] = (
+                    complete_motion(log, MotionConfig(), self.dof),
                     log,
                 )
             except ResidnetError as error:
-                self.left_out[path] = str(error)
-        if not self.whole:
+                self.exclusion_reasons[path] = str(error)
+        if not self.complete_logs:
             # what the names of columns did not tell may be what is missing
-            untold = "; ".join(text for _, text in marks.notes if text.startswith(_UNTOLD))
-            reason = next(iter(self.left_out.values()))
-            raise DataError(f"{reason} ({untold})" if untold else reason)
+            unmatched_notes = "; ".join(
+                text for _, text in draft_notes.notes if text.startswith(_UNMATCHED_COLUMN_NOTES)
+            )
+            reason = next(iter(self.exclusion_reasons.values()))
+            raise DataError(f"{reason} ({unmatched_notes})" if unmatched_notes else reason)
 
-    def keep(self, inputs: Sequence[str], marks: Marks) -> tuple[str, ...]:
+    def keep_inputs(self, inputs: Sequence[str], draft_notes: DraftNotes) -> tuple[str, ...]:
         """Rename chosen forces to tau_x, tau_y, tau_n, drop channels that nothing uses; returns the
         inputs.
         """
-        new = {
+        renamed_inputs = {
             name: next((f for f in ("tau_x", "tau_y", "tau_n") if name.startswith(f"{f}_")), name)
             for name in inputs
         }
         if channels := self.reader.get("channels"):
-            layout = SIX if self.live.spatial else ROLL
-            state = [*layout.names, *WIND_INPUTS, *BOW_WIND]
-            state += [f"{name}{part}" for name in state for part in (COSINE, SINE)]
-            state += [] if "x" in channels else ["latitude", "longitude"]
-            state += [] if "psi" in channels else QUATERNION
+            layout = SIX_DOF_LAYOUT if self.dof.is_six_dof else ROLL_LAYOUT
+            state_channels = [*layout.state_names, *WIND_INPUTS, *BOW_WIND_CHANNELS]
+            state_channels += [
+                f"{name}{part}" for name in state_channels for part in (COSINE_SUFFIX, SINE_SUFFIX)
+            ]
+            state_channels += [] if "x" in channels else ["latitude", "longitude"]
+            state_channels += [] if "psi" in channels else QUATERNION
             self.reader["channels"] = {
-                new.get(name, name): entry
+                renamed_inputs.get(name, name): entry
                 for name, entry in channels.items()
-                if name in state or name in new
+                if name in state_channels or name in renamed_inputs
             }
-            marks.rename(CHANNELS, {name: new.get(name, name) for name in (*state, *new)})
-        for logs in (self.logs, self.whole):
+            draft_notes.rename_keys(
+                CHANNELS_KEY,
+                {
+                    name: renamed_inputs.get(name, name)
+                    for name in (*state_channels, *renamed_inputs)
+                },
+            )
+        for logs in (self.logs, self.complete_logs):
             for path, log in logs.items():
-                changed = {new.get(key, key): values for key, values in log.channels.items()}
-                units = {new.get(key, key): unit for key, unit in log.units.items()}
-                logs[path] = log.replace(channels=changed, units=units)
-        return tuple(new.values())
+                renamed_channels = {
+                    renamed_inputs.get(key, key): values for key, values in log.channels.items()
+                }
+                units = {renamed_inputs.get(key, key): unit for key, unit in log.units.items()}
+                logs[path] = log.replace(channels=renamed_channels, units=units)
+        return tuple(renamed_inputs.values())
 
-    def usable(self, columns: Sequence[str], preparation: Mapping[str, Any]) -> dict[Path, Log]:
+    def select_usable(
+        self, columns: Sequence[str], preparation: Mapping[str, Any]
+    ) -> dict[Path, Log]:
         """Return the logs that can be prepared; the others are left out with the reason."""
         from residnet.data.prepare import PrepareConfig
-        from residnet.identification.recipe import longest_time
+        from residnet.identification.recipe import longest_usable_duration
 
-        config = validate(dict(preparation), PrepareConfig, "draft")
-        self.longest = lambda log: longest_time(log, columns, config, self.live)
-        out: dict[Path, Log] = {}
+        config = validate_config(dict(preparation), PrepareConfig, "draft")
+        self.longest_gapless_time = lambda log: longest_usable_duration(
+            log, columns, config, self.dof
+        )
+        usable_logs: dict[Path, Log] = {}
         for path, log in self.logs.items():
             try:
-                self.lasting[path] = self.longest(log)
-                if self.lasting[path]:
-                    out[path] = self.whole[path]
+                self.longest_times[path] = self.longest_gapless_time(log)
+                if self.longest_times[path]:
+                    usable_logs[path] = self.complete_logs[path]
                 else:
-                    self.left_out[path] = "no stretch is as long as the window of the derivative"
+                    self.exclusion_reasons[path] = (
+                        "no stretch is as long as the window of the derivative"
+                    )
             except ResidnetError as error:
-                self.left_out[path] = str(error)
-        if not out:
-            raise DataError(next(iter(self.left_out.values())))
-        kept = {log.name for log in without_copies(list(out.values()))}
-        copies = [path for path, log in out.items() if log.name not in kept]
-        self.left_out |= dict.fromkeys(copies, "its rows are a copy of part of another log")
-        return {path: log for path, log in out.items() if path not in copies}
+                self.exclusion_reasons[path] = str(error)
+        if not usable_logs:
+            raise DataError(next(iter(self.exclusion_reasons.values())))
+        unique_names = {log.name for log in remove_copies(list(usable_logs.values()))}
+        copies = [path for path, log in usable_logs.items() if log.name not in unique_names]
+        self.exclusion_reasons |= dict.fromkeys(
+            copies, "its rows are a copy of part of another log"
+        )
+        return {path: log for path, log in usable_logs.items() if path not in copies}
 
-    def head(self) -> list[str]:
+    def header_lines(self) -> list[str]:
         """Return the lines at the top of the config."""
         lines = [
             "Drafted by `residnet new` from the logs alone. Lines with 'guess' say what the logs do"
             " not tell, and why this value was taken: read them before the results are trusted."
         ]
-        lines += [f"left out: {path.name}: {reason}" for path, reason in self.left_out.items()]
-        if made := next(iter(self.whole.values())).meta.get("smoothed"):
+        lines += [
+            f"left out: {path.name}: {reason}" for path, reason in self.exclusion_reasons.items()
+        ]
+        if derived_channels := next(iter(self.complete_logs.values())).meta.get("smoothed"):
             lines.append(
-                f"{', '.join(made)} are not measured at every sample: a smoother makes them from"
+                f"{', '.join(derived_channels)} are not measured at every sample: a smoother makes them from"
                 " position and heading. Where the antenna stands off the vessel's centre, or its"
                 " positions come late, add prepare.motion: {antenna: {x: ..., y: ...}, delay: ...}."
             )
-        if made := next(iter(self.whole.values())).meta.get("integrated"):
+        if derived_channels := next(iter(self.complete_logs.values())).meta.get("integrated"):
             lines.append(
-                f"{', '.join(made)} are not measured: they are integrated from the velocities, and"
+                f"{', '.join(derived_channels)} are not measured: they are integrated from the velocities, and"
                 " errors of position and heading are those of integrated velocities."
             )
-        say(f"{len(self.logs)} logs were read, {len(self.left_out)} left out")
+        log_message(f"{len(self.logs)} logs were read, {len(self.exclusion_reasons)} left out")
         return lines
 
 
-_Part = tuple[Any, Log, float]
+_SplitEntry = tuple[Any, Log, float]
 """Entry of a split in a config, its log with the whole motion, and the longest time in s without a
 gap that preparing leaves of it."""
 
 
-def _split(
-    read: _Read, usable: Mapping[Path, Log], folder: Path, marks: Marks
-) -> tuple[str, dict[str, list[_Part]]]:
+def _split_logs(
+    draft_logs: _DraftLogs, usable_logs: Mapping[Path, Log], folder: Path, draft_notes: DraftNotes
+) -> tuple[str, dict[str, list[_SplitEntry]]]:
     """Return the folder of the logs and their split.
 
     Raises:
         DataError: where nothing that can be prepared is left of the logs for a split.
     """
-    paths = {log.name: path for path, log in usable.items()}
-    common = Path(os.path.commonpath([path.resolve().parent for path in usable]))
-    near = os.path.relpath(common, folder.resolve())
+    paths = {log.name: path for path, log in usable_logs.items()}
+    common_folder = Path(os.path.commonpath([path.resolve().parent for path in usable_logs]))
+    relative_root = os.path.relpath(common_folder, folder.resolve())
     # absolute where it lies far from the config
-    root = common.as_posix() if near.count("..") > 2 else Path(near).as_posix()
-    why = (
+    root = (
+        common_folder.as_posix()
+        if relative_root.count("..") > 2
+        else Path(relative_root).as_posix()
+    )
+    reason = (
         "of each five logs, in the order of their manoeuvres, one is for validation and one for the"
         " test, of eight logs or more three at least"
     )
-    if called_splits(list(usable.values())):
-        why = "folders or files are called after the splits"
-    parts: dict[str, list[_Part]] = {split: [] for split in SPLITS}
-    for split, logs in divided(list(usable.values())).items():
+    if splits_from_names(list(usable_logs.values())):
+        reason = "folders or files are called after the splits"
+    split_entries: dict[str, list[_SplitEntry]] = {split: [] for split in SPLITS}
+    for split, logs in split_logs(list(usable_logs.values())).items():
         for log in logs:
-            ends = log.meta.get("stretch")
+            segment_limits = log.meta.get("stretch")
             # the name of a stretch begins with that of its log, and may with a shorter one
-            own = [n for n in paths if n == log.name or (ends and log.name.startswith(n))]
-            path = paths[max(own, key=len)]
-            entry: Any = path.resolve().relative_to(common).as_posix()
-            time = read.lasting[path]
-            if ends:
-                why, source = "few logs: each is cut in time", usable[path]
+            matching_names = [
+                n for n in paths if n == log.name or (segment_limits and log.name.startswith(n))
+            ]
+            path = paths[max(matching_names, key=len)]
+            entry: Any = path.resolve().relative_to(common_folder).as_posix()
+            duration = draft_logs.longest_times[path]
+            if segment_limits:
+                reason, source = "few logs: each is cut in time", usable_logs[path]
                 entry = {"log": entry}
-                entry |= {"from": f"{ends[0]:.13g} s"} if ends[0] > source.t[0] else {}
-                entry |= {"to": f"{ends[1]:.13g} s"} if ends[1] < source.t[-1] else {}
+                entry |= (
+                    {"from": f"{segment_limits[0]:.13g} s"}
+                    if segment_limits[0] > source.t[0]
+                    else {}
+                )
+                entry |= (
+                    {"to": f"{segment_limits[1]:.13g} s"}
+                    if segment_limits[1] < source.t[-1]
+                    else {}
+                )
                 try:
-                    time = read.longest(stretch_of(read.logs[path], *ends))
+                    duration = draft_logs.longest_gapless_time(
+                        extract_segment(draft_logs.logs[path], *segment_limits)
+                    )
                 except DataError:
-                    time = 0.0
-            if time:
-                parts[split].append((entry, log, time))
+                    duration = 0.0
+            if duration:
+                split_entries[split].append((entry, log, duration))
             else:
                 text = f"{log.name} is left out: its gaps leave no stretch to learn from"
-                marks.note(("data", "split"), text)
-        if logs and not parts[split]:
+                draft_notes.add_note(("data", "split"), text)
+        if logs and not split_entries[split]:
             raise DataError(
                 f"the logs hold nothing for {split}: in {', '.join(log.name for log in logs)[:120]}"
                 " no stretch without a gap is as long as the window of the derivative; fill gaps"
                 " that may be interpolated, or give longer logs"
             )
-    marks.guess(("data", "split"), f"{why}; logs of one day may be alike, so check the choice")
-    return root, parts
+    draft_notes.add_guess(
+        ("data", "split"), f"{reason}; logs of one day may be alike, so check the choice"
+    )
+    return root, split_entries
 
 
-def _judge_long_ones(parts: dict[str, list[_Part]], memory: float, marks: Marks) -> None:
+def _move_short_logs_to_training(
+    split_entries: dict[str, list[_SplitEntry]], memory_time: float, draft_notes: DraftNotes
+) -> None:
     """Learn from the logs that are too short to be judged on, but for the last one of a split."""
-    from residnet.identification.recipe import protocols, window_length
+    from residnet.identification.recipe import choose_window_length, make_protocols
 
     for name in SPLITS[1:]:
-        laid = protocols(window_length([time for *_, time in parts[name]], memory)).values()
-        shortest = 1.2 * min(float(entry["length"].split()[0]) for entry in laid)
-        for part in list(parts[name]):
-            if part[2] < shortest and len(parts[name]) > 1:
-                parts[name].remove(part)
-                parts["train"].append(part)
-                marks.note(("data", "split"), f"{part[1].name} is too short to be judged on")
+        protocol_settings = make_protocols(
+            choose_window_length([time for *_, time in split_entries[name]], memory_time)
+        ).values()
+        shortest = 1.2 * min(float(entry["length"].split()[0]) for entry in protocol_settings)
+        for split_entry in list(split_entries[name]):
+            if split_entry[2] < shortest and len(split_entries[name]) > 1:
+                split_entries[name].remove(split_entry)
+                split_entries["train"].append(split_entry)
+                draft_notes.add_note(
+                    ("data", "split"), f"{split_entry[1].name} is too short to be judged on"
+                )
 
 
-_PASSIVE = (
-    *(*STATE, *ACCELERATION, *SIX.moving, "latitude", "longitude", *QUATERNION),
-    *(*WIND_INPUTS, *BOW_WIND, "current_north", "current_east"),
+_NON_INPUT_CHANNELS = (
+    *(
+        *STATE_NAMES,
+        *ACCELERATION_NAMES,
+        *SIX_DOF_LAYOUT.dynamic_states,
+        "latitude",
+        "longitude",
+        *QUATERNION,
+    ),
+    *(*WIND_INPUTS, *BOW_WIND_CHANNELS, "current_north", "current_east"),
 )
-_STILL = 2e-3
+_MIN_RELATIVE_STD = 2e-3
 """Spread of an input, as a share of its size, below which it stays where it is."""
-_SAME = 0.9995
+_MIN_DUPLICATE_CORRELATION = 0.9995
 """Correlation from which two inputs count as one."""
-_MOST = 8
+_MAX_INPUTS = 8
 """Most inputs that a drafted config takes."""
-_FORCES = ("tau_x", "tau_y", "tau_n")
+_FORCE_CHANNELS = ("tau_x", "tau_y", "tau_n")
 
 
-def driving(logs: Sequence[Log], marks: Marks) -> tuple[str, ...]:
+def choose_inputs(logs: Sequence[Log], draft_notes: DraftNotes) -> tuple[str, ...]:
     """Return the channels that drive the vessel; empty where the logs hold none.
 
     Those that stay where they are, what was ordered beside what was measured, and one of two that
@@ -429,144 +545,199 @@ def driving(logs: Sequence[Log], marks: Marks) -> tuple[str, ...]:
 
     Args:
         logs: in SI.
-        marks: is told what was left out and why.
+        draft_notes: is told what was left out and why.
     """
     values = {
         name: np.concatenate([log[name] for log in logs])
         for name in logs[0].channels
-        if name not in _PASSIVE and all(name in log.channels for log in logs)
+        if name not in _NON_INPUT_CHANNELS and all(name in log.channels for log in logs)
     }
     # the signals of a control loop: of e_yaw, r_yaw, u_yaw and y_yaw the second drives the vessel
-    loops = {
+    control_loops = {
         n[2:] for n in values if n.startswith("y_") and {f"u{n[1:]}", f"r{n[1:]}"} <= {*values}
     }
-    own = {f"{signal}_{loop}" for loop in loops for signal in "eruy"}
-    acting = [
+    loop_signals = {f"{signal}_{loop}" for loop in control_loops for signal in "eruy"}
+    actuator_names = [
         name
         for name in values
-        if (name in own and name[0] == "u") or (name not in own and _acts(name, marks))
+        if (name in loop_signals and name[0] == "u")
+        or (name not in loop_signals and _is_actuator_name(name, draft_notes))
     ]
-    if loops:
-        marks.guess(
-            INPUTS, f"u_{min(loops)} is taken as what a controller asks for, by the names beside it"
+    if control_loops:
+        draft_notes.add_guess(
+            INPUTS_KEY,
+            f"u_{min(control_loops)} is taken as what a controller asks for, by the names beside it",
         )
-    names = [name for name in acting if _moves(name, values[name], marks)]
-    names = _measured(_forces(logs, names, marks), marks)
-    out: list[str] = []
+    names = [name for name in actuator_names if _is_excited(name, values[name], draft_notes)]
+    names = _prefer_measured_inputs(_choose_force_set(logs, names, draft_notes), draft_notes)
+    inputs: list[str] = []
     for name in names:
-        twin = next((other for other in out if _alike(values[name], values[other])), None)
-        if twin is None:
-            out.append(name)
+        duplicate = next(
+            (
+                selected_input
+                for selected_input in inputs
+                if _are_duplicates(values[name], values[selected_input])
+            ),
+            None,
+        )
+        if duplicate is None:
+            inputs.append(name)
             continue
-        if name in CHANNEL_UNITS and twin not in CHANNEL_UNITS:
+        if name in CHANNEL_UNITS and duplicate not in CHANNEL_UNITS:
             # an angle or revolutions say more than a share or pulses
-            out[out.index(twin)], name, twin = name, twin, name
-        marks.guess(INPUTS, f"{name} moves as {twin} does in every log, and is left out")
-    if len(out) > _MOST:
-        marks.guess(INPUTS, f"of {len(out)} possible inputs the first {_MOST} are taken")
-    return tuple(out[:_MOST])
+            inputs[inputs.index(duplicate)], name, duplicate = name, duplicate, name
+        draft_notes.add_guess(
+            INPUTS_KEY, f"{name} moves as {duplicate} does in every log, and is left out"
+        )
+    if len(inputs) > _MAX_INPUTS:
+        draft_notes.add_guess(
+            INPUTS_KEY, f"of {len(inputs)} possible inputs the first {_MAX_INPUTS} are taken"
+        )
+    return tuple(inputs[:_MAX_INPUTS])
 
 
-def _acts(name: str, marks: Marks) -> bool:
+def _is_actuator_name(name: str, draft_notes: DraftNotes) -> bool:
     """Return whether the name of a channel does not say that it measures something else."""
-    words = words_of(name)
-    if input_channel(words) is not None:
+    parsed_name = parse_name(name)
+    if match_input_channel(parsed_name) is not None:
         return True
-    passive = not words.lacks("voltage", "age", "depth", "index", "machinery")
-    if passive or state_channel(words) is not None:
-        marks.note(INPUTS, f"{name} is left out: by its name it drives nothing")
+    is_passive = not parsed_name.has_none("voltage", "age", "depth", "index", "machinery")
+    if is_passive or match_state_channel(parsed_name) is not None:
+        draft_notes.add_note(INPUTS_KEY, f"{name} is left out: by its name it drives nothing")
         return False
-    marks.guess(INPUTS, f"{name} is taken, though its name does not say what it drives")
+    draft_notes.add_guess(
+        INPUTS_KEY, f"{name} is taken, though its name does not say what it drives"
+    )
     return True
 
 
-def _moves(name: str, values: np.ndarray, marks: Marks) -> bool:
-    known = values[np.isfinite(values)]
-    if known.size > 1 and float(np.std(known)) > _STILL * float(np.abs(known).max()):
+def _is_excited(name: str, values: np.ndarray, draft_notes: DraftNotes) -> bool:
+    finite_values = values[np.isfinite(values)]
+    if finite_values.size > 1 and float(np.std(finite_values)) > _MIN_RELATIVE_STD * float(
+        np.abs(finite_values).max()
+    ):
         return True
-    level = float(np.median(known)) if known.size else 0.0
-    marks.guess(INPUTS, f"{name} stays at {level:.4g}: its effect cannot be told, it is left out")
+    level = float(np.median(finite_values)) if finite_values.size else 0.0
+    draft_notes.add_guess(
+        INPUTS_KEY, f"{name} stays at {level:.4g}: its effect cannot be told, it is left out"
+    )
     return False
 
 
-def _forces(logs: Sequence[Log], names: Sequence[str], marks: Marks) -> list[str]:
+def _choose_force_set(
+    logs: Sequence[Log], names: Sequence[str], draft_notes: DraftNotes
+) -> list[str]:
     """Return one set of forces where there are any; it stands for all actuators."""
-    sets: dict[str, list[str]] = {}
+    force_sets: dict[str, list[str]] = {}
     for name in names:
-        force = next((f for f in _FORCES if name == f or name.startswith(f"{f}_")), None)
+        force = next((f for f in _FORCE_CHANNELS if name == f or name.startswith(f"{f}_")), None)
         if force is not None:
-            sets.setdefault(name.removeprefix(force), []).append(name)
-    shares = {tuple(found): _explained(logs, found) for found in sets.values() if len(found) > 1}
-    if not shares:
+            force_sets.setdefault(name.removeprefix(force), []).append(name)
+    explained_shares = {
+        tuple(force_names): _explained_variance(logs, force_names)
+        for force_names in force_sets.values()
+        if len(force_names) > 1
+    }
+    if not explained_shares:
         return list(names)
-    told = ", ".join(f"{', '.join(found)}: {share:.2f}" for found, share in shares.items())
-    marks.guess(
-        INPUTS, f"forces stand for all actuators; share of the accelerations explained: {told}"
+    shares_text = ", ".join(
+        f"{', '.join(force_names)}: {share:.2f}" for force_names, share in explained_shares.items()
     )
-    return list(max(shares.items(), key=lambda pair: pair[1])[0])
+    draft_notes.add_guess(
+        INPUTS_KEY,
+        f"forces stand for all actuators; share of the accelerations explained: {shares_text}",
+    )
+    return list(max(explained_shares.items(), key=lambda pair: pair[1])[0])
 
 
-def _explained(logs: Sequence[Log], names: Sequence[str]) -> float:
+def _explained_variance(logs: Sequence[Log], names: Sequence[str]) -> float:
     """Return the mean share of the accelerations that velocities and inputs explain in a line."""
-    rows, grown = [], []
+    rows, velocity_changes = [], []
     for log in logs:
-        wanted = [name for name in (*STATE[3:], *names) if name in log.channels]
-        if len(wanted) < 3 + len(names):
+        columns = [name for name in (*STATE_NAMES[3:], *names) if name in log.channels]
+        if len(columns) < 3 + len(names):
             continue
-        table = log.stack(wanted)
-        span = max(1, round(1.0 / float(np.median(np.diff(log.t)))))
-        known = np.isfinite(table).all(axis=1)
-        both = known[span:] & known[:-span]
-        rows.append(table[:-span][both])
-        grown.append((table[span:, :3] - table[:-span, :3])[both])
+        table = log.stack(columns)
+        horizon = max(1, round(1.0 / float(np.median(np.diff(log.t)))))
+        is_finite = np.isfinite(table).all(axis=1)
+        is_usable = is_finite[horizon:] & is_finite[:-horizon]
+        rows.append(table[:-horizon][is_usable])
+        velocity_changes.append((table[horizon:, :3] - table[:-horizon, :3])[is_usable])
     if not rows or sum(map(len, rows)) < 50:
         return 0.0
-    x, y = np.concatenate(rows), np.concatenate(grown)
-    x = np.column_stack(((x - x.mean(0)) / np.maximum(x.std(0), 1e-12), np.ones(len(x))))
-    left = y - x @ np.linalg.lstsq(x, y, rcond=1e-9)[0]
-    return float((1.0 - left.var(axis=0) / np.maximum(y.var(axis=0), 1e-300)).mean())
+    regressors, responses = np.concatenate(rows), np.concatenate(velocity_changes)
+    regressors = np.column_stack(
+        (
+            (regressors - regressors.mean(0)) / np.maximum(regressors.std(0), 1e-12),
+            np.ones(len(regressors)),
+        )
+    )
+    residual = responses - regressors @ np.linalg.lstsq(regressors, responses, rcond=1e-9)[0]
+    return float((1.0 - residual.var(axis=0) / np.maximum(responses.var(axis=0), 1e-300)).mean())
 
 
-def _measured(names: Sequence[str], marks: Marks) -> list[str]:
+def _prefer_measured_inputs(names: Sequence[str], draft_notes: DraftNotes) -> list[str]:
     """Return the channels without commands whose outcome is measured, and thrust beside turns."""
-    turning = [name for name in names if name == "n" or name.startswith("n_")]
-    out = []
+    shaft_inputs = [name for name in names if name == "n" or name.startswith("n_")]
+    selected = []
     for name in names:
-        bare = name.removeprefix("cmd_")
-        partners = [bare, f"n_{bare}"] if bare != name else []
-        found = next((other for other in partners if other in names and other != name), None)
-        if found is not None:
-            marks.guess(INPUTS, f"{found} is taken as measured, and not what was ordered ({name})")
+        base_name = name.removeprefix("cmd_")
+        measured_names = [base_name, f"n_{base_name}"] if base_name != name else []
+        measured_name = next(
+            (
+                measured_candidate
+                for measured_candidate in measured_names
+                if measured_candidate in names and measured_candidate != name
+            ),
+            None,
+        )
+        if measured_name is not None:
+            draft_notes.add_guess(
+                INPUTS_KEY,
+                f"{measured_name} is taken as measured, and not what was ordered ({name})",
+            )
         elif name.removesuffix("_rate") in {*names} - {name}:
-            marks.note(INPUTS, f"{name} is left out beside {name.removesuffix('_rate')}")
-        elif name.removeprefix("cmd_").startswith("thrust") and turning:
-            marks.note(INPUTS, f"{name} is left out beside {turning[0]}: it follows from it")
+            draft_notes.add_note(
+                INPUTS_KEY, f"{name} is left out beside {name.removesuffix('_rate')}"
+            )
+        elif name.removeprefix("cmd_").startswith("thrust") and shaft_inputs:
+            draft_notes.add_note(
+                INPUTS_KEY, f"{name} is left out beside {shaft_inputs[0]}: it follows from it"
+            )
         else:
-            out.append(name)
-    return out
+            selected.append(name)
+    return selected
 
 
-def _alike(a: np.ndarray, b: np.ndarray) -> bool:
-    known = np.isfinite(a) & np.isfinite(b)
-    if known.sum() < 10 or min(float(np.std(a[known])), float(np.std(b[known]))) == 0.0:
+def _are_duplicates(first: np.ndarray, second: np.ndarray) -> bool:
+    is_finite = np.isfinite(first) & np.isfinite(second)
+    if (
+        is_finite.sum() < 10
+        or min(float(np.std(first[is_finite])), float(np.std(second[is_finite]))) == 0.0
+    ):
         return False
-    return abs(float(np.corrcoef(a[known], b[known])[0, 1])) > _SAME
+    return (
+        abs(float(np.corrcoef(first[is_finite], second[is_finite])[0, 1]))
+        > _MIN_DUPLICATE_CORRELATION
+    )
 
 
-def lacks(names: Sequence[str], live: Live = ALIVE) -> str:
+def missing_control(names: Sequence[str], dof: DegreesOfFreedom = SURGE_SWAY_YAW) -> str:
     """Return what no input does, `drives` or `steers`; empty where both are done.
 
     A vessel that does not turn needs none that steers, one that does not move none that drives.
 
     Forces, thrusters that turn, and several thrusters do both.
     """
-    plain = [name.removeprefix("cmd_") for name in names if not PLANES.match(name)]
-    steering = [name.startswith("delta") for name in plain]
-    driving = [name in ("n", "thrust", "throttle") for name in plain]
+    base_names = [name.removeprefix("cmd_") for name in names if not PLANE_PATTERN.match(name)]
+    is_steering = [name.startswith("delta") for name in base_names]
+    is_driving = [name in ("n", "thrust", "throttle") for name in base_names]
     # one whose name says neither may do either
-    rest = [n for n, s, d in zip(plain, steering, driving, strict=True) if not (s or d)]
-    both = any(name.startswith(("tau", "azimuth", "nozzle")) for name in rest)
-    if both or any(steering) + any(driving) + len(rest) > 1:
+    undetermined = [
+        n for n, s, d in zip(base_names, is_steering, is_driving, strict=True) if not (s or d)
+    ]
+    has_both = any(name.startswith(("tau", "azimuth", "nozzle")) for name in undetermined)
+    if has_both or any(is_steering) + any(is_driving) + len(undetermined) > 1:
         return ""
-    lacking = "drives" if any(steering) else "steers"
-    return lacking if {"drives": live.moves, "steers": live.turns}[lacking] else ""
+    missing = "drives" if any(is_steering) else "steers"
+    return missing if {"drives": dof.has_position, "steers": dof.has_heading}[missing] else ""

@@ -12,55 +12,55 @@ from pydantic import PrivateAttr, model_validator
 
 from residnet.core.config import Config, dump_config
 from residnet.core.errors import DataError, UsageError
-from residnet.core.names import nearest
-from residnet.core.progress import begin, say
-from residnet.data.simulated import SimulatedTrials, stand_ins
-from residnet.data.sources import DataConfig, Splits, input_files, read_logs
-from residnet.documents import STUDY_MODELS, StudyName, study_sections
+from residnet.core.names import suggest_name
+from residnet.core.progress import begin_stage, log_message
+from residnet.data.simulated import SimulatedTrials, make_dummy_logs
+from residnet.data.sources import DataConfig, LogsBySplit, list_input_files, read_split_logs
+from residnet.documents import STUDY_MODELS, StudyName, build_study_sections
 from residnet.dynamics.store import load_model, model_names
 from residnet.export.vessel import ExportedVessel
-from residnet.identification.fit import fit
-from residnet.identification.fitter import FittedModel, require_fit
+from residnet.identification.fit import fit_models
+from residnet.identification.fitter import FittedModel, check_fit
 from residnet.identification.identified import (
-    candidates,
-    evaluate,
-    goodness_rows,
-    residual_table,
-    term_table,
+    build_goodness_rows,
+    build_residual_table,
+    build_term_table,
+    evaluate_splits,
+    make_candidates,
 )
 from residnet.identification.prepared import (
-    prepare_logs,
-    require_window,
-    through_currents,
+    check_window_fits,
+    convert_to_motion_through_water,
+    prepare_splits,
 )
-from residnet.identification.settings import FitSettings, require_known
+from residnet.identification.settings import FitSettings, check_known_names
 from residnet.judge.band import bands_content
 from residnet.judge.booklet import BookletConfig
-from residnet.judge.goodness import content
-from residnet.judge.soundness import sanity_content
-from residnet.judge.verdict import level as verdict_level
-from residnet.judge.verdict import objections
-from residnet.judge.verdict import verdict as verdict_sentences
+from residnet.judge.goodness import build_goodness_content
+from residnet.judge.soundness import build_sanity_content
+from residnet.judge.verdict import list_model_objections
+from residnet.judge.verdict import rate_model as verdict_level
+from residnet.judge.verdict import write_verdict as verdict_sentences
 from residnet.report.blocks import Section
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections.verdict import evidence
+from residnet.report.sections.verdict import collect_evidence
 from residnet.runs.folder import Provenance, RunFolder, require_apart
-from residnet.runs.model_store import FolderStore
-from residnet.runs.task import ComputingTask, ExportRequest, Finished, Outcome
+from residnet.runs.model_store import RunModelStore
+from residnet.runs.task import ComputingTask, ExportRequest, FinishedRun, TaskOutcome
 from residnet.tasks.booklet import require_flyable, write_booklet
 from residnet.tasks.fit_outcome import (
-    SPLIT,
-    external_logs,
-    fit_outcome,
-    limit_of,
+    EXTERNAL_SPLIT,
+    build_fit_outcome,
+    divergence_limit,
+    read_external_logs,
+    write_evaluation,
     write_inspection,
-    write_judged,
 )
 
 if TYPE_CHECKING:
-    from residnet.tasks.fit_service import PlannedTrials, RefitRun, WatchedLog
+    from residnet.tasks.fit_service import MonitoredLog, NextTrials, RefitResult
 
-_CHOSEN = ("predictor", "selected")
+_MODEL_ALIASES = ("predictor", "selected")
 """What stands for a model's name: the one reported first, and the single one chosen."""
 
 
@@ -93,25 +93,33 @@ class FitConfig(FitSettings, ComputingTask):
     booklet: BookletConfig | None = None
     export: ExportConfig = ExportConfig()
 
-    verbs: ClassVar[tuple[str, ...]] = ("report", "evaluate", "export", "monitor", "plan-trial")
-    _checked: Splits | None = PrivateAttr(None)
+    supported_commands: ClassVar[tuple[str, ...]] = (
+        "report",
+        "evaluate",
+        "export",
+        "monitor",
+        "plan-trial",
+    )
+    _checked_logs: LogsBySplit | None = PrivateAttr(None)
 
     @model_validator(mode="after")
-    def _outputs(self) -> FitConfig:
+    def _validate_outputs(self) -> FitConfig:
         if self.booklet is not None:
-            require_known("booklet.model", (self.booklet.model,), self.refit, "refitted baseline")
-            self.booklet.rudder()
+            check_known_names(
+                "booklet.model", (self.booklet.model,), self.refit, "refitted baseline"
+            )
+            self.booklet.steering_input()
         if self.study is not None:
-            absent = [m for m in STUDY_MODELS[self.study] if m not in self.model_names]
-            if absent:
+            missing_models = [m for m in STUDY_MODELS[self.study] if m not in self.model_names]
+            if missing_models:
                 raise ValueError(
                     f"study: {self.study} shows the models {', '.join(STUDY_MODELS[self.study])};"
-                    f" '{absent[0]}' is absent; give it, or leave the study out (study=null)"
+                    f" '{missing_models[0]}' is absent; give it, or leave the study out (study=null)"
                 )
-        known = ("predictor", "selected", *self.model_names)
-        require_known("export.models", self.export.models, known, "model")
+        valid_names = ("predictor", "selected", *self.model_names)
+        check_known_names("export.models", self.export.models, valid_names, "model")
         if isinstance(self.data, SimulatedTrials):
-            self.data.splits(self.data.draw())
+            self.data.assign_splits(self.data.draw_manoeuvres())
             if abs(self.data.step - self.prepare.grid.step) > 1e-9:
                 raise ValueError(
                     f"prepare.grid.step ({self.prepare.grid.step:g} s) must equal data.step"
@@ -120,19 +128,19 @@ class FitConfig(FitSettings, ComputingTask):
         return self
 
     def input_files(self) -> list[Path]:
-        return input_files(self.data)
+        return list_input_files(self.data)
 
-    def recorded_seed(self) -> int:
+    def provenance_seed(self) -> int:
         return self.seed
 
-    def logs(self) -> Splits:
+    def load_logs(self) -> LogsBySplit:
         """Return the logs by split; those that a check has just read are not read again.
 
         Raises:
             ResidnetError: where a file is missing or its contents cannot be used.
         """
-        known, self._checked = self._checked, None
-        return known or read_logs(self.data)
+        cached_logs, self._checked_logs = self._checked_logs, None
+        return cached_logs or read_split_logs(self.data)
 
     def check(self) -> None:
         """Check that the logs hold what every part of the fit asks for, without fitting.
@@ -145,22 +153,22 @@ class FitConfig(FitSettings, ComputingTask):
         """
         settings = self
         if isinstance(self.data, SimulatedTrials):
-            logs: Splits = {"train": [], "validation": [], "test": []}
-            drawn = self.data.splits(self.data.draw())
-            for log, split in zip(stand_ins(self.data), drawn, strict=True):
+            logs: LogsBySplit = {"train": [], "validation": [], "test": []}
+            split_names = self.data.assign_splits(self.data.draw_manoeuvres())
+            for log, split in zip(make_dummy_logs(self.data), split_names, strict=True):
                 logs[split].append(log)
             # what masks leave of a motion is not known before it is flown
             prepare = self.prepare.model_copy(update={"masks": ()})
             settings = self.model_copy(update={"prepare": prepare})
         else:
-            self._checked = logs = self.logs()
-        fitter = require_fit(prepare_logs(logs, settings), self)
+            self._checked_logs = logs = self.load_logs()
+        fitter = check_fit(prepare_splits(logs, settings), self)
         if self.booklet is not None:
             name = self.booklet.model
-            spec = fitter.spec(name, "baseline", self.all_baselines[name])
+            spec = fitter.build_spec(name, "baseline", self.all_baselines[name])
             require_flyable(self.booklet, FittedModel(spec, spec.build(), {}))
 
-    def carry_out(self, folder: RunFolder) -> Outcome:
+    def execute(self, folder: RunFolder) -> TaskOutcome:
         """Fit all models, judge them in free run, and write what was found.
 
         Logs that ran in currents are taken through the water.
@@ -168,42 +176,55 @@ class FitConfig(FitSettings, ComputingTask):
         Raises:
             ResidnetError: where the logs cannot be used, or do not determine a model.
         """
-        begin(f"{self.name}: reading logs")
-        read = self.logs()
-        write_inspection(folder, read, self)
-        logs = prepare_logs(read, self)
-        say("  " + ", ".join(f"{split} {len(members)} logs" for split, members in logs.items()))
-        logs, currents = through_currents(logs, self)
+        begin_stage(f"{self.name}: reading logs")
+        raw_logs = self.load_logs()
+        write_inspection(folder, raw_logs, self)
+        logs = prepare_splits(raw_logs, self)
+        log_message(
+            "  " + ", ".join(f"{split} {len(members)} logs" for split, members in logs.items())
+        )
+        logs, currents = convert_to_motion_through_water(logs, self)
         if self.current is not None:
             folder.write_json(folder.path / "currents.json", currents)
-        identified = fit(logs, self, store=FolderStore(folder))
-        begin("free runs")
-        fitted, step = list(identified.values()), self.prepare.grid.step
+        identified_models = fit_models(logs, self, store=RunModelStore(folder))
+        begin_stage("free runs")
+        fitted_models, time_step = list(identified_models.values()), self.prepare.grid.step
         if self.bands is not None:
-            bands = {entry.name: entry.bands for entry in fitted}
+            bands = {entry.name: entry.bands for entry in fitted_models}
             folder.write_json(folder.bands, bands_content(self.name, bands))
-        held = {str(split): logs[split] for split in self.evaluation.splits}
-        judged = identified.evaluate(held, self.data)
-        chosen = identified.select(judged)
-        told = "" if chosen.leading is None else f"; predictor: {chosen.leading}"
-        say(f"  selected: {chosen.selected}{told}")
-        folder.write_json(folder.selection, chosen.content())
-        folder.write_json(folder.sanity, sanity_content(identified.findings))
-        names = (chosen.selected, chosen.selected_ensemble, chosen.predictor)
-        write_judged(folder, self, judged, names, logs)
-        for place, found in {
-            folder.residuals: residual_table(fitted, logs["test"]),
-            folder.path / "terms.parquet": term_table(fitted, logs["test"]),
+        evaluation_logs = {str(split): logs[split] for split in self.evaluation.splits}
+        evaluations = identified_models.evaluate(evaluation_logs, self.data)
+        selection = identified_models.select_models(evaluations)
+        predictor_text = (
+            ""
+            if selection.default_ensemble is None
+            else f"; predictor: {selection.default_ensemble}"
+        )
+        log_message(f"  selected: {selection.selected}{predictor_text}")
+        folder.write_json(folder.selection, selection.to_json())
+        folder.write_json(folder.sanity, build_sanity_content(identified_models.sanity_findings))
+        names = (selection.selected, selection.selected_ensemble, selection.default_model)
+        write_evaluation(folder, self, evaluations, names, logs)
+        for table_path, result_table in {
+            folder.residuals: build_residual_table(fitted_models, logs["test"]),
+            folder.path / "terms.parquet": build_term_table(fitted_models, logs["test"]),
         }.items():
-            if len(found):
-                folder.write_table(place, found)
-        splits = goodness_rows(fitted, logs, step)
-        folder.write_json(folder.goodness, content(self.name, splits, step))
+            if len(result_table):
+                folder.write_table(table_path, result_table)
+        goodness_by_split = build_goodness_rows(fitted_models, logs, time_step)
+        folder.write_json(
+            folder.goodness, build_goodness_content(self.name, goodness_by_split, time_step)
+        )
         failure = ""
         if self.booklet is not None:
-            refitted = identified[self.booklet.model]
+            refitted = identified_models[self.booklet.model]
             try:
-                say("  " + write_booklet(folder, self.booklet, refitted, logs, identified.limit))
+                log_message(
+                    "  "
+                    + write_booklet(
+                        folder, self.booklet, refitted, logs, identified_models.velocity_limits
+                    )
+                )
             except DataError as error:
                 # the fit itself is done, and its report is worth having
                 failure = str(error)
@@ -211,7 +232,7 @@ class FitConfig(FitSettings, ComputingTask):
             name: partial(self.export_model, ExportRequest(folder, name))
             for name in self.export.models
         }
-        return fit_outcome(folder, "test", exports, failure)
+        return build_fit_outcome(folder, "test", exports, failure)
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
@@ -220,27 +241,27 @@ class FitConfig(FitSettings, ComputingTask):
         files = RunFiles(run.path)
         write_fit_figures(files)
         sections = fit_sections(files)
-        study = files.resolved.get("study")
+        study = files.resolved_config.get("study")
         if study is not None and "test" in files.splits:
-            sections += study_sections(study, run.path)
+            sections += build_study_sections(study, run.path)
         return sections
 
-    def evaluate_on(
+    def evaluate_on_logs(
         self,
         run: RunFolder,
         logs: Sequence[Path],
-        out: Path | None,
+        output_folder: Path | None,
         *,
         resume: bool = False,
         overwrite: bool = False,
-    ) -> Finished:
+    ) -> FinishedRun:
         """Free-run every model of a fit on logs that it has never seen.
 
         Its reader, masks, protocols and scales are used; `zero` comes first, then the config's
         order.
 
         Args:
-            out: folder of the results; RUN/external-<time> where none is given.
+            output_folder: folder of the results; RUN/external-<time> where none is given.
             resume: carry out an interrupted evaluation of the same logs again in its folder.
             overwrite: replace an earlier evaluation in its folder.
 
@@ -248,48 +269,55 @@ class FitConfig(FitSettings, ComputingTask):
             DataError: where a log cannot be used or is too short.
             UsageError: where a path or a channel is missing, or the folder may not be used.
         """
-        place = out or run.path / time.strftime("external-%Y%m%dT%H%M%S")
+        folder_path = output_folder or run.path / time.strftime("external-%Y%m%dT%H%M%S")
         resolved = dump_config(self)
         # before the logs are read, which may take long
-        require_apart(place, [run.resolved])
-        RunFolder(place).require(resolved, resume=resume, overwrite=overwrite)
-        files, read, prepared = external_logs(self, logs)
+        require_apart(folder_path, [run.resolved_config])
+        RunFolder(folder_path).require_usable(resolved, resume=resume, overwrite=overwrite)
+        input_paths, raw_logs, prepared = read_external_logs(self, logs)
         for log in prepared:
-            require_window(log, self)
-        made_from = Provenance(run.resolved, (), self.seed, files, time.time())
+            check_window_fits(log, self)
+        provenance = Provenance(run.resolved_config, (), self.seed, input_paths, time.time())
         if resume:
-            made_from.require_same_inputs(RunFolder(place))
+            provenance.require_same_inputs(RunFolder(folder_path))
         if overwrite:
-            require_apart(place, files)
+            require_apart(folder_path, input_paths)
 
-        def judge(folder: RunFolder) -> Outcome:
-            store, order = FolderStore(run), ["zero", *self.model_names]
-            fitted = [store.load(name) for name in store.names()]
-            fitted.sort(key=lambda model: (*order, model.name).index(model.name))
-            say(f"{self.name}: {len(prepared)} logs, {len(fitted)} models")
-            write_inspection(folder, {SPLIT: read}, self)
-            simulated = isinstance(self.data, SimulatedTrials) and all(
-                "vessel" in log.meta for log in read
+        def evaluate_models(folder: RunFolder) -> TaskOutcome:
+            store, model_order = RunModelStore(run), ["zero", *self.model_names]
+            fitted_models = [store.load(name) for name in store.names()]
+            fitted_models.sort(key=lambda model: (*model_order, model.name).index(model.name))
+            log_message(f"{self.name}: {len(prepared)} logs, {len(fitted_models)} models")
+            write_inspection(folder, {EXTERNAL_SPLIT: raw_logs}, self)
+            is_simulated = isinstance(self.data, SimulatedTrials) and all(
+                "vessel" in log.meta for log in raw_logs
             )
-            models = [c for c in candidates(fitted, self.data) if c.kind != "truth" or simulated]
-            limit = limit_of(fitted[0].spec, self)
-            judged = evaluate(
-                models, {SPLIT: prepared}, self.evaluation, self.prepare.grid.step, limit
+            models = [
+                candidate
+                for candidate in make_candidates(fitted_models, self.data)
+                if candidate.model_kind != "truth" or is_simulated
+            ]
+            limit = divergence_limit(fitted_models[0].spec, self)
+            evaluations = evaluate_splits(
+                models, {EXTERNAL_SPLIT: prepared}, self.evaluation, self.prepare.grid.step, limit
             )
             # bands, and why the model was selected, are the fit's own; the report shows them
-            for own, copy in ((run.bands, folder.bands), (run.selection, folder.selection)):
-                if own.is_file():
-                    folder.write(copy, own.read_text(encoding="utf-8"))
-            chosen = run.read_metrics()
-            selected = str(chosen["selected"])
-            predictor = str(chosen.get("predictor", selected))
-            names = (selected, chosen.get("selected_ensemble"), predictor)
-            write_judged(folder, self, judged, names, {SPLIT: prepared})
-            return fit_outcome(folder, SPLIT)
+            for source_path, target_path in (
+                (run.bands, folder.bands),
+                (run.selection, folder.selection),
+            ):
+                if source_path.is_file():
+                    folder.write(target_path, source_path.read_text(encoding="utf-8"))
+            fit_metrics = run.read_metrics()
+            selected = str(fit_metrics["selected"])
+            predictor = str(fit_metrics.get("predictor", selected))
+            names = (selected, fit_metrics.get("selected_ensemble"), predictor)
+            write_evaluation(folder, self, evaluations, names, {EXTERNAL_SPLIT: prepared})
+            return build_fit_outcome(folder, EXTERNAL_SPLIT)
 
-        with RunFolder(place).held():
-            folder = RunFolder.create(place, resolved, resume=resume, overwrite=overwrite)
-            return self.conduct(folder, made_from, judge)
+        with RunFolder(folder_path).lock():
+            folder = RunFolder.create(folder_path, resolved, resume=resume, overwrite=overwrite)
+            return self.run_in_folder(folder, provenance, evaluate_models)
 
     def monitor(
         self,
@@ -297,43 +325,45 @@ class FitConfig(FitSettings, ComputingTask):
         logs: Sequence[Path],
         model: str,
         settings: Mapping[str, Any],
-        refit: Path | None,
-    ) -> tuple[list[WatchedLog], RefitRun | None]:
+        refit_folder: Path | None,
+    ) -> tuple[list[MonitoredLog], RefitResult | None]:
         """Watch new logs with a model of a finished fit, and refit it to them where that is asked.
 
         Args:
             logs: new logs, in the order of time.
             model: name of the model; `selected` for the one chosen on validation data.
             settings: of `MonitorConfig`.
-            refit: folder of a run for the refitted model; None for no refit.
+            refit_folder: folder of a run for the refitted model; None for no refit.
 
         Raises:
             UsageError: where there is no such model, or the folder may not be used.
             DataError: where a log cannot be used, or clean logs are too few.
         """
-        from residnet.tasks.fit_service import Service, refit_run, require_refit
+        from residnet.tasks.fit_service import FittedModelService, require_refit_folder, run_refit
 
-        if refit is not None:
-            require_refit(run, refit, self)
-        service = Service(self, run, logs, model, settings)
-        return service.watched(), None if refit is None else refit_run(service, refit)
+        if refit_folder is not None:
+            require_refit_folder(run, refit_folder, self)
+        service = FittedModelService(self, run, logs, model, settings)
+        return service.monitor_logs(), None if refit_folder is None else run_refit(
+            service, refit_folder
+        )
 
-    def plan_trial(self, run: RunFolder, model: str, limits: Mapping[str, Any]) -> PlannedTrials:
+    def plan_trial(self, run: RunFolder, model: str, trial_limits: Mapping[str, Any]) -> NextTrials:
         """Plan the next trials for a refitted baseline of a finished fit.
 
         Args:
             model: name of the baseline; empty for the booklet's, else the first that was refitted.
-            limits: of `TrialLimits`.
+            trial_limits: of `TrialLimits`.
 
         Raises:
             UsageError: where the run has no such refitted baseline, or no input steers.
             DataError: where no candidate stays within the limits.
         """
-        from residnet.tasks.fit_service import plan_trials
+        from residnet.tasks.fit_service import plan_next_trials
 
-        return plan_trials(self, run, model, limits)
+        return plan_next_trials(self, run, model, trial_limits)
 
-    def export_model(self, asked: ExportRequest) -> Path:
+    def export_model(self, request: ExportRequest) -> Path:
         """Export one model of a fit, and return the file.
 
         `predictor` stands for the one that is reported first, `selected` for the single one chosen
@@ -344,17 +374,23 @@ class FitConfig(FitSettings, ComputingTask):
             WithheldError: where it is worse than doing without it, but for `asked.anyway`.
             ExportError: where the exported model does not agree with the one that it came from.
         """
-        run, name, metrics = asked.run, asked.model, asked.run.read_metrics()
-        chosen = str(metrics.get(name, metrics["selected"])) if name in _CHOSEN else name
-        known = model_names(run.models)
-        if chosen not in known:
-            raise UsageError(f"{run.path}: no model '{name}'{nearest(name, [*_CHOSEN, *known])}")
-        spec, model = load_model(run.models / chosen)
+        run, name, metrics = request.run, request.model, request.run.read_metrics()
+        model_name = str(metrics.get(name, metrics["selected"])) if name in _MODEL_ALIASES else name
+        available_models = model_names(run.models)
+        if model_name not in available_models:
+            raise UsageError(
+                f"{run.path}: no model '{name}'{suggest_name(name, [*_MODEL_ALIASES, *available_models])}"
+            )
+        spec, model = load_model(run.models / model_name)
         rows = [
-            row for row in metrics["rows"] if row["model"] == chosen and row["manoeuvre"] == "all"
+            row
+            for row in metrics["rows"]
+            if row["model"] == model_name and row["manoeuvre"] == "all"
         ]
-        found = evidence(RunFiles(run.path), chosen)
+        found = collect_evidence(RunFiles(run.path), model_name)
         # a model without free runs on the split that counts has no verdict
-        sentences = verdict_sentences(found) if chosen in found.rows else []
+        sentences = verdict_sentences(found) if model_name in found.rows_by_model else []
         judged = (verdict_level(found), sentences)
-        return asked.write(ExportedVessel(spec, model, rows), objections(found), chosen, judged)
+        return request.write(
+            ExportedVessel(spec, model, rows), list_model_objections(found), model_name, judged
+        )

@@ -9,29 +9,29 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from residnet.core.log import Log
-from residnet.core.names import CHANNEL_UNITS, END_UNITS, si_unit
-from residnet.core.progress import begin, say
-from residnet.data.drafting.reading import log_files
-from residnet.data.masks import Spike
-from residnet.data.prepare import Prepared, prepare
+from residnet.core.names import CHANNEL_UNITS, POSE_ERROR_UNITS, si_unit
+from residnet.core.progress import begin_stage, log_message
+from residnet.data.drafting.reading import find_log_files
+from residnet.data.masks import SpikeMask
+from residnet.data.prepare import PreparedLog, prepare_log
 from residnet.data.readers.base import CanonicalConfig
 from residnet.data.simulated import SimulatedTrials
-from residnet.data.split import log_names
+from residnet.data.split import assign_log_names
 from residnet.dynamics.store import ModelSpec
-from residnet.identification.identified import Evaluation
-from residnet.identification.prepared import velocity_limit
-from residnet.judge.goodness import repeatability
-from residnet.judge.metrics import LIMITS_SCHEMA, metrics_content, write_rollouts
+from residnet.identification.identified import SplitEvaluation
+from residnet.identification.prepared import compute_velocity_limits
+from residnet.judge.goodness import assess_repeatability
+from residnet.judge.metrics import LIMITS_SCHEMA, build_metrics_content, write_rollouts
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.free_runs import errors_table
-from residnet.report.sections.verdict import level, verdict
+from residnet.report.sections.verdict import verdict_level, verdict_sentences
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import Exports, MainFigure, Outcome
+from residnet.runs.task import ExportWriters, SummaryMetric, TaskOutcome
 
 if TYPE_CHECKING:
     from residnet.tasks.fit import FitConfig
 
-SPLIT = "external"
+EXTERNAL_SPLIT = "external"
 """Name of the split of logs that no fit has seen."""
 
 
@@ -40,71 +40,92 @@ def write_inspection(
 ) -> None:
     """Write doctor.json: what the doctor finds in all logs as the run's masks leave them."""
     # a check does not wait for the doctor
-    from residnet.data.doctor import inspect, inspect_together, inspection, summary
+    from residnet.data.doctor import (
+        build_inspection,
+        inspect_log,
+        inspect_log_set,
+        summarize_inspection,
+    )
 
-    begin("examining logs")
-    inputs, masks = config.signals.columns, (*config.prepare.masks, Spike())
+    begin_stage("examining logs")
+    inputs, masks = config.signals.input_columns, (*config.prepare.masks, SpikeMask())
     logs = [log for members in splits.values() for log in members]
     split_of = {log.name: split for split, members in splits.items() for log in members}
-    reports = [inspect(log, inputs, masks) for log in logs]
-    together = inspect_together(logs, inputs, split_of)
+    reports = [inspect_log(log, inputs, masks) for log in logs]
+    joint_report = inspect_log_set(logs, inputs, split_of)
     for report in reports:
-        for finding in report.find("fill_values"):
-            say(f"  {report.name}: {finding.text}")
-    found = inspection(reports, together)
-    folder.write_json(folder.path / "doctor.json", found)
+        for finding in report.find_by_code("fill_values"):
+            log_message(f"  {report.name}: {finding.text}")
+    inspection_json = build_inspection(reports, joint_report)
+    folder.write_json(folder.path / "doctor.json", inspection_json)
     # the tally stands in the verdict; what may be corrected is told before the fit takes its time
-    if first := summary(found).first:
-        say(f"  {first}")
+    if first_finding := summarize_inspection(inspection_json).first_action:
+        log_message(f"  {first_finding}")
 
 
-def write_judged(
+def write_evaluation(
     folder: RunFolder,
     config: FitConfig,
-    judged: Mapping[str, Evaluation],
+    evaluations: Mapping[str, SplitEvaluation],
     names: tuple[str, str | None, str],
-    logs: Mapping[str, Sequence[Prepared]],
+    logs: Mapping[str, Sequence[PreparedLog]],
 ) -> None:
     """Write what free runs show: rollouts, metrics.json, limits.json and data_quality.json.
 
     Args:
         folder: of the run, or of an evaluation.
-        judged: free runs by split.
+        evaluations: free runs by split.
         names: of the selected model, of the selected mean of models, and of the predictor.
         logs: by split, those that were not judged too.
     """
-    for split, part in judged.items():
+    for split, evaluation in evaluations.items():
         write_rollouts(
-            folder.rollouts / split, part.runs, part.logs, config.signals.columns, part.bands
+            folder.rollouts / split,
+            evaluation.free_runs,
+            evaluation.logs,
+            config.signals.input_columns,
+            evaluation.bands_by_model,
         )
-    scales = config.evaluation.scales.named()
-    states = config.signals.live.states
-    units = {name: si_unit(unit) for name, unit in config.signals.units().items() if name in states}
-    rows = [row for part in judged.values() for row in part.rows]
-    folder.write_json(folder.metrics, metrics_content(config.name, units, scales, *names, rows))
-    commands, step = len(config.signals.inputs), config.prepare.grid.step
-    seen = [log for part in judged.values() for log in part.logs]
+    scales = config.evaluation.scales.to_dict()
+    states = config.signals.dof.state_names
+    units = {
+        name: si_unit(unit)
+        for name, unit in config.signals.channel_units().items()
+        if name in states
+    }
+    rows = [row for evaluation in evaluations.values() for row in evaluation.rows]
+    folder.write_json(
+        folder.metrics, build_metrics_content(config.name, units, scales, *names, rows)
+    )
+    n_commands, step = len(config.signals.inputs), config.prepare.grid.step
+    evaluated_logs = [log for evaluation in evaluations.values() for log in evaluation.logs]
     limits = {
         "schema": LIMITS_SCHEMA,
         "run": config.name,
-        "splits": {split: part.limits for split, part in judged.items()},
+        "splits": {
+            split: evaluation.limits_by_protocol for split, evaluation in evaluations.items()
+        },
         "repeatability": {
-            name: repeatability(protocol, seen, commands, scales, step)
+            name: assess_repeatability(protocol, evaluated_logs, n_commands, scales, step)
             for name, protocol in config.evaluation.protocols.items()
         },
     }
     folder.write_json(folder.limits, limits)
     quality = [
         {
-            **log.described(split),
+            **log.to_table_row(split),
             "masked": {
                 reason: float(np.mean(mask)) for reason, mask in log.log.masks.items() if mask.any()
             },
             "largest": {
-                name: float(np.abs(log.y[log.usable, log.live.states.index(name)]).max())
-                for name in log.live.channels
+                name: float(np.abs(log.y[log.usable, log.dof.state_names.index(name)]).max())
+                for name in log.dof.active_states
             },
-            **({"integrated": made} if (made := log.log.meta.get("integrated")) else {}),
+            **(
+                {"integrated": integrated_channels}
+                if (integrated_channels := log.log.meta.get("integrated"))
+                else {}
+            ),
         }
         for split, members in logs.items()
         for log in members
@@ -112,41 +133,48 @@ def write_judged(
     folder.write_json(folder.data_quality, quality)
 
 
-def fit_outcome(
-    folder: RunFolder, split: str, exports: Exports | None = None, failure: str = ""
-) -> Outcome:
+def build_fit_outcome(
+    folder: RunFolder, split: str, exports: ExportWriters | None = None, failure_message: str = ""
+) -> TaskOutcome:
     """Return the verdict of a fit or an evaluation, and the errors of its selected model.
 
     Args:
         folder: where the results stand.
         split: that is shown.
         exports: what writes each export when the run ends; None for none.
-        failure: a line where a result fails a check.
+        failure_message: a line where a result fails a check.
     """
     files = RunFiles(folder.path)
-    row = files.row(files.lead, split, files.protocols[0])
-    figures: dict[str, MainFigure] = {}
+    row = files.find_row(files.main_model, split, files.protocols[0])
+    summary_metrics: dict[str, SummaryMetric] = {}
     if row is not None:
-        figures = {
-            "nrmse": MainFigure(row["nrmse"]["mean"]),
+        summary_metrics = {
+            "nrmse": SummaryMetric(row["nrmse"]["mean"]),
             **{
-                f"rmse_{name}": MainFigure(row["rmse"][name], CHANNEL_UNITS[name])
+                f"rmse_{name}": SummaryMetric(row["rmse"][name], CHANNEL_UNITS[name])
                 for name in files.channels
             },
             **{
-                f"{end}_error_end": MainFigure(row[f"{end}_error_end"], END_UNITS[end])
-                for end in files.ends
+                f"{pose_name}_error_end": SummaryMetric(
+                    row[f"{pose_name}_error_end"], POSE_ERROR_UNITS[pose_name]
+                )
+                for pose_name in files.pose_errors
             },
         }
-    sentences = [sentence for sentence in verdict(files) if sentence]
-    return Outcome(
-        sentences, figures, errors_table(files, split).text(), failure, exports or {}, level(files)
+    sentences = [sentence for sentence in verdict_sentences(files) if sentence]
+    return TaskOutcome(
+        sentences,
+        summary_metrics,
+        errors_table(files, split).to_text(),
+        failure_message,
+        exports or {},
+        verdict_level(files),
     )
 
 
-def external_logs(
+def read_external_logs(
     config: FitConfig, paths: Sequence[Path]
-) -> tuple[list[Path], list[Log], list[Prepared]]:
+) -> tuple[list[Path], list[Log], list[PreparedLog]]:
     """Return the files of other logs, the logs, and the logs prepared as those of the fit.
 
     They are read as the fit read its own; canonical files are recognised by their own mark.
@@ -155,18 +183,35 @@ def external_logs(
         ResidnetError: where a file cannot be read.
     """
     data = config.data
-    own = CanonicalConfig() if isinstance(data, SimulatedTrials) else data.reader
+    fit_reader = CanonicalConfig() if isinstance(data, SimulatedTrials) else data.reader
     # a folder may be one log, as a ROS 2 bag is, or hold sheets and lines of JSON
-    files = own.build().logs_among(log_files(paths))
-    readers = {path: (CanonicalConfig() if Log.recognises(path) else own).build() for path in files}
-    read = [readers[path].read(path).replace(name=name) for path, name in log_names(files).items()]
+    log_paths = fit_reader.build().select_logs(find_log_files(paths))
+    readers = {
+        path: (CanonicalConfig() if Log.is_canonical_log(path) else fit_reader).build()
+        for path in log_paths
+    }
+    raw_logs = [
+        readers[path].read(path).replace(name=name)
+        for path, name in assign_log_names(log_paths).items()
+    ]
     signals = config.signals
-    logs = [prepare(log, SPLIT, signals.columns, config.prepare, signals.live) for log in read]
-    return [part for path in files for part in readers[path].files(path)], read, logs
+    logs = [
+        prepare_log(log, EXTERNAL_SPLIT, signals.input_columns, config.prepare, signals.dof)
+        for log in raw_logs
+    ]
+    return (
+        [
+            member_file
+            for path in log_paths
+            for member_file in readers[path].list_member_files(path)
+        ],
+        raw_logs,
+        logs,
+    )
 
 
-def limit_of(spec: ModelSpec, config: FitConfig) -> np.ndarray:
+def divergence_limit(spec: ModelSpec, config: FitConfig) -> np.ndarray:
     """Return the |u, v, r| [3] beyond which a free run of a model has diverged."""
-    return velocity_limit(
-        np.array(spec.low), np.array(spec.high), config.evaluation.divergence, spec.signals.live
+    return compute_velocity_limits(
+        np.array(spec.low), np.array(spec.high), config.evaluation.divergence, spec.signals.dof
     )

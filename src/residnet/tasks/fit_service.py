@@ -13,110 +13,142 @@ import numpy as np
 import torch
 import yaml
 
-from residnet.core.config import dump_config, validate
+from residnet.core.config import dump_config, validate_config
 from residnet.core.errors import DataError, UsageError
-from residnet.core.files import whole
-from residnet.core.format import fixed, number, plural
-from residnet.core.layout import SIX
-from residnet.core.names import nearest
-from residnet.core.ownership import recorded_folder
-from residnet.core.progress import say
-from residnet.data.prepare import samples
+from residnet.core.files import atomic_write
+from residnet.core.format import format_count, format_fixed, format_number
+from residnet.core.layout import SIX_DOF_LAYOUT
+from residnet.core.names import suggest_name
+from residnet.core.ownership import record_folder
+from residnet.core.progress import log_message
+from residnet.data.prepare import make_samples
 from residnet.data.windows import WindowStore
-from residnet.identification.identified import candidates, evaluate
-from residnet.identification.monitoring import MonitorConfig, Verdict, Watch, Watcher
-from residnet.identification.planning import Aim, Plan, TrialLimits, plan, shares_of
-from residnet.identification.prepared import prepare_logs, require_window, through_currents
-from residnet.identification.recursive_refit import Refit, recursive_refit, refitted
-from residnet.judge.metrics import find
-from residnet.report.blocks import Section, Table, bad_where, table_of
-from residnet.report.figure import DASHED, GLANCE, SOLID, ZERO, Case, Figure, Panel, family
+from residnet.identification.identified import evaluate_splits, make_candidates
+from residnet.identification.monitoring import (
+    ChangeDetector,
+    MonitorConfig,
+    MonitorVerdict,
+    OnlineChangeDetector,
+)
+from residnet.identification.planning import (
+    PredictionGoal,
+    TrialLimits,
+    TrialPlan,
+    infer_input_shares,
+    plan_trials,
+)
+from residnet.identification.prepared import (
+    check_window_fits,
+    convert_to_motion_through_water,
+    prepare_splits,
+)
+from residnet.identification.recursive_refit import (
+    RecursiveRefit,
+    make_refitted_model,
+    refit_recursively,
+)
+from residnet.judge.metrics import find_row
+from residnet.report.blocks import Section, Table, build_table, flag_cell
+from residnet.report.figure import (
+    DASHED_STYLE,
+    MAX_PREVIEW_HEIGHT,
+    SOLID_STYLE,
+    ZERO_LINE_STYLE,
+    Case,
+    Figure,
+    Panel,
+    style_family,
+)
 from residnet.report.figure_files import write_figure
 from residnet.report.page import write_page
 from residnet.runs.folder import Provenance, RunFolder
-from residnet.runs.model_store import FolderStore
-from residnet.runs.task import Outcome
+from residnet.runs.model_store import RunModelStore
+from residnet.runs.task import TaskOutcome
 from residnet.tasks.fit_outcome import (
-    SPLIT,
-    external_logs,
-    fit_outcome,
-    limit_of,
-    write_judged,
+    EXTERNAL_SPLIT,
+    build_fit_outcome,
+    divergence_limit,
+    read_external_logs,
+    write_evaluation,
 )
 from residnet.training.left_out import left_open
 
 if TYPE_CHECKING:
     from residnet.tasks.fit import FitConfig
 
-_NAMED = 3
+_MAX_NAMED_CAUSES = 3
 """Causes that are named."""
-_HELD = 3
+_HOLD_OUT_RATIO = 3
 """One log of so many, the last ones, is kept to judge a refit by."""
-_SHOWN = 12
+_MAX_SHOWN_TRIALS = 12
 """Candidates for trials in the table."""
 
 
 @dataclass(frozen=True)
-class WatchedLog:
+class MonitoredLog:
     """What a monitor found in one log.
 
     Attributes:
         name: of the log.
-        since: time in s from its start to the first alarm; None where there was none.
-        last: the verdict at its end.
-        window: length of its windows in s.
+        alarm_time: time in s from its start to the first alarm; None where there was none.
+        final_verdict: the verdict at its end.
+        window_seconds: length of its windows in s.
         scores: the largest score of any cause after each of them.
     """
 
     name: str
-    since: float | None
-    last: Verdict
-    window: float
+    alarm_time: float | None
+    final_verdict: MonitorVerdict
+    window_seconds: float
     scores: Sequence[float]
 
     @property
-    def windows(self) -> int:
+    def n_windows(self) -> int:
         """How many windows it held."""
         return len(self.scores)
 
-    def content(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return what was found as JSON takes it."""
         return {
             "log": self.name,
-            "windows": self.windows,
-            "alarm_after": self.since,
-            "threshold": self.last.threshold,
-            "innovation": self.last.innovation,
+            "windows": self.n_windows,
+            "alarm_after": self.alarm_time,
+            "threshold": self.final_verdict.threshold,
+            "innovation": self.final_verdict.innovation_rms,
             "suspects": [
                 {
                     "cause": suspect.change.name,
-                    "score": suspect.score,
-                    "size": suspect.size,
-                    "standard_error": suspect.error,
+                    "score": suspect.test_statistic,
+                    "size": suspect.estimated_size,
+                    "standard_error": suspect.standard_error,
                     "unit": suspect.change.unit,
-                    "explains": suspect.explains,
+                    "explains": suspect.explained_square,
                 }
-                for suspect in self.last.suspects
+                for suspect in self.final_verdict.hypotheses
             ],
         }
 
-    def text(self) -> list[str]:
+    def to_lines(self) -> list[str]:
         """Return what was found in words."""
-        state = "no alarm" if self.since is None else f"ALARM after {self.since:.0f} s"
-        named = self.last.suspects[: _NAMED if self.since is not None else 1]
-        return [f"{self.name}: {state} ({self.windows} windows)"] + [
-            f"  {suspect.change.name}: score {suspect.score:.1f} of {self.last.threshold:.1f},"
-            f" size {suspect.size:+.3g} +- {suspect.error:.2g} {suspect.change.unit}"
-            f" (the logs look as if {suspect.change.words})"
-            for suspect in named
+        alarm_text = (
+            "no alarm" if self.alarm_time is None else f"ALARM after {self.alarm_time:.0f} s"
+        )
+        suspects = self.final_verdict.hypotheses[
+            : _MAX_NAMED_CAUSES if self.alarm_time is not None else 1
+        ]
+        return [f"{self.name}: {alarm_text} ({self.n_windows} windows)"] + [
+            f"  {suspect.change.name}: score {suspect.test_statistic:.1f} of {self.final_verdict.threshold:.1f},"
+            f" size {suspect.estimated_size:+.3g} +- {suspect.standard_error:.2g} {suspect.change.unit}"
+            f" (the logs look as if {suspect.change.description})"
+            for suspect in suspects
         ]
 
 
-class Service:
+class FittedModelService:
     """A model in service, the watch over it, and the logs that are new.
 
     Args:
-        paths: logs, in the order of time.
+        log_paths: logs, in the order of time.
         model: name of the model; `selected` for the one chosen on validation data.
         settings: of `MonitorConfig`.
 
@@ -129,189 +161,202 @@ class Service:
         self,
         config: FitConfig,
         run: RunFolder,
-        paths: Sequence[Path],
+        log_paths: Sequence[Path],
         model: str,
         settings: Mapping[str, Any],
     ) -> None:
-        chosen = validate(dict(settings), MonitorConfig, "monitor")
-        store = FolderStore(run)
+        monitor_config = validate_config(dict(settings), MonitorConfig, "monitor")
+        store = RunModelStore(run)
         name = str(run.read_metrics()["selected"]) if model == "selected" else model
         if name not in store.names():
-            valid = ["selected", *store.names()]
-            raise UsageError(f"{run.path}: no model '{name}'{nearest(name, valid)}")
-        self.config, self.run, self.fitted = config, run, store.load(name)
-        self.files, _, self.logs = external_logs(config, paths)
+            valid_names = ["selected", *store.names()]
+            raise UsageError(f"{run.path}: no model '{name}'{suggest_name(name, valid_names)}")
+        self.config, self.run, self.fitted_model = config, run, store.load(name)
+        self.input_paths, _, self.logs = read_external_logs(config, log_paths)
         # clean logs over ground, as new ones are: a current is taken out of either alike
-        clean = prepare_logs(config.logs(), config)
-        known = [*clean["train"], *clean["validation"]]
-        self.watch = Watch.of(self.fitted.spec, self.fitted.model, known, chosen)
+        clean_splits = prepare_splits(config.load_logs(), config)
+        reference_logs = [*clean_splits["train"], *clean_splits["validation"]]
+        self.detector = ChangeDetector.from_logs(
+            self.fitted_model.spec, self.fitted_model.model, reference_logs, monitor_config
+        )
 
-    def watched(self) -> list[WatchedLog]:
+    def monitor_logs(self) -> list[MonitoredLog]:
         """Watch the logs one after the other; what is looked back over goes on between them.
 
         Raises:
             DataError: where a log holds no window.
         """
-        watcher, out = Watcher(self.watch), []
+        online_detector, monitored = OnlineChangeDetector(self.detector), []
         for log in self.logs:
-            found = self.watch.windows(log)
-            watcher.restart()
-            verdicts = [watcher.take(sums) for sums in self.watch.sums(found)]
-            alarms = np.flatnonzero([verdict.alarm for verdict in verdicts])
-            first = (int(alarms[0]) + 1) * self.watch.config.window if alarms.size else None
-            scores = [verdict.largest for verdict in verdicts]
-            window = self.watch.config.window
-            out.append(WatchedLog(log.log.name, first, verdicts[-1], window, scores))
-        return out
+            windows = self.detector.make_windows(log)
+            online_detector.start_new_log()
+            verdicts = [
+                online_detector.update_with_sums(window_sums)
+                for window_sums in self.detector.compute_sums(windows)
+            ]
+            alarm_windows = np.flatnonzero([verdict.is_alarm for verdict in verdicts])
+            alarm_time = (
+                (int(alarm_windows[0]) + 1) * self.detector.config.window
+                if alarm_windows.size
+                else None
+            )
+            scores = [verdict.max_score for verdict in verdicts]
+            window_seconds = self.detector.config.window
+            monitored.append(
+                MonitoredLog(log.log.name, alarm_time, verdicts[-1], window_seconds, scores)
+            )
+        return monitored
 
 
-def write_watched(folder: Path, logs: Sequence[WatchedLog]) -> Path:
+def write_monitoring_page(folder: Path, logs: Sequence[MonitoredLog]) -> Path:
     """Write the page of what a monitor found: which logs raise an alarm, and the scores over time.
 
     Args:
         logs: in the order of time.
     """
-    step = logs[0].window / 60.0
-    alarmed = [log for log in logs if log.since is not None]
-    told = [f"No alarm in {plural(len(logs), 'log')}: the model fits them as it fitted its own."]
-    if alarmed:
-        first = alarmed[-1].last.suspects[0].change
-        told = [
-            f"ALARM in {len(alarmed)} of {plural(len(logs), 'log')}: as if {first.words}.",
+    step = logs[0].window_seconds / 60.0
+    logs_with_alarm = [log for log in logs if log.alarm_time is not None]
+    summary = [
+        f"No alarm in {format_count(len(logs), 'log')}: the model fits them as it fitted its own."
+    ]
+    if logs_with_alarm:
+        likeliest_change = logs_with_alarm[-1].final_verdict.hypotheses[0].change
+        summary = [
+            f"ALARM in {len(logs_with_alarm)} of {format_count(len(logs), 'log')}: as if {likeliest_change.description}.",
             "Another cause may look alike: see the scores of all causes.",
         ]
-    ends = step * np.cumsum([log.windows for log in logs])
+    log_end_times = step * np.cumsum([log.n_windows for log in logs])
     scores = np.concatenate([log.scores for log in logs])
-    threshold = logs[0].last.threshold
-    curves = {
+    threshold = logs[0].final_verdict.threshold
+    score_curves = {
         "score": (step * (1.0 + np.arange(len(scores))), scores),
         "threshold": (np.zeros(1), np.array([threshold])),
-        "logs": (ends, ends),
+        "logs": (log_end_times, log_end_times),
     }
     figure = Figure(
         "scores",
         "Largest score over time",
         "The largest score of any cause after each window; above the threshold it is an alarm.",
         {
-            "score": replace(SOLID, label="largest score"),
-            "threshold": replace(DASHED, label="threshold", kind="across"),
-            "logs": replace(ZERO, label="end of a log", kind="upright", dash="dotted"),
+            "score": replace(SOLID_STYLE, label="largest score"),
+            "threshold": replace(DASHED_STYLE, label="threshold", kind="across"),
+            "logs": replace(ZERO_LINE_STYLE, label="end of a log", kind="upright", dash="dotted"),
         },
-        [Panel("score [-]", "time of the logs [min]", height=GLANCE)],
-        [Case("", [curves])],
+        [Panel("score [-]", "time of the logs [min]", height=MAX_PREVIEW_HEIGHT)],
+        [Case("", [score_curves])],
     )
-    glance = table_of(
+    overview = build_table(
         logs,
         [
             ("log", lambda log: log.name),
             (
                 "alarm",
-                lambda log: bad_where(
+                lambda log: flag_cell(
                     "no" if log.since is None else f"after {log.since:.0f} s", log.since
                 ),
             ),
-            ("likeliest cause", lambda log: log.last.suspects[0].change.name),
-            ("score", lambda log: number(log.last.suspects[0].score), str),
+            ("likeliest cause", lambda log: log.last.hypotheses[0].change.name),
+            ("score", lambda log: format_number(log.last.hypotheses[0].score), str),
         ],
-        selected=lambda log: log.since is not None,
+        is_selected=lambda log: log.since is not None,
     )
-    suspects = table_of(
-        [(log, suspect) for log in logs for suspect in log.last.suspects],
+    suspects = build_table(
+        [(log, suspect) for log in logs for suspect in log.final_verdict.hypotheses],
         [
             ("log", lambda row: row[0].name),
             ("cause", lambda row: row[1].change.name),
-            ("score", lambda row: number(row[1].score), str),
-            ("size", lambda row: f"{number(row[1].size)} {row[1].change.unit}", str),
-            ("standard error", lambda row: number(row[1].error, 2), str),
+            ("score", lambda row: format_number(row[1].score), str),
+            ("size", lambda row: f"{format_number(row[1].size)} {row[1].change.unit}", str),
+            ("standard error", lambda row: format_number(row[1].error, 2), str),
             ("the logs look as if", lambda row: row[1].change.words),
         ],
-        rule=lambda row: row[0].name,
+        group_key=lambda row: row[0].name,
     )
     return write_page(
         folder,
         "New logs watched",
-        f"{plural(len(scores), 'window')} of {logs[0].window:g} s, threshold {number(threshold)}",
-        told,
+        f"{format_count(len(scores), 'window')} of {logs[0].window_seconds:g} s, threshold {format_number(threshold)}",
+        summary,
         [
-            Section("", [write_figure(folder / "figures", figure), glance]),
-            Section("Every cause, at the end of each log", [suspects], folded=True),
+            Section("", [write_figure(folder / "figures", figure), overview]),
+            Section("Every cause, at the end of each log", [suspects], is_folded=True),
         ],
     )
 
 
 @dataclass(frozen=True)
-class RefitRun:
+class RefitResult:
     """What a recursive refit has found, and whether it is worth taking.
 
     Attributes:
-        found: the changes that were put into the model.
+        recursive_refit: the changes that were put into the model.
         folder: of the new run; None where the monitor named no change to refit.
         old: mean free-run error (NRMSE) of the old model on the logs that were held out.
         new: that of the new one.
         worth: whether the new one is better by more than a paired interval leaves open.
     """
 
-    found: Refit
+    recursive_refit: RecursiveRefit
     folder: Path | None = None
     old: float = float("nan")
     new: float = float("nan")
     worth: bool = False
 
-    def text(self) -> list[str]:
+    def to_lines(self) -> list[str]:
         """Return what was found in words."""
-        out = [
-            f"refit: {one.change.name} {one.size:+.3g} +- {one.error:.2g} {one.change.unit}, after"
-            f" each log {', '.join(f'{size:+.3g}' for size in one.after)}"
-            for one in self.found.moved
+        lines = [
+            f"refit: {changed_parameter.change.name} {changed_parameter.estimated_size:+.3g} +- {changed_parameter.standard_error:.2g} {changed_parameter.change.unit}, after"
+            f" each log {', '.join(f'{size_after_log:+.3g}' for size_after_log in changed_parameter.size_by_log)}"
+            for changed_parameter in self.recursive_refit.identified_changes
         ]
-        out.append(f"refit: ended since {self.found.ended}")
+        lines.append(f"refit: ended since {self.recursive_refit.stopping_reason}")
         if self.folder is None:
-            return [*out, "refit: no model was written; the old one stays"]
-        errors = f"old {self.old:.4f}, new {self.new:.4f} (mean NRMSE of free runs)"
-        worth = (
+            return [*lines, "refit: no model was written; the old one stays"]
+        error_text = f"old {self.old:.4f}, new {self.new:.4f} (mean NRMSE of free runs)"
+        conclusion = (
             f"it IS worth taking; {self.folder}"
             if self.worth
             else f"it is NOT worth taking; it stands in {self.folder}, with the old model selected"
         )
-        return [*out, f"refit: on the logs held out: {errors}", f"refit: {worth}"]
+        return [*lines, f"refit: on the logs held out: {error_text}", f"refit: {conclusion}"]
 
-    def content(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return what was found as JSON takes it."""
-        judged = self.folder is not None
+        has_run = self.folder is not None
         return {
             "changes": [
                 {
-                    "cause": one.change.name,
-                    "size": one.size,
-                    "standard_error": one.error,
-                    "unit": one.change.unit,
-                    "after_each_log": list(one.after),
+                    "cause": changed_parameter.change.name,
+                    "size": changed_parameter.estimated_size,
+                    "standard_error": changed_parameter.standard_error,
+                    "unit": changed_parameter.change.unit,
+                    "after_each_log": list(changed_parameter.size_by_log),
                 }
-                for one in self.found.moved
+                for changed_parameter in self.recursive_refit.identified_changes
             ],
-            "ended": self.found.ended,
-            "run": str(self.folder) if judged else None,
-            "nrmse_old": self.old if judged else None,
-            "nrmse_new": self.new if judged else None,
+            "ended": self.recursive_refit.stopping_reason,
+            "run": str(self.folder) if has_run else None,
+            "nrmse_old": self.old if has_run else None,
+            "nrmse_new": self.new if has_run else None,
             "worth_taking": self.worth,
         }
 
 
-def require_refit(run: RunFolder, out: Path, config: FitConfig) -> None:
+def require_refit_folder(run: RunFolder, output_folder: Path, config: FitConfig) -> None:
     """Check that a refit may write its run, before any work.
 
     Raises:
         UsageError: where the folder exists, or lies within that of the old run.
     """
-    if out.resolve().is_relative_to(run.path.resolve()):
+    if output_folder.resolve().is_relative_to(run.path.resolve()):
         raise UsageError(
-            f"{out}: lies within the run {run.path}, which a refit leaves as it is; give another"
+            f"{output_folder}: lies within the run {run.path}, which a refit leaves as it is; give another"
             " folder for --refit"
         )
-    RunFolder(out).require(dump_config(config))
+    RunFolder(output_folder).require_usable(dump_config(config))
 
 
-def refit_run(service: Service, out: Path) -> RefitRun:
+def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
     """Refit a model on the first two thirds of the new logs, and judge it on the others.
 
     The new run holds `zero`, the old model under its name, and the new one as `<name>_refit`.
@@ -323,64 +368,101 @@ def refit_run(service: Service, out: Path) -> RefitRun:
         UsageError: where the folder may not be used, or the model has no parameters to move.
         DataError: where there are fewer than two logs, or one is too short.
     """
-    config, old = service.config, service.fitted
+    config, original_model = service.config, service.fitted_model
     if len(service.logs) < 2:
         raise DataError(
             "a refit needs at least two new logs, the last of which are held out to judge it; give"
             " more --logs, or cut the log into several"
         )
     for log in service.logs:
-        require_window(log, config)
-    held = max(len(service.logs) // _HELD, 1)
-    used, kept = service.logs[:-held], service.logs[-held:]
-    say(f"recursive refit of {old.name} on {len(used)} logs, {held} held out")
-    found = recursive_refit(service.watch, [service.watch.windows(log) for log in used])
-    if not found.moved:
-        return RefitRun(found)
-    new = refitted(old, found)
-    asked = {"split": SPLIT, "protocol": config.evaluation.selection, "manoeuvre": "all"}
-    made_from = Provenance(service.run.resolved, (), config.seed, service.files, time.time())
+        check_window_fits(log, config)
+    n_held_out = max(len(service.logs) // _HOLD_OUT_RATIO, 1)
+    training_logs, held_out_logs = service.logs[:-n_held_out], service.logs[-n_held_out:]
+    log_message(
+        f"recursive refit of {original_model.name} on {len(training_logs)} logs, {n_held_out} held out"
+    )
+    recursive_result = refit_recursively(
+        service.detector, [service.detector.make_windows(log) for log in training_logs]
+    )
+    if not recursive_result.identified_changes:
+        return RefitResult(recursive_result)
+    refitted_model = make_refitted_model(original_model, recursive_result)
+    row_filter = {
+        "split": EXTERNAL_SPLIT,
+        "protocol": config.evaluation.selection,
+        "manoeuvre": "all",
+    }
+    provenance = Provenance(
+        service.run.resolved_config, (), config.seed, service.input_paths, time.time()
+    )
     errors: dict[str, Any] = {}
 
-    def judge(folder: RunFolder) -> Outcome:
-        store, models = FolderStore(folder), service.run.models
-        beside = [name for name in dict.fromkeys(("zero", old.name)) if (models / name).is_dir()]
-        for name in beside:
+    def evaluate_refit(folder: RunFolder) -> TaskOutcome:
+        store, models = RunModelStore(folder), service.run.models
+        reference_names = [
+            name
+            for name in dict.fromkeys(("zero", original_model.name))
+            if (models / name).is_dir()
+        ]
+        for name in reference_names:
             shutil.copytree(models / name, folder.models / name)
-        store.keep(new)
-        judged = evaluate(
+        store.save(refitted_model)
+        evaluations = evaluate_splits(
             [
-                replace(one, reference=old.name) if one.name == new.name else one
-                for one in candidates([store.load(name) for name in (*beside, new.name)])
+                replace(candidate_model, reference=original_model.name)
+                if candidate_model.name == refitted_model.name
+                else candidate_model
+                for candidate_model in make_candidates(
+                    [store.load(name) for name in (*reference_names, refitted_model.name)]
+                )
             ],
-            {SPLIT: kept},
+            {EXTERNAL_SPLIT: held_out_logs},
             config.evaluation,
             config.prepare.grid.step,
-            limit_of(old.spec, config),
+            divergence_limit(original_model.spec, config),
         )
-        row = find(judged[SPLIT].rows, model=new.name, **asked)
-        gain = row["difference"]
-        upper = gain["nrmse_mean"] if gain["ci95"] is None else gain["ci95"][1]
-        worth = bool(row["diverged"] == 0 and upper < 0.0)
-        before = find(judged[SPLIT].rows, model=old.name, **asked)
-        errors.update(old=before["nrmse"]["mean"], new=row["nrmse"]["mean"], worth=worth)
-        chosen = new.name if worth else old.name
-        write_judged(folder, config, judged, (chosen, None, chosen), {SPLIT: kept})
-        changes = [f"{one['cause']} {one['size']:+.3g}" for one in new.notes["refit_changes"]]
+        refitted_row = find_row(
+            evaluations[EXTERNAL_SPLIT].rows, model=refitted_model.name, **row_filter
+        )
+        difference = refitted_row["difference"]
+        upper_bound = (
+            difference["nrmse_mean"] if difference["ci95"] is None else difference["ci95"][1]
+        )
+        is_better = bool(refitted_row["diverged"] == 0 and upper_bound < 0.0)
+        original_row = find_row(
+            evaluations[EXTERNAL_SPLIT].rows, model=original_model.name, **row_filter
+        )
+        errors.update(
+            old=original_row["nrmse"]["mean"], new=refitted_row["nrmse"]["mean"], worth=is_better
+        )
+        selected_name = refitted_model.name if is_better else original_model.name
+        write_evaluation(
+            folder,
+            config,
+            evaluations,
+            (selected_name, None, selected_name),
+            {EXTERNAL_SPLIT: held_out_logs},
+        )
+        changes = [
+            f"{candidate_model['cause']} {candidate_model['size']:+.3g}"
+            for candidate_model in refitted_model.notes["refit_changes"]
+        ]
         sentence = (
-            f"The recursive refit ({', '.join(changes)}) is {'' if worth else 'not '}worth taking"
+            f"The recursive refit ({', '.join(changes)}) is {'' if is_better else 'not '}worth taking"
             " by the logs that were held out."
         )
-        outcome = fit_outcome(folder, SPLIT)
+        outcome = build_fit_outcome(folder, EXTERNAL_SPLIT)
         return replace(outcome, verdict=[*outcome.verdict, sentence])
 
-    with RunFolder(out).held():
-        config.conduct(RunFolder.create(out, dump_config(config)), made_from, judge)
-    return RefitRun(found, out, **errors)
+    with RunFolder(output_folder).lock():
+        config.run_in_folder(
+            RunFolder.create(output_folder, dump_config(config)), provenance, evaluate_refit
+        )
+    return RefitResult(recursive_result, output_folder, **errors)
 
 
 @dataclass(frozen=True)
-class PlannedTrials:
+class NextTrials:
     """The next trials of a run.
 
     Attributes:
@@ -389,107 +471,135 @@ class PlannedTrials:
     """
 
     model: str
-    plan: Plan
+    plan_trials: TrialPlan
 
     @property
     def table(self) -> Table:
         """The candidates, the most telling per minute first; those to run are marked."""
-        return table_of(
-            self.plan.trials[:_SHOWN],
+        return build_table(
+            self.plan.candidates[:_MAX_SHOWN_TRIALS],
             [
                 ("manoeuvre", lambda trial: trial.flight.motion.name),
-                ("time [min]", lambda trial: fixed(trial.minutes, 1), str),
-                ("reach [m]", lambda trial: fixed(trial.reach, 0), str),
-                ("narrower by [%]", lambda trial: fixed(100 * trial.shrinks, 1), str),
-                ("volume per minute", lambda trial: fixed(trial.volume, 2), str),
+                ("time [min]", lambda trial: format_fixed(trial.duration_minutes, 1), str),
+                ("reach [m]", lambda trial: format_fixed(trial.reach, 0), str),
+                (
+                    "narrower by [%]",
+                    lambda trial: format_fixed(100 * trial.uncertainty_reduction, 1),
+                    str,
+                ),
+                ("volume per minute", lambda trial: format_fixed(trial.volume, 2), str),
             ],
             caption=f"Candidates for {self.model}, by what they narrow per minute.",
-            selected=lambda trial: any(trial is one for one in self.plan.chosen),
+            is_selected=lambda trial: any(
+                trial is selected_trial for selected_trial in self.plan.selected_trials
+            ),
         )
 
     @property
-    def choice(self) -> str:
+    def recommendation(self) -> str:
         """What to run, and by how much that narrows predictions, in a sentence."""
-        names = ", ".join(trial.flight.motion.name for trial in self.plan.chosen)
+        names = ", ".join(trial.simulated_run.true_log.name for trial in self.plan.selected_trials)
         return (
             f"Run {names}: together they narrow the intervals of predictions by"
-            f" {100 * self.plan.shrinks:.0f} %, as the model expects it."
+            f" {100 * self.plan.uncertainty_reduction:.0f} %, as the model expects it."
         )
 
-    def text(self) -> str:
+    def to_text(self) -> str:
         """Return the table and the choice in words."""
-        return f"{self.table.text()}\n{self.choice}"
+        return f"{self.table.to_text()}\n{self.recommendation}"
 
-    def write(self, folder: Path) -> list[Path]:
+    def write_files(self, folder: Path) -> list[Path]:
         """Write the chosen manoeuvres as YAML, tracks as CSV, and a page; returns the files."""
-        with recorded_folder(folder):
+        with record_folder(folder):
             return self._write(folder)
 
     def _write(self, folder: Path) -> list[Path]:
         trials, tracks = folder / "next_trials.yaml", folder / "next_tracks.csv"
-        flights = [trial.flight for trial in self.plan.chosen]
+        flights = [trial.simulated_run for trial in self.plan.selected_trials]
         chosen = [flight.manoeuvre.model_dump(mode="json") for flight in flights]
-        states = [name for name in SIX.names if name in flights[0].motion.channels]
+        states = [
+            name for name in SIX_DOF_LAYOUT.state_names if name in flights[0].true_log.channels
+        ]
         lines = [",".join(("manoeuvre", "t", *states))]
-        for motion in (flight.motion for flight in flights):
+        for motion in (flight.true_log for flight in flights):
             every = max(round(1.0 / float(motion.t[1] - motion.t[0])), 1)
             rows = np.column_stack((motion.t, motion.stack(states)))
             lines += [
                 ",".join([motion.name, *(f"{value:.6g}" for value in row)]) for row in rows[::every]
             ]
-        with whole(trials) as file:
+        with atomic_write(trials) as file:
             file.write_text(yaml.safe_dump({"manoeuvres": chosen}, sort_keys=False))
-        with whole(tracks) as file:
+        with atomic_write(tracks) as file:
             file.write_text("\n".join(lines) + "\n")
         curves = {
             motion.name: (motion["y"] - motion["y"][0], motion["x"] - motion["x"][0])
-            for motion in (flight.motion for flight in flights)
+            for motion in (flight.true_log for flight in flights)
         }
         panel = Panel("north [m]", "east [m]", kind="map", height=300)
         figure = Figure(
-            "tracks", "Tracks", "As the model flies them.", family(curves), [panel],
+            "tracks", "Tracks", "As the model flies them.", style_family(curves), [panel],
             [Case("", [curves])],
         )  # fmt: skip
-        shown = Section("", [write_figure(folder / "figures", figure), self.table.part(0, 3)])
-        table = Section("Candidates", [self.table], folded=True)
+        shown = Section(
+            "", [write_figure(folder / "figures", figure), self.table.select_columns(0, 3)]
+        )
+        table = Section("Candidates", [self.table], is_folded=True)
         about = f"For {self.model}."
-        page = write_page(folder, "Next trials", about, [self.choice], [shown, table])
+        page = write_page(folder, "Next trials", about, [self.recommendation], [shown, table])
         return [trials, tracks, page]
 
 
-def plan_trials(
+def plan_next_trials(
     config: FitConfig, run: RunFolder, model: str, limits: Mapping[str, Any]
-) -> PlannedTrials:
+) -> NextTrials:
     """Return the trials that would tell most about a refitted baseline, see `FitConfig`."""
-    allowed = validate(dict(limits), TrialLimits, "plan-trial")
-    known = [name for name in config.refit if "refit" in run.fit_notes(name)]
-    if not known:
+    trial_limits = validate_config(dict(limits), TrialLimits, "plan-trial")
+    refitted_names = [name for name in config.refit if "refit" in run.read_fit_notes(name)]
+    if not refitted_names:
         raise UsageError(
             f"{run.path}: no baseline of this run was refitted through rollouts, so nothing says"
             " how sure its parameters are; add `refit` to the config"
         )
     booklet = config.booklet
-    name = model or (booklet.model if booklet is not None else known[0])
-    if name not in known:
-        raise UsageError(f"{run.path}: no refitted baseline '{name}'{nearest(name, known)}")
-    logs, _ = through_currents(prepare_logs(config.logs(), config), config)
-    fitted, train, refit = FolderStore(run).load(name), logs["train"], config.refit[name]
-    refit = refit.with_prior(float(fitted.notes.get("prior", refit.prior)))
-    scales = config.evaluation.scales.array()
-    open_ = left_open(
-        fitted.model.double(),
-        samples(train, config.signals.build()),
-        WindowStore.gather(train, torch.float64),
+    name = model or (booklet.model if booklet is not None else refitted_names[0])
+    if name not in refitted_names:
+        raise UsageError(
+            f"{run.path}: no refitted baseline '{name}'{suggest_name(name, refitted_names)}"
+        )
+    logs, _ = convert_to_motion_through_water(prepare_splits(config.load_logs(), config), config)
+    fitted_model, training_logs, refit = (
+        RunModelStore(run).load(name),
+        logs["train"],
+        config.refit[name],
+    )
+    refit = refit.with_prior(float(fitted_model.notes.get("prior", refit.prior)))
+    scales = config.evaluation.scales.to_array()
+    open_directions = left_open(
+        fitted_model.model.double(),
+        make_samples(training_logs, config.signals.build()),
+        WindowStore.from_logs(training_logs, torch.float64),
         refit,
         torch.from_numpy(scales),
-        fitted.notes["refit"].get("at_rest", ()),
+        fitted_model.notes["refit"].get("at_rest", ()),
     )
-    limit, aim = limit_of(fitted.spec, config), None
+    divergence_bounds, goal = divergence_limit(fitted_model.spec, config), None
     if booklet is None:
-        shares = shares_of(fitted.spec)
+        input_shares = infer_input_shares(fitted_model.spec)
     else:
         initial = {key: float(value) for key, value in booklet.initial.items()}
         # zigzags and turns of one kind fly together
         manoeuvres = sorted(booklet.manoeuvres, key=lambda manoeuvre: manoeuvre.kind)
-        aim, shares = Aim(manoeuvres, booklet.duration, initial), booklet.inputs
-    return PlannedTrials(name, plan(fitted, open_, refit, scales, shares, limit, allowed, aim))
+        goal, input_shares = PredictionGoal(manoeuvres, booklet.duration, initial), booklet.inputs
+    return NextTrials(
+        name,
+        plan_trials(
+            fitted_model,
+            open_directions,
+            refit,
+            scales,
+            input_shares,
+            divergence_bounds,
+            trial_limits,
+            goal,
+        ),
+    )

@@ -12,24 +12,32 @@ from pydantic import Field
 
 from residnet.core.config import ConfigPath
 from residnet.core.errors import ConfigError
-from residnet.core.files import file_stem
-from residnet.core.format import minus, number, shown_unit, whole
+from residnet.core.files import make_file_stem
+from residnet.core.format import display_unit, format_integer, format_minus_signs, format_number
 from residnet.core.log import Log
-from residnet.core.names import nearest
-from residnet.core.progress import report
+from residnet.core.names import suggest_name
+from residnet.core.progress import report_progress
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.base import files_of
-from residnet.data.split import log_names
-from residnet.report.blocks import Block, Bullets, Section, Table, Text, bad_where, table_of
-from residnet.report.figure import GLANCE, SOLID, START, Case, Curve, Figure, Panel
+from residnet.data.readers.base import list_files
+from residnet.data.split import assign_log_names
+from residnet.report.blocks import Block, Bullets, Section, Table, Text, build_table, flag_cell
+from residnet.report.figure import (
+    MAX_PREVIEW_HEIGHT,
+    SOLID_STYLE,
+    START_STYLE,
+    Case,
+    Curve,
+    Figure,
+    Panel,
+)
 from residnet.report.figure_files import write_figure
 from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import MainFigure, Outcome, Task
+from residnet.runs.task import SummaryMetric, Task, TaskOutcome
 
-_READ_AT_ONCE = 50_000_000
+_MAX_CHECKED_BYTES = 50_000_000
 """Bytes of the largest recording that a check reads."""
-_NOTE = "note"
+_NOTE_LEVEL = "note"
 
 
 class ImportConfig(Task):
@@ -56,86 +64,97 @@ class ImportConfig(Task):
                 config says.
         """
         reader = self.reader.build()
-        smallest: dict[str, tuple[int, Path]] = {}
-        for path in self._paths():
-            size = sum(file.stat().st_size for file in files_of(path))
-            kind = path.suffix.lower()
-            if size <= _READ_AT_ONCE and (kind not in smallest or size < smallest[kind][0]):
-                smallest[kind] = (size, path)
-        for _, path in smallest.values():
+        smallest_by_suffix: dict[str, tuple[int, Path]] = {}
+        for path in self._find_paths():
+            size = sum(file.stat().st_size for file in list_files(path))
+            suffix = path.suffix.lower()
+            if size <= _MAX_CHECKED_BYTES and (
+                suffix not in smallest_by_suffix or size < smallest_by_suffix[suffix][0]
+            ):
+                smallest_by_suffix[suffix] = (size, path)
+        for _, path in smallest_by_suffix.values():
             reader.read(path)
 
     def input_files(self) -> list[Path]:
-        return [file for path in self._paths() for file in files_of(path)]
+        return [file for path in self._find_paths() for file in list_files(path)]
 
-    def carry_out(self, folder: RunFolder) -> Outcome:
+    def execute(self, folder: RunFolder) -> TaskOutcome:
         """Read the recordings, and write logs and findings.
 
         Raises:
             UsageError: where a recording, topic or package is missing.
             DataError: where a recording cannot be used; those before it have been written.
         """
-        paths = self._paths()
-        reader, names = self.reader.build(), log_names(paths)
+        paths = self._find_paths()
+        reader, names = self.reader.build(), assign_log_names(paths)
         findings: dict[str, Any] = {}
         rows = []
-        for place, path in enumerate(paths):
-            report("reading recordings", place, len(paths))
+        for number, path in enumerate(paths):
+            report_progress("reading recordings", number, len(paths))
             log = reader.read(path).replace(name=names[path])
-            log.save(folder.path / "logs" / f"{file_stem(log.name)}.parquet")
+            log.save(folder.path / "logs" / f"{make_file_stem(log.name)}.parquet")
             findings[log.name] = log.meta.get("findings", [])
-            rows.append(log_row(log, findings[log.name]))
-        report("reading recordings", len(paths), len(paths))
+            rows.append(describe_log(log, findings[log.name]))
+        report_progress("reading recordings", len(paths), len(paths))
         folder.write_json(folder.path / "findings.json", findings)
-        loud = sum(row["loud"] > 0 for row in rows)
+        n_with_warnings = sum(row["loud"] > 0 for row in rows)
         sentence = (
             f"{len(paths)} recording{'s were' if len(paths) > 1 else ' was'} read;"
-            f" {loud or 'none'} of them {'have findings' if loud != 1 else 'has findings'} that"
+            f" {n_with_warnings or 'none'} of them {'have findings' if n_with_warnings != 1 else 'has findings'} that"
             " need a look."
         )
-        figures = {"logs": MainFigure(len(paths)), "logs_with_findings": MainFigure(loud)}
-        text = "\n".join([log_table(rows).text(), *loud_lines(findings)])
-        return Outcome([sentence], figures, text)
+        summary_metrics = {
+            "logs": SummaryMetric(len(paths)),
+            "logs_with_findings": SummaryMetric(n_with_warnings),
+        }
+        text = "\n".join([tabulate_logs(rows).to_text(), *warning_lines(findings)])
+        return TaskOutcome([sentence], summary_metrics, text)
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        findings: Mapping[str, Sequence[Mapping[str, Any]]] = RunFiles(run.path).json(
+        findings: Mapping[str, Sequence[Mapping[str, Any]]] = RunFiles(run.path).read_json(
             "findings.json"
         )
         logs = [Log.load(path) for path in sorted((run.path / "logs").glob("*.parquet"))]
-        channels = [Section(log.name, [channel_table(log)], folded=True) for log in logs]
-        table = log_table([log_row(log, findings.get(log.name, [])) for log in logs])
-        severe = loud_lines(findings)
+        channels = [Section(log.name, [tabulate_channels(log)], is_folded=True) for log in logs]
+        table = tabulate_logs([describe_log(log, findings.get(log.name, [])) for log in logs])
+        warnings = warning_lines(findings)
         blocks: list[Block] = (
-            [Bullets(severe, warning=True)] if severe else [Text("Nothing needs a look.")]
+            [Bullets(warnings, is_warning=True)] if warnings else [Text("Nothing needs a look.")]
         )
-        for log, found in findings.items():
-            notes = [minus(str(finding["text"])) for finding in found if finding["level"] == _NOTE]
+        for log, log_findings in findings.items():
+            notes = [
+                format_minus_signs(str(finding["text"]))
+                for finding in log_findings
+                if finding["level"] == _NOTE_LEVEL
+            ]
             if notes:
-                blocks.append(Section(f"Notes on {log}", [Bullets(notes)], folded=True))
+                blocks.append(Section(f"Notes on {log}", [Bullets(notes)], is_folded=True))
         return [
-            Section("", [write_figure(run.figures, motion(logs)), table]),
+            Section("", [write_figure(run.figures, plot_recordings(logs)), table]),
             Section("Channels", channels),
             Section("What was noticed on the way in", blocks),
         ]
 
-    def _paths(self) -> list[Path]:
+    def _find_paths(self) -> list[Path]:
         root = self.root or Path.cwd()
-        found: dict[Path, None] = {}
+        paths: dict[Path, None] = {}
         for pattern in self.logs:
-            matches = [root / pattern] if (root / pattern).exists() else _globbed(root, pattern)
+            matches = (
+                [root / pattern] if (root / pattern).exists() else _expand_pattern(root, pattern)
+            )
             if not matches:
-                near = (
-                    nearest(pattern, (path.name for path in root.iterdir()))
+                suggestion = (
+                    suggest_name(pattern, (path.name for path in root.iterdir()))
                     if root.is_dir()
                     else f"; there is no folder {root}"
                 )
-                raise ConfigError(f"logs: '{pattern}' matches nothing in {root}{near}")
-            found.update(dict.fromkeys(matches))
-        return list(found)
+                raise ConfigError(f"logs: '{pattern}' matches nothing in {root}{suggestion}")
+            paths.update(dict.fromkeys(matches))
+        return list(paths)
 
 
-def _globbed(root: Path, pattern: str) -> list[Path]:
+def _expand_pattern(root: Path, pattern: str) -> list[Path]:
     try:
         return sorted(root.glob(pattern))
     except (ValueError, NotImplementedError) as error:
@@ -144,102 +163,110 @@ def _globbed(root: Path, pattern: str) -> list[Path]:
         ) from error
 
 
-def motion(logs: Sequence[Log]) -> Figure:
+def plot_recordings(logs: Sequence[Log]) -> Figure:
     """Return the tracks of the recordings, one to be chosen; else a channel that all of them hold.
 
     Args:
         logs: at least one; positions count from the first of each.
     """
-    shared = [name for name in logs[0].channels if all(name in log.channels for log in logs)]
-    if placed := {"x", "y"} <= set(shared):
-        panel = Panel("north [m]", "east [m]", kind="map", height=GLANCE)
+    common_channels = [
+        name for name in logs[0].channels if all(name in log.channels for log in logs)
+    ]
+    if has_position := {"x", "y"} <= set(common_channels):
+        panel = Panel("north [m]", "east [m]", kind="map", height=MAX_PREVIEW_HEIGHT)
     else:
-        name = next(iter(shared), next(iter(logs[0].channels)))
-        unit, factor = shown_unit(logs[0].units.get(name, "-"))
-        panel = Panel(f"{name} [{unit}]", "time [s]", height=GLANCE)
+        name = next(iter(common_channels), next(iter(logs[0].channels)))
+        unit, factor = display_unit(logs[0].units.get(name, "-"))
+        panel = Panel(f"{name} [{unit}]", "time [s]", height=MAX_PREVIEW_HEIGHT)
 
-    def curves(log: Log) -> dict[str, Curve]:
-        if not placed:
+    def log_curves(log: Log) -> dict[str, Curve]:
+        if not has_position:
             return {"log": (log.t, factor * log[name])} if name in log.channels else {}
-        known = np.isfinite(log["x"]) & np.isfinite(log["y"])
-        first = int(np.argmax(known))
-        track = tuple(log[axis][known] - log[axis][first] for axis in ("y", "x"))
+        is_finite = np.isfinite(log["x"]) & np.isfinite(log["y"])
+        first_index = int(np.argmax(is_finite))
+        track = tuple(log[axis][is_finite] - log[axis][first_index] for axis in ("y", "x"))
         return {"log": (track[0], track[1]), "start": (np.zeros(1), np.zeros(1))}
 
     return Figure(
         "recordings",
         "What was recorded",
         "",
-        {"log": replace(SOLID, label="measured"), "start": START},
+        {"log": replace(SOLID_STYLE, label="measured"), "start": START_STYLE},
         [panel],
-        [Case(log.name, [curves(log)], still=log is logs[0]) for log in logs],
+        [Case(log.name, [log_curves(log)], still=log is logs[0]) for log in logs],
         "Recording",
     )
 
 
-def loud_lines(findings: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
+def warning_lines(findings: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
     """Return a line for each finding above a note, by the name of its log."""
     return [
-        f"{log}: {finding['level']}: {minus(str(finding['text']))}"
-        for log, found in findings.items()
-        for finding in found
-        if finding["level"] != _NOTE
+        f"{log}: {finding['level']}: {format_minus_signs(str(finding['text']))}"
+        for log, log_findings in findings.items()
+        for finding in log_findings
+        if finding["level"] != _NOTE_LEVEL
     ]
 
 
-def log_row(log: Log, findings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def describe_log(log: Log, findings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return what a log holds, and how many of its findings are above a note."""
     return {
         "log": log.name,
         "samples": len(log),
         "duration": float(log.t[-1] - log.t[0]),
         "channels": len(log.channels),
-        "lost": sum(int(mask.sum()) for why, mask in log.masks.items() if why.startswith("hard:")),
-        "loud": sum(finding["level"] != _NOTE for finding in findings),
+        "lost": sum(
+            int(mask.sum()) for reason, mask in log.masks.items() if reason.startswith("hard:")
+        ),
+        "loud": sum(finding["level"] != _NOTE_LEVEL for finding in findings),
         "findings": len(findings),
     }
 
 
-def log_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return a row for each log, as `log_row` describes it."""
-    return table_of(
+def tabulate_logs(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Return a row for each log, as `describe_log` describes it."""
+    return build_table(
         rows,
         [
             ("log", "log"),
-            ("samples", "samples", whole),
-            ("step [s]", lambda row: number(row["duration"] / max(row["samples"] - 1, 1), 4), str),
-            ("duration [s]", lambda row: number(row["duration"], 4), str),
+            ("samples", "samples", format_integer),
+            (
+                "step [s]",
+                lambda row: format_number(row["duration"] / max(row["samples"] - 1, 1), 4),
+                str,
+            ),
+            ("duration [s]", lambda row: format_number(row["duration"], 4), str),
             ("channels", "channels", str),
-            ("samples in gaps", "lost", whole),
-            ("to look at", lambda row: bad_where(row["loud"], row["loud"])),
+            ("samples in gaps", "lost", format_integer),
+            ("to look at", lambda row: flag_cell(row["loud"], row["loud"])),
             ("notes", lambda row: row["findings"] - row["loud"], str),
         ],
     )
 
 
-def channel_table(log: Log) -> Table:
+def tabulate_channels(log: Log) -> Table:
     """Return a row for each channel: unit, range, and how many samples are missing."""
     rows = []
     for name, values in log.channels.items():
-        unit, factor = shown_unit(log.units.get(name, "-"))
+        unit, factor = display_unit(log.units.get(name, "-"))
         finite = factor * np.asarray(values, dtype=float)[np.isfinite(values)]
-        known = finite if finite.size else np.array([np.nan])
+        finite_or_nan = finite if finite.size else np.array([np.nan])
         rows.append(
             {
                 "channel": name,
                 "unit": unit,
-                "least": float(known.min()),
-                "mean": float(known.mean()),
-                "largest": float(known.max()),
-                "missing": number(100.0 * (1.0 - finite.size / max(values.size, 1)), 2),
+                "least": float(finite_or_nan.min()),
+                "mean": float(finite_or_nan.mean()),
+                "largest": float(finite_or_nan.max()),
+                "missing": format_number(100.0 * (1.0 - finite.size / max(values.size, 1)), 2),
             }
         )
-    return table_of(
+    return build_table(
         rows,
         [
             ("channel", "channel"),
             ("unit", "unit", str),
-            *((name, name, number) for name in ("least", "mean", "largest")),
+            *((name, name, format_number) for name in ("least", "mean", "largest")),
             ("missing [%]", "missing", str),
         ],
     )

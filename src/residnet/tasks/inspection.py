@@ -13,20 +13,20 @@ import numpy as np
 from residnet.core.errors import ConfigError, DataError, ResidnetError, UsageError
 from residnet.core.files import write_owned
 from residnet.core.log import Log
-from residnet.core.progress import report
+from residnet.core.progress import report_progress
 from residnet.data.doctor import (
     Finding,
-    Report,
-    conditioning,
-    date_findings,
-    inspect,
-    inspect_together,
-    inspection,
-    summary,
+    InspectionReport,
+    build_inspection,
+    compute_condition_number,
+    find_clock_rate_errors,
+    inspect_log,
+    inspect_log_set,
+    summarize_inspection,
 )
-from residnet.data.drafting.questions import commented
-from residnet.data.drafting.reading import log_files, read_each
-from residnet.data.split import log_names
+from residnet.data.drafting.questions import dump_commented_yaml
+from residnet.data.drafting.reading import find_log_files, read_mixed_formats
+from residnet.data.split import assign_log_names
 
 if TYPE_CHECKING:
     from residnet.tasks.fit import FitConfig
@@ -36,7 +36,7 @@ _ILL_CONDITIONED = 1e6
 
 
 @dataclass(frozen=True)
-class Inspection:
+class InspectionResult:
     """What the doctor found.
 
     Attributes:
@@ -48,7 +48,7 @@ class Inspection:
     content: Mapping[str, Any]
 
     @property
-    def misled(self) -> bool:
+    def has_problems(self) -> bool:
         """Whether a fit to these logs would be misled."""
         return bool(self.content["misled"])
 
@@ -58,11 +58,11 @@ class Inspection:
         Raises:
             UsageError: where the file cannot be written.
         """
-        with write_owned(file) as place:
-            place.write_text(json.dumps(self.content, indent=1) + "\n")
+        with write_owned(file) as temporary_path:
+            temporary_path.write_text(json.dumps(self.content, indent=1) + "\n")
 
 
-def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
+def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult:
     """Return what the doctor finds in each log and between them.
 
     Args:
@@ -73,56 +73,74 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
         ResidnetError: where a path does not exist, the config cannot be used, or the only log
             cannot be read.
     """
-    task, fit = (None, None) if config is None else _logs_task(config)
-    inputs, masks = (fit.signals.columns, fit.prepare.masks) if fit is not None else (None, ())
-    own = None if task is None else getattr(task, "reader", None) or task.data.reader
-    files = log_files(paths)
-    read, maps = dict[Path, Log | ResidnetError](), list[str]()
-    if own is None:
-        for draft in read_each(files):
-            read |= {**draft.logs, **draft.left_out}
+    task, fit_config = (None, None) if config is None else _load_logs_task(config)
+    inputs, masks = (
+        (fit_config.signals.input_columns, fit_config.prepare.masks)
+        if fit_config is not None
+        else (None, ())
+    )
+    configured_reader = None if task is None else getattr(task, "reader", None) or task.data.reader
+    files = find_log_files(paths)
+    results, channel_map_lines = dict[Path, Log | ResidnetError](), list[str]()
+    if configured_reader is None:
+        for draft in read_mixed_formats(files):
+            results |= {**draft.logs, **draft.errors}
             if {"channels", "parts"} & set(draft.reader):
-                drafted = {"data": {"kind": "measured", "reader": draft.reader}}
-                maps += ["channel map as guessed, to check and paste into a config:"]
-                maps += commented(drafted, draft.marks.comments).splitlines()
+                drafted_config = {"data": {"kind": "measured", "reader": draft.reader}}
+                channel_map_lines += ["channel map as guessed, to check and paste into a config:"]
+                channel_map_lines += dump_commented_yaml(
+                    drafted_config, draft.draft_notes.comments_at
+                ).splitlines()
     else:
-        reader = own.build()
-        for file in reader.logs_among(files):
+        reader = configured_reader.build()
+        for file in reader.select_logs(files):
             try:
-                read[file] = reader.read(file)
+                results[file] = reader.read(file)
             except DataError as error:
-                read[file] = error
+                results[file] = error
     # files that only belong to others are no logs
-    files = [file for file in files if file in read]
-    names = log_names(files)
+    files = [file for file in files if file in results]
+    names = assign_log_names(files)
     logs: list[Log] = []
-    reports: list[Report] = []
+    reports: list[InspectionReport] = []
     for number, path in enumerate(files):
-        report("inspecting logs", number, len(files))
-        log = read[path]
+        report_progress("inspecting logs", number, len(files))
+        log = results[path]
         try:
             if isinstance(log, ResidnetError):
                 raise DataError(str(log)) if len(files) > 1 else log
             log = log.replace(name=names[path])
-            found = inspect(log, inputs, masks).joined(date_findings(log, path))
+            quality_report = inspect_log(log, inputs, masks).with_findings(
+                find_clock_rate_errors(log, path)
+            )
             logs.append(log)
         except DataError as error:
             if len(files) == 1:
                 raise
             unreadable = Finding("fatal", "unreadable", str(error))
-            found = Report(names[path], (unreadable,), str(path))
-        reports.append(found)
-    splits = {} if fit is None else _splits(fit, names)
-    together = inspect_together(logs, inputs, splits) if logs else Report("together", ())
-    if fit is not None and logs:
-        together = Report("together", (*together.findings, *_regressors(logs, fit)))
-    report("inspecting logs", len(files), len(files))
-    lines = [line for one in (*reports, together) for line in one.lines()]
-    content = inspection(reports, together)
-    return Inspection("\n".join((*summary(content).lines, *lines, *maps)), content)
+            quality_report = InspectionReport(names[path], (unreadable,), str(path))
+        reports.append(quality_report)
+    splits = {} if fit_config is None else _split_of_logs(fit_config, names)
+    joint_report = (
+        inspect_log_set(logs, inputs, splits) if logs else InspectionReport("together", ())
+    )
+    if fit_config is not None and logs:
+        joint_report = InspectionReport(
+            "together", (*joint_report.findings, *_check_regressor_conditioning(logs, fit_config))
+        )
+    report_progress("inspecting logs", len(files), len(files))
+    lines = [
+        line
+        for quality_report_of_log in (*reports, joint_report)
+        for line in quality_report_of_log.to_lines()
+    ]
+    content = build_inspection(reports, joint_report)
+    return InspectionResult(
+        "\n".join((*summarize_inspection(content).sentences, *lines, *channel_map_lines)), content
+    )
 
 
-def _logs_task(config: Path) -> tuple[Any, FitConfig | None]:
+def _load_logs_task(config: Path) -> tuple[Any, FitConfig | None]:
     """Return the task of a config that says how its logs are read, and the same if it is a fit.
 
     Raises:
@@ -135,8 +153,8 @@ def _logs_task(config: Path) -> tuple[Any, FitConfig | None]:
     from residnet.tasks.registry import load_task
 
     task = load_task(config)
-    measured = isinstance(task, FitConfig) and isinstance(task.data, MeasuredLogs)
-    if not measured and not isinstance(task, ImportConfig):
+    is_measured_fit = isinstance(task, FitConfig) and isinstance(task.data, MeasuredLogs)
+    if not is_measured_fit and not isinstance(task, ImportConfig):
         raise ConfigError(
             f"{config}: has no channel map (data.kind is not 'measured'); leave --config out for"
             " logs that describe themselves"
@@ -144,56 +162,75 @@ def _logs_task(config: Path) -> tuple[Any, FitConfig | None]:
     return task, task if isinstance(task, FitConfig) else None
 
 
-def _splits(fit: FitConfig, names: Mapping[Path, str]) -> dict[str, str]:
+def _split_of_logs(fit_config: FitConfig, names: Mapping[Path, str]) -> dict[str, str]:
     """Return the split of each log that the config names."""
     from residnet.data.sources import MeasuredLogs
 
-    assert isinstance(fit.data, MeasuredLogs)
+    assert isinstance(fit_config.data, MeasuredLogs)
     try:
-        resolved = fit.data.split.resolve()
+        resolved = fit_config.data.split.resolve_paths()
     except ConfigError:
         # the split's own files need not be here to look at others
         return {}
-    known = {path.resolve(): split for split, paths in resolved.items() for path in paths}
-    return {n: known[real] for path, n in names.items() if (real := path.resolve()) in known}
+    split_by_path = {path.resolve(): split for split, paths in resolved.items() for path in paths}
+    return {
+        n: split_by_path[resolved_path]
+        for path, n in names.items()
+        if (resolved_path := path.resolve()) in split_by_path
+    }
 
 
-def _regressors(logs: Sequence[Log], fit: FitConfig) -> list[Finding]:
+def _check_regressor_conditioning(logs: Sequence[Log], fit_config: FitConfig) -> list[Finding]:
     """Return how well the prepared logs condition the regressors of each baseline."""
     from residnet.baselines.regressors import RegressorBaseline
-    from residnet.data.prepare import prepare, samples
+    from residnet.data.prepare import make_samples, prepare_log
 
     try:
-        signals = fit.signals
+        signals = fit_config.signals
         prepared = [
-            prepare(log, "train", signals.columns, fit.prepare, signals.live) for log in logs
+            prepare_log(log, "train", signals.input_columns, fit_config.prepare, signals.dof)
+            for log in logs
         ]
-        data = samples([log for log in prepared if log.good.any()], fit.signals.build())
+        data = make_samples(
+            [log for log in prepared if log.trainable.any()], fit_config.signals.build()
+        )
     except (DataError, UsageError) as error:
         text = f"the config cannot prepare these logs: {error}"
         return [Finding("will mislead", "not_prepared", text)]
-    out = []
-    for name, config in fit.all_baselines.items():
+    findings = []
+    for name, config in fit_config.all_baselines.items():
         baseline = config.build(data.names)
         if not isinstance(baseline, RegressorBaseline):
             continue
-        phi, terms = baseline.library(data.z).numpy(), list(baseline.library.terms)
-        moves = np.ptp(phi, axis=0) > 1e-12 * np.abs(phi).max(axis=0, initial=0.0)
-        moving = np.flatnonzero(moves)
-        if len(moving) < 2 or len(phi) <= 2 * len(moving):
+        regressor_matrix, terms = baseline.library(data.z).numpy(), list(baseline.library.terms)
+        is_varying = np.ptp(regressor_matrix, axis=0) > 1e-12 * np.abs(regressor_matrix).max(
+            axis=0, initial=0.0
+        )
+        varying_indices = np.flatnonzero(is_varying)
+        if len(varying_indices) < 2 or len(regressor_matrix) <= 2 * len(varying_indices):
             continue
-        condition, worst = conditioning(phi[:, moving], [terms[j] for j in moving])
-        still = [term for term, free in zip(terms, moves, strict=True) if not free and term != "1"]
+        condition, collinear_terms = compute_condition_number(
+            regressor_matrix[:, varying_indices], [terms[j] for j in varying_indices]
+        )
+        constant_terms = [
+            term
+            for term, varies in zip(terms, is_varying, strict=True)
+            if not varies and term != "1"
+        ]
         text = (
-            f"regressors of {name} over these logs: {len(moving)} move, condition number"
+            f"regressors of {name} over these logs: {len(varying_indices)} move, condition number"
             f" {condition:.3g} (centred, scaled)"
         )
-        text += f"; constant: {', '.join(still)}" if still else ""
-        text += f"; {', '.join(worst)} move together" if condition > 30.0 else ""
-        ill = condition > _ILL_CONDITIONED
-        action = "leave regressors out, give the baseline a ridge, or add manoeuvres" if ill else ""
-        found = {"condition": condition, "regressors": len(moving)}
+        text += f"; constant: {', '.join(constant_terms)}" if constant_terms else ""
+        text += f"; {', '.join(collinear_terms)} move together" if condition > 30.0 else ""
+        is_ill_conditioned = condition > _ILL_CONDITIONED
+        action = (
+            "leave regressors out, give the baseline a ridge, or add manoeuvres"
+            if is_ill_conditioned
+            else ""
+        )
+        conditioning_figures = {"condition": condition, "regressors": len(varying_indices)}
         # a log or two are looked at, not fitted: what they lack others have
-        level: Any = "will mislead" if ill and len(logs) > 2 else "note"
-        out.append(Finding(level, "regressors", text, found, action))
-    return out
+        level: Any = "will mislead" if is_ill_conditioned and len(logs) > 2 else "note"
+        findings.append(Finding(level, "regressors", text, conditioning_figures, action))
+    return findings

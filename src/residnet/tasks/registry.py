@@ -13,29 +13,34 @@ from typing import Annotated, Any
 from residnet.baselines import BaselineConfig
 from residnet.core.config import load_config, load_mapping
 from residnet.core.errors import ConfigError, ResidnetError, UsageError
-from residnet.core.files import config_folder, read_json, require_room, shipped_configs
-from residnet.core.names import nearest
+from residnet.core.files import (
+    find_config_folder,
+    find_shipped_configs,
+    read_json,
+    require_free_space,
+)
+from residnet.core.names import suggest_name
 from residnet.core.ownership import require_regular
 from residnet.core.registry import (
-    Kinds,
-    ThirdParty,
-    broken_line,
-    broken_vessels,
-    listed,
-    marker,
-    vessel_files,
+    EntryPointPart,
+    PluginUnion,
+    describe_broken_part,
+    find_broken_vessels,
+    find_vessel_files,
+    get_plugin_union,
+    list_parts,
 )
 from residnet.core.run_loader import SIZE_LIMITS, name_damaged_key
 from residnet.data.readers import ReaderConfig
-from residnet.export import FORMATS
+from residnet.export import EXPORT_FORMATS
 from residnet.heads import HeadConfig
 from residnet.manoeuvres import ManoeuvreConfig
-from residnet.report.blocks import table_of
-from residnet.runs.folder import RunFolder, require_recorded, seal
+from residnet.report.blocks import build_table
+from residnet.runs.folder import RunFolder, require_recorded, write_checksums
 from residnet.runs.task import Task
 
-_BASE, _DOCUMENTS = "residnet.runs.task:Task", "residnet.documents"
-SINGLE = {
+_TASK_BASE, _DOCUMENTS = "residnet.runs.task:Task", "residnet.documents"
+SINGLE_TASKS = {
     "fit": "residnet.tasks.fit:FitConfig",
     "import": "residnet.tasks.import_logs:ImportConfig",
     "simulate": "residnet.tasks.simulate:SimulateConfig",
@@ -49,19 +54,21 @@ SINGLE = {
     "sea_trial": f"{_DOCUMENTS}.halvorsen2019.sea_trial:SeaTrialTaskConfig",
 }
 """All but the sweep, which varies any of these."""
-_ALL = {**SINGLE, "sweep": "residnet.tasks.sweep:SweepConfig"}
-TaskConfig = Annotated[Task, Kinds("residnet.tasks", _BASE, _ALL, key="task")]
-SweepableConfig = Annotated[Task, Kinds("residnet.tasks", _BASE, SINGLE, key="task")]
+_ALL_TASKS = {**SINGLE_TASKS, "sweep": "residnet.tasks.sweep:SweepConfig"}
+TaskConfig = Annotated[Task, PluginUnion("residnet.tasks", _TASK_BASE, _ALL_TASKS, key="task")]
+SweepableConfig = Annotated[
+    Task, PluginUnion("residnet.tasks", _TASK_BASE, SINGLE_TASKS, key="task")
+]
 
-_LISTS: dict[str, Any] = {
+_CONFIG_UNIONS: dict[str, Any] = {
     "heads": HeadConfig,
     "manoeuvres": ManoeuvreConfig,
     "readers": ReaderConfig,
     "tasks": TaskConfig,
     "baselines": BaselineConfig,
-    "formats": FORMATS,
+    "formats": EXPORT_FORMATS,
 }
-_UNITS = (("d", 86_400.0), ("h", 3_600.0), ("min", 60.0), ("s", 1.0))
+_AGE_UNITS = (("d", 86_400.0), ("h", 3_600.0), ("min", 60.0), ("s", 1.0))
 
 
 def load_task(path: Path, overrides: Sequence[str] = ()) -> Task:
@@ -74,11 +81,11 @@ def load_task(path: Path, overrides: Sequence[str] = ()) -> Task:
     Raises:
         ConfigError: one line with file or override, key, fault and the nearest valid name.
     """
-    task: Task = load_config(config_file(path), overrides, TaskConfig)
+    task: Task = load_config(resolve_config_file(path), overrides, TaskConfig)
     return task
 
 
-def config_file(path: Path) -> Path:
+def resolve_config_file(path: Path) -> Path:
     """Return the file of a config: the path itself, or that of a shipped config of this name.
 
     Raises:
@@ -89,16 +96,16 @@ def config_file(path: Path) -> Path:
             return path
     except OSError as error:
         raise ConfigError(f"{path}: is no path ({error.strerror})") from error
-    shipped = shipped_configs()
+    shipped = find_shipped_configs()
     if (name := path.as_posix()) in shipped:
         return shipped[name]
     raise ConfigError(
         f"{path}: no such file, and no config of this name comes with residnet"
-        f"{nearest(name, shipped)}; residnet list configs shows them"
+        f"{suggest_name(name, shipped)}; residnet list configs shows them"
     )
 
 
-def task_class(run: RunFolder) -> type[Task]:
+def get_task_class(run: RunFolder) -> type[Task]:
     """Return the class of a run's task, by the name in its resolved.yaml.
 
     The class alone can write the report, so that a run can be reported whose inputs have gone.
@@ -106,27 +113,30 @@ def task_class(run: RunFolder) -> type[Task]:
     Raises:
         UsageError: where there is no such task, or it cannot be used.
     """
-    mark, name = marker(TaskConfig), str(load_mapping(run.resolved).get("task"))
-    if name not in (known := mark.names()):
-        raise UsageError(f"{run.resolved}: no task '{name}'{nearest(name, known)}")
-    found: type[Task] | ThirdParty = mark.find(name)
-    if isinstance(found, ThirdParty):
-        raise UsageError(f"{run.resolved}: task {found.complaint}")
-    return found
+    plugin_union, name = (
+        get_plugin_union(TaskConfig),
+        str(load_mapping(run.resolved_config).get("task")),
+    )
+    if name not in (task_names := plugin_union.kind_names()):
+        raise UsageError(f"{run.resolved_config}: no task '{name}'{suggest_name(name, task_names)}")
+    task_type: type[Task] | EntryPointPart = plugin_union.find_kind(name)
+    if isinstance(task_type, EntryPointPart):
+        raise UsageError(f"{run.resolved_config}: task {task_type.error_message}")
+    return task_type
 
 
-def finished_task(path: Path, verb: str) -> tuple[RunFolder, Any]:
+def open_finished_task(path: Path, command: str) -> tuple[RunFolder, Any]:
     """Return the folder and the config of a finished run whose task answers to a verb.
 
     Raises:
         UsageError: where there is no finished run, or its task lacks the verb.
     """
     run = RunFolder.open(path)
-    found = task_class(run)
-    if verb not in found.verbs:
+    task_type = get_task_class(run)
+    if command not in task_type.supported_commands:
         # said before the config is read: its inputs may have gone
-        raise found.lacks_verb(run)
-    return run, load_config(run.resolved, [], found)
+        raise task_type.unsupported_verb_error(run)
+    return run, load_config(run.resolved_config, [], task_type)
 
 
 def report_run(path: Path) -> Path:
@@ -136,38 +146,43 @@ def report_run(path: Path) -> Path:
         UsageError: where there is no finished run, or its task is not known.
     """
     run = RunFolder.open(path)
-    require_room(path)
+    require_free_space(path)
     require_recorded(path)
     # before the figures are drawn
     run.manifest.require_recorded_unchanged(run.report.name, run.figures.name)
     with name_damaged_key(path):
-        page = task_class(run).write_report(run)
+        page = get_task_class(run).write_report(run)
     # a study writes its comparison anew with the report
-    seal(path)
+    write_checksums(path)
     return page
 
 
-def catalogue(what: str) -> list[tuple[str, str]]:
+def list_catalogue(part_kind: str) -> list[tuple[str, str]]:
     """Return names and one-line descriptions of what there is, third-party parts included.
 
     Args:
-        what: `vessels`, `heads`, `manoeuvres`, `readers`, `tasks`, `baselines`, `formats` or
+        part_kind: `vessels`, `heads`, `manoeuvres`, `readers`, `tasks`, `baselines`, `formats` or
             `configs`.
     """
-    if what == "vessels":
-        known = [(name, _description(name, file)) for name, file in vessel_files().items()]
-        return known + [(part.name, broken_line(part)) for part in broken_vessels()]
-    if what == "configs":
-        files = {file: name for name, file in reversed(shipped_configs().items())}
+    if part_kind == "vessels":
+        vessels = [
+            (name, _vessel_description(name, file)) for name, file in find_vessel_files().items()
+        ]
+        return vessels + [
+            (broken_part.name, describe_broken_part(broken_part))
+            for broken_part in find_broken_vessels()
+        ]
+    if part_kind == "configs":
+        files = {file: name for name, file in reversed(find_shipped_configs().items())}
         return [
             (name, str(load_mapping(file).get("description") or ""))
             for file, name in sorted(files.items())
         ]
-    return listed(_LISTS[what])
+    return list_parts(_CONFIG_UNIONS[part_kind])
 
 
-def _description(name: str, file: Path) -> str:
-    if file.is_relative_to(config_folder()):
+def _vessel_description(name: str, file: Path) -> str:
+    if file.is_relative_to(find_config_folder()):
         return str(load_mapping(file).get("description") or "")
     from residnet.physics.vessel import load_vessel
 
@@ -178,7 +193,7 @@ def _description(name: str, file: Path) -> str:
         return f"(cannot be used: {error})"
 
 
-def runs_below(folder: Path) -> list[dict[str, Any]]:
+def list_runs(folder: Path) -> list[dict[str, Any]]:
     """Return what lies below a folder of runs, the newest first.
 
     Each entry has run, task, state (`finished`, `unfinished` or `damaged`), best (name, value and
@@ -189,31 +204,37 @@ def runs_below(folder: Path) -> list[dict[str, Any]]:
     """
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder; runs lie in runs/ unless --out says otherwise")
-    found = [_entry(file.parent) for file in folder.rglob("resolved.yaml")]
-    return sorted(found, key=lambda entry: float(entry["age"]))
+    entries = [_describe_run(file.parent) for file in folder.rglob("resolved.yaml")]
+    return sorted(entries, key=lambda entry: float(entry["age"]))
 
 
-def runs_text(folder: Path, entries: Sequence[Mapping[str, Any]]) -> str:
+def format_runs(folder: Path, entries: Sequence[Mapping[str, Any]]) -> str:
     """Return the runs as a table for the terminal."""
     if not entries:
         return f"{folder}: no runs"
 
-    def best(entry: Mapping[str, Any]) -> str:
+    def format_best(entry: Mapping[str, Any]) -> str:
         if (figure := entry["best"]) is None:
             return ""
         value = "not finite" if figure["value"] is None else f"{figure['value']:.4g}"
         return f"{figure['name']} {value} {figure['unit']}".removesuffix(" -")
 
-    columns = [*((key, key) for key in ("run", "task", "state")), ("best", best), ("age", _age)]
-    return table_of(entries, columns).text()
+    columns = [
+        *((key, key) for key in ("run", "task", "state")),
+        ("best", format_best),
+        ("age", _format_age),
+    ]
+    return build_table(entries, columns).to_text()
 
 
-def _age(entry: Mapping[str, Any]) -> str:
-    unit, size = next((pair for pair in _UNITS if entry["age"] >= pair[1]), _UNITS[-1])
-    return f"{entry['age'] / size:.0f} {unit}"
+def _format_age(entry: Mapping[str, Any]) -> str:
+    unit, unit_seconds = next(
+        (pair for pair in _AGE_UNITS if entry["age"] >= pair[1]), _AGE_UNITS[-1]
+    )
+    return f"{entry['age'] / unit_seconds:.0f} {unit}"
 
 
-def _entry(folder: Path) -> dict[str, Any]:
+def _describe_run(folder: Path) -> dict[str, Any]:
     entry: dict[str, Any] = {"run": str(folder), "task": "unknown", "state": "unfinished"}
     entry |= {"best": None, "age": time.time() - (folder / "resolved.yaml").stat().st_mtime}
     try:

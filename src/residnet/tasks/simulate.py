@@ -14,42 +14,42 @@ from torch import Tensor
 
 from residnet.core.config import Config, ExistingPath, Metres, Quantity, Seconds
 from residnet.core.errors import ConfigError, UsageError
-from residnet.core.files import file_stem
-from residnet.core.names import CHANNEL_UNITS, nearest
-from residnet.core.progress import say
+from residnet.core.files import make_file_stem
+from residnet.core.names import CHANNEL_UNITS, suggest_name
+from residnet.core.progress import log_message
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.base import CanonicalConfig
 from residnet.data.simulated import (
-    Craft,
-    Disturbance,
-    Flight,
-    Sea,
-    SensorNoise,
+    DisturbanceConfig,
+    ManoeuvreRun,
+    SensorsConfig,
     SimulatedTrials,
-    fly,
-    fly_trials,
-    log_names,
-    source_of,
-    stand_ins,
-    surrounded,
-    trials_craft,
+    SimulatedVessel,
+    TrialEnvironment,
+    build_plant,
+    build_trial_vessel,
+    make_dummy_logs,
+    make_log_names,
+    make_manoeuvre_source,
+    simulate_manoeuvres,
+    simulate_trials,
 )
 from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, PlantActuators
 from residnet.dynamics.simulated import RecordedPlantDynamics, check_steps
 from residnet.dynamics.store import chosen_model, load_model
-from residnet.judge.booklet import index_contents, index_rows
+from residnet.judge.booklet import build_index_rows, build_index_table
 from residnet.manoeuvres import FamilyConfig, ManoeuvreConfig
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.open_loop import Replay
 from residnet.physics.vessel import load_vessel
 from residnet.report.figure_files import write_figures
-from residnet.report.sections.manoeuvres import flight_figures, indices_text
+from residnet.report.sections.manoeuvres import indices_text, trial_figures
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, MainFigure, Outcome
+from residnet.runs.task import ComputingTask, SummaryMetric, TaskOutcome
 
-_SHOWN = 24
+_MAX_SHOWN_ROWS = 24
 """Manoeuvres whose indices are shown on the terminal; more stand in a file."""
-STEP = 0.05
+DEFAULT_TIME_STEP = 0.05
 """Step in s between the samples of a simulation, where none is given."""
 
 
@@ -71,13 +71,13 @@ class ModelChoice(Config):
     inputs: dict[str, InputShare] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _one(self) -> ModelChoice:
+    def _require_one_actuator_source(self) -> ModelChoice:
         if self.actuators is not None and self.inputs:
             raise ValueError("give actuators (a vessel) or inputs, not both")
         return self
 
     @property
-    def folder(self) -> Path:
+    def model_folder(self) -> Path:
         """The folder of the model in its run.
 
         Raises:
@@ -116,79 +116,84 @@ class Programme(Config):
     initial: dict[str, float | str] = Field(default_factory=dict)
     length: Metres | None = Field(default=None, gt=0)
     reader: ReaderConfig = CanonicalConfig()
-    noise: SensorNoise = SensorNoise()
-    disturbance: Disturbance = Disturbance()
+    noise: SensorsConfig = SensorsConfig()
+    disturbance: DisturbanceConfig = DisturbanceConfig()
     seed: int = Field(default=0, ge=0)
 
     @field_validator("initial")
     @classmethod
-    def _units(cls, initial: dict[str, float | str]) -> dict[str, float | str]:
+    def _convert_units(cls, initial: dict[str, float | str]) -> dict[str, float | str]:
         return {
             name: Quantity(CHANNEL_UNITS.get(name, "-")).convert(value)
             for name, value in initial.items()
         }
 
     @model_validator(mode="after")
-    def _complete(self) -> Programme:
+    def _validate_manoeuvres(self) -> Programme:
         if self.vessel is None and self.model is None:
             raise ValueError("nothing flies: give vessel, model or both")
         if not self.manoeuvres and not self.families:
             raise ValueError("nothing is flown: give manoeuvres, families or both")
-        drawn = self.draw()
-        for manoeuvre in drawn:
-            check_steps(manoeuvre.duration or self.duration, self.step or STEP)
-        names = log_names(drawn)
-        if repeated := [name for name in names if names.count(name) > 1]:
-            raise ValueError(f"two manoeuvres are named '{repeated[0]}'")
+        manoeuvres = self.sample_manoeuvres()
+        for manoeuvre in manoeuvres:
+            check_steps(manoeuvre.duration or self.duration, self.step or DEFAULT_TIME_STEP)
+        names = make_log_names(manoeuvres)
+        if duplicates := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"two manoeuvres are named '{duplicates[0]}'")
         try:
             if self.vessel is not None and self.model is None:
-                self._vessel_craft(self.vessel, self.step or STEP)
+                self._build_vessel_craft(self.vessel, self.step or DEFAULT_TIME_STEP)
         except UsageError as error:
             raise ValueError(str(error)) from None
         return self
 
-    def draw(self) -> list[Manoeuvre]:
+    def sample_manoeuvres(self) -> list[Manoeuvre]:
         """Return the manoeuvres: those given, then those drawn."""
-        random = np.random.default_rng([self.seed, 1])
-        drawn = [family.draw(random, self.duration) for family in self.families]
-        return [*self.manoeuvres, *(manoeuvre for some in drawn for manoeuvre in some)]
+        generator = np.random.default_rng([self.seed, 1])
+        families = [family.sample_all(generator, self.duration) for family in self.families]
+        return [
+            *self.manoeuvres,
+            *(manoeuvre for family_manoeuvres in families for manoeuvre in family_manoeuvres),
+        ]
 
     @cached_property
-    def flown(self) -> list[Manoeuvre]:
+    def loaded_manoeuvres(self) -> list[Manoeuvre]:
         """The manoeuvres, with the logs of replays read.
 
         Raises:
             ResidnetError: where a log cannot be read.
         """
-        manoeuvres, reader = self.draw(), self.reader.build()
+        manoeuvres, reader = self.sample_manoeuvres(), self.reader.build()
         for manoeuvre in manoeuvres:
             if isinstance(manoeuvre, Replay):
-                manoeuvre.take(reader.read(manoeuvre.log))
+                manoeuvre.use_log(reader.read(manoeuvre.log))
         return manoeuvres
 
     @property
     def hull_length(self) -> float | None:
         """The length of the hull in m; None where it is not known."""
         vessel = self.vessel or (self.model.actuators if self.model is not None else None)
-        known = self.length is not None or vessel is None
-        return self.length if known else load_vessel(str(vessel)).length.value
+        is_length_given = self.length is not None or vessel is None
+        return self.length if is_length_given else load_vessel(str(vessel)).length.value
 
-    def crafts(self) -> list[tuple[Craft, Sea]]:
+    def build_crafts(self) -> list[tuple[SimulatedVessel, TrialEnvironment]]:
         """Return what flies, each with what surrounds it: the vessel, then the model.
 
         Raises:
             UsageError: where one of them cannot fly the manoeuvres.
         """
-        model = None if self.model is None else self._model_craft(self.model)
-        step = self.step or (STEP if model is None else model[0].dynamics.dt)
-        out = [] if self.vessel is None else [self._vessel_craft(self.vessel, step)]
-        return out if model is None else [*out, model]
+        model = None if self.model is None else self._build_model_craft(self.model)
+        step = self.step or (DEFAULT_TIME_STEP if model is None else model[0].dynamics.dt)
+        crafts_and_seas = (
+            [] if self.vessel is None else [self._build_vessel_craft(self.vessel, step)]
+        )
+        return crafts_and_seas if model is None else [*crafts_and_seas, model]
 
-    def fly(self, craft: Craft, sea: Sea) -> list[Flight]:
+    def simulate_all(self, craft: SimulatedVessel, sea: TrialEnvironment) -> list[ManoeuvreRun]:
         """Fly all manoeuvres in one batch."""
-        step = self.step or (craft.dynamics.dt if self.model is not None else STEP)
+        step = self.step or (craft.dynamics.dt if self.model is not None else DEFAULT_TIME_STEP)
         meta = {"vessel": self.vessel, "craft": craft.name}
-        return fly(craft, self.flown, sea, self.duration, step, meta)
+        return simulate_manoeuvres(craft, self.loaded_manoeuvres, sea, self.duration, step, meta)
 
     def check(self) -> None:
         """Build everything that flies, and the source of every manoeuvre.
@@ -196,31 +201,37 @@ class Programme(Config):
         Raises:
             ResidnetError: where that is not possible.
         """
-        times = torch.arange(2, dtype=torch.float64) * (self.step or STEP)
-        for craft, _ in self.crafts():
-            source_of(self.flown, craft.helm, times)
-            for manoeuvre in self.flown:
-                manoeuvre.begin(craft.start[0], craft.helm.state)
+        times = torch.arange(2, dtype=torch.float64) * (self.step or DEFAULT_TIME_STEP)
+        for craft, _ in self.build_crafts():
+            make_manoeuvre_source(self.loaded_manoeuvres, craft.helm, times)
+            for manoeuvre in self.loaded_manoeuvres:
+                manoeuvre.initial_state(craft.initial_state[0], craft.helm.state)
 
-    def _vessel_craft(self, vessel: str, step: float) -> tuple[Craft, Sea]:
-        plant = surrounded(vessel, self.disturbance)
+    def _build_vessel_craft(
+        self, vessel: str, step: float
+    ) -> tuple[SimulatedVessel, TrialEnvironment]:
+        plant = build_plant(vessel, self.disturbance)
         # actuators with dead time move by a step of their own
-        inputs = torch.zeros(1, len(plant.inputs), dtype=torch.float64)
-        plant.end_step(plant.approach(1), inputs, step / self.substeps)
-        self.disturbance.check(plant, vessel)
-        logged = (*plant.state, *plant.inputs[: plant.commands], *self.disturbance.logged)
-        self.noise.check(logged, step, vessel)
-        craft = Craft(
+        inputs = torch.zeros(1, len(plant.input_names), dtype=torch.float64)
+        plant.finish_step(plant.make_initial_state(1), inputs, step / self.substeps)
+        self.disturbance.check_plant(plant, vessel)
+        logged_channels = (
+            *plant.state_names,
+            *plant.input_names[: plant.n_commands],
+            *self.disturbance.logged_inputs,
+        )
+        self.noise.check_sensors(logged_channels, step, vessel)
+        craft = SimulatedVessel(
             load_vessel(vessel).name,
             RecordedPlantDynamics(plant, step, self.substeps),
             Helm.from_plant(plant),
-            plant.commands,
-            self._started(plant.approach(1), plant.state, vessel),
+            plant.n_commands,
+            self._set_initial_state(plant.make_initial_state(1), plant.state_names, vessel),
         )
-        return craft, Sea(plant, self.disturbance, self.noise, self.seed)
+        return craft, TrialEnvironment(plant, self.disturbance, self.noise, self.seed)
 
-    def _model_craft(self, choice: ModelChoice) -> tuple[Craft, Sea]:
-        name, (spec, model) = choice.folder.name, load_model(choice.folder)
+    def _build_model_craft(self, choice: ModelChoice) -> tuple[SimulatedVessel, TrialEnvironment]:
+        name, (spec, model) = choice.model_folder.name, load_model(choice.model_folder)
         step = spec.dt
         if self.step is not None and abs(self.step - step) > 1e-9:
             raise ConfigError(
@@ -228,38 +239,51 @@ class Programme(Config):
                 " leave it out"
             )
         vessel, plant = choice.actuators or self.vessel, None
-        gear: GivenActuators | PlantActuators
+        actuators: GivenActuators | PlantActuators
         forces: Callable[[Tensor], Tensor] | None = None
         if choice.inputs:
-            gear = GivenActuators(choice.inputs, spec.signals.exogenous, step)
+            actuators = GivenActuators(choice.inputs, spec.signals.exogenous, step)
         elif vessel is not None:
             plant = load_vessel(vessel).build()
-            gear, forces = PlantActuators(plant, step, self.substeps), Helm.from_plant(plant).forces
+            actuators, forces = (
+                PlantActuators(plant, step, self.substeps),
+                Helm.from_plant(plant).forces,
+            )
         else:
             raise ConfigError(
                 "a model flies with actuators: name a vessel's in programme.model.actuators, or"
                 " give programme.model.inputs"
             )
         # waves and forces do not reach a learned model
-        calm = self.disturbance.model_copy(update={"waves": None})
-        actuated = ActuatedDynamics(model.double(), spec.signals.columns, spec.hold, gear)
-        logged = (*actuated.state, *gear.inputs[: gear.commands], *self.disturbance.logged)
-        self.noise.check(logged, step, name)
-        if missing := [wanted for wanted in self.disturbance.logged if wanted not in gear.inputs]:
+        wind_only = self.disturbance.model_copy(update={"waves": None})
+        actuated = ActuatedDynamics(
+            model.double(), spec.signals.input_columns, spec.hold, actuators
+        )
+        logged_channels = (
+            *actuated.state,
+            *actuators.inputs[: actuators.commands],
+            *self.disturbance.logged_inputs,
+        )
+        self.noise.check_sensors(logged_channels, step, name)
+        if missing_inputs := [
+            channel for channel in self.disturbance.logged_inputs if channel not in actuators.inputs
+        ]:
             raise ConfigError(
-                f"disturbance.wind: model '{name}' and its actuators have no input '{missing[0]}'"
+                f"disturbance.wind: model '{name}' and its actuators have no input '{missing_inputs[0]}'"
             )
-        helm = Helm(gear.demand, actuated.state, gear.inputs, forces)
-        start = self._started(actuated.approach(1), actuated.state, name)
-        sea = Sea(plant, calm, self.noise, self.seed)
-        return Craft(name, actuated, helm, gear.commands, start), sea
+        helm = Helm(actuators.demand, actuated.state, actuators.inputs, forces)
+        start = self._set_initial_state(actuated.approach(1), actuated.state, name)
+        sea = TrialEnvironment(plant, wind_only, self.noise, self.seed)
+        return SimulatedVessel(name, actuated, helm, actuators.commands, start), sea
 
-    def _started(self, x: Tensor, state: tuple[str, ...], who: str) -> Tensor:
+    def _set_initial_state(self, states: Tensor, state: tuple[str, ...], craft_name: str) -> Tensor:
         for name, value in self.initial.items():
             if name not in state:
-                raise ConfigError(f"initial: '{who}' has no state '{name}'{nearest(name, state)}")
-            x[:, state.index(name)] = float(value)
-        return x
+                raise ConfigError(
+                    f"initial: '{craft_name}' has no state '{name}'{suggest_name(name, state)}"
+                )
+            states[:, state.index(name)] = float(value)
+        return states
 
 
 class SimulateConfig(ComputingTask):
@@ -271,21 +295,21 @@ class SimulateConfig(ComputingTask):
         data: trials as the task `fit` draws and splits them: logs/<split>/<log>.parquet.
     """
 
-    page: ClassVar[str] = "manoeuvres"
+    section_module: ClassVar[str] = "manoeuvres"
 
     task: Literal["simulate"]
     programme: Programme | None = None
     data: SimulatedTrials | None = None
 
     @model_validator(mode="after")
-    def _one(self) -> SimulateConfig:
+    def _require_one_source(self) -> SimulateConfig:
         if (self.programme is None) == (self.data is None):
             raise ValueError(
                 "give programme (manoeuvres on a vessel or a model) or data (trials with splits),"
                 " one of the two"
             )
         if self.data is not None:
-            self.data.splits(self.data.draw())
+            self.data.assign_splits(self.data.draw_manoeuvres())
         return self
 
     def check(self) -> None:
@@ -297,7 +321,7 @@ class SimulateConfig(ComputingTask):
         if self.programme is not None:
             self.programme.check()
         if self.data is not None:
-            stand_ins(self.data)
+            make_dummy_logs(self.data)
 
     def input_files(self) -> list[Path]:
         """Return the logs that are replayed, and the files of the learned model."""
@@ -305,15 +329,15 @@ class SimulateConfig(ComputingTask):
             return []
         files = [m.log for m in self.programme.manoeuvres if isinstance(m, Replay)]
         model = self.programme.model
-        return files if model is None else [*files, *sorted(model.folder.glob("model.*"))]
+        return files if model is None else [*files, *sorted(model.model_folder.glob("model.*"))]
 
-    def recorded_seed(self) -> int:
+    def provenance_seed(self) -> int:
         """Return the seed of everything random in the trials."""
-        given = self.programme or self.data
-        assert given is not None
-        return given.seed
+        trial_source = self.programme or self.data
+        assert trial_source is not None
+        return trial_source.seed
 
-    def carry_out(self, folder: RunFolder) -> Outcome:
+    def execute(self, folder: RunFolder) -> TaskOutcome:
         """Fly the manoeuvres, and write logs, indices and figures.
 
         Flights that were drawn at random may end otherwise than they should; only those that the
@@ -323,53 +347,69 @@ class SimulateConfig(ComputingTask):
             UsageError: where something cannot fly the manoeuvres.
         """
         if self.programme is not None:
-            flown = [
-                (craft, self.programme.fly(craft, sea)) for craft, sea in self.programme.crafts()
+            flights_by_craft = [
+                (craft, self.programme.simulate_all(craft, sea))
+                for craft, sea in self.programme.build_crafts()
             ]
-            length, listed = self.programme.hull_length, len(self.programme.manoeuvres)
-            crafts = zip(("logs", "model_logs"), flown, strict=False)
-            places = [(place, flight) for place, (_, flights) in crafts for flight in flights]
+            length, n_listed = self.programme.hull_length, len(self.programme.manoeuvres)
+            crafts = zip(("logs", "model_logs"), flights_by_craft, strict=False)
+            flights_by_folder = [
+                (subfolder, flight) for subfolder, (_, flights) in crafts for flight in flights
+            ]
         else:
             assert self.data is not None
-            manoeuvres = self.data.draw()
-            flown = [(trials_craft(self.data), fly_trials(manoeuvres, self.data))]
-            length, listed = load_vessel(self.data.vessel).length.value, 0
-            drawn = zip(self.data.splits(manoeuvres), flown[0][1], strict=True)
-            places = [(f"logs/{split}", flight) for split, flight in drawn]
-        for place, flight in places:
-            flight.log.save(folder.path / place / f"{file_stem(flight.log.name)}.parquet")
-        rows = [row for craft, flights in flown for row in index_rows(craft, flights, length)]
-        content = index_contents(self.name, length, rows)
+            manoeuvres = self.data.draw_manoeuvres()
+            flights_by_craft = [
+                (build_trial_vessel(self.data), simulate_trials(manoeuvres, self.data))
+            ]
+            length, n_listed = load_vessel(self.data.vessel).length.value, 0
+            flights_by_split = zip(
+                self.data.assign_splits(manoeuvres), flights_by_craft[0][1], strict=True
+            )
+            flights_by_folder = [(f"logs/{split}", flight) for split, flight in flights_by_split]
+        for subfolder, flight in flights_by_folder:
+            flight.measured_log.save(
+                folder.path / subfolder / f"{make_file_stem(flight.measured_log.name)}.parquet"
+            )
+        rows = [
+            row
+            for craft, flights in flights_by_craft
+            for row in build_index_rows(craft, flights, length)
+        ]
+        content = build_index_table(self.name, length, rows)
         folder.write_json(folder.path / "indices.json", content)
-        figures = flight_figures({craft.name: flights for craft, flights in flown})
+        figures = trial_figures({craft.name: flights for craft, flights in flights_by_craft})
         write_figures(folder.figures, figures)
-        count, faults = len(places), [row for row in rows if row["fault"]]
-        ended = (
-            f"{len(faults)} of {count} manoeuvres did NOT end as they should"
-            if faults
-            else f"All {count} manoeuvres ended as they should"
+        n_flights, faulty_rows = len(flights_by_folder), [row for row in rows if row["fault"]]
+        completion_text = (
+            f"{len(faulty_rows)} of {n_flights} manoeuvres did NOT end as they should"
+            if faulty_rows
+            else f"All {n_flights} manoeuvres ended as they should"
         )
         verdict = [
-            f"{ended}; they were flown by {' and '.join(craft.name for craft, _ in flown)}, and"
+            f"{completion_text}; they were flown by {' and '.join(craft.name for craft, _ in flights_by_craft)}, and"
             " their logs are in the folder logs."
         ]
-        verdict += [f"{row['craft']}, {row['log']}: {row['fault']}." for row in faults[:5]]
-        told = [
-            (f"{craft.name}, {flight.log.name}: {flight.fault}", number < listed)
-            for craft, flights in flown
+        verdict += [f"{row['craft']}, {row['log']}: {row['fault']}." for row in faulty_rows[:5]]
+        fault_messages = [
+            (f"{craft.name}, {flight.measured_log.name}: {flight.fault_text}", number < n_listed)
+            for craft, flights in flights_by_craft
             for number, flight in enumerate(flights)
-            if flight.fault
+            if flight.fault_text
         ]
-        for line, _ in told:
-            say(line)
-        failures = [line for line, of_config in told if of_config]
-        failure = failures and (
-            f"{failures[-1]} ({len(failures)} of {count} flights did not end as they should; give"
+        for line, _ in fault_messages:
+            log_message(line)
+        failures = [line for line, is_listed in fault_messages if is_listed]
+        failure_message = failures and (
+            f"{failures[-1]} ({len(failures)} of {n_flights} flights did not end as they should; give"
             " more duration, drive or steer)"
         )
-        return Outcome(
+        return TaskOutcome(
             verdict,
-            {"logs": MainFigure(count), "flights_with_a_fault": MainFigure(len(faults))},
-            indices_text(content) if len(rows) <= _SHOWN else "",
-            failure or "",
+            {
+                "logs": SummaryMetric(n_flights),
+                "flights_with_a_fault": SummaryMetric(len(faulty_rows)),
+            },
+            indices_text(content) if len(rows) <= _MAX_SHOWN_ROWS else "",
+            failure_message or "",
         )

@@ -14,17 +14,34 @@ from pydantic import Field, model_validator
 from residnet.core.config import BaseConfig, load_config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import read_json
-from residnet.core.format import plural, signed
-from residnet.core.names import nearest
-from residnet.core.processes import processes
-from residnet.core.progress import report
-from residnet.judge.metrics import blocks, intervals
-from residnet.report.blocks import Cell, Column, Section, Table, Text, paired_interval, table_of
-from residnet.report.figure import BLUE, Case, Figure, Look, Panel, joined, names_of, whiskers
+from residnet.core.format import format_count, format_signed
+from residnet.core.names import suggest_name
+from residnet.core.processes import process_pool
+from residnet.core.progress import report_progress
+from residnet.judge.metrics import bootstrap_intervals, make_resampling_blocks
+from residnet.report.blocks import (
+    Cell,
+    Column,
+    Section,
+    Table,
+    Text,
+    build_table,
+    format_paired_interval,
+)
+from residnet.report.figure import (
+    BLUE,
+    Case,
+    Figure,
+    GlyphStyle,
+    Panel,
+    error_bars,
+    join_with_gaps,
+    tick_labels,
+)
 from residnet.report.figure_files import write_figures
-from residnet.report.run_reader import Content, RunFiles
+from residnet.report.run_reader import JsonObject, RunFiles
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import MainFigure, Outcome, PartName, Task
+from residnet.runs.task import PartName, SummaryMetric, Task, TaskOutcome
 from residnet.tasks.fit import FitConfig
 
 if TYPE_CHECKING:
@@ -58,17 +75,17 @@ class StudyConfig(Task):
     workers: int = Field(default=1, ge=1, le=1_024)
 
     @model_validator(mode="after")
-    def _combination(self) -> StudyConfig:
+    def _validate_study(self) -> StudyConfig:
         if self.reference not in self.variants:
             raise ValueError(
                 "reference: no variant is named"
-                f" '{self.reference}'{nearest(self.reference, self.variants)}"
+                f" '{self.reference}'{suggest_name(self.reference, self.variants)}"
             )
         if len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds: each only once, given {list(self.seeds)}")
         return self
 
-    def overrides(self, variant: str, seed: int) -> list[str]:
+    def build_overrides(self, variant: str, seed: int) -> list[str]:
         """Overrides of the base for one run."""
         return [
             *self.common,
@@ -85,50 +102,55 @@ class StudyConfig(Task):
             UsageError: where one has no such model.
         """
         for variant in self.variants:
-            fit = load_config(self.base, self.overrides(variant, self.seeds[0]), FitConfig)
+            fit = load_config(self.base, self.build_overrides(variant, self.seeds[0]), FitConfig)
             fit.check()
             models = ("selected", *fit.model_names)
             if self.model not in models:
                 raise UsageError(
                     f"variant {variant}: no model is named"
-                    f" '{self.model}'{nearest(self.model, models)}"
+                    f" '{self.model}'{suggest_name(self.model, models)}"
                 )
 
     def input_files(self) -> list[Path]:
         return [self.base]
 
-    def recorded_seed(self) -> int:
+    def provenance_seed(self) -> int:
         return self.seeds[0]
 
-    def carry_out(self, folder: RunFolder) -> Outcome:
+    def execute(self, folder: RunFolder) -> TaskOutcome:
         """Fit all variants and write the comparison; runs that are there already are kept.
 
         Raises:
             ResidnetError: where a variant cannot be run, or the system ends a process.
         """
-        places = {
+        folder_by_job = {
             (variant, seed): folder.path / "variants" / f"{variant}.{seed}"
             for variant in self.variants
             for seed in self.seeds
         }
         seconds = dict[tuple[str, int], float]()
         if self.workers == 1:
-            for number, (job, out) in enumerate(places.items()):
-                report("fits of the study", number, len(places))
-                seconds[job] = _fit(self, *job, out)
-            report("fits of the study", len(places), len(places))
+            for number, (job, folder_path) in enumerate(folder_by_job.items()):
+                report_progress("fits of the study", number, len(folder_by_job))
+                seconds[job] = _run_variant(self, *job, folder_path)
+            report_progress("fits of the study", len(folder_by_job), len(folder_by_job))
         else:
-            with processes(self.workers) as pool:
-                work = [(self, *job, out) for job, out in places.items()]
-                found = pool.map(_fit, *zip(*work, strict=True))
-                seconds = dict(zip(places, found, strict=True))
+            with process_pool(self.workers) as pool:
+                job_arguments = [
+                    (self, *job, folder_path) for job, folder_path in folder_by_job.items()
+                ]
+                durations = pool.map(_run_variant, *zip(*job_arguments, strict=True))
+                seconds = dict(zip(folder_by_job, durations, strict=True))
         import pandas as pd
 
         errors = pd.concat(
-            {job: window_nrmse(out, self.model, self.split) for job, out in places.items()},
+            {
+                job: compute_window_errors(folder_path, self.model, self.split)
+                for job, folder_path in folder_by_job.items()
+            },
             names=["variant", "seed"],
         )
-        rows = variant_rows(errors, self.reference)
+        rows = compare_variants(errors, self.reference)
         for row in rows:
             row["overrides"] = list(self.variants[row["variant"]])
             row["seconds"] = float(np.mean([seconds[row["variant"], seed] for seed in self.seeds]))
@@ -141,72 +163,80 @@ class StudyConfig(Task):
             "rows": rows,
         }
         folder.write_json(folder.path / "study.json", content)
-        figures = {
-            f"nrmse_{row['variant']}_{row['protocol']}": MainFigure(row["nrmse_mean"])
+        summary_metrics = {
+            f"nrmse_{row['variant']}_{row['protocol']}": SummaryMetric(row["nrmse_mean"])
             for row in rows
         }
-        text = variants_table(rows, self.reference).text()
-        return Outcome(_verdict(rows, self.reference), figures, text)
+        text = tabulate_variants(rows, self.reference).to_text()
+        return TaskOutcome(_summarize_variants(rows, self.reference), summary_metrics, text)
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        content = RunFiles(run.path).json("study.json")
+        content = RunFiles(run.path).read_json("study.json")
         rows = content["rows"]
-        drawn = write_figures(run.figures, [differences(rows, content["reference"])])
-        about = [
+        figure_blocks = write_figures(run.figures, [plot_differences(rows, content["reference"])])
+        explanation = [
             f"Free-run NRMSE of model {content['model']} on {content['split']} data, mean over the"
-            f" windows and {plural(rows[0]['seeds'], 'seed')}.",
+            f" windows and {format_count(rows[0]['seeds'], 'seed')}.",
             f"Difference: to {content['reference']} over the same windows, seeds averaged first;"
             " negative is better, and a bold interval excludes 0. Its 95 % interval comes from"
             " blocks of windows.",
         ]
-        shown = variants_table(rows, content["reference"])
-        return [Section("", [shown, *drawn, Text(about, quiet=True)])]
+        table = tabulate_variants(rows, content["reference"])
+        return [Section("", [table, *figure_blocks, Text(explanation, is_secondary=True)])]
 
 
-def _verdict(rows: Sequence[dict[str, Any]], reference: str) -> list[str]:
+def _summarize_variants(rows: Sequence[dict[str, Any]], reference: str) -> list[str]:
     """Return for each protocol which variant has the least error, and by how much."""
     sentences = []
     for protocol in dict.fromkeys(row["protocol"] for row in rows):
-        found = [row for row in rows if row["protocol"] == protocol]
+        protocol_rows = [row for row in rows if row["protocol"] == protocol]
         # the error of runs that diverged is that of zero: a steady variant comes before them
-        best = min(found, key=lambda row: (int(row["diverged"]) > 0, float(row["nrmse_mean"])))
-        steady = " of the steady ones" if any(row["diverged"] for row in found) else ""
-        sentence = (
-            f"{protocol}: '{best['variant']}' has the least free-run NRMSE{steady},"
-            f" {best['nrmse_mean']:.4f}"
+        best_row = min(
+            protocol_rows, key=lambda row: (int(row["diverged"]) > 0, float(row["nrmse_mean"]))
         )
-        if best["diverged"]:
+        qualifier = " of the steady ones" if any(row["diverged"] for row in protocol_rows) else ""
+        sentence = (
+            f"{protocol}: '{best_row['variant']}' has the least free-run NRMSE{qualifier},"
+            f" {best_row['nrmse_mean']:.4f}"
+        )
+        if best_row["diverged"]:
             sentence = (
                 f"{protocol}: EVERY VARIANT DIVERGED in some windows; of the errors, which count"
-                f" those windows as zero does, that of '{best['variant']}' is the least,"
-                f" {best['nrmse_mean']:.4f}"
+                f" those windows as zero does, that of '{best_row['variant']}' is the least,"
+                f" {best_row['nrmse_mean']:.4f}"
             )
-        interval = best["difference_ci95"]
-        if best["variant"] != reference and interval is not None:
+        interval = best_row["difference_ci95"]
+        if best_row["variant"] != reference and interval is not None:
             sentence += (
-                f"; that is {best['difference']:+.4f} [{interval[0]:+.4f}, {interval[1]:+.4f}]"
+                f"; that is {best_row['difference']:+.4f} [{interval[0]:+.4f}, {interval[1]:+.4f}]"
                 f" from '{reference}'"
             )
         sentences.append(f"{sentence}.")
-        lost = [row for row in found if row["diverged"]]
-        if lost:
-            named = ", ".join(f"'{row['variant']}' in {row['diverged']} windows" for row in lost)
-            sentences.append(f"{protocol}: free runs DIVERGED: {named}.")
+        diverged_rows = [row for row in protocol_rows if row["diverged"]]
+        if diverged_rows:
+            diverged_text = ", ".join(
+                f"'{row['variant']}' in {row['diverged']} windows" for row in diverged_rows
+            )
+            sentences.append(f"{protocol}: free runs DIVERGED: {diverged_text}.")
     return sentences
 
 
-def _fit(study: StudyConfig, variant: str, seed: int, out: Path) -> float:
+def _run_variant(study: StudyConfig, variant: str, seed: int, folder_path: Path) -> float:
     """Run one variant with one seed unless it is finished; returns the seconds that it took."""
-    if not RunFolder(out).finished:
-        overrides = study.overrides(variant, seed)
+    if not RunFolder(folder_path).is_finished:
+        overrides = study.build_overrides(variant, seed)
         load_config(study.base, overrides, FitConfig).run(
-            source=study.base, overrides=overrides, out=out, resume=True, report=False
+            source=study.base,
+            overrides=overrides,
+            output_folder=folder_path,
+            resume=True,
+            report=False,
         )
-    return float(read_json(RunFolder(out).provenance)["seconds"])
+    return float(read_json(RunFolder(folder_path).provenance)["seconds"])
 
 
-def window_nrmse(run: Path, model: str, split: str) -> pd.DataFrame:
+def compute_window_errors(run: Path, model: str, split: str) -> pd.DataFrame:
     """Return the errors of one model of a finished run, from its stored rollouts.
 
     Args:
@@ -223,25 +253,25 @@ def window_nrmse(run: Path, model: str, split: str) -> pd.DataFrame:
 
     files = RunFiles(run)
     name = files.selected if model == "selected" else model
-    windows = files.windows(split)
+    windows = files.read_split_windows(split)
     if not windows:
         raise DataError(f"{run}: no rollouts of the split '{split}'")
     if name is None or name not in windows[0].predicted:
         raise DataError(f"{run}: no model '{name}' among {', '.join(windows[0].predicted)}")
-    scales = {name: float(files.metrics["scales"][name]) for name in files.live.channels}
+    scales = {name: float(files.metrics["scales"][name]) for name in files.dof.active_states}
     return pd.DataFrame(
         {
-            "protocol": one.protocol,
-            "log": one.log,
-            "window": one.number,
-            "nrmse": one.nrmse(name, scales),
-            "diverged": one.diverged[name],
+            "protocol": window.protocol,
+            "log": window.log,
+            "window": window.number,
+            "nrmse": window.mean_nrmse(name, scales),
+            "diverged": window.diverged[name],
         }
-        for one in windows
+        for window in windows
     )
 
 
-def variant_rows(errors: pd.DataFrame, reference: str) -> list[dict[str, Any]]:
+def compare_variants(errors: pd.DataFrame, reference: str) -> list[dict[str, Any]]:
     """Return one row per variant and protocol.
 
     A row has the number of windows that diverged, the mean error over windows and seeds, its
@@ -250,40 +280,45 @@ def variant_rows(errors: pd.DataFrame, reference: str) -> list[dict[str, Any]]:
     95 % interval by blocks of windows.
 
     Args:
-        errors: as of `window_nrmse`, by variant and seed.
+        errors: as of `compute_window_errors`, by variant and seed.
         reference: name of the variant that differences are taken to.
     """
     import pandas as pd
 
-    out = []
-    for (variant, protocol), own in errors.groupby(["variant", "protocol"], sort=False):
-        known = errors.loc[reference]
-        apart, level = (
-            of.groupby(["log", "window"], sort=False)["nrmse"].mean()
-            for of in (own, known[known["protocol"] == protocol])
+    rows = []
+    for (variant, protocol), variant_errors in errors.groupby(["variant", "protocol"], sort=False):
+        reference_errors = errors.loc[reference]
+        differences_mean, reference_mean = (
+            error_table.groupby(["log", "window"], sort=False)["nrmse"].mean()
+            for error_table in (
+                variant_errors,
+                reference_errors[reference_errors["protocol"] == protocol],
+            )
         )
-        apart -= level
-        logs = pd.factorize(apart.index.get_level_values("log"))[0]
-        (interval,) = intervals(apart.to_numpy()[:, None], blocks(logs))
-        by_seed = own.groupby("seed")["nrmse"].mean()
-        out.append(
+        differences_mean -= reference_mean
+        logs = pd.factorize(differences_mean.index.get_level_values("log"))[0]
+        (interval,) = bootstrap_intervals(
+            differences_mean.to_numpy()[:, None], make_resampling_blocks(logs)
+        )
+        by_seed = variant_errors.groupby("seed")["nrmse"].mean()
+        rows.append(
             {
                 "variant": variant,
                 "protocol": protocol,
                 "seeds": len(by_seed),
-                "windows": len(apart),
-                "diverged": int(own["diverged"].sum()),
+                "windows": len(differences_mean),
+                "diverged": int(variant_errors["diverged"].sum()),
                 "nrmse_mean": float(by_seed.mean()),
                 "nrmse_sd": float(by_seed.std()) if len(by_seed) > 1 else None,
                 "nrmse_range": [float(by_seed.min()), float(by_seed.max())],
-                "difference": float(apart.mean()),
+                "difference": float(differences_mean.mean()),
                 "difference_ci95": None if variant == reference else interval,
             }
         )
-    return out
+    return rows
 
 
-def differences(rows: Sequence[Content], reference: str) -> Figure:
+def plot_differences(rows: Sequence[JsonObject], reference: str) -> Figure:
     """Draw the differences to the reference with their intervals, a panel for each protocol.
 
     Args:
@@ -291,18 +326,30 @@ def differences(rows: Sequence[Content], reference: str) -> Figure:
     """
     protocols = list(dict.fromkeys(row["protocol"] for row in rows))
     names = [name for name in dict.fromkeys(row["variant"] for row in rows) if name != reference]
-    curves, panels = [], []
+    panel_curves, panels = [], []
     for protocol in protocols:
-        found = [row for row in rows if row["protocol"] == protocol and row["variant"] != reference]
-        at = [names.index(row["variant"]) for row in found]
-        spans = [
-            (place, *row["difference_ci95"])
-            for place, row in zip(at, found, strict=True)
+        protocol_rows = [
+            row for row in rows if row["protocol"] == protocol and row["variant"] != reference
+        ]
+        positions = [names.index(row["variant"]) for row in protocol_rows]
+        interval_spans = [
+            (position, *row["difference_ci95"])
+            for position, row in zip(positions, protocol_rows, strict=True)
             if row["difference_ci95"]
         ]
-        lines = joined([whiskers(*[[part] for part in span])[::-1] for span in spans])
-        points = (np.array([row["difference"] for row in found]), np.array(at, dtype=float))
-        curves.append({"interval": lines, "difference": points, "zero": (np.zeros(1), np.zeros(1))})
+        interval_lines = join_with_gaps(
+            [
+                error_bars(*[[part] for part in interval_span])[::-1]
+                for interval_span in interval_spans
+            ]
+        )
+        points = (
+            np.array([row["difference"] for row in protocol_rows]),
+            np.array(positions, dtype=float),
+        )
+        panel_curves.append(
+            {"interval": interval_lines, "difference": points, "zero": (np.zeros(1), np.zeros(1))}
+        )
         label = f"{protocol}: NRMSE minus that of {reference} [-]"
         panels.append(
             Panel(
@@ -310,7 +357,7 @@ def differences(rows: Sequence[Content], reference: str) -> Figure:
                 label,
                 height=80 + 31 * len(names),
                 group=protocol,
-                y_names=names_of(names),
+                y_names=tick_labels(names),
                 y_limits=(len(names) - 0.5, -0.5),
             )
         )
@@ -320,57 +367,59 @@ def differences(rows: Sequence[Content], reference: str) -> Figure:
         f"Free-run error of each variant minus that of {reference}, mean over windows and seeds."
         " The bars are 95 % intervals over logs.",
         {
-            "zero": Look("", "#666666", width=0.8, kind="upright", order=1),
-            "interval": Look("95 % interval", width=1.2),
-            "difference": Look("difference", BLUE, kind="points", size=4.5, order=4),
+            "zero": GlyphStyle("", "#666666", width=0.8, kind="upright", z_order=1),
+            "interval": GlyphStyle("95 % interval", width=1.2),
+            "difference": GlyphStyle("difference", BLUE, kind="points", size=4.5, z_order=4),
         },
         panels,
-        [Case("", curves)],
+        [Case("", panel_curves)],
         columns=len(protocols),
     )
 
 
-def variants_table(rows: Sequence[Content], reference: str) -> Table:
+def tabulate_variants(rows: Sequence[JsonObject], reference: str) -> Table:
     """Return a row for each variant with its error and difference under each protocol.
 
     Args:
         reference: name of the variant that differences are taken to.
     """
-    by_variant: dict[str, dict[str, Content]] = {}
+    by_variant: dict[str, dict[str, JsonObject]] = {}
     for row in rows:
         by_variant.setdefault(row["variant"], {})[row["protocol"]] = row
     protocols = list(dict.fromkeys(row["protocol"] for row in rows))
 
-    def error(row: Content) -> Cell:
+    def format_error(row: JsonObject) -> Cell:
         # a study of an earlier version does not know what diverged
-        lost = int(row.get("diverged", 0))
-        note = f"{lost} diverged" if lost else ""
-        same = [other for other in rows if other["protocol"] == row["protocol"]]
-        least = row["nrmse_mean"] == min(other["nrmse_mean"] for other in same)
-        return Cell(f"{row['nrmse_mean']:.4f}", note, "bad" if lost else "best" if least else "")
+        n_diverged = int(row.get("diverged", 0))
+        note = f"{n_diverged} diverged" if n_diverged else ""
+        protocol_rows = [other for other in rows if other["protocol"] == row["protocol"]]
+        is_lowest = row["nrmse_mean"] == min(other["nrmse_mean"] for other in protocol_rows)
+        return Cell(
+            f"{row['nrmse_mean']:.4f}", note, "bad" if n_diverged else "best" if is_lowest else ""
+        )
 
-    heads: list[Column] = [
-        ("NRMSE", error),
+    protocol_columns: list[Column] = [
+        ("NRMSE", format_error),
         ("sd of seeds", lambda row: row["nrmse_sd"], 4),
         (
             "difference",
-            lambda row: signed(row["difference"]) if row["difference_ci95"] else "",
+            lambda row: format_signed(row["difference"]) if row["difference_ci95"] else "",
             str,
         ),
-        ("95 % interval", lambda row: paired_interval(row["difference_ci95"], "")),
+        ("95 % interval", lambda row: format_paired_interval(row["difference_ci95"], "")),
     ]
-    return table_of(
+    return build_table(
         by_variant.values(),
         [
             ("variant", lambda row: row[protocols[0]]["variant"]),
             *(
-                (title, lambda row, name=name, of=of: of(row[name]), *how)
+                (title, lambda row, name=name, of=cell_function: of(row[name]), *number_format)
                 for name in protocols
-                for title, of, *how in heads
+                for title, cell_function, *number_format in protocol_columns
             ),
             ("run [s]", f"{protocols[0]}.seconds", 0),
             ("what changes", lambda row: ", ".join(row[protocols[0]]["overrides"])),
         ],
-        groups=[*((f"protocol {name}", len(heads)) for name in protocols), ("", 2)],
-        selected=lambda row: row[protocols[0]]["variant"] == reference,
+        groups=[*((f"protocol {name}", len(protocol_columns)) for name in protocols), ("", 2)],
+        is_selected=lambda row: row[protocols[0]]["variant"] == reference,
     )

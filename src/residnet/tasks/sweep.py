@@ -23,31 +23,31 @@ from pydantic import Field, JsonValue, model_validator
 from residnet.core.config import BaseConfig, Config, dump_config, load_config
 from residnet.core.errors import DataError, FitError, ResidnetError, UsageError, require_package
 from residnet.core.files import read_json
-from residnet.core.names import nearest
-from residnet.core.processes import ApartProcesses, ThisProcess, spread
-from residnet.core.progress import Progress, listen, report, say
+from residnet.core.names import suggest_name
+from residnet.core.processes import InlineExecutor, IsolatedProcessPool, worker_limit
+from residnet.core.progress import Progress, log_message, on_progress, report_progress
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.sweep import trials_table
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import MainFigure, Outcome, Task
+from residnet.runs.task import SummaryMetric, Task, TaskOutcome
 from residnet.tasks.registry import SweepableConfig
 
 if TYPE_CHECKING:
     import optuna
 
-_MOST = 100_000
+_MAX_TRIALS = 100_000
 """Most trials of a sweep."""
-_LOSSES = 3
+_MAX_LOST_PROCESSES = 3
 """Times that a trial may lose its process before it has failed: twice is an accident."""
-_STALE = 10
+_LOCK_TIMEOUT = 10
 """Seconds after which the lock of a killed process is taken away."""
-_PRIME = 7_919
+_SEED_STRIDE = 7_919
 """Keeps the seeds of the trials of neighbouring seeds of a search apart."""
-JOURNAL, BEST = "journal.log", "best.yaml"
-_STATES = {"COMPLETE": "finished", "PRUNED": "ended early", "FAIL": "failed"}
+JOURNAL_FILE, BEST_CONFIG_FILE = "journal.log", "best.yaml"
+_STATE_NAMES = {"COMPLETE": "finished", "PRUNED": "ended early", "FAIL": "failed"}
 
 
-class Values(Config):
+class SearchValues(Config):
     """Values that a key of the base takes: `choices`, or a range from `low` to `high`.
 
     Attributes:
@@ -66,11 +66,11 @@ class Values(Config):
     points: int | None = Field(default=None, ge=2, le=10_000)
 
     @model_validator(mode="after")
-    def _one_kind(self) -> Values:
+    def _validate_range(self) -> SearchValues:
         if self.choices is not None:
             if self.low is not None or self.high is not None or self.points or self.log:
                 raise ValueError("give choices, or low and high, not both")
-            if len(set(self._texts)) < len(self.choices):
+            if len(set(self._choice_texts)) < len(self.choices):
                 raise ValueError("choices: each only once")
         elif self.low is None or self.high is None:
             raise ValueError("give choices, or low and high")
@@ -81,45 +81,54 @@ class Values(Config):
         return self
 
     @property
-    def _texts(self) -> list[str]:
+    def _choice_texts(self) -> list[str]:
         """Choices as Optuna knows them."""
         return [json.dumps(choice) for choice in self.choices or ()]
 
     @property
-    def _whole(self) -> bool:
+    def _is_integer(self) -> bool:
         return isinstance(self.low, int) and isinstance(self.high, int)
 
-    def distribution(self) -> Any:
+    def to_distribution(self) -> Any:
         """Return the Optuna distribution; a choice is its JSON text there."""
-        from optuna import distributions as of
 
         if self.choices is not None:
-            return of.CategoricalDistribution(self._texts)
-        kind: Any = of.IntDistribution if self._whole else of.FloatDistribution
-        return kind(self.low, self.high, log=self.log)
+            return optuna_distributions.CategoricalDistribution(self._choice_texts)
+        distribution_type: Any = (
+            optuna_distributions.IntDistribution
+            if self._is_integer
+            else optuna_distributions.FloatDistribution
+        )
+        return distribution_type(self.low, self.high, log=self.log)
 
-    def grid(self) -> list[Any]:
+    def grid_values(self) -> list[Any]:
         """Return all values of a grid, as the distribution knows them.
 
         Raises:
             ValueError: for a range without a number of points.
         """
         if self.choices is not None:
-            return list(self._texts)
+            return list(self._choice_texts)
         assert self.low is not None
         assert self.high is not None
         if self.points is None:
-            if not self._whole:
+            if not self._is_integer:
                 raise ValueError("a grid needs the number of points of a range")
             return list(range(int(self.low), int(self.high) + 1))
-        found = (np.geomspace if self.log else np.linspace)(self.low, self.high, self.points)
+        points_on_range = (np.geomspace if self.log else np.linspace)(
+            self.low, self.high, self.points
+        )
         # the ends themselves, or rounding may leave the range
-        found[0], found[-1] = self.low, self.high
-        return sorted({round(value) for value in found.tolist()}) if self._whole else found.tolist()
+        points_on_range[0], points_on_range[-1] = self.low, self.high
+        return (
+            sorted({round(value) for value in points_on_range.tolist()})
+            if self._is_integer
+            else points_on_range.tolist()
+        )
 
-    def extremes(self) -> list[Any]:
+    def boundary_values(self) -> list[Any]:
         """Return values that a check tries: all choices, or the ends of a range."""
-        return self.grid() if self.choices is not None else [self.low, self.high]
+        return self.grid_values() if self.choices is not None else [self.low, self.high]
 
 
 class GridSearch(Config):
@@ -142,7 +151,7 @@ class RandomSearch(Config):
     """
 
     kind: Literal["random"]
-    trials: int = Field(ge=1, le=_MOST)
+    trials: int = Field(ge=1, le=_MAX_TRIALS)
     seed: int = Field(default=0, ge=0)
 
 
@@ -188,19 +197,19 @@ class FreeRunObjective(Config):
     kind: Literal["free_run"] = "free_run"
     model: str = "selected"
 
-    minimized: ClassVar[bool] = True
+    is_minimized: ClassVar[bool] = True
 
     @property
-    def watched(self) -> str | None:
+    def monitored_model(self) -> str | None:
         """The model whose training may be ended early; None where it is not named."""
         return None if self.model == "selected" else self.model
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """What is sought, for tables and axes."""
         return f"validation NRMSE of {self.model} [-]"
 
-    def check(self, task: Task) -> None:
+    def require_valid_task(self, task: Task) -> None:
         """Check that runs of a task have this objective.
 
         Raises:
@@ -214,10 +223,10 @@ class FreeRunObjective(Config):
         models = ("selected", *task.model_names)  # type: ignore[attr-defined]
         if self.model not in models:
             raise UsageError(
-                f"objective.model: no model is named '{self.model}'{nearest(self.model, models)}"
+                f"objective.model: no model is named '{self.model}'{suggest_name(self.model, models)}"
             )
 
-    def value(self, run: RunFolder) -> float | None:
+    def read_value(self, run: RunFolder) -> float | None:
         """Return the objective of a finished run.
 
         Raises:
@@ -225,7 +234,7 @@ class FreeRunObjective(Config):
         """
         files = RunFiles(run.path)
         model = files.selected if self.model == "selected" else self.model
-        row = files.row(model, "validation", files.evaluation["selection"])
+        row = files.find_row(model, "validation", files.evaluation["selection"])
         if row is None:
             raise DataError(f"{run.metrics}: has no validation error of model '{model}'")
         return float(row["nrmse"]["mean"])
@@ -245,19 +254,19 @@ class FigureObjective(Config):
     direction: Literal["minimize", "maximize"] = "minimize"
 
     # no training shows the figure before a run ends
-    watched: ClassVar[None] = None
+    monitored_model: ClassVar[None] = None
 
     @property
-    def minimized(self) -> bool:
+    def is_minimized(self) -> bool:
         """Whether a lesser figure is better."""
         return self.direction == "minimize"
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """What is sought, for tables and axes."""
         return self.name
 
-    def check(self, task: Task) -> None:
+    def require_valid_task(self, task: Task) -> None:
         """Check that the figure may be sought.
 
         Raises:
@@ -269,19 +278,19 @@ class FigureObjective(Config):
                 " choose anything; take objective: {kind: free_run}"
             )
 
-    def value(self, run: RunFolder) -> float | None:
+    def read_value(self, run: RunFolder) -> float | None:
         """Return the objective of a finished run.
 
         Raises:
             DataError: where the run has no such figure.
         """
-        figures = run.read_summary()["figures"]
-        if self.name not in figures:
+        summary_figures = run.read_summary()["figures"]
+        if self.name not in summary_figures:
             raise DataError(
-                f"{run.summary}: has no main figure '{self.name}'{nearest(self.name, figures)}"
+                f"{run.summary}: has no main figure '{self.name}'{suggest_name(self.name, summary_figures)}"
             )
-        found: float | None = figures[self.name]["value"]
-        return found
+        figure_value: float | None = summary_figures[self.name]["value"]
+        return figure_value
 
 
 class ProcessesConfig(Config):
@@ -296,11 +305,11 @@ class ProcessesConfig(Config):
     kind: Literal["processes"] = "processes"
     workers: int | None = Field(default=None, ge=1, le=1_024)
 
-    def check(self) -> None:
+    def require_available(self) -> None:
         """Check nothing: processes need no package."""
 
     @property
-    def side_by_side(self) -> int:
+    def n_parallel(self) -> int:
         """How many trials run at a time."""
         if self.workers is not None:
             return self.workers
@@ -309,17 +318,17 @@ class ProcessesConfig(Config):
         return int(cpu_count())
 
     @contextmanager
-    def executor(self) -> Iterator[Executor]:
+    def open_executor(self) -> Iterator[Executor]:
         """Hold the processes; an interruption ends them all at once. One worker is this process."""
-        if self.side_by_side == 1:
-            with spread(1):
-                yield ThisProcess()
+        if self.n_parallel == 1:
+            with worker_limit(1):
+                yield InlineExecutor()
             return
-        with ApartProcesses(self.side_by_side) as pool:
+        with IsolatedProcessPool(self.n_parallel) as pool:
             yield pool
 
     @property
-    def losses(self) -> tuple[type[Exception], ...]:
+    def worker_lost_errors(self) -> tuple[type[Exception], ...]:
         """Errors with which a trial ends whose process was lost."""
         return (BrokenProcessPool,)
 
@@ -344,7 +353,7 @@ class RayConfig(Config):
     cpus: float = Field(default=1.0, gt=0)
     gpus: float = Field(default=0.0, ge=0)
 
-    def check(self) -> None:
+    def require_available(self) -> None:
         """Check that Ray is installed.
 
         Raises:
@@ -353,18 +362,18 @@ class RayConfig(Config):
         require_package("ray", "runner.kind: ray", "ray")
 
     @property
-    def side_by_side(self) -> int:
+    def n_parallel(self) -> int:
         """How many trials run at a time."""
         return self.workers
 
     @contextmanager
-    def executor(self) -> Iterator[Executor]:
+    def open_executor(self) -> Iterator[Executor]:
         """Hold a connection to Ray, whose processes end with this one.
 
         Raises:
             FitError: where the cluster cannot be reached, or ends a trial that was not lost.
         """
-        self.check()
+        self.require_available()
         import ray
 
         try:
@@ -389,15 +398,14 @@ class RayConfig(Config):
             ray.shutdown()
 
     @property
-    def losses(self) -> tuple[type[Exception], ...]:
+    def worker_lost_errors(self) -> tuple[type[Exception], ...]:
         """Errors with which a trial ends whose process, node or memory was lost."""
-        from ray import exceptions as lost
 
         return (
-            lost.WorkerCrashedError,
-            lost.NodeDiedError,
-            lost.OutOfMemoryError,
-            lost.ObjectLostError,
+            ray_errors.WorkerCrashedError,
+            ray_errors.NodeDiedError,
+            ray_errors.OutOfMemoryError,
+            ray_errors.ObjectLostError,
         )
 
 
@@ -406,11 +414,11 @@ class _RayExecutor(Executor):
 
     def __init__(self, ray: Any, cpus: float, gpus: float) -> None:
         # the sweep counts what is lost, and begins it again
-        self._wrap = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)
+        self._make_remote = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)
 
-    def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        found: Future[Any] = self._wrap(work).remote(*args, **kwargs).future()
-        return found
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = self._make_remote(function).remote(*args, **kwargs).future()
+        return future
 
 
 SearchConfig = Annotated[GridSearch | RandomSearch | TpeSearch, Field(discriminator="kind")]
@@ -433,28 +441,28 @@ class SweepConfig(Task):
         runner: where trials run.
     """
 
-    page: ClassVar[str] = "sweep"
+    section_module: ClassVar[str] = "sweep"
 
     task: Literal["sweep"]
     base: BaseConfig
     common: tuple[str, ...] = ()
-    space: dict[str, Values] = Field(min_length=1)
+    space: dict[str, SearchValues] = Field(min_length=1)
     search: SearchConfig
     objective: ObjectiveConfig = FreeRunObjective()
     pruning: PruningConfig | None = None
     runner: RunnerConfig = ProcessesConfig()
 
     @model_validator(mode="after")
-    def _combination(self) -> SweepConfig:
+    def _validate_sweep(self) -> SweepConfig:
         if isinstance(self.search, GridSearch):
             for key, values in self.space.items():
                 try:
-                    values.grid()
+                    values.grid_values()
                 except ValueError as error:
                     raise ValueError(f"space.{key}: {error}") from None
-            if self.trials > _MOST:
-                raise ValueError(f"space: a grid of {self.trials} trials; at most {_MOST}")
-        if self.pruning is not None and self.objective.watched is None:
+            if self.n_trials > _MAX_TRIALS:
+                raise ValueError(f"space: a grid of {self.n_trials} trials; at most {_MAX_TRIALS}")
+        if self.pruning is not None and self.objective.monitored_model is None:
             raise ValueError(
                 "pruning: objective must be of kind free_run and name the network whose training"
                 " is watched in objective.model"
@@ -462,13 +470,13 @@ class SweepConfig(Task):
         return self
 
     @property
-    def trials(self) -> int:
+    def n_trials(self) -> int:
         """Number of trials that the search asks for; of a grid, all its combinations."""
         if isinstance(self.search, GridSearch):
-            return math.prod(len(values.grid()) for values in self.space.values())
+            return math.prod(len(values.grid_values()) for values in self.space.values())
         return self.search.trials
 
-    def trial(self, values: Mapping[str, Any], name: str) -> tuple[Any, list[str]]:
+    def build_trial(self, values: Mapping[str, Any], name: str) -> tuple[Any, list[str]]:
         """Return the run that values of the space describe, and the overrides of its base.
 
         Args:
@@ -477,9 +485,11 @@ class SweepConfig(Task):
         Raises:
             ConfigError: where they do not make a valid config.
         """
-        drawn = {key: values[key] for key in self.space}
-        texts = [f"{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in drawn.items()]
-        overrides = [*self.common, *texts, f"name={name}"]
+        trial_values = {key: values[key] for key in self.space}
+        value_overrides = [
+            f"{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in trial_values.items()
+        ]
+        overrides = [*self.common, *value_overrides, f"name={name}"]
         return load_config(self.base, overrides, SweepableConfig), overrides
 
     def check(self) -> None:
@@ -491,13 +501,13 @@ class SweepConfig(Task):
             ResidnetError: where one does not, or the objective does not fit the task.
         """
         require_package("optuna", "task sweep", "sweep")
-        self.runner.check()
-        first = {key: values.extremes()[0] for key, values in self.space.items()}
+        self.runner.require_available()
+        first_values = {key: values.boundary_values()[0] for key, values in self.space.items()}
         for key, values in self.space.items():
-            for value in values.extremes():
-                self.trial({**first, key: value}, f"{self.name}.check")
-        task, _ = self.trial(first, f"{self.name}.check")
-        self.objective.check(task)
+            for value in values.boundary_values():
+                self.build_trial({**first_values, key: value}, f"{self.name}.check")
+        task, _ = self.build_trial(first_values, f"{self.name}.check")
+        self.objective.require_valid_task(task)
         task.check()
 
     def input_files(self) -> list[Path]:
@@ -505,55 +515,65 @@ class SweepConfig(Task):
         base = load_config(self.base, self.common, SweepableConfig)
         return [self.base, *base.input_files()]
 
-    def recorded_seed(self) -> int:
+    def provenance_seed(self) -> int:
         return 0 if isinstance(self.search, GridSearch) else self.search.seed
 
-    def carry_out(self, folder: RunFolder) -> Outcome:
+    def execute(self, folder: RunFolder) -> TaskOutcome:
         """Carry out all trials and write what they found; those that are done already are kept.
 
         Raises:
             ResidnetError: where the system ends a process, or a journal is damaged.
         """
-        journal = folder.path / JOURNAL
-        for file in (journal, journal.with_name(f"{JOURNAL}.lock")):
+        journal = folder.path / JOURNAL_FILE
+        for file in (journal, journal.with_name(f"{JOURNAL_FILE}.lock")):
             folder.manifest.record(file, None)
         if journal.is_file():
             # a kill may have left the last line without its end
             content = journal.read_bytes()
             journal.write_bytes(content[: content.rfind(b"\n") + 1])
-        study = open_study(self, folder.path)
-        trials, running = Trials(self, study), dict[Future[Ended], Any]()
-        lost, again = Counter[int](), list[Any]()
-        with self.runner.executor() as pool:
+        study = open_optuna_study(self, folder.path)
+        queue, trial_by_future = TrialQueue(self, study), dict[Future[TrialResult], Any]()
+        n_lost, restart_queue = Counter[int](), list[Any]()
+        with self.runner.open_executor() as pool:
             while True:
-                while len(running) < self.runner.side_by_side and (
-                    trial := again.pop(0) if again else trials.next()
+                while len(trial_by_future) < self.runner.n_parallel and (
+                    trial := restart_queue.pop(0) if restart_queue else queue.start_next()
                 ):
-                    work = (self, folder.path, trial._trial_id, trial.number, dict(trial.params))
-                    running[pool.submit(carry_out_trial, *work)] = trial
-                if not running:
-                    return _results(self, study, folder)
-                done, _ = wait(running, return_when=FIRST_COMPLETED)
+                    trial_arguments = (
+                        self,
+                        folder.path,
+                        trial._trial_id,
+                        trial.number,
+                        dict(trial.params),
+                    )
+                    trial_by_future[pool.submit(run_sweep_trial, *trial_arguments)] = trial
+                if not trial_by_future:
+                    return _write_results(self, study, folder)
+                completed, _ = wait(trial_by_future, return_when=FIRST_COMPLETED)
                 # in the order of their numbers, so that nothing hangs on chance
-                for future in sorted(done, key=lambda one: running[one].number):
-                    trial = running.pop(future)
+                for future in sorted(
+                    completed, key=lambda completed_future: trial_by_future[completed_future].number
+                ):
+                    trial = trial_by_future.pop(future)
                     try:
-                        trials.tell(trial, future.result())
-                    except self.runner.losses as error:
-                        lost[trial.number] += 1
-                        if lost[trial.number] < _LOSSES:
-                            say(f"  trial {trial.number}: its process was lost, it goes on anew")
-                            again.append(trial)
+                        queue.record_result(trial, future.result())
+                    except self.runner.worker_lost_errors as error:
+                        n_lost[trial.number] += 1
+                        if n_lost[trial.number] < _MAX_LOST_PROCESSES:
+                            log_message(
+                                f"  trial {trial.number}: its process was lost, it goes on anew"
+                            )
+                            restart_queue.append(trial)
                             continue
-                        said = str(error).partition("\n")[0]
-                        fault = (
-                            f"its process was lost {_LOSSES} times ({said});"
+                        error_line = str(error).partition("\n")[0]
+                        error_message = (
+                            f"its process was lost {_MAX_LOST_PROCESSES} times ({error_line});"
                             " the memory may not be enough, so give fewer runner.workers"
                         )
-                        trials.tell(trial, Ended(None, False, fault, 0.0))
+                        queue.record_result(trial, TrialResult(None, False, error_message, 0.0))
 
 
-def open_study(config: SweepConfig, folder: Path) -> optuna.Study:
+def open_optuna_study(config: SweepConfig, folder: Path) -> optuna.Study:
     """Return the study of a sweep, new or as an interrupted sweep left it.
 
     Raises:
@@ -564,12 +584,14 @@ def open_study(config: SweepConfig, folder: Path) -> optuna.Study:
     from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
 
     optuna.logging.set_verbosity(logging.ERROR)
-    path, pruning = str((folder / JOURNAL).absolute()), config.pruning
+    path, pruning = str((folder / JOURNAL_FILE).absolute()), config.pruning
     try:
         return optuna.create_study(
-            storage=JournalStorage(JournalFileBackend(path, JournalFileSymlinkLock(path, _STALE))),
+            storage=JournalStorage(
+                JournalFileBackend(path, JournalFileSymlinkLock(path, _LOCK_TIMEOUT))
+            ),
             study_name=config.name,
-            direction="minimize" if config.objective.minimized else "maximize",
+            direction="minimize" if config.objective.is_minimized else "maximize",
             load_if_exists=True,
             pruner=optuna.pruners.NopPruner()
             if pruning is None
@@ -582,94 +604,99 @@ def open_study(config: SweepConfig, folder: Path) -> optuna.Study:
         ) from error
 
 
-class Trials:
+class TrialQueue:
     """The trials of a sweep that have still to be carried out, in their order."""
 
     def __init__(self, config: SweepConfig, study: optuna.Study) -> None:
         from optuna.trial import TrialState
 
         self.config, self.study = config, study
-        self.space = {key: values.distribution() for key, values in config.space.items()}
-        kept = study.get_trials(deepcopy=False)
+        self.distributions = {key: values.to_distribution() for key, values in config.space.items()}
+        existing_trials = study.get_trials(deepcopy=False)
         # a kill leaves trials without an end: they go on
-        self._begun = [trial for trial in kept if trial.state is TrialState.RUNNING]
-        self._next = sum(trial.state is not TrialState.WAITING for trial in kept)
+        self._interrupted = [
+            trial for trial in existing_trials if trial.state is TrialState.RUNNING
+        ]
+        self._n_started = sum(trial.state is not TrialState.WAITING for trial in existing_trials)
         if isinstance(config.search, GridSearch):
             # the last key varies fastest
-            grid = itertools.product(*(values.grid() for values in config.space.values()))
-            for values in itertools.islice(grid, len(kept), None):
+            grid = itertools.product(*(values.grid_values() for values in config.space.values()))
+            for values in itertools.islice(grid, len(existing_trials), None):
                 study.enqueue_trial(dict(zip(config.space, values, strict=True)))
 
-    def next(self) -> optuna.Trial | None:
+    def start_next(self) -> optuna.Trial | None:
         """Return the next trial to be carried out; None where all have begun."""
         import optuna
 
-        if self._begun:
-            number = self._begun[0].number
-            trial = optuna.Trial(self.study, self._begun.pop(0)._trial_id)
-            self.study.sampler = self._sampler(number)
-            for key, distribution in self.space.items():
+        if self._interrupted:
+            number = self._interrupted[0].number
+            trial = optuna.Trial(self.study, self._interrupted.pop(0)._trial_id)
+            self.study.sampler = self._make_sampler(number)
+            for key, distribution in self.distributions.items():
                 # a kill may have come before all values were written
                 trial._suggest(key, distribution)
             return trial
-        if self._next >= self.config.trials:
+        if self._n_started >= self.config.n_trials:
             return None
-        self._next += 1
-        self.study.sampler = self._sampler(self._next - 1)
-        return self.study.ask(self.space)
+        self._n_started += 1
+        self.study.sampler = self._make_sampler(self._n_started - 1)
+        return self.study.ask(self.distributions)
 
-    def _sampler(self, number: int) -> Any:
+    def _make_sampler(self, number: int) -> Any:
         """Return the sampler of a trial; its seed is that of the trial alone."""
         from optuna.samplers import RandomSampler, TPESampler
 
         search = self.config.search
-        seed = self.config.recorded_seed() * _PRIME + number
+        seed = self.config.provenance_seed() * _SEED_STRIDE + number
         if isinstance(search, TpeSearch):
             return TPESampler(n_startup_trials=search.startup, seed=seed, constant_liar=True)
         return RandomSampler(seed=seed)
 
-    def tell(self, trial: optuna.Trial, ended: Ended) -> None:
+    def record_result(self, trial: optuna.Trial, result: TrialResult) -> None:
         """Write into the journal how a trial ended, and say so."""
         from optuna.trial import TrialState
 
-        trial.set_user_attr("seconds", ended.seconds)
-        if ended.fault:
-            trial.set_user_attr("fault", ended.fault)
+        trial.set_user_attr("seconds", result.seconds)
+        if result.error_message:
+            trial.set_user_attr("fault", result.error_message)
         state = TrialState.COMPLETE
-        if ended.value is None:
-            state = TrialState.PRUNED if ended.pruned else TrialState.FAIL
-        self.study.tell(trial.number, ended.value, state=state)
-        over = sum(kept.state.is_finished() for kept in self.study.get_trials(deepcopy=False))
-        report("trials of the sweep", over, self.config.trials)
-        words = "ended early" if ended.pruned else f"failed: {ended.fault}"
-        if ended.value is not None:
-            words = f"{ended.value:.5g} (the best so far {self.study.best_value:.5g})"
-        say(f"  trial {trial.number}: {words}")
+        if result.value is None:
+            state = TrialState.PRUNED if result.is_pruned else TrialState.FAIL
+        self.study.tell(trial.number, result.value, state=state)
+        n_finished = sum(
+            stored_trial.state.is_finished()
+            for stored_trial in self.study.get_trials(deepcopy=False)
+        )
+        report_progress("trials of the sweep", n_finished, self.config.n_trials)
+        outcome_text = "ended early" if result.is_pruned else f"failed: {result.error_message}"
+        if result.value is not None:
+            outcome_text = f"{result.value:.5g} (the best so far {self.study.best_value:.5g})"
+        log_message(f"  trial {trial.number}: {outcome_text}")
 
 
-class Ended(NamedTuple):
+class TrialResult(NamedTuple):
     """How a trial ended.
 
     Attributes:
         value: of the objective; None where there is none.
-        pruned: whether it was ended early.
-        fault: one line where it failed; else empty.
+        is_pruned: whether it was ended early.
+        error_message: one line where it failed; else empty.
         seconds: that its run took.
     """
 
     value: float | None
-    pruned: bool
-    fault: str
+    is_pruned: bool
+    error_message: str
     seconds: float
 
 
-def _trial_folder(folder: Path, number: int) -> Path:
+def _trial_folder_path(folder: Path, number: int) -> Path:
     return folder / "trials" / f"{number:05d}"
 
 
-def carry_out_trial(
-    config: SweepConfig, folder: Path, trial: int, number: int, values: dict[str, Any]
-) -> Ended:
+def run_sweep_trial(
+    config: SweepConfig, folder: Path, trial_id: int, number: int, values: dict[str, Any]
+) -> TrialResult:
     """Carry out a trial unless its run is finished.
 
     Args:
@@ -677,121 +704,136 @@ def carry_out_trial(
     """
     import optuna
 
-    run = RunFolder(_trial_folder(folder, number))
-    value, pruned, fault = None, False, ""
+    run = RunFolder(_trial_folder_path(folder, number))
+    value, is_pruned, error_message = None, False, ""
     try:
-        if not run.finished:
-            task, overrides = config.trial(values, f"{config.name}.{number:05d}")
-            with listen(watch(config, folder, trial)):
+        if not run.is_finished:
+            task, overrides = config.build_trial(values, f"{config.name}.{number:05d}")
+            with on_progress(make_pruning_callback(config, folder, trial_id)):
                 task.run(
                     source=config.base, overrides=overrides, out=run.path, resume=True, report=False
                 )
     except optuna.TrialPruned:
-        pruned = True
+        is_pruned = True
     except ResidnetError as error:
-        fault = str(error)
+        error_message = str(error)
     # a complete run whose results fail a check has a value all the same
-    if run.finished and not pruned:
+    if run.is_finished and not is_pruned:
         try:
-            value, fault = config.objective.value(run), ""
+            value, error_message = config.objective.read_value(run), ""
             if value is None or not math.isfinite(value):
-                value, fault = None, f"{run.path}: what is sought is not finite"
+                value, error_message = None, f"{run.path}: what is sought is not finite"
         except ResidnetError as error:
-            fault = str(error)
-    known = run.provenance.is_file()
-    seconds = float(read_json(run.provenance)["seconds"]) if known else 0.0
-    return Ended(value, pruned, fault, seconds)
+            error_message = str(error)
+    has_provenance = run.provenance.is_file()
+    seconds = float(read_json(run.provenance)["seconds"]) if has_provenance else 0.0
+    return TrialResult(value, is_pruned, error_message, seconds)
 
 
-def watch(config: SweepConfig, folder: Path, number: int) -> Callable[[Progress], None] | None:
+def make_pruning_callback(
+    config: SweepConfig, folder: Path, number: int
+) -> Callable[[Progress], None] | None:
     """Return what hears of a trial's progress; None where no trial is ended early."""
     if config.pruning is None:
         return None
     import optuna
 
-    trial = optuna.Trial(open_study(config, folder), number)
-    watched = f"training {config.objective.watched}"
+    trial = optuna.Trial(open_optuna_study(config, folder), number)
+    monitored_stage = f"training {config.objective.monitored_model}"
 
-    def heard(progress: Progress) -> None:
-        if progress.stage != watched or progress.score is None or progress.done is None:
+    def report_to_pruner(progress: Progress) -> None:
+        if progress.stage != monitored_stage or progress.score is None or progress.done is None:
             return
         trial.report(progress.score, round(progress.done))
         if trial.should_prune():
             raise optuna.TrialPruned
 
-    return heard
+    return report_to_pruner
 
 
-def _results(config: SweepConfig, study: optuna.Study, folder: RunFolder) -> Outcome:
+def _write_results(config: SweepConfig, study: optuna.Study, folder: RunFolder) -> TaskOutcome:
     """Write sweep.json and best.yaml; returns what the sweep found."""
-    rows = [_row(config, trial) for trial in study.get_trials(deepcopy=False)]
-    by_state = {state: [row for row in rows if row["state"] == state] for state in _STATES.values()}
-    finished, sign = by_state["finished"], 1.0 if config.objective.minimized else -1.0
-    best = min(finished, key=lambda row: (sign * row["value"], row["number"]), default=None)
+    rows = [_trial_row(config, trial) for trial in study.get_trials(deepcopy=False)]
+    by_state = {
+        state: [row for row in rows if row["state"] == state] for state in _STATE_NAMES.values()
+    }
+    finished_rows, direction_sign = (
+        by_state["finished"],
+        1.0 if config.objective.is_minimized else -1.0,
+    )
+    best_row = min(
+        finished_rows, key=lambda row: (direction_sign * row["value"], row["number"]), default=None
+    )
     content = {
         "schema": "residnet.sweep/1",
         "run": config.name,
-        "objective": config.objective.words,
-        "minimized": config.objective.minimized,
+        "objective": config.objective.description,
+        "minimized": config.objective.is_minimized,
         "search": config.search.kind,
         "keys": list(config.space),
         "log": [key for key, values in config.space.items() if values.log],
-        "best": None if best is None else best["number"],
-        "importance": _importance(study, len(finished)),
+        "best": None if best_row is None else best_row["number"],
+        "importance": _parameter_importance(study, len(finished_rows)),
         "trials": rows,
     }
     folder.write_json(folder.path / "sweep.json", content)
-    figures = {s.replace(" ", "_"): MainFigure(len(found)) for s, found in by_state.items()}
-    if best is None:
-        first = next((row["fault"] for row in rows if row["fault"]), "none came to its end")
-        return Outcome(
+    summary_metrics = {
+        state_name.replace(" ", "_"): SummaryMetric(len(state_rows))
+        for state_name, state_rows in by_state.items()
+    }
+    if best_row is None:
+        first_error = next((row["fault"] for row in rows if row["fault"]), "none came to its end")
+        return TaskOutcome(
             ["No trial of the sweep has a value."],
-            figures,
-            failure=f"{config.name}: no trial has a value; the first fault: {first}",
+            summary_metrics,
+            failure=f"{config.name}: no trial has a value; the first fault: {first_error}",
         )
-    texts = {key: json.dumps(value) for key, value in best["values"].items()}
-    folder.write(folder.path / BEST, dump_config(config.trial(texts, f"{config.name}.best")[0]))
+    texts = {key: json.dumps(value) for key, value in best_row["values"].items()}
+    folder.write(
+        folder.path / BEST_CONFIG_FILE,
+        dump_config(config.build_trial(texts, f"{config.name}.best")[0]),
+    )
     verdict = [
-        f"Trial {best['number']} of {len(rows)} is the best:"
-        f" {config.objective.words.removesuffix(' [-]')} {best['value']:.5g}, with"
+        f"Trial {best_row['number']} of {len(rows)} is the best:"
+        f" {config.objective.description.removesuffix(' [-]')} {best_row['value']:.5g}, with"
         f" {', '.join(f'{key} = {text}' for key, text in texts.items())}.",
-        f"Its run is {_trial_folder(Path(), best['number'])} in the sweep's folder, and the config"
-        f" {BEST} there repeats it.",
+        f"Its run is {_trial_folder_path(Path(), best_row['number'])} in the sweep's folder, and the config"
+        f" {BEST_CONFIG_FILE} there repeats it.",
     ]
     if by_state["ended early"]:
         verdict.append(f"{len(by_state['ended early'])} trials were ended early.")
-    if failed := by_state["failed"]:
-        verdict.append(f"{len(failed)} trials failed; the first: {failed[0]['fault']}.")
-    if len(finished) > 1:
+    if failed_rows := by_state["failed"]:
+        verdict.append(f"{len(failed_rows)} trials failed; the first: {failed_rows[0]['fault']}.")
+    if len(finished_rows) > 1:
         verdict.append(
-            f"The best of {len(finished)} values is lucky as well as good: judge it on data that"
+            f"The best of {len(finished_rows)} values is lucky as well as good: judge it on data that"
             " chose nothing, such as the test split of its run."
         )
-    figures = {"best": MainFigure(best["value"]), **figures}
-    return Outcome(verdict, figures, trials_table(content).text())
+    summary_metrics = {"best": SummaryMetric(best_row["value"]), **summary_metrics}
+    return TaskOutcome(verdict, summary_metrics, trials_table(content).to_text())
 
 
-def _row(config: SweepConfig, trial: Any) -> dict[str, Any]:
-    drawn = {key: trial.params[key] for key in config.space}
+def _trial_row(config: SweepConfig, trial: Any) -> dict[str, Any]:
+    trial_values = {key: trial.params[key] for key in config.space}
     return {
         "number": trial.number,
-        "state": _STATES[trial.state.name],
+        "state": _STATE_NAMES[trial.state.name],
         "value": trial.value if trial.state.name == "COMPLETE" else None,
         "seconds": trial.user_attrs.get("seconds", 0.0),
         "fault": trial.user_attrs.get("fault", ""),
-        "values": {k: json.loads(v) if isinstance(v, str) else v for k, v in drawn.items()},
+        "values": {k: json.loads(v) if isinstance(v, str) else v for k, v in trial_values.items()},
     }
 
 
-def _importance(study: optuna.Study, finished: int) -> dict[str, float]:
+def _parameter_importance(study: optuna.Study, n_finished: int) -> dict[str, float]:
     """Return the share of each key in the variance of the objective; empty for too few trials."""
-    if finished < 4:
+    if n_finished < 4:
         return {}
     from optuna.importance import FanovaImportanceEvaluator, get_param_importances
 
     try:
-        found = get_param_importances(study, evaluator=FanovaImportanceEvaluator(seed=0))
+        importances = get_param_importances(study, evaluator=FanovaImportanceEvaluator(seed=0))
     except (RuntimeError, ValueError):
         # all values are alike: there is no variance to share
         return {}
-    return {key: float(share) for key, share in found.items()}
+    return {key: float(share) for key, share in importances.items()}

@@ -19,8 +19,8 @@ from residnet.testing.checks import (
     check_manoeuvre,
     check_reader,
     check_vessel,
-    example_models,
-    example_samples,
+    make_example_models,
+    make_example_samples,
 )
 
 __all__ = [
@@ -31,6 +31,6 @@ __all__ = [
     "check_manoeuvre",
     "check_reader",
     "check_vessel",
-    "example_models",
-    "example_samples",
+    "make_example_models",
+    "make_example_samples",
 ]

@@ -20,25 +20,25 @@ from torch import Tensor, nn
 from residnet.baselines import BaselineConfig
 from residnet.baselines.base import IdentifiedConfig
 from residnet.baselines.regressors import RegressorsConfig
-from residnet.core.config import Config, validate
+from residnet.core.config import Config, validate_config
 from residnet.core.errors import ExportError, ResidnetError, UsageError
-from residnet.core.layout import PLANAR, ROLL, SIX
+from residnet.core.layout import PLANAR_LAYOUT, ROLL_LAYOUT, SIX_DOF_LAYOUT
 from residnet.core.log import Log
 from residnet.core.names import si_unit
-from residnet.core.registry import kind_of
+from residnet.core.registry import get_kind
 from residnet.core.samples import Samples
-from residnet.data.prepare import PrepareConfig, prepare, samples
+from residnet.data.prepare import PrepareConfig, make_samples, prepare_log
 from residnet.data.readers.base import LogReader
 from residnet.data.simulated import (
-    Craft,
-    Disturbance,
-    Flight,
-    Sea,
-    SensorNoise,
+    DisturbanceConfig,
+    ManoeuvreRun,
+    SensorsConfig,
     SimulatedTrials,
-    fly,
-    fly_trials,
-    source_of,
+    SimulatedVessel,
+    TrialEnvironment,
+    make_manoeuvre_source,
+    simulate_manoeuvres,
+    simulate_trials,
 )
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
@@ -55,32 +55,36 @@ from residnet.heads.lstm import LstmConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.physics.signals import SignalsConfig
-from residnet.physics.symmetry import live_of
+from residnet.physics.symmetry import get_dof
 from residnet.physics.vessel import load_vessel
 
-SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").resolved()
+EXAMPLE_SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").with_thrusters()
 """Inputs of the example models: the revolutions of two propellers, and the forces they make."""
 
-ROLLING = SignalsConfig(inputs=("delta", "cmd_thrust"), velocities=("u", "v", "r", "p"))
+ROLLING_SIGNALS = SignalsConfig(inputs=("delta", "cmd_thrust"), velocities=("u", "v", "r", "p"))
 """Inputs of example models of a patrol vessel that rolls."""
 
-SUBMERGED = SignalsConfig(
+SUBMERGED_SIGNALS = SignalsConfig(
     inputs=("delta", "delta_s", "n"), velocities=("u", "v", "r", "w", "p", "q")
 )
 """Inputs of example models of a torpedo in six degrees of freedom."""
 
-_VESSELS = {PLANAR: "wam_v_cal", ROLL: "patrol_p06_linear", SIX: "remus_100"}
+_VESSEL_OF_LAYOUT = {
+    PLANAR_LAYOUT: "wam_v_cal",
+    ROLL_LAYOUT: "patrol_p06_linear",
+    SIX_DOF_LAYOUT: "remus_100",
+}
 
-STEP = 0.1
+EXAMPLE_TIME_STEP = 0.1
 """Step of the example models in s."""
 
 
-_DERIVATIVE = {"kind": "savitzky_golay", "window": 1.1, "order": 2}
+_DERIVATIVE_SETTINGS = {"kind": "savitzky_golay", "window": 1.1, "order": 2}
 
 
 @functools.cache
-def example_samples(
-    vessel: str = "", signals: SignalsConfig = SIGNALS, duration: float = 20.0
+def make_example_samples(
+    vessel: str = "", signals: SignalsConfig = EXAMPLE_SIGNALS, duration: float = 20.0
 ) -> Samples:
     """Return samples of simulated trials: channels z [N, nz], accelerations [N, n], float64, SI.
 
@@ -93,10 +97,10 @@ def example_samples(
         signals: what drives the model; channels of the vessel's logs.
         duration: of each manoeuvre in s.
     """
-    trials = SimulatedTrials.model_validate(
+    trial_settings = SimulatedTrials.model_validate(
         {
-            "vessel": vessel or _VESSELS[signals.live.layout],
-            "step": STEP,
+            "vessel": vessel or _VESSEL_OF_LAYOUT[signals.dof.layout],
+            "step": EXAMPLE_TIME_STEP,
             "substeps": 1,
             "duration": duration,
             "trials": [
@@ -105,7 +109,7 @@ def example_samples(
                 {
                     "kind": "random_steps",
                     "count": 4,
-                    "dive_amplitude": [0.0, 0.4 if signals.live.spatial else 0.0],
+                    "dive_amplitude": [0.0, 0.4 if signals.dof.is_six_dof else 0.0],
                 },
             ],
             "identification": {"zigzag": 3},
@@ -113,65 +117,80 @@ def example_samples(
             "seed": 4,
         }
     )
-    config = PrepareConfig.model_validate({"grid": {"step": STEP}, "derivative": _DERIVATIVE})
-    logs = [flight.log for flight in fly_trials(trials.draw(), trials)]
-    prepared = [prepare(log, "train", signals.columns, config, signals.live) for log in logs]
-    return samples(prepared, signals.build())
+    config = PrepareConfig.model_validate(
+        {"grid": {"step": EXAMPLE_TIME_STEP}, "derivative": _DERIVATIVE_SETTINGS}
+    )
+    logs = [
+        flight.measured_log
+        for flight in simulate_trials(trial_settings.draw_manoeuvres(), trial_settings)
+    ]
+    prepared = [
+        prepare_log(log, "train", signals.input_columns, config, signals.dof) for log in logs
+    ]
+    return make_samples(prepared, signals.build())
 
 
-def example_spec(head: FeatureConfig | None, signals: SignalsConfig = SIGNALS) -> ModelSpec:
+def make_example_spec(
+    head: FeatureConfig | None, signals: SignalsConfig = EXAMPLE_SIGNALS
+) -> ModelSpec:
     """Return the description of a model with an equation as baseline and a head, or none.
 
     Args:
         head: config of any head.
         signals: inputs, forces and velocities of the model.
     """
-    seen = example_samples(signals=signals).z[:, : signals.live.size + len(signals.inputs)]
-    forces = ("u", "v", "r", "tau_x", "tau_n")
+    example_channels = make_example_samples(signals=signals).z[
+        :, : signals.dof.n_dynamic + len(signals.inputs)
+    ]
+    baseline_terms = ("u", "v", "r", "tau_x", "tau_n")
     return ModelSpec.model_validate(
         {
             "schema": "residnet.model/1",
             "name": "example",
             "role": "baseline" if head is None else "head",
             "signals": signals.model_dump(),
-            "baseline": RegressorsConfig(terms=forces if signals.forces else ()).model_dump(),
+            "baseline": RegressorsConfig(
+                terms=baseline_terms if signals.forces else ()
+            ).model_dump(),
             "head": None if head is None else head.model_dump(),
-            "dt": STEP,
+            "dt": EXAMPLE_TIME_STEP,
             "integrator": "rk4",
-            "low": seen.amin(0).tolist(),
-            "high": seen.amax(0).tolist(),
+            "low": example_channels.amin(0).tolist(),
+            "high": example_channels.amax(0).tolist(),
         }
     )
 
 
-def example_models() -> list[tuple[ModelSpec, HybridDynamics]]:
+def make_example_models() -> list[tuple[ModelSpec, HybridDynamics]]:
     """Return fitted models: a baseline alone, one with a memoryless head, one with a memory."""
     heads = (None, RidgeConfig(), LstmConfig(hidden_size=4))
-    return [(spec, example_model(spec)) for spec in map(example_spec, heads)]
+    return [(spec, make_example_model(spec)) for spec in map(make_example_spec, heads)]
 
 
-def example_model(spec: ModelSpec) -> HybridDynamics:
-    """Return the model of a description from `example_spec`, its baseline identified.
+def make_example_model(spec: ModelSpec) -> HybridDynamics:
+    """Return the model of a description from `make_example_spec`, its baseline identified.
 
     A head takes its scales from the example samples; a closed form is fitted on them too.
     """
     torch.manual_seed(0)
-    model, known = spec.build(), example_samples(signals=spec.signals)
-    spec.baseline.fit(model.baseline, known)
+    model, training_samples = spec.build(), make_example_samples(signals=spec.signals)
+    spec.baseline.fit_preferred(model.baseline, training_samples)
     with torch.no_grad():
-        residual = model.head.residual_target(known, model.baseline(known.z))
-    model.head.calibrate(residual)
+        residual_samples = model.head.residual_samples(
+            training_samples, model.baseline(training_samples.z)
+        )
+    model.head.calibrate(residual_samples)
     if isinstance(model.head, ClosedFormHead):
-        model.head.solve(residual)
+        model.head.fit_preferred(residual_samples)
     return model.eval()
 
 
-_ROWS, _STEPS = 4, 12
-_STEP, _SHORT = 0.1, 4
+_N_ROWS, _N_STEPS = 4, 12
+_TIME_STEP, _SHORT_SAMPLES = 0.1, 4
 """Step of flights in s, and rows of one that ended at once."""
 
 
-def require(condition: bool, message: str) -> None:
+def assert_true(condition: bool, message: str) -> None:
     """Stop where a contract is broken.
 
     Raises:
@@ -181,25 +200,27 @@ def require(condition: bool, message: str) -> None:
         raise AssertionError(message)
 
 
-def require_equal(found: Tensor, expected: Tensor, tolerance: float, message: str) -> None:
+def assert_close(actual: Tensor, expected: Tensor, tolerance: float, message: str) -> None:
     """Stop where two tensors of one shape differ by more than a share of the larger number.
 
     Raises:
         AssertionError: with the message and the largest difference.
     """
-    require(found.shape == expected.shape, f"{message} (shapes {found.shape}, {expected.shape})")
-    if found.numel():
-        difference = float((found - expected).abs().max()) / (1.0 + float(expected.abs().max()))
-        require(difference <= tolerance, f"{message} (largest difference {difference:.2g})")
+    assert_true(
+        actual.shape == expected.shape, f"{message} (shapes {actual.shape}, {expected.shape})"
+    )
+    if actual.numel():
+        difference = float((actual - expected).abs().max()) / (1.0 + float(expected.abs().max()))
+        assert_true(difference <= tolerance, f"{message} (largest difference {difference:.2g})")
 
 
-def require_finite(values: Tensor, message: str) -> None:
+def assert_finite(values: Tensor, message: str) -> None:
     """Stop where a tensor holds what is no number.
 
     Raises:
         AssertionError: with the message.
     """
-    require(bool(torch.isfinite(values).all()), message)
+    assert_true(bool(torch.isfinite(values).all()), message)
 
 
 def _traced(module: nn.Module, examples: tuple[Tensor, ...], who: str) -> Any:
@@ -211,17 +232,25 @@ def _traced(module: nn.Module, examples: tuple[Tensor, ...], who: str) -> Any:
         raise AssertionError(str(error)) from error
 
 
-def _read_back(config: Config, union: Any, who: str) -> None:
-    written = config.model_dump(mode="json")
+def _check_round_trip(config: Config, config_union: Any, subject: str) -> None:
+    serialised = config.model_dump(mode="json")
     try:
-        again, known = (validate(written, kind, "written") for kind in (type(config), union))
+        reloaded, from_union = (
+            validate_config(serialised, config_type, "written")
+            for config_type in (type(config), config_union)
+        )
     except Exception as error:  # also of a validator that the part brings
-        raise AssertionError(f"{who}: its config cannot be read back: {error}") from error
-    require(again == config, f"{who}: its config changes when it is written and read back")
-    require(type(known) is type(config), f"{who}: its name leads to {type(known).__name__} instead")
+        raise AssertionError(f"{subject}: its config cannot be read back: {error}") from error
+    assert_true(
+        reloaded == config, f"{subject}: its config changes when it is written and read back"
+    )
+    assert_true(
+        type(from_union) is type(config),
+        f"{subject}: its name leads to {type(from_union).__name__} instead",
+    )
 
 
-def check_head(config: FeatureConfig, signals: SignalsConfig = SIGNALS) -> None:
+def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) -> None:
     """Check everything that residnet relies on in a head.
 
     Shapes and precision, a residual that is not zero, equal answers for equal questions, rows of a
@@ -230,118 +259,160 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = SIGNALS) -> None:
     loaded without a change.
 
     Args:
-        config: of the head; it must work with the channels of `example_samples`.
+        config: of the head; it must work with the channels of `make_example_samples`.
         signals: of the models; those of `examples.ROLLING` move roll too.
 
     Raises:
         AssertionError: one line that says which contract is broken.
     """
-    who, spec, n = f"head {kind_of(type(config))}", example_spec(config, signals), signals.live.size
-    _read_back(config, HeadConfig, who)
-    fitted, samples = example_model(spec), example_samples(signals=signals).z
+    subject, spec, n_dynamic = (
+        f"head {get_kind(type(config))}",
+        make_example_spec(config, signals),
+        signals.dof.n_dynamic,
+    )
+    _check_round_trip(config, HeadConfig, subject)
+    fitted_model, samples = make_example_model(spec), make_example_samples(signals=signals).z
     # what follows changes precision
-    model = copy.deepcopy(fitted)
+    model = copy.deepcopy(fitted_model)
     head = model.head.eval()
     # channels [4, 12, nz] from the middle of the example samples
-    begin = torch.arange(_ROWS) * (len(samples) // _ROWS) + 30
-    z = samples[begin[:, None] + torch.arange(_STEPS)[None]]
+    start_rows = torch.arange(_N_ROWS) * (len(samples) // _N_ROWS) + 30
+    z = samples[start_rows[:, None] + torch.arange(_N_STEPS)[None]]
 
-    def empty(rows: int, dtype: torch.dtype) -> Tensor:
-        return torch.zeros(rows, head.n_state, dtype=dtype)
+    def zero_memory(n_rows: int, dtype: torch.dtype) -> Tensor:
+        return torch.zeros(n_rows, head.n_state, dtype=dtype)
 
-    def stepped(module: Any, given: Tensor) -> tuple[Tensor, Tensor]:
-        s, residuals = empty(len(given), given.dtype), []
-        for k in range(given.shape[1]):
-            rho, s = module(given[:, k], s)
+    def run_steps(module: Any, channel_steps: Tensor) -> tuple[Tensor, Tensor]:
+        s, residuals = zero_memory(len(channel_steps), channel_steps.dtype), []
+        for k in range(channel_steps.shape[1]):
+            rho, s = module(channel_steps[:, k], s)
             residuals.append(rho)
         return torch.stack(residuals, dim=1), s
 
     with torch.no_grad():
         for dtype in (torch.float32, torch.float64):
-            first, s = z[:, 0].to(dtype), empty(_ROWS, dtype)
-            (rho, after), (again, _) = (head.to(dtype)(first, s) for _ in range(2))
-            shapes = {"residual": (rho.shape, n), "memory": (after.shape, head.n_state)}
-            for name, (shape, size) in shapes.items():
-                wanted = f"[B, {n}]" if name == "residual" else f"[B, n_state = {size}]"
-                message = f"{who}: the {name} has the shape {shape}, not {wanted}"
-                require(shape == (_ROWS, size), message)
-            require(
-                rho.dtype == after.dtype == dtype,
-                f"{who}: answers {rho.dtype} and {after.dtype} where it is asked in {dtype}",
+            first_channels, s = z[:, 0].to(dtype), zero_memory(_N_ROWS, dtype)
+            (rho, next_memory), (repeated, _) = (
+                head.to(dtype)(first_channels, s) for _ in range(2)
             )
-            require_finite(rho, f"{who}: the residual at a training sample is not finite")
-            require(float(rho.abs().max()) > 0, f"{who}: the residual is zero everywhere")
-            message = f"{who}: two answers to one question differ; is it in eval?"
-            require(torch.equal(rho, again), message)
-        residuals, memory = stepped(head, z)
-        whole = head.sequence(z)
-        require_equal(whole, residuals, 1e-9, f"{who}: sequence differs from steps")
-        require_equal(head.warmup(z), memory, 1e-9, f"{who}: warmup differs from the steps' memory")
-        message = f"{who}: the memory without a past is not zeros [B, {head.n_state}]"
-        require_equal(head.warmup(z[:, :0]), empty(_ROWS, z.dtype), 0.0, message)
-        message = f"{who}: the answer for a row depends on the other rows of the batch"
-        for i in range(_ROWS):
-            alone = z[i : i + 1]
-            require_equal(head.sequence(alone), whole[i : i + 1], 1e-9, message)
-            require_equal(stepped(head, alone)[0], residuals[i : i + 1], 1e-9, message)
-        single = z.float()
-        rho, memory = stepped(head.float(), single)
-        examples = (single[:, 0], empty(_ROWS, torch.float32))
-        traced = head if head.refusal else _traced(head, examples, who)
-        same, after = stepped(traced, single)
-        require_equal(same, rho, 1e-5, f"{who}: the traced head gives other residuals")
-        require_equal(after, memory, 1e-5, f"{who}: the traced head keeps another memory")
+            shapes = {
+                "residual": (rho.shape, n_dynamic),
+                "memory": (next_memory.shape, head.n_state),
+            }
+            for name, (shape, n_columns) in shapes.items():
+                expected_shape = (
+                    f"[B, {n_dynamic}]" if name == "residual" else f"[B, n_state = {n_columns}]"
+                )
+                message = f"{subject}: the {name} has the shape {shape}, not {expected_shape}"
+                assert_true(shape == (_N_ROWS, n_columns), message)
+            assert_true(
+                rho.dtype == next_memory.dtype == dtype,
+                f"{subject}: answers {rho.dtype} and {next_memory.dtype} where it is asked in {dtype}",
+            )
+            assert_finite(rho, f"{subject}: the residual at a training sample is not finite")
+            assert_true(float(rho.abs().max()) > 0, f"{subject}: the residual is zero everywhere")
+            message = f"{subject}: two answers to one question differ; is it in eval?"
+            assert_true(torch.equal(rho, repeated), message)
+        residuals, memory = run_steps(head, z)
+        sequence_residuals = head.teacher_forced_residuals(z)
+        assert_close(sequence_residuals, residuals, 1e-9, f"{subject}: sequence differs from steps")
+        assert_close(
+            head.warmup(z), memory, 1e-9, f"{subject}: warmup differs from the steps' memory"
+        )
+        message = f"{subject}: the memory without a past is not zeros [B, {head.n_state}]"
+        assert_close(head.warmup(z[:, :0]), zero_memory(_N_ROWS, z.dtype), 0.0, message)
+        message = f"{subject}: the answer for a row depends on the other rows of the batch"
+        for i in range(_N_ROWS):
+            single_row = z[i : i + 1]
+            assert_close(
+                head.teacher_forced_residuals(single_row),
+                sequence_residuals[i : i + 1],
+                1e-9,
+                message,
+            )
+            assert_close(run_steps(head, single_row)[0], residuals[i : i + 1], 1e-9, message)
+        single_precision = z.float()
+        rho, memory = run_steps(head.float(), single_precision)
+        examples = (single_precision[:, 0], zero_memory(_N_ROWS, torch.float32))
+        traced = head if head.export_error else _traced(head, examples, subject)
+        scripted_residuals, next_memory = run_steps(traced, single_precision)
+        assert_close(
+            scripted_residuals, rho, 1e-5, f"{subject}: the traced head gives other residuals"
+        )
+        assert_close(next_memory, memory, 1e-5, f"{subject}: the traced head keeps another memory")
         head.double()
-        far, further = (samples.mean(0) + times * samples.std(0) for times in (1e6, 1e9))
-        rho, memory = head(far[None], empty(1, z.dtype))
-        beyond, _ = head(further[None], empty(1, z.dtype))
-        held = head.sequence(far.expand(1, 200, -1))
-        x = torch.cat((torch.zeros_like(z[:, 0, :3]), z[:, 0, :n]), dim=-1)
-        w, s = z[..., n : n + model.signals.inputs], torch.rand(_ROWS, model.n_state).to(z)
-        free = Rollout(model.double())
+        far_channels, farther_channels = (
+            samples.mean(0) + std_multiple * samples.std(0) for std_multiple in (1e6, 1e9)
+        )
+        rho, memory = head(far_channels[None], zero_memory(1, z.dtype))
+        far_residual, _ = head(farther_channels[None], zero_memory(1, z.dtype))
+        far_sequence = head.teacher_forced_residuals(far_channels.expand(1, 200, -1))
+        x = torch.cat((torch.zeros_like(z[:, 0, :3]), z[:, 0, :n_dynamic]), dim=-1)
+        w, s = (
+            z[..., n_dynamic : n_dynamic + model.signals.n_inputs],
+            torch.rand(_N_ROWS, model.n_state).to(z),
+        )
+        rollout = Rollout(model.double())
         model.positions = False
-        states, _, memory = free(x, w, s)
-        for k in range(_STEPS):
+        states, _, memory = rollout(x, w, s)
+        for k in range(_N_STEPS):
             x, s = model.step(x, w[:, k], s)
-        message = f"{who}: a free run differs from its steps"
-        require_equal(states[:, -1], x, 1e-9, message)
-        require_equal(memory, s, 1e-9, f"{message}' memory")
-    require_finite(torch.cat((rho, beyond)), f"{who}: not finite far outside of the training range")
-    require_finite(memory, f"{who}: its memory is not finite far outside of the training range")
-    require_finite(held, f"{who}: not finite after 200 steps outside of the training range")
-    inside, largest = float(whole.abs().max()), float(held.abs().max())
-    require(
-        largest < 50 * inside + 10,
-        f"{who}: runs away outside of the training range ({largest:.3g}, inside {inside:.3g});"
+        message = f"{subject}: a free run differs from its steps"
+        assert_close(states[:, -1], x, 1e-9, message)
+        assert_close(memory, s, 1e-9, f"{message}' memory")
+    assert_finite(
+        torch.cat((rho, far_residual)), f"{subject}: not finite far outside of the training range"
+    )
+    assert_finite(memory, f"{subject}: its memory is not finite far outside of the training range")
+    assert_finite(
+        far_sequence, f"{subject}: not finite after 200 steps outside of the training range"
+    )
+    max_inside, max_outside = float(sequence_residuals.abs().max()), float(far_sequence.abs().max())
+    assert_true(
+        max_outside < 50 * max_inside + 10,
+        f"{subject}: runs away outside of the training range ({max_outside:.3g}, inside {max_inside:.3g});"
         " hold the features at its edge (residnet.heads.base.Features)",
     )
-    first = z[:, 0].clone().requires_grad_()
-    head(first, empty(_ROWS, z.dtype))[0].sum().backward()
-    slope = first.grad
-    require(slope is not None, f"{who}: cannot be differentiated with respect to the channels")
-    assert slope is not None
-    require_finite(slope, f"{who}: its gradient with respect to the channels is not finite")
-    require(float(slope.abs().max()) > 0, f"{who}: its gradient is zero everywhere")
-    counts, spread = head.parameter_count(), head.residual_std()
-    require(
-        len(counts) == n and all(count >= 0 for count in counts),
-        f"{who}: parameter_count gives {counts}, not one number for each of {n} axes",
+    first_channels = z[:, 0].clone().requires_grad_()
+    head(first_channels, zero_memory(_N_ROWS, z.dtype))[0].sum().backward()
+    gradient = first_channels.grad
+    assert_true(
+        gradient is not None, f"{subject}: cannot be differentiated with respect to the channels"
     )
-    require(
-        spread.shape == (n,) and bool((spread > 0).all()),
-        f"{who}: residual_std gives {spread.tolist()}, not {n} positive numbers",
+    assert gradient is not None
+    assert_finite(gradient, f"{subject}: its gradient with respect to the channels is not finite")
+    assert_true(float(gradient.abs().max()) > 0, f"{subject}: its gradient is zero everywhere")
+    parameter_counts, residual_std = head.parameter_counts(), head.residual_scale()
+    assert_true(
+        len(parameter_counts) == n_dynamic
+        and all(parameter_count >= 0 for parameter_count in parameter_counts),
+        f"{subject}: parameter_count gives {parameter_counts}, not one number for each of {n_dynamic} axes",
+    )
+    assert_true(
+        residual_std.shape == (n_dynamic,) and bool((residual_std > 0).all()),
+        f"{subject}: residual_std gives {residual_std.tolist()}, not {n_dynamic} positive numbers",
     )
     with tempfile.TemporaryDirectory() as folder:
-        save_model(Path(folder) / "example", spec, fitted)
+        save_model(Path(folder) / "example", spec, fitted_model)
         stored_spec, stored = load_model(Path(folder) / "example")
-    require(stored_spec == spec, f"{who}: its description changes when it is stored")
-    state = fitted.state_dict()
+    assert_true(stored_spec == spec, f"{subject}: its description changes when it is stored")
+    fitted_state = fitted_model.state_dict()
     for name, value in stored.state_dict().items():
-        same_number = value.dtype == state[name].dtype and torch.equal(value, state[name])
-        require(same_number, f"{who}: '{name}' changes when the model is stored")
+        is_unchanged = value.dtype == fitted_state[name].dtype and torch.equal(
+            value, fitted_state[name]
+        )
+        assert_true(is_unchanged, f"{subject}: '{name}' changes when the model is stored")
     with torch.no_grad():
-        kept, given = (part.head.double().eval().sequence(z) for part in (stored, fitted))
-    require_equal(kept, given, 0.0, f"{who}: the stored model gives other residuals")
+        stored_residuals, fitted_residuals = (
+            evaluated_model.head.double().eval().teacher_forced_residuals(z)
+            for evaluated_model in (stored, fitted_model)
+        )
+    assert_close(
+        stored_residuals,
+        fitted_residuals,
+        0.0,
+        f"{subject}: the stored model gives other residuals",
+    )
 
 
 def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> None:
@@ -354,52 +425,65 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
     Args:
         config: of the baseline.
         samples: whose target is the measured acceleration [N, n]; those of a catamaran with two
-            propellers (`example_samples`) where None.
+            propellers (`make_example_samples`) where None.
 
     Raises:
         AssertionError: one line that says which contract is broken.
     """
-    who = f"baseline {kind_of(type(config))}"
-    known = example_samples() if samples is None else samples
-    resolved = config.resolved()
-    n = live_of(known.names).size
-    baseline, again = (resolved.build(known.names) for _ in range(2))
-    table = resolved.fit(baseline, known)
-    require(resolved.fit(again, known) == table, f"{who}: two fits give different coefficients")
-    z = known.z[:: max(len(known) // 40, 1)]
+    subject = f"baseline {get_kind(type(config))}"
+    training_samples = make_example_samples() if samples is None else samples
+    resolved = config.without_file_references()
+    n_dynamic = get_dof(training_samples.names).n_dynamic
+    baseline, refitted = (resolved.build(training_samples.names) for _ in range(2))
+    table = resolved.fit_preferred(baseline, training_samples)
+    assert_true(
+        resolved.fit_preferred(refitted, training_samples) == table,
+        f"{subject}: two fits give different coefficients",
+    )
+    z = training_samples.z[:: max(len(training_samples) // 40, 1)]
     with torch.no_grad():
         accelerations = baseline(z)
-        require(
-            accelerations.shape == (len(z), n),
-            f"{who}: the accelerations have the shape {accelerations.shape}, not [N, {n}]",
+        assert_true(
+            accelerations.shape == (len(z), n_dynamic),
+            f"{subject}: the accelerations have the shape {accelerations.shape}, not [N, {n_dynamic}]",
         )
-        require_finite(accelerations, f"{who}: its accelerations are not finite")
-        require_equal(again(z), accelerations, 0.0, f"{who}: two fits give different answers")
-        together = baseline(z[None].expand(2, -1, -1))
-        require_equal(together[1], accelerations, 1e-12, f"{who}: fails for channels [B, T, nz]")
-        message = f"{who}: the answer for a row depends on the other rows of the batch"
-        require_equal(baseline(z[3:4]), accelerations[3:4], 1e-9, message)
-        single = copy.deepcopy(baseline).float()(z.float())
-        require(single.dtype == torch.float32, f"{who}: answers {single.dtype} in float32")
-        require_equal(single.double(), accelerations, 1e-3, f"{who}: float32 differs too much")
-    moving = z.clone().requires_grad_()
+        assert_finite(accelerations, f"{subject}: its accelerations are not finite")
+        assert_close(refitted(z), accelerations, 0.0, f"{subject}: two fits give different answers")
+        batched = baseline(z[None].expand(2, -1, -1))
+        assert_close(batched[1], accelerations, 1e-12, f"{subject}: fails for channels [B, T, nz]")
+        message = f"{subject}: the answer for a row depends on the other rows of the batch"
+        assert_close(baseline(z[3:4]), accelerations[3:4], 1e-9, message)
+        single_precision = copy.deepcopy(baseline).float()(z.float())
+        assert_true(
+            single_precision.dtype == torch.float32,
+            f"{subject}: answers {single_precision.dtype} in float32",
+        )
+        assert_close(
+            single_precision.double(), accelerations, 1e-3, f"{subject}: float32 differs too much"
+        )
+    differentiable = z.clone().requires_grad_()
     # a baseline that knows nothing may answer with a constant
-    (baseline(moving).sum() + 0.0 * moving.sum()).backward()
-    gradient = torch.zeros_like(z) if moving.grad is None else moving.grad
-    require_finite(gradient, f"{who}: its gradient with respect to the channels is not finite")
-    traced = _traced(baseline, (z,), who)
+    (baseline(differentiable).sum() + 0.0 * differentiable.sum()).backward()
+    gradient = torch.zeros_like(z) if differentiable.grad is None else differentiable.grad
+    assert_finite(gradient, f"{subject}: its gradient with respect to the channels is not finite")
+    traced = _traced(baseline, (z,), subject)
     with torch.no_grad():
-        require_equal(traced(z), accelerations, 1e-9, f"{who}: traced, it answers otherwise")
-    counts = baseline.parameter_count()
-    require(len(counts) == n, f"{who}: parameter_count gives {counts}, not one for each axis")
-    empty = resolved.build(known.names)
-    empty.load_state_dict(baseline.state_dict())
+        assert_close(traced(z), accelerations, 1e-9, f"{subject}: traced, it answers otherwise")
+    parameter_counts = baseline.parameter_counts()
+    assert_true(
+        len(parameter_counts) == n_dynamic,
+        f"{subject}: parameter_count gives {parameter_counts}, not one for each axis",
+    )
+    unfitted = resolved.build(training_samples.names)
+    unfitted.load_state_dict(baseline.state_dict())
     with torch.no_grad():
-        require_equal(empty(z), accelerations, 0.0, f"{who}: its state dict does not hold it all")
-    _read_back(resolved, BaselineConfig, who)
+        assert_close(
+            unfitted(z), accelerations, 0.0, f"{subject}: its state dict does not hold it all"
+        )
+    _check_round_trip(resolved, BaselineConfig, subject)
 
 
-def check_vessel(name: str, step: float = 0.1) -> None:
+def check_vessel(name: str, time_step: float = 0.1) -> None:
     """Check that a vessel can be built and stepped.
 
     Its description is one line, its length positive, its motion under half drive finite, and equal
@@ -407,35 +491,41 @@ def check_vessel(name: str, step: float = 0.1) -> None:
 
     Args:
         name: of the vessel, or path of its file.
-        step: of the simulation in s.
+        time_step: of the simulation in s.
 
     Raises:
         AssertionError: one line that says which contract is broken.
     """
-    who = f"vessel {name}"
+    subject = f"vessel {name}"
     vessel = load_vessel(name)
-    require("\n" not in vessel.description.strip(), f"{who}: its description is not one line")
-    require(vessel.length.value > 0, f"{who}: its length is not positive")
+    assert_true(
+        "\n" not in vessel.description.strip(), f"{subject}: its description is not one line"
+    )
+    assert_true(vessel.length.value > 0, f"{subject}: its length is not positive")
     plant = vessel.build()
-    require(plant.commands > 0, f"{who}: has no commands")
-    dynamics = PlantDynamics(plant, step)
-    x = plant.approach(3)
-    w = torch.zeros(3, len(plant.inputs), dtype=torch.float64)
-    half = torch.full((3,), 0.5, dtype=torch.float64)
-    w[:, : plant.commands] = plant.demand(half, 0.2 * half)
-    start, memory = x.clone(), dynamics.initial_state(3).to(x.dtype)
+    assert_true(plant.n_commands > 0, f"{subject}: has no commands")
+    dynamics = PlantDynamics(plant, time_step)
+    x = plant.make_initial_state(3)
+    w = torch.zeros(3, len(plant.input_names), dtype=torch.float64)
+    half_drive = torch.full((3,), 0.5, dtype=torch.float64)
+    w[:, : plant.n_commands] = plant.commands_for_demand(half_drive, 0.2 * half_drive)
+    initial_state, memory = x.clone(), dynamics.initial_state(3).to(x.dtype)
     with torch.no_grad():
         for _ in range(100):
             x, memory = dynamics.step(x, w, memory)
-        require_finite(x, f"{who}: its motion is not finite")
-        first, _ = dynamics.step(start, w, dynamics.initial_state(3).to(x.dtype))
-        alone, _ = dynamics.step(start[:1], w[:1], dynamics.initial_state(1).to(x.dtype))
-    require_equal(alone, first[:1], 1e-12, f"{who}: moves otherwise beside other vessels")
+        assert_finite(x, f"{subject}: its motion is not finite")
+        next_states, _ = dynamics.step(initial_state, w, dynamics.initial_state(3).to(x.dtype))
+        next_state, _ = dynamics.step(
+            initial_state[:1], w[:1], dynamics.initial_state(1).to(x.dtype)
+        )
+    assert_close(
+        next_state, next_states[:1], 1e-12, f"{subject}: moves otherwise beside other vessels"
+    )
 
 
 def check_manoeuvre(
     manoeuvre: Manoeuvre, vessel: str = "wam_v_cal", duration: float = 30.0
-) -> Flight:
+) -> ManoeuvreRun:
     """Check everything that residnet relies on in a manoeuvre, and return a flight of it.
 
     It is written and read back, flown alone and beside another of its kind with equal results, with
@@ -450,61 +540,70 @@ def check_manoeuvre(
     Raises:
         AssertionError: one line that says which contract is broken.
     """
-    who = f"manoeuvre {kind_of(type(manoeuvre))}"
-    read = validate(manoeuvre.model_dump(mode="json"), ManoeuvreConfig, "written")
-    require(read == manoeuvre, f"{who}: changes when it is written and read back")
+    subject = f"manoeuvre {get_kind(type(manoeuvre))}"
+    reloaded = validate_config(manoeuvre.model_dump(mode="json"), ManoeuvreConfig, "written")
+    assert_true(reloaded == manoeuvre, f"{subject}: changes when it is written and read back")
     plant = load_vessel(vessel).build()
-    duration = manoeuvre.lasts(duration)
-    dynamics = RecordedPlantDynamics(plant, _STEP)
-    alone, inputs = _flown([manoeuvre], dynamics, duration)
-    pair, commands = _flown([manoeuvre, manoeuvre], dynamics, duration)
-    require_finite(alone, f"{who}: the motion is not finite")
-    require_finite(inputs, f"{who}: a command is not finite")
-    count = dynamics.plant.commands
-    require(
-        bool((inputs[:, :, count:] == 0.01).all()),
-        f"{who}: changes inputs that are no commands, such as wind and current",
+    duration = manoeuvre.duration_within(duration)
+    dynamics = RecordedPlantDynamics(plant, _TIME_STEP)
+    single_states, inputs = _simulate([manoeuvre], dynamics, duration)
+    paired_states, commands = _simulate([manoeuvre, manoeuvre], dynamics, duration)
+    assert_finite(single_states, f"{subject}: the motion is not finite")
+    assert_finite(inputs, f"{subject}: a command is not finite")
+    n_commands = dynamics.plant.n_commands
+    assert_true(
+        bool((inputs[:, :, n_commands:] == 0.01).all()),
+        f"{subject}: changes inputs that are no commands, such as wind and current",
     )
     for row in range(2):
-        message = f"{who}: flown beside another one it does something else"
-        require_equal(pair[row], alone[0], 1e-9, message)
-        require_equal(commands[row, :, :count], inputs[0, :, :count], 1e-9, message)
+        message = f"{subject}: flown beside another one it does something else"
+        assert_close(paired_states[row], single_states[0], 1e-9, message)
+        assert_close(commands[row, :, :n_commands], inputs[0, :, :n_commands], 1e-9, message)
     helm, length = Helm.from_plant(plant), load_vessel(vessel).length.value
-    craft = Craft(vessel, dynamics, helm, plant.commands, plant.approach(1))
-    sea = Sea(plant, Disturbance(), SensorNoise(), 0)
-    flight = fly(craft, [manoeuvre], sea, duration, _STEP)[0]
-    _check_indices(manoeuvre.indices(flight.motion, length), who)
-    motion = flight.motion
-    few = {name: values[:_SHORT] for name, values in motion.channels.items()}
-    short = Log(motion.name, motion.t[:_SHORT], few, motion.units)
-    _check_indices(manoeuvre.indices(short, None), who)
-    limits = manoeuvre.limits(helm, length, 1.0)
-    require(all(math.isfinite(limit) for limit in limits.values()), f"{who}: a limit is not finite")
+    craft = SimulatedVessel(vessel, dynamics, helm, plant.n_commands, plant.make_initial_state(1))
+    environment = TrialEnvironment(plant, DisturbanceConfig(), SensorsConfig(), 0)
+    flight = simulate_manoeuvres(craft, [manoeuvre], environment, duration, _TIME_STEP)[0]
+    _check_indices(manoeuvre.compute_indices(flight.true_log, length), subject)
+    motion = flight.true_log
+    short_channels = {name: values[:_SHORT_SAMPLES] for name, values in motion.channels.items()}
+    short_log = Log(motion.name, motion.t[:_SHORT_SAMPLES], short_channels, motion.units)
+    _check_indices(manoeuvre.compute_indices(short_log, None), subject)
+    manoeuvre_limits = manoeuvre.imo_limits(helm, length, 1.0)
+    assert_true(
+        all(math.isfinite(limit) for limit in manoeuvre_limits.values()),
+        f"{subject}: a limit is not finite",
+    )
     return flight
 
 
-def _flown(
-    manoeuvres: list[Manoeuvre], dynamics: RecordedPlantDynamics, seconds: float
+def _simulate(
+    manoeuvres: list[Manoeuvre], dynamics: RecordedPlantDynamics, duration: float
 ) -> tuple[Tensor, Tensor]:
     """Return states [B, T+1, nx] and inputs [B, T, m] of manoeuvres of one kind side by side."""
     plant = dynamics.plant
     helm = Helm.from_plant(plant)
-    t = torch.arange(max(round(seconds / _STEP), 2), dtype=torch.float64) * _STEP
-    start = torch.stack([m.begin(plant.approach(1)[0], helm.state) for m in manoeuvres])
-    w = torch.zeros(len(manoeuvres), len(t), len(plant.inputs), dtype=torch.float64)
-    w[:, :, plant.commands :] = 0.01
-    source = source_of(manoeuvres, helm, t)
+    t = torch.arange(max(round(duration / _TIME_STEP), 2), dtype=torch.float64) * _TIME_STEP
+    initial_states = torch.stack(
+        [
+            manoeuvre.initial_state(plant.make_initial_state(1)[0], helm.state)
+            for manoeuvre in manoeuvres
+        ]
+    )
+    w = torch.zeros(len(manoeuvres), len(t), len(plant.input_names), dtype=torch.float64)
+    w[:, :, plant.n_commands :] = 0.01
+    source = make_manoeuvre_source(manoeuvres, helm, t)
     with torch.no_grad():
-        states, inputs, _ = Rollout(dynamics, source)(start, w, start[:, :0])
+        states, inputs, _ = Rollout(dynamics, source)(initial_states, w, initial_states[:, :0])
     return states, inputs
 
 
-def _check_indices(indices: dict[str, Any], who: str) -> None:
+def _check_indices(indices: dict[str, Any], subject: str) -> None:
     for name, value in indices.items():
-        numbers = np.atleast_1d(np.asarray(value))
-        require(
-            numbers.dtype.kind in "fiub" and bool(np.isfinite(numbers.astype(float)).all()),
-            f"{who}: its index '{name}' is {value!r}, not finite numbers; leave it out instead",
+        index_values = np.atleast_1d(np.asarray(value))
+        assert_true(
+            index_values.dtype.kind in "fiub"
+            and bool(np.isfinite(index_values.astype(float)).all()),
+            f"{subject}: its index '{name}' is {value!r}, not finite numbers; leave it out instead",
         )
 
 
@@ -522,62 +621,66 @@ def check_reader(config: Config, file: Path) -> Log:
     Raises:
         AssertionError: one line that says which contract is broken.
     """
-    who = f"reader {kind_of(type(config))}"
+    subject = f"reader {get_kind(type(config))}"
     reader: LogReader = getattr(config, "build")()  # noqa: B009  readers have no common base
-    require(isinstance(reader, LogReader), f"{who}: build gives no LogReader")
+    assert_true(isinstance(reader, LogReader), f"{subject}: build gives no LogReader")
     file = Path(file)
-    log, again = reader.read(file), reader.read(file)
-    require(log.name == file.stem, f"{who}: names the log '{log.name}', not '{file.stem}'")
-    require(bool(log.channels), f"{who}: the log has no channels")
-    require(log.t.dtype == np.float64, f"{who}: time is {log.t.dtype}, not float64")
-    require(log.t.size >= 2, f"{who}: the log has {log.t.size} samples, at least 2 are needed")
-    require(bool((np.diff(log.t) > 0).all()), f"{who}: time does not strictly increase")
+    log, reread = reader.read(file), reader.read(file)
+    assert_true(log.name == file.stem, f"{subject}: names the log '{log.name}', not '{file.stem}'")
+    assert_true(bool(log.channels), f"{subject}: the log has no channels")
+    assert_true(log.t.dtype == np.float64, f"{subject}: time is {log.t.dtype}, not float64")
+    assert_true(
+        log.t.size >= 2, f"{subject}: the log has {log.t.size} samples, at least 2 are needed"
+    )
+    assert_true(bool((np.diff(log.t) > 0).all()), f"{subject}: time does not strictly increase")
     for name, values in log.channels.items():
-        require(values.dtype == np.float64, f"{who}: {name} is {values.dtype}, not float64")
+        assert_true(values.dtype == np.float64, f"{subject}: {name} is {values.dtype}, not float64")
         unit = log.units[name]
-        require(si_unit(unit) == unit, f"{who}: {name} is in {unit}, not in SI units")
+        assert_true(si_unit(unit) == unit, f"{subject}: {name} is in {unit}, not in SI units")
     if "psi" in log.channels:
         psi = log["psi"][np.isfinite(log["psi"])]
-        require(bool((np.abs(np.diff(psi)) < np.pi).all()), f"{who}: psi jumps by half a circle")
+        assert_true(
+            bool((np.abs(np.diff(psi)) < np.pi).all()), f"{subject}: psi jumps by half a circle"
+        )
     missing = [key for key in ("source", "sha256") if key not in log.meta]
-    require(not missing, f"{who}: the log's meta lacks {', '.join(missing)}")
-    require(
-        list(log.channels) == list(again.channels)
+    assert_true(not missing, f"{subject}: the log's meta lacks {', '.join(missing)}")
+    assert_true(
+        list(log.channels) == list(reread.channels)
         and all(
-            np.array_equal(values, again.channels[name], equal_nan=True)
+            np.array_equal(values, reread.channels[name], equal_nan=True)
             for name, values in log.channels.items()
         ),
-        f"{who}: reads the same file twice with different results",
+        f"{subject}: reads the same file twice with different results",
     )
     with tempfile.TemporaryDirectory() as folder:
-        _check_refusals(reader, Path(folder), file, who)
+        _check_error_messages(reader, Path(folder), file, subject)
     return log
 
 
-def _check_refusals(reader: LogReader, folder: Path, file: Path, who: str) -> None:
-    empty, damaged = (folder / f"{name}{file.suffix}" for name in ("empty", "damaged"))
-    empty.write_bytes(b"")
-    damaged.write_bytes(np.random.default_rng(0).bytes(4096))
+def _check_error_messages(reader: LogReader, folder: Path, file: Path, subject: str) -> None:
+    empty_file, damaged_file = (folder / f"{name}{file.suffix}" for name in ("empty", "damaged"))
+    empty_file.write_bytes(b"")
+    damaged_file.write_bytes(np.random.default_rng(0).bytes(4096))
     (folder / "nothing").mkdir()
     cases: list[tuple[Path, str, type[ResidnetError]]] = [
         (folder / f"absent{file.suffix}", "missing", UsageError),
         (folder / "nothing", "an empty folder", ResidnetError),
-        (empty, "empty", ResidnetError),
-        (damaged, "random bytes", ResidnetError),
+        (empty_file, "empty", ResidnetError),
+        (damaged_file, "random bytes", ResidnetError),
     ]
-    for path, what, kind in cases:
+    for path, description, error_type in cases:
         try:
             reader.read(path)
-        except kind as error:
-            text = str(error)
-            named = "\n" not in text and str(path) in text
-            require(named, f"{who}: its error does not name the file")
+        except error_type as error:
+            message = str(error)
+            is_file_named = "\n" not in message and str(path) in message
+            assert_true(is_file_named, f"{subject}: its error does not name the file")
         except Exception as error:
             raise AssertionError(
-                f"{who}: a file that is {what} raises {type(error).__name__}, not {kind.__name__}"
+                f"{subject}: a file that is {description} raises {type(error).__name__}, not {error_type.__name__}"
             ) from error
         else:
-            raise AssertionError(f"{who}: reads a file that is {what}")
+            raise AssertionError(f"{subject}: reads a file that is {description}")
 
 
 def check_exporter(exporter: Exporter) -> None:
@@ -592,34 +695,44 @@ def check_exporter(exporter: Exporter) -> None:
     Raises:
         AssertionError: one line that says which contract is broken.
     """
-    who = f"export format {exporter.name}"
-    require(bool(exporter.about) and "\n" not in exporter.about, f"{who}: `about` is not one line")
-    require(exporter.suffix.count(".") >= 1, f"{who}: the suffix {exporter.suffix!r} has no ending")
-    for spec, model in example_models():
-        before = {name: value.clone() for name, value in model.state_dict().items()}
+    subject = f"export format {exporter.name}"
+    assert_true(
+        bool(exporter.about) and "\n" not in exporter.about, f"{subject}: `about` is not one line"
+    )
+    assert_true(
+        exporter.suffix.count(".") >= 1, f"{subject}: the suffix {exporter.suffix!r} has no ending"
+    )
+    for spec, model in make_example_models():
+        state_before = {name: value.clone() for name, value in model.state_dict().items()}
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "exports" / f"{spec.name}{exporter.suffix}"
             try:
                 card = exporter.export(ExportedVessel(spec, model), file)
             except UsageError as error:
-                require("\n" not in str(error), f"{who}: refuses a model in more than one line")
-                require(not file.exists(), f"{who}: leaves a file of a model that it refuses")
+                assert_true(
+                    "\n" not in str(error), f"{subject}: refuses a model in more than one line"
+                )
+                assert_true(
+                    not file.exists(), f"{subject}: leaves a file of a model that it refuses"
+                )
                 continue
-            require(file.exists(), f"{who}: writes no {file.name}")
-            require(isinstance(card, Mapping) and bool(card), f"{who}: returns no card")
-            left = [path.name for path in file.parent.iterdir() if path.name.endswith(".partial")]
-            require(not left, f"{who}: leaves {', '.join(left)} behind")
+            assert_true(file.exists(), f"{subject}: writes no {file.name}")
+            assert_true(isinstance(card, Mapping) and bool(card), f"{subject}: returns no card")
+            partial_files = [
+                path.name for path in file.parent.iterdir() if path.name.endswith(".partial")
+            ]
+            assert_true(not partial_files, f"{subject}: leaves {', '.join(partial_files)} behind")
         for name, value in model.state_dict().items():
-            wanted = before[name].to(torch.float64)
-            message = f"{who}: changes '{name}' of the model"
-            require_equal(value.to(torch.float64), wanted, 1e-6, message)
+            expected = state_before[name].to(torch.float64)
+            message = f"{subject}: changes '{name}' of the model"
+            assert_close(value.to(torch.float64), expected, 1e-6, message)
 
 
-_BEFORE, _AFTER = 6, 8
-_BAD_STEP = 3
+_PAST_STEPS, _FREE_STEPS = 6, 8
+_BAD_STEP_INDEX = 3
 """Step of bad values: good ones come before it and after it."""
-_FAR = (1e38, -1e38, 1e20, -1e20, 1e9, -1e9, 1e5)
-_WRONG = (float("nan"), float("inf"), float("-inf"), *_FAR)
+_FAR_VALUES = (1e38, -1e38, 1e20, -1e20, 1e9, -1e9, 1e5)
+_BAD_VALUES = (float("nan"), float("inf"), float("-inf"), *_FAR_VALUES)
 """Values that stand in the place of an entry; times of the range's edge are drawn as well."""
 
 
@@ -634,7 +747,7 @@ def check_bad_inputs(
     answer; good samples after the bad one are answered as if it had not been.
 
     Args:
-        exported: anything with `initial_state`, `warmup`, `step` and `rollout` that takes and gives
+        exported: anything with `initial_state`, `warmup`, `time_step` and `rollout` that takes and gives
             tensors, as `residnet.export.base` says.
         spec: of the model that was exported.
         model: that model; its precision is changed to float32.
@@ -644,32 +757,45 @@ def check_bad_inputs(
     Raises:
         AssertionError: one line that says which contract is broken.
     """
-    who = f"exported {spec.name}"
+    subject = f"exported {spec.name}"
     guard = GuardedDynamics(model.float().eval(), spec)
-    random = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
-        first, n = PLANAR.pose_columns.stop, guard.dof
-        low, high = guard.ranges.low[first:], guard.ranges.high[first:]
-        share = 0.05 + 0.9 * torch.rand(cases, _BEFORE + _AFTER, low.numel(), generator=random)
-        seen = low + share * (high - low)
-        pose = 40.0 * torch.rand(cases, _BEFORE + _AFTER, 3, generator=random) - 20.0
-        y, w = torch.cat((pose, seen[..., :n]), dim=-1), seen[..., n:]
-        x, w, past, given = y[:, _BEFORE], w[:, _BEFORE:], y[:, :_BEFORE], w[:, :_BEFORE]
-        s = exported.warmup(past, given)
-        require_equal(s, model.warmup(past, given), 1e-4, f"{who}: warms up otherwise")
-        _check_steps(exported, guard, x, w, s, random, who)
-        _check_rollout(exported, x, w, s, random, who)
-        _check_histories(exported, past, given, random, who)
+        n_pose, n_dynamic = PLANAR_LAYOUT.pose_columns.stop, guard.dof
+        lower, upper = guard.ranges.lower[n_pose:], guard.ranges.upper[n_pose:]
+        range_share = 0.05 + 0.9 * torch.rand(
+            cases, _PAST_STEPS + _FREE_STEPS, lower.numel(), generator=generator
+        )
+        channels = lower + range_share * (upper - lower)
+        pose = 40.0 * torch.rand(cases, _PAST_STEPS + _FREE_STEPS, 3, generator=generator) - 20.0
+        y, w = torch.cat((pose, channels[..., :n_dynamic]), dim=-1), channels[..., n_dynamic:]
+        x, w, past_states, past_inputs = (
+            y[:, _PAST_STEPS],
+            w[:, _PAST_STEPS:],
+            y[:, :_PAST_STEPS],
+            w[:, :_PAST_STEPS],
+        )
+        s = exported.warmup(past_states, past_inputs)
+        assert_close(
+            s, model.warmup(past_states, past_inputs), 1e-4, f"{subject}: warms up otherwise"
+        )
+        _check_steps(exported, guard, x, w, s, generator, subject)
+        _check_rollout(exported, x, w, s, generator, subject)
+        _check_histories(exported, past_states, past_inputs, generator, subject)
 
 
-def damage(values: Tensor, edge: Tensor, share: float, random: torch.Generator) -> Tensor:
+def replace_entries(
+    values: Tensor, upper_edge: Tensor, damaged_share: float, generator: torch.Generator
+) -> Tensor:
     """Return values [B, k] with a share of the entries replaced, some just beyond the edge [k]."""
-    wrong = torch.tensor(_WRONG)[torch.randint(len(_WRONG), values.shape, generator=random)]
-    times = 10.0 ** (6.0 * torch.rand(values.shape, generator=random) - 2.0)
-    beyond = (edge + edge.abs().clamp(min=1e-3) * times).expand_as(values)
-    kind = torch.rand(values.shape, generator=random)
-    chosen = torch.rand(values.shape, generator=random) < share
-    return torch.where(chosen, torch.where(kind < 0.7, wrong, beyond), values)
+    bad_values = torch.tensor(_BAD_VALUES)[
+        torch.randint(len(_BAD_VALUES), values.shape, generator=generator)
+    ]
+    edge_factor = 10.0 ** (6.0 * torch.rand(values.shape, generator=generator) - 2.0)
+    beyond_edge = (upper_edge + upper_edge.abs().clamp(min=1e-3) * edge_factor).expand_as(values)
+    random_kind = torch.rand(values.shape, generator=generator)
+    is_damaged = torch.rand(values.shape, generator=generator) < damaged_share
+    return torch.where(is_damaged, torch.where(random_kind < 0.7, bad_values, beyond_edge), values)
 
 
 def _check_steps(
@@ -678,110 +804,154 @@ def _check_steps(
     x: Tensor,
     w: Tensor,
     s: Tensor,
-    random: torch.Generator,
-    who: str,
+    generator: torch.Generator,
+    subject: str,
 ) -> None:
     """Step freely with one bad sample, then on with good ones."""
     columns = x.shape[1]
     for k in range(w.shape[1]):
-        before, inputs, memory = x, w[:, k], s
-        if k == _BAD_STEP:
-            where = torch.rand(3, len(x), 1, generator=random) < 0.5
-            before = torch.where(where[0], damage(x, guard.ranges.high[:columns], 0.4, random), x)
-            edge = guard.ranges.high[columns:]
-            inputs = torch.where(where[1], damage(inputs, edge, 0.5, random), inputs)
-            edge = guard.memory_high
-            memory = torch.where(where[2], damage(s, edge, 1.0 / (1 + s.shape[1]), random), s)
-        x, s, outside = exported.step(before, inputs, memory)
-        _check_answer(guard, (before, inputs, memory), (x, s, outside), f"{who}, step {k}")
-        if k == _BAD_STEP:
+        state, inputs, memory = x, w[:, k], s
+        if k == _BAD_STEP_INDEX:
+            is_damaged = torch.rand(3, len(x), 1, generator=generator) < 0.5
+            state = torch.where(
+                is_damaged[0], replace_entries(x, guard.ranges.upper[:columns], 0.4, generator), x
+            )
+            upper_edge = guard.ranges.upper[columns:]
+            inputs = torch.where(
+                is_damaged[1], replace_entries(inputs, upper_edge, 0.5, generator), inputs
+            )
+            upper_edge = guard.memory_upper
+            memory = torch.where(
+                is_damaged[2], replace_entries(s, upper_edge, 1.0 / (1 + s.shape[1]), generator), s
+            )
+        x, s, outside = exported.step(state, inputs, memory)
+        _check_answer(guard, (state, inputs, memory), (x, s, outside), f"{subject}, step {k}")
+        if k == _BAD_STEP_INDEX:
             # what the controller measures next is good again, and so is what it remembers
-            middle = 0.5 * (guard.ranges.low + guard.ranges.high).expand(len(x), -1)
-            measured, inputs = middle[:, :columns], middle[:, columns:]
-            for kept in (s, exported.initial_state(len(x))):
-                answer = exported.step(measured, inputs, kept)
-                _check_answer(guard, (measured, inputs, kept), answer, f"{who}, after a bad sample")
+            midpoints = 0.5 * (guard.ranges.lower + guard.ranges.upper).expand(len(x), -1)
+            measured_state, inputs = midpoints[:, :columns], midpoints[:, columns:]
+            for start_memory in (s, exported.initial_state(len(x))):
+                answer = exported.step(measured_state, inputs, start_memory)
+                _check_answer(
+                    guard,
+                    (measured_state, inputs, start_memory),
+                    answer,
+                    f"{subject}, after a bad sample",
+                )
 
 
 def _check_answer(
     guard: GuardedDynamics,
-    given: tuple[Tensor, Tensor, Tensor],
+    step_inputs: tuple[Tensor, Tensor, Tensor],
     answer: tuple[Tensor, Tensor, Tensor],
-    who: str,
+    subject: str,
 ) -> None:
     """Check what came out of one step: finite, flagged where it must be, else the model's own."""
-    x, w, s = given
-    after, memory, outside = answer
-    require(outside.dtype == torch.bool, f"{who}: the flag is {outside.dtype}, not bool")
-    require(outside.shape == (len(x),), f"{who}: the flag has the shape {outside.shape}, not [B]")
-    require_finite(after, f"{who}: a state is not finite")
-    require_finite(memory, f"{who}: a memory is not finite")
-    seen = torch.cat((x, w), dim=-1)
-    inside = ((seen >= guard.ranges.low) & (seen <= guard.ranges.high)).all(dim=-1)
-    inside &= guard.remembers(s)
-    missed = ~inside & ~outside
-    require(not bool(missed.any()), f"{who}: {int(missed.sum())} bad samples are not flagged")
-    own, left = guard.model.step(x, w, s)
-    sound = (
-        inside
-        & (own >= guard.ranges.least[:6]).all(dim=-1)
-        & (own <= guard.ranges.most[:6]).all(dim=-1)
+    x, w, s = step_inputs
+    next_state, memory, outside = answer
+    assert_true(outside.dtype == torch.bool, f"{subject}: the flag is {outside.dtype}, not bool")
+    assert_true(
+        outside.shape == (len(x),), f"{subject}: the flag has the shape {outside.shape}, not [B]"
     )
-    false = sound & outside
-    require(not bool(false.any()), f"{who}: {int(false.sum())} good samples are flagged")
-    require_equal(after[sound], own[sound], 1e-4, f"{who}: a good sample is answered otherwise")
-    require_equal(memory[sound], left[sound], 1e-4, f"{who}: a good sample is remembered otherwise")
-    expected, kept, _ = guard.flagged_step(x, w, s)
-    require_equal(after, expected, 1e-4, f"{who}: a bad sample is answered otherwise than stated")
-    require_equal(memory, kept, 1e-4, f"{who}: a bad sample is remembered otherwise than stated")
+    assert_finite(next_state, f"{subject}: a state is not finite")
+    assert_finite(memory, f"{subject}: a memory is not finite")
+    channels = torch.cat((x, w), dim=-1)
+    is_inside = ((channels >= guard.ranges.lower) & (channels <= guard.ranges.upper)).all(dim=-1)
+    is_inside &= guard.is_valid_memory(s)
+    is_unflagged = ~is_inside & ~outside
+    assert_true(
+        not bool(is_unflagged.any()),
+        f"{subject}: {int(is_unflagged.sum())} bad samples are not flagged",
+    )
+    model_state, model_memory = guard.model.step(x, w, s)
+    is_sound = (
+        is_inside
+        & (model_state >= guard.ranges.accepted_lower[:6]).all(dim=-1)
+        & (model_state <= guard.ranges.accepted_upper[:6]).all(dim=-1)
+    )
+    is_false_alarm = is_sound & outside
+    assert_true(
+        not bool(is_false_alarm.any()),
+        f"{subject}: {int(is_false_alarm.sum())} good samples are flagged",
+    )
+    assert_close(
+        next_state[is_sound],
+        model_state[is_sound],
+        1e-4,
+        f"{subject}: a good sample is answered otherwise",
+    )
+    assert_close(
+        memory[is_sound],
+        model_memory[is_sound],
+        1e-4,
+        f"{subject}: a good sample is remembered otherwise",
+    )
+    expected, guarded_memory, _ = guard.flagged_step(x, w, s)
+    assert_close(
+        next_state, expected, 1e-4, f"{subject}: a bad sample is answered otherwise than stated"
+    )
+    assert_close(
+        memory, guarded_memory, 1e-4, f"{subject}: a bad sample is remembered otherwise than stated"
+    )
 
 
 def _check_rollout(
-    exported: Any, x: Tensor, w: Tensor, s: Tensor, random: torch.Generator, who: str
+    exported: Any, x: Tensor, w: Tensor, s: Tensor, generator: torch.Generator, subject: str
 ) -> None:
     """Check that a rollout with bad samples is the same as its steps."""
     w = w.clone()
-    w[:, _BAD_STEP] = damage(w[:, _BAD_STEP], w.amax((0, 1)), 0.5, random)
-    first = damage(x, x.amax(0), 0.1, random)
-    states, last, flags = exported.rollout(first, w, s)
-    require(
+    w[:, _BAD_STEP_INDEX] = replace_entries(w[:, _BAD_STEP_INDEX], w.amax((0, 1)), 0.5, generator)
+    first_state = replace_entries(x, x.amax(0), 0.1, generator)
+    states, last_memory, flags = exported.rollout(first_state, w, s)
+    assert_true(
         states.shape == (len(x), w.shape[1] + 1, x.shape[1]) and flags.shape == w.shape[:2],
-        f"{who}: a rollout gives the shapes {tuple(states.shape)} and {tuple(flags.shape)}",
+        f"{subject}: a rollout gives the shapes {tuple(states.shape)} and {tuple(flags.shape)}",
     )
-    require_finite(states, f"{who}: a rollout gives a state that is not finite")
-    after, memory, raised = first, s, []
+    assert_finite(states, f"{subject}: a rollout gives a state that is not finite")
+    next_state, memory, step_flags = first_state, s, []
     for k in range(w.shape[1]):
-        after, memory, outside = exported.step(after, w[:, k], memory)
-        raised.append(outside)
-        message = f"{who}: a rollout differs from its steps at step {k}"
-        require_equal(states[:, k + 1], after, 1e-5, message)
-    require(
-        torch.equal(flags, torch.stack(raised, dim=1)),
-        f"{who}: a rollout raises other flags than its steps",
+        next_state, memory, outside = exported.step(next_state, w[:, k], memory)
+        step_flags.append(outside)
+        message = f"{subject}: a rollout differs from its steps at step {k}"
+        assert_close(states[:, k + 1], next_state, 1e-5, message)
+    assert_true(
+        torch.equal(flags, torch.stack(step_flags, dim=1)),
+        f"{subject}: a rollout raises other flags than its steps",
     )
-    require_equal(last, memory, 1e-5, f"{who}: a rollout ends with another memory than its steps")
+    assert_close(
+        last_memory, memory, 1e-5, f"{subject}: a rollout ends with another memory than its steps"
+    )
 
 
 def _check_histories(
-    exported: Any, past: Tensor, given: Tensor, random: torch.Generator, who: str
+    exported: Any,
+    past_states: Tensor,
+    past_inputs: Tensor,
+    generator: torch.Generator,
+    subject: str,
 ) -> None:
     """Check that bad samples of a history are left out."""
-    y, w = past.clone(), given.clone()
-    bad = torch.rand(y.shape[:2], generator=random) < 0.4
-    y[bad] = torch.nan
-    w[bad.roll(1, dims=0)] = torch.inf
-    require_finite(exported.warmup(y, w), f"{who}: a history with gaps leaves what is no number")
-    empty = exported.initial_state(len(y))
-    nothing = exported.warmup(torch.full_like(y, torch.nan), w)
-    require_equal(nothing, empty, 0.0, f"{who}: a history without a number leaves a memory")
-    held = past.clone()
-    held[:, 2], w = held[:, 1], given.clone()
+    y, w = past_states.clone(), past_inputs.clone()
+    is_bad = torch.rand(y.shape[:2], generator=generator) < 0.4
+    y[is_bad] = torch.nan
+    w[is_bad.roll(1, dims=0)] = torch.inf
+    assert_finite(exported.warmup(y, w), f"{subject}: a history with gaps leaves what is no number")
+    initial_memory = exported.initial_state(len(y))
+    warmed_without_data = exported.warmup(torch.full_like(y, torch.nan), w)
+    assert_close(
+        warmed_without_data,
+        initial_memory,
+        0.0,
+        f"{subject}: a history without a number leaves a memory",
+    )
+    repeated = past_states.clone()
+    repeated[:, 2], w = repeated[:, 1], past_inputs.clone()
     w[:, 2] = w[:, 1]
-    lost = past.clone()
-    lost[:, 2, 4] = torch.nan
-    require_equal(
-        exported.warmup(lost, given),
-        exported.warmup(held, w),
+    missing_sample = past_states.clone()
+    missing_sample[:, 2, 4] = torch.nan
+    assert_close(
+        exported.warmup(missing_sample, past_inputs),
+        exported.warmup(repeated, w),
         1e-5,
-        f"{who}: the last good sample does not stand for a bad one in a history",
+        f"{subject}: the last good sample does not stand for a bad one in a history",
     )

@@ -21,7 +21,7 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.config import Config, MetresPerSecond
 from residnet.core.errors import FitError
 from residnet.core.layout import HEADING, POSITION, VELOCITIES, YAW_RATE
-from residnet.data.prepare import Prepared, samples
+from residnet.data.prepare import PreparedLog, make_samples
 from residnet.physics.signals import Signals
 
 _ROUNDS = 4
@@ -53,9 +53,9 @@ class CurrentConfig(Config):
 def estimate_currents(
     baseline: RegressorBaseline,
     signals: Signals,
-    logs: Sequence[Prepared],
+    logs: Sequence[PreparedLog],
     config: CurrentConfig,
-    others: Sequence[Prepared] = (),
+    others: Sequence[PreparedLog] = (),
 ) -> tuple[np.ndarray, list[dict[str, Any]]]:
     """Return currents to north and east [L + K, 2] in m/s of logs over ground, and their table.
 
@@ -77,7 +77,7 @@ def estimate_currents(
             currents.
     """
     for p in (*logs, *others):
-        if not p.good.any():
+        if not p.trainable.any():
             raise FitError(
                 f"log {p.log.name}: has no sample to estimate its current from; leave it out"
             )
@@ -86,8 +86,8 @@ def estimate_currents(
     current, error, theta = _found(problem, config)
     halves = []
     for p in logs:
-        late = np.arange(len(p)) >= np.flatnonzero(p.good)[p.good.sum() // 2]
-        halves += [replace(p, good=p.good & half) for half in (~late, late)]
+        late = np.arange(len(p)) >= np.flatnonzero(p.trainable)[p.trainable.sum() // 2]
+        halves += [replace(p, trainable=p.trainable & half) for half in (~late, late)]
     apart, alone, _ = _found(replace(problem, logs=halves), config)
     first, second = apart.reshape(-1, 2, 2).unbind(1)
     scatter = (first - second).square() / alone.reshape(-1, 2, 2).square().sum(1)
@@ -142,7 +142,7 @@ def _descend(
     return best
 
 
-def through_water(log: Prepared, current: np.ndarray, signals: Signals) -> Prepared:
+def through_water(log: PreparedLog, current: np.ndarray, signals: Signals) -> PreparedLog:
     """Return a log as seen from a frame that drifts with the current [2].
 
     Positions, velocities, accelerations and the wind change.
@@ -152,7 +152,7 @@ def through_water(log: Prepared, current: np.ndarray, signals: Signals) -> Prepa
     across = np.cos(psi) * current[1] - np.sin(psi) * current[0]
     drift = np.stack((along, across, np.zeros_like(along)), axis=1)
     # the current is constant in earth axes, so it turns in body axes
-    turning = log.smooth[:, YAW_RATE, None] * np.stack(
+    turning = log.smoothed[:, YAW_RATE, None] * np.stack(
         (across, -along, np.zeros_like(along)), axis=1
     )
 
@@ -164,16 +164,16 @@ def through_water(log: Prepared, current: np.ndarray, signals: Signals) -> Prepa
     return replace(
         log,
         y=less(log.y),
-        smooth=less(log.smooth),
+        smoothed=less(log.smoothed),
         nu_dot=log.nu_dot - turning,
         w=_felt(log.w, current, signals),
-        recorded=_felt(log.recorded, current, signals),
+        rate_inputs=_felt(log.rate_inputs, current, signals),
     )
 
 
 def _felt(w: np.ndarray, current: np.ndarray, signals: Signals) -> np.ndarray:
     """Inputs [T, m] with the true wind as one that drifts with the current sees it."""
-    if not signals.wind:
+    if not signals.has_wind:
         return w
     speed, direction = w[:, signals.speed_column], w[:, signals.direction_column]
     north, east = -speed * np.cos(direction) - current[0], -speed * np.sin(direction) - current[1]
@@ -200,7 +200,7 @@ class _State:
 class _Problem:
     baseline: RegressorBaseline
     signals: Signals
-    logs: Sequence[Prepared]
+    logs: Sequence[PreparedLog]
     precision: float
     theta: Tensor | None = None
     """Coefficients [3, J] that are known and stay; else they are eliminated."""
@@ -210,7 +210,7 @@ class _Problem:
 
         They are of the motion through the water.
         """
-        moved = samples(
+        moved = make_samples(
             [
                 through_water(p, c, self.signals)
                 for p, c in zip(self.logs, current.numpy(), strict=True)
@@ -227,7 +227,7 @@ class _Problem:
         phi, target, group = self.regression(current)
         theta = torch.zeros_like(self.baseline.theta) if self.theta is None else self.theta
         for axis in range(3) if self.theta is None else ():
-            columns = self.baseline.columns(axis)
+            columns = self.baseline.term_columns(axis)
             theta[axis, columns] = torch.linalg.solve(
                 _gram(phi[:, columns]), phi[:, columns].T @ target[:, axis]
             )
@@ -247,7 +247,7 @@ class _Problem:
         hessian = self.precision * torch.eye(2 * count, dtype=torch.float64)
         gradient = self.precision * current
         for axis in range(3):
-            slope, columns = slopes[:, axis], self.baseline.columns(axis)
+            slope, columns = slopes[:, axis], self.baseline.term_columns(axis)
             phi, weight = state.phi[:, columns], 1.0 / state.variance[axis]
             blocks = torch.zeros(count, 2, 2, dtype=torch.float64).index_add_(
                 0, state.group, slope[:, :, None] * slope[:, None, :]
@@ -272,7 +272,10 @@ class _Problem:
         """
         thin = replace(
             self,
-            logs=[replace(p, good=p.good & (np.arange(len(p)) % _THIN == 0)) for p in self.logs],
+            logs=[
+                replace(p, trainable=p.trainable & (np.arange(len(p)) % _THIN == 0))
+                for p in self.logs
+            ],
         )
         count = len(self.logs)
 

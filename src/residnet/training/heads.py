@@ -10,19 +10,19 @@ from typing import Any, final
 import torch
 from torch import Tensor, nn
 
-from residnet.baselines.given import GivenBaseline
+from residnet.baselines.given import FixedBaseline
 from residnet.core.arrays import paged
-from residnet.core.columns import pose, velocities, velocities_on
+from residnet.core.columns import all_but_pose, dynamic_states, pose
 from residnet.core.samples import Samples
-from residnet.data.module import Windows, WindowsDataModule
+from residnet.data.module import WindowBatch, WindowsDataModule
 from residnet.data.windows import WindowStore
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import MANY, FreeRun, Rollout
-from residnet.heads.recurrent import RecurrentHead
+from residnet.heads.recurrent import GRUEnsembleHead
 from residnet.physics.signals import Signals
-from residnet.physics.symmetry import axis_parities, mirrored_channels
+from residnet.physics.symmetry import get_axis_parities, mirror_channels
 from residnet.training.config import TrainingConfig
 from residnet.training.score import Score
 from residnet.training.trainer import EpochTraining, run_epochs
@@ -93,7 +93,7 @@ def rollout_loss(
     """
     states, _, _ = rollout(x0, w, s)
     n = scales.numel()
-    error = (velocities(states[:, 1:], n) - velocities(y, n)) / scales
+    error = (dynamic_states(states[:, 1:], n) - dynamic_states(y, n)) / scales
     weight, count = usable.to(error.dtype).unsqueeze(-1), float(n)
     if robust > 0:
         square = (error.square() * weight).sum((1, 2)) / (count * weight.sum((1, 2))).clamp(min=1.0)
@@ -125,26 +125,26 @@ class Mirror:
     @classmethod
     def of(cls, signals: Signals) -> Mirror | None:
         """Return that of the channels of a model; None where it is not known for one of them."""
-        found = mirrored_channels(signals.names)
+        found = mirror_channels(signals.names)
         if found is None:
             return None
-        n = signals.dof
-        index, sign = (part[n : n + signals.inputs] for part in found)
+        n = signals.n_dof
+        index, sign = (part[n : n + signals.n_inputs] for part in found)
         index = [place - n for place in index]
-        if signals.wind:
+        if signals.has_wind:
             # where an earth-fixed wind comes from is mirrored as headings are
             index = [*index, signals.speed_column, signals.direction_column]
             sign = [*sign, 1.0, -1.0]
-            order = [*range(signals.inputs), signals.speed_column, signals.direction_column]
+            order = [*range(signals.n_inputs), signals.speed_column, signals.direction_column]
             index = [index[order.index(place)] for place in range(len(order))]
             sign = [sign[order.index(place)] for place in range(len(order))]
         return cls(
-            torch.tensor([1.0, -1.0, -1.0, *map(float, axis_parities(signals.names))]),
+            torch.tensor([1.0, -1.0, -1.0, *map(float, get_axis_parities(signals.names))]),
             torch.tensor(index, dtype=torch.long),
             torch.tensor(sign),
         )
 
-    def every_other(self, windows: Windows) -> Windows:
+    def every_other(self, windows: WindowBatch) -> WindowBatch:
         """Return windows of which every other one is seen in the mirror."""
         rows = torch.arange(len(windows.y)) % 2 == 1
 
@@ -195,7 +195,7 @@ class HeadTraining(EpochTraining):
             DataError: where no log is long enough for a stage.
         """
         if self.stages[0] is not None:
-            store = replace(store, told=self._told(store))
+            store = replace(store, precomputed=self._told(store))
         # methods, which other processes can be given
         return WindowsDataModule(
             store, self.stages, self.settings.steps, self.seed, self.stage_of, self.present_epoch
@@ -207,12 +207,12 @@ class HeadTraining(EpochTraining):
         Epochs go through each of them many times, and neither channels nor baseline change.
         """
         width, n = len(self.model.signals.names), self.model.dof
-        told = paged.rows(len(store.y), width + 2 * n, dtype=store.y.dtype)
+        told = paged.allocate_rows(len(store.y), width + 2 * n, dtype=store.y.dtype)
         with torch.no_grad():
-            for rows in paged.row_pieces(len(told)):
-                z = self.model.channels(store.smooth[rows], store.recorded[rows])
+            for rows in paged.iterate_row_chunks(len(told)):
+                z = self.model.channels(store.smoothed[rows], store.rate_inputs[rows])
                 told[rows] = torch.cat((z, self.model.known(z), store.nu_dot[rows]), dim=-1)
-                paged.forget()
+                paged.release_pages()
         return told
 
     def stage_of(self, epoch: int) -> int:
@@ -245,7 +245,7 @@ class HeadTraining(EpochTraining):
         for group in self.trainer.optimizers[0].param_groups:
             group["lr"] = self.settings.rate(self.epoch)
 
-    def training_step(self, windows: tuple[Windows, ...], batch_index: int) -> Tensor:
+    def training_step(self, windows: tuple[WindowBatch, ...], batch_index: int) -> Tensor:
         """Return the loss of one batch of windows, some of which may begin a stretch."""
         stage, _ = self.settings.stage(self.epoch)
         loss = self._one_step(windows) if stage == 0 else self._multi_step(windows, stage)
@@ -260,7 +260,7 @@ class HeadTraining(EpochTraining):
         torch.distributed.all_reduce(total)
         return total / self.world
 
-    def _one_step(self, windows: Sequence[Windows]) -> Tensor:
+    def _one_step(self, windows: Sequence[WindowBatch]) -> Tensor:
         told, good, depth = (
             torch.cat([getattr(part, name) for part in windows])
             for name in ("told", "good", "depth")
@@ -272,26 +272,26 @@ class HeadTraining(EpochTraining):
             washout[depth == 0] = 0
         samples = torch.arange(z.shape[1], device=z.device)
         counted = good & (samples >= washout[:, None])
-        spread = self.model.head.residual_std().to(z.dtype)
+        spread = self.model.head.residual_scale().to(z.dtype)
         return one_step_loss(self.model, z, known, nu_dot, counted, spread, self.shared)
 
-    def _multi_step(self, windows: Sequence[Windows], stage: int) -> Tensor:
+    def _multi_step(self, windows: Sequence[WindowBatch], stage: int) -> Tensor:
         begins, memories = [], []
         if self.mirror is not None:
             windows = [self.mirror.every_other(part) for part in windows]
         for number, part in enumerate(windows):
             memories.append(self.model.warmup(part.past_y, part.past_w))
-            x0 = part.smooth[:, 0]
+            x0 = part.smoothed[:, 0]
             if number == 1:
                 # at the beginning of a stretch the mean of what is known is all that is known
-                mean = velocities_on(part.past_y).mean(1)
+                mean = all_but_pose(part.past_y).mean(1)
                 x0 = torch.cat((pose(x0), mean), dim=1)
             begins.append(x0)
         x0 = torch.cat(begins)
         if self.settings.start_noise > 0:
             drawn = self._drawn(stage).to(x0)
             noise = self.settings.start_noise * self.scales * drawn
-            x0 = torch.cat((pose(x0), velocities_on(x0) + noise), dim=1)
+            x0 = torch.cat((pose(x0), all_but_pose(x0) + noise), dim=1)
         w, y, usable = (
             torch.cat([getattr(part, name) for part in windows]) for name in ("w", "y", "usable")
         )
@@ -315,9 +315,12 @@ class HeadTraining(EpochTraining):
         windows = self.stages[stage]
         assert windows is not None, "an epoch of a stage without windows"
         drawn = torch.randn(
-            windows.batch, self.scales.numel(), dtype=self.scales.dtype, device="cpu"
+            windows.batch_size, self.scales.numel(), dtype=self.scales.dtype, device="cpu"
         )
-        sizes = [windows.batch - windows.begun, windows.begun]
+        sizes = [
+            windows.batch_size - windows.n_segment_start_windows,
+            windows.n_segment_start_windows,
+        ]
         return torch.cat([part[self.rank :: self.world] for part in drawn.split(sizes)])
 
     def _free_run(self) -> FreeRun:
@@ -365,7 +368,7 @@ def train(
         FitError: where training never gave a finite free run.
     """
     model.head.calibrate(samples)
-    if isinstance(model.head, RecurrentHead):
+    if isinstance(model.head, GRUEnsembleHead):
         return _train_coarse(name, model, store, config, scales, validate, seed, folder)
     dtype = torch.float64 if config.double else torch.float32
     # losses and scores are those of velocities
@@ -393,12 +396,12 @@ def _train_coarse(
     Every batch holds as many windows for each network, and no network sees those of another.
     """
     head = model.head
-    assert isinstance(head, RecurrentHead)
-    steps = max(round(head.coarse / model.dt), 1)
+    assert isinstance(head, GRUEnsembleHead)
+    steps = max(round(head.training_step / model.dt), 1)
     signals = model.signals
-    turning = [signals.direction_column] if signals.wind else []
+    turning = [signals.direction_column] if signals.has_wind else []
     # a baseline in steps so long asks for a scheme of second order; a residual alone is held
-    alone = isinstance(model.baseline, GivenBaseline) and not model.baseline.library.count
+    alone = isinstance(model.baseline, FixedBaseline) and not model.baseline.library.n_terms
     # an oscillation of the roll grows under Euler's scheme
     first: Integrator = "semi_implicit_euler" if model.rolls else "euler"
     scheme: Integrator = first if alone else "heun"
@@ -419,7 +422,7 @@ def _train_coarse(
     dtype = torch.float64 if config.double else torch.float32
     try:
         module = HeadTraining(coarse.to(dtype), config, scales.to(dtype), validated, seed)
-        data = module.data(store.coarse(steps, turning))
+        data = module.data(store.coarsen(steps, turning))
         return run_epochs(name, module, data, coarse, head, folder, config)
     finally:
         head.set_step(model.dt)

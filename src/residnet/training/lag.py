@@ -12,13 +12,13 @@ import scipy
 import torch
 from torch import Tensor
 
-from residnet.control.motion import Lag
+from residnet.control.motion import ActuatorLag
 from residnet.core.errors import FitError
 
 _LEAST, _MOST = np.array([0.1, 0.1, 0.0]), np.array([30.0, 3.0, 2.0])
 
 
-def followed(command: Tensor, lag: Lag, dt: float, runs: Sequence[int] = ()) -> Tensor:
+def followed(command: Tensor, lag: ActuatorLag, dt: float, runs: Sequence[int] = ()) -> Tensor:
     """Return the force [N, c] that follows a command [N, c] sampled every dt seconds.
 
     The command is straight between samples and at rest before.
@@ -62,7 +62,7 @@ def fit_lag(
     dt: float,
     use: Tensor | None = None,
     runs: Sequence[int] = (),
-) -> Lag:
+) -> ActuatorLag:
     """Return the lag under which F_believed + basis explains the followed command best.
 
     Args:
@@ -91,7 +91,7 @@ def fit_lag(
         return left
 
     def miss(p: np.ndarray) -> np.ndarray:
-        lag = Lag(frequency=float(p[0]), damping=float(p[1]), delay=float(p[2]))
+        lag = ActuatorLag(frequency=float(p[0]), damping=float(p[1]), delay=float(p[2]))
         force = followed(command, lag, dt, runs)[keep]
         # in units of the followed force itself: a lag that lets nothing through would leave nothing
         # to explain
@@ -117,7 +117,7 @@ def fit_lag(
     return _lag_within_bounds(found.x)
 
 
-def _lag_within_bounds(p: np.ndarray) -> Lag:
+def _lag_within_bounds(p: np.ndarray) -> ActuatorLag:
     """Return the lag of frequency, damping and delay [3]; FitError where one ends at a bound."""
     inside = [
         low * 1.02 < value < high * 0.98 or (low == 0.0 and value < 0.98 * high)
@@ -131,4 +131,4 @@ def _lag_within_bounds(p: np.ndarray) -> Lag:
             f" {p[1]:.3g}, {p[2]:.3g} s): the data show no lag; give a run in which the command"
             " changes faster"
         )
-    return Lag(frequency=float(p[0]), damping=float(p[1]), delay=float(p[2]))
+    return ActuatorLag(frequency=float(p[0]), damping=float(p[1]), delay=float(p[2]))

@@ -99,7 +99,7 @@ def without_logs(
     problem = problem_of(model, samples, store, config, scales).fixing(still)
     problem = estimate_initial_states(model, problem)
     level, states = simulate(model, problem)
-    fitted, parameters = baseline.theta.detach().clone(), baseline.free()
+    fitted, parameters = baseline.theta.detach().clone(), baseline.get_free()
     of_window = fold[problem.log]
     folds = int(fold.max()) + 1
     count = torch.bincount(of_window, minlength=folds).to(parameters.dtype)
@@ -130,9 +130,9 @@ def without_logs(
         step = torch.linalg.lstsq(hessian, slope.unsqueeze(1), driver="gelsd").solution.squeeze(1)
         step[problem.fixed] = 0.0
         others = _rows(problem, of_window != k)
-        baseline.place(_best_share(model, others, parameters, step))
+        baseline.set_free(_best_share(model, others, parameters, step))
         out.append(baseline.theta.detach().clone())
-        baseline.place(parameters)
+        baseline.set_free(parameters)
     return out
 
 
@@ -141,9 +141,9 @@ def _best_share(model: HybridDynamics, others: Problem, parameters: Tensor, step
     baseline, (before, _) = parametric(model), simulate(model, others)
     for halving in range(_HALVINGS):
         trial = parameters + 0.5**halving * step
-        baseline.place(trial)
+        baseline.set_free(trial)
         after, _ = simulate(model, others)
-        baseline.place(parameters)
+        baseline.set_free(parameters)
         if torch.isfinite(after) and after <= before:
             return trial
     return parameters
@@ -174,6 +174,6 @@ def _part(
         precision=torch.zeros_like(part.precision),
         symmetry=torch.zeros_like(part.symmetry),
         belief_precision=torch.zeros_like(part.belief_precision),
-        prior_mean=parametric(model).free(),
+        prior_mean=parametric(model).get_free(),
     )
     return normal_equations(model, nothing, level, states)

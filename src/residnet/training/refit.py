@@ -19,17 +19,17 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.baselines.base import ParametricBaseline
-from residnet.core.columns import pose, velocities_on
+from residnet.core.columns import all_but_pose, pose
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
-from residnet.data.channels import noise_of
+from residnet.data.channels import estimate_noise_std
 from residnet.data.windows import WindowStore
 from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.jacobian import StepJacobian
 from residnet.dynamics.rollout import Rollout
-from residnet.regression.least_squares import Descent, descend
+from residnet.regression.least_squares import DescentResult, minimize_levenberg_marquardt
 
 _ROWS_PER_BATCH = 1_024  # Jacobians held in memory at once
 _REGULARISATION = 1e-8  # of a parameter's own information: keeps the Hessian definite
@@ -154,7 +154,7 @@ class Problem:
 
     def mean_square(self, states: Tensor) -> Tensor:
         """Return the mean square error [B] of free runs [B, T + 1, 3 + n], in scales."""
-        error = (velocities_on(states[:, 1:]) - self.measured) * self.weight
+        error = (all_but_pose(states[:, 1:]) - self.measured) * self.weight
         return error.square().mean((1, 2))
 
     def cost_per_nat(self, cost: Tensor) -> Tensor:
@@ -201,8 +201,8 @@ def free_run_starts(store: WindowStore, config: RefitConfig, dt: float) -> Tenso
         FitError: where no log is long enough.
     """
     steps, every = round(config.horizon / dt), max(round(config.every / dt), 1)
-    starts = store.starts(steps + 1)
-    starts = starts[store.depth[starts] % every == 0]
+    starts = store.find_starts(steps + 1)
+    starts = starts[store.n_elapsed[starts] % every == 0]
     if starts.numel() == 0:
         raise FitError(
             f"no training log holds a free run of {config.horizon:g} s for the refit; shorten"
@@ -221,30 +221,32 @@ def problem_of(
     """Return the problem that follows a least-squares fit to `samples`; nothing is fixed yet."""
     baseline, steps = parametric(model), round(config.horizon / model.dt)
     starts = free_run_starts(store, config, model.dt)
-    usable = store.take(store.usable, starts + 1, steps).to(scales.dtype).unsqueeze(-1)
+    usable = store.take_windows(store.usable, starts + 1, steps).to(scales.dtype).unsqueeze(-1)
     # u and v come from positions, which can freeze; all else from an IMU, which then still measures
     from_imu = torch.ones_like(usable).expand(-1, -1, model.dof - 2)
-    information = baseline.information(samples)
+    information = baseline.mean_information(samples)
     regularisation = torch.diag(_REGULARISATION * information.diagonal())
     belief_mean, belief_precision = baseline.prior()
     initial = None
     if config.starts == "estimated":
-        logs = [velocities_on(store.y[store.log == k]).numpy().T for k in store.log.unique()]
-        noise = torch.tensor([[noise_of(channel) for channel in log] for log in logs])
+        logs = [
+            all_but_pose(store.y[store.log_index == k]).numpy().T for k in store.log_index.unique()
+        ]
+        noise = torch.tensor([[estimate_noise_std(channel) for channel in log] for log in logs])
         noise = noise.to(store.y.dtype).median(0).values.clamp(min=_MIN_NOISE)
-        initial = InitialStates(velocities_on(store.y[starts]), noise)
+        initial = InitialStates(all_but_pose(store.y[starts]), noise)
     covered = (starts[:, None] + torch.arange(1, steps + 1)).unique().numel()
     free = baseline.free_indices()
     return Problem(
         x0=store.y[starts],
-        inputs=store.take(store.w, starts, steps),
-        measured=velocities_on(store.take(store.y, starts + 1, steps)),
+        inputs=store.take_windows(store.w, starts, steps),
+        measured=all_but_pose(store.take_windows(store.y, starts + 1, steps)),
         weight=torch.cat((usable, usable, from_imu), dim=-1) / scales,
         free=free,
         precision=config.prior * information + regularisation,
-        prior_mean=baseline.free(),
+        prior_mean=baseline.get_free(),
         regularisation=regularisation,
-        symmetry=config.asymmetric * baseline.asymmetry(samples),
+        symmetry=config.asymmetric * baseline.symmetry_precision(samples),
         belief_mean=belief_mean,
         belief_precision=belief_precision,
         fixed=torch.zeros(free.numel(), dtype=torch.bool),
@@ -252,7 +254,7 @@ def problem_of(
         independent_errors=max(covered * model.dt / config.correlation, 1.0)
         * float(model.living.mean()),
         robust=config.robust,
-        log=store.log[starts],
+        log=store.log_index[starts],
         initial=initial,
     )
 
@@ -314,12 +316,12 @@ def normal_equations(
     rms = torch.sqrt(problem.mean_square(states) + problem.robust**2)
     window = (0.5 / rms / (model.dof * steps * batch)).sqrt()[:, None, None]
     root_weight = (window * problem.weight).transpose(0, 1)
-    error = (velocities_on(states[:, 1:]) - problem.measured).transpose(0, 1) * root_weight
+    error = (all_but_pose(states[:, 1:]) - problem.measured).transpose(0, 1) * root_weight
     for part, s in sensitivities(model, states[:, :-1], problem.inputs):
         rows = (s[:, :, 1:] * root_weight[part].unsqueeze(-1)).flatten(0, 2)
         hessian.addmm_(rows.T, rows)
         gradient.addmv_(rows.T, error[part].flatten())
-    theta = parametric(model).free()
+    theta = parametric(model).get_free()
     belief = problem.cost_per_nat(cost) * problem.belief_precision
     hessian = hessian + problem.precision + problem.symmetry + torch.diag(belief)
     gradient = gradient + problem.precision @ (theta - problem.prior_mean)
@@ -335,16 +337,18 @@ class _Iterate(NamedTuple):
     states: Tensor  # of the free runs with them [B, T + 1, 3 + n]
 
 
-def _gauss_newton(model: HybridDynamics, problem: Problem, iterations: int) -> Descent[_Iterate]:
+def _gauss_newton(
+    model: HybridDynamics, problem: Problem, iterations: int
+) -> DescentResult[_Iterate]:
     """Minimise over the parameters, with Levenberg-Marquardt damping."""
     baseline = parametric(model)
 
     def at(theta: Tensor) -> _Iterate:
-        baseline.place(theta)
+        baseline.set_free(theta)
         return _Iterate(theta, *simulate(model, problem))
 
     def linearise(point: _Iterate) -> tuple[float, Callable[[float], tuple[float, _Iterate]]]:
-        baseline.place(point.theta)
+        baseline.set_free(point.theta)
         hessian, gradient = normal_equations(model, problem, point.cost, point.states)
         per_nat = problem.cost_per_nat(point.cost)
 
@@ -355,8 +359,10 @@ def _gauss_newton(model: HybridDynamics, problem: Problem, iterations: int) -> D
 
         return float(point.cost + problem.prior_cost(point.theta, per_nat)), trial
 
-    found = descend(at(baseline.free()), linearise, iterations, gain=_MIN_GAIN)
-    baseline.place(found.point.theta)
+    found = minimize_levenberg_marquardt(
+        at(baseline.get_free()), linearise, iterations, min_relative_decrease=_MIN_GAIN
+    )
+    baseline.set_free(found.minimizer.theta)
     return found
 
 
@@ -370,13 +376,13 @@ def estimate_initial_states(model: HybridDynamics, problem: Problem) -> Problem:
     if problem.initial is None:
         return problem
     states = simulate(model, problem)[1]
-    error, counts = velocities_on(states[:, 1:]) - problem.measured, problem.weight > 0.0
+    error, counts = all_but_pose(states[:, 1:]) - problem.measured, problem.weight > 0.0
     noise = problem.initial.noise.square()
     mean_square = (error.square() * counts).sum((0, 1)) / counts.sum((0, 1)).clamp(min=1)
     variance = noise + (mean_square - noise).clamp(min=0.0) * error.shape[1]
     rms = torch.sqrt(problem.mean_square(states) + problem.robust**2)
     root_weight = counts / (variance * (rms / rms.mean())[:, None]).sqrt()[:, None]
-    nu0 = velocities_on(problem.x0)
+    nu0 = all_but_pose(problem.x0)
     hessian = torch.diag(1.0 / noise).repeat(len(states), 1, 1)
     gradient = (nu0 - problem.initial.measured) / noise
     for part, s in sensitivities(model, states[:, :-1], problem.inputs, to_start=True):
@@ -422,7 +428,7 @@ def _fit_growing_horizon(
             )
         horizon, first = longer, first or longer
         if horizon < whole:
-            iterated += _gauss_newton(model, problem.truncated(horizon), iterations).steps
+            iterated += _gauss_newton(model, problem.truncated(horizon), iterations).n_steps
     return first, iterated
 
 
@@ -463,24 +469,24 @@ def refit(
     undamped: list[int] = []
     for _ in range(_SIGN_ROUNDS):
         found = _gauss_newton(model, problem, config.iterations)
-        iterated += found.steps
+        iterated += found.n_steps
         # alternate with the initial states until these gain no more
         for _ in range(config.iterations if problem.initial else 0):
             moved = estimate_initial_states(model, problem)
-            if not simulate(model, moved)[0] < (1.0 - _MIN_GAIN) * found.point.cost:
+            if not simulate(model, moved)[0] < (1.0 - _MIN_GAIN) * found.minimizer.cost:
                 break
             problem, found = moved, _gauss_newton(model, moved, config.iterations)
-            iterated += found.steps
-        cost = found.point.cost
-        if feeding := baseline.feeding():
+            iterated += found.n_steps
+        cost = found.minimizer.cost
+        if feeding := baseline.destabilising_terms():
             problem = problem.fixing(feeding)
-        elif more := baseline.undamped(samples):
+        elif more := baseline.undamped_terms(samples):
             # terms that fed energy beside these may not without them: give them another chance
             undamped += more
             problem = replace(problem, fixed=torch.zeros_like(problem.fixed)).fixing(undamped)
         else:
             break
-        baseline.place(baseline.free().masked_fill(problem.fixed, 0.0))
+        baseline.set_free(baseline.get_free().masked_fill(problem.fixed, 0.0))
     hessian, _ = normal_equations(model, problem, *simulate(model, problem))
     inverse = problem.inverse(hessian)
     return RefitResult(

@@ -22,10 +22,10 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor, nn
 
 from residnet.core.errors import FitError, UsageError
-from residnet.core.files import whole
-from residnet.core.ownership import require_inside, run_manifest_above
-from residnet.core.progress import report
-from residnet.data.module import EpochDataModule, epoch_seed
+from residnet.core.files import atomic_write
+from residnet.core.ownership import find_run_manifest, require_inside
+from residnet.core.progress import report_progress
+from residnet.data.module import EpochDataModule, compute_epoch_seed
 from residnet.training.config import MachineConfig, OneStage, TrainingConfig
 from residnet.training.score import Shown
 
@@ -95,7 +95,7 @@ class EpochTraining(L.LightningModule, ABC):
 
     def seed_epoch(self) -> None:
         """Seed the random numbers of the present epoch."""
-        torch.manual_seed(epoch_seed(self.seed, self.epoch))
+        torch.manual_seed(compute_epoch_seed(self.seed, self.epoch))
 
     def finish_epoch(self) -> None:
         """Validate, keep the best weights, and stop early in the last stage.
@@ -187,7 +187,7 @@ class EpochEnd(L.Callback):
         assert isinstance(pl_module, EpochTraining)
         pl_module.finish_epoch()
         if self.checkpoint is not None and trainer.is_global_zero:
-            with whole(self.checkpoint) as file:
+            with atomic_write(self.checkpoint) as file:
                 trainer.save_checkpoint(file)
         elif self.checkpoint is not None:
             # the processes wait for each other there; the first alone writes
@@ -200,7 +200,7 @@ class EpochEnd(L.Callback):
             + ("" if score is None else f", best validation {score:.4g}")
         )
         shown = done % max(self.epochs // 10, 1) == 0 or done == self.epochs
-        report(f"training {self.name}", done, self.epochs, line if shown else "", score)
+        report_progress(f"training {self.name}", done, self.epochs, line if shown else "", score)
 
 
 def run_epochs(
@@ -347,7 +347,7 @@ def _fit(
 def _record_events(logger: TensorBoardLogger) -> None:
     """Record the files of a TensorBoard log in the manifest of its run folder."""
     folder = Path(logger.log_dir)
-    if (manifest := run_manifest_above(folder / "events")) is not None:
+    if (manifest := find_run_manifest(folder / "events")) is not None:
         for file in (*folder.iterdir(), folder / "hparams.yaml"):
             manifest.record(file, None)
 

@@ -13,45 +13,45 @@ from residnet.core.errors import DataError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
-from residnet.identification.changes import Change, ChangedDynamics
+from residnet.identification.changes import PerturbedDynamics, SystemChange
 from residnet.identification.monitoring import (
-    Groups,
+    ChangeDetector,
+    GroupScores,
+    MeasuredWindow,
     MonitorConfig,
-    Piece,
-    Scatter,
-    Verdict,
-    Watch,
-    Watcher,
-    scattered,
-    weighed,
+    MonitorVerdict,
+    OnlineChangeDetector,
+    ScoreDistribution,
+    compute_robust_score_sums,
+    fit_score_distribution,
     wider,
 )
-from residnet.identification.recursive_refit import recursive_refit
-from residnet.testing.checks import STEP, example_model, example_spec
+from residnet.identification.recursive_refit import refit_recursively
+from residnet.testing.checks import EXAMPLE_TIME_STEP, make_example_model, make_example_spec
 
 SECONDS, WINDOW = 60, 100
 NOISE = np.array([0.0, 0.0, 0.002, 0.02, 0.02, 0.003])
-NONE = Change("none", "", "", 1.0)
+NONE = SystemChange("none", "", "", 1.0)
 
 
 @pytest.fixture(scope="module")
 def known() -> tuple[ModelSpec, HybridDynamics]:
-    spec = example_spec(None)
-    return spec, example_model(spec).to(torch.float64)
+    spec = make_example_spec(None)
+    return spec, make_example_model(spec).to(torch.float64)
 
 
 def logs(
-    model: HybridDynamics, change: Change, count: int, seed: int
+    model: HybridDynamics, change: SystemChange, count: int, seed: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """States and inputs of runs of a changed vessel under random revolutions, with noise."""
     random = np.random.default_rng(seed)
-    steps = round(SECONDS / STEP)
+    steps = round(SECONDS / EXAMPLE_TIME_STEP)
     held = random.uniform(-10, 25, size=(count, steps // 50 + 1, 2)).repeat(50, axis=1)[:, :steps]
     x0 = np.zeros((count, 6))
     x0[:, 2] = random.uniform(-3, 3, size=count)
     x0[:, 3] = 1.0
     with torch.no_grad():
-        states, _, _ = Rollout(ChangedDynamics(model, [change], count, 2))(
+        states, _, _ = Rollout(PerturbedDynamics(model, [change], count, 2))(
             torch.from_numpy(x0), torch.from_numpy(held), torch.zeros(count, 0)
         )
     y = states.numpy() + NOISE * random.normal(size=states.shape)
@@ -60,99 +60,107 @@ def logs(
     return [(y[i], held[i]) for i in range(count)]
 
 
-def windows(log: tuple[np.ndarray, np.ndarray]) -> list[Piece]:
+def windows(log: tuple[np.ndarray, np.ndarray]) -> list[MeasuredWindow]:
     y, w = log
     starts = range(0, len(w) - WINDOW + 1, WINDOW)
-    return [Piece(y[k : k + WINDOW + 1], w[k : k + WINDOW], y[:0], w[:0]) for k in starts]
+    return [MeasuredWindow(y[k : k + WINDOW + 1], w[k : k + WINDOW], y[:0], w[:0]) for k in starts]
 
 
 @pytest.fixture(scope="module")
-def watch(known: tuple[ModelSpec, HybridDynamics]) -> Watch:
+def watch(known: tuple[ModelSpec, HybridDynamics]) -> ChangeDetector:
     spec, model = known
     clean = [windows(log) for log in logs(model, NONE, 20, 0)]
     with pytest.raises(DataError, match="needs at least 5"):
-        Watch(spec, model, clean[:2], MonitorConfig())
-    return Watch(spec, model, clean, MonitorConfig())
+        ChangeDetector(spec, model, clean[:2], MonitorConfig())
+    return ChangeDetector(spec, model, clean, MonitorConfig())
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        Change("mass", "", "", 0.15, heavier=1.0),
-        Change("gain n_stbd", "", "", -0.1, gain=1),
-        Change("damping yaw", "", "", -0.2, damping="r"),
-        Change("gyro scale", "", "", 0.05, sensor="gyro_scale"),
+        SystemChange("mass", "", "", 0.15, inertia_share=1.0),
+        SystemChange("gain n_stbd", "", "", -0.1, gain_input=1),
+        SystemChange("damping yaw", "", "", -0.2, damping="r"),
+        SystemChange("gyro scale", "", "", 0.05, sensor="gyro_scale"),
     ],
     ids=lambda change: change.name,
 )
 def test_a_planted_change_is_found_and_named(
-    known: tuple[ModelSpec, HybridDynamics], watch: Watch, change: Change
+    known: tuple[ModelSpec, HybridDynamics], watch: ChangeDetector, change: SystemChange
 ) -> None:
-    watcher = Watcher(watch)
+    watcher = OnlineChangeDetector(watch)
     for log in logs(known[1], change, 4, 50):
-        watcher.restart()
-        *_, verdict = map(watcher.take, watch.sums(windows(log)))
-    assert verdict.alarm
-    first = verdict.suspects[0]
+        watcher.start_new_log()
+        *_, verdict = map(watcher.update_with_sums, watch.compute_sums(windows(log)))
+    assert verdict.is_alarm
+    first = verdict.hypotheses[0]
     assert first.change.name == change.name
-    assert first.size == pytest.approx(change.size, rel=0.3, abs=3 * first.error)
+    assert first.estimated_size == pytest.approx(change.size, rel=0.3, abs=3 * first.standard_error)
 
 
-def test_clean_logs_raise_no_alarm(known: tuple[ModelSpec, HybridDynamics], watch: Watch) -> None:
-    watcher = Watcher(watch)
+def test_clean_logs_raise_no_alarm(
+    known: tuple[ModelSpec, HybridDynamics], watch: ChangeDetector
+) -> None:
+    watcher = OnlineChangeDetector(watch)
     for log in logs(known[1], NONE, 6, 99):
-        watcher.restart()
-        assert not any(watcher.take(sums).alarm for sums in watch.sums(windows(log)))
+        watcher.start_new_log()
+        assert not any(
+            watcher.update_with_sums(sums).is_alarm for sums in watch.compute_sums(windows(log))
+        )
 
 
 def test_an_alarm_ends_where_scores_have_fallen_clearly_below_the_threshold(
-    known: tuple[ModelSpec, HybridDynamics], watch: Watch, monkeypatch: pytest.MonkeyPatch
+    known: tuple[ModelSpec, HybridDynamics], watch: ChangeDetector, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sums = watch.sums(windows(logs(known[1], NONE, 1, 7)[0]))[:1]
-    plain = watch.judge([0], sums)
+    sums = watch.compute_sums(windows(logs(known[1], NONE, 1, 7)[0]))[:1]
+    plain = watch.evaluate([0], sums)
     above = iter([-0.1, 0.2, -0.3, -0.9, -1.1, -0.5, 0.1])
 
-    def judge(*_: object) -> Verdict:
+    def judge(*_: object) -> MonitorVerdict:
         score = watch.threshold + next(above)
-        suspects = [replace(plain.suspects[0], score=score), *plain.suspects[1:]]
-        return replace(plain, alarm=score > watch.threshold, suspects=suspects)
+        suspects = [replace(plain.hypotheses[0], test_statistic=score), *plain.hypotheses[1:]]
+        return replace(plain, is_alarm=score > watch.threshold, hypotheses=suspects)
 
     monkeypatch.setattr(watch, "judge", judge)
-    watcher = Watcher(watch)
-    alarms = [watcher.take(sums[0]).alarm for _ in range(7)]
+    watcher = OnlineChangeDetector(watch)
+    alarms = [watcher.update_with_sums(sums[0]).is_alarm for _ in range(7)]
     assert alarms == [False, True, True, True, False, False, True]
 
 
 def test_sample_by_sample_it_says_what_windows_say(
-    known: tuple[ModelSpec, HybridDynamics], watch: Watch
+    known: tuple[ModelSpec, HybridDynamics], watch: ChangeDetector
 ) -> None:
     y, w = logs(known[1], NONE, 1, 7)[0]
-    whole, single = Watcher(watch), Watcher(watch)
-    wanted = [whole.take(sums) for sums in watch.sums(windows((y, w)))]
+    whole, single = OnlineChangeDetector(watch), OnlineChangeDetector(watch)
+    wanted = [whole.update_with_sums(sums) for sums in watch.compute_sums(windows((y, w)))]
     given = np.concatenate((w, w[-1:]))
-    found = [verdict for k in range(len(y)) if (verdict := single.step(y[k], given[k])) is not None]
+    found = [
+        verdict for k in range(len(y)) if (verdict := single.update(y[k], given[k])) is not None
+    ]
     assert len(found) == len(wanted)
-    assert found[-1].suspects[0].score == pytest.approx(wanted[-1].suspects[0].score)
+    assert found[-1].hypotheses[0].test_statistic == pytest.approx(
+        wanted[-1].hypotheses[0].test_statistic
+    )
     # a lost sample begins anew
-    assert single.step(np.full(6, np.nan), w[0]) is None
-    assert all(single.step(y[k], given[k]) is None for k in range(WINDOW))
+    assert single.update(np.full(6, np.nan), w[0]) is None
+    assert all(single.update(y[k], given[k]) is None for k in range(WINDOW))
 
 
 def test_a_refit_finds_the_size_of_a_planted_change_and_leaves_the_old_model_alone(
-    known: tuple[ModelSpec, HybridDynamics], watch: Watch
+    known: tuple[ModelSpec, HybridDynamics], watch: ChangeDetector
 ) -> None:
-    weaker = Change("gain n_stbd", "", "", -0.1, gain=1)
+    weaker = SystemChange("gain n_stbd", "", "", -0.1, gain_input=1)
     fresh = logs(known[1], weaker, 3, 50)
     before = known[1].baseline.state_dict()["theta"].clone()
-    found = recursive_refit(watch, [windows(log) for log in fresh])
+    found = refit_recursively(watch, [windows(log) for log in fresh])
     assert torch.equal(known[1].baseline.state_dict()["theta"], before)
-    (moved,) = found.moved
+    (moved,) = found.identified_changes
     assert moved.change.name == "gain n_stbd"
-    assert moved.size == pytest.approx(-0.1, abs=2 * moved.error)
-    assert moved.error < 0.005
-    assert len(moved.after) == len(fresh)
-    assert found.before.alarm
-    assert not found.verdict.alarm
+    assert moved.estimated_size == pytest.approx(-0.1, abs=2 * moved.standard_error)
+    assert moved.standard_error < 0.005
+    assert len(moved.size_by_log) == len(fresh)
+    assert found.verdict_before.is_alarm
+    assert not found.verdict_after.is_alarm
     # on a log that the refit has not seen, the new model runs as the changed vessel does
     (y, w), *_ = logs(known[1], weaker, 1, 91)
     begun = torch.from_numpy(y[:1]), torch.from_numpy(w[None]), torch.zeros(1, 0)
@@ -164,27 +172,27 @@ def test_a_refit_finds_the_size_of_a_planted_change_and_leaves_the_old_model_alo
 
 
 def test_a_refit_leaves_errors_of_sensors_and_unchanged_vessels_alone(
-    known: tuple[ModelSpec, HybridDynamics], watch: Watch
+    known: tuple[ModelSpec, HybridDynamics], watch: ChangeDetector
 ) -> None:
-    gyro = Change("gyro scale", "", "", 0.05, sensor="gyro_scale")
+    gyro = SystemChange("gyro scale", "", "", 0.05, sensor="gyro_scale")
     for change, words in ((gyro, "mend the sensor"), (NONE, "no cause exceeds")):
-        found = recursive_refit(watch, [windows(log) for log in logs(known[1], change, 3, 50)])
-        assert not found.moved
+        found = refit_recursively(watch, [windows(log) for log in logs(known[1], change, 3, 50)])
+        assert not found.identified_changes
         assert found.model is watch.model
-        assert words in found.ended
+        assert words in found.stopping_reason
 
 
 def test_windows_that_run_away_tell_nothing(
-    known: tuple[ModelSpec, HybridDynamics], watch: Watch
+    known: tuple[ModelSpec, HybridDynamics], watch: ChangeDetector
 ) -> None:
     """A start that no vessel has ends a free run far off; the verdict stays that of the others."""
     y, w = logs(known[1], NONE, 1, 7)[0]
     wild = y.copy()
     wild[:, 5] = 1e9
-    alone = watch.sums(windows((wild, w)))
+    alone = watch.compute_sums(windows((wild, w)))
     assert all(np.isfinite(one.score).all() and not one.score.any() for one in alone)
-    both = alone[0] + watch.sums(windows((y, w)))[0]
-    assert not np.isnan(watch.judge([0], [both]).suspects[0].score)
+    both = alone[0] + watch.compute_sums(windows((y, w)))[0]
+    assert not np.isnan(watch.evaluate([0], [both]).hypotheses[0].test_statistic)
 
 
 CAUSES = 3
@@ -202,62 +210,62 @@ def groups(
     change: np.ndarray,
     apart: float,
     shared: float = 0.0,
-) -> Groups:
+) -> GroupScores:
     """Groups whose information varies a hundredfold, logs and groups of sizes of their own."""
     log = np.arange(logs).repeat(each)
     information = ALIKE * 10.0 ** random.uniform(0, 2, (logs * each, 1, 1))
     size = change + (shared * random.normal(size=(logs, CAUSES)))[log]
     size = size + apart * random.normal(size=(len(log), CAUSES))
     noise = np.linalg.cholesky(information) @ random.normal(size=(len(log), CAUSES, 1))
-    return Groups(log, (information @ size[..., None] + noise)[..., 0], information)
+    return GroupScores(log, (information @ size[..., None] + noise)[..., 0], information)
 
 
-def scores(scatter: Scatter, count: int, made: Callable[[], Groups]) -> float:
+def scores(scatter: ScoreDistribution, count: int, made: Callable[[], GroupScores]) -> float:
     """How far the scores of all causes scatter over drawn groups."""
     found = []
     for _ in range(count):
-        size, error, _ = scatter.together(made())
+        size, error, _ = scatter.estimate_sizes(made())
         found.append(size / error)
     return float(np.std(found))
 
 
-def joined(*parts: Groups) -> Groups:
+def joined(*parts: GroupScores) -> GroupScores:
     each = zip(*(vars(part).values() for part in parts), strict=True)
-    return Groups(*(np.concatenate(one) for one in each))
+    return GroupScores(*(np.concatenate(one) for one in each))
 
 
 def test_much_information_about_a_wrong_model_is_no_alarm() -> None:
     random = np.random.default_rng(0)
-    scatter = scattered(groups(random, 60, 1, UNCHANGED, 0.5))
+    scatter = fit_score_distribution(groups(random, 60, 1, UNCHANGED, 0.5))
     assert 0.75 < scores(scatter, 200, lambda: groups(random, 5, 1, UNCHANGED, 0.5)) < 1.2
     # without what logs differ in, five vigorous logs would seem to know better
-    assert (scatter.apart > 0.05).all()
+    assert (scatter.size_variance > 0.05).all()
 
 
 def test_groups_of_one_log_share_what_is_their_own() -> None:
     random = np.random.default_rng(1)
-    scatter = scattered(groups(random, 40, 5, UNCHANGED, 0.1, shared=0.5))
-    assert (scatter.shared > 0.5 * scatter.apart).all()
+    scatter = fit_score_distribution(groups(random, 40, 5, UNCHANGED, 0.1, shared=0.5))
+    assert (scatter.shared_size_variance > 0.5 * scatter.size_variance).all()
     spread = scores(scatter, 300, lambda: groups(random, 1, 5, UNCHANGED, 0.1, shared=0.5))
     assert 0.8 < spread < 1.25
-    free = scattered(groups(random, 40, 5, UNCHANGED, 0.5))
-    assert (free.shared < 0.3 * free.apart).all()
+    free = fit_score_distribution(groups(random, 40, 5, UNCHANGED, 0.5))
+    assert (free.shared_size_variance < 0.3 * free.size_variance).all()
     # where no clean log tells, a single log counts once
-    alone = scattered(groups(random, 40, 1, UNCHANGED, 0.5))
-    np.testing.assert_array_equal(alone.shared, alone.apart)
+    alone = fit_score_distribution(groups(random, 40, 1, UNCHANGED, 0.5))
+    np.testing.assert_array_equal(alone.shared_size_variance, alone.size_variance)
 
 
 def test_what_lasts_for_a_stretch_makes_its_scores_lie_wider() -> None:
     """Logs left out tell it: pairs of groups of a long log share less than those of a stretch."""
     random = np.random.default_rng(3)
 
-    def sailed(logs: int, legs: int) -> Groups:
+    def sailed(logs: int, legs: int) -> GroupScores:
         parts = [groups(random, 1, 5, UNCHANGED, 0.05, shared=0.5) for _ in range(logs * legs)]
-        return replace(joined(*parts), log=np.arange(logs).repeat(5 * legs))
+        return replace(joined(*parts), log_index=np.arange(logs).repeat(5 * legs))
 
     held = joined(*(sailed(2, 4) for _ in range(5)))
     fold = np.arange(5).repeat(40)
-    scatter = scattered(held)
+    scatter = fit_score_distribution(held)
     spread = scores(scatter, 300, lambda: sailed(1, 1))
     assert spread > 1.3
     assert 0.75 < spread / wider(held, fold, 5) < 1.25
@@ -267,15 +275,17 @@ def test_what_lasts_for_a_stretch_makes_its_scores_lie_wider() -> None:
 
 def test_one_log_at_odds_with_the_others_does_not_speak_for_all() -> None:
     random = np.random.default_rng(5)
-    scatter = scattered(groups(random, 60, 1, UNCHANGED, 0.1))
+    scatter = fit_score_distribution(groups(random, 60, 1, UNCHANGED, 0.1))
     changed, strange = [], []
     for _ in range(50):
         known = groups(random, 5, 1, UNCHANGED, 0.1)
         # a manoeuvre that no clean log held asks for ten standard deviations alone
-        known.score[-1] += 10.0 * np.sqrt(scatter.variance(known.own))[-1]
-        size, error, _ = scatter.together(known)
+        known.score[-1] += 10.0 * np.sqrt(scatter.variance(known.diagonal_information))[-1]
+        size, error, _ = scatter.estimate_sizes(known)
         strange.append(np.abs(size / error).max())
-        size, error, _ = scatter.together(groups(random, 5, 1, np.array([0.0, 0.0, 2.0]), 0.1))
+        size, error, _ = scatter.estimate_sizes(
+            groups(random, 5, 1, np.array([0.0, 0.0, 2.0]), 0.1)
+        )
         changed.append(size[2] / error[2])
         assert abs(size[2] - 2.0) < 5 * error[2]
     assert np.median(strange) < 4.0
@@ -284,13 +294,13 @@ def test_one_log_at_odds_with_the_others_does_not_speak_for_all() -> None:
 
 def test_a_cause_is_no_likelier_because_clean_logs_were_surer_of_it() -> None:
     random = np.random.default_rng(4)
-    scatter = scattered(groups(random, 60, 1, UNCHANGED, 0.3))
+    scatter = fit_score_distribution(groups(random, 60, 1, UNCHANGED, 0.3))
     # clean logs leave open what the mean size of the right cause is, and so its score is smaller
-    vague = replace(scatter, known=np.array([1.0, 0.0, 0.0]))
+    vague = replace(scatter, mean_size_variance=np.array([1.0, 0.0, 0.0]))
     first = 0
     for _ in range(50):
         found = groups(random, 5, 1, np.array([1.5, 0.0, 0.0]), 0.3)
-        size, error, explains = vague.together(found)
+        size, error, explains = vague.estimate_sizes(found)
         assert abs(size[0]) / error[0] < abs(size[1]) / error[1]
         first += int(np.argmax(explains) == 0)
     assert first > 40
@@ -301,7 +311,7 @@ BELIEF = np.diag([1.0, 1.0, 1.0])
 
 
 def told(error: np.ndarray, effects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    sums = weighed([(error, effects)], [np.eye(VALUES)], BELIEF)
+    sums = compute_robust_score_sums([(error, effects)], [np.eye(VALUES)], BELIEF)
     return sums.score, sums.information
 
 

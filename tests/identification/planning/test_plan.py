@@ -9,20 +9,20 @@ from made_system import LINEAR, SCALES, STEP, model_of, trials
 
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.errors import DataError, UsageError
-from residnet.data.prepare import envelope, samples
+from residnet.data.prepare import compute_training_ranges, make_samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.actuated import InputShare
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.fitter import FittedModel
 from residnet.identification.planning import (
-    Aim,
-    Plan,
+    PredictionGoal,
     TrialLimits,
-    after,
-    plan,
-    shares_of,
-    spread,
-    volume_gain,
+    TrialPlan,
+    compute_expected_uncertainty,
+    compute_volume_gain,
+    infer_input_shares,
+    plan_trials,
+    update_covariance,
 )
 from residnet.manoeuvres.open_loop import ConstantInput
 from residnet.physics.signals import SignalsConfig
@@ -37,10 +37,10 @@ SHARES = {"tau_x": InputShare(drive=1.0), "tau_n": InputShare(steer=0.3)}
 def known() -> tuple[FittedModel, LeftOpen, torch.Tensor]:
     logs = trials()[:3]
     model = model_of(LINEAR)
-    given, store = samples(logs, model.signals), WindowStore.gather(logs, torch.float64)
-    RegressorsConfig(terms=tuple(LINEAR)).fit(model.baseline, given)
+    given, store = make_samples(logs, model.signals), WindowStore.from_logs(logs, torch.float64)
+    RegressorsConfig(terms=tuple(LINEAR)).fit_preferred(model.baseline, given)
     refitted = refit(model, given, store, CONFIG, SCALES)
-    low, high = envelope(logs)
+    low, high = compute_training_ranges(logs)
     spec = ModelSpec(
         name="baseline",
         role="baseline",
@@ -56,10 +56,14 @@ def known() -> tuple[FittedModel, LeftOpen, torch.Tensor]:
 
 
 def planned(
-    known: tuple[FittedModel, LeftOpen, torch.Tensor], limits: TrialLimits, aim: Aim | None = None
-) -> Plan:
+    known: tuple[FittedModel, LeftOpen, torch.Tensor],
+    limits: TrialLimits,
+    aim: PredictionGoal | None = None,
+) -> TrialPlan:
     fitted, open_, _ = known
-    return plan(fitted, open_, CONFIG, SCALES.numpy(), SHARES, np.full(3, 100.0), limits, aim)
+    return plan_trials(
+        fitted, open_, CONFIG, SCALES.numpy(), SHARES, np.full(3, 100.0), limits, aim
+    )
 
 
 def test_a_look_back_finds_the_covariance_of_the_refit(
@@ -75,10 +79,14 @@ def test_information_adds_to_what_is_known() -> None:
     random = torch.Generator().manual_seed(0)
     a, b = (torch.randn(4, 4, generator=random, dtype=torch.float64) for _ in range(2))
     covariance, told = torch.linalg.inv(a @ a.T), b @ b.T
-    torch.testing.assert_close(after(covariance, told), torch.linalg.inv(a @ a.T + told))
+    torch.testing.assert_close(
+        update_covariance(covariance, told), torch.linalg.inv(a @ a.T + told)
+    )
     wanted = 0.5 * (torch.logdet(a @ a.T + told) - torch.logdet(a @ a.T))
-    assert volume_gain(covariance, told) == pytest.approx(float(wanted))
-    assert spread(covariance, told) == pytest.approx(float((told @ covariance).trace().sqrt()))
+    assert compute_volume_gain(covariance, told) == pytest.approx(float(wanted))
+    assert compute_expected_uncertainty(covariance, told) == pytest.approx(
+        float((told @ covariance).trace().sqrt())
+    )
 
 
 def test_trials_are_chosen_for_what_is_to_be_predicted(
@@ -89,8 +97,8 @@ def test_trials_are_chosen_for_what_is_to_be_predicted(
     limits = TrialLimits(time=8.0, count=1)
     found = {
         one.name: {
-            trial.flight.motion.name: trial.shrinks
-            for trial in planned(known, limits, Aim([one], 8.0, {"u": 0.5})).trials
+            trial.simulated_run.true_log.name: trial.uncertainty_reduction
+            for trial in planned(known, limits, PredictionGoal([one], 8.0, {"u": 0.5})).candidates
         }
         for one in (straight, turning)
     }
@@ -102,12 +110,17 @@ def test_trials_are_chosen_within_the_limits_and_narrow_the_intervals(
     known: tuple[FittedModel, LeftOpen, torch.Tensor],
 ) -> None:
     found = planned(known, TrialLimits(time=8.0, count=2))
-    assert len(found.chosen) == 2
-    assert 0.0 < max(trial.shrinks for trial in found.chosen) < found.shrinks < 1.0
-    reach = float(np.median([trial.reach for trial in found.trials]))
+    assert len(found.selected_trials) == 2
+    assert (
+        0.0
+        < max(trial.uncertainty_reduction for trial in found.selected_trials)
+        < found.uncertainty_reduction
+        < 1.0
+    )
+    reach = float(np.median([trial.max_distance for trial in found.candidates]))
     near = planned(known, TrialLimits(time=8.0, area=reach, count=2))
-    assert all(trial.reach <= reach for trial in near.trials)
-    assert len(near.trials) < len(found.trials)
+    assert all(trial.max_distance <= reach for trial in near.candidates)
+    assert len(near.candidates) < len(found.candidates)
     with pytest.raises(DataError, match="stays within the limits"):
         planned(known, TrialLimits(time=8.0, area=1e-6))
 
@@ -116,14 +129,14 @@ def test_inputs_that_steer_are_known_by_unit_or_side(
     known: tuple[FittedModel, LeftOpen, torch.Tensor],
 ) -> None:
     spec = known[0].spec
-    assert shares_of(spec)["tau_n"].steer == max(map(abs, spec.ranges["tau_n"]))
+    assert infer_input_shares(spec)["tau_n"].steer == max(map(abs, spec.ranges["tau_n"]))
     twin = spec.model_copy(update={"signals": SignalsConfig(inputs=("n_port", "n_stbd"))})
-    shares = shares_of(twin)
+    shares = infer_input_shares(twin)
     assert float(shares["n_port"].steer) > 0 > float(shares["n_stbd"].steer)
     short = {"low": spec.low[:4], "high": spec.high[:4]}
     single = spec.model_copy(update={"signals": SignalsConfig(inputs=("n",)), **short})
     with pytest.raises(UsageError, match="known to steer"):
-        shares_of(single)
+        infer_input_shares(single)
 
 
 def test_manoeuvres_too_short_to_tell_anything_are_refused(
@@ -131,4 +144,4 @@ def test_manoeuvres_too_short_to_tell_anything_are_refused(
 ) -> None:
     short = ConstantInput(name="short", drive=1.0, steer=0.0, duration=1.0)
     with pytest.raises(DataError, match="cannot fly them"):
-        planned(known, TrialLimits(time=8.0, count=1), Aim([short], 1.0, {}))
+        planned(known, TrialLimits(time=8.0, count=1), PredictionGoal([short], 1.0, {}))

@@ -8,10 +8,10 @@ from typing import Literal, final
 from torch import Tensor, nn
 
 from residnet.core.samples import Samples
-from residnet.heads.base import Features, HeadKind, ResidualHead, ResidualScale
+from residnet.heads.base import BaseHeadConfig, Features, ResidualHead, ResidualScale
 
 
-class CrowdedConfig(HeadKind):
+class CrowdedConfig(BaseHeadConfig):
     """A linear map of channels that are centred over the batch, which no head may do.
 
     Attributes:
@@ -31,9 +31,9 @@ class CrowdedHead(ResidualHead):
 
     def __init__(self, config: CrowdedConfig, names: Sequence[str]) -> None:
         super().__init__()
-        self.features = Features(config.chosen(names), names, config.margin)
+        self.features = Features(config.select_features(names), names, config.margin)
         self.scale = ResidualScale()
-        self.readout = nn.Linear(self.features.count, 3)
+        self.readout = nn.Linear(self.features.n_features, 3)
 
     def calibrate(self, samples: Samples) -> None:
         """Take the scales of features and residual from the samples."""

@@ -13,11 +13,11 @@ from residnet.core.log import Log
 from residnet.data.readers.base import (
     LogReader,
     ReaderKind,
-    provenance,
+    describe_provenance,
     require_file,
     require_increasing,
     require_samples,
-    unwrap,
+    unwrap_angle,
 )
 
 _KNOT = 1852.0 / 3600.0
@@ -56,11 +56,11 @@ class KnotsReader(LogReader):
         channels = {
             "x": table[:, 1],
             "y": table[:, 2],
-            "psi": unwrap(table[:, 3] * math.pi / 180.0),
+            "psi": unwrap_angle(table[:, 3] * math.pi / 180.0),
             "u": table[:, 4] * _KNOT,
             "v": table[:, 5] * _KNOT,
             "r": table[:, 6] * math.pi / 180.0,
         }
         commands = dict(zip(("n_port", "n_stbd"), table[:, 7:].T, strict=False))
-        meta = provenance(path, len(t), 0)
+        meta = describe_provenance(path, len(t), 0)
         return Log(path.stem, t, channels | commands, meta=meta)

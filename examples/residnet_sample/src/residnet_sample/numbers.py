@@ -9,7 +9,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from residnet.core.errors import ExportError, UsageError
-from residnet.export.base import Exported, Exporter
+from residnet.export.base import Exportable, Exporter
 from residnet.export.vessel import ExportedVessel
 
 
@@ -21,10 +21,10 @@ class NumbersExporter(Exporter):
     suffix: ClassVar[str] = ".csv"
     about: ClassVar[str] = "every number of a model as a table of text (sample package)"
 
-    def export(self, exported: Exported, file: Path) -> Mapping[str, Any]:
+    def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
         """Write the table, read it back, and return how many numbers it holds."""
         if not isinstance(exported, ExportedVessel):
-            raise UsageError(f"{exported.what}: only the numbers of vessel models are written")
+            raise UsageError(f"{exported.label}: only the numbers of vessel models are written")
         numbers = [
             (f"{name},{index}", float(value))
             for name, tensor in exported.model.state_dict().items()

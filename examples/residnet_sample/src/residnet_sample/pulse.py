@@ -9,11 +9,11 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.core.config import Seconds
-from residnet.manoeuvres.base import Scheduled
+from residnet.manoeuvres.base import ScheduledManoeuvre
 
 
 @final
-class Pulse(Scheduled):
+class Pulse(ScheduledManoeuvre):
     """Steer for a while, then straight on.
 
     Attributes:
@@ -30,7 +30,7 @@ class Pulse(Scheduled):
     start: Annotated[Seconds, Field(ge=0)] = 5.0
     length: Annotated[Seconds, Field(gt=0)] = 5.0
 
-    def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
+    def demands_at(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Return drive and steer [T] at times t [T] in s."""
         within = (t >= self.start) & (t < self.start + self.length)
         return torch.full_like(t, self.drive), torch.where(within, self.steer, 0.0).to(t.dtype)

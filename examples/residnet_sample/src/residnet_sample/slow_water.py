@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from residnet.core.config import Seconds
 from residnet.core.samples import Samples
-from residnet.heads.base import Features, HeadKind, ResidualHead, ResidualScale
+from residnet.heads.base import BaseHeadConfig, Features, ResidualHead, ResidualScale
 
 
-class SlowWaterConfig(HeadKind):
+class SlowWaterConfig(BaseHeadConfig):
     """A linear map of the channels and of their running means.
 
     Attributes:
@@ -38,11 +38,11 @@ class SlowWaterHead(ResidualHead):
 
     def __init__(self, config: SlowWaterConfig, names: Sequence[str]) -> None:
         super().__init__()
-        self.features = Features(config.chosen(names), names, config.margin)
+        self.features = Features(config.select_features(names), names, config.margin)
         self.scale = ResidualScale()
-        self.n_state = self.features.count
+        self.n_state = self.features.n_features
         self.share = min(config.step / config.time_constant, 1.0)
-        self.readout = nn.Linear(2 * self.features.count, 3)
+        self.readout = nn.Linear(2 * self.features.n_features, 3)
         with torch.no_grad():
             self.readout.weight.mul_(0.1)
             self.readout.bias.zero_()
@@ -54,7 +54,7 @@ class SlowWaterHead(ResidualHead):
 
     def spread(self) -> Tensor:
         """Return the spread of the residual on the training samples, [3]."""
-        return self.scale.spread
+        return self.scale.std
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the residual [B, 3] at channels z [B, nz] and the running means one step later."""
@@ -62,7 +62,7 @@ class SlowWaterHead(ResidualHead):
         s = s + self.share * (f - s)
         return self.scale(self.readout(torch.cat((f, s), dim=-1))), s
 
-    def sequence(self, z: Tensor) -> Tensor:
+    def teacher_forced_residuals(self, z: Tensor) -> Tensor:
         """Return residuals [B, T, 3] along channels [B, T, nz], from an empty memory."""
         s = torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)
         residuals = []

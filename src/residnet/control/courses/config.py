@@ -12,44 +12,45 @@ import numpy as np
 from pydantic import Field
 
 from residnet.control.courses.course_check import BuoyConfig, Protocol
-from residnet.control.courses.course_plan import Course, CourseRequest, plan
+from residnet.control.courses.course_plan import Course, CourseRequest, find_quickest_course
 from residnet.control.courses.outline import Circle
 from residnet.control.courses.turns import (
     SteadyTurn,
     TurnMaker,
-    Turns,
-    arcs,
-    simulated_turns,
-    steady_turn,
-    turning_step,
+    TurnTables,
+    arc_turns,
+    choose_time_step,
+    simulate_steady_turn,
+    simulate_turns,
 )
-from residnet.control.heading.turning import Turning
+from residnet.control.heading.turning import NomotoModel
 from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Seconds
 from residnet.core.errors import ConfigError
 
 
-def widened(buoys: Sequence[BuoyConfig], smallest: float) -> list[BuoyConfig]:
+def enlarge_to_turning_radius(buoys: Sequence[BuoyConfig], min_radius: float) -> list[BuoyConfig]:
     """Return the buoys with radii that the vessel can follow."""
-    return [buoy.model_copy(update={"radius": max(buoy.radius, smallest)}) for buoy in buoys]
+    return [buoy.model_copy(update={"radius": max(buoy.radius, min_radius)}) for buoy in buoys]
 
 
-def overlapping(buoys: Sequence[BuoyConfig]) -> list[tuple[int, int]]:
+def overlapping_pairs(buoys: Sequence[BuoyConfig]) -> list[tuple[int, int]]:
     """Return the numbers of following buoys that no course passes between, though it has to.
 
     Their circles overlap, and they are left to different sides.
     """
     return [
         (number, number + 1)
-        for number, (one, two) in enumerate(itertools.pairwise(buoys), start=1)
-        if one.leave_to != two.leave_to
-        and math.hypot(two.north - one.north, two.east - one.east) < one.radius + two.radius
+        for number, (first, second) in enumerate(itertools.pairwise(buoys), start=1)
+        if first.leave_to != second.leave_to
+        and math.hypot(second.north - first.north, second.east - first.east)
+        < first.radius + second.radius
     ]
 
 
-_STEP = math.log(1.12)
+_LOG_RADIUS_STEP = math.log(1.12)
 """Between the radii of the turns that a plan uses, logarithmic."""
-_BESIDE = 0.05
+_MIN_START_CLEARANCE = 0.05
 """Of a buoy's radius by which a plan comes nearer than where it begins, unless room lacks."""
 
 
@@ -104,24 +105,28 @@ class PlannedCourse:
     shortest: CourseRequest
 
     @cached_property
-    def reference(self) -> float:
+    def reference_length(self) -> float:
         """The length in m of the shortest course found, which times are compared with."""
         try:
-            found = plan(self.shortest, self.course.step, self.course.step).length
+            shortest_length = find_quickest_course(
+                self.shortest, self.course.step, self.course.step
+            ).length
         except ConfigError:
             return self.course.length
-        return min(found, self.course.length)
+        return min(shortest_length, self.course.length)
 
 
 def smallest_turn(
-    config: BuoyCourseConfig, vessel: SteeredVessel, turning: Turning, limit: float
+    config: BuoyCourseConfig, vessel: SteeredVessel, nomoto: NomotoModel, limit: float
 ) -> SteadyTurn:
     """Return the smallest turn of the nominal vessel, at the rudder's limit in rad."""
-    step = config.planning_dt or turning_step(vessel, turning, limit)
-    return steady_turn(vessel, limit, config.turning_time, step)
+    step = config.planning_dt or choose_time_step(vessel, nomoto, limit)
+    return simulate_steady_turn(vessel, limit, config.turning_time, step)
 
 
-def feasibility(buoys: Sequence[BuoyConfig], smallest: float) -> list[dict[str, float | bool]]:
+def buoy_feasibility(
+    buoys: Sequence[BuoyConfig], min_radius: float
+) -> list[dict[str, float | bool]]:
     """Return each buoy's radius and the smallest possible one in m, and whether it is possible.
 
     Both printed courses ask for less than the vessel can do (correction G18).
@@ -130,8 +135,8 @@ def feasibility(buoys: Sequence[BuoyConfig], smallest: float) -> list[dict[str, 
         {
             "buoy": number,
             "radius": buoy.radius,
-            "smallest": smallest,
-            "possible": buoy.radius >= smallest,
+            "smallest": min_radius,
+            "possible": buoy.radius >= min_radius,
         }
         for number, buoy in enumerate(buoys, start=1)
     ]
@@ -141,7 +146,7 @@ def plan_course(
     config: BuoyCourseConfig,
     protocol: Protocol,
     vessel: SteeredVessel,
-    turning: Turning,
+    nomoto: NomotoModel,
     limit: float,
     steady: SteadyTurn,
 ) -> PlannedCourse:
@@ -150,84 +155,99 @@ def plan_course(
     Raises:
         ConfigError: where none is found.
     """
-    buoys = tuple(widened(config.buoys, steady.radius))
-    if protocol == "sides" and (pairs := overlapping(buoys)):
-        one, two = pairs[0]
+    buoys = tuple(enlarge_to_turning_radius(config.buoys, steady.radius))
+    if protocol == "sides" and (pairs := overlapping_pairs(buoys)):
+        first, second = pairs[0]
         raise ConfigError(
-            f"buoys {one} and {two}: their circles overlap, and the course has to pass between"
+            f"buoys {first} and {second}: their circles overlap, and the course has to pass between"
             " them; move one, or give them smaller circles"
         )
-    current = config.current / turning.speed
-    share = config.share * (1.0 - current)
-    aside = config.current * (turning.time + config.lookahead / turning.speed)
-    margin = config.reach if protocol == "enter" else config.margin
+    current = config.current / nomoto.speed
+    rudder_share = config.share * (1.0 - current)
+    max_offset = config.current * (nomoto.time + config.lookahead / nomoto.speed)
+    clearance_margin = config.reach if protocol == "enter" else config.margin
     # what a turn takes is seen from the yaw rate that it reaches, which K overstates in hard turns
-    reached = replace(turning, gain=steady.yaw_rate / limit)
-    make = TurnMaker(vessel, reached, steady.step)
+    achieved_nomoto = replace(nomoto, gain=steady.yaw_rate / limit)
+    turn_maker = TurnMaker(vessel, achieved_nomoto, steady.step)
 
     def request(
-        tightest: float, margin: float, aside: float, turns: Callable[[np.ndarray], Turns]
+        min_radius: float,
+        margin: float,
+        max_offset: float,
+        make_turns: Callable[[np.ndarray], TurnTables],
     ) -> CourseRequest:
-        circles, radii = _circles(config, protocol, buoys, tightest, margin, aside)
-        asked = buoys
+        circles, radii = _clearance_circles(config, protocol, buoys, min_radius, margin, max_offset)
+        checked_buoys = buoys
         if protocol == "enter":
-            asked = tuple(one.model_copy(update={"radius": config.acceptance}) for one in buoys)
+            checked_buoys = tuple(
+                buoy.model_copy(update={"radius": config.acceptance}) for buoy in buoys
+            )
         return CourseRequest(
-            config.start, config.heading, circles, asked, protocol, turns(radii), aside
+            config.start,
+            config.heading,
+            circles,
+            checked_buoys,
+            protocol,
+            make_turns(radii),
+            max_offset,
         )
 
-    def simulated(radii: np.ndarray) -> Turns:
-        return simulated_turns(make, limit * steady.radius / radii, steady.radius)
+    def simulated(radii: np.ndarray) -> TurnTables:
+        return simulate_turns(turn_maker, limit * steady.radius / radii, steady.radius)
 
-    step = 0.1 * turning.speed
-    wanted = request(steady.radius / share, margin, aside, simulated)
-    course = plan(wanted, step, 5.0 * config.lookahead, make)
-    shortest = request(steady.radius, 0.0, 0.0, lambda radii: arcs(radii, turning.speed))
+    step = 0.1 * nomoto.speed
+    course_request = request(steady.radius / rudder_share, clearance_margin, max_offset, simulated)
+    course = find_quickest_course(course_request, step, 5.0 * config.lookahead, turn_maker)
+    shortest = request(steady.radius, 0.0, 0.0, lambda radii: arc_turns(radii, nomoto.speed))
     return PlannedCourse(protocol, course, buoys, steady, shortest)
 
 
-def _circles(
+def _clearance_circles(
     config: BuoyCourseConfig,
     protocol: Protocol,
     buoys: tuple[BuoyConfig, ...],
-    tightest: float,
+    min_radius: float,
     margin: float,
-    aside: float,
+    max_offset: float,
 ) -> tuple[tuple[Circle, ...], np.ndarray]:
     """Return the circles that a plan keeps to, and the radii in m of the turns that it uses.
 
     A wide circle is rounded with less rudder.
     """
     if protocol == "enter":
-        depth = max((1.0 - margin) * config.acceptance - aside, 0.05 * config.acceptance)
+        depth = max((1.0 - margin) * config.acceptance - max_offset, 0.05 * config.acceptance)
         return tuple(
             Circle(complex(buoy.north, buoy.east), depth, 0, 0) for buoy in buoys
-        ), np.array([tightest])
-    radii = [_kept(buoy, config.start, margin, aside) for buoy in buoys]
+        ), np.array([min_radius])
+    radii = [_clearance_radius(buoy, config.start, margin, max_offset) for buoy in buoys]
     # a few rudder angles do for circles of many sizes
-    steps = [max(math.floor(math.log(radius / tightest) / _STEP), 0) for radius in radii]
-    wide = sorted({0, *steps})
+    buoy_steps = [
+        max(math.floor(math.log(radius / min_radius) / _LOG_RADIUS_STEP), 0) for radius in radii
+    ]
+    radius_steps = sorted({0, *buoy_steps})
     return tuple(
         Circle(
             complex(buoy.north, buoy.east),
             radius,
             1 if buoy.leave_to == "starboard" else -1,
-            wide.index(step),
+            radius_steps.index(step),
         )
-        for buoy, radius, step in zip(buoys, radii, steps, strict=True)
-    ), tightest * np.exp(_STEP * np.array(wide))
+        for buoy, radius, step in zip(buoys, radii, buoy_steps, strict=True)
+    ), min_radius * np.exp(_LOG_RADIUS_STEP * np.array(radius_steps))
 
 
-def _kept(buoy: BuoyConfig, start: tuple[float, float], margin: float, aside: float) -> float:
+def _clearance_radius(
+    buoy: BuoyConfig, start: tuple[float, float], margin: float, max_offset: float
+) -> float:
     """Return the radius in m that a plan keeps from a buoy: less where it begins nearer than that.
 
     The start may lie on the wrong side: then the course passes nearer than it begins, by as much as
     it may be displaced, or half way between its start and the circle. Where it begins within the
     buoy's own circle, it leaves that first.
     """
-    radius = (1.0 + margin) * buoy.radius + aside
-    room = math.hypot(buoy.north - start[0], buoy.east - start[1]) - buoy.radius
-    if room < 0:
+    radius = (1.0 + margin) * buoy.radius + max_offset
+    start_distance = math.hypot(buoy.north - start[0], buoy.east - start[1]) - buoy.radius
+    if start_distance < 0:
         return radius
-    nearer = min(max(aside, _BESIDE * buoy.radius), 0.5 * room)
-    return min(radius, buoy.radius + room - nearer)
+    start_clearance = min(max(max_offset, _MIN_START_CLEARANCE * buoy.radius), 0.5 * start_distance)
+    return min(radius, buoy.radius + start_distance - start_clearance)

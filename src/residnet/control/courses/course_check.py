@@ -42,21 +42,21 @@ class Passage(NamedTuple):
     """How a track passes a buoy.
 
     Attributes:
-        at: sample of the closest approach in the buoy's turn.
-        side: that the buoy lies on there.
+        sample: sample of the closest approach in the buoy's turn.
+        passing_side: that the buoy lies on there.
         distance: there, in m.
-        least: smallest distance on the whole track, from `left_behind` on.
-        side_there: that the buoy lies on at that distance.
+        min_distance: smallest distance on the whole track, from `first_counted_sample` on.
+        side_at_min_distance: that the buoy lies on at that distance.
     """
 
-    at: int
-    side: str
+    sample: int
+    passing_side: str
     distance: float
-    least: float
-    side_there: str
+    min_distance: float
+    side_at_min_distance: str
 
 
-def left_behind(distance: Array, radius: float) -> int:
+def first_counted_sample(distance: Array, radius: float) -> int:
     """Return the sample from which a buoy counts: 0, or where the circle is left that it begins in.
 
     It is left once the track is outside and comes nearer again: going away is no approach. It is
@@ -68,80 +68,90 @@ def left_behind(distance: Array, radius: float) -> int:
     """
     if distance[0] >= radius:
         return 0
-    outside = distance >= radius
-    if not outside.any():
+    is_outside = distance >= radius
+    if not is_outside.any():
         return len(distance)
-    first = int(outside.argmax())
-    nearer = np.flatnonzero(np.diff(distance[first:]) < 0)
-    return first + int(nearer[0]) if len(nearer) else len(distance) - 1
+    first_outside = int(is_outside.argmax())
+    approaching = np.flatnonzero(np.diff(distance[first_outside:]) < 0)
+    return first_outside + int(approaching[0]) if len(approaching) else len(distance) - 1
 
 
-def passages(track: Array, buoys: Sequence[BuoyConfig]) -> list[Passage]:
+def find_passages(track: Array, buoys: Sequence[BuoyConfig]) -> list[Passage]:
     """Return how a track [N, 2] passes buoys in their order.
 
     The moments are in the order of the buoys, and the sum of the distances then is least.
     """
     distance = np.stack([np.hypot(*(track - (b.north, b.east)).T) for b in buoys])
-    for row, buoy in zip(distance, buoys, strict=True):
-        begin = left_behind(row, buoy.radius)
-        row[: begin if begin < len(row) else 0] = np.inf
-    total, choices = distance[0], []
-    number = np.arange(len(track))
-    for row in distance[1:]:
-        best = np.minimum.accumulate(total)
-        choices.append(np.maximum.accumulate(np.where(total <= best, number, 0)))
-        total = row + best
-    at = [int(total.argmin())]
-    for choice in reversed(choices):
-        at.append(int(choice[at[-1]]))
-    found = []
-    for row, buoy, here in zip(distance, buoys, reversed(at), strict=True):
-        nearest = int(row.argmin())
-        found.append(
+    for distances, buoy in zip(distance, buoys, strict=True):
+        first_sample = first_counted_sample(distances, buoy.radius)
+        distances[: first_sample if first_sample < len(distances) else 0] = np.inf
+    cumulative_distance, predecessor_tables = distance[0], []
+    sample_index = np.arange(len(track))
+    for distances in distance[1:]:
+        running_minimum = np.minimum.accumulate(cumulative_distance)
+        predecessor_tables.append(
+            np.maximum.accumulate(np.where(cumulative_distance <= running_minimum, sample_index, 0))
+        )
+        cumulative_distance = distances + running_minimum
+    samples = [int(cumulative_distance.argmin())]
+    for predecessors in reversed(predecessor_tables):
+        samples.append(int(predecessors[samples[-1]]))
+    passages_found = []
+    for distances, buoy, sample in zip(distance, buoys, reversed(samples), strict=True):
+        nearest_sample = int(distances.argmin())
+        passages_found.append(
             Passage(
-                here,
-                _side(track, here, buoy),
-                float(row[here]),
-                float(row[nearest]),
-                _side(track, nearest, buoy),
+                sample,
+                _side_of_buoy(track, sample, buoy),
+                float(distances[sample]),
+                float(distances[nearest_sample]),
+                _side_of_buoy(track, nearest_sample, buoy),
             )
         )
-    return found
+    return passages_found
 
 
-def _side(track: Array, at: int, buoy: BuoyConfig) -> str:
+def _side_of_buoy(track: Array, sample: int, buoy: BuoyConfig) -> str:
     """Return the side that a buoy lies on at a sample."""
-    step = track[min(at + 1, len(track) - 1)] - track[max(at - 1, 0)]
-    north, east = buoy.north - track[at, 0], buoy.east - track[at, 1]
+    step = track[min(sample + 1, len(track) - 1)] - track[max(sample - 1, 0)]
+    north, east = buoy.north - track[sample, 0], buoy.east - track[sample, 1]
     return "starboard" if step[0] * east - step[1] * north > 0 else "port"
 
 
-def first_fault(
-    track: Array, buoys: Sequence[BuoyConfig], protocol: Protocol, turn: float, missed: float = 0.0
+def find_first_violation(
+    track: Array,
+    buoys: Sequence[BuoyConfig],
+    protocol: Protocol,
+    min_turn_radius: float,
+    tolerance: float = 0.0,
 ) -> tuple[int, str] | None:
     """Return the first buoy, from 0, where a track [N, 2] does wrong, and what; None where nowhere.
 
-    A circle may be entered between the samples: nearer by what `_between` says.
+    A circle may be entered between the samples: nearer by what `_sampling_error` says.
 
     Args:
         track: north, east in m.
         buoys: in their order.
-        turn: least radius of its turns in m.
-        missed: by which circles may be missed, in m.
+        min_turn_radius: least radius of its turns in m.
+        tolerance: by which circles may be missed, in m.
     """
     step = float(np.hypot(*np.diff(track, axis=0).T).max())
-    for number, (passage, buoy) in enumerate(zip(passages(track, buoys), buoys, strict=True), 1):
+    for number, (passage, buoy) in enumerate(
+        zip(find_passages(track, buoys), buoys, strict=True), 1
+    ):
         if protocol == "enter":
-            if passage.distance > buoy.radius + missed + _between(buoy.radius, step, turn):
+            if passage.distance > buoy.radius + tolerance + _sampling_error(
+                buoy.radius, step, min_turn_radius
+            ):
                 return number - 1, (
                     f"buoy {number}: passed at {passage.distance:.4g} m, its circle of"
                     f" {buoy.radius:.4g} m is not entered in its turn"
                 )
-        elif passage.least < buoy.radius - missed:
+        elif passage.min_distance < buoy.radius - tolerance:
             return number - 1, (
-                f"buoy {number}: its circle of {buoy.radius:.4g} m is cut, {passage.least:.4g} m"
+                f"buoy {number}: its circle of {buoy.radius:.4g} m is cut, {passage.min_distance:.4g} m"
             )
-        elif {passage.side, passage.side_there} != {buoy.leave_to}:
+        elif {passage.passing_side, passage.side_at_min_distance} != {buoy.leave_to}:
             return (
                 number - 1,
                 f"buoy {number}: it is not left to {buoy.leave_to} where it is nearest",
@@ -149,9 +159,9 @@ def first_fault(
     return None
 
 
-def _between(distance: float, step: float, turn: float) -> float:
+def _sampling_error(distance: float, step: float, min_turn_radius: float) -> float:
     """Return how much nearer than its samples a track may come to a point that it passes.
 
     A sample lies at most half a step from the closest approach, along an arc that bends away.
     """
-    return min(0.5 * step, step**2 / 8 * (1 / turn + 1 / distance)) if distance else 0.0
+    return min(0.5 * step, step**2 / 8 * (1 / min_turn_radius + 1 / distance)) if distance else 0.0

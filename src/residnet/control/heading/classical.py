@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from residnet.control.base import Policy
 from residnet.core.errors import ConfigError
-from residnet.core.frames import wrap
+from residnet.core.frames import wrap_angle
 
 
 @final
@@ -33,7 +33,7 @@ class HeadingPD(Policy):
         self.kp, self.kd, self.limit = kp, kd, limit
 
     @classmethod
-    def placed(
+    def from_pole_placement(
         cls,
         state: Sequence[str],
         *,
@@ -55,9 +55,9 @@ class HeadingPD(Policy):
         )
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        error = wrap(reference - x[:, self.psi : self.psi + 1])
-        wish = self.kp * error - self.kd * x[:, self.r : self.r + 1]
-        return wish.clamp(-self.limit, self.limit), s
+        error = wrap_angle(reference - x[:, self.psi : self.psi + 1])
+        unlimited_command = self.kp * error - self.kd * x[:, self.r : self.r + 1]
+        return unlimited_command.clamp(-self.limit, self.limit), s
 
 
 @final
@@ -65,14 +65,14 @@ class BangBangHeading(Policy):
     """Full rudder towards the switching curve of T r_dot + r = K delta (document 004 eq. (5.9)).
 
     Full counter-rudder stops a yaw rate r within T r - T K d ln(1 + r / (K d)) of heading, d the
-    largest angle; the sign of the heading error less that decides. Within `layer` of the curve the
+    largest angle; the sign of the heading error less that decides. Within `boundary_layer` of the curve the
     command is proportional, and where error and yaw rate are inside `capture` the command is kp e -
     kd r, which brings them to zero.
 
     Args:
         gain, time: K [1/s] and T [s], both positive.
         limit: d [rad].
-        layer: of the heading error about the curve [rad].
+        boundary_layer: of the heading error about the curve [rad].
         capture: largest heading error [rad] and yaw rate [rad/s] of the linear law.
         kp, kd: of the linear law; kd is T / (2 K) where none is given.
     """
@@ -96,9 +96,9 @@ class BangBangHeading(Policy):
                 f" {time:g}, {limit:g}, {layer:g}"
             )
         self.psi, self.r = state.index("psi"), state.index("r")
-        self.time, self.limit, self.layer = time, limit, layer
-        self.steady = gain * limit
-        self.near, self.slow = capture
+        self.time, self.limit, self.boundary_layer = time, limit, layer
+        self.max_yaw_rate = gain * limit
+        self.capture_angle, self.capture_rate = capture
         self.kp, self.kd = kp, time / (2.0 * gain) if kd is None else kd
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -110,15 +110,19 @@ class BangBangHeading(Policy):
             s: memory [B, 0].
         """
         r = x[:, self.r : self.r + 1]
-        error = wrap(reference - x[:, self.psi : self.psi + 1])
-        braking = self.time * (r - r.sign() * self.steady * torch.log1p(r.abs() / self.steady))
-        full = ((error - braking) * (self.limit / self.layer)).clamp(-self.limit, self.limit)
-        caught = (error.abs() < self.near) & (r.abs() < self.slow)
-        linear = (self.kp * error - self.kd * r).clamp(-self.limit, self.limit)
-        return torch.where(caught, linear, full), s
+        error = wrap_angle(reference - x[:, self.psi : self.psi + 1])
+        braking = self.time * (
+            r - r.sign() * self.max_yaw_rate * torch.log1p(r.abs() / self.max_yaw_rate)
+        )
+        switching_command = ((error - braking) * (self.limit / self.boundary_layer)).clamp(
+            -self.limit, self.limit
+        )
+        is_captured = (error.abs() < self.capture_angle) & (r.abs() < self.capture_rate)
+        linear_command = (self.kp * error - self.kd * r).clamp(-self.limit, self.limit)
+        return torch.where(is_captured, linear_command, switching_command), s
 
 
-_HALVINGS = 40
+_N_BISECTIONS = 40
 """Of the range of the effort: 2^-40 of it is less than single precision resolves."""
 
 
@@ -132,7 +136,7 @@ class RatedBangBangHeading(Policy):
     largest one, and brings it amidships, such that T r_dot + r = K delta (document 004 eq. (5.9))
     ends at rest; how much counter-rudder that takes is found by halving. The heading that is gained
     on the way, K times the integral of delta plus T r, is compared with the heading error. Within
-    `layer` of equality the two commands are mixed, and where error, yaw rate and rudder are inside
+    `boundary_layer` of equality the two commands are mixed, and where error, yaw rate and rudder are inside
     `capture` the command is kp e - kd r.
 
     Args:
@@ -141,7 +145,7 @@ class RatedBangBangHeading(Policy):
         limit: largest rudder angle [rad].
         rate: of the rudder [rad/s].
         dt: step of the controller [s]: the rudder answers a command one step later.
-        layer: of the heading error [rad].
+        boundary_layer: of the heading error [rad].
         capture: largest heading error [rad] and yaw rate [rad/s] of the linear law.
     """
 
@@ -163,7 +167,7 @@ class RatedBangBangHeading(Policy):
                 "bang-bang heading: gain, time, limit, rate, step and layer must be positive"
             )
         self.psi, self.r, self.delta = (state.index(name) for name in ("psi", "r", "delta"))
-        self.gain, self.time, self.limit, self.rate, self.dt, self.layer = (
+        self.gain, self.time, self.limit, self.rate, self.dt, self.boundary_layer = (
             gain,
             time,
             limit,
@@ -171,29 +175,36 @@ class RatedBangBangHeading(Policy):
             dt,
             layer,
         )
-        self.near, self.slow = capture
+        self.capture_angle, self.capture_rate = capture
 
-    def _ramp(self, r: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+    def _ramp_rudder(self, r: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
         """Return yaw rate and integral of the angle after the rudder has gone to another angle."""
-        wait = (end - start).abs() / self.rate
+        ramp_time = (end - start).abs() / self.rate
         slope = (end - start).sign() * self.rate
         steady = self.gain * (start - slope * self.time)
         return (
-            self.gain * (end - slope * self.time) + (r - steady) * torch.exp(-wait / self.time),
-            0.5 * (start + end) * wait,
+            self.gain * (end - slope * self.time)
+            + (r - steady) * torch.exp(-ramp_time / self.time),
+            0.5 * (start + end) * ramp_time,
         )
 
-    def _braked(self, r: Tensor, rudder: Tensor, effort: Tensor) -> tuple[Tensor, Tensor]:
+    def _simulate_braking(self, r: Tensor, rudder: Tensor, effort: Tensor) -> tuple[Tensor, Tensor]:
         """Return the yaw rate after a braking programme, and the heading gained in it.
 
         The effort is in rad; beyond the rudder's limit it is time held there.
         """
-        most = effort.clamp(max=self.limit)
-        after, first = self._ramp(r, rudder, -most)
-        wait = (effort - most) / self.rate
-        held = -self.gain * most + (after + self.gain * most) * torch.exp(-wait / self.time)
-        end, last = self._ramp(held, -most, torch.zeros_like(most))
-        return end, self.gain * (first - most * wait + last) + self.time * (r - end)
+        held_angle = effort.clamp(max=self.limit)
+        rate_after_ramp, first_integral = self._ramp_rudder(r, rudder, -held_angle)
+        hold_time = (effort - held_angle) / self.rate
+        rate_after_hold = -self.gain * held_angle + (
+            rate_after_ramp + self.gain * held_angle
+        ) * torch.exp(-hold_time / self.time)
+        final_rate, last_integral = self._ramp_rudder(
+            rate_after_hold, -held_angle, torch.zeros_like(held_angle)
+        )
+        return final_rate, self.gain * (
+            first_integral - held_angle * hold_time + last_integral
+        ) + self.time * (r - final_rate)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the rudder command [B, 1] in rad; there is no memory.
@@ -203,40 +214,54 @@ class RatedBangBangHeading(Policy):
             reference: heading [B, 1] in rad.
             s: memory [B, 0].
         """
-        error = wrap(reference - x[:, self.psi : self.psi + 1])
-        turn, angle = x[:, self.r : self.r + 1], x[:, self.delta : self.delta + 1]
+        error = wrap_angle(reference - x[:, self.psi : self.psi + 1])
+        yaw_rate, rudder_angle = x[:, self.r : self.r + 1], x[:, self.delta : self.delta + 1]
         # this step goes by as it is: the rudder answers at its end
-        steady = self.gain * angle
-        later = steady + (turn - steady) * math.exp(-self.dt / self.time)
-        error, turn = error - steady * self.dt - self.time * (turn - later), later
-        # the way that the vessel will have turned once the rudder is amidships
-        coming = self._ramp(turn, angle, torch.zeros_like(angle))[0]
-        side = torch.where(coming.abs() > 1e-9, coming.sign(), error.sign())
-        r, rudder = side * turn, side * angle
-        low, high = torch.zeros_like(r), torch.full_like(r, 20.0 * self.limit)
-        for _ in range(_HALVINGS):
-            middle = 0.5 * (low + high)
-            moving = self._braked(r, rudder, middle)[0] > 0
-            low, high = torch.where(moving, middle, low), torch.where(moving, high, middle)
-        effort = 0.5 * (low + high)
-        distance = self._braked(r, rudder, effort)[1]
-        left = side * error - distance
-        share = (left / self.layer).clamp(-1.0, 1.0)
-        brake = -effort.clamp(max=self.limit)
-        command = side * torch.where(
-            share > 0, brake + share * (self.limit - brake), brake - share * (-self.limit - brake)
+        steady = self.gain * rudder_angle
+        next_yaw_rate = steady + (yaw_rate - steady) * math.exp(-self.dt / self.time)
+        error, yaw_rate = (
+            error - steady * self.dt - self.time * (yaw_rate - next_yaw_rate),
+            next_yaw_rate,
         )
-        caught = (error.abs() < self.near) & (turn.abs() < self.slow)
+        # the way that the vessel will have turned once the rudder is amidships
+        centred_yaw_rate = self._ramp_rudder(
+            yaw_rate, rudder_angle, torch.zeros_like(rudder_angle)
+        )[0]
+        turn_direction = torch.where(
+            centred_yaw_rate.abs() > 1e-9, centred_yaw_rate.sign(), error.sign()
+        )
+        r, rudder = turn_direction * yaw_rate, turn_direction * rudder_angle
+        lower, upper = torch.zeros_like(r), torch.full_like(r, 20.0 * self.limit)
+        for _ in range(_N_BISECTIONS):
+            trial_effort = 0.5 * (lower + upper)
+            is_turning = self._simulate_braking(r, rudder, trial_effort)[0] > 0
+            lower, upper = (
+                torch.where(is_turning, trial_effort, lower),
+                torch.where(is_turning, upper, trial_effort),
+            )
+        effort = 0.5 * (lower + upper)
+        distance = self._simulate_braking(r, rudder, effort)[1]
+        remaining_error = turn_direction * error - distance
+        mixing_factor = (remaining_error / self.boundary_layer).clamp(-1.0, 1.0)
+        brake = -effort.clamp(max=self.limit)
+        command = turn_direction * torch.where(
+            mixing_factor > 0,
+            brake + mixing_factor * (self.limit - brake),
+            brake - mixing_factor * (-self.limit - brake),
+        )
+        is_captured = (error.abs() < self.capture_angle) & (yaw_rate.abs() < self.capture_rate)
         kp = 0.8
         kd = self.time / (2.0 * self.gain)
         return (
-            torch.where(caught, (kp * error - kd * turn).clamp(-self.limit, self.limit), command),
+            torch.where(
+                is_captured, (kp * error - kd * yaw_rate).clamp(-self.limit, self.limit), command
+            ),
             s,
         )
 
 
-def centred(
-    error: Tensor, r: Tensor, acting: Tensor, force: Tensor, decay: Tensor, swing: float
+def predict_centred_rudder(
+    error: Tensor, r: Tensor, rudder_share: Tensor, force: Tensor, decay: Tensor, swing_time: float
 ) -> tuple[Tensor, Tensor]:
     """Return the error and yaw rate [B, 1] that will be left once the rudder is centred.
 
@@ -245,18 +270,25 @@ def centred(
     Args:
         error: heading error [B, 1] in rad.
         r: yaw rate [B, 1] in rad/s.
-        acting: rudder [B, 1] as a share of its limit.
+        rudder_share: rudder [B, 1] as a share of its limit.
         force: yaw acceleration [B, 1] of full rudder in rad/s^2.
         decay: 1/T [B, 1] in 1/s.
-        swing: time in s that the rudder takes from amidships to its limit.
+        swing_time: time in s that the rudder takes from amidships to its limit.
     """
-    wait = acting.abs() * swing
-    later = r + wait * (0.5 * force * acting - decay * r)
-    return error - wait * (r + wait * (force * acting / 3.0 - 0.5 * decay * r)), later
+    centring_time = rudder_share.abs() * swing_time
+    centred_yaw_rate = r + centring_time * (0.5 * force * rudder_share - decay * r)
+    return error - centring_time * (
+        r + centring_time * (force * rudder_share / 3.0 - 0.5 * decay * r)
+    ), centred_yaw_rate
 
 
-def braking(
-    r: Tensor, force: Tensor, decay: Tensor, stiffness: Tensor, stiff: Tensor, swing: float
+def braking_distance(
+    r: Tensor,
+    force: Tensor,
+    decay: Tensor,
+    stiffness: Tensor,
+    damping_ratio: Tensor,
+    swing_time: float,
 ) -> Tensor:
     """Return the heading [B, 1] that passes while r_dot = -force - decay r stops the yaw rate.
 
@@ -264,38 +296,48 @@ def braking(
 
     The rudder starts from amidships and comes back there: that takes half of its swing more, or a
     pulse that does not reach the limit. nu is chosen such that e'' + (decay + stiffness / nu) e' +
-    stiffness e = 0 has the relative damping `stiff`.
+    stiffness e = 0 has the relative damping `damping_ratio`.
 
     Args:
         r: yaw rate [B, 1] in rad/s.
         force: yaw acceleration that is counted on, in rad/s^2.
         decay: 1/T in 1/s.
         stiffness: yaw acceleration per heading error near the reference in 1/s^2.
-        swing: time in s that the rudder takes from amidships to its limit.
+        swing_time: time in s that the rudder takes from amidships to its limit.
     """
-    line = ((2.0 * stiff * torch.sqrt(stiffness) - decay) / stiffness).clamp(min=1e-3)
-    lead = (line - 0.5 * swing).clamp(min=1e-3)
-    end = force * lead / (1.0 - decay * lead).clamp(min=0.1)
-    if swing > 0.0:
-        end = torch.where(line < 1.5 * swing, (line / 1.5).square() * force / swing, end)
-    size = r.abs()
-    beyond = torch.maximum(size, end)
-    curve = (
-        _distance(beyond, force, decay, swing) - _distance(end, force, decay, swing) + end * line
+    linear_time = ((2.0 * damping_ratio * torch.sqrt(stiffness) - decay) / stiffness).clamp(
+        min=1e-3
     )
-    return r.sign() * torch.where(size < end, size * line, curve)
+    saturated_time = (linear_time - 0.5 * swing_time).clamp(min=1e-3)
+    linear_limit = force * saturated_time / (1.0 - decay * saturated_time).clamp(min=0.1)
+    if swing_time > 0.0:
+        linear_limit = torch.where(
+            linear_time < 1.5 * swing_time,
+            (linear_time / 1.5).square() * force / swing_time,
+            linear_limit,
+        )
+    yaw_rate_size = r.abs()
+    saturated_rate = torch.maximum(yaw_rate_size, linear_limit)
+    saturated_distance = (
+        _stopping_angle(saturated_rate, force, decay, swing_time)
+        - _stopping_angle(linear_limit, force, decay, swing_time)
+        + linear_limit * linear_time
+    )
+    return r.sign() * torch.where(
+        yaw_rate_size < linear_limit, yaw_rate_size * linear_time, saturated_distance
+    )
 
 
-def _distance(r: Tensor, force: Tensor, decay: Tensor, swing: float) -> Tensor:
+def _stopping_angle(r: Tensor, force: Tensor, decay: Tensor, swing_time: float) -> Tensor:
     """Return the heading [B, 1] in which a yaw rate r > 0 is stopped.
 
     It is the integral of r dr / (force + decay r), and what the rudder's swing adds.
     """
     braking_angle = (r - force / decay * torch.log1p(decay * r / force)) / decay
-    if swing == 0.0:
+    if swing_time == 0.0:
         return braking_angle
-    pulse = r * torch.sqrt(r * swing / force) - 0.5 * r.square() / force
-    return braking_angle + torch.where(r < force * swing, pulse, 0.5 * swing * r)
+    pulse_angle = r * torch.sqrt(r * swing_time / force) - 0.5 * r.square() / force
+    return braking_angle + torch.where(r < force * swing_time, pulse_angle, 0.5 * swing_time * r)
 
 
 class HeadingLaw(nn.Module, ABC):
@@ -312,7 +354,7 @@ class HeadingLaw(nn.Module, ABC):
         self,
         error: Tensor,
         r: Tensor,
-        acting: Tensor,
+        rudder_share: Tensor,
         force: Tensor,
         decay: Tensor,
         constants: list[Tensor],
@@ -322,7 +364,7 @@ class HeadingLaw(nn.Module, ABC):
         Args:
             error: heading error [B, 1] in rad.
             r: yaw rate [B, 1] in rad/s.
-            acting: rudder angle and push [B, 1] as a share of the limit.
+            rudder_share: rudder angle and push [B, 1] as a share of the limit.
             force: yaw acceleration [B, 1] of full rudder in rad/s^2.
             decay: 1/T [B, 1] in 1/s.
             constants: the law's own, [1] or [B, 1] each.
@@ -347,7 +389,7 @@ class RegulatorLaw(HeadingLaw):
         self,
         error: Tensor,
         r: Tensor,
-        acting: Tensor,
+        rudder_share: Tensor,
         force: Tensor,
         decay: Tensor,
         constants: list[Tensor],
@@ -363,41 +405,45 @@ def regulator_gains(
 ) -> tuple[Tensor, Tensor]:
     """Return kp [-] and kd [s] of the regulator's weights; K [1/s], T [s], shapes broadcast."""
     kp = heading_weight.sqrt()
-    square = 1.0 + (gain * time).square() * rate_weight + 2.0 * gain * time * kp
-    return kp, (square.sqrt() - 1.0) / gain
+    discriminant = 1.0 + (gain * time).square() * rate_weight + 2.0 * gain * time * kp
+    return kp, (discriminant.sqrt() - 1.0) / gain
 
 
 @final
-class StoppingLaw(HeadingLaw):
+class ProximateTimeOptimalLaw(HeadingLaw):
     """The proximate time-optimal law: full rudder until only the way to stop is left.
 
     steepness (e - g(r)) with g the heading in which counter-rudder stops the yaw rate, a straight
     line near the reference (M. L. Workman, Adaptive proximate time-optimal servomechanisms, 1987).
-    `share` of the rudder's braking is counted on; `damping` is the relative damping near the
+    `mixing_factor` of the rudder's braking is counted on; `damping` is the relative damping near the
     reference.
     """
 
     constants: ClassVar[tuple[str, ...]] = ("steepness", "share", "damping")
 
-    def __init__(self, swing: float) -> None:
+    def __init__(self, swing_time: float) -> None:
         super().__init__()
-        self.swing = swing
+        self.swing_time = swing_time
 
     def forward(
         self,
         error: Tensor,
         r: Tensor,
-        acting: Tensor,
+        rudder_share: Tensor,
         force: Tensor,
         decay: Tensor,
         constants: list[Tensor],
     ) -> Tensor:
         """Return steepness times the heading that is left once the yaw rate is stopped, [B, 1]."""
-        steep, share, stiff = constants[0], constants[1], constants[2]
-        ahead, left = error, r
-        if self.swing > 0.0:
+        steepness, share, damping_ratio = constants[0], constants[1], constants[2]
+        predicted_error, predicted_rate = error, r
+        if self.swing_time > 0.0:
             # the rudder answers its own angle with a gain above one, within its rate: a gradient
             # through that would grow from step to step and say nothing of the flight
-            ahead, left = centred(error, r, acting.detach(), force, decay, self.swing)
-        stopping = braking(left, share * force, decay, steep * force, stiff, self.swing)
-        return steep * (ahead - stopping)
+            predicted_error, predicted_rate = predict_centred_rudder(
+                error, r, rudder_share.detach(), force, decay, self.swing_time
+            )
+        stopping_angle = braking_distance(
+            predicted_rate, share * force, decay, steepness * force, damping_ratio, self.swing_time
+        )
+        return steepness * (predicted_error - stopping_angle)

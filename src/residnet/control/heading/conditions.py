@@ -16,28 +16,28 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from residnet.control.base import Followed, Policy
-from residnet.control.heading.controllers import Steering, TunableConfig
+from residnet.control.base import Policy, ReferenceInInputs
+from residnet.control.heading.controllers import ControlTask, TunableConfig
 from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import ExportError, FitError
-from residnet.core.frames import wrap
+from residnet.core.frames import wrap_angle
 from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.rollout import FreeRun, Rollout, Source
 from residnet.dynamics.simulated import check_steps
 from residnet.dynamics.steering_variation import DEPTH, HEADING, Axis, PushedSteering
-from residnet.physics.environment import JonswapSpectrum
+from residnet.physics.environment import JonswapSpectrumConfig
 
 if TYPE_CHECKING:
     from residnet.dynamics.compiled import CompiledRollout
 
 
 Range = Annotated[tuple[float, float], Field(description="low and high multiple")]
-_SINES = 12
+_N_WAVE_COMPONENTS = 12
 """That a motion with the waves is made of."""
 
 
-class DepthChanges(Config):
+class DepthStepConfig(Config):
     """Changes of depth, in place of those of heading.
 
     Attributes:
@@ -51,7 +51,7 @@ class DepthChanges(Config):
     noise: Metres = Field(default=0.02, ge=0)
 
 
-_DECIMETRE, _DEGREE = 0.1, math.pi / 180.0
+_DEPTH_UNIT, _DEGREE = 0.1, math.pi / 180.0
 """What stands for a degree of heading where depths are changed: the default bands' ratio, in m."""
 
 
@@ -92,7 +92,7 @@ class ConditionsConfig(Config):
         travel_weight: cost of a degree of rudder travel, in s.
     """
 
-    depth: DepthChanges | None = None
+    depth: DepthStepConfig | None = None
     effect: Range = (0.8, 1.2)
     time: Range = (0.8, 1.2)
     delay: tuple[Seconds, Seconds] = (0.0, 0.4)
@@ -114,7 +114,7 @@ class ConditionsConfig(Config):
     travel_weight: float = Field(default=0.01, ge=0)
 
     @model_validator(mode="after")
-    def _ordered(self) -> ConditionsConfig:
+    def _check_ranges(self) -> ConditionsConfig:
         ranges = {
             "effect": (*self.effect, 1e-6, 10.0),
             "time": (*self.time, 1e-6, 10.0),
@@ -129,11 +129,11 @@ class ConditionsConfig(Config):
         check_steps(self.hold + self.duration, self.dt)
         if self.wind is not None:
             ranges["wind"] = (*self.wind, 0.0, 60.0)
-        for name, (low, high, least, most) in ranges.items():
-            if not least <= low <= high <= most:
+        for name, (lower, upper, lower_limit, upper_limit) in ranges.items():
+            if not lower_limit <= lower <= upper <= upper_limit:
                 raise ValueError(
-                    f"{name}: low and high must be in order and within {least:g} and {most:g},"
-                    f" given {low:g}, {high:g}"
+                    f"{name}: low and high must be in order and within {lower_limit:g} and {upper_limit:g},"
+                    f" given {lower:g}, {upper:g}"
                 )
         return self
 
@@ -143,101 +143,110 @@ class ConditionsConfig(Config):
         return HEADING if self.depth is None else DEPTH
 
     @property
-    def span(self) -> tuple[float, float]:
+    def step_range(self) -> tuple[float, float]:
         """Smallest and largest change in rad, or in m of depth."""
         return self.heading if self.depth is None else self.depth.change
 
     @property
-    def unit(self) -> float:
+    def overshoot_unit(self) -> float:
         """A degree in rad, or a decimetre in m, which `overshoot_weight` is for."""
-        return _DEGREE if self.depth is None else _DECIMETRE
+        return _DEGREE if self.depth is None else _DEPTH_UNIT
 
     @property
-    def weather(self) -> bool:
+    def has_weather(self) -> bool:
         """Whether there is wind or current."""
         return self.wind is not None or self.current > 0
 
-    def needs(self) -> tuple[str, ...]:
+    def required_inputs(self) -> tuple[str, ...]:
         """Return the inputs that a vessel must have to be flown under these conditions."""
         return (
             *(("wind_speed", "wind_dir") if self.wind is not None else ()),
             *(("current_north", "current_east") if self.current > 0 else ()),
         )
 
-    def draw(
-        self, rows: int, dt: float, random: torch.Generator, share: float = 1.0
-    ) -> HeadingChanges:
+    def sample_steps(
+        self, rows: int, dt: float, generator: torch.Generator, share: float = 1.0
+    ) -> HeadingStepBatch:
         """Draw heading changes for a number of flights, float32.
 
         Args:
             dt: step in s.
-            random: source of all that is drawn.
+            generator: source of all that is drawn.
             share: part of all departures from the nominal vessel in calm water, 0 to 1.
         """
 
-        def even(low: float, high: float) -> Tensor:
-            return low + (high - low) * torch.rand(rows, generator=random)
+        def sample_uniform(lower: float, upper: float) -> Tensor:
+            return lower + (upper - lower) * torch.rand(rows, generator=generator)
 
-        hold = round(self.hold / dt)
-        steps = hold + round(self.duration / dt)
+        hold_steps = round(self.hold / dt)
+        steps = hold_steps + round(self.duration / dt)
         scale = share * math.sqrt(self.dt / dt)
-        sizes = [self.noise_psi, self.noise_r]
-        sizes = sizes if self.depth is None else [self.depth.noise, *sizes]
-        noise = torch.randn(rows, steps, len(sizes), generator=random)
-        noise *= torch.tensor([scale * size for size in sizes])
-        sign = torch.where(torch.rand(rows, generator=random) < 0.5, -1.0, 1.0)
-        effect, time = (1.0 + share * (even(*values) - 1.0) for values in (self.effect, self.time))
-        bias = share * even(-self.bias, self.bias)
-        changes = HeadingChanges(
-            heading=sign * even(*self.span),
-            start=torch.randint(0, hold + 1, (rows,), generator=random),
-            variation=torch.stack((effect, time, bias), dim=1),
-            delay=torch.round(share * even(*self.delay) / dt),
-            push=share * self.push * gauss_markov(rows, steps, dt / self.push_time, random),
+        noise_levels = [self.noise_psi, self.noise_r]
+        noise_levels = noise_levels if self.depth is None else [self.depth.noise, *noise_levels]
+        noise = torch.randn(rows, steps, len(noise_levels), generator=generator)
+        noise *= torch.tensor([scale * noise_level for noise_level in noise_levels])
+        sign = torch.where(torch.rand(rows, generator=generator) < 0.5, -1.0, 1.0)
+        effect_factor, time_factor = (
+            1.0 + share * (sample_uniform(*values) - 1.0) for values in (self.effect, self.time)
+        )
+        bias = share * sample_uniform(-self.bias, self.bias)
+        changes = HeadingStepBatch(
+            target=sign * sample_uniform(*self.step_range),
+            step_index=torch.randint(0, hold_steps + 1, (rows,), generator=generator),
+            vessel_variation=torch.stack((effect_factor, time_factor, bias), dim=1),
+            delay_steps=torch.round(share * sample_uniform(*self.delay) / dt),
+            push=share
+            * self.push
+            * sample_gauss_markov(rows, steps, dt / self.push_time, generator),
             noise=noise,
-            weather=self._weather(rows, random, share),
+            weather=self._sample_weather(rows, generator, share),
             dt=dt,
-            count=steps - hold,
+            n_counted=steps - hold_steps,
         )
         if self.waves > 0:
             # drawn last, so that all else is the same with waves and without
-            size, period = even(0.0, share * self.waves), even(*self.wave_period)
-            noise += size[:, None, None] * wave_motion(period, steps, dt, random)
+            noise_level, period = (
+                sample_uniform(0.0, share * self.waves),
+                sample_uniform(*self.wave_period),
+            )
+            noise += noise_level[:, None, None] * sample_wave_motion(period, steps, dt, generator)
         return changes
 
-    def at_corners(
-        self, changes: HeadingChanges, rows: int, random: torch.Generator, share: float = 1.0
-    ) -> HeadingChanges:
+    def with_corner_rows(
+        self, changes: HeadingStepBatch, rows: int, generator: torch.Generator, share: float = 1.0
+    ) -> HeadingStepBatch:
         """Return changes whose first rows have vessels and delays at corners of their ranges.
 
-        `share` is the part of all departures from the nominal vessel, as in `draw`.
+        `fraction` is the part of all departures from the nominal vessel, as in `sample_steps`.
         """
-        variation, delay = changes.variation.clone(), changes.delay.clone()
+        variation, delay = changes.vessel_variation.clone(), changes.delay_steps.clone()
 
-        def either(low: float, high: float) -> Tensor:
-            return torch.where(torch.rand(rows, generator=random) < 0.5, low, high)
+        def sample_end(lower: float, upper: float) -> Tensor:
+            return torch.where(torch.rand(rows, generator=generator) < 0.5, lower, upper)
 
-        variation[:rows, 0] = 1.0 + share * (either(*self.effect) - 1.0)
-        variation[:rows, 1] = 1.0 + share * (either(*self.time) - 1.0)
-        delay[:rows] = torch.round(share * either(*self.delay) / changes.dt)
-        return replace(changes, variation=variation, delay=delay)
+        variation[:rows, 0] = 1.0 + share * (sample_end(*self.effect) - 1.0)
+        variation[:rows, 1] = 1.0 + share * (sample_end(*self.time) - 1.0)
+        delay[:rows] = torch.round(share * sample_end(*self.delay) / changes.dt)
+        return replace(changes, vessel_variation=variation, delay_steps=delay)
 
-    def _weather(self, rows: int, random: torch.Generator, share: float) -> dict[str, Tensor]:
-        drawn = torch.rand(2, rows, generator=random)
-        around = 2.0 * torch.pi * torch.rand(2, rows, generator=random)
-        out: dict[str, Tensor] = {}
+    def _sample_weather(
+        self, rows: int, generator: torch.Generator, share: float
+    ) -> dict[str, Tensor]:
+        fractions = torch.rand(2, rows, generator=generator)
+        directions = 2.0 * torch.pi * torch.rand(2, rows, generator=generator)
+        inputs: dict[str, Tensor] = {}
         if self.wind is not None:
-            low, high = self.wind
-            out["wind_speed"] = share * (low + (high - low) * drawn[0])
-            out["wind_dir"] = around[0]
+            lower, upper = self.wind
+            inputs["wind_speed"] = share * (lower + (upper - lower) * fractions[0])
+            inputs["wind_dir"] = directions[0]
         if self.current > 0:
-            speed = share * self.current * drawn[1]
-            out["current_north"] = speed * torch.cos(around[1])
-            out["current_east"] = speed * torch.sin(around[1])
-        return out
+            speed = share * self.current * fractions[1]
+            inputs["current_north"] = speed * torch.cos(directions[1])
+            inputs["current_east"] = speed * torch.sin(directions[1])
+        return inputs
 
 
-def wave_motion(period: Tensor, steps: int, dt: float, random: torch.Generator) -> Tensor:
+def sample_wave_motion(period: Tensor, steps: int, dt: float, generator: torch.Generator) -> Tensor:
     """Return motions with the waves and their rates [B, T, 2], of unit variance before the rate.
 
     Each is a sum of sines of random phase with a JONSWAP spectrum: the wave-frequency motion that
@@ -247,76 +256,76 @@ def wave_motion(period: Tensor, steps: int, dt: float, random: torch.Generator) 
         period: at the peak in s, [B].
         dt: step in s.
     """
-    ratios = torch.linspace(0.7, 1.8, _SINES + 1)
+    band_edges = torch.linspace(0.7, 1.8, _N_WAVE_COMPONENTS + 1)
     # somewhere within its band each, so that the sum does not repeat itself
-    within = torch.rand(len(period), _SINES, generator=random)
-    ratio = ratios[:-1] + within * torch.diff(ratios)
-    form = JonswapSpectrum().density(ratio.numpy(), 1.0, 2.0 * math.pi)
-    power = torch.from_numpy(form).float()
+    band_fraction = torch.rand(len(period), _N_WAVE_COMPONENTS, generator=generator)
+    ratio = band_edges[:-1] + band_fraction * torch.diff(band_edges)
+    density = JonswapSpectrumConfig().spectral_density(ratio.numpy(), 1.0, 2.0 * math.pi)
+    power = torch.from_numpy(density).float()
     amplitude = (2.0 * power / power.sum(1, keepdim=True)).sqrt()
     omega = ratio * (2.0 * math.pi / period[:, None])
-    phase = 2.0 * math.pi * torch.rand(len(period), _SINES, generator=random)
+    phase = 2.0 * math.pi * torch.rand(len(period), _N_WAVE_COMPONENTS, generator=generator)
     angle = omega[:, None] * (dt * torch.arange(steps))[None, :, None] + phase[:, None]
     motion = (amplitude[:, None] * torch.cos(angle)).sum(2)
     rate = (-(amplitude * omega)[:, None] * torch.sin(angle)).sum(2)
     return torch.stack((motion, rate), dim=2)
 
 
-def gauss_markov(rows: int, steps: int, step: float, random: torch.Generator) -> Tensor:
+def sample_gauss_markov(rows: int, steps: int, step: float, generator: torch.Generator) -> Tensor:
     """Return stationary first-order processes [B, T] of unit variance, exact at their samples.
 
     `step` is the time between samples as a multiple of the correlation time.
     """
     from scipy.signal import lfilter
 
-    keep = math.exp(-step)
-    drive = torch.randn(rows, steps, generator=random, dtype=torch.float64).numpy()
-    drive[:, 1:] *= math.sqrt(1.0 - keep * keep)
-    return torch.from_numpy(lfilter([1.0], [1.0, -keep], drive, axis=1)).float()
+    decay_factor = math.exp(-step)
+    white_noise = torch.randn(rows, steps, generator=generator, dtype=torch.float64).numpy()
+    white_noise[:, 1:] *= math.sqrt(1.0 - decay_factor * decay_factor)
+    return torch.from_numpy(lfilter([1.0], [1.0, -decay_factor], white_noise, axis=1)).float()
 
 
 @dataclass(frozen=True)
-class HeadingChanges:
+class HeadingStepBatch:
     """B changes of heading, or of depth, of T steps, as they were drawn.
 
     Attributes:
-        heading: change [B] in rad, or in m of depth.
-        start: number [B] of the step at which the reference jumps.
-        variation: of the vessel [B, 3], `dynamics.steering_variation.VARIATION`.
-        delay: of the command [B] in steps.
+        target: change [B] in rad, or in m of depth.
+        step_index: number [B] of the step at which the reference jumps.
+        vessel_variation: of the vessel [B, 3], `dynamics.steering_variation.VARIATION`.
+        delay_steps: of the command [B] in steps.
         push: angle [B, T] in rad that is added to the rudder's.
         noise: on what is measured of the axis (`Axis.measured`), [B, T, 2 or 3] in SI units.
         weather: constant inputs of the vessel [B] by name, SI.
         dt: step in s.
-        count: number of steps that are counted, from the jump on.
+        n_counted: number of steps that are counted, from the jump on.
     """
 
-    heading: Tensor
-    start: Tensor
-    variation: Tensor
-    delay: Tensor
+    target: Tensor
+    step_index: Tensor
+    vessel_variation: Tensor
+    delay_steps: Tensor
     push: Tensor
     noise: Tensor
     weather: dict[str, Tensor]
     dt: float
-    count: int
+    n_counted: int
 
     def reference(self) -> Tensor:
         """Return the reference [B, T]: zero, then the new heading in rad or the new depth in m."""
         steps = torch.arange(self.push.shape[1])
-        return torch.where(steps >= self.start[:, None], self.heading[:, None], 0.0)
+        return torch.where(steps >= self.step_index[:, None], self.target[:, None], 0.0)
 
-    def repeated(self, times: int) -> HeadingChanges:
+    def repeat(self, times: int) -> HeadingStepBatch:
         """Return the same flights several times, one block after the other."""
 
-        def more(values: Tensor) -> Tensor:
+        def repeat_rows(values: Tensor) -> Tensor:
             return values.repeat(times, *[1] * (values.dim() - 1))
 
-        given = vars(self)
+        attributes = vars(self)
         tensors: dict[str, Any] = {
-            name: more(part) for name, part in given.items() if isinstance(part, Tensor)
+            name: repeat_rows(part) for name, part in attributes.items() if isinstance(part, Tensor)
         }
-        weather = {name: more(values) for name, values in self.weather.items()}
+        weather = {name: repeat_rows(values) for name, values in self.weather.items()}
         return replace(self, **tensors, weather=weather)
 
 
@@ -329,7 +338,7 @@ ExportError where it cannot."""
 
 
 @final
-class ConditionedLoop(Source):
+class NoisyDelayedLoop(Source):
     """A controller that sees through noisy sensors and whose commands arrive late.
 
     Given inputs [B, m + 3 + k]: those of the vessel, then push, reference, the delay in steps, and
@@ -338,57 +347,59 @@ class ConditionedLoop(Source):
     controller.
 
     Args:
-        columns: of what is measured in the state, k of them.
-        inputs: number m of the vessel's inputs.
-        longest: delay in steps that the memory holds.
+        measured_columns: of what is measured in the state, k of them.
+        n_inputs: number m of the vessel's inputs.
+        max_delay: delay in steps that the memory holds.
     """
 
-    def __init__(self, policy: Policy, columns: tuple[int, ...], inputs: int, longest: int) -> None:
+    def __init__(
+        self, policy: Policy, measured_columns: tuple[int, ...], n_inputs: int, max_delay: int
+    ) -> None:
         super().__init__()
-        self.policy, self.columns = policy, list(columns)
-        self.inputs, self.longest = inputs, longest
+        self.policy, self.measured_columns = policy, list(measured_columns)
+        self.n_inputs, self.max_delay = n_inputs, max_delay
 
     def initial(self, x: Tensor) -> Tensor:
         """Return the memory at the start: rudder amidships for as long as commands may take."""
-        late = torch.zeros(x.shape[0], self.longest, dtype=x.dtype)
-        return torch.cat((late, self.policy.initial_state(x)), dim=-1)
+        pending_commands = torch.zeros(x.shape[0], self.max_delay, dtype=x.dtype)
+        return torch.cat((pending_commands, self.policy.initial_state(x)), dim=-1)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        m = self.inputs
+        m = self.n_inputs
         push, reference, delay = w[:, m : m + 3].split(1, dim=1)
-        seen = torch.zeros_like(x)
-        for k, column in enumerate(self.columns):
-            seen[:, column : column + 1] = w[:, m + 3 + k : m + 4 + k]
-        command, s = self.policy(x + seen, reference, memory[:, self.longest :])
-        late = torch.cat((command, memory[:, : self.longest]), dim=1)
-        arriving = late.gather(1, delay.to(torch.int64))
-        acting = torch.cat((arriving, w[:, 1:m], push, command), dim=1)
-        return acting, torch.cat((late[:, : self.longest], s), dim=1)
+        measurement_noise = torch.zeros_like(x)
+        for k, column in enumerate(self.measured_columns):
+            measurement_noise[:, column : column + 1] = w[:, m + 3 + k : m + 4 + k]
+        command, s = self.policy(x + measurement_noise, reference, memory[:, self.max_delay :])
+        pending_commands = torch.cat((command, memory[:, : self.max_delay]), dim=1)
+        delayed_command = pending_commands.gather(1, delay.to(torch.int64))
+        applied_inputs = torch.cat((delayed_command, w[:, 1:m], push, command), dim=1)
+        return applied_inputs, torch.cat((pending_commands[:, : self.max_delay], s), dim=1)
 
 
 @dataclass(frozen=True)
-class Flights:
+class ClosedLoopTrajectories:
     """B changes of heading, or of depth, of T steps as they were flown.
 
     Attributes:
         states: [B, T+1, nx].
         command: rudder command [B, T] in rad, as it was issued.
-        heading: the new reference [B] in rad, or in m of depth.
+        target: the new reference [B] in rad, or in m of depth.
         dt: step in s.
         names: of the states.
         axis: that is steered.
-        start: number [B] of the step at which the reference jumps.
-        count: number of samples that count, from the jump on.
+        step_index: number [B] of the step at which the reference jumps.
+        n_counted: number of samples that count, from the jump on.
     """
 
     states: Tensor
     command: Tensor
-    heading: Tensor
+    target: Tensor
     dt: float
     names: tuple[str, ...]
     axis: Axis
-    start: Tensor
-    count: int
+    step_index: Tensor
+    n_counted: int
 
     def state(self, name: str) -> Tensor:
         """Return a state [B, T+1] by its name."""
@@ -397,135 +408,148 @@ class Flights:
     @cached_property
     def error(self) -> Tensor:
         """New heading less heading [B, T+1] in rad, wrapped, or new depth less depth in m."""
-        lacking = self.heading[:, None] - self.state(self.axis.value)
-        return wrap(lacking) if self.axis.value == self.axis.angle else lacking
+        difference = self.target[:, None] - self.state(self.axis.value)
+        return wrap_angle(difference) if self.axis.value == self.axis.angle else difference
 
-    def since(self, after: int) -> Tensor:
+    def is_after_step(self, n_steps: int) -> Tensor:
         """Return which samples [B, T+1] are so many steps behind the jump, or more."""
-        return torch.arange(self.states.shape[1]) >= self.start[:, None] + after
+        return torch.arange(self.states.shape[1]) >= self.step_index[:, None] + n_steps
 
     @cached_property
-    def counted(self) -> Tensor:
+    def counted_mask(self) -> Tensor:
         """Which samples [B, T+1] count, as ones and zeros."""
-        return (self.since(0) & ~self.since(self.count)).to(self.states.dtype)
+        return (self.is_after_step(0) & ~self.is_after_step(self.n_counted)).to(self.states.dtype)
 
-    def settled(self, band: float) -> Tensor:
+    def settling_time(self, band: float) -> Tensor:
         """Return the time [B] in s of the last entry into +-band [rad] about the reference.
 
         It lies between samples along a straight line; it is the flight's length where it ends
         outside.
         """
-        size = self.error.abs()
-        outside = ~(size <= band)
-        inside = outside.flip(1).to(torch.int64).argmax(1)
-        last = (size.shape[1] - 1 - inside).unsqueeze(1)
-        before, after = (
-            size.gather(1, k.clamp(max=size.shape[1] - 1))[:, 0] for k in (last, last + 1)
+        absolute_error = self.error.abs()
+        is_outside = ~(absolute_error <= band)
+        steps_inside = is_outside.flip(1).to(torch.int64).argmax(1)
+        last_outside = (absolute_error.shape[1] - 1 - steps_inside).unsqueeze(1)
+        error_before, error_after = (
+            absolute_error.gather(1, k.clamp(max=absolute_error.shape[1] - 1))[:, 0]
+            for k in (last_outside, last_outside + 1)
         )
-        share = torch.where(inside > 0, (before - band) / (before - after).clamp(min=1e-12), 0.0)
-        return torch.where(outside.any(1), last[:, 0] + share, 0.0) * self.dt
+        fraction = torch.where(
+            steps_inside > 0,
+            (error_before - band) / (error_before - error_after).clamp(min=1e-12),
+            0.0,
+        )
+        return torch.where(is_outside.any(1), last_outside[:, 0] + fraction, 0.0) * self.dt
 
     def overshoot(self) -> Tensor:
         """Return the largest heading beyond the reference [B] in rad; zero where there is none."""
-        beyond = -self.error * self.heading.sign()[:, None]
+        signed_overshoot = -self.error * self.target.sign()[:, None]
         # plus zero: no negative zero is shown
-        return (beyond * self.counted).amax(1).clamp(min=0.0) + 0.0
+        return (signed_overshoot * self.counted_mask).amax(1).clamp(min=0.0) + 0.0
 
-    def absolute_error(self) -> Tensor:
+    def integrated_absolute_error(self) -> Tensor:
         """Return the integral of |error| [B] in rad s."""
-        return (self.error.abs() * self.counted)[:, :-1].sum(1) * self.dt
+        return (self.error.abs() * self.counted_mask)[:, :-1].sum(1) * self.dt
 
-    def travel(self) -> Tensor:
+    def rudder_travel(self) -> Tensor:
         """Return how far the rudder command travels [B] in rad, from amidships on."""
-        moved = torch.diff(self.command, dim=1, prepend=torch.zeros_like(self.command[:, :1]))
-        return (moved.abs() * self.counted[:, :-1]).sum(1)
+        command_change = torch.diff(
+            self.command, dim=1, prepend=torch.zeros_like(self.command[:, :1])
+        )
+        return (command_change.abs() * self.counted_mask[:, :-1]).sum(1)
 
-    def effort(self) -> Tensor:
+    def control_effort(self) -> Tensor:
         """Return the integral of the squared rudder command [B] in rad^2 s: the control energy."""
         return self.command.square().sum(1) * self.dt
 
-    def swing(self, after: float) -> tuple[Tensor, Tensor]:
+    def peak_to_peak(self, start_time: float) -> tuple[Tensor, Tensor]:
         """Return how far heading [rad] or depth [m] and command [rad] move, peak to peak, [B].
 
         Args:
-            after: time in s from the change of heading on, up to the flight's end.
+            start_time: time in s from the change of heading on, up to the flight's end.
         """
-        late = self.since(round(after / self.dt))[:, :-1]
+        late_mask = self.is_after_step(round(start_time / self.dt))[:, :-1]
 
-        def between(values: Tensor) -> Tensor:
-            highest = torch.where(late, values, -torch.inf).amax(1)
-            return highest - torch.where(late, values, torch.inf).amin(1)
+        def peak_to_peak_range(values: Tensor) -> Tensor:
+            maximum = torch.where(late_mask, values, -torch.inf).amax(1)
+            return maximum - torch.where(late_mask, values, torch.inf).amin(1)
 
-        return between(self.state(self.axis.value)[:, :-1]), between(self.command)
+        return peak_to_peak_range(self.state(self.axis.value)[:, :-1]), peak_to_peak_range(
+            self.command
+        )
 
-    def late_swing(self, share: float) -> Tensor:
+    def late_command_variance(self, share: float) -> Tensor:
         """Return the variance of the rudder command [B] in rad^2 in the last share of what counts.
 
         What counts is the time from the change on that the cost is of.
         """
-        late = (self.counted * self.since(round((1.0 - share) * self.count)))[:, :-1]
-        number = late.sum(1, keepdim=True).clamp(min=1)
-        mean = (self.command * late).sum(1, keepdim=True) / number
-        return ((self.command - mean).square() * late).sum(1) / number[:, 0]
+        late_mask = (self.counted_mask * self.is_after_step(round((1.0 - share) * self.n_counted)))[
+            :, :-1
+        ]
+        n_late = late_mask.sum(1, keepdim=True).clamp(min=1)
+        mean = (self.command * late_mask).sum(1, keepdim=True) / n_late
+        return ((self.command - mean).square() * late_mask).sum(1) / n_late[:, 0]
 
-    def measured(self, conditions: ConditionsConfig) -> dict[str, Tensor]:
+    def step_metrics(self, conditions: ConditionsConfig) -> dict[str, Tensor]:
         """Return each of `QUANTITIES` by flight, [B]; what is no number is left so."""
         band = (conditions.depth or conditions).band
-        size, overshoot, travel = self.error.abs(), self.overshoot(), self.travel()
-        outside = (self.counted * size / (size + band))[:, :-1].sum(1) * self.dt
+        absolute_error, overshoot, travel = self.error.abs(), self.overshoot(), self.rudder_travel()
+        time_outside = (self.counted_mask * absolute_error / (absolute_error + band))[:, :-1].sum(
+            1
+        ) * self.dt
         cost = (
-            outside
-            + conditions.overshoot_weight / conditions.unit * overshoot
+            time_outside
+            + conditions.overshoot_weight / conditions.overshoot_unit * overshoot
             + conditions.travel_weight / _DEGREE * travel
         )
-        values = (cost, outside, overshoot, travel, self.absolute_error())
+        values = (cost, time_outside, overshoot, travel, self.integrated_absolute_error())
         return dict(zip(QUANTITIES, values, strict=True))
 
 
-def fly(
+def simulate_heading_steps(
     vessel: SteeredVessel,
     policy: Policy,
-    heading: Tensor,
+    target: Tensor,
     variation: Tensor,
     *,
     dt: float,
     duration: float,
     weather: Mapping[str, float | Tensor] | None = None,
-    surround: Callable[[Source], Source] | None = None,
-) -> Flights:
+    wrap_source: Callable[[Source], Source] | None = None,
+) -> ClosedLoopTrajectories:
     """Return the flights of heading changes [B] in rad from straight ahead, without gradients.
 
     The vessels are varied by [B, 3]; all is float64, and counts from the first sample to the last.
 
     Args:
         weather: exogenous inputs by name, SI, for all rows or [B].
-        surround: what adds to the inputs of the closed loop, for example waves.
+        wrap_source: what adds to the inputs of the closed loop, for example waves.
     """
-    heading, variation = heading.double(), variation.double()
-    x, w = vessel.start(torch.ones_like(heading))
+    target, variation = target.double(), variation.double()
+    x, w = vessel.straight_course(torch.ones_like(target))
     for name, value in (weather or {}).items():
         w[:, vessel.inputs.index(name)] = value
     steps = round(duration / dt)
-    loop: Source = Followed(policy.double(), w.shape[1])
-    given = torch.cat((w, heading[:, None]), dim=1).unsqueeze(1).expand(-1, steps, -1)
+    loop: Source = ReferenceInInputs(policy.double(), w.shape[1])
+    rollout_inputs = torch.cat((w, target[:, None]), dim=1).unsqueeze(1).expand(-1, steps, -1)
     with torch.no_grad():
-        free = Rollout(vessel.model(dt), loop if surround is None else surround(loop))
-        states, inputs, _ = compiled(free, steps)(x, given, vessel.memory(variation))
-    begun = torch.zeros(len(heading), dtype=torch.int64)
-    return Flights(
-        states, inputs[:, :, 0], heading, dt, vessel.state, vessel.axis, begun, steps + 1
+        rollout = Rollout(vessel.model(dt), loop if wrap_source is None else wrap_source(loop))
+        states, inputs, _ = compiled(rollout, steps)(x, rollout_inputs, vessel.memory(variation))
+    step_index = torch.zeros(len(target), dtype=torch.int64)
+    return ClosedLoopTrajectories(
+        states, inputs[:, :, 0], target, dt, vessel.state, vessel.axis, step_index, steps + 1
     )
 
 
 @final
-class ConditionedRun:
+class ClosedLoopSimulation:
     """A vessel and a controller ready to fly heading changes at one step.
 
     Args:
         dt: step in s.
         compiler: of flights without gradients; None to fly them as they are, as are those that it
             cannot compile.
-        longest: delay in steps that there is room for; None for that of each call's changes.
+        max_delay: delay in steps that there is room for; None for that of each call's changes.
     """
 
     def __init__(
@@ -536,79 +560,89 @@ class ConditionedRun:
         integrator: str = "rk4",
         dtype: torch.dtype = torch.float64,
         compiler: Compiler | None = None,
-        longest: int | None = None,
+        max_delay: int | None = None,
     ) -> None:
         self.vessel, self.dtype, self.dt = vessel, dtype, dt
-        self.columns = tuple(map(vessel.column, vessel.axis.measured))
-        self.policy, self.compiler, self.longest = policy, compiler, longest
-        self._flying: dict[int, FreeRun] = {}
+        self.measured_columns = tuple(map(vessel.state_column, vessel.axis.measured))
+        self.policy, self.compiler, self.max_delay = policy, compiler, max_delay
+        self._compiled_rollouts: dict[int, FreeRun] = {}
         self.model = PushedSteering(vessel.model(dt, integrator), len(vessel.inputs))
         self.model.to(dtype).requires_grad_(False)
 
-    def rollout(self, longest: int) -> Rollout:
+    def rollout(self, max_delay: int) -> Rollout:
         """Return the closed loop, with room for delays of so many steps."""
-        loop = ConditionedLoop(self.policy, self.columns, len(self.vessel.inputs), longest)
+        loop = NoisyDelayedLoop(
+            self.policy, self.measured_columns, len(self.vessel.inputs), max_delay
+        )
         return Rollout(self.model, loop)
 
-    def given(self, changes: HeadingChanges) -> tuple[Tensor, Tensor, Tensor]:
+    def rollout_arguments(self, changes: HeadingStepBatch) -> tuple[Tensor, Tensor, Tensor]:
         """Return states [B, nx], inputs [B, T, m + 3 + k] and the vessel's memory for a rollout."""
         rows, steps = changes.push.shape
-        x, w = self.vessel.start(torch.ones(rows, dtype=self.dtype))
+        x, w = self.vessel.straight_course(torch.ones(rows, dtype=self.dtype))
         for name, value in changes.weather.items():
             w[:, self.vessel.inputs.index(name)] = value.to(self.dtype)
-        late = changes.delay[:, None].expand(-1, steps)
-        extra = torch.stack((changes.push, changes.reference(), late), dim=2)
-        parts = (w.unsqueeze(1).expand(-1, steps, -1), extra, changes.noise)
-        inputs = torch.cat([part.to(self.dtype) for part in parts], dim=2)
-        return x, inputs, self.vessel.memory(changes.variation.to(self.dtype))
+        delay_columns = changes.delay_steps[:, None].expand(-1, steps)
+        extra_inputs = torch.stack((changes.push, changes.reference(), delay_columns), dim=2)
+        input_parts = (w.unsqueeze(1).expand(-1, steps, -1), extra_inputs, changes.noise)
+        inputs = torch.cat([part.to(self.dtype) for part in input_parts], dim=2)
+        return x, inputs, self.vessel.memory(changes.vessel_variation.to(self.dtype))
 
-    def flights(self, changes: HeadingChanges, states: Tensor, inputs: Tensor) -> Flights:
+    def to_trajectories(
+        self, changes: HeadingStepBatch, states: Tensor, inputs: Tensor
+    ) -> ClosedLoopTrajectories:
         """Return what a rollout gave: states [B, T+1, nx] and inputs [B, T, m + 2]."""
-        vessel, new = self.vessel, changes.heading
-        about = (vessel.state, vessel.axis, changes.start, changes.count)
-        return Flights(states, inputs[:, :, -1], new, changes.dt, *about)
+        vessel, target = self.vessel, changes.target
+        trajectory_fields = (vessel.state, vessel.axis, changes.step_index, changes.n_counted)
+        return ClosedLoopTrajectories(
+            states, inputs[:, :, -1], target, changes.dt, *trajectory_fields
+        )
 
-    def fly(self, changes: HeadingChanges) -> Flights:
+    def simulate(self, changes: HeadingStepBatch) -> ClosedLoopTrajectories:
         """Fly heading changes without gradients."""
-        longest = self.longest or max(int(changes.delay.max()), 1)
-        given = self.given(changes)
+        max_delay = self.max_delay or max(int(changes.delay_steps.max()), 1)
+        arguments = self.rollout_arguments(changes)
         with torch.no_grad():
-            if longest not in self._flying:
-                x, w, s = (part[:2] for part in given)
-                self._flying[longest] = quickly(self.rollout(longest), self.compiler, (x, w, s))
-            return self.flights(changes, *self._flying[longest](*given)[:2])
+            if max_delay not in self._compiled_rollouts:
+                x, w, s = (part[:2] for part in arguments)
+                self._compiled_rollouts[max_delay] = compile_or_fallback(
+                    self.rollout(max_delay), self.compiler, (x, w, s)
+                )
+            return self.to_trajectories(
+                changes, *self._compiled_rollouts[max_delay](*arguments)[:2]
+            )
 
 
-def quickly(
+def compile_or_fallback(
     rollout: Rollout,
     compiler: Compiler | None,
-    given: tuple[Tensor, Tensor, Tensor],
-    failed: Callable[[ExportError], None] = lambda error: None,
+    example_arguments: tuple[Tensor, Tensor, Tensor],
+    on_failure: Callable[[ExportError], None] = lambda error: None,
 ) -> FreeRun:
     """Return the flights of a closed loop, compiled where a compiler is given and works.
 
     Args:
         compiler: None to fly as it is.
-        given: states, inputs and memory that it is flown with, an example of two rows.
-        failed: is told why a loop is not compiled.
+        example_arguments: states, inputs and memory that it is flown with, an example of two rows.
+        on_failure: is told why a loop is not compiled.
     """
     if compiler is not None:
         try:
-            return compiler(rollout, *given)
+            return compiler(rollout, *example_arguments)
         except ExportError as error:
-            failed(error)
+            on_failure(error)
     return rollout
 
 
-_AFTER, _FOR = 10.0 / 7.0, 5.0 / 7.0
+_SETTLED_TIME_FACTOR, _OBSERVED_TIME_FACTOR = 10.0 / 7.0, 5.0 / 7.0
 """Multiples of what the cost counts: after that time a flight without noise is looked at for
 swinging, for that long (with 14 s from 20 s on, for 10 s).
 """
-_NOMINAL = 16
+_N_NOMINAL = 16
 """Flights of the nominal vessel beside those under conditions, half to each side."""
 
 
-def quiet(conditions: ConditionsConfig) -> ConditionsConfig:
+def noise_free(conditions: ConditionsConfig) -> ConditionsConfig:
     """Return the conditions without noise, waves and slow push, with time enough to settle."""
     return conditions.model_copy(
         update={
@@ -617,17 +651,18 @@ def quiet(conditions: ConditionsConfig) -> ConditionsConfig:
             "push": 0.0,
             "waves": 0.0,
             "hold": 0.0,
-            "duration": quiet_after(conditions.duration) + _FOR * conditions.duration,
+            "duration": settled_time(conditions.duration)
+            + _OBSERVED_TIME_FACTOR * conditions.duration,
         }
     )
 
 
-def quiet_after(duration: float) -> float:
+def settled_time(duration: float) -> float:
     """Return the time in s after a change from which nothing should swing.
 
     `duration` is the time in s that the cost counts.
     """
-    return _AFTER * duration
+    return _SETTLED_TIME_FACTOR * duration
 
 
 class DepthLimits(Config):
@@ -671,7 +706,7 @@ class SteadinessLimits(Config):
     overshoot_p95: Radians = Field(default=0.008377580409572781, gt=0)
     flights: int = Field(default=256, ge=2, le=1_000_000)
 
-    def of(self, axis: Axis) -> tuple[float, float, float]:
+    def limits_for(self, axis: Axis) -> tuple[float, float, float]:
         """Return the largest swing, overshoot and 95th percentile of it, in rad or m."""
         if axis is DEPTH:
             return self.depth.swing, self.depth.overshoot, self.depth.overshoot_p95
@@ -679,72 +714,78 @@ class SteadinessLimits(Config):
 
 
 @final
-class SteadyTest:
+class LimitCycleTest:
     """Counts flights without noise that a policy should not make; no training sees them.
 
     Args:
         conditions: with noise, those of the training.
 
     Attributes:
-        flights: number of all, those of the nominal vessel included.
+        n_simulations: number of all, those of the nominal vessel included.
     """
 
     def __init__(self, limits: SteadinessLimits, conditions: ConditionsConfig, seed: int) -> None:
-        self.limits, self.after = limits, quiet_after(conditions.duration)
-        self.conditions = quiet(conditions)
-        random = torch.Generator().manual_seed(seed)
-        drawn = self.conditions.draw(limits.flights + _NOMINAL, conditions.dt, random)
+        self.limits, self.settled_time = limits, settled_time(conditions.duration)
+        self.conditions = noise_free(conditions)
+        generator = torch.Generator().manual_seed(seed)
+        sampled_steps = self.conditions.sample_steps(
+            limits.flights + _N_NOMINAL, conditions.dt, generator
+        )
         # a loop swings first where delay, K and T are at their bounds, which few draws come near
-        drawn = self.conditions.at_corners(drawn, limits.flights // 2, random)
-        heading = drawn.heading.clone()
-        sides = torch.tensor([1.0, -1.0]).repeat(_NOMINAL // 2)
-        heading[limits.flights :] = sides * torch.linspace(*conditions.span, _NOMINAL)
-        self.changes = nominal(replace(drawn, heading=heading), limits.flights, _NOMINAL)
-        self.flights = limits.flights + _NOMINAL
+        sampled_steps = self.conditions.with_corner_rows(
+            sampled_steps, limits.flights // 2, generator
+        )
+        targets = sampled_steps.target.clone()
+        step_signs = torch.tensor([1.0, -1.0]).repeat(_N_NOMINAL // 2)
+        targets[limits.flights :] = step_signs * torch.linspace(*conditions.step_range, _N_NOMINAL)
+        self.changes = with_nominal_rows(
+            replace(sampled_steps, target=targets), limits.flights, _N_NOMINAL
+        )
+        self.n_simulations = limits.flights + _N_NOMINAL
 
-    def refused(self, run: ConditionedRun) -> int:
+    def count_failures(self, simulation: ClosedLoopSimulation) -> int:
         """Return how many flights swing, or overshoot on the nominal vessel."""
-        flown = run.fly(self.changes)
-        heading, rudder = flown.swing(self.after)
-        limits, last = self.limits, self.limits.flights
-        swing, most, _ = limits.of(flown.axis)
-        over = flown.measured(self.conditions)["overshoot"]
+        trajectories = simulation.simulate(self.changes)
+        axis_swing, rudder_swing = trajectories.peak_to_peak(self.settled_time)
+        limits, n_varied = self.limits, self.limits.flights
+        max_swing, max_overshoot, _ = limits.limits_for(trajectories.axis)
+        overshoots = trajectories.step_metrics(self.conditions)["overshoot"]
         # what is no number is not within its limit
-        steady = (heading <= swing) & (rudder <= limits.rudder_swing)
-        steady[last:] &= over[last:] <= most
-        return int((~steady).sum())
+        is_steady = (axis_swing <= max_swing) & (rudder_swing <= limits.rudder_swing)
+        is_steady[n_varied:] &= overshoots[n_varied:] <= max_overshoot
+        return int((~is_steady).sum())
 
 
-def too_many(overshoot: Tensor, limit: float) -> int:
+def count_excess_overshoots(overshoot: Tensor, limit: float) -> int:
     """Return how many flights more than one in twenty overshoot by more than a limit.
 
     Args:
         overshoot: of flights under the conditions in rad, [N]; what is no number is beyond.
         limit: in rad.
     """
-    beyond = int((~(overshoot <= limit)).sum())
-    return max(beyond - len(overshoot) // 20, 0)
+    n_beyond = int((~(overshoot <= limit)).sum())
+    return max(n_beyond - len(overshoot) // 20, 0)
 
 
-def nominal(changes: HeadingChanges, first: int, rows: int) -> HeadingChanges:
+def with_nominal_rows(changes: HeadingStepBatch, first_row: int, n_rows: int) -> HeadingStepBatch:
     """Return changes of which some rows fly the nominal vessel in calm water, without delay."""
 
-    def with_rows(values: Tensor, new: Tensor | float) -> Tensor:
+    def replace_rows(values: Tensor, nominal_values: Tensor | float) -> Tensor:
         values = values.clone()
-        values[first : first + rows] = new
+        values[first_row : first_row + n_rows] = nominal_values
         return values
 
     return replace(
         changes,
-        variation=with_rows(changes.variation, torch.tensor([1.0, 1.0, 0.0])),
-        delay=with_rows(changes.delay, 0.0),
-        weather={name: with_rows(values, 0.0) for name, values in changes.weather.items()},
+        vessel_variation=replace_rows(changes.vessel_variation, torch.tensor([1.0, 1.0, 0.0])),
+        delay_steps=replace_rows(changes.delay_steps, 0.0),
+        weather={name: replace_rows(values, 0.0) for name, values in changes.weather.items()},
     )
 
 
-_ROWS = 4096
+_BATCH_SIZE = 4096
 """Flights that are flown side by side."""
-_LOST = 1e3
+_DIVERGED_COST = 1e3
 """Cost in s of a flight that is lost, far above that of any other."""
 
 
@@ -770,12 +811,12 @@ class TuningResult:
 
     parameters: dict[str, float]
     cost: float
-    tried: int
+    n_candidates: int
 
 
-def tune(
+def tune_parameters(
     config: TunableConfig,
-    steering: Steering,
+    task: ControlTask,
     conditions: ConditionsConfig,
     settings: TuningConfig,
     seed: int,
@@ -794,29 +835,29 @@ def tune(
     # scipy.optimize takes a third of a second to import
     from scipy.optimize import differential_evolution
 
-    random = torch.Generator().manual_seed(seed)
-    changes = conditions.draw(settings.flights, conditions.dt, random)
-    given = config.parameters()
-    fixed = {name: value for name, value in given.items() if value is not None}
-    names = [name for name, value in given.items() if value is None]
-    steering = steering._replace(dt=conditions.dt)
-    trials = Trials(config, steering, conditions, changes, compiler)
+    generator = torch.Generator().manual_seed(seed)
+    steps = conditions.sample_steps(settings.flights, conditions.dt, generator)
+    parameters = config.parameter_values()
+    fixed = {name: value for name, value in parameters.items() if value is not None}
+    names = [name for name, value in parameters.items() if value is None]
+    task = task._replace(dt=conditions.dt)
+    evaluation = CandidateEvaluation(config, task, conditions, steps, compiler)
 
     def costs(points: np.ndarray, /) -> Any:
-        searched = torch.from_numpy(np.exp(points.reshape(len(names), -1).T))
-        candidates = {name: searched[:, j] for j, name in enumerate(names)}
+        candidate_values = torch.from_numpy(np.exp(points.reshape(len(names), -1).T))
+        candidates = {name: candidate_values[:, j] for j, name in enumerate(names)}
         candidates |= {
-            name: torch.full((len(searched),), value, dtype=torch.float64)
+            name: torch.full((len(candidate_values),), value, dtype=torch.float64)
             for name, value in fixed.items()
         }
-        return trials.costs(candidates).numpy()
+        return evaluation.mean_costs(candidates).numpy()
 
     if not names:
-        alone = {name: torch.tensor([value]).double() for name, value in fixed.items()}
-        return TuningResult(fixed, float(trials.costs(alone)[0]), 1)
-    axes = config.axes(steering.turning)
-    bounds: Any = [(math.log(axes[name].low), math.log(axes[name].high)) for name in names]
-    found = differential_evolution(
+        fixed_candidate = {name: torch.tensor([value]).double() for name, value in fixed.items()}
+        return TuningResult(fixed, float(evaluation.mean_costs(fixed_candidate)[0]), 1)
+    axes = config.search_ranges(task.nomoto)
+    bounds: Any = [(math.log(axes[name].lower), math.log(axes[name].upper)) for name in names]
+    result_de = differential_evolution(
         costs,
         bounds,
         vectorized=True,
@@ -828,26 +869,34 @@ def tune(
         polish=False,
         rng=seed,
     )
-    if not found.fun < _LOST:
+    if not result_de.fun < _DIVERGED_COST:
         raise FitError(
-            f"no {config.model_dump()['kind']} controller of {found.nfev} tried holds the vessel"
+            f"no {config.model_dump()['kind']} controller of {result_de.nfev} tried holds the vessel"
             " under these conditions; widen the rudder's limit or narrow the conditions"
         )
-    best = dict(zip(names, (math.exp(value) for value in found.x), strict=True))
-    ordered = {name: best.get(name, fixed.get(name, 0.0)) for name in given}
-    result = TuningResult(ordered, float(found.fun), int(found.nfev))
-    if not (idle := {name: end for name in names if (end := axes[name].idle) is not None}):
-        return result
-    simpler = tune(config.tuned(idle), steering, conditions, settings, seed, compiler)
-    return min(result, simpler, key=lambda each: each.cost)
+    best_parameters = dict(zip(names, (math.exp(value) for value in result_de.x), strict=True))
+    ordered_parameters = {
+        name: best_parameters.get(name, fixed.get(name, 0.0)) for name in parameters
+    }
+    tuned = TuningResult(ordered_parameters, float(result_de.fun), int(result_de.nfev))
+    if not (
+        disabled_parameters := {
+            name: disabled for name in names if (disabled := axes[name].disabled_value) is not None
+        }
+    ):
+        return tuned
+    simpler_result = tune_parameters(
+        config.with_parameters(disabled_parameters), task, conditions, settings, seed, compiler
+    )
+    return min(tuned, simpler_result, key=lambda each: each.cost)
 
 
 @final
-class Trials:
+class CandidateEvaluation:
     """Flights of candidates for the parameters of a controller, all over the same changes.
 
     Args:
-        steering: its task, at the step of the changes.
+        task: its task, at the step of the changes.
         conditions: with the cost.
         compiler: of the flights; None to fly them as they are.
     """
@@ -855,52 +904,74 @@ class Trials:
     def __init__(
         self,
         config: TunableConfig,
-        steering: Steering,
+        task: ControlTask,
         conditions: ConditionsConfig,
-        changes: HeadingChanges,
+        steps: HeadingStepBatch,
         compiler: type[CompiledRollout] | None = None,
     ) -> None:
-        self.config, self.steering, self.conditions = config, steering, conditions
-        self.changes, self.compiler = changes, compiler
-        self.loop: CompiledRollout | None = None
-        self.given: dict[int, tuple[HeadingChanges, tuple[Tensor, Tensor, Tensor]]] = {}
+        self.config, self.task, self.conditions = config, task, conditions
+        self.steps, self.compiler = steps, compiler
+        self.compiled_rollout: CompiledRollout | None = None
+        self.cached_arguments: dict[
+            int, tuple[HeadingStepBatch, tuple[Tensor, Tensor, Tensor]]
+        ] = {}
 
-    def costs(self, candidates: dict[str, Tensor]) -> Tensor:
+    def mean_costs(self, candidates: dict[str, Tensor]) -> Tensor:
         """Return the mean cost [C] in s of candidates, parameters [C] by name.
 
         One that diverges costs a thousand seconds.
         """
-        flights = len(self.changes.heading)
-        count = len(next(iter(candidates.values())))
-        at_once = max(_ROWS // flights, 1)
-        out = []
-        for first in range(0, count, at_once):
-            some = {name: values[first : first + at_once] for name, values in candidates.items()}
-            size = len(next(iter(some.values())))
-            rows = {name: values.repeat_interleave(flights) for name, values in some.items()}
-            flown = self._flown(rows, size)
-            cost = flown.measured(self.conditions)["cost"].reshape(size, flights)
-            out.append(cost.double().nan_to_num(_LOST, _LOST).clamp(max=_LOST).mean(1))
-        return torch.cat(out)
+        n_simulations = len(self.steps.target)
+        n_total = len(next(iter(candidates.values())))
+        candidates_per_batch = max(_BATCH_SIZE // n_simulations, 1)
+        costs_found = []
+        for first_candidate in range(0, n_total, candidates_per_batch):
+            candidate_batch = {
+                name: values[first_candidate : first_candidate + candidates_per_batch]
+                for name, values in candidates.items()
+            }
+            n_candidates = len(next(iter(candidate_batch.values())))
+            row_parameters = {
+                name: values.repeat_interleave(n_simulations)
+                for name, values in candidate_batch.items()
+            }
+            trajectories = self._simulate_candidates(row_parameters, n_candidates)
+            cost = trajectories.step_metrics(self.conditions)["cost"].reshape(
+                n_candidates, n_simulations
+            )
+            costs_found.append(
+                cost.double()
+                .nan_to_num(_DIVERGED_COST, _DIVERGED_COST)
+                .clamp(max=_DIVERGED_COST)
+                .mean(1)
+            )
+        return torch.cat(costs_found)
 
-    def _flown(self, rows: dict[str, Tensor], size: int) -> Flights:
-        policy = self.config.rows(rows, self.steering).float().requires_grad_(False)
-        run = ConditionedRun(self.steering.vessel, policy, self.changes.dt, "heun", torch.float32)
-        if size not in self.given:
-            again = self.changes.repeated(size)
-            x, w, s = run.given(again)
+    def _simulate_candidates(
+        self, row_parameters: dict[str, Tensor], n_candidates: int
+    ) -> ClosedLoopTrajectories:
+        policy = self.config.build_batched(row_parameters, self.task).float().requires_grad_(False)
+        simulation = ClosedLoopSimulation(
+            self.task.vessel, policy, self.steps.dt, "heun", torch.float32
+        )
+        if n_candidates not in self.cached_arguments:
+            repeated_steps = self.steps.repeat(n_candidates)
+            x, w, s = simulation.rollout_arguments(repeated_steps)
             # rows next to each other in memory, as the compiled flights take them
-            self.given[size] = again, (x, w.permute(1, 2, 0).contiguous().permute(2, 0, 1), s)
-        changes, given = self.given[size]
+            self.cached_arguments[n_candidates] = (
+                repeated_steps,
+                (x, w.permute(1, 2, 0).contiguous().permute(2, 0, 1), s),
+            )
+        steps, arguments = self.cached_arguments[n_candidates]
         if self.compiler is None:
-            return run.fly(changes)
-        rollout = run.rollout(max(int(changes.delay.max()), 1))
+            return simulation.simulate(steps)
+        rollout = simulation.rollout(max(int(steps.delay_steps.max()), 1))
         try:
-            if self.loop is None:
-                own = [f"source.policy.{name}" for name in self.config.own]
-                self.loop = self.compiler(rollout, *given, own=own)
+            if self.compiled_rollout is None:
+                per_row_names = [f"source.policy.{name}" for name in self.config.batched_parameters]
+                self.compiled_rollout = self.compiler(rollout, *arguments, own=per_row_names)
         except ExportError:
             # what cannot be compiled is flown as it is
             self.compiler = None
-            return run.fly(changes)
-        return run.flights(changes, *self.loop.of(rollout)(*given)[:2])
+            return simulation.simulate(steps)
+        return simulation.to_trajectories(steps, *self.compiled_rollout.of(rollout)(*arguments)[:2])

@@ -15,31 +15,31 @@ from residnet.control.base import Policy
 from residnet.control.heading.classical import (
     BangBangHeading,
     HeadingLaw,
+    ProximateTimeOptimalLaw,
     RatedBangBangHeading,
     RegulatorLaw,
-    StoppingLaw,
     regulator_gains,
 )
 from residnet.control.heading.policies import (
-    SIGHT,
+    SIGHT_CONSTANTS,
     AnglePolicy,
     DepthPolicy,
     NetworkPolicy,
     ObservedPolicy,
 )
-from residnet.control.heading.turning import Turning
+from residnet.control.heading.turning import NomotoModel
 from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.config import Config, Metres, Radians, Seconds
 from residnet.core.errors import ConfigError
-from residnet.core.frames import wrap
+from residnet.core.frames import wrap_angle
 from residnet.dynamics.store import Stored, read_spec, read_weights
 
 
-class Steering(NamedTuple):
+class ControlTask(NamedTuple):
     """The task of a controller: vessel, K and T, largest rudder angle [rad] and step [s]."""
 
     vessel: SteeredVessel
-    turning: Turning
+    nomoto: NomotoModel
     limit: float
     dt: float
 
@@ -49,23 +49,23 @@ class SearchRange(NamedTuple):
 
     Attributes:
         low, high: its ends.
-        idle: value at which the law does without the parameter, None for none. The law is searched
+        disabled_value: value at which the law does without the parameter, None for none. The law is searched
             without it too, so that none does worse than the simpler one within it.
-        power: of T that all three are multiples of; those of a distance go with the speed too.
-        way: whether it is a distance.
+        time_power: of T that all three are multiples of; those of a distance go with the speed too.
+        is_distance: whether it is a distance.
     """
 
-    low: float
-    high: float
-    idle: float | None = None
-    power: int = 0
-    way: bool = False
+    lower: float
+    upper: float
+    disabled_value: float | None = None
+    time_power: int = 0
+    is_distance: bool = False
 
-    def of(self, turning: Turning) -> SearchRange:
+    def to_si(self, nomoto: NomotoModel) -> SearchRange:
         """Return the range of a vessel in SI units."""
-        unit = turning.time**self.power * (turning.speed if self.way else 1.0)
-        idle = None if self.idle is None else self.idle * unit
-        return SearchRange(self.low * unit, self.high * unit, idle)
+        scale = nomoto.time**self.time_power * (nomoto.speed if self.is_distance else 1.0)
+        disabled_value = None if self.disabled_value is None else self.disabled_value * scale
+        return SearchRange(self.lower * scale, self.upper * scale, disabled_value)
 
 
 @final
@@ -81,14 +81,14 @@ class LinearLaw(AnglePolicy):
         gains: kp, kd [s], ki [1/s] and the filter's time constant [s]; [B] or one number each.
     """
 
-    NUMBERS: ClassVar[tuple[str, ...]] = ("kp", "kd", "ki", "lag")
+    PARAMETERS: ClassVar[tuple[str, ...]] = ("kp", "kd", "ki", "lag")
 
-    def __init__(self, steering: Steering, gains: Sequence[Tensor]) -> None:
+    def __init__(self, task: ControlTask, gains: Sequence[Tensor]) -> None:
         super().__init__()
-        self.read_from(steering.vessel.state)
-        self.at(steering.dt)
-        self.limit = steering.limit
-        for name, gain in zip(self.NUMBERS, gains, strict=True):
+        self.set_state_columns(task.vessel.state)
+        self.set_step(task.dt)
+        self.limit = task.limit
+        for name, gain in zip(self.PARAMETERS, gains, strict=True):
             self.register_buffer(name, gain.reshape(-1, 1), persistent=False)
         self.kp: Tensor
         self.kd: Tensor
@@ -98,25 +98,27 @@ class LinearLaw(AnglePolicy):
 
     def initial_state(self, x: Tensor) -> Tensor:
         """Return the memory at the start: the filters stand at what is measured."""
-        seen = x[:, [self.psi, self.r]]
-        return torch.cat((torch.zeros_like(seen[:, :1]), seen), dim=1)
+        measured = x[:, [self.psi, self.r]]
+        return torch.cat((torch.zeros_like(measured[:, :1]), measured), dim=1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        share = 1.0 - torch.exp(-self.dt / self.lag.clamp(min=1e-6))
-        heading = s[:, 1:2] + share * wrap(x[:, self.psi : self.psi + 1] - s[:, 1:2])
-        rate = s[:, 2:3] + share * (x[:, self.r : self.r + 1] - s[:, 2:3])
-        error, integral = wrap(reference - heading), s[:, 0:1]
-        wish = self.kp * error - self.kd * rate + self.ki * integral
-        winding = (wish.abs() > self.limit) & (wish * error > 0)
-        after = torch.where(winding, integral, integral + self.dt * error)
-        return wish.clamp(-self.limit, self.limit), torch.cat((after, heading, rate), dim=1)
+        filter_factor = 1.0 - torch.exp(-self.dt / self.lag.clamp(min=1e-6))
+        heading = s[:, 1:2] + filter_factor * wrap_angle(x[:, self.psi : self.psi + 1] - s[:, 1:2])
+        rate = s[:, 2:3] + filter_factor * (x[:, self.r : self.r + 1] - s[:, 2:3])
+        error, integral = wrap_angle(reference - heading), s[:, 0:1]
+        unlimited_command = self.kp * error - self.kd * rate + self.ki * integral
+        is_winding_up = (unlimited_command.abs() > self.limit) & (unlimited_command * error > 0)
+        next_integral = torch.where(is_winding_up, integral, integral + self.dt * error)
+        return unlimited_command.clamp(-self.limit, self.limit), torch.cat(
+            (next_integral, heading, rate), dim=1
+        )
 
 
 class ControllerConfig(Config, ABC):
     """The config of a heading controller."""
 
     @abstractmethod
-    def build(self, steering: Steering) -> Policy:
+    def build(self, task: ControlTask) -> Policy:
         """Build the controller for a vessel.
 
         Raises:
@@ -131,44 +133,44 @@ class TunableConfig(ControllerConfig, ABC):
 
     @property
     @abstractmethod
-    def own(self) -> tuple[str, ...]:
-        """The names of the numbers of what `rows` returns that every row has for itself."""
+    def batched_parameters(self) -> tuple[str, ...]:
+        """The names of the numbers of what `build_batched` returns that every row has for itself."""
 
-    def parameters(self) -> dict[str, float | None]:
+    def parameter_values(self) -> dict[str, float | None]:
         """Return the parameters by name; None where they are to be tuned."""
         return {name: getattr(self, name) for name in self.ranges}
 
-    def axes(self, turning: Turning) -> dict[str, SearchRange]:
+    def search_ranges(self, nomoto: NomotoModel) -> dict[str, SearchRange]:
         """Return the ranges that tuning searches, by parameter."""
-        return {name: one.of(turning) for name, one in self.ranges.items()}
+        return {name: search_range.to_si(nomoto) for name, search_range in self.ranges.items()}
 
     @abstractmethod
-    def rows(self, parameters: Mapping[str, Tensor], steering: Steering) -> Policy:
+    def build_batched(self, parameters: Mapping[str, Tensor], task: ControlTask) -> Policy:
         """Return a controller whose parameters [B] differ from row to row."""
 
-    def tuned(self, found: Mapping[str, float]) -> Self:
+    def with_parameters(self, parameters: Mapping[str, float]) -> Self:
         """Return the config with parameters given."""
-        return type(self).model_validate(self.model_dump() | dict(found))
+        return type(self).model_validate(self.model_dump() | dict(parameters))
 
-    def complete(self) -> dict[str, float]:
+    def complete_parameters(self) -> dict[str, float]:
         """Return the parameters by name.
 
         Raises:
             ConfigError: where one is still to be tuned.
         """
-        given = self.parameters()
-        if missing := [name for name, value in given.items() if value is None]:
+        parameters = self.parameter_values()
+        if missing := [name for name, value in parameters.items() if value is None]:
             raise ConfigError(
                 f"controller without {', '.join(missing)}: tune it first or give them"
             )
-        return {name: value for name, value in given.items() if value is not None}
+        return {name: value for name, value in parameters.items() if value is not None}
 
 
 # from nearly none to where it slows the loop
-_FILTER = {"filter_time": SearchRange(0.002, 0.3, power=1)}
+_FILTER_RANGES = {"filter_time": SearchRange(0.002, 0.3, time_power=1)}
 
 
-class TunedConfig(TunableConfig, ABC):
+class LinearLawConfig(TunableConfig, ABC):
     """A linear law kp e - kd r + ki I whose missing parameters are tuned.
 
     Attributes:
@@ -179,33 +181,38 @@ class TunedConfig(TunableConfig, ABC):
     filter_time: Seconds | None = Field(default=None, ge=0)
 
     @property
-    def own(self) -> tuple[str, ...]:
-        return LinearLaw.NUMBERS
+    def batched_parameters(self) -> tuple[str, ...]:
+        return LinearLaw.PARAMETERS
 
     @abstractmethod
     def gains(
-        self, parameters: Mapping[str, Tensor], turning: Turning
+        self, parameters: Mapping[str, Tensor], nomoto: NomotoModel
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return kp, kd, ki of parameters, any shape."""
 
     @final
-    def parameters(self) -> dict[str, float | None]:
-        given, lag = super().parameters(), self.filter_time
-        open_ = None in [value for name, value in given.items() if name != "filter_time"]
-        return {**given, "filter_time": 0.0 if lag is None and not open_ else lag}
+    def parameter_values(self) -> dict[str, float | None]:
+        parameters, lag = super().parameter_values(), self.filter_time
+        has_open_gain = None in [
+            value for name, value in parameters.items() if name != "filter_time"
+        ]
+        return {**parameters, "filter_time": 0.0 if lag is None and not has_open_gain else lag}
 
-    def build(self, steering: Steering) -> LinearLaw:
+    def build(self, task: ControlTask) -> LinearLaw:
         """Return the law with these parameters."""
-        found = {name: torch.tensor([value]).double() for name, value in self.complete().items()}
-        return self.rows(found, steering)
+        parameters = {
+            name: torch.tensor([value]).double()
+            for name, value in self.complete_parameters().items()
+        }
+        return self.build_batched(parameters, task)
 
-    def rows(self, parameters: Mapping[str, Tensor], steering: Steering) -> LinearLaw:
+    def build_batched(self, parameters: Mapping[str, Tensor], task: ControlTask) -> LinearLaw:
         """Return the law with gains of its own for every row."""
-        gains = self.gains(parameters, steering.turning)
-        return LinearLaw(steering, [*gains, parameters["filter_time"]])
+        gains = self.gains(parameters, task.nomoto)
+        return LinearLaw(task, [*gains, parameters["filter_time"]])
 
 
-class PdConfig(TunedConfig):
+class PdConfig(LinearLawConfig):
     """Proportional and derivative action on the heading error.
 
     Attributes:
@@ -215,15 +222,15 @@ class PdConfig(TunedConfig):
 
     ranges: ClassVar[Mapping[str, SearchRange]] = {
         "kp": SearchRange(0.3, 60.0),
-        "damping_time": SearchRange(0.05, 2.0, power=1),
-        **_FILTER,
+        "damping_time": SearchRange(0.05, 2.0, time_power=1),
+        **_FILTER_RANGES,
     }
     kind: Literal["pd"] = "pd"
     kp: float | None = Field(default=None, gt=0)
     damping_time: Seconds | None = Field(default=None, gt=0)
 
     def gains(
-        self, parameters: Mapping[str, Tensor], turning: Turning
+        self, parameters: Mapping[str, Tensor], nomoto: NomotoModel
     ) -> tuple[Tensor, Tensor, Tensor]:
         return (
             parameters["kp"],
@@ -241,22 +248,22 @@ class PidConfig(PdConfig):
 
     ranges: ClassVar[Mapping[str, SearchRange]] = {
         "kp": SearchRange(0.3, 60.0),
-        "damping_time": SearchRange(0.05, 2.0, power=1),
+        "damping_time": SearchRange(0.05, 2.0, time_power=1),
         # a million T is no integral in single precision
-        "integral_time": SearchRange(1.0, 50.0, idle=1e6, power=1),
-        **_FILTER,
+        "integral_time": SearchRange(1.0, 50.0, disabled_value=1e6, time_power=1),
+        **_FILTER_RANGES,
     }
     kind: Literal["pid"] = "pid"  # type: ignore[assignment]
     integral_time: Seconds | None = Field(default=None, gt=0)
 
     def gains(
-        self, parameters: Mapping[str, Tensor], turning: Turning
+        self, parameters: Mapping[str, Tensor], nomoto: NomotoModel
     ) -> tuple[Tensor, Tensor, Tensor]:
-        kp, kd, _ = super().gains(parameters, turning)
+        kp, kd, _ = super().gains(parameters, nomoto)
         return kp, kd, kp / parameters["integral_time"]
 
 
-class LqrConfig(TunedConfig):
+class LqrConfig(LinearLawConfig):
     """A linear-quadratic regulator of T r_dot + r = K delta.
 
     The integral of heading_weight e^2 + rate_weight (T r)^2 + delta^2 is least.
@@ -272,16 +279,16 @@ class LqrConfig(TunedConfig):
     ranges: ClassVar[Mapping[str, SearchRange]] = {
         "heading_weight": SearchRange(0.1, 3600.0),
         "rate_weight": SearchRange(1e-3, 3600.0),
-        **_FILTER,
+        **_FILTER_RANGES,
     }
     kind: Literal["lqr"] = "lqr"
     heading_weight: float | None = Field(default=None, gt=0)
     rate_weight: float | None = Field(default=None, ge=0)
 
     def gains(
-        self, parameters: Mapping[str, Tensor], turning: Turning
+        self, parameters: Mapping[str, Tensor], nomoto: NomotoModel
     ) -> tuple[Tensor, Tensor, Tensor]:
-        gain, time = torch.tensor(turning.gain), torch.tensor(turning.time)
+        gain, time = torch.tensor(nomoto.gain), torch.tensor(nomoto.time)
         kp, kd = regulator_gains(
             parameters["heading_weight"], parameters["rate_weight"], gain, time
         )
@@ -296,33 +303,33 @@ class BangBangConfig(ControllerConfig):
 
     kind: Literal["bang_bang"] = "bang_bang"
 
-    def build(self, steering: Steering) -> Policy:
-        vessel, turning = steering.vessel, steering.turning
+    def build(self, task: ControlTask) -> Policy:
+        vessel, nomoto = task.vessel, task.nomoto
         if vessel.rate is not None:
             return RatedBangBangHeading(
                 vessel.state,
-                gain=turning.gain,
-                time=turning.time,
-                limit=steering.limit,
+                gain=nomoto.gain,
+                time=nomoto.time,
+                limit=task.limit,
                 rate=vessel.rate,
-                dt=steering.dt,
+                dt=task.dt,
             )
         return BangBangHeading(
-            steering.vessel.state,
-            gain=steering.turning.gain,
-            time=steering.turning.time,
-            limit=steering.limit,
+            task.vessel.state,
+            gain=task.nomoto.gain,
+            time=task.nomoto.time,
+            limit=task.limit,
         )
 
 
 Positive = Annotated[float, Field(gt=0)]
 
 
-_OBSERVER = {
-    "heading_rate": SearchRange(1.0, 120.0, power=-1),
-    "yaw_rate_rate": SearchRange(1.0, 120.0, power=-1),
-    "push_rate": SearchRange(0.08, 30.0, power=-1),
-    "cross_rate": SearchRange(0.15, 150.0, power=-2),
+_OBSERVER_RANGES = {
+    "heading_rate": SearchRange(1.0, 120.0, time_power=-1),
+    "yaw_rate_rate": SearchRange(1.0, 120.0, time_power=-1),
+    "push_rate": SearchRange(0.08, 30.0, time_power=-1),
+    "cross_rate": SearchRange(0.15, 150.0, time_power=-2),
 }
 
 
@@ -346,26 +353,28 @@ class ObservedConfig(TunableConfig, ABC):
     cross_rate: Positive | None = None
 
     @property
-    def own(self) -> tuple[str, ...]:
+    def batched_parameters(self) -> tuple[str, ...]:
         return ("constants",)
 
     @abstractmethod
-    def law(self, limit: float, rate: float | None) -> HeadingLaw:
+    def build_law(self, limit: float, rate: float | None) -> HeadingLaw:
         """Return the law for a rudder with a limit in rad and a rate in rad/s, None for none."""
 
-    def build(self, steering: Steering) -> ObservedPolicy:
-        return self.rows(self.complete(), steering)
+    def build(self, task: ControlTask) -> ObservedPolicy:
+        return self.build_batched(self.complete_parameters(), task)
 
-    def rows(self, parameters: Mapping[str, float | Tensor], steering: Steering) -> ObservedPolicy:
+    def build_batched(
+        self, parameters: Mapping[str, float | Tensor], task: ControlTask
+    ) -> ObservedPolicy:
         """Return the law without a network; each constant is one number or [B]."""
-        vessel = steering.vessel
+        vessel = task.vessel
         return ObservedPolicy(
             vessel.state,
-            turning=steering.turning,
-            law=self.law(steering.limit, vessel.rate),
+            nomoto=task.nomoto,
+            law=self.build_law(task.limit, vessel.rate),
             constants=parameters,
-            limit=steering.limit,
-            dt=steering.dt,
+            limit=task.limit,
+            dt=task.dt,
             rate=vessel.rate,
             lag=self.lag,
         )
@@ -382,13 +391,13 @@ class ObservedLqrConfig(ObservedConfig):
     ranges: ClassVar[Mapping[str, SearchRange]] = {
         "heading_weight": SearchRange(0.01, 3600.0),
         "rate_weight": SearchRange(1e-3, 3600.0),
-        **_OBSERVER,
+        **_OBSERVER_RANGES,
     }
     kind: Literal["lqr_observer"] = "lqr_observer"
     heading_weight: Positive | None = None
     rate_weight: Positive | None = None
 
-    def law(self, limit: float, rate: float | None) -> HeadingLaw:
+    def build_law(self, limit: float, rate: float | None) -> HeadingLaw:
         """Return the linear regulator with this rudder limit in rad."""
         return RegulatorLaw(limit)
 
@@ -406,20 +415,20 @@ class PtosConfig(ObservedConfig):
         "steepness": SearchRange(3.0, 600.0),
         "share": SearchRange(0.2, 1.2),
         "damping": SearchRange(0.3, 3.0),
-        **_OBSERVER,
+        **_OBSERVER_RANGES,
     }
     kind: Literal["ptos"] = "ptos"
     steepness: Positive | None = None
     share: Positive | None = None
     damping: Positive | None = None
 
-    def law(self, limit: float, rate: float | None) -> HeadingLaw:
-        return StoppingLaw(0.0 if rate is None else limit / rate)
+    def build_law(self, limit: float, rate: float | None) -> HeadingLaw:
+        return ProximateTimeOptimalLaw(0.0 if rate is None else limit / rate)
 
 
-AnyObserved = Annotated[ObservedLqrConfig | PtosConfig, Field(discriminator="kind")]
+AnyObservedLaw = Annotated[ObservedLqrConfig | PtosConfig, Field(discriminator="kind")]
 
-AnyPitch = Annotated[
+AnyPitchLaw = Annotated[
     PdConfig | PidConfig | LqrConfig | ObservedLqrConfig | PtosConfig, Field(discriminator="kind")
 ]
 
@@ -438,60 +447,66 @@ class DepthConfig(TunableConfig):
 
     # a vessel goes speed times T while its dive angle changes
     ranges: ClassVar[Mapping[str, SearchRange]] = {
-        "lookahead": SearchRange(0.3, 20.0, power=1, way=True),
-        "depth_rate": SearchRange(0.05, 20.0, power=-1),
-        "drift_rate": SearchRange(0.01, 1.0, power=-1),
+        "lookahead": SearchRange(0.3, 20.0, time_power=1, is_distance=True),
+        "depth_rate": SearchRange(0.05, 20.0, time_power=-1),
+        "drift_rate": SearchRange(0.01, 1.0, time_power=-1),
     }
     kind: Literal["depth"] = "depth"
-    pitch: AnyPitch
+    pitch: AnyPitchLaw
     steepest: Radians = Field(default=0.5235987755982988, gt=0, lt=1.3)
     lookahead: Annotated[Metres, Field(gt=0)] | None = None
     depth_rate: Positive | None = None
     drift_rate: Positive | None = None
 
     @property
-    def own(self) -> tuple[str, ...]:
-        return ("constants", *(f"law.{name}" for name in self.pitch.own))
+    def batched_parameters(self) -> tuple[str, ...]:
+        return ("constants", *(f"law.{name}" for name in self.pitch.batched_parameters))
 
-    def parameters(self) -> dict[str, float | None]:
+    def parameter_values(self) -> dict[str, float | None]:
         """Return the constants of the line of sight, then those of the law."""
-        return super().parameters() | self.pitch.parameters()
+        return super().parameter_values() | self.pitch.parameter_values()
 
-    def axes(self, turning: Turning) -> dict[str, SearchRange]:
-        return super().axes(turning) | self.pitch.axes(turning)
+    def search_ranges(self, nomoto: NomotoModel) -> dict[str, SearchRange]:
+        return super().search_ranges(nomoto) | self.pitch.search_ranges(nomoto)
 
-    def tuned(self, found: Mapping[str, float]) -> Self:
+    def with_parameters(self, parameters: Mapping[str, float]) -> Self:
         """Return the config with parameters given, those of the law in it."""
-        own = {name: found[name] for name in SIGHT if name in found}
-        law = {name: value for name, value in found.items() if name not in own}
-        return self.model_copy(update={**own, "pitch": self.pitch.tuned(law)})
+        sight_parameters = {
+            name: parameters[name] for name in SIGHT_CONSTANTS if name in parameters
+        }
+        law_parameters = {
+            name: value for name, value in parameters.items() if name not in sight_parameters
+        }
+        return self.model_copy(
+            update={**sight_parameters, "pitch": self.pitch.with_parameters(law_parameters)}
+        )
 
-    def rows(self, parameters: Mapping[str, Tensor], steering: Steering) -> DepthPolicy:
+    def build_batched(self, parameters: Mapping[str, Tensor], task: ControlTask) -> DepthPolicy:
         """Return the policy with constants of its own for every row."""
-        return self.over(self.pitch.rows(parameters, steering), parameters, steering)
+        return self.build_policy(self.pitch.build_batched(parameters, task), parameters, task)
 
-    def build(self, steering: Steering) -> DepthPolicy:
-        return self.over(self.pitch.build(steering), self.complete(), steering)
+    def build(self, task: ControlTask) -> DepthPolicy:
+        return self.build_policy(self.pitch.build(task), self.complete_parameters(), task)
 
-    def over(
-        self, law: AnglePolicy, constants: Mapping[str, float | Tensor], steering: Steering
+    def build_policy(
+        self, law: AnglePolicy, constants: Mapping[str, float | Tensor], task: ControlTask
     ) -> DepthPolicy:
         """Return the policy over a law; each constant is one number or [B]."""
         return DepthPolicy(
-            steering.vessel.state,
-            turning=steering.turning,
+            task.vessel.state,
+            nomoto=task.nomoto,
             law=law,
             constants=constants,
             steepest=self.steepest,
-            limit=steering.limit,
-            dt=steering.dt,
-            rate=steering.vessel.rate,
+            limit=task.limit,
+            dt=task.dt,
+            rate=task.vessel.rate,
         )
 
 
-def observed_of(peer: object) -> object:
+def angle_law_of(controller: object) -> object:
     """Return the law that a peer steers by: that on the dive angle of a depth controller."""
-    return peer.pitch if isinstance(peer, DepthConfig) else peer
+    return controller.pitch if isinstance(controller, DepthConfig) else controller
 
 
 ClassicalController = Annotated[
@@ -532,9 +547,9 @@ class _PolicySpec(Stored):
     trained_at: float = Field(gt=0)
 
     @property
-    def turning(self) -> Turning:
+    def nomoto(self) -> NomotoModel:
         """K, T, speed and c of that vessel."""
-        return Turning(self.gain, self.time, self.speed, self.righting)
+        return NomotoModel(self.gain, self.time, self.speed, self.righting)
 
 
 class ObservedPolicySpec(_PolicySpec):
@@ -549,16 +564,16 @@ class ObservedPolicySpec(_PolicySpec):
     schema_name: Literal["residnet.observed_policy/1"] = Field(
         default="residnet.observed_policy/1", alias="schema"
     )
-    law: AnyObserved
+    law: AnyObservedLaw
     units: int = Field(ge=0, le=10_000)
 
     def build(self) -> ObservedPolicy:
         """Return the policy with its network not yet trained."""
         return ObservedPolicy(
             self.state,
-            turning=self.turning,
-            law=self.law.law(self.limit, self.rate),
-            constants=self.law.complete(),
+            nomoto=self.nomoto,
+            law=self.law.build_law(self.limit, self.rate),
+            constants=self.law.complete_parameters(),
             limit=self.limit,
             dt=self.dt,
             rate=self.rate,
@@ -585,7 +600,7 @@ class NetworkPolicySpec(_PolicySpec):
         """Return the policy with its network not yet trained."""
         return NetworkPolicy(
             self.state,
-            turning=self.turning,
+            nomoto=self.nomoto,
             limit=self.limit,
             dt=self.dt,
             rate=self.rate,
@@ -616,7 +631,7 @@ class DepthPolicySpec(Stored):
         law = self.law
         return DepthPolicy(
             law.state,
-            turning=law.turning,
+            nomoto=law.nomoto,
             law=law.build(),
             constants=self.sight,
             steepest=self.steepest,
@@ -630,12 +645,12 @@ RecurrentSpec = ObservedPolicySpec | NetworkPolicySpec | DepthPolicySpec
 RecurrentPolicy = ObservedPolicy | NetworkPolicy | DepthPolicy
 
 
-def load_recurrent(folder: Path, kind: type[RecurrentSpec]) -> RecurrentPolicy:
+def load_recurrent(folder: Path, spec_type: type[RecurrentSpec]) -> RecurrentPolicy:
     """Read a trained recurrent policy, frozen and in float64.
 
     Raises:
         UsageError: where the folder holds none, or one that is not as it was written.
     """
-    policy = read_spec(folder, kind).build()
+    policy = read_spec(folder, spec_type).build()
     read_weights(folder, policy)
     return policy.eval().requires_grad_(False).double()

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 
 from residnet.control.base import Policy
 from residnet.control.heading.classical import HeadingLaw
-from residnet.control.heading.turning import Turning
-from residnet.core.frames import wrap
+from residnet.control.heading.turning import NomotoModel
+from residnet.core.frames import wrap_angle
 from residnet.dynamics.steering_variation import DEPTH, HEADING, Axis
 
 
@@ -30,11 +30,11 @@ class AnglePolicy(Policy, ABC):
 
     dt: float
 
-    def read_from(self, state: Sequence[str]) -> None:
+    def set_state_columns(self, state: Sequence[str]) -> None:
         """Take heading and yaw rate, and the speed, from a state with these names."""
         self.psi, self.u, self.r = state.index("psi"), state.index("u"), state.index("r")
 
-    def at(self, dt: float) -> None:
+    def set_step(self, dt: float) -> None:
         """Take steps of dt seconds from now on."""
         self.dt = dt
 
@@ -50,42 +50,44 @@ class HeadingPolicy(AnglePolicy, ABC):
         speed: at which K and T hold, in m/s.
         limit: of the rudder in rad.
         rate: of the rudder in rad/s; infinite where it stands at its command at once.
-        travel: most that the rudder moves in a step, in rad.
+        max_rudder_step: most that the rudder moves in a step, in rad.
     """
 
     axis: ClassVar[Axis] = HEADING
     measured: ClassVar[Mapping[str, str]] = {"psi": "rad", "u": "m/s", "r": "rad/s"}
 
     def __init__(
-        self, state: Sequence[str], turning: Turning, limit: float, rate: float | None
+        self, state: Sequence[str], nomoto: NomotoModel, limit: float, rate: float | None
     ) -> None:
         super().__init__()
-        self.read_from(state)
-        self.gain, self.time, self.speed = turning.gain, turning.time, turning.speed
+        self.set_state_columns(state)
+        self.gain, self.time, self.speed = nomoto.gain, nomoto.time, nomoto.speed
         self.limit = limit
         self.rate = math.inf if rate is None else rate
 
-    def at(self, dt: float) -> None:
-        super().at(dt)
+    def set_step(self, dt: float) -> None:
+        super().set_step(dt)
         # a large number where the rudder has no rate: infinity would spoil gradients
-        self.travel = min(self.rate * dt, 2.0 * self.limit)
+        self.max_rudder_step = min(self.rate * dt, 2.0 * self.limit)
 
     @abstractmethod
-    def memory_ranges(self, turn: float, angle: float) -> dict[str, tuple[float, float]]:
+    def memory_ranges(
+        self, max_yaw_rate: float, max_rudder: float
+    ) -> dict[str, tuple[float, float]]:
         """Return what the entries of the memory can be, [low, high] by name, with some room.
 
         Args:
-            turn: fastest yaw rate in rad/s that is measured.
-            angle: largest rudder angle in rad, relative to that of a course where one is followed.
+            max_yaw_rate: fastest yaw rate in rad/s that is measured.
+            max_rudder: largest rudder angle in rad, relative to that of a course where one is followed.
         """
 
     @abstractmethod
-    def described(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """Return what the card of an exported policy says of its structure."""
 
 
 @final
-class OddCell(nn.Module):
+class OddGRUCell(nn.Module):
     """A gated recurrent unit whose memory changes sign with its features.
 
     Gates see the sizes of features and memory, so that they are even; the candidate has no bias, so
@@ -99,58 +101,60 @@ class OddCell(nn.Module):
 
     def __init__(self, features: int, units: int, dt: float, hidden: int = 0) -> None:
         super().__init__()
-        both = features + units
-        self.gates = nn.Linear(both, 2 * units)
-        self.candidate = nn.Linear(both, units, bias=False)
-        self.hidden = nn.Linear(both, hidden, bias=False) if hidden > 0 else None
-        self.out = nn.Linear(both + hidden, 1, bias=False)
-        nn.init.normal_(self.gates.weight, std=1.0 / math.sqrt(both))
+        n_joint = features + units
+        self.gates = nn.Linear(n_joint, 2 * units)
+        self.candidate = nn.Linear(n_joint, units, bias=False)
+        self.hidden = nn.Linear(n_joint, hidden, bias=False) if hidden > 0 else None
+        self.out = nn.Linear(n_joint + hidden, 1, bias=False)
+        nn.init.normal_(self.gates.weight, std=1.0 / math.sqrt(n_joint))
         nn.init.zeros_(self.gates.bias)
-        nn.init.normal_(self.candidate.weight, std=1.0 / math.sqrt(both))
+        nn.init.normal_(self.candidate.weight, std=1.0 / math.sqrt(n_joint))
         nn.init.zeros_(self.out.weight)
         self.units, self.trained_at = units, dt
 
     def forward(self, features: Tensor, memory: Tensor, dt: float) -> tuple[Tensor, Tensor]:
         """Return the output [B, 1] and the memory [B, units] after a step of dt seconds."""
-        sizes = torch.cat((features, memory), dim=1).abs()
-        update, reset = torch.sigmoid(self.gates(sizes)).chunk(2, dim=1)
-        kept = (1.0 - update).clamp(min=1e-6)
+        magnitudes = torch.cat((features, memory), dim=1).abs()
+        update, reset = torch.sigmoid(self.gates(magnitudes)).chunk(2, dim=1)
+        retention = (1.0 - update).clamp(min=1e-6)
         if dt != self.trained_at:
-            kept = kept.pow(dt / self.trained_at)
+            retention = retention.pow(dt / self.trained_at)
         candidate = torch.tanh(self.candidate(torch.cat((features, reset * memory), dim=1)))
-        memory = candidate + kept * (memory - candidate)
-        known = torch.cat((features, memory), dim=1)
+        memory = candidate + retention * (memory - candidate)
+        output_features = torch.cat((features, memory), dim=1)
         if self.hidden is not None:
-            known = torch.cat((known, torch.tanh(self.hidden(known))), dim=1)
-        output: Tensor = self.out(known)
+            output_features = torch.cat(
+                (output_features, torch.tanh(self.hidden(output_features))), dim=1
+            )
+        output: Tensor = self.out(output_features)
         return output, memory
 
 
-CONSTANTS = ("heading_rate", "yaw_rate_rate", "push_rate", "cross_rate")
+OBSERVER_CONSTANTS = ("heading_rate", "yaw_rate_rate", "push_rate", "cross_rate")
 """Of the observer: how fast heading, yaw rate and push follow what is measured in 1/s, and how
 fast the yaw rate follows the heading's innovation in 1/s^2."""
 
-_LOST = 0.35
+_MAX_INNOVATION = 0.35
 """Difference in rad between measured and expected heading beyond which the estimate is lost."""
 
 
-class Estimate(NamedTuple):
+class ObserverEstimate(NamedTuple):
     """What is known of the vessel at a step, each [B, 1], SI.
 
     Attributes:
         heading, r: now.
-        push: rudder angle that what pushes the bow stands for.
+        disturbance_rudder: rudder angle that what pushes the bow stands for.
         heading_ahead, r_ahead: once the pending commands have arrived.
         surprise_heading, surprise_r: measured less expected.
     """
 
     heading: Tensor
     r: Tensor
-    push: Tensor
-    heading_ahead: Tensor
-    r_ahead: Tensor
-    surprise_heading: Tensor
-    surprise_r: Tensor
+    disturbance_rudder: Tensor
+    predicted_heading: Tensor
+    predicted_r: Tensor
+    heading_innovation: Tensor
+    r_innovation: Tensor
 
 
 @final
@@ -163,27 +167,27 @@ class HeadingObserver(nn.Module):
     expected, the estimate begins anew at what is measured.
 
     Args:
-        turning: K, T and speed of the vessel about straight ahead.
+        nomoto: K, T and speed of the vessel about straight ahead.
         limit: largest push in rad.
         lag: time in s between a command and its rudder; 0 for no predictor.
         dt: step in s.
     """
 
-    def __init__(self, turning: Turning, limit: float, lag: float, dt: float) -> None:
+    def __init__(self, nomoto: NomotoModel, limit: float, lag: float, dt: float) -> None:
         super().__init__()
-        self.gain, self.time, self.c = turning.gain, turning.time, turning.righting
-        self.limit, self.lag, self.lost = limit, lag, _LOST
-        self.dt, self.pending = dt, round(lag / dt)
-        self.register_buffer("left", torch.zeros(0), persistent=False)
-        self.left: Tensor
-        self.at(dt)
+        self.gain, self.time, self.restoring = nomoto.gain, nomoto.time, nomoto.restoring
+        self.limit, self.lag, self.max_innovation = limit, lag, _MAX_INNOVATION
+        self.dt, self.n_pending = dt, round(lag / dt)
+        self.register_buffer("remaining_lag", torch.zeros(0), persistent=False)
+        self.remaining_lag: Tensor
+        self.set_step(dt)
 
-    def at(self, dt: float) -> None:
+    def set_step(self, dt: float) -> None:
         """Take steps of dt seconds from now on."""
-        self.dt, self.pending = dt, round(self.lag / dt)
+        self.dt, self.n_pending = dt, round(self.lag / dt)
         # time in s that is left of the lag when each pending command has acted, the oldest first
-        left = dt * torch.arange(self.pending - 1, -1, -1, dtype=torch.float64)
-        self.left = left.to(self.left.dtype)
+        remaining = dt * torch.arange(self.n_pending - 1, -1, -1, dtype=torch.float64)
+        self.remaining_lag = remaining.to(self.remaining_lag.dtype)
 
     def forward(
         self,
@@ -191,11 +195,11 @@ class HeadingObserver(nn.Module):
         r: Tensor,
         heading: Tensor,
         yaw_rate: Tensor,
-        push: Tensor,
+        disturbance: Tensor,
         pending: Tensor,
         ratio: Tensor,
         constants: list[Tensor],
-    ) -> Estimate:
+    ) -> ObserverEstimate:
         """Return the estimate with a measurement taken in.
 
         Args:
@@ -203,59 +207,88 @@ class HeadingObserver(nn.Module):
             heading, yaw_rate, push: expected before the measurement, [B, 1].
             pending: rudder angles [B, pending] that have still to act, the oldest first.
             ratio: speed [B, 1] over that of K and T.
-            constants: `CONSTANTS`, [1] or [B, 1] each.
+            constants: `OBSERVER_CONSTANTS`, [1] or [B, 1] each.
         """
-        surprise_heading, surprise_r = wrap(psi - heading), r - yaw_rate
+        heading_innovation, r_innovation = wrap_angle(psi - heading), r - yaw_rate
         # no vessel does this within a step: measurements were missing, and the estimate is taken
         # up anew where they come back, with the push as it was
-        full = 3.0 * self.gain * ratio * self.limit
-        lost = (surprise_heading.abs() > self.lost) | (surprise_r.abs() > full)
-        heading, yaw_rate = torch.where(lost, psi, heading), torch.where(lost, r, yaw_rate)
-        nothing = torch.zeros_like(surprise_r)
-        surprise_heading = torch.where(lost, nothing, surprise_heading)
-        surprise_r = torch.where(lost, nothing, surprise_r)
-        shares = [1.0 - torch.exp(-self.dt * rate) for rate in constants[:2]]
-        turn = shares[1] * surprise_r + self.dt * constants[3] * surprise_heading
-        heading, yaw_rate = heading + shares[0] * surprise_heading, yaw_rate + turn
-        per_push = self.time / (self.gain * ratio.square())
-        push = (push + constants[2] * per_push * turn).clamp(-self.limit, self.limit)
-        ahead, r_ahead = heading, yaw_rate
-        if self.pending > 0:
-            felt = self.righted(push, heading, ratio)
-            ahead, r_ahead = self._ahead(heading, yaw_rate, felt, pending, ratio)
-        return Estimate(heading, yaw_rate, push, ahead, r_ahead, surprise_heading, surprise_r)
+        max_yaw_rate = 3.0 * self.gain * ratio * self.limit
+        is_lost = (heading_innovation.abs() > self.max_innovation) | (
+            r_innovation.abs() > max_yaw_rate
+        )
+        heading, yaw_rate = torch.where(is_lost, psi, heading), torch.where(is_lost, r, yaw_rate)
+        zero_innovation = torch.zeros_like(r_innovation)
+        heading_innovation = torch.where(is_lost, zero_innovation, heading_innovation)
+        r_innovation = torch.where(is_lost, zero_innovation, r_innovation)
+        filter_gains = [1.0 - torch.exp(-self.dt * rate) for rate in constants[:2]]
+        rate_correction = (
+            filter_gains[1] * r_innovation + self.dt * constants[3] * heading_innovation
+        )
+        heading, yaw_rate = (
+            heading + filter_gains[0] * heading_innovation,
+            yaw_rate + rate_correction,
+        )
+        rudder_per_rate = self.time / (self.gain * ratio.square())
+        disturbance = (disturbance + constants[2] * rudder_per_rate * rate_correction).clamp(
+            -self.limit, self.limit
+        )
+        predicted_heading, predicted_r = heading, yaw_rate
+        if self.n_pending > 0:
+            effective_disturbance = self.with_restoring(disturbance, heading, ratio)
+            predicted_heading, predicted_r = self._predict_pending(
+                heading, yaw_rate, effective_disturbance, pending, ratio
+            )
+        return ObserverEstimate(
+            heading,
+            yaw_rate,
+            disturbance,
+            predicted_heading,
+            predicted_r,
+            heading_innovation,
+            r_innovation,
+        )
 
-    def righted(self, push: Tensor, heading: Tensor, ratio: Tensor) -> Tensor:
+    def with_restoring(self, disturbance: Tensor, heading: Tensor, ratio: Tensor) -> Tensor:
         """Return the push [B, 1] in rad of rudder with what rights the vessel at an angle."""
-        return push if self.c == 0.0 else push - self.c / ratio.square() * heading
+        return (
+            disturbance
+            if self.restoring == 0.0
+            else disturbance - self.restoring / ratio.square() * heading
+        )
 
-    def _ahead(
-        self, heading: Tensor, r: Tensor, push: Tensor, pending: Tensor, ratio: Tensor
+    def _predict_pending(
+        self, heading: Tensor, r: Tensor, disturbance: Tensor, pending: Tensor, ratio: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return heading and yaw rate [B, 1] when the pending rudder angles have acted."""
-        constant = self.time / ratio
-        step = 1.0 - torch.exp(-self.dt / constant)
-        later = torch.exp(-self.left / constant)
-        acting = self.gain * ratio * (pending + push)
-        lag = self.dt * self.pending
-        kept = torch.exp(-lag / constant)
-        r_ahead = kept * r + (acting * step * later).sum(1, keepdim=True)
-        turned = (acting * (self.dt - constant * step * later)).sum(1, keepdim=True)
-        return heading + constant * (1.0 - kept) * r + turned, r_ahead
+        time_constant = self.time / ratio
+        step_response = 1.0 - torch.exp(-self.dt / time_constant)
+        remaining_decay = torch.exp(-self.remaining_lag / time_constant)
+        steady_rates = self.gain * ratio * (pending + disturbance)
+        lag = self.dt * self.n_pending
+        lag_decay = torch.exp(-lag / time_constant)
+        predicted_r = lag_decay * r + (steady_rates * step_response * remaining_decay).sum(
+            1, keepdim=True
+        )
+        heading_change = (
+            steady_rates * (self.dt - time_constant * step_response * remaining_decay)
+        ).sum(1, keepdim=True)
+        return heading + time_constant * (1.0 - lag_decay) * r + heading_change, predicted_r
 
-    def expected(
-        self, heading: Tensor, r: Tensor, push: Tensor, rudder: Tensor, ratio: Tensor
+    def predict_step(
+        self, heading: Tensor, r: Tensor, disturbance: Tensor, rudder: Tensor, ratio: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return heading [-pi, pi) and yaw rate [B, 1] a step later under a rudder angle."""
-        constant = self.time / ratio
-        steady = self.gain * ratio * (rudder + push)
-        change = (1.0 - torch.exp(-self.dt / constant)) * (steady - r)
-        return wrap(heading + self.dt * steady - constant * change), r + change
+        time_constant = self.time / ratio
+        steady_rate = self.gain * ratio * (rudder + disturbance)
+        rate_change = (1.0 - torch.exp(-self.dt / time_constant)) * (steady_rate - r)
+        return wrap_angle(
+            heading + self.dt * steady_rate - time_constant * rate_change
+        ), r + rate_change
 
 
-FIXED = ("heading", "yaw_rate", "push", "rudder", "last_command")
+OBSERVER_MEMORY = ("heading", "yaw_rate", "push", "rudder", "last_command")
 """Memory of every observed policy; pending rudder angles and the network's units stand behind."""
-_FEATURES = 11
+_N_FEATURES = 11
 """Columns that the network sees; `ObservedPolicy.forward` lists them."""
 _DEGREE = math.pi / 180.0
 
@@ -270,14 +303,14 @@ class ObservedPolicy(HeadingPolicy):
     recurrent residual, odd, so that port and starboard are alike; its output starts at zero. With
     no units there is no network.
 
-    Memory s [B, 5 + pending + units]: `FIXED` in rad and rad/s, rudder angles that have still to
+    Memory s [B, 5 + pending + units]: `OBSERVER_MEMORY` in rad and rad/s, rudder angles that have still to
     act, the oldest first, and the network's units.
 
     Args:
-        turning: K, T and speed of the vessel about straight ahead.
+        nomoto: K, T and speed of the vessel about straight ahead.
         constants: of the law, then `observer.CONSTANTS`, all positive.
         limit: of the rudder in rad.
-        dt: step of the controller in s; `at` changes it.
+        dt: step of the controller in s; `set_step` changes it.
         rate: of the rudder in rad/s; None where it stands at its command at once.
         lag: time in s between a command and its rudder; 0 for no predictor.
         units: of the network; 0 for none.
@@ -288,7 +321,7 @@ class ObservedPolicy(HeadingPolicy):
         self,
         state: Sequence[str],
         *,
-        turning: Turning,
+        nomoto: NomotoModel,
         law: HeadingLaw,
         constants: Mapping[str, float | Tensor],
         limit: float,
@@ -298,53 +331,67 @@ class ObservedPolicy(HeadingPolicy):
         units: int = 0,
         trained_at: float = 0.04,
     ) -> None:
-        super().__init__(state, turning, limit, rate)
-        self.units, self.degree = units, _DEGREE
+        super().__init__(state, nomoto, limit, rate)
+        self.units, self.radians_per_degree = units, _DEGREE
         self.law = law
-        self.observer = HeadingObserver(turning, limit, lag, dt)
-        self.names = (*law.constants, *CONSTANTS)
-        self.own = len(law.constants)
-        values = [torch.as_tensor(constants[name], dtype=torch.float32) for name in self.names]
+        self.observer = HeadingObserver(nomoto, limit, lag, dt)
+        self.constant_names = (*law.constants, *OBSERVER_CONSTANTS)
+        self.n_law_constants = len(law.constants)
+        values = [
+            torch.as_tensor(constants[name], dtype=torch.float32) for name in self.constant_names
+        ]
         self.constants = torch.nn.Parameter(torch.stack(values, dim=-1).log())
-        self.network = OddCell(_FEATURES, max(units, 1), trained_at).requires_grad_(units > 0)
+        self.network = OddGRUCell(_N_FEATURES, max(units, 1), trained_at).requires_grad_(units > 0)
         self.trained_at = trained_at
-        self.at(dt)
+        self.set_step(dt)
 
-    def at(self, dt: float) -> None:
-        super().at(dt)
-        self.observer.at(dt)
-        self.n_state = len(FIXED) + self.observer.pending + self.units
+    def set_step(self, dt: float) -> None:
+        super().set_step(dt)
+        self.observer.set_step(dt)
+        self.n_state = len(OBSERVER_MEMORY) + self.observer.n_pending + self.units
 
     def without_network(self) -> ObservedPolicy:
         """Return a copy whose network gives nothing: the law with its constants as they are."""
-        alone = copy.deepcopy(self)
-        torch.nn.init.zeros_(alone.network.out.weight)
-        return alone
+        policy = copy.deepcopy(self)
+        torch.nn.init.zeros_(policy.network.out.weight)
+        return policy
 
-    def values(self) -> dict[str, float]:
+    def constant_values(self) -> dict[str, float]:
         """Return the constants by name."""
-        found = torch.exp(self.constants.detach()).tolist()
-        return dict(zip(self.names, found, strict=True))
+        constants = torch.exp(self.constants.detach()).tolist()
+        return dict(zip(self.constant_names, constants, strict=True))
 
-    def told(self, s: Tensor, rudder: Tensor) -> Tensor:
-        newest = 5 + self.observer.pending
-        parts = (s[:, :3], rudder, s[:, 4:newest])
-        if self.observer.pending > 0:
-            parts = (s[:, :3], rudder, torch.cat((s[:, 4 : newest - 1], rudder), dim=1))
-        return torch.cat((parts[0], parts[1], parts[2], s[:, newest:]), dim=1)
+    def with_applied_rudder(self, s: Tensor, rudder: Tensor) -> Tensor:
+        pending_end = 5 + self.observer.n_pending
+        parts = (s[:, :3], rudder, s[:, 4:pending_end])
+        if self.observer.n_pending > 0:
+            parts = (s[:, :3], rudder, torch.cat((s[:, 4 : pending_end - 1], rudder), dim=1))
+        return torch.cat((parts[0], parts[1], parts[2], s[:, pending_end:]), dim=1)
 
-    def memory_ranges(self, turn: float, angle: float) -> dict[str, tuple[float, float]]:
-        push, rudder, half = 1.001 * self.limit, 1.001 * angle, 1.001 * math.pi
-        most = dict(zip(FIXED, (half, 3.0 * turn, push, rudder, rudder), strict=True))
-        most |= {f"pending_{k}": rudder for k in range(self.observer.pending)}
-        most |= {f"unit_{k}": 1.001 for k in range(self.units)}
-        return {name: (-high, high) for name, high in most.items()}
+    def memory_ranges(
+        self, max_yaw_rate: float, max_rudder: float
+    ) -> dict[str, tuple[float, float]]:
+        disturbance, max_pending, half_turn = (
+            1.001 * self.limit,
+            1.001 * max_rudder,
+            1.001 * math.pi,
+        )
+        upper_limits = dict(
+            zip(
+                OBSERVER_MEMORY,
+                (half_turn, 3.0 * max_yaw_rate, disturbance, max_pending, max_pending),
+                strict=True,
+            )
+        )
+        upper_limits |= {f"pending_{k}": max_pending for k in range(self.observer.n_pending)}
+        upper_limits |= {f"unit_{k}": 1.001 for k in range(self.units)}
+        return {name: (-upper, upper) for name, upper in upper_limits.items()}
 
-    def described(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """Return the constants of law and observer, the predictor's lag and the network's units."""
         return {
             "kind": "observed",
-            "constants": self.values(),
+            "constants": self.constant_values(),
             "lag": self.observer.lag,
             "units": self.units,
             "trained_at": self.trained_at,
@@ -352,18 +399,18 @@ class ObservedPolicy(HeadingPolicy):
 
     def initial_state(self, x: Tensor) -> Tensor:
         """Return the memory at the start: heading and yaw rate as seen, rudder amidships."""
-        heading = wrap(x[:, self.psi : self.psi + 1])
-        rest = torch.zeros(x.shape[0], self.n_state - 2, dtype=x.dtype)
-        return torch.cat((heading, x[:, self.r : self.r + 1], rest), dim=-1)
+        heading = wrap_angle(x[:, self.psi : self.psi + 1])
+        zero_memory = torch.zeros(x.shape[0], self.n_state - 2, dtype=x.dtype)
+        return torch.cat((heading, x[:, self.r : self.r + 1], zero_memory), dim=-1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        fixed, waiting = 5, self.observer.pending
-        rudder, last = s[:, 3:4], s[:, 4:5]
-        pending = s[:, fixed : fixed + waiting]
+        n_fixed, n_pending = 5, self.observer.n_pending
+        rudder, last_command = s[:, 3:4], s[:, 4:5]
+        pending = s[:, n_fixed : n_fixed + n_pending]
         constants = list(torch.exp(self.constants).split(1, dim=-1))
         ratio = (x[:, self.u : self.u + 1] / self.speed).clamp(0.3, 3.0)
         psi = x[:, self.psi : self.psi + 1]
-        seen = self.observer(
+        estimate = self.observer(
             psi,
             x[:, self.r : self.r + 1],
             s[:, 0:1],
@@ -371,44 +418,57 @@ class ObservedPolicy(HeadingPolicy):
             s[:, 2:3],
             pending,
             ratio,
-            constants[self.own :],
+            constants[self.n_law_constants :],
         )
-        error = wrap(reference - seen.heading_ahead)
+        error = wrap_angle(reference - estimate.predicted_heading)
         decay = ratio / self.time
         force = decay * self.gain * ratio * self.limit
-        felt = self.observer.righted(seen.push, seen.heading_ahead, ratio)
-        acting = (rudder + felt) / self.limit
-        law = self.law(error, seen.r_ahead, acting, force, decay, constants[: self.own])
-        law = law - felt / self.limit
-        memory = s[:, fixed + waiting :]
-        wish = law
+        effective_disturbance = self.observer.with_restoring(
+            estimate.push, estimate.predicted_heading, ratio
+        )
+        rudder_share = (rudder + effective_disturbance) / self.limit
+        law_share = self.law(
+            error,
+            estimate.predicted_r,
+            rudder_share,
+            force,
+            decay,
+            constants[: self.n_law_constants],
+        )
+        law_share = law_share - effective_disturbance / self.limit
+        memory = s[:, n_fixed + n_pending :]
+        unlimited_share = law_share
         if self.units > 0:
-            full = self.gain * ratio * self.limit
-            noise = math.sqrt(self.dt / self.trained_at)
+            max_yaw_rate = self.gain * ratio * self.limit
+            noise_scale = math.sqrt(self.dt / self.trained_at)
             features = torch.cat(
                 (
-                    torch.tanh(wrap(reference - psi) / self.degree),
-                    torch.tanh(error / self.degree),
-                    torch.tanh(error / (5.0 * self.degree)),
-                    error / (30.0 * self.degree),
-                    1.7 * seen.r_ahead / full,
-                    torch.tanh(17.0 * seen.r_ahead / full),
-                    5.0 * seen.push / self.limit,
-                    (3.0 * noise / self.degree) * seen.surprise_heading,
-                    (52.0 * noise) * seen.surprise_r / full,
-                    last / self.limit,
-                    torch.tanh(law),
+                    torch.tanh(wrap_angle(reference - psi) / self.radians_per_degree),
+                    torch.tanh(error / self.radians_per_degree),
+                    torch.tanh(error / (5.0 * self.radians_per_degree)),
+                    error / (30.0 * self.radians_per_degree),
+                    1.7 * estimate.predicted_r / max_yaw_rate,
+                    torch.tanh(17.0 * estimate.predicted_r / max_yaw_rate),
+                    5.0 * estimate.push / self.limit,
+                    (3.0 * noise_scale / self.radians_per_degree) * estimate.heading_innovation,
+                    (52.0 * noise_scale) * estimate.r_innovation / max_yaw_rate,
+                    last_command / self.limit,
+                    torch.tanh(law_share),
                 ),
                 dim=1,
             )
             correction, memory = self.network(features, memory, self.dt)
-            wish = law + correction
-        command = self.limit * wish.clamp(-1.0, 1.0)
-        follows = rudder + (command - rudder).clamp(-self.travel, self.travel)
-        queue = torch.cat((pending, follows), dim=1)
-        felt = self.observer.righted(seen.push, seen.heading, ratio)
-        heading, yaw_rate = self.observer.expected(seen.heading, seen.r, felt, queue[:, 0:1], ratio)
-        s = torch.cat((heading, yaw_rate, seen.push, follows, command, queue[:, 1:], memory), dim=1)
+            unlimited_share = law_share + correction
+        command = self.limit * unlimited_share.clamp(-1.0, 1.0)
+        next_rudder = rudder + (command - rudder).clamp(-self.max_rudder_step, self.max_rudder_step)
+        queue = torch.cat((pending, next_rudder), dim=1)
+        effective_disturbance = self.observer.with_restoring(estimate.push, estimate.heading, ratio)
+        heading, yaw_rate = self.observer.predict_step(
+            estimate.heading, estimate.r, effective_disturbance, queue[:, 0:1], ratio
+        )
+        s = torch.cat(
+            (heading, yaw_rate, estimate.push, next_rudder, command, queue[:, 1:], memory), dim=1
+        )
         return command, s
 
 
@@ -424,9 +484,9 @@ class NetworkPolicy(HeadingPolicy):
     Memory s [B, 2 + units]: rudder and last command in rad, then the network's units.
 
     Args:
-        turning: K, T and speed of the vessel about straight ahead.
+        nomoto: K, T and speed of the vessel about straight ahead.
         limit: of the rudder in rad.
-        dt: step of the controller in s; `at` changes it.
+        dt: step of the controller in s; `set_step` changes it.
         rate: of the rudder in rad/s; None where it stands at its command at once.
         units: of the network, at least one.
         trained_at: step in s that the network is trained at.
@@ -436,65 +496,67 @@ class NetworkPolicy(HeadingPolicy):
         self,
         state: Sequence[str],
         *,
-        turning: Turning,
+        nomoto: NomotoModel,
         limit: float,
         dt: float,
         rate: float | None = None,
         units: int,
         trained_at: float = 0.04,
     ) -> None:
-        super().__init__(state, turning, limit, rate)
-        self.units, self.degree, self.trained_at = units, _DEGREE, trained_at
-        self.network = OddCell(8, units, trained_at, hidden=units)
+        super().__init__(state, nomoto, limit, rate)
+        self.units, self.radians_per_degree, self.trained_at = units, _DEGREE, trained_at
+        self.network = OddGRUCell(8, units, trained_at, hidden=units)
         self.n_state = 2 + units
-        self.at(dt)
+        self.set_step(dt)
 
-    def values(self) -> dict[str, float]:
+    def constant_values(self) -> dict[str, float]:
         """Return no constants: there is no law that has any."""
         return {}
 
-    def told(self, s: Tensor, rudder: Tensor) -> Tensor:
+    def with_applied_rudder(self, s: Tensor, rudder: Tensor) -> Tensor:
         return torch.cat((rudder, s[:, 1:]), dim=1)
 
-    def memory_ranges(self, turn: float, angle: float) -> dict[str, tuple[float, float]]:
-        most = dict.fromkeys(("rudder", "last_command"), 1.001 * angle)
-        most |= {f"unit_{k}": 1.001 for k in range(self.units)}
-        return {name: (-high, high) for name, high in most.items()}
+    def memory_ranges(
+        self, max_yaw_rate: float, max_rudder: float
+    ) -> dict[str, tuple[float, float]]:
+        upper_limits = dict.fromkeys(("rudder", "last_command"), 1.001 * max_rudder)
+        upper_limits |= {f"unit_{k}": 1.001 for k in range(self.units)}
+        return {name: (-upper, upper) for name, upper in upper_limits.items()}
 
-    def described(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """Return the network's units and the step of its training."""
         return {"kind": "network", "units": self.units, "trained_at": self.trained_at}
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        rudder, last, memory = s[:, 0:1], s[:, 1:2], s[:, 2:]
+        rudder, last_command, memory = s[:, 0:1], s[:, 1:2], s[:, 2:]
         ratio = (x[:, self.u : self.u + 1] / self.speed).clamp(0.3, 3.0)
-        error = wrap(reference - x[:, self.psi : self.psi + 1]) / self.degree
-        turning = x[:, self.r : self.r + 1] / (self.gain * ratio * self.limit)
+        error = wrap_angle(reference - x[:, self.psi : self.psi + 1]) / self.radians_per_degree
+        relative_yaw_rate = x[:, self.r : self.r + 1] / (self.gain * ratio * self.limit)
         features = torch.cat(
             (
                 torch.tanh(error),
                 torch.tanh(error / 5.0),
                 torch.tanh(error / 20.0),
                 error / 30.0,
-                1.7 * turning,
-                torch.tanh(17.0 * turning),
+                1.7 * relative_yaw_rate,
+                torch.tanh(17.0 * relative_yaw_rate),
                 rudder / self.limit,
-                last / self.limit,
+                last_command / self.limit,
             ),
             dim=1,
         )
-        wish, memory = self.network(features, memory, self.dt)
-        command = self.limit * wish.clamp(-1.0, 1.0)
-        follows = rudder + (command - rudder).clamp(-self.travel, self.travel)
-        return command, torch.cat((follows, command, memory), dim=1)
+        unlimited_share, memory = self.network(features, memory, self.dt)
+        command = self.limit * unlimited_share.clamp(-1.0, 1.0)
+        next_rudder = rudder + (command - rudder).clamp(-self.max_rudder_step, self.max_rudder_step)
+        return command, torch.cat((next_rudder, command, memory), dim=1)
 
 
-SIGHT = ("lookahead", "depth_rate", "drift_rate")
+SIGHT_CONSTANTS = ("lookahead", "depth_rate", "drift_rate")
 """Of a depth policy: look-ahead distance in m, and how fast depth and drift follow what is
 measured, in 1/s."""
-DEEP = 1.2e4
+MAX_DEPTH = 1.2e4
 """Largest depth in m, beyond the deepest sea."""
-_DRIFT = 0.5
+_MAX_DRIFT_SHARE = 0.5
 """Largest drift of the depth as a share of the speed."""
 
 
@@ -510,8 +572,8 @@ class DepthPolicy(HeadingPolicy):
     Memory s [B, 2 + k]: z expected [m], d [m/s], then that of the law.
 
     Args:
-        turning: K, T, c and speed of the dive angle.
-        constants: `SIGHT`, all positive.
+        nomoto: K, T, c and speed of the dive angle.
+        constants: `SIGHT_CONSTANTS`, all positive.
         steepest: largest dive angle wanted in rad.
         limit, rate, dt: as of a heading policy, of the planes.
     """
@@ -523,7 +585,7 @@ class DepthPolicy(HeadingPolicy):
         self,
         state: Sequence[str],
         *,
-        turning: Turning,
+        nomoto: NomotoModel,
         law: AnglePolicy,
         constants: Mapping[str, float | Tensor],
         steepest: float,
@@ -531,77 +593,88 @@ class DepthPolicy(HeadingPolicy):
         dt: float,
         rate: float | None = None,
     ) -> None:
-        super().__init__(state, turning, limit, rate)
-        self.law, self.steepest, self.share = law, steepest, _DRIFT
-        law.read_from(tuple(HeadingPolicy.measured))
-        values = [torch.as_tensor(constants[name], dtype=torch.float32) for name in SIGHT]
+        super().__init__(state, nomoto, limit, rate)
+        self.law, self.steepest, self.max_drift_share = law, steepest, _MAX_DRIFT_SHARE
+        law.set_state_columns(tuple(HeadingPolicy.measured))
+        values = [torch.as_tensor(constants[name], dtype=torch.float32) for name in SIGHT_CONSTANTS]
         self.constants = torch.nn.Parameter(torch.stack(values, dim=-1).log())
-        self.at(dt)
+        self.set_step(dt)
 
-    def read_from(self, state: Sequence[str]) -> None:
+    def set_state_columns(self, state: Sequence[str]) -> None:
         """Take depth, speed, pitch and pitch rate from a state with these names."""
-        self.columns = [state.index(name) for name in self.measured]
+        self.state_columns = [state.index(name) for name in self.measured]
 
-    def at(self, dt: float) -> None:
-        super().at(dt)
-        self.law.at(dt)
+    def set_step(self, dt: float) -> None:
+        super().set_step(dt)
+        self.law.set_step(dt)
         self.n_state = 2 + self.law.n_state
 
     def without_network(self) -> DepthPolicy:
         """Return a copy whose law has no network."""
-        alone, law = copy.deepcopy(self), self.law
+        policy, law = copy.deepcopy(self), self.law
         assert isinstance(law, ObservedPolicy)
-        alone.law = law.without_network()
-        return alone
+        policy.law = law.without_network()
+        return policy
 
-    def values(self) -> dict[str, float]:
+    def constant_values(self) -> dict[str, float]:
         """Return the constants by name, those of an observed law too."""
-        found = dict(zip(SIGHT, torch.exp(self.constants.detach()).tolist(), strict=True))
-        return found | (self.law.values() if isinstance(self.law, ObservedPolicy) else {})
+        constants = dict(
+            zip(SIGHT_CONSTANTS, torch.exp(self.constants.detach()).tolist(), strict=True)
+        )
+        return constants | (
+            self.law.constant_values() if isinstance(self.law, ObservedPolicy) else {}
+        )
 
-    def memory_ranges(self, turn: float, angle: float) -> dict[str, tuple[float, float]]:
+    def memory_ranges(
+        self, max_yaw_rate: float, max_rudder: float
+    ) -> dict[str, tuple[float, float]]:
         assert isinstance(self.law, HeadingPolicy)
-        fast = 3.1 * self.share * self.speed
-        own = {"depth": (-1.01 * DEEP, 1.01 * DEEP), "drift": (-fast, fast)}
-        return own | self.law.memory_ranges(turn, angle)
+        max_drift = 3.1 * self.max_drift_share * self.speed
+        depth_ranges = {
+            "depth": (-1.01 * MAX_DEPTH, 1.01 * MAX_DEPTH),
+            "drift": (-max_drift, max_drift),
+        }
+        return depth_ranges | self.law.memory_ranges(max_yaw_rate, max_rudder)
 
-    def described(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """Return the constants, the steepest dive, and what the law says of itself."""
         assert isinstance(self.law, HeadingPolicy)
         return {
             "kind": "depth",
-            "constants": dict(zip(SIGHT, torch.exp(self.constants.detach()).tolist(), strict=True)),
+            "constants": dict(
+                zip(SIGHT_CONSTANTS, torch.exp(self.constants.detach()).tolist(), strict=True)
+            ),
             "steepest": self.steepest,
-            "law": self.law.described(),
+            "law": self.law.describe(),
         }
 
-    def told(self, s: Tensor, rudder: Tensor) -> Tensor:
-        return torch.cat((s[:, :2], self.law.told(s[:, 2:], rudder)), dim=1)
+    def with_applied_rudder(self, s: Tensor, rudder: Tensor) -> Tensor:
+        return torch.cat((s[:, :2], self.law.with_applied_rudder(s[:, 2:], rudder)), dim=1)
 
-    def _angled(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def _to_angle_state(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return the depth [B, 1], and dive angle, speed and rate [B, 3] as the law sees them."""
-        z, u, theta, q = x[:, self.columns].split(1, dim=1)
+        z, u, theta, q = x[:, self.state_columns].split(1, dim=1)
         return z, torch.cat((-theta, u, -q), dim=1)
 
     def initial_state(self, x: Tensor) -> Tensor:
         """Return the memory at the start: the depth as seen, no drift."""
-        z, angled = self._angled(x)
-        return torch.cat((z, torch.zeros_like(z), self.law.initial_state(angled)), dim=-1)
+        z, angle_state = self._to_angle_state(x)
+        return torch.cat((z, torch.zeros_like(z), self.law.initial_state(angle_state)), dim=-1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        z, angled = self._angled(x)
-        lookahead, follow, learn = torch.exp(self.constants).split(1, dim=-1)
-        u = angled[:, 1:2].clamp(0.3 * self.speed, 3.0 * self.speed)
-        surprise = z - s[:, 0:1]
+        z, angle_state = self._to_angle_state(x)
+        lookahead, depth_rate, drift_rate = torch.exp(self.constants).split(1, dim=-1)
+        u = angle_state[:, 1:2].clamp(0.3 * self.speed, 3.0 * self.speed)
+        innovation = z - s[:, 0:1]
         # no vessel does this within a step: the estimate begins anew, with the drift as it was
-        surprise = torch.where(surprise.abs() > u, torch.zeros_like(z), surprise)
-        known = z - surprise
-        depth = known + (1.0 - torch.exp(-self.dt * follow)) * surprise
-        most = self.share * u
-        drift = s[:, 1:2] + (self.dt * follow * learn) * surprise
-        drift = torch.minimum(torch.maximum(drift, -most), most)
-        wanted = torch.atan((reference - depth) / lookahead) - drift / u
-        wanted = wanted.clamp(-self.steepest, self.steepest)
-        command, memory = self.law(angled, wanted, s[:, 2:])
-        moved = depth + self.dt * (u * torch.sin(angled[:, 0:1]) + drift)
-        return command, torch.cat((moved, drift, memory), dim=1)
+        innovation = torch.where(innovation.abs() > u, torch.zeros_like(z), innovation)
+        predicted_depth = z - innovation
+        depth = predicted_depth + (1.0 - torch.exp(-self.dt * depth_rate)) * innovation
+        max_drift = self.max_drift_share * u
+        drift = s[:, 1:2] + (self.dt * depth_rate * drift_rate) * innovation
+        drift = torch.minimum(torch.maximum(drift, -max_drift), max_drift)
+        target_angle = torch.atan((reference - depth) / lookahead) - drift / u
+        target_angle = target_angle.clamp(-self.steepest, self.steepest)
+        command, memory = self.law(angle_state, target_angle, s[:, 2:])
+        next_depth = depth + self.dt * (u * torch.sin(angle_state[:, 0:1]) + drift)
+        return command, torch.cat((next_depth, drift, memory), dim=1)

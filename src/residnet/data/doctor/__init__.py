@@ -1,7 +1,7 @@
 """The data doctor: what logs hold, what is wrong with them, and whether a fit would be misled.
 
 A check is a function with `@check` above it, in the module of its subject; it reads a `Record` and
-yields findings. `STAGES` says when it looks, and at what state of the log.
+yields findings. `STAGE_DESCRIPTIONS` says when it looks, and at what state of the log.
 """
 
 from __future__ import annotations
@@ -13,44 +13,44 @@ import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.data.align import GridConfig, align
+from residnet.data.align import GridConfig, align_to_grid
 from residnet.data.doctor import actuators, excitation, frames, inputs, values
-from residnet.data.doctor.between import Together
-from residnet.data.doctor.clock import date_findings
-from residnet.data.doctor.effects import Effects
-from residnet.data.doctor.excitation import conditioning
+from residnet.data.doctor.between import LogSet
+from residnet.data.doctor.clock import find_clock_rate_errors
+from residnet.data.doctor.effects import FindingEffects
+from residnet.data.doctor.excitation import compute_condition_number
 from residnet.data.doctor.findings import (
     CHECKS,
     Finding,
-    Report,
-    imported,
-    inspection,
-    run,
-    summary,
+    InspectionReport,
+    build_inspection,
+    convert_reader_findings,
+    run_checks,
+    summarize_inspection,
 )
-from residnet.data.doctor.statistics import MEASURED, Record
-from residnet.data.masks import Mask, apply_masks
-from residnet.data.motion import as_recorded
+from residnet.data.doctor.statistics import MOTION_CHANNELS, LogStatistics
+from residnet.data.masks import MaskRule, apply_masks
+from residnet.data.motion import original_input_names
 
 __all__ = [
     "CHECKS",
-    "STAGES",
+    "STAGE_DESCRIPTIONS",
     "Finding",
-    "Report",
+    "InspectionReport",
     "actuators",
-    "conditioning",
-    "date_findings",
+    "build_inspection",
+    "compute_condition_number",
     "excitation",
+    "find_clock_rate_errors",
     "frames",
     "inputs",
-    "inspect",
-    "inspect_together",
-    "inspection",
-    "summary",
+    "inspect_log",
+    "inspect_log_set",
+    "summarize_inspection",
     "values",
 ]
 
-STAGES = {
+STAGE_DESCRIPTIONS = {
     "header": "as recorded",
     "order": "as recorded; a finding here ends the examination",
     "clock": "as recorded, with an increasing clock",
@@ -64,7 +64,9 @@ STAGES = {
 """Stage -> the state of the log that its checks see, in the order of the stages."""
 
 
-def inspect(log: Log, inputs: Sequence[str] | None = None, masks: Sequence[Mask] = ()) -> Report:
+def inspect_log(
+    log: Log, inputs: Sequence[str] | None = None, masks: Sequence[MaskRule] = ()
+) -> InspectionReport:
     """Examine one log as recorded (before the grid, whose effect it cannot see).
 
     Args:
@@ -85,54 +87,74 @@ def inspect(log: Log, inputs: Sequence[str] | None = None, masks: Sequence[Mask]
             raise DataError(
                 f"log {log.name}: channel {name} holds no number; take it out of the channel map"
             )
-    driving = [name for name in log.channels if name not in MEASURED]
-    driving = driving if inputs is None else as_recorded(log, inputs)
-    log.stack(driving)
-    raw = Record(log, driving)
-    found = [*imported(log.meta.get("findings", ())), *run("header", raw)]
+    driving_inputs = [name for name in log.channels if name not in MOTION_CHANNELS]
+    driving_inputs = driving_inputs if inputs is None else original_input_names(log, inputs)
+    log.stack(driving_inputs)
+    raw_statistics = LogStatistics(log, driving_inputs)
+    findings = [
+        *convert_reader_findings(log.meta.get("findings", ())),
+        *run_checks("header", raw_statistics),
+    ]
     source = str(log.meta.get("source", ""))
-    broken = [*run("order", raw)]
-    if broken:
-        return Report(log.name, (*found, *broken), source)
-    record = Record(values.unwrapped(log), driving)
-    about_values = [*run("values", record)]
-    found += [*run("clock", raw), *about_values]
-    wrong = [one.at for one in about_values if one.spoils and one.at is not None]
-    bad = np.logical_or.reduce([np.zeros(len(log), dtype=bool), *wrong])
-    trusted = record if bad.mean() > 0.5 else record.without(bad)
-    found += _on_grid(trusted)
-    found += [*run("inputs", record), *run("actuators", trusted), *run("excitation", record)]
-    left_out = ~apply_masks(log, masks).usable if masks else np.zeros(len(log), dtype=bool)
-    found = [one.excused(left_out) for one in found]
-    if any(one.level == "will mislead" for one in found):
-        effects = Effects(record.without(left_out))
-        found = [effects.measured(one) for one in found]
-    return Report(log.name, tuple(found), source)
+    order_findings = [*run_checks("order", raw_statistics)]
+    if order_findings:
+        return InspectionReport(log.name, (*findings, *order_findings), source)
+    statistics = LogStatistics(values.unwrap_headings(log), driving_inputs)
+    value_findings = [*run_checks("values", statistics)]
+    findings += [*run_checks("clock", raw_statistics), *value_findings]
+    invalid_masks = [
+        finding.sample_mask
+        for finding in value_findings
+        if finding.invalidates_samples and finding.sample_mask is not None
+    ]
+    invalid = np.logical_or.reduce([np.zeros(len(log), dtype=bool), *invalid_masks])
+    trusted_statistics = statistics if invalid.mean() > 0.5 else statistics.mask_samples(invalid)
+    findings += _check_on_grid(trusted_statistics)
+    findings += [
+        *run_checks("inputs", statistics),
+        *run_checks("actuators", trusted_statistics),
+        *run_checks("excitation", statistics),
+    ]
+    masked = ~apply_masks(log, masks).usable if masks else np.zeros(len(log), dtype=bool)
+    findings = [finding.downgrade_if_masked(masked) for finding in findings]
+    if any(finding.level == "will mislead" for finding in findings):
+        effects = FindingEffects(statistics.mask_samples(masked))
+        findings = [effects.measure(finding) for finding in findings]
+    return InspectionReport(log.name, tuple(findings), source)
 
 
-def _on_grid(log: Record) -> list[Finding]:
+def _check_on_grid(log: LogStatistics) -> list[Finding]:
     """Return the findings of the checks that need a uniform grid, told at the log's own samples."""
-    few = log.few
+    subsample = log.subsample
     # from one stretch to the next a heading may have turned round many times
-    whole = few.log if few is log else values.unwrapped(few.log)
+    unwrapped_log = subsample.log if subsample is log else values.unwrap_headings(subsample.log)
     try:
-        grid = few.on(values.upright(align(whole, GridConfig(step=log.step))))
+        gridded = subsample.on_grid(
+            values.horizontal_motion(
+                align_to_grid(unwrapped_log, GridConfig(step=log.sampling_interval))
+            )
+        )
     except DataError as error:
         return [Finding("fatal", "clock_span", f"frames not checked: {error}")]
-    if few is not log:
+    if subsample is not log:
         # what single samples of a long log do is seen as they were recorded
-        return [*run("grid", log.told_by(grid, values.upright(log.log)))]
-    found = [*run("grid", grid)]
-    near = np.searchsorted(grid.t - grid.t[0], log.t - log.t[0] - 1e-9)
-    near = np.minimum(near, len(grid) - 1)
-    return [one if one.at is None else dataclasses.replace(one, at=one.at[near]) for one in found]
+        return [*run_checks("grid", log.with_subsample(gridded, values.horizontal_motion(log.log)))]
+    findings = [*run_checks("grid", gridded)]
+    nearest_grid_points = np.searchsorted(gridded.t - gridded.t[0], log.t - log.t[0] - 1e-9)
+    nearest_grid_points = np.minimum(nearest_grid_points, len(gridded) - 1)
+    return [
+        finding
+        if finding.sample_mask is None
+        else dataclasses.replace(finding, sample_mask=finding.sample_mask[nearest_grid_points])
+        for finding in findings
+    ]
 
 
-def inspect_together(
+def inspect_log_set(
     logs: Sequence[Log],
     inputs: Sequence[str] | None = None,
     splits: Mapping[str, str] | None = None,
-) -> Report:
+) -> InspectionReport:
     """Examine logs beside each other: copies, runs cut into files, ranges, excitation.
 
     The last is whether a fit to all of them has something to learn from.
@@ -143,8 +165,16 @@ def inspect_together(
             measures.
         splits: log's name -> train, validation or test, where a config says.
     """
-    sound = [log for log in logs if len(log) > 1 and not [*run("order", Record(log))]]
+    ordered_logs = [
+        log for log in logs if len(log) > 1 and not [*run_checks("order", LogStatistics(log))]
+    ]
     if inputs is not None:
-        inputs = [*dict.fromkeys(name for log in sound for name in as_recorded(log, inputs))]
-    found = run("between", Together(sound, inputs, splits or {})) if sound else ()
-    return Report("together", tuple(found))
+        inputs = [
+            *dict.fromkeys(
+                name for log in ordered_logs for name in original_input_names(log, inputs)
+            )
+        ]
+    findings = (
+        run_checks("between", LogSet(ordered_logs, inputs, splits or {})) if ordered_logs else ()
+    )
+    return InspectionReport("together", tuple(findings))

@@ -9,350 +9,469 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from residnet.core.names import sides
-from residnet.core.stretches import stretches
-from residnet.data.channels import SIGMA_OF_MAD, deviation, quantiles
-from residnet.data.doctor.findings import Check, Finding, check, correction
+from residnet.core.names import port_starboard_pairs
+from residnet.core.stretches import find_runs
+from residnet.data.channels import SIGMA_OF_MAD, nan_quantiles, nan_std
+from residnet.data.doctor.findings import Check, Finding, check, make_correction
 from residnet.data.doctor.statistics import (
-    SECTIONS,
-    STEERING,
-    WINDOW,
-    Fit,
-    Record,
-    blocks_of,
-    fit,
-    high,
-    of_inputs,
-    of_motion,
+    N_SECTIONS,
+    SMOOTHING_SAMPLES,
+    STEERING_CHANNELS,
+    LeastSquaresFit,
+    LogStatistics,
+    abs_quantile,
+    fit_least_squares,
+    make_blocks,
+    make_input_terms,
+    make_velocity_terms,
 )
-from residnet.data.statistics import AT_ONCE, FEWEST, Blocks
+from residnet.data.statistics import CHUNK_SAMPLES, MIN_SAMPLES, OverlappingBlocks
 
-_SURE = 6.0
+_MIN_T_STATISTIC = 6.0
 """Standard errors that call a sign wrong: many, since to turn a right one would ruin a fit."""
-_TURN = "turn it in the channel map (sign: -1)"
-_TURN_AND_CHECK = f"{_TURN}, and check the sign of r and psi"
+_REVERSE_SIGN_FIX = "turn it in the channel map (sign: -1)"
+_REVERSE_SIGN_AND_CHECK_FIX = f"{_REVERSE_SIGN_FIX}, and check the sign of r and psi"
 
 
-def propellers(log: Record) -> list[str]:
+def find_propellers(log: LogStatistics) -> list[str]:
     """Return the inputs that are revolutions."""
-    found = [name for name in log.inputs if log.units[name] == "1/s" and high(log[name], 1.0) > 0.0]
+    revolution_inputs = [
+        name
+        for name in log.inputs
+        if log.units[name] == "1/s" and abs_quantile(log[name], 1.0) > 0.0
+    ]
     # what a shaft does tells more than what it was told to do
-    return [name for name in found if not name.startswith("cmd_")] or found
+    return [name for name in revolution_inputs if not name.startswith("cmd_")] or revolution_inputs
 
 
 # rad of turning per revolution, at full rudder; vessels lie between .003 and .03
-_FEWEST_TURNS, _MOST_TURNS = 8e-4, 0.3
+_MIN_TURN_RATIO, _MAX_TURN_RATIO = 8e-4, 0.3
 # no propeller of a vessel turns faster, 1/s
-_FASTEST = 250.0
+_MAX_REVOLUTIONS = 250.0
 _FULL_RUDDER = 0.35
 """Angle of full rudder in rad."""
-_LEAST_STEERING = 0.2
+_MIN_STEERING_SHARE = 0.2
 """Share of full rudder from which on the turning of a vessel tells how fast its propellers are."""
 
 
-@check("actuators", "unit", fix="correct its unit in the channel map", certain=True, few=True)
-def propeller_unit(log: Record, found: Check) -> Iterator[Finding]:
+@check(
+    "actuators",
+    "unit",
+    fix="correct its unit in the channel map",
+    is_record_fault=True,
+    on_subsample=True,
+)
+def check_propeller_unit(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report revolutions that cannot be revolutions per second."""
-    names = log.of(propellers)
+    names = log.cached(find_propellers)
     # one of several may hardly turn while the others drive the vessel
-    driving = max((high(log[name]) for name in names), default=0.0)
+    max_revolutions = max((abs_quantile(log[name]) for name in names), default=0.0)
     for name in names:
-        fastest, factor = high(log[name]), 0.0
-        text = f"{name} reaches {fastest:.3g} 1/s, out of proportion to how the vessel turns"
-        share = _steered(log, names) if "r" in log else 0.0
-        if fastest > _FASTEST:
-            text, factor = f"{name} reaches {fastest:.4g} 1/s, more than any propeller", 60.0
-        elif share > _LEAST_STEERING:
-            ratio = high(log["r"]) / min(share, 1.0) / max(driving, 1e-12)
-            if fastest > 20.0 and ratio < _FEWEST_TURNS:
+        revolutions, factor = abs_quantile(log[name]), 0.0
+        text = f"{name} reaches {revolutions:.3g} 1/s, out of proportion to how the vessel turns"
+        steering_share = _steering_share(log, names) if "r" in log else 0.0
+        if revolutions > _MAX_REVOLUTIONS:
+            text, factor = f"{name} reaches {revolutions:.4g} 1/s, more than any propeller", 60.0
+        elif steering_share > _MIN_STEERING_SHARE:
+            turn_ratio = (
+                abs_quantile(log["r"]) / min(steering_share, 1.0) / max(max_revolutions, 1e-12)
+            )
+            if revolutions > 20.0 and turn_ratio < _MIN_TURN_RATIO:
                 factor = 60.0
-            elif driving < 1.0 and ratio > _MOST_TURNS:
+            elif max_revolutions < 1.0 and turn_ratio > _MAX_TURN_RATIO:
                 factor = 1.0 / 60.0
         if factor:
             text += ": rpm taken as 1/s?" if factor > 1.0 else ": 1/s taken as rpm?"
-            yield found(text, {"largest": fastest}, repair=correction((name,), factor=factor))
+            yield make_finding(
+                text, {"largest": revolutions}, repair=make_correction((name,), factor=factor)
+            )
 
 
-def _steered(log: Record, names: Sequence[str]) -> float:
+def _steering_share(log: LogStatistics, names: Sequence[str]) -> float:
     """Return how far the vessel was steered, as a share of full rudder; 0 where nothing tells.
 
     Without a rudder it is steered by propellers that differ. A vessel that was not steered does
     not turn, however fast its propellers are.
     """
-    rudder = [high(log[name]) / _FULL_RUDDER for name in ("delta", "cmd_delta") if name in log]
-    if rudder:
-        return max(rudder)
-    turns = np.stack([log[name] for name in names])
-    return high(np.ptp(turns, axis=0)) / max(high(np.abs(turns).max(axis=0)), 1e-12)
+    rudder_shares = [
+        abs_quantile(log[name]) / _FULL_RUDDER for name in ("delta", "cmd_delta") if name in log
+    ]
+    if rudder_shares:
+        return max(rudder_shares)
+    revolutions = np.stack([log[name] for name in names])
+    return abs_quantile(np.ptp(revolutions, axis=0)) / max(
+        abs_quantile(np.abs(revolutions).max(axis=0)), 1e-12
+    )
 
 
-@check("actuators", "propeller_sign", fix=_TURN, needs=("u",), certain=True, few=True)
-def propeller_sign(log: Record, found: Check) -> Iterator[Finding]:
+@check(
+    "actuators",
+    "propeller_sign",
+    fix=_REVERSE_SIGN_FIX,
+    required_channels=("u",),
+    is_record_fault=True,
+    on_subsample=True,
+)
+def check_propeller_sign(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report propellers that turn against the way that the vessel goes, or slow it down."""
-    names = log.of(propellers)
-    moving = np.abs(log["u"]) > 0.3 * high(log["u"], 0.9)
-    if not names or not moving.any():
+    names = log.cached(find_propellers)
+    is_moving = np.abs(log["u"]) > 0.3 * abs_quantile(log["u"], 0.9)
+    if not names or not is_moving.any():
         return
-    against = [
+    opposing_propellers = [
         name
         for name in names
-        if float(np.mean((log[name] != 0.0)[moving])) > 0.5
-        and float(np.mean((log[name] * log["u"])[moving & (log[name] != 0.0)] < 0.0)) > 0.9
+        if float(np.mean((log[name] != 0.0)[is_moving])) > 0.5
+        and float(np.mean((log[name] * log["u"])[is_moving & (log[name] != 0.0)] < 0.0)) > 0.9
     ]
-    rate = log["r"][moving & np.isfinite(log["r"])] if "r" in log else np.zeros(0)
-    one_way = not rate.size or abs(float(rate.mean())) > 0.8 * float(np.abs(rate).mean())
-    if len(against) < len(names) and one_way:
+    yaw_rate = log["r"][is_moving & np.isfinite(log["r"])] if "r" in log else np.zeros(0)
+    is_one_sided = not yaw_rate.size or abs(float(yaw_rate.mean())) > 0.8 * float(
+        np.abs(yaw_rate).mean()
+    )
+    if len(opposing_propellers) < len(names) and is_one_sided:
         # a propeller that runs astern beside one that runs ahead is how such a vessel turns
-        against = []
-    for name in against:
+        opposing_propellers = []
+    for name in opposing_propellers:
         text = f"{name} turns against the way that the vessel goes"
-        yield found(text, repair=correction((name,), factor=-1.0))
-    for name, sure in () if against else _reversed(log, names).items():
-        text = f"more {name} makes the vessel slower ({sure:.0f} standard errors)"
-        yield found(text, {"t": sure}, repair=correction((name,), factor=-1.0))
+        yield make_finding(text, repair=make_correction((name,), factor=-1.0))
+    for name, t_statistic in (
+        () if opposing_propellers else _find_reversed_propellers(log, names).items()
+    ):
+        text = f"more {name} makes the vessel slower ({t_statistic:.0f} standard errors)"
+        yield make_finding(text, {"t": t_statistic}, repair=make_correction((name,), factor=-1.0))
 
 
-def _reversed(log: Record, names: Sequence[str]) -> dict[str, float]:
+def _find_reversed_propellers(log: LogStatistics, names: Sequence[str]) -> dict[str, float]:
     """Return reversed propellers, and by how many standard errors their thrust is the wrong way.
 
     All choices of signs are compared by how well the sum of thrusts explains the surge: effects of
     single propellers cannot be told apart where one runs ahead while the other runs astern.
     """
-    blocks, u = log.of(blocks_of, "u"), log["u"]
-    drift = [log["v"] * log["r"], log["r"] ** 2] if "v" in log and "r" in log else []
+    blocks, u = log.cached(make_blocks, "u"), log["u"]
+    drift_terms = [log["v"] * log["r"], log["r"] ** 2] if "v" in log and "r" in log else []
     thrusts = np.stack([log[name] * np.abs(log[name]) for name in names], axis=-1)
-    table = np.column_stack((np.ones(len(log)), u, u * np.abs(u), *drift, thrusts))
-    x, y = blocks.integrals(table)(0), blocks.change(u)
-    if (np.isfinite(x).all(axis=1) & np.isfinite(y)).sum() < 40:
+    regressors = np.column_stack((np.ones(len(log)), u, u * np.abs(u), *drift_terms, thrusts))
+    integrated_regressors, velocity_changes = (
+        blocks.make_integrator(regressors)(0),
+        blocks.compute_changes(u),
+    )
+    if (np.isfinite(integrated_regressors).all(axis=1) & np.isfinite(velocity_changes)).sum() < 40:
         return {}
-    known, each = x[:, : -len(names)], x[:, -len(names) :]
+    common_terms, thrust_integrals = (
+        integrated_regressors[:, : -len(names)],
+        integrated_regressors[:, -len(names) :],
+    )
 
-    trials = [
-        np.array((1.0, *rest)) for rest in itertools.product((1.0, -1.0), repeat=len(names) - 1)
+    sign_choices = [
+        np.array((1.0, *other_signs))
+        for other_signs in itertools.product((1.0, -1.0), repeat=len(names) - 1)
     ]
-    fits = [fit(np.column_stack((known, each @ signs)), y) for signs in trials]
-    best = min(range(len(fits)), key=lambda i: fits[i].left)
+    fits = [
+        fit_least_squares(
+            np.column_stack((common_terms, thrust_integrals @ signs)), velocity_changes
+        )
+        for signs in sign_choices
+    ]
+    best_index = min(range(len(fits)), key=lambda i: fits[i].sum_of_squares)
     # other signs must leave clearly less than those that were logged
-    best = best if fits[best].left < 0.6 * fits[0].left else 0
-    signs, sure = trials[best], fits[best].sure
-    total = thrusts @ signs
+    best_index = best_index if fits[best_index].sum_of_squares < 0.6 * fits[0].sum_of_squares else 0
+    signs, t_statistic = sign_choices[best_index], fits[best_index].t_statistic
+    total_thrust = thrusts @ signs
     # of a thrust that hardly varies the effect cannot be told
-    varied = deviation(total) / max(high(total, 1.0), 1e-12)
-    if abs(sure) < _SURE or varied < 0.2:
+    relative_variation = nan_std(total_thrust) / max(abs_quantile(total_thrust, 1.0), 1e-12)
+    if abs(t_statistic) < _MIN_T_STATISTIC or relative_variation < 0.2:
         return {}
     return {
-        n: abs(sure) for n, sign in zip(names, signs * np.sign(sure), strict=True) if sign < 0.0
+        n: abs(t_statistic)
+        for n, sign in zip(names, signs * np.sign(t_statistic), strict=True)
+        if sign < 0.0
     }
 
 
 @dataclass(frozen=True)
-class Neutral:
+class NeutralRudderAngle:
     """The rudder angle at which the vessel goes straight, rad, and its standard error."""
 
     angle: float
-    error: float
-    effect: float
-    effect_error: float
+    standard_error: float
+    rudder_effect: float
+    rudder_effect_error: float
 
 
-def neutral_angle(log: Record) -> Neutral | None:
+def estimate_neutral_angle(log: LogStatistics) -> NeutralRudderAngle | None:
     """Return the neutral angle of delta, from the yaw moment that is there without any rudder."""
-    found = _yaw_fit(log)
-    if found is None or not abs(found.values[1]) > 4.0 * found.errors[1]:
+    yaw_fit = _fit_yaw_model(log)
+    if yaw_fit is None or not abs(yaw_fit.coefficients[1]) > 4.0 * yaw_fit.standard_errors[1]:
         return None
-    moment, effect = (float(value) for value in found.values[:2])
-    gradient = np.array([-1.0 / effect, moment / effect**2])
-    error = float(np.sqrt(max(gradient @ found.spread[:2, :2] @ gradient, 0.0)))
-    return Neutral(-moment / effect, error, effect, float(found.errors[1]))
+    moment, rudder_effect = (float(value) for value in yaw_fit.coefficients[:2])
+    gradient = np.array([-1.0 / rudder_effect, moment / rudder_effect**2])
+    standard_error = float(np.sqrt(max(gradient @ yaw_fit.covariance[:2, :2] @ gradient, 0.0)))
+    return NeutralRudderAngle(
+        -moment / rudder_effect, standard_error, rudder_effect, float(yaw_fit.standard_errors[1])
+    )
 
 
-def _yaw_table(log: Record, *further: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _yaw_regression_data(
+    log: LogStatistics, *additional_angles: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows of a yaw model linear in the rudder angle, x [K, k] and y [K].
 
     The first two columns are the moment without rudder and the effect of the rudder, those of
-    `further` ones [T], which act as the rudder does, come next.
+    `additional_angles` ones [T], which act as the rudder does, come next.
     """
-    blocks, u, r = log.of(blocks_of, "r"), log["u"], log["r"]
+    blocks, u, r = log.cached(make_blocks, "r"), log["u"], log["r"]
     v = log["v"] if "v" in log else np.zeros(len(log))
-    speed = u * np.abs(u)
+    flow_squared = u * np.abs(u)
     if "n" in log:
-        race = log["n"] * np.abs(log["n"])
-        speed, race = (flow / max(float(np.nanmean(np.abs(flow))), 1e-9) for flow in (speed, race))
-        speed = speed + race
-    columns = [speed, speed * log["delta"], *(speed * one for one in further)]
-    columns += [np.abs(u) * r, r * np.abs(r), np.abs(u) * v, v * np.abs(v)]
+        propeller_race = log["n"] * np.abs(log["n"])
+        flow_squared, propeller_race = (
+            flow / max(float(np.nanmean(np.abs(flow))), 1e-9)
+            for flow in (flow_squared, propeller_race)
+        )
+        flow_squared = flow_squared + propeller_race
+    regressors = [
+        flow_squared,
+        flow_squared * log["delta"],
+        *(flow_squared * angle for angle in additional_angles),
+    ]
+    regressors += [np.abs(u) * r, r * np.abs(r), np.abs(u) * v, v * np.abs(v)]
     if "wind_speed" in log and "wind_dir" in log:
-        side = log["wind_dir"] - (log["psi"] if "psi" in log else np.zeros(len(log)))
-        columns += [log["wind_speed"] ** 2 * np.sin(k * side) for k in (1.0, 2.0)]
-    return blocks.integrals(np.stack(columns, axis=-1))(0), blocks.change(r)
+        relative_wind_angle = log["wind_dir"] - (log["psi"] if "psi" in log else np.zeros(len(log)))
+        regressors += [log["wind_speed"] ** 2 * np.sin(k * relative_wind_angle) for k in (1.0, 2.0)]
+    return blocks.make_integrator(np.stack(regressors, axis=-1))(0), blocks.compute_changes(r)
 
 
-def _yaw_fit(log: Record, *further: np.ndarray) -> Fit | None:
+def _fit_yaw_model(log: LogStatistics, *additional_angles: np.ndarray) -> LeastSquaresFit | None:
     """Return the fit of the yaw model; None where the log does not tell."""
     if any(name not in log for name in ("delta", "u", "r")):
         return None
-    found = fit(*_yaw_table(log, *further))
-    varies = log.std("delta") >= math.radians(1.0)
-    return found if found.rest.size >= 60 and varies else None
+    yaw_fit = fit_least_squares(*_yaw_regression_data(log, *additional_angles))
+    is_rudder_excited = log.std("delta") >= math.radians(1.0)
+    return yaw_fit if yaw_fit.residuals.size >= 60 and is_rudder_excited else None
 
 
-@check("actuators", "rudder_bias", needs=("delta",), certain=True, few=True)
-def rudder_bias(log: Record, found: Check) -> Iterator[Finding]:
+@check(
+    "actuators",
+    "rudder_bias",
+    required_channels=("delta",),
+    is_record_fault=True,
+    on_subsample=True,
+)
+def check_rudder_bias(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report a rudder whose zero is not where the vessel goes straight, or that is reversed."""
-    neutral = log.of(neutral_angle) if "delta" in log.inputs else None
+    neutral = log.cached(estimate_neutral_angle) if "delta" in log.inputs else None
     if neutral is None:
         return
-    if neutral.effect < -_SURE * neutral.effect_error:
+    if neutral.rudder_effect < -_MIN_T_STATISTIC * neutral.rudder_effect_error:
         text = "positive delta turns the vessel to port"
-        yield found(text, {"effect": neutral.effect}, code="rudder_sign", fix=_TURN_AND_CHECK)
+        yield make_finding(
+            text,
+            {"effect": neutral.rudder_effect},
+            code="rudder_sign",
+            fix=_REVERSE_SIGN_AND_CHECK_FIX,
+        )
     # hulls and single propellers have a neutral angle of a degree or so; beyond 2.6 even a wind is
     # no excuse
-    elif abs(neutral.angle) > max(math.radians(2.6), _SURE * neutral.error):
+    elif abs(neutral.angle) > max(math.radians(2.6), _MIN_T_STATISTIC * neutral.standard_error):
         text = (
             f"the vessel goes straight at delta = {math.degrees(neutral.angle):+.1f} +-"
-            f" {math.degrees(2.0 * neutral.error):.1f} deg"
+            f" {math.degrees(2.0 * neutral.standard_error):.1f} deg"
         )
-        yield found(
+        yield make_finding(
             text,
-            {"angle": neutral.angle, "error": neutral.error},
+            {"angle": neutral.angle, "error": neutral.standard_error},
             fix="take the offset off, or give a steady wind or current as an input",
-            repair=correction(("delta",), offset=-neutral.angle),
+            repair=make_correction(("delta",), offset=-neutral.angle),
         )
 
 
-_WIDER = "log with a wider range, or leave these parts out"
+_WIDER_RANGE_FIX = "log with a wider range, or leave these parts out"
 
 
 # share of the time at one end, and how much harder the vessel then turns
-_AT_END, _HARDER, _SURE_AT_END = 0.03, 1.3, 4.5
+_MIN_SHARE_AT_LIMIT, _MIN_EFFECT_RATIO, _MIN_T_STATISTIC_AT_LIMIT = 0.03, 1.3, 4.5
 
 
 @check(
     "actuators",
     "rudder_clipped",
-    fix=_WIDER,
-    needs=("delta", "u", "r"),
-    certain=True,
-    few=True,
+    fix=_WIDER_RANGE_FIX,
+    required_channels=("delta", "u", "r"),
+    is_record_fault=True,
+    on_subsample=True,
 )
-def rudder_clipped(log: Record, found: Check) -> Iterator[Finding]:
+def check_rudder_clipping(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report a rudder at whose recorded limit the vessel turns harder than the angle explains."""
-    size = high(log["delta"], 1.0)
-    at_end = np.abs(log["delta"]) > 0.999 * size
-    share, visits = float(at_end.mean()), stretches(at_end)[0].size
+    rudder_limit = abs_quantile(log["delta"], 1.0)
+    is_at_limit = np.abs(log["delta"]) > 0.999 * rudder_limit
+    share_at_limit, n_visits = float(is_at_limit.mean()), find_runs(is_at_limit)[0].size
     # a turning circle goes there once, and all of it lies there
-    if "delta" not in log.inputs or not _AT_END < share < 1.0 - _AT_END or visits < 3:
+    if (
+        "delta" not in log.inputs
+        or not _MIN_SHARE_AT_LIMIT < share_at_limit < 1.0 - _MIN_SHARE_AT_LIMIT
+        or n_visits < 3
+    ):
         return
     # the ramps of a zigzag tell the effect of smaller angles
-    fitted, beyond = _yaw_fit(log, np.sign(log["delta"]) * at_end), 0.0
-    if fitted is not None:
-        sure = float(abs(fitted.values[2]) / fitted.errors[2])
-        more = float(fitted.values[2] / (fitted.values[1] * size))
-        beyond = sure if more > _HARDER - 1.0 and sure > _SURE_AT_END else 0.0
-    beyond = max(beyond, _unexplained(log, at_end) if visits >= 8 else 0.0)
-    if beyond > 0.0:
-        text = (
-            f"at {math.degrees(size):.1f} deg of delta the vessel turns harder than smaller angles"
-            f" explain ({beyond:.1f} times what they leave open): its record is cut off there"
+    yaw_fit, excess_statistic = _fit_yaw_model(log, np.sign(log["delta"]) * is_at_limit), 0.0
+    if yaw_fit is not None:
+        t_statistic = float(abs(yaw_fit.coefficients[2]) / yaw_fit.standard_errors[2])
+        relative_effect = float(yaw_fit.coefficients[2] / (yaw_fit.coefficients[1] * rudder_limit))
+        excess_statistic = (
+            t_statistic
+            if relative_effect > _MIN_EFFECT_RATIO - 1.0 and t_statistic > _MIN_T_STATISTIC_AT_LIMIT
+            else 0.0
         )
-        yield found(text, {"limit": size, "harder": beyond})
+    excess_statistic = max(
+        excess_statistic, _excess_turning_at_limit(log, is_at_limit) if n_visits >= 8 else 0.0
+    )
+    if excess_statistic > 0.0:
+        text = (
+            f"at {math.degrees(rudder_limit):.1f} deg of delta the vessel turns harder than smaller angles"
+            f" explain ({excess_statistic:.1f} times what they leave open): its record is cut off there"
+        )
+        yield make_finding(text, {"limit": rudder_limit, "harder": excess_statistic})
 
 
-def _unexplained(log: Record, at_end: np.ndarray) -> float:
+def _excess_turning_at_limit(log: LogStatistics, is_at_limit: np.ndarray) -> float:
     """Return how much harder the vessel turns at the limit, over what a fit elsewhere leaves.
 
     The fit is one to all that lies off the limit, so it must hold rests at smaller angles; 0 where
     it does not, or explains what happens at the limit.
     """
-    blocks, values, (x, y) = log.of(blocks_of, "r"), log["delta"], _yaw_table(log)
-    known = np.isfinite(x).all(axis=1) & np.isfinite(y)
-    inside, outside = known & blocks.clear_of(~at_end), known & blocks.clear_of(at_end)
-    first, half = values[blocks.first], replace(blocks, size=blocks.size // 2)
-    moved, most = np.abs(blocks.change(values)) + np.abs(half.change(values)), high(values, 1.0)
-    resting = outside & (moved < 0.05 * most) & (np.abs(first) > 0.15 * most)
-    if inside.sum() < 10 or resting.sum() < 20:
+    blocks, values, (x, y) = log.cached(make_blocks, "r"), log["delta"], _yaw_regression_data(log)
+    is_finite = np.isfinite(x).all(axis=1) & np.isfinite(y)
+    is_inside_limit, is_outside_limit = (
+        is_finite & blocks.are_clear_of(~is_at_limit),
+        is_finite & blocks.are_clear_of(is_at_limit),
+    )
+    initial_angles, half_blocks = values[blocks.starts], replace(blocks, length=blocks.length // 2)
+    rudder_travel, max_angle = (
+        np.abs(blocks.compute_changes(values)) + np.abs(half_blocks.compute_changes(values)),
+        abs_quantile(values, 1.0),
+    )
+    is_rudder_constant = (
+        is_outside_limit
+        & (rudder_travel < 0.05 * max_angle)
+        & (np.abs(initial_angles) > 0.15 * max_angle)
+    )
+    if is_inside_limit.sum() < 10 or is_rudder_constant.sum() < 20:
         return 0.0
-    fitted = fit(x[outside], y[outside])
-    usual = max(float(np.sqrt(np.mean(fitted.rest**2))), 1e-300)
-    left = (y - x @ fitted.values)[inside] * np.sign(first[inside] * fitted.values[1])
-    harder = float(np.mean(left)) / usual
-    return harder if harder > _SURE_AT_END else 0.0
+    yaw_fit = fit_least_squares(x[is_outside_limit], y[is_outside_limit])
+    rms_residual = max(float(np.sqrt(np.mean(yaw_fit.residuals**2))), 1e-300)
+    limit_residuals = (y - x @ yaw_fit.coefficients)[is_inside_limit] * np.sign(
+        initial_angles[is_inside_limit] * yaw_fit.coefficients[1]
+    )
+    excess = float(np.mean(limit_residuals)) / rms_residual
+    return excess if excess > _MIN_T_STATISTIC_AT_LIMIT else 0.0
 
 
 # so many times less must be left with the inputs shifted in time, and more without the steering
-_BETTER, _WORTH = 1.3, 1.2
+_MIN_SHIFT_IMPROVEMENT, _MIN_STEERING_IMPROVEMENT = 1.3, 1.2
 
 
-@check("inputs", "rudder_sign", needs=("r",), certain=True, few=True)
-def rudder_sign(log: Record, found: Check) -> Iterator[Finding]:
+@check("inputs", "rudder_sign", required_channels=("r",), is_record_fault=True, on_subsample=True)
+def check_rudder_sign(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report the side to which what steers turns the vessel."""
-    name, steer = _steering(log)
-    if not name or np.isfinite(log["r"]).sum() < 2 * FEWEST:
+    name, steering = _find_steering(log)
+    if not name or np.isfinite(log["r"]).sum() < 2 * MIN_SAMPLES:
         return
-    good = np.isfinite(log["r"]) & np.isfinite(steer)
-    r, given = log.smooth("r")[good], steer[good]
-    if good.sum() >= 2 * FEWEST and float(np.abs(r).mean()) >= 6.0 * log.noise("r"):
-        one_sided = all(abs(x.sum()) > 0.95 * np.abs(x).sum() for x in (r, given))
+    is_finite = np.isfinite(log["r"]) & np.isfinite(steering)
+    r, steering_values = log.smoothed("r")[is_finite], steering[is_finite]
+    if is_finite.sum() >= 2 * MIN_SAMPLES and float(np.abs(r).mean()) >= 6.0 * log.noise_std("r"):
+        is_one_sided = all(
+            abs(signal.sum()) > 0.95 * np.abs(signal).sum() for signal in (r, steering_values)
+        )
         # of a turning circle the loss of speed slows the turn, which no rudder does
-        if one_sided and float(r.sum()) * float(given.sum()) < 0.0:
+        if is_one_sided and float(r.sum()) * float(steering_values.sum()) < 0.0:
             text = f"{name} stays on one side and the vessel turns to the other"
-            yield found(text, fix=_TURN_AND_CHECK)
-        elif one_sided:
+            yield make_finding(text, fix=_REVERSE_SIGN_AND_CHECK_FIX)
+        elif is_one_sided:
             text = f"{name} stays on one side and the vessel turns to it"
-            yield found(text, level="note", fix="")
-        if one_sided:
+            yield make_finding(text, level="note", fix="")
+        if is_one_sided:
             return
     # a rudder turns by the square of the speed past it
-    flow = np.ones(len(log))
+    flow_speed = np.ones(len(log))
     if "delta" in name and "u" in log:
-        flow, good = np.abs(log.smooth("u")), good & np.isfinite(log["u"])
-    without, fits = _answers(log, steer, flow, good)
-    if not fits:
+        flow_speed, is_finite = np.abs(log.smoothed("u")), is_finite & np.isfinite(log["u"])
+    sum_of_squares_without_steering, fits_by_shift = _fit_steering_responses(
+        log, steering, flow_speed, is_finite
+    )
+    if not fits_by_shift:
         return
-    zero, best = fits[0], min(fits, key=lambda shift: fits[shift].left)
-    plain, moved = zero.sure, fits[best].sure
+    unshifted_fit, best_shift = (
+        fits_by_shift[0],
+        min(fits_by_shift, key=lambda shift: fits_by_shift[shift].sum_of_squares),
+    )
+    unshifted_t_statistic, shifted_t_statistic = (
+        unshifted_fit.t_statistic,
+        fits_by_shift[best_shift].t_statistic,
+    )
     # with the shift where that is surer and of the same sign
-    same = plain * moved > 0.0 and abs(plain) > 0.5 * _SURE
-    sure = moved if same and abs(moved) > abs(plain) else plain
-    better = zero.left / max(fits[best].left, 1e-300)
-    told = without / max(zero.left, 1e-300) > _WORTH and (better < _BETTER or moved < 0.0)
-    effect = float(zero.values[-1] * np.nanmean(flow**2))
-    figures = {"effect": effect, "t": plain, "lag": best * log.step, "better": better}
-    if sure < -_SURE and told:
+    is_consistent = (
+        unshifted_t_statistic * shifted_t_statistic > 0.0
+        and abs(unshifted_t_statistic) > 0.5 * _MIN_T_STATISTIC
+    )
+    t_statistic = (
+        shifted_t_statistic
+        if is_consistent and abs(shifted_t_statistic) > abs(unshifted_t_statistic)
+        else unshifted_t_statistic
+    )
+    improvement = unshifted_fit.sum_of_squares / max(
+        fits_by_shift[best_shift].sum_of_squares, 1e-300
+    )
+    is_identifiable = sum_of_squares_without_steering / max(
+        unshifted_fit.sum_of_squares, 1e-300
+    ) > _MIN_STEERING_IMPROVEMENT and (
+        improvement < _MIN_SHIFT_IMPROVEMENT or shifted_t_statistic < 0.0
+    )
+    effect = float(unshifted_fit.coefficients[-1] * np.nanmean(flow_speed**2))
+    figures = {
+        "effect": effect,
+        "t": unshifted_t_statistic,
+        "lag": best_shift * log.sampling_interval,
+        "better": improvement,
+    }
+    if t_statistic < -_MIN_T_STATISTIC and is_identifiable:
         text = (
             f"positive {name} turns the vessel to port (yaw acceleration {effect:.3g} per unit,"
-            f" {-sure:.0f} standard errors)"
+            f" {-t_statistic:.0f} standard errors)"
         )
-        both = "exchange the columns of both sides, or check the sign of r and psi"
-        yield found(text, figures, fix=_TURN_AND_CHECK if name in log else both)
-    elif sure > _SURE:
-        text = f"positive {name} turns the vessel to starboard ({sure:.0f} standard errors)"
-        yield found(text, figures, level="note", fix="")
+        exchange_fix = "exchange the columns of both sides, or check the sign of r and psi"
+        yield make_finding(
+            text, figures, fix=_REVERSE_SIGN_AND_CHECK_FIX if name in log else exchange_fix
+        )
+    elif t_statistic > _MIN_T_STATISTIC:
+        text = f"positive {name} turns the vessel to starboard ({t_statistic:.0f} standard errors)"
+        yield make_finding(text, figures, level="note", fix="")
 
 
-def _steering(log: Record) -> tuple[str, np.ndarray]:
+def _find_steering(log: LogStatistics) -> tuple[str, np.ndarray]:
     """Return what steers and its values [T], positive to starboard; no name where none is known."""
-    for name in STEERING[:4]:
+    for name in STEERING_CHANNELS[:4]:
         if name in log and log.std(name) > 1e-9:
             return name, log[name]
-    for port, starboard in sides(log).items():
-        if log.units[port] != "rad":
-            steer = log[port] * np.abs(log[port]) - log[starboard] * np.abs(log[starboard])
-            if deviation(steer) > 1e-9:
-                return f"{port} less {starboard}", steer
+    for port_name, starboard_name in port_starboard_pairs(log).items():
+        if log.units[port_name] != "rad":
+            steering = log[port_name] * np.abs(log[port_name]) - log[starboard_name] * np.abs(
+                log[starboard_name]
+            )
+            if nan_std(steering) > 1e-9:
+                return f"{port_name} less {starboard_name}", steering
     return "", np.zeros(0)
 
 
-_HELD = 0.02
+_MIN_STEERING_VARIATION = 0.02
 """Share of its size within which a rudder is held; of 24 helices of a torpedo all lie within 1.6 %,
 of its zigzags and random steps all beyond 46 %."""
-_MOST_ROWS = 10_000
+_MAX_BLOCKS = 10_000
 """Blocks that a rudder's side is told by: more only overlap."""
 
 
-def _answers(
-    log: Record, steer: np.ndarray, flow: np.ndarray, good: np.ndarray
-) -> tuple[float, dict[int, Fit]]:
+def _fit_steering_responses(
+    log: LogStatistics, steering: np.ndarray, flow: np.ndarray, is_known: np.ndarray
+) -> tuple[float, dict[int, LeastSquaresFit]]:
     """Return what a yaw model leaves without steering, and fits with it by shift in samples: that
     without a shift, and the one that leaves least.
 
@@ -361,187 +480,306 @@ def _answers(
 
     Args:
         log: with r.
-        steer: what steers [T].
+        steering: what steers [T].
         flow: the speed U that it acts by [T]; 1 where it acts without any.
-        good: samples that are known [T].
+        is_known: samples that are known [T].
     """
-    r, size = log.smooth("r"), max(round(1.0 / log.step), WINDOW)
-    low, top = quantiles(log["r"], 0.05, 0.95)
+    r, block_length = log.smoothed("r"), max(round(1.0 / log.sampling_interval), SMOOTHING_SAMPLES)
+    lower, upper = nan_quantiles(log["r"], 0.05, 0.95)
     v = np.zeros(len(log))
-    if "v" in log and np.isfinite(log["v"]).sum() > 2 * FEWEST:
-        v = log.smooth("v")
+    if "v" in log and np.isfinite(log["v"]).sum() > 2 * MIN_SAMPLES:
+        v = log.smoothed("v")
     # a shift can be recognised as far as the yaw rate is correlated with itself
-    power = np.abs(np.fft.rfft(r - r.mean(), 2 * r.size)) ** 2
-    memory = np.append(np.fft.irfft(power)[: r.size], -1.0)
-    reach = max(min(int(np.argmax(memory < 0.0)), r.size // 8, round(30.0 / log.step)), 3)
-    gaps = ~good | (np.append(np.diff(log.t), log.step) > 3.0 * log.step) | log.torn(reach + size)
-    margin = reach + WINDOW
-    stride = max(round(0.2 / log.step), len(log) // _MOST_ROWS, 1)
-    first = np.arange(margin, len(log) - margin - size, stride)
-    blocks = Blocks(log.t, first, size)
-    blocks = replace(blocks, first=first[blocks.clear_of(gaps)])
-    if blocks.first.size < FEWEST or top - low < 4.0 * log.noise("r"):
+    power_spectrum = np.abs(np.fft.rfft(r - r.mean(), 2 * r.size)) ** 2
+    autocorrelation = np.append(np.fft.irfft(power_spectrum)[: r.size], -1.0)
+    max_shift = max(
+        min(
+            int(np.argmax(autocorrelation < 0.0)), r.size // 8, round(30.0 / log.sampling_interval)
+        ),
+        3,
+    )
+    is_gap = (
+        ~is_known
+        | (np.append(np.diff(log.t), log.sampling_interval) > 3.0 * log.sampling_interval)
+        | log.near_seam(max_shift + block_length)
+    )
+    n_margin_samples = max_shift + SMOOTHING_SAMPLES
+    stride = max(round(0.2 / log.sampling_interval), len(log) // _MAX_BLOCKS, 1)
+    block_starts = np.arange(n_margin_samples, len(log) - n_margin_samples - block_length, stride)
+    blocks = OverlappingBlocks(log.t, block_starts, block_length)
+    blocks = replace(blocks, starts=block_starts[blocks.are_clear_of(is_gap)])
+    if blocks.starts.size < MIN_SAMPLES or upper - lower < 4.0 * log.noise_std("r"):
         return 0.0, {}
-    terms = np.stack((flow**2, flow * r, r * np.abs(r), flow * v, v * np.abs(v)), axis=-1)
-    known, y = blocks.integrals(terms)(0), blocks.change(r)
-    given = blocks.integrals((flow**2 * np.nan_to_num(steer))[:, None])
-    shifts = sorted({round(float(shift)) for shift in np.linspace(-reach, reach, 61)})
-    told = np.isfinite(known).all(axis=1) & np.isfinite(y)
+    regressors = np.stack((flow**2, flow * r, r * np.abs(r), flow * v, v * np.abs(v)), axis=-1)
+    integrated_terms, y = blocks.make_integrator(regressors)(0), blocks.compute_changes(r)
+    steering_integrals = blocks.make_integrator((flow**2 * np.nan_to_num(steering))[:, None])
+    candidate_shifts = sorted(
+        {round(float(shift)) for shift in np.linspace(-max_shift, max_shift, 61)}
+    )
+    is_finite = np.isfinite(integrated_terms).all(axis=1) & np.isfinite(y)
     # of a rudder that is held through a steady turn only its shifted entry would seem to answer
-    mean = given(0)[told, 0] / np.maximum(known[told, 0], 1e-300)
-    if told.sum() < FEWEST or mean.std() < _HELD * np.abs(mean).mean():
+    mean_steering = steering_integrals(0)[is_finite, 0] / np.maximum(
+        integrated_terms[is_finite, 0], 1e-300
+    )
+    if (
+        is_finite.sum() < MIN_SAMPLES
+        or mean_steering.std() < _MIN_STEERING_VARIATION * np.abs(mean_steering).mean()
+    ):
         return 0.0, {}
-    length = np.maximum(np.linalg.norm(known[told], axis=0), 1e-300)
-    side, sizes, _ = np.linalg.svd(known[told] / length, full_matrices=False)
-    side = side[:, sizes > 1e-5 * sizes[0]]
+    column_norms = np.maximum(np.linalg.norm(integrated_terms[is_finite], axis=0), 1e-300)
+    left_singular_vectors, singular_values, _ = np.linalg.svd(
+        integrated_terms[is_finite] / column_norms, full_matrices=False
+    )
+    left_singular_vectors = left_singular_vectors[:, singular_values > 1e-5 * singular_values[0]]
     # what steers explains by the part of it that the other terms do not
-    tried = given(shifts)[told][..., 0]
-    rest, own = (part - side @ (side.T @ part) for part in (y[told], tried))
-    gain = (rest @ own) ** 2 / np.maximum((own**2).sum(axis=0), 1e-300)
-    surest = shifts[int(np.argmax(gain))]
-    fits = {s: fit(np.column_stack((known, given(s))), y) for s in sorted({0, surest})}
-    return fit(known, y).left, fits
+    shifted_steering = steering_integrals(candidate_shifts)[is_finite][..., 0]
+    residual_response, residual_steering = (
+        signal - left_singular_vectors @ (left_singular_vectors.T @ signal)
+        for signal in (y[is_finite], shifted_steering)
+    )
+    explained_squares = (residual_response @ residual_steering) ** 2 / np.maximum(
+        (residual_steering**2).sum(axis=0), 1e-300
+    )
+    best_shift = candidate_shifts[int(np.argmax(explained_squares))]
+    fits_by_shift = {
+        s: fit_least_squares(np.column_stack((integrated_terms, steering_integrals(s))), y)
+        for s in sorted({0, best_shift})
+    }
+    return fit_least_squares(integrated_terms, y).sum_of_squares, fits_by_shift
 
 
 # an answer so early, s, is no inaccuracy
-EARLY = 0.45
+MIN_LEAD_TIME = 0.45
 # minima that are looked at closely, and how many times the least counts as good a fit
-_MINIMA, _ALIKE = 4, 1.15
-_SHIFTS = 12
+_N_MINIMA, _MAX_EQUIVALENT_RATIO = 4, 1.15
+_N_SHIFTS_PER_SIDE = 12
 """To either side, coarse ones first; chosen by hand: each costs a fit."""
 
 
 @dataclass(frozen=True)
-class Delay:
+class ResponseDelay:
     """When the motion answers an input.
 
     Attributes:
-        seconds: how late the answer comes; negative where it comes before the input.
-        error: standard error of that, s.
-        better: what a fit leaves without the shift, over what it leaves with it (sums of squares).
-        late: what the best shift leaves that is no early answer, over the least that any leaves.
+        delay: how late the answer comes; negative where it comes before the input.
+        standard_error: standard error of that, s.
+        improvement: what a fit leaves without the shift, over what it leaves with it (sums of squares).
+        late_answer_ratio: what the best shift leaves that is no early answer, over the least that any leaves.
     """
 
-    seconds: float
-    error: float
-    better: float
-    late: float
+    delay: float
+    standard_error: float
+    improvement: float
+    late_answer_ratio: float
 
 
-def delays(log: Record) -> dict[tuple[str, str], tuple[tuple[str, ...], Delay]]:
+def estimate_delays(
+    log: LogStatistics,
+) -> dict[tuple[str, str], tuple[tuple[str, ...], ResponseDelay]]:
     """Return (channels, the velocity that answers) -> the channels one by one, and the delay.
 
     Channels that may be shifted together are the first that steers, and all propellers.
     """
-    pairs: list[tuple[tuple[str, ...], str]] = []
-    rudder = next((name for name in STEERING if name in log.inputs), "")
-    turning = tuple(name for name in log.of(propellers) if not name.startswith("cmd_"))
-    pairs += [((rudder,), "r")] if rudder else []
-    pairs += [(turning, "u" if len(turning) == 1 else "r")] if turning else []
-    found = {}
-    for names, answer in pairs:
-        varied = all(log.std(n) > 0.02 * np.nanmax(np.abs(log[n])) for n in names)
-        delay = delay_of(log, names, answer) if answer in log and varied else None
+    input_groups: list[tuple[tuple[str, ...], str]] = []
+    rudder_name = next((name for name in STEERING_CHANNELS if name in log.inputs), "")
+    propeller_names = tuple(
+        name for name in log.cached(find_propellers) if not name.startswith("cmd_")
+    )
+    input_groups += [((rudder_name,), "r")] if rudder_name else []
+    input_groups += (
+        [(propeller_names, "u" if len(propeller_names) == 1 else "r")] if propeller_names else []
+    )
+    delays_by_input = {}
+    for names, answer in input_groups:
+        is_excited = all(log.std(n) > 0.02 * np.nanmax(np.abs(log[n])) for n in names)
+        delay = estimate_delay(log, names, answer) if answer in log and is_excited else None
         if delay is not None:
-            found[", ".join(names), answer] = names, delay
-    return found
+            delays_by_input[", ".join(names), answer] = names, delay
+    return delays_by_input
 
 
-def delay_of(log: Record, names: Sequence[str], answer: str) -> Delay | None:
+def estimate_delay(log: LogStatistics, names: Sequence[str], answer: str) -> ResponseDelay | None:
     """Return how late a velocity answers inputs; None where the log does not tell."""
-    step, blocks = log.step, log.of(blocks_of, answer)
-    reach = max(2 * blocks.size, round(3.0 / step))
-    if len(log) < max(20 * blocks.size, 6 * reach):
+    step, blocks = log.sampling_interval, log.cached(make_blocks, answer)
+    max_shift = max(2 * blocks.length, round(3.0 / step))
+    if len(log) < max(20 * blocks.length, 6 * max_shift):
         return None
-    first = blocks.first
-    inside = (first >= reach) & (first + blocks.size + reach < len(log))
-    blocks = replace(blocks, first=first[inside & blocks.clear_of(log.torn(reach))])
-    other = [name for name in log if name in ("n", "delta", "wind_speed") and name not in names]
-    y = blocks.change(log[answer])
+    block_starts = blocks.starts
+    is_inside = (block_starts >= max_shift) & (block_starts + blocks.length + max_shift < len(log))
+    blocks = replace(
+        blocks, starts=block_starts[is_inside & blocks.are_clear_of(log.near_seam(max_shift))]
+    )
+    other_inputs = [
+        name for name in log if name in ("n", "delta", "wind_speed") and name not in names
+    ]
+    velocity_changes = blocks.compute_changes(log[answer])
     # shift -> the squares [K] that a fit leaves with the inputs shifted, NaN where unknown, and sum
-    sums, total = dict[int, np.ndarray](), dict[int, float]()
+    squared_residuals_by_shift, sum_of_squares_by_shift = (
+        dict[int, np.ndarray](),
+        dict[int, float](),
+    )
     # the flow over a rudder falls as the vessel turns: without their product in the fit the answer
     # seems to come early
-    moving = {name: log[name][:, None] for name in log.moving}
-    driving = [name for name in (*other, *names) if log.std(name) > 0.0]
-    linear = len(driving) > 4
+    velocity_columns = {name: log[name][:, None] for name in log.velocities}
+    driving_inputs = [name for name in (*other_inputs, *names) if log.std(name) > 0.0]
+    is_linear = len(driving_inputs) > 4
 
-    def given(part: Sequence[str], shifts: Sequence[int] | np.ndarray) -> list[np.ndarray]:
+    def make_shifted_terms(
+        input_names: Sequence[str], shifts: Sequence[int] | np.ndarray
+    ) -> list[np.ndarray]:
         """Return terms [T, S] of inputs that are shifted by so many samples each."""
-        at = np.arange(len(log))[:, None] - np.array(shifts)
-        inputs = [np.take(log[name], at, mode="wrap") for name in driving if name in part]
-        return of_inputs(inputs, moving.get("u"), linear=linear)
+        shifted_indices = np.arange(len(log))[:, None] - np.array(shifts)
+        inputs = [
+            np.take(log[name], shifted_indices, mode="wrap")
+            for name in driving_inputs
+            if name in input_names
+        ]
+        return make_input_terms(inputs, velocity_columns.get("u"), is_linear=is_linear)
 
-    def integrals(columns: Sequence[np.ndarray]) -> np.ndarray:
-        return np.stack([blocks.integrals(one)(0) for one in columns], axis=-1)
+    def integrate_columns(columns: Sequence[np.ndarray]) -> np.ndarray:
+        return np.stack([blocks.make_integrator(column)(0) for column in columns], axis=-1)
 
-    fixed = integrals([np.ones((len(log), 1)), *of_motion(moving), *given(other, [0])])
+    fixed_terms = integrate_columns(
+        [
+            np.ones((len(log), 1)),
+            *make_velocity_terms(velocity_columns),
+            *make_shifted_terms(other_inputs, [0]),
+        ]
+    )
 
-    def look(shifts: Iterable[int]) -> None:
-        new = [k for k in dict.fromkeys(shifts) if k not in sums and abs(k) <= reach]
-        pieces = np.array_split(new, -(-len(new) * len(log) // AT_ONCE)) if new else ()
-        for some in pieces:
-            own = integrals(given(names, some))
-            x = np.concatenate((fixed.repeat(some.size, axis=1), own), axis=2).transpose(1, 0, 2)
-            good = np.isfinite(x).all(axis=2) & np.isfinite(y)
-            part, target = np.where(good[..., None], x, 0.0), np.where(good, y, 0.0)[..., None]
-            part /= np.maximum(np.linalg.norm(part, axis=1, keepdims=True), 1e-300)
-            turned = part.transpose(0, 2, 1)
-            gram = turned @ part + 1e-9 * np.eye(part.shape[2])
-            rest = (target - part @ np.linalg.solve(gram, turned @ target))[..., 0]
-            sums.update(zip(some.tolist(), np.where(good, rest**2, np.nan), strict=True))
-            total.update(zip(some.tolist(), (rest**2).sum(axis=1).tolist(), strict=True))
+    def evaluate_shifts(candidate_shifts: Iterable[int]) -> None:
+        new_shifts = [
+            k
+            for k in dict.fromkeys(candidate_shifts)
+            if k not in squared_residuals_by_shift and abs(k) <= max_shift
+        ]
+        shift_batches = (
+            np.array_split(new_shifts, -(-len(new_shifts) * len(log) // CHUNK_SAMPLES))
+            if new_shifts
+            else ()
+        )
+        for shift_batch in shift_batches:
+            shifted_terms = integrate_columns(make_shifted_terms(names, shift_batch))
+            x = np.concatenate(
+                (fixed_terms.repeat(shift_batch.size, axis=1), shifted_terms), axis=2
+            ).transpose(1, 0, 2)
+            is_finite = np.isfinite(x).all(axis=2) & np.isfinite(velocity_changes)
+            regressors, target = (
+                np.where(is_finite[..., None], x, 0.0),
+                np.where(is_finite, velocity_changes, 0.0)[..., None],
+            )
+            regressors /= np.maximum(np.linalg.norm(regressors, axis=1, keepdims=True), 1e-300)
+            transposed = regressors.transpose(0, 2, 1)
+            gram = transposed @ regressors + 1e-9 * np.eye(regressors.shape[2])
+            residuals = (target - regressors @ np.linalg.solve(gram, transposed @ target))[..., 0]
+            squared_residuals_by_shift.update(
+                zip(shift_batch.tolist(), np.where(is_finite, residuals**2, np.nan), strict=True)
+            )
+            sum_of_squares_by_shift.update(
+                zip(shift_batch.tolist(), (residuals**2).sum(axis=1).tolist(), strict=True)
+            )
 
-    def lowest() -> list[int]:
+    def find_minima() -> list[int]:
         """Return the shifts of the minima so far, the lowest first."""
-        shifts = sorted(total)
-        left = np.array([total[shift] for shift in shifts])
-        fenced = np.concatenate(([np.inf], left, [np.inf]))
-        minima = np.flatnonzero((left <= fenced[:-2]) & (left <= fenced[2:]))
-        return [shifts[i] for i in minima[np.argsort(left[minima])]]
+        shifts = sorted(sum_of_squares_by_shift)
+        sums_of_squares = np.array([sum_of_squares_by_shift[shift] for shift in shifts])
+        padded = np.concatenate(([np.inf], sums_of_squares, [np.inf]))
+        minimum_indices = np.flatnonzero(
+            (sums_of_squares <= padded[:-2]) & (sums_of_squares <= padded[2:])
+        )
+        return [shifts[i] for i in minimum_indices[np.argsort(sums_of_squares[minimum_indices])]]
 
-    look(round(k * reach / _SHIFTS) for k in range(-_SHIFTS, _SHIFTS + 1))
-    gap = max(round(reach / _SHIFTS), 1)
-    look(least + round(k * gap / 6) for least in lowest()[:_MINIMA] for k in range(-6, 7))
+    evaluate_shifts(
+        round(k * max_shift / _N_SHIFTS_PER_SIDE)
+        for k in range(-_N_SHIFTS_PER_SIDE, _N_SHIFTS_PER_SIDE + 1)
+    )
+    coarse_spacing = max(round(max_shift / _N_SHIFTS_PER_SIDE), 1)
+    evaluate_shifts(
+        min_shift + round(k * coarse_spacing / 6)
+        for min_shift in find_minima()[:_N_MINIMA]
+        for k in range(-6, 7)
+    )
     # of several that fit alike the least that is no early answer: an input that repeats itself, as
     # that of a zigzag, fits as well half a period away
-    floor = max(min(total.values()), 1e-300)
-    alike = [shift for shift in lowest() if total[shift] <= _ALIKE * floor]
-    best = min(alike, key=lambda shift: (-shift * step > EARLY, abs(shift)))
-    good = np.isfinite(sums[best]) & np.isfinite(sums[0])
-    if abs(best) >= reach - gap or good.sum() < 5 * (fixed.shape[2] + len(given(names, [0]))):
+    min_sum_of_squares = max(min(sum_of_squares_by_shift.values()), 1e-300)
+    equivalent_shifts = [
+        shift
+        for shift in find_minima()
+        if sum_of_squares_by_shift[shift] <= _MAX_EQUIVALENT_RATIO * min_sum_of_squares
+    ]
+    best_shift = min(
+        equivalent_shifts, key=lambda shift: (-shift * step > MIN_LEAD_TIME, abs(shift))
+    )
+    is_finite = np.isfinite(squared_residuals_by_shift[best_shift]) & np.isfinite(
+        squared_residuals_by_shift[0]
+    )
+    if abs(best_shift) >= max_shift - coarse_spacing or is_finite.sum() < 5 * (
+        fixed_terms.shape[2] + len(make_shifted_terms(names, [0]))
+    ):
         return None
     # how well the least is determined: its scatter over sections of the log
-    tried, table = np.array([*sums]) * step, np.array([*sums.values()])
-    sections = np.array_split(np.flatnonzero(good), SECTIONS // 2)
-    each = [tried[np.argmin(np.nan_to_num(table[:, p].sum(axis=1), nan=np.inf))] for p in sections]
-    scatter = SIGMA_OF_MAD * float(np.median(np.abs(np.array(each) - np.median(each))))
-    error = max(1.5 * scatter / np.sqrt(len(sections)), 0.25 * step)
-    rest = max(float(sums[best][good].sum()), 1e-300)
-    late = min(value for shift, value in total.items() if -shift * step <= EARLY) / floor
-    return Delay(best * step, error, float(sums[0][good].sum()) / rest, late)
+    tried_delays, squared_residuals = (
+        np.array([*squared_residuals_by_shift]) * step,
+        np.array([*squared_residuals_by_shift.values()]),
+    )
+    section_indices = np.array_split(np.flatnonzero(is_finite), N_SECTIONS // 2)
+    best_delay_by_section = [
+        tried_delays[
+            np.argmin(np.nan_to_num(squared_residuals[:, section].sum(axis=1), nan=np.inf))
+        ]
+        for section in section_indices
+    ]
+    scatter = SIGMA_OF_MAD * float(
+        np.median(np.abs(np.array(best_delay_by_section) - np.median(best_delay_by_section)))
+    )
+    standard_error = max(1.5 * scatter / np.sqrt(len(section_indices)), 0.25 * step)
+    best_sum_of_squares = max(
+        float(squared_residuals_by_shift[best_shift][is_finite].sum()), 1e-300
+    )
+    late_ratio = (
+        min(
+            value
+            for shift, value in sum_of_squares_by_shift.items()
+            if -shift * step <= MIN_LEAD_TIME
+        )
+        / min_sum_of_squares
+    )
+    return ResponseDelay(
+        best_shift * step,
+        standard_error,
+        float(squared_residuals_by_shift[0][is_finite].sum()) / best_sum_of_squares,
+        late_ratio,
+    )
 
 
 @check(
     "actuators",
     "acausal",
     fix="the clocks of inputs and motion differ: shift one of them",
-    certain=True,
-    few=True,
+    is_record_fault=True,
+    on_subsample=True,
 )
-def acausal(log: Record, found: Check) -> Iterator[Finding]:
+def check_acausal_response(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report inputs that the motion answers before they are given.
 
     A vessel cannot answer before it is told. That it answers late may be its actuators; among logs
     of one vessel, though, the delay is the same (`between`).
     """
-    for (channels, answer), (names, delay) in log.of(delays).items():
-        early = -delay.seconds
-        sure = delay.better > 1.35 and delay.late > _ALIKE
-        if sure and early > max(EARLY, 1.5 * log.step, 3.0 * delay.error):
+    for (channels, answer), (names, delay) in log.cached(estimate_delays).items():
+        lead_time = -delay.delay
+        is_significant = (
+            delay.improvement > 1.35 and delay.late_answer_ratio > _MAX_EQUIVALENT_RATIO
+        )
+        if is_significant and lead_time > max(
+            MIN_LEAD_TIME, 1.5 * log.sampling_interval, 3.0 * delay.standard_error
+        ):
             text = (
-                f"{answer} answers {channels} {early:.2f} +- {2.0 * delay.error:.2f} s before it is"
-                f" given (a fit leaves {delay.better:.1f} times less with it shifted)"
+                f"{answer} answers {channels} {lead_time:.2f} +- {2.0 * delay.standard_error:.2f} s before it is"
+                f" given (a fit leaves {delay.improvement:.1f} times less with it shifted)"
             )
-            figures = {"lag": delay.seconds, "error": delay.error, "better": delay.better}
-            yield found(text, figures, repair=correction(names, lag=early))
+            figures = {
+                "lag": delay.delay,
+                "error": delay.standard_error,
+                "better": delay.improvement,
+            }
+            yield make_finding(text, figures, repair=make_correction(names, delay=lead_time))

@@ -6,126 +6,158 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from residnet.core.stretches import stretches
-from residnet.data.channels import quantiles
-from residnet.data.doctor.findings import Check, Finding, Level, check, share_of, show
-from residnet.data.doctor.statistics import Record, averaged, bridged
+from residnet.core.stretches import find_runs
+from residnet.data.channels import nan_quantiles
+from residnet.data.doctor.findings import (
+    Check,
+    Finding,
+    Level,
+    check,
+    format_quantity,
+    format_share,
+)
+from residnet.data.doctor.statistics import LogStatistics, interpolate_gaps, moving_average
 
-_COLLINEAR = 30.0
+_MAX_CONDITION_NUMBER = 30.0
 """Condition number of harmful collinearity: Belsley, Kuh and Welsch, 1980."""
 
 
 @check("excitation", "range", "note")
-def ranges(log: Record, found: Check) -> Iterator[Finding]:
+def report_ranges(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report range and spectrum of velocities and inputs."""
-    for name in (*log.moving, *log.inputs):
+    for name in (*log.velocities, *log.inputs):
         values, unit = log[name][np.isfinite(log[name])], log.units[name]
-        low, top, std = float(values.min()), float(values.max()), float(values.std())
-        figures = {"min": low, "max": top, "std": std}
-        if std <= 1e-6 * max(abs(low), abs(top)):
+        lower, upper, std = float(values.min()), float(values.max()), float(values.std())
+        figures = {"min": lower, "max": upper, "std": std}
+        if std <= 1e-6 * max(abs(lower), abs(upper)):
             text = (
-                f"{name} stays at {show(low, unit)}: its effect cannot be identified from this log"
+                f"{name} stays at {format_quantity(lower, unit)}: its effect cannot be identified from this log"
                 " alone"
             )
-            yield found(text, figures, code="constant")
+            yield make_finding(text, figures, code="constant")
             continue
-        text = f"{name} from {show(low, unit)} to {show(top, unit)}, standard deviation"
-        text += f" {show(std, unit)}"
+        text = f"{name} from {format_quantity(lower, unit)} to {format_quantity(upper, unit)}, standard deviation"
+        text += f" {format_quantity(std, unit)}"
         if name in log.inputs and values.size >= 20:
-            few = log.few
-            power = np.abs(np.fft.rfft(bridged(few.t, few[name]) - values.mean())[1:]) ** 2
-            total = np.cumsum(power)
-            below = 1 + np.searchsorted(total, 0.95 * total[-1])
-            figures["band"] = float(below / (len(few) * log.step))
+            subsample = log.subsample
+            power_spectrum = (
+                np.abs(
+                    np.fft.rfft(interpolate_gaps(subsample.t, subsample[name]) - values.mean())[1:]
+                )
+                ** 2
+            )
+            cumulative_power = np.cumsum(power_spectrum)
+            band_index = 1 + np.searchsorted(cumulative_power, 0.95 * cumulative_power[-1])
+            figures["band"] = float(band_index / (len(subsample) * log.sampling_interval))
             text += f", 95 % of its power below {figures['band']:.3g} Hz"
-        yield found(text, figures)
+        yield make_finding(text, figures)
 
 
-def still(log: Record) -> np.ndarray:
+def find_rest(log: LogStatistics) -> np.ndarray:
     """Return [T] bool: no motion beyond the noise over two seconds."""
-    samples = max(round(2.0 / log.step), 5)
-    at_rest = np.ones(len(log), dtype=bool)
-    speed = np.hypot(averaged(log["u"], samples), averaged(log["v"], samples))
-    turning = np.abs(averaged(log["r"], samples))
-    noise = np.hypot(log.noise("u"), log.noise("v")), log.noise("r")
-    for values, level in zip((speed, turning), noise, strict=True):
+    n_samples = max(round(2.0 / log.sampling_interval), 5)
+    is_at_rest = np.ones(len(log), dtype=bool)
+    speeds = np.hypot(moving_average(log["u"], n_samples), moving_average(log["v"], n_samples))
+    yaw_rates = np.abs(moving_average(log["r"], n_samples))
+    noise_levels = np.hypot(log.noise_std("u"), log.noise_std("v")), log.noise_std("r")
+    for values, noise_level in zip((speeds, yaw_rates), noise_levels, strict=True):
         # what is left of the noise after averaging, but never a motion that is one for this vessel
-        usual, left = quantiles(values, 0.95)[0], 4.0 * level / np.sqrt(samples)
-        at_rest &= values < min(max(0.03 * usual, left), max(0.2 * usual, left))
-    return at_rest
+        high_level, averaged_noise = (
+            nan_quantiles(values, 0.95)[0],
+            4.0 * noise_level / np.sqrt(n_samples),
+        )
+        is_at_rest &= values < min(
+            max(0.03 * high_level, averaged_noise), max(0.2 * high_level, averaged_noise)
+        )
+    return is_at_rest
 
 
 @check(
     "excitation",
     "standing",
     fix="leave these parts out: they hold noise only",
-    needs=("u", "v", "r"),
+    required_channels=("u", "v", "r"),
 )
-def rest(log: Record, found: Check) -> Iterator[Finding]:
+def check_rest(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report a vessel at rest; for a tenth of a log that makes it one about noise."""
-    at_rest = still(log)
-    starts, stops = stretches(at_rest)
-    share = float(at_rest.mean())
-    seconds = log.t[stops - 1] - log.t[starts]
-    longest = int(np.argmax(stops - starts)) if starts.size else 0
-    if share > 0.02 and seconds[longest] > 3.0:
-        first, most = float(log.t[starts[longest]]), float(seconds[longest])
-        text = (
-            f"the vessel rests for {share_of(share)} of the time, at most {most:.1f} s on end from"
-            f" t = {first:.2f} s"
+    is_at_rest = find_rest(log)
+    starts, stops = find_runs(is_at_rest)
+    rest_share = float(is_at_rest.mean())
+    durations = log.t[stops - 1] - log.t[starts]
+    longest_segment = int(np.argmax(stops - starts)) if starts.size else 0
+    if rest_share > 0.02 and durations[longest_segment] > 3.0:
+        start_time, longest_duration = (
+            float(log.t[starts[longest_segment]]),
+            float(durations[longest_segment]),
         )
-        level: Level = "will mislead" if share > 0.1 else "note"
-        yield found(text, {"share": share, "longest": most, "t": first}, level=level, at=at_rest)
+        text = (
+            f"the vessel rests for {format_share(rest_share)} of the time, at most {longest_duration:.1f} s on end from"
+            f" t = {start_time:.2f} s"
+        )
+        level: Level = "will mislead" if rest_share > 0.1 else "note"
+        yield make_finding(
+            text,
+            {"share": rest_share, "longest": longest_duration, "t": start_time},
+            level=level,
+            sample_mask=is_at_rest,
+        )
 
 
-@check("excitation", "slow", "note", "there is little to learn there", needs=("u", "v"))
-def slow(log: Record, found: Check) -> Iterator[Finding]:
+@check("excitation", "slow", "note", "there is little to learn there", required_channels=("u", "v"))
+def check_slow_motion(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report a vessel that hardly moves."""
     speed = np.hypot(log["u"], log["v"])
-    limit = 0.1 * quantiles(speed, 0.95)[0]
-    share = float(np.mean(speed[np.isfinite(speed)] <= limit))
-    if share > 0.05:
+    slow_speed = 0.1 * nan_quantiles(speed, 0.95)[0]
+    slow_share = float(np.mean(speed[np.isfinite(speed)] <= slow_speed))
+    if slow_share > 0.05:
         text = (
-            f"the vessel stands almost still (slower than {show(limit, 'm/s')}, a tenth of its"
-            f" speed) for {share_of(share)} of the time"
+            f"the vessel stands almost still (slower than {format_quantity(slow_speed, 'm/s')}, a tenth of its"
+            f" speed) for {format_share(slow_share)} of the time"
         )
-        yield found(text, {"share": share})
+        yield make_finding(text, {"share": slow_share})
 
 
-@check("excitation", "condition", "note", few=True)
-def condition(log: Record, found: Check) -> Iterator[Finding]:
+@check("excitation", "condition", "note", on_subsample=True)
+def report_condition_number(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report velocities and inputs that move together in a log."""
     names = [
         name
-        for name in (*log.moving, *log.inputs)
+        for name in (*log.velocities, *log.inputs)
         if log.std(name) > 1e-6 * np.nanmax(np.abs(log[name]))
     ]
     columns = log.log.stack(names)
     columns = columns[np.isfinite(columns).all(axis=1)]
     if len(names) < 2 or columns.shape[0] < 10 * len(names):
         return
-    number, worst = conditioning(columns, names)
-    text = f"condition number of {in_brackets(names)} (centred, scaled): {number:.3g}"
-    if number > _COLLINEAR:
+    condition_number, collinear_names = compute_condition_number(columns, names)
+    text = f"condition number of {format_names(names)} (centred, scaled): {condition_number:.3g}"
+    if condition_number > _MAX_CONDITION_NUMBER:
         text += (
-            f"; {', '.join(worst)} move together in this log: their effects are separated by other"
+            f"; {', '.join(collinear_names)} move together in this log: their effects are separated by other"
             " manoeuvres only"
         )
-    yield found(text, {"condition": number})
+    yield make_finding(text, {"condition": condition_number})
 
 
-def in_brackets(names: Sequence[str]) -> str:
+def format_names(names: Sequence[str]) -> str:
     """Return names in brackets, or how many they are where they are many."""
     return f"[{', '.join(names)}]" if len(names) <= 12 else f"{len(names)} channels"
 
 
-def conditioning(columns: np.ndarray, names: Sequence[str]) -> tuple[float, list[str]]:
+def compute_condition_number(columns: np.ndarray, names: Sequence[str]) -> tuple[float, list[str]]:
     """Return the condition number of columns [N, k], and the names that move together most.
 
     Columns are centred and scaled; there are up to three names.
     """
-    spread = np.maximum(columns.std(axis=0), np.finfo(float).tiny)
-    _, sizes, directions = np.linalg.svd((columns - columns.mean(axis=0)) / spread, False)
-    number = float(sizes[0] / max(sizes[-1], 1e-16 * sizes[0], np.finfo(float).tiny))
-    most = np.argsort(-np.abs(directions[-1]))[:3]
-    return number, [names[i] for i in most if abs(directions[-1][i]) > 0.2]
+    column_std = np.maximum(columns.std(axis=0), np.finfo(float).tiny)
+    _, singular_values, singular_vectors = np.linalg.svd(
+        (columns - columns.mean(axis=0)) / column_std, False
+    )
+    condition_number = float(
+        singular_values[0]
+        / max(singular_values[-1], 1e-16 * singular_values[0], np.finfo(float).tiny)
+    )
+    largest_indices = np.argsort(-np.abs(singular_vectors[-1]))[:3]
+    return condition_number, [
+        names[i] for i in largest_indices if abs(singular_vectors[-1][i]) > 0.2
+    ]

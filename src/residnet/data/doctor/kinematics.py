@@ -20,52 +20,60 @@ import numpy as np
 import scipy
 
 from residnet.core.log import Log
-from residnet.data.channels import SIGMA_OF_MAD, deviation, median
-from residnet.data.derivatives import local_polynomials
-from residnet.data.doctor.findings import Check, Finding, Level, correction, with_channels
-from residnet.data.doctor.statistics import SECTIONS, WINDOW, Record, bridged, fit
-from residnet.data.statistics import FEWEST
+from residnet.data.channels import SIGMA_OF_MAD, nan_median, nan_std
+from residnet.data.derivatives import fit_local_polynomials
+from residnet.data.doctor.findings import Check, Finding, Level, make_correction, with_channels
+from residnet.data.doctor.statistics import (
+    N_SECTIONS,
+    SMOOTHING_SAMPLES,
+    LogStatistics,
+    fit_least_squares,
+    interpolate_gaps,
+)
+from residnet.data.statistics import MIN_SAMPLES
 
-LEAST_LAG = 0.2
+MIN_LAG = 0.2
 """A lag below this matters to no rollout of a vessel, s."""
-_MOST_CAUSES = 4
+_MAX_CAUSES = 4
 """Causes of one difference; chosen by hand: further ones would explain one another."""
 # a cause must lower the sum of squares by this many variances of the noise, and be this many
 # standard errors from nothing
-_WORTH, _SURE = 60.0, 3.5
-_REACH = WINDOW // 2
-_APART = np.abs(np.arange(-_REACH, _REACH + 1)) > 1
-_BESIDE = np.zeros(WINDOW)
+_MIN_IMPROVEMENT, _MIN_T_STATISTIC = 60.0, 3.5
+_HALF_WINDOW = SMOOTHING_SAMPLES // 2
+_IS_DISTANT = np.abs(np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)) > 1
+_LEAVE_OUT_WEIGHTS = np.zeros(SMOOTHING_SAMPLES)
 """Weights of the samples about one in the parabola that leaves it and its neighbours out."""
-_BESIDE[_APART] = np.linalg.pinv(np.vander(np.arange(-_REACH, _REACH + 1)[_APART], 3))[-1]
-_DEPENDENT = 1e-9
+_LEAVE_OUT_WEIGHTS[_IS_DISTANT] = np.linalg.pinv(
+    np.vander(np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)[_IS_DISTANT], 3)
+)[-1]
+_COLLINEARITY_TOLERANCE = 1e-9
 """Square of what others leave of columns of length 1, below which they are sums of theirs."""
 
 
 @dataclass(frozen=True)
-class Cause:
+class KinematicCause:
     """What explains a difference between two measurements.
 
     Attributes:
-        values: its size, one number for each column.
-        errors: their standard errors.
+        estimates: its size, one number for each column.
+        standard_errors: their standard errors.
     """
 
-    values: np.ndarray
-    errors: np.ndarray
+    estimates: np.ndarray
+    standard_errors: np.ndarray
 
     @property
-    def sure(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether any of its numbers differs from zero."""
-        return bool((np.abs(self.values) > _SURE * self.errors).any())
+        return bool((np.abs(self.estimates) > _MIN_T_STATISTIC * self.standard_errors).any())
 
 
 # standard deviations of a heading's noise by which it has to move before the scale of r is told:
 # smoothing leaves .4 of them
-_TURNED = 3.0
+_MIN_HEADING_SIGNAL_TO_NOISE = 3.0
 
 
-def yaw_causes(log: Record) -> dict[str, Cause]:
+def estimate_yaw_causes(log: LogStatistics) -> dict[str, KinematicCause]:
     """Return what makes the increments of psi differ from the integral of r.
 
     Causes: `gain` (r is too large by 1 + value), `lag` (r trails psi, s), `bias` (of r, rad/s, the
@@ -74,18 +82,26 @@ def yaw_causes(log: Record) -> dict[str, Cause]:
     """
     psi, r, t = log["psi"], log["r"], log.t
     dt = np.diff(t)
-    smooth = log.of(_around, "r")
-    time = (0.5 * (t[1:] + t[:-1]) - t.mean()) / max(float(t[-1] - t[0]), 1e-12)
-    columns = {"bias": [-dt], "ramp": [-dt, -dt * time]}
+    smoothed_rate = log.cached(_smooth_leaving_out_centre, "r")
+    normalized_time = (0.5 * (t[1:] + t[:-1]) - t.mean()) / max(float(t[-1] - t[0]), 1e-12)
+    columns = {"bias": [-dt], "ramp": [-dt, -dt * normalized_time]}
     # where the heading does not move, a bias of r would be all gain
-    turned = deviation(log.of(_around, "psi"))
-    if _stands_out(log, "r") and turned > _TURNED * log.noise("psi"):
-        columns = {"gain": [-_area(dt, smooth)], "lag": [np.diff(smooth)], **columns}
-    rate = np.full(dt.size, log.noise("r"))
-    return _explained(psi, _area(dt, r), dt, log.noise("psi"), rate, columns)
+    heading_std = nan_std(log.cached(_smooth_leaving_out_centre, "psi"))
+    if _is_significant(log, "r") and heading_std > _MIN_HEADING_SIGNAL_TO_NOISE * log.noise_std(
+        "psi"
+    ):
+        columns = {
+            "gain": [-_integrate_steps(dt, smoothed_rate)],
+            "lag": [np.diff(smoothed_rate)],
+            **columns,
+        }
+    rate_noise = np.full(dt.size, log.noise_std("r"))
+    return _explain_increments(
+        psi, _integrate_steps(dt, r), dt, log.noise_std("psi"), rate_noise, columns
+    )
 
 
-def position_causes(log: Record) -> dict[str, Cause]:
+def estimate_position_causes(log: LogStatistics) -> dict[str, KinematicCause]:
     """Return what makes the increments of x, y differ from the integral of R(psi) [u, v].
 
     Causes: `gain_u`, `gain_v`, `gain` (u, v, or both too large by 1 + value), `heading` (to be
@@ -95,60 +111,79 @@ def position_causes(log: Record) -> dict[str, Cause]:
     m/s).
     """
     dt, psi = np.diff(log.t), log["psi"]
-    turn, mid = np.exp(1j * psi), np.exp(0.5j * (psi[1:] + psi[:-1]))
-    u, v = log.of(_around, "u"), log.of(_around, "v")
-    along, across = _area(dt, turn * u), _area(dt, 1j * turn * v)
-    lag_u, lag_v = mid * np.diff(u), 1j * mid * np.diff(v)
-    ground = turn * (u + 1j * v)
-    lag_psi = 0.5j * np.diff(log.of(_around, "psi")) * (ground[1:] + ground[:-1])
+    heading_rotation, mid_rotation = np.exp(1j * psi), np.exp(0.5j * (psi[1:] + psi[:-1]))
+    u, v = log.cached(_smooth_leaving_out_centre, "u"), log.cached(_smooth_leaving_out_centre, "v")
+    surge_increments, sway_increments = (
+        _integrate_steps(dt, heading_rotation * u),
+        _integrate_steps(dt, 1j * heading_rotation * v),
+    )
+    lag_u, lag_v = mid_rotation * np.diff(u), 1j * mid_rotation * np.diff(v)
+    earth_velocity = heading_rotation * (u + 1j * v)
+    lag_psi = (
+        0.5j
+        * np.diff(log.cached(_smooth_leaving_out_centre, "psi"))
+        * (earth_velocity[1:] + earth_velocity[:-1])
+    )
     columns = {
-        "gain_u": [-along],
-        "gain_v": [-across],
-        "gain": [-(along + across)],
-        "heading": [-1j * (along + across)],
+        "gain_u": [-surge_increments],
+        "gain_v": [-sway_increments],
+        "gain": [-(surge_increments + sway_increments)],
+        "heading": [-1j * (surge_increments + sway_increments)],
         "lag_u": [lag_u],
         "lag_v": [lag_v],
         "lag": [lag_u + lag_v],
         "lag_psi": [lag_psi],
         "lag_xy": [-(lag_u + lag_v + lag_psi)],
-        "lever_arm": [np.diff(turn), 1j * np.diff(turn)],
+        "lever_arm": [np.diff(heading_rotation), 1j * np.diff(heading_rotation)],
         "current": [dt + 0j, 1j * dt],
-        "bias": [-_area(dt, turn), -1j * _area(dt, turn)],
+        "bias": [
+            -_integrate_steps(dt, heading_rotation),
+            -1j * _integrate_steps(dt, heading_rotation),
+        ],
     }
-    quiet = {name for name in ("u", "v") if not _stands_out(log, name)}
-    quiet |= {"psi"} if "r" in log and not _stands_out(log, "r") else set()
+    noise_only_channels = {name for name in ("u", "v") if not _is_significant(log, name)}
+    noise_only_channels |= {"psi"} if "r" in log and not _is_significant(log, "r") else set()
     columns = {
-        name: parts
-        for name, parts in columns.items()
-        if not any(name in _NEEDS[channel] for channel in quiet)
+        name: cause_columns
+        for name, cause_columns in columns.items()
+        if not any(name in _UNIDENTIFIABLE_CAUSES[channel] for channel in noise_only_channels)
     }
     speed = np.hypot(np.nan_to_num(log["u"]), np.nan_to_num(log["v"]))
-    turned = log.noise("psi") * 0.5 * (speed[1:] + speed[:-1])
-    rate = np.hypot(max(log.noise("u"), log.noise("v")), turned)
-    measured = _area(dt, turn * (log["u"] + 1j * log["v"]))
-    place = log["x"] + 1j * log["y"]
-    return _explained(place, measured, dt, max(log.noise("x"), log.noise("y")), rate, columns)
+    heading_noise_velocity = log.noise_std("psi") * 0.5 * (speed[1:] + speed[:-1])
+    rate_noise = np.hypot(max(log.noise_std("u"), log.noise_std("v")), heading_noise_velocity)
+    integrated_increments = _integrate_steps(dt, heading_rotation * (log["u"] + 1j * log["v"]))
+    position = log["x"] + 1j * log["y"]
+    return _explain_increments(
+        position,
+        integrated_increments,
+        dt,
+        max(log.noise_std("x"), log.noise_std("y")),
+        rate_noise,
+        columns,
+    )
 
 
 # channel -> causes that cannot be found where it holds noise only: the noise would explain itself
-_NEEDS = {
+_UNIDENTIFIABLE_CAUSES = {
     "u": ("gain_u", "lag_u", "gain", "lag", "lag_xy", "heading"),
     "v": ("gain_v", "lag_v"),
     "psi": ("lag_psi", "lever_arm", "lag_v"),
 }
 
 
-def _area(dt: np.ndarray, rate: np.ndarray) -> np.ndarray:
+def _integrate_steps(dt: np.ndarray, rates: np.ndarray) -> np.ndarray:
     """Return the integrals [T - 1] of a rate [T] over each step."""
-    return np.asarray(0.5 * dt * (rate[1:] + rate[:-1]))
+    return np.asarray(0.5 * dt * (rates[1:] + rates[:-1]))
 
 
-def _stands_out(log: Record, name: str) -> bool:
+def _is_significant(log: LogStatistics, name: str) -> bool:
     """Return whether a channel does more than its noise."""
-    return float(np.sqrt(np.nanmean(log.of(_around, name) ** 2))) > 1.2 * log.noise(name)
+    return float(
+        np.sqrt(np.nanmean(log.cached(_smooth_leaving_out_centre, name) ** 2))
+    ) > 1.2 * log.noise_std(name)
 
 
-def _around(log: Record, name: str) -> np.ndarray:
+def _smooth_leaving_out_centre(log: LogStatistics, name: str) -> np.ndarray:
     """Return a channel [T] smoothed by a parabola over 15 samples; NaN stay where they are.
 
     The parabola is that of the samples around each one, without it and its neighbours: columns then
@@ -156,239 +191,349 @@ def _around(log: Record, name: str) -> np.ndarray:
     a log they do.
     """
     values = log[name]
-    known = np.isfinite(values)
-    if known.sum() < WINDOW:
+    is_finite = np.isfinite(values)
+    if is_finite.sum() < SMOOTHING_SAMPLES:
         return values
-    filled = bridged(np.arange(values.size), values)
-    smooth = local_polynomials(filled[:, None], WINDOW, 2, 1.0)[0][:, 0]
-    smooth[_REACH:-_REACH] = np.convolve(filled, _BESIDE, "valid")
-    return np.where(known & ~log.torn(_REACH), smooth, np.nan)
+    gap_free = interpolate_gaps(np.arange(values.size), values)
+    smoothed_values = fit_local_polynomials(gap_free[:, None], SMOOTHING_SAMPLES, 2, 1.0)[0][:, 0]
+    smoothed_values[_HALF_WINDOW:-_HALF_WINDOW] = np.convolve(gap_free, _LEAVE_OUT_WEIGHTS, "valid")
+    return np.where(is_finite & ~log.near_seam(_HALF_WINDOW), smoothed_values, np.nan)
 
 
-def _explained(
-    pose: np.ndarray,
-    known: np.ndarray,
+def _explain_increments(
+    measured_pose: np.ndarray,
+    integrated_increments: np.ndarray,
     dt: np.ndarray,
-    noise: float,
-    rate: np.ndarray,
+    pose_noise: float,
+    rate_noise: np.ndarray,
     columns: Mapping[str, list[np.ndarray]],
-) -> dict[str, Cause]:
+) -> dict[str, KinematicCause]:
     """Return the causes that it takes to explain a pose, in the order of their weight.
 
     Args:
-        pose: [T] real or complex, NaN where it was not measured.
-        known: its increments [T - 1] by the velocities, NaN where these are missing.
+        measured_pose: [T] real or complex, NaN where it was not measured.
+        integrated_increments: its increments [T - 1] by the velocities, NaN where these are missing.
         dt: time steps [T - 1], s.
-        noise: of the pose at each sample.
-        rate: noise [T - 1] of the velocity.
+        pose_noise: of the pose at each sample.
+        rate_noise: noise [T - 1] of the velocity.
         columns: what each cause adds to the increments, [T - 1] each.
     """
-    at = np.flatnonzero(np.isfinite(pose))
+    measured_indices = np.flatnonzero(np.isfinite(measured_pose))
 
-    def between(steps: np.ndarray) -> np.ndarray:
+    def sum_between_poses(steps: np.ndarray) -> np.ndarray:
         """Return the sums [K, ...] of steps [T - 1, ...] from one pose to the next, NaN as well."""
-        if at.size == pose.size:
+        if measured_indices.size == measured_pose.size:
             return steps
-        unknown, start = ~np.isfinite(steps), np.zeros((1, *steps.shape[1:]))
-        total = np.concatenate((start, np.cumsum(np.where(unknown, 0.0, steps), axis=0)))[at]
-        count = np.concatenate((start, np.cumsum(unknown, axis=0)))[at]
-        return np.where(np.diff(count, axis=0) > 0, np.nan, np.diff(total, axis=0))
+        is_missing, initial_zeros = ~np.isfinite(steps), np.zeros((1, *steps.shape[1:]))
+        cumulative_sums = np.concatenate(
+            (initial_zeros, np.cumsum(np.where(is_missing, 0.0, steps), axis=0))
+        )[measured_indices]
+        n_missing = np.concatenate((initial_zeros, np.cumsum(is_missing, axis=0)))[measured_indices]
+        return np.where(np.diff(n_missing, axis=0) > 0, np.nan, np.diff(cumulative_sums, axis=0))
 
-    if at.size < FEWEST:
+    if measured_indices.size < MIN_SAMPLES:
         return {}
-    excess, seconds, variance = np.diff(pose[at]) - between(known), between(dt), (dt * rate) ** 2
-    table = between(np.stack([part for parts in columns.values() for part in parts], axis=-1))
-    usable = np.isfinite(excess) & np.isfinite(table).all(axis=1) & np.isfinite(between(rate))
-    keep = np.flatnonzero(usable & (seconds <= 3.0 * median(seconds)))
-    if keep.size < FEWEST:
+    unexplained_increments, durations, variance = (
+        np.diff(measured_pose[measured_indices]) - sum_between_poses(integrated_increments),
+        sum_between_poses(dt),
+        (dt * rate_noise) ** 2,
+    )
+    cause_columns = sum_between_poses(
+        np.stack(
+            [column for columns_of_cause in columns.values() for column in columns_of_cause],
+            axis=-1,
+        )
+    )
+    is_usable = (
+        np.isfinite(unexplained_increments)
+        & np.isfinite(cause_columns).all(axis=1)
+        & np.isfinite(sum_between_poses(rate_noise))
+    )
+    retained_indices = np.flatnonzero(is_usable & (durations <= 3.0 * nan_median(durations)))
+    if retained_indices.size < MIN_SAMPLES:
         return {}
-    total = between(variance)[keep]
-    shared = variance[np.minimum(at[keep], variance.size - 1)]
-    shared = np.where(np.isfinite(shared), np.minimum(shared, total), total)
-    floor = 1e-3 * median(np.abs(excess[keep])) + 1e-12
+    total_variance = sum_between_poses(variance)[retained_indices]
+    shared_variance = variance[np.minimum(measured_indices[retained_indices], variance.size - 1)]
+    shared_variance = np.where(
+        np.isfinite(shared_variance), np.minimum(shared_variance, total_variance), total_variance
+    )
+    min_deviation = 1e-3 * nan_median(np.abs(unexplained_increments[retained_indices])) + 1e-12
     # the trapezoid shares half a sample with its neighbour, which noise of the pose hides at least
     # in part: increments are never taken as more alike than independent ones, or the whitening
     # would look at the highest frequencies alone
-    ends = np.maximum(noise**2 - 0.25 * shared, 0.0)
-    adjacent = np.append(keep[1:] == keep[:-1] + 1, False)
+    end_variance = np.maximum(pose_noise**2 - 0.25 * shared_variance, 0.0)
+    is_adjacent = np.append(retained_indices[1:] == retained_indices[:-1] + 1, False)
     # noise of the pose alone is singular in the limit: a little of the diagonal keeps the factor
-    band = np.stack((1.0001 * (total + 2.0 * ends + floor**2), np.where(adjacent, -ends, 0.0)))
-    factor = scipy.linalg.cholesky_banded(band, lower=True)
+    covariance_band = np.stack(
+        (
+            1.0001 * (total_variance + 2.0 * end_variance + min_deviation**2),
+            np.where(is_adjacent, -end_variance, 0.0),
+        )
+    )
+    cholesky_factor = scipy.linalg.cholesky_banded(covariance_band, lower=True)
     # real and imaginary parts of a sample side by side, so that sections hold both
-    rows = np.column_stack((excess[keep], table[keep]))
-    rows = scipy.linalg.solve_banded((1, 0), factor, rows, overwrite_b=True)
-    if np.iscomplexobj(rows):
-        rows = np.stack((rows.real, rows.imag), axis=1).reshape(-1, rows.shape[1])
-    y, table = rows[:, 0], rows[:, 1:]
+    whitened_rows = np.column_stack(
+        (unexplained_increments[retained_indices], cause_columns[retained_indices])
+    )
+    whitened_rows = scipy.linalg.solve_banded(
+        (1, 0), cholesky_factor, whitened_rows, overwrite_b=True
+    )
+    if np.iscomplexobj(whitened_rows):
+        whitened_rows = np.stack((whitened_rows.real, whitened_rows.imag), axis=1).reshape(
+            -1, whitened_rows.shape[1]
+        )
+    y, cause_columns = whitened_rows[:, 0], whitened_rows[:, 1:]
     # rows that stand far out and that no cause explains are jumps
-    scale = np.maximum(np.abs(table).max(axis=0), 1e-300)
-    unit = table / scale
-    rest = np.abs(y - unit @ np.linalg.lstsq(unit.T @ unit, unit.T @ y, rcond=1e-12)[0])
-    trust = rest <= 8.0 * SIGMA_OF_MAD * max(median(rest), 1e-300)
-    names = np.array([name for name, parts in columns.items() for _ in parts])
-    return _pursuit(np.where(trust, y, 0.0), np.where(trust[:, None], table, 0.0), names)
+    column_scales = np.maximum(np.abs(cause_columns).max(axis=0), 1e-300)
+    scaled_columns = cause_columns / column_scales
+    abs_residuals = np.abs(
+        y
+        - scaled_columns
+        @ np.linalg.lstsq(scaled_columns.T @ scaled_columns, scaled_columns.T @ y, rcond=1e-12)[0]
+    )
+    is_inlier = abs_residuals <= 8.0 * SIGMA_OF_MAD * max(nan_median(abs_residuals), 1e-300)
+    names = np.array([name for name, columns_of_cause in columns.items() for _ in columns_of_cause])
+    return _orthogonal_matching_pursuit(
+        np.where(is_inlier, y, 0.0), np.where(is_inlier[:, None], cause_columns, 0.0), names
+    )
 
 
-def _pursuit(y: np.ndarray, x: np.ndarray, names: np.ndarray) -> dict[str, Cause]:
+def _orthogonal_matching_pursuit(
+    response: np.ndarray, regressors: np.ndarray, names: np.ndarray
+) -> dict[str, KinematicCause]:
     """Select groups of columns one at a time, then drop those that others made superfluous."""
-    scale = np.linalg.norm(x, axis=0)
-    x, names = x[:, scale > 0.0] / scale[scale > 0.0], names[scale > 0.0]
-    scale = scale[scale > 0.0]
-    gram, product, energy = x.T @ x, x.T @ y, float(y @ y)
-    groups = {name: np.flatnonzero(names == name) for name in dict.fromkeys(names.tolist())}
+    column_norms = np.linalg.norm(regressors, axis=0)
+    regressors, names = (
+        regressors[:, column_norms > 0.0] / column_norms[column_norms > 0.0],
+        names[column_norms > 0.0],
+    )
+    column_norms = column_norms[column_norms > 0.0]
+    gram, product, energy = (
+        regressors.T @ regressors,
+        regressors.T @ response,
+        float(response @ response),
+    )
+    columns_by_cause = {
+        name: np.flatnonzero(names == name) for name in dict.fromkeys(names.tolist())
+    }
 
-    def left(chosen: Iterable[str]) -> float:
+    def compute_residual_energy(causes: Iterable[str]) -> float:
         """Return the sum of squares that some causes leave."""
-        part = np.concatenate([groups[name] for name in chosen])
-        values = np.linalg.lstsq(gram[part][:, part], product[part], rcond=_DEPENDENT)[0]
-        return energy - float(product[part] @ values)
+        column_indices = np.concatenate([columns_by_cause[name] for name in causes])
+        coefficients = np.linalg.lstsq(
+            gram[column_indices][:, column_indices],
+            product[column_indices],
+            rcond=_COLLINEARITY_TOLERANCE,
+        )[0]
+        return energy - float(product[column_indices] @ coefficients)
 
-    if not groups:
+    if not columns_by_cause:
         return {}
-    variance = max(left(groups) / y.size, 1e-12 * energy / y.size)
-    price = {n: _WORTH * variance * (1.0 + 0.2 * part.size) for n, part in groups.items()}
-    chosen, rest = list[str](), energy
-    while len(chosen) < _MOST_CAUSES:
-        lower = {name: left([*chosen, name]) for name in groups if name not in chosen}
+    variance = max(
+        compute_residual_energy(columns_by_cause) / response.size, 1e-12 * energy / response.size
+    )
+    min_gain_by_cause = {
+        cause_name: _MIN_IMPROVEMENT * variance * (1.0 + 0.2 * is_selected.size)
+        for cause_name, is_selected in columns_by_cause.items()
+    }
+    selected_causes, residual_energy = list[str](), energy
+    while len(selected_causes) < _MAX_CAUSES:
+        residual_energy_by_cause = {
+            name: compute_residual_energy([*selected_causes, name])
+            for name in columns_by_cause
+            if name not in selected_causes
+        }
         # of causes that explain the same, as lags of all channels but one and of that one do, the
         # first counts
-        more = {
-            n: round((rest - one - price[n]) / max(energy, 1e-300), 9) for n, one in lower.items()
+        net_gain_by_cause = {
+            cause_name: round(
+                (residual_energy - energy_of_cause - min_gain_by_cause[cause_name])
+                / max(energy, 1e-300),
+                9,
+            )
+            for cause_name, energy_of_cause in residual_energy_by_cause.items()
         }
-        best = max(more, key=lambda name: more[name], default="")
-        if not best or more[best] <= 0.0:
+        best_cause = max(net_gain_by_cause, key=lambda name: net_gain_by_cause[name], default="")
+        if not best_cause or net_gain_by_cause[best_cause] <= 0.0:
             break
-        chosen, rest = [*chosen, best], lower[best]
-    for name in list(chosen[:-1]):
-        fewer = [cause for cause in chosen if cause != name]
-        chosen = fewer if left(fewer) - left(chosen) < price[name] else chosen
-    if not chosen:
+        selected_causes, residual_energy = (
+            [*selected_causes, best_cause],
+            residual_energy_by_cause[best_cause],
+        )
+    for name in list(selected_causes[:-1]):
+        reduced_causes = [cause for cause in selected_causes if cause != name]
+        selected_causes = (
+            reduced_causes
+            if compute_residual_energy(reduced_causes) - compute_residual_energy(selected_causes)
+            < min_gain_by_cause[name]
+            else selected_causes
+        )
+    if not selected_causes:
         return {}
-    part = np.isin(names, chosen)
-    columns, names, scale = x[:, part], names[part], scale[part]
-    fitted = fit(columns, y)
-    plain = np.linalg.pinv(columns.T @ columns) * fitted.left / max(y.size - columns.shape[1], 1)
-    spread = np.diag(fitted.spread) * SECTIONS / (SECTIONS - 1)
-    errors = np.sqrt(np.maximum(spread, np.diag(plain))) / scale
-    values = fitted.values / scale
-    return {name: Cause(values[names == name], errors[names == name]) for name in chosen}
+    is_selected = np.isin(names, selected_causes)
+    columns, names, column_norms = (
+        regressors[:, is_selected],
+        names[is_selected],
+        column_norms[is_selected],
+    )
+    least_squares_fit = fit_least_squares(columns, response)
+    white_noise_covariance = (
+        np.linalg.pinv(columns.T @ columns)
+        * least_squares_fit.sum_of_squares
+        / max(response.size - columns.shape[1], 1)
+    )
+    sandwich_variance = np.diag(least_squares_fit.covariance) * N_SECTIONS / (N_SECTIONS - 1)
+    standard_errors = (
+        np.sqrt(np.maximum(sandwich_variance, np.diag(white_noise_covariance))) / column_norms
+    )
+    estimates = least_squares_fit.coefficients / column_norms
+    return {
+        name: KinematicCause(estimates[names == name], standard_errors[names == name])
+        for name in selected_causes
+    }
 
 
 @dataclass(frozen=True)
-class Limit:
+class CauseLimit:
     """What a cause of disagreement is called, and the size from which on it misleads.
 
     Attributes:
         text: before its size.
         unit: of the size as shown.
-        least: size from which on it misleads, SI.
+        min_size: size from which on it misleads, SI.
         fix: what to do about it.
-        steps: least size in time steps.
-        of_speed: least size as a share of the speed.
+        min_time_steps: least size in time steps.
+        min_speed_share: least size as a share of the speed.
     """
 
     text: str
     unit: str
-    least: float
+    min_size: float
     fix: str
-    steps: float = 0.0
-    of_speed: float = 0.0
+    min_time_steps: float = 0.0
+    min_speed_share: float = 0.0
 
 
-def _lag(text: str, least: float = LEAST_LAG) -> Limit:
+def _lag_limit(text: str, min_size: float = MIN_LAG) -> CauseLimit:
     fix = "shift it in time, or estimate the lag where the reader can"
-    return Limit(text, "s", least, fix, steps=1.0)
+    return CauseLimit(text, "s", min_size, fix, min_time_steps=1.0)
 
 
-def _gain(text: str, least: float, fix: str = "correct its unit or scale") -> Limit:
-    return Limit(f"{text} by a share of", "", least, fix)
+def _gain_limit(text: str, min_size: float, fix: str = "correct its unit or scale") -> CauseLimit:
+    return CauseLimit(f"{text} by a share of", "", min_size, fix)
 
 
 YAW_LIMITS = {
-    "gain": _gain("r is too large against psi", 0.06),
-    "lag": _lag("r trails psi by"),
+    "gain": _gain_limit("r is too large against psi", 0.06),
+    "lag": _lag_limit("r trails psi by"),
 }
 POSITION_LIMITS = {
-    "gain_u": _gain("u is too large against the position", 0.04),
-    "gain_v": _gain("v is too large against the position", 0.25),
-    "gain": _gain("u, v are too large against the position", 0.04, "correct their unit or scale"),
-    "heading": Limit(
+    "gain_u": _gain_limit("u is too large against the position", 0.04),
+    "gain_v": _gain_limit("v is too large against the position", 0.25),
+    "gain": _gain_limit(
+        "u, v are too large against the position", 0.04, "correct their unit or scale"
+    ),
+    "heading": CauseLimit(
         "psi is off against course and drift by",
         "deg",
         math.radians(3.0),
         "take the offset off psi",
     ),
-    "lag_u": _lag("u trails the position by"),
-    "lag_v": _lag("v trails the position by"),
-    "lag": _lag("u, v trail the position by"),
-    "lag_psi": _lag("psi trails position and velocities by", 2.0 * LEAST_LAG),
-    "lag_xy": _lag("x, y trail heading and velocities by"),
-    "lever_arm": Limit(
+    "lag_u": _lag_limit("u trails the position by"),
+    "lag_v": _lag_limit("v trails the position by"),
+    "lag": _lag_limit("u, v trail the position by"),
+    "lag_psi": _lag_limit("psi trails position and velocities by", 2.0 * MIN_LAG),
+    "lag_xy": _lag_limit("x, y trail heading and velocities by"),
+    "lever_arm": CauseLimit(
         "x, y belong to a point forward and to starboard of where u, v hold by",
         "m",
         0.3,
         "move it to the vessel's centre (lever arm)",
-        of_speed=0.05,
+        min_speed_share=0.05,
     ),
-    "current": Limit(
+    "current": CauseLimit(
         "u, v are through water that moves north and east by",
         "m/s",
         0.02,
         "give the current as an input",
-        of_speed=0.1,
+        min_speed_share=0.1,
     ),
-    "bias": Limit(
-        "u, v are too large against the position by", "m/s", 0.02, "take the bias off", of_speed=0.1
+    "bias": CauseLimit(
+        "u, v are too large against the position by",
+        "m/s",
+        0.02,
+        "take the bias off",
+        min_speed_share=0.1,
     ),
 }
 
 
-def cause_findings(
-    causes: Mapping[str, Cause], limits: Mapping[str, Limit], log: Record, found: Check
+def make_cause_findings(
+    causes: Mapping[str, KinematicCause],
+    limits: Mapping[str, CauseLimit],
+    log: LogStatistics,
+    make_finding: Check,
 ) -> Iterator[Finding]:
     """Return the findings for the causes that are certain and large enough to matter."""
     for name, cause in causes.items():
         limit = limits.get(name)
-        if limit is None or not cause.sure:
+        if limit is None or not cause.is_significant:
             continue
-        size = float(np.hypot.reduce(cause.values))
-        least = max(limit.least, limit.steps * log.step, limit.of_speed * log.speed)
-        if size < 0.3 * least:
+        magnitude = float(np.hypot.reduce(cause.estimates))
+        min_size = max(
+            limit.min_size,
+            limit.min_time_steps * log.sampling_interval,
+            limit.min_speed_share * log.rms_speed,
+        )
+        if magnitude < 0.3 * min_size:
             continue
-        early = "trail" in limit.text and cause.values[0] < 0.0
-        text = limit.text.replace("trail", "lead") if early else limit.text
-        factor = (math.degrees(1.0) if limit.unit == "deg" else 1.0) * (-1.0 if early else 1.0)
-        sizes = zip(factor * cause.values, np.abs(2.0 * factor * cause.errors), strict=True)
-        shown = ", ".join(f"{value:+.3g} +- {error:.2g}" for value, error in sizes)
-        level: Level = "will mislead" if size > least else "note"
-        figures = {f"value_{i + 1}": float(value) for i, value in enumerate(cause.values)}
-        yield found(
-            f"{text}: {shown} {limit.unit}".rstrip(),
-            {"size": size, **figures, "error": cause.errors.max()},
+        is_leading = "trail" in limit.text and cause.estimates[0] < 0.0
+        text = limit.text.replace("trail", "lead") if is_leading else limit.text
+        display_factor = (math.degrees(1.0) if limit.unit == "deg" else 1.0) * (
+            -1.0 if is_leading else 1.0
+        )
+        values_and_errors = zip(
+            display_factor * cause.estimates,
+            np.abs(2.0 * display_factor * cause.standard_errors),
+            strict=True,
+        )
+        sizes_text = ", ".join(
+            f"{estimate:+.3g} +- {interval_half_width:.2g}"
+            for estimate, interval_half_width in values_and_errors
+        )
+        level: Level = "will mislead" if magnitude > min_size else "note"
+        figures = {f"value_{i + 1}": float(estimate) for i, estimate in enumerate(cause.estimates)}
+        yield make_finding(
+            f"{text}: {sizes_text} {limit.unit}".rstrip(),
+            {"size": magnitude, **figures, "error": cause.standard_errors.max()},
             code=name,
             level=level,
             fix=limit.fix if level != "note" else "",
-            repair=_repair(name, cause.values, ("r",) if limits is YAW_LIMITS else ("u", "v")),
+            repair=_make_repair(
+                name, cause.estimates, ("r",) if limits is YAW_LIMITS else ("u", "v")
+            ),
         )
 
 
-def _repair(name: str, values: np.ndarray, pair: tuple[str, ...]) -> Callable[[Log], Log] | None:
-    """Return what corrects a cause; `pair` are the channels that are compared with the pose."""
-    what, _, channel = name.partition("_")
-    names = {"": pair, "xy": ("x", "y")}.get(channel, (channel,))
-    if what == "gain":
-        return correction(names, factor=1.0 + values[0])
-    if what == "lag":
-        return correction(names, lag=values[0])
+def _make_repair(
+    name: str, estimates: np.ndarray, velocity_names: tuple[str, ...]
+) -> Callable[[Log], Log] | None:
+    """Return what corrects a cause; `velocity_names` are the channels that are compared with the pose."""
+    cause_kind, _, channel_suffix = name.partition("_")
+    channel_names = {"": velocity_names, "xy": ("x", "y")}.get(channel_suffix, (channel_suffix,))
+    if cause_kind == "gain":
+        return make_correction(channel_names, factor=1.0 + estimates[0])
+    if cause_kind == "lag":
+        return make_correction(channel_names, delay=estimates[0])
     if name == "heading":
-        return correction(("psi",), offset=values[0])
+        return make_correction(("psi",), offset=estimates[0])
     if name == "bias":
-        return lambda log: with_channels(log, u=log["u"] - values[0], v=log["v"] - values[1])
+        return lambda log: with_channels(log, u=log["u"] - estimates[0], v=log["v"] - estimates[1])
     if name == "lever_arm":
 
-        def moved(log: Log) -> Log:
-            arm = (values[0] + 1j * values[1]) * np.exp(1j * log["psi"])
-            return with_channels(log, x=log["x"] - arm.real, y=log["y"] - arm.imag)
+        def move_to_centre(log: Log) -> Log:
+            lever_arm = (estimates[0] + 1j * estimates[1]) * np.exp(1j * log["psi"])
+            return with_channels(log, x=log["x"] - lever_arm.real, y=log["y"] - lever_arm.imag)
 
-        return moved
+        return move_to_centre
     return None

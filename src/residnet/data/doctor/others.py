@@ -20,15 +20,21 @@ from functools import cached_property
 import numpy as np
 import scipy
 
-from residnet.core.arrays.paged import LARGE
-from residnet.core.layout import SIX
-from residnet.core.names import VELOCITY, sides, thrusters_that_turn
-from residnet.core.stretches import stretches
-from residnet.core.units import slips
+from residnet.core.arrays.paged import MAX_SAMPLES_IN_MEMORY
+from residnet.core.layout import SIX_DOF_LAYOUT
+from residnet.core.names import VELOCITY_NAMES, azimuth_thrusters, port_starboard_pairs
+from residnet.core.stretches import find_runs
+from residnet.core.units import unit_confusions
 from residnet.data.channels import SIGMA_OF_MAD
-from residnet.data.doctor.findings import show, slip_in_words
-from residnet.data.doctor.statistics import STEERING, Record, blocks_of, bridged, reversals
-from residnet.data.statistics import FEWEST
+from residnet.data.doctor.findings import describe_unit_confusion, format_quantity
+from residnet.data.doctor.statistics import (
+    STEERING_CHANNELS,
+    LogStatistics,
+    count_reversals,
+    interpolate_gaps,
+    make_blocks,
+)
+from residnet.data.statistics import MIN_SAMPLES
 
 _RIDGE = 1e-6
 """Of the mean of a diagonal: solves what moves together, and changes the rest by a millionth."""
@@ -96,7 +102,7 @@ def _weight(log: _Sampled, moving: Sequence[str]) -> list[np.ndarray]:
 
 def _thrusts(log: _Sampled, driving: Sequence[str]) -> tuple[list[np.ndarray], list[str]]:
     """Return the thrusts of azimuth thrusters along and across the vessel, and all other inputs."""
-    turned = thrusters_that_turn(driving)
+    turned = azimuth_thrusters(driving)
     along = [log[by] * np.abs(log[by]) * np.exp(1j * log[angle]) for angle, by in turned.items()]
     rest = [name for name in driving if name not in turned and name not in turned.values()]
     return [part for one in along for part in (one.real, one.imag)], rest
@@ -261,14 +267,16 @@ class Fleet:
         apart: numbers of those that do not, the worst first.
     """
 
-    def __init__(self, logs: Sequence[Record], inputs: Sequence[str]) -> None:
+    def __init__(self, logs: Sequence[LogStatistics], inputs: Sequence[str]) -> None:
         self.logs, self.inputs = list(logs), tuple(inputs)
-        self.moving = [name for name in VELOCITY if all(name in log for log in logs)]
-        if all(name in log for log in logs for name in SIX.moving):
-            self.moving = list(SIX.velocities)
+        self.moving = [name for name in VELOCITY_NAMES if all(name in log for log in logs)]
+        if all(name in log for log in logs for name in SIX_DOF_LAYOUT.dynamic_states):
+            self.moving = list(SIX_DOF_LAYOUT.velocities)
         self.driving = [name for name in inputs if not name.startswith(("wind", "current"))]
         seconds = [
-            blocks_of(log, *self.moving).size * log.step for log in logs if len(log) >= FEWEST
+            make_blocks(log, *self.moving).length * log.sampling_interval
+            for log in logs
+            if len(log) >= MIN_SAMPLES
         ]
         self.seconds = float(np.median(seconds)) if seconds else 1.0
         self.form: _Form = _polynomial
@@ -302,8 +310,12 @@ class Fleet:
         left = [float(np.sqrt(model.left(self.rows[i])).sum()) for i, model in models.items()]
         return float(np.median(left)) if left else 0.0
 
-    def _rows(self, log: Record) -> Rows:
-        size = max(round(self.seconds / log.step), 4) if len(log) >= FEWEST else len(log)
+    def _rows(self, log: LogStatistics) -> Rows:
+        size = (
+            max(round(self.seconds / log.sampling_interval), 4)
+            if len(log) >= MIN_SAMPLES
+            else len(log)
+        )
         stride = max(size // int(_OVERLAP), (len(log) - size) // _MOST_ROWS, 1)
         first, parts = np.arange(0, max(len(log) - size, 0), stride), []
         needed = {*self.moving, *self.inputs, "psi", "phi", "theta"}
@@ -319,8 +331,8 @@ class Fleet:
         x, seconds = np.concatenate(parts), log.t[first + size] - log.t[first]
         y = np.stack([log[n][first + size] - log[n][first] for n in self.moving], axis=-1)
         known = np.isfinite(x).all(1) & np.isfinite(y).all(1)
-        known &= seconds <= (size + 3.0) * log.step
-        noise = np.array([2.0 * log.noise(name) ** 2 for name in self.moving])
+        known &= seconds <= (size + 3.0) * log.sampling_interval
+        noise = np.array([2.0 * log.noise_std(name) ** 2 for name in self.moving])
         return Rows(x[known], y[known], first[known], size, noise)
 
     def _scaled(self, rows: Rows) -> Rows:
@@ -332,7 +344,7 @@ class Fleet:
             rows.noise / self.spread**2,
         )
 
-    def of(self, log: Record) -> Rows:
+    def of(self, log: LogStatistics) -> Rows:
         """Return the rows of a log, or of a changed one, in the scales of the fleet."""
         return self._scaled(self._rows(log))
 
@@ -527,7 +539,7 @@ class Fleet:
         Of a log that lies beyond them from end to end no part tells that it is right.
         """
 
-        def acting(log: Record) -> np.ndarray:
+        def acting(log: LogStatistics) -> np.ndarray:
             thrusts, rest = _thrusts(dict(log.log.channels), self.driving)
             return np.stack([*thrusts, *(log[name] for name in (*rest, *self.moving))])
 
@@ -541,7 +553,7 @@ class Fleet:
         if not led.any() or led.all():
             return False
         # where such inputs led to a motion of which nothing is known, it lasts beyond them
-        for start, stop in zip(*stretches(out), strict=True):
+        for start, stop in zip(*find_runs(out), strict=True):
             out[start:stop] = led[start:stop].any()
         count = np.append(0, np.cumsum(out))
         self.rows[i] = whole.some(count[whole.first + whole.size + 1] == count[whole.first])
@@ -556,7 +568,7 @@ class Fleet:
         self._whole = _totals([self.rows[j] for j in core])
 
     def unexplained_rests(
-        self, log: Record, rows: Rows, without: int | None = None, at_zero: bool = False
+        self, log: LogStatistics, rows: Rows, without: int | None = None, at_zero: bool = False
     ) -> list[tuple[int, int]]:
         """Return first and last samples of rests of all inputs whose motion nothing explains.
 
@@ -569,7 +581,7 @@ class Fleet:
         same = (np.diff(given, axis=0) == 0.0).all(1)
         if at_zero:
             same &= (given[1:] == 0.0).all(1)
-        starts, stops = stretches(np.append(same, False))
+        starts, stops = find_runs(np.append(same, False))
         long = stops - starts >= rows.size
         rest = self.model(without).rest(rows) if long.any() else np.zeros(0)
         for start, stop in zip(starts[long].tolist(), stops[long].tolist(), strict=True):
@@ -617,10 +629,10 @@ class Fleet:
         return np.asarray(np.sqrt(np.median([*self._usually.values()], axis=0)))
 
 
-def changed(log: Record, channels: Mapping[str, np.ndarray]) -> Record:
+def changed(log: LogStatistics, channels: Mapping[str, np.ndarray]) -> LogStatistics:
     """Return a record with some channels changed."""
     whole = {**log.log.channels, **channels}
-    return Record(log.log.replace(channels=whole), log.inputs)
+    return LogStatistics(log.log.replace(channels=whole), log.inputs)
 
 
 @dataclass(frozen=True)
@@ -670,14 +682,14 @@ def _in_words(kind: str, name: str, unit: str, size: float) -> str:
     if kind == "sign":
         return f"{would} have the opposite sign"
     if kind == "scale":
-        return f"{would} be {size:.3g} times as large{slip_in_words(1.0 / size, unit)}"
+        return f"{would} be {size:.3g} times as large{describe_unit_confusion(1.0 / size, unit)}"
     if kind == "late":
         word = "later" if size > 0.0 else "earlier"
         return f"{would} act {abs(size):.2g} s {word}: the clocks differ"
-    return f"{would} be larger by {show(size, unit)}"
+    return f"{would} be larger by {format_quantity(size, unit)}"
 
 
-def _alike(log: Record, names: Sequence[str]) -> list[tuple[str, ...]]:
+def _alike(log: LogStatistics, names: Sequence[str]) -> list[tuple[str, ...]]:
     """Return inputs that move together: of one recorder, so that one fault has them all."""
     table = np.atleast_2d(np.corrcoef(np.nan_to_num(log.log.stack([*names]).T)))
     pairs = [[one == f"cmd_{name}" for one in names] for name in names]
@@ -703,7 +715,7 @@ def causes(fleet: Fleet, i: int) -> list[Cause]:
             out.append(Cause("dead", name, 0.0, surprise, text))
             continue
         sizes = {"sign": [-1.0]} if derived != whole else {}
-        sizes["scale"] = [1.0 / size for size in slips(unit)]
+        sizes["scale"] = [1.0 / size for size in unit_confusions(unit)]
         if drives:
             sizes["scale"] += _FACTORS
             sizes["late"] = [step * fleet.seconds for step in _STEPS]
@@ -729,7 +741,7 @@ def causes(fleet: Fleet, i: int) -> list[Cause]:
                 surprise, size = min((surprise, size), (float(near.fun), float(near.x)))
             text = _in_words(kind, said, unit, size)
             out.append(Cause(kind, name, size, surprise, text))
-    for port, stbd in sides(fleet.driving).items():
+    for port, stbd in port_starboard_pairs(fleet.driving).items():
         surprise = model.surprise(fleet.of(changed(log, {port: log[stbd], stbd: log[port]})))
         text = f"{port} and {stbd} would have to be exchanged"
         out.append(Cause("exchanged", port, 0.0, surprise, text))
@@ -755,7 +767,7 @@ def _freed(fleet: Fleet, model: Model, i: int, name: str, step: float) -> float:
     return float((rest**2).sum(1).mean()) * (rest.shape[1] / free if free else 1.0)
 
 
-def _heading_off(fleet: Fleet, model: Model, log: Record) -> Cause:
+def _heading_off(fleet: Fleet, model: Model, log: LogStatistics) -> Cause:
     """Return the angle by which ahead is another way than the velocities have it."""
 
     def surprise(angle: float) -> float:
@@ -776,12 +788,12 @@ def _heading_off(fleet: Fleet, model: Model, log: Record) -> Cause:
     return Cause("heading", "psi", angle, float(found.fun), text)
 
 
-def _current(fleet: Fleet, model: Model, log: Record) -> list[Cause]:
+def _current(fleet: Fleet, model: Model, log: LogStatistics) -> list[Cause]:
     """Return the current that would explain velocities over ground, by search on a grid.
 
     None where the search ends at slack water.
     """
-    usual = float(np.nanmedian([fleet.logs[j].speed for j in fleet.core]))
+    usual = float(np.nanmedian([fleet.logs[j].rms_speed for j in fleet.core]))
 
     def surprise(current: complex) -> float:
         water = (log["u"] + 1j * log["v"]) - current * np.exp(-1j * log["psi"])
@@ -831,7 +843,7 @@ share of a log up to which such stretches are a hand on the wheel, and not a wro
 
 
 def dead_commands(
-    learned: Sequence[Record], further: Sequence[Record], inputs: Sequence[str]
+    learned: Sequence[LogStatistics], further: Sequence[LogStatistics], inputs: Sequence[str]
 ) -> dict[str, list[tuple[int, int]]]:
     """Return stretches of motion that no recorded input explains while all inputs rest.
 
@@ -846,7 +858,7 @@ def dead_commands(
         Name of a log -> first and last samples.
     """
     fit = [log for log in learned if _usable(log, inputs)]
-    if not fit or not any(all(name in log for log in fit) for name in VELOCITY):
+    if not fit or not any(all(name in log for log in fit) for name in VELOCITY_NAMES):
         return {}
     fleet = Fleet(fit, inputs)
     out = {log.name: fleet.rests(i) for i, log in enumerate(fit)}
@@ -856,10 +868,10 @@ def dead_commands(
     return {name: found for name, found in out.items() if found}
 
 
-def _usable(log: Record, inputs: Sequence[str]) -> bool:
+def _usable(log: LogStatistics, inputs: Sequence[str]) -> bool:
     """Return whether a log has a clock and all inputs, and is not too long to be looked at."""
     return (
-        1 < len(log) <= LARGE
+        1 < len(log) <= MAX_SAMPLES_IN_MEMORY
         and bool((np.diff(log.t) > 0.0).all())
         and all(name in log for name in inputs)
     )
@@ -874,7 +886,7 @@ def nothing_steers(fleet: Fleet) -> tuple[list[str], float]:
     if "r" not in fleet.moving or len(fleet.core) < 2:
         return [], 0.0
     sides = [name for name in fleet.driving if name.endswith(("port", "stbd", "left", "right"))]
-    steering = [name for name in fleet.driving if name in STEERING] or sides
+    steering = [name for name in fleet.driving if name in STEERING_CHANNELS] or sides
     dead = [
         name
         for name in steering
@@ -887,12 +899,12 @@ def nothing_steers(fleet: Fleet) -> tuple[list[str], float]:
     if not dead or left <= _UNSTEERED:
         return [], left
     headings = (
-        bridged(log.t, log["psi"])
+        interpolate_gaps(log.t, log["psi"])
         if "psi" in log
-        else np.cumsum(np.nan_to_num(log["r"])) * log.step
+        else np.cumsum(np.nan_to_num(log["r"])) * log.sampling_interval
         for log in fleet.logs
     )
-    weaving = [reversals(heading, _SWING) >= 2 for heading in headings]
+    weaving = [count_reversals(heading, _SWING) >= 2 for heading in headings]
     return (dead, left) if np.mean(weaving) >= _WEAVE else ([], left)
 
 

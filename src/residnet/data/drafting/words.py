@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from residnet.core.errors import UsageError
-from residnet.core.names import ACCELERATION, BOW_WIND, CHANNEL_UNITS, si_of
-from residnet.core.units import is_unit, known_unit, si_unit
+from residnet.core.names import ACCELERATION_NAMES, BOW_WIND_CHANNELS, CHANNEL_UNITS, get_si_unit
+from residnet.core.units import canonical_unit, is_unit, si_unit
 
 _IN_BRACKETS = re.compile(r"[\[({]([^\])}]*)[\])}]")
-_FULL = 35.0
+_FULL_RUDDER_DEG = 35.0
 """Angle in deg of a rudder that is hard over, as most are built."""
-_GERMAN = {"grad": "deg", "grad/s": "deg/s", "grad/min": "deg/min"}
+_GERMAN_UNITS = {"grad": "deg", "grad/s": "deg/s", "grad/min": "deg/min"}
 _SUFFIXES: dict[str, dict[str, str]] = {
     "m": {"m": "m"},
     "s": {"s": "s", "ms": "ms"},
@@ -39,7 +39,7 @@ time, `_rps` is rad/s behind a yaw rate and revolutions behind a propeller.
 """
 
 
-def written_unit(column: str, expected: str | None) -> str | None:
+def parse_header_unit(column: str, expected: str | None) -> str | None:
     """Return the unit that a column's name holds, in brackets or at its end; None for none.
 
     Args:
@@ -47,57 +47,61 @@ def written_unit(column: str, expected: str | None) -> str | None:
     """
     texts = [text.strip() for text in _IN_BRACKETS.findall(column)]
     if expected is not None:
-        tail = re.split(r"[\s_,;]+", _IN_BRACKETS.sub("", column).strip())
+        name_parts = re.split(r"[\s_,;]+", _IN_BRACKETS.sub("", column).strip())
         # `r_deg_s` and `speed_m_s` are quotients
-        texts += ["/".join(tail[-2:]), tail[-1]] if len(tail) > 1 else []
-        texts += [f"{tail[-3]}/{tail[-1]}"] if len(tail) > 3 and tail[-2] == "per" else []
+        texts += ["/".join(name_parts[-2:]), name_parts[-1]] if len(name_parts) > 1 else []
+        texts += (
+            [f"{name_parts[-3]}/{name_parts[-1]}"]
+            if len(name_parts) > 3 and name_parts[-2] == "per"
+            else []
+        )
         stem, _, suffix = column.strip().rpartition("_")
         if stem and (unit := _SUFFIXES.get(expected, {}).get(suffix.casefold())):
             return unit
     for text in texts:
-        unit = _GERMAN.get(text.casefold(), text)
+        unit = _GERMAN_UNITS.get(text.casefold(), text)
         if len(unit) == 1 and unit.isalpha() and text not in _IN_BRACKETS.findall(column):
             # a letter at the end is rather a name
             continue
         try:
-            return known_unit(unit, expected)
+            return canonical_unit(unit, expected)
         except UsageError:
             continue
     return None
 
 
-def other_dimension(column: str, expected: str) -> str | None:
+def find_mismatched_unit(column: str, expected: str) -> str | None:
     """Return the unit in the brackets of a name where it measures something else; None for none."""
     for text in map(str.strip, _IN_BRACKETS.findall(column)):
         # (T) and (M) tell a true and a magnetic heading
         if is_unit(text) and not (expected == "rad" and text in ("T", "M")):
-            unit = known_unit(text)
+            unit = canonical_unit(text)
             if si_unit(unit) != expected:
                 return unit
     return None
 
 
-def unit_by_size(channel: str, values: np.ndarray) -> tuple[str, str]:
+def guess_unit_from_size(channel: str, values: np.ndarray) -> tuple[str, str]:
     """Return the unit of a channel by the size of its values, and why.
 
     Args:
         channel: canonical name, or a name of one's own.
         values: of the column [T], of all logs together.
     """
-    known = np.abs(values[np.isfinite(values)])
-    largest = float(np.quantile(known, 0.99)) if known.size else 0.0
-    expected = si_of(channel) or "-"
+    magnitudes = np.abs(values[np.isfinite(values)])
+    upper_quantile = float(np.quantile(magnitudes, 0.99)) if magnitudes.size else 0.0
+    expected = get_si_unit(channel) or "-"
     if expected == "rad":
-        limit = 7.0 if channel in ("psi", "wind_dir") or "azimuth" in channel else 1.6
-        unit = "deg" if largest > limit else "rad"
+        threshold = 7.0 if channel in ("psi", "wind_dir") or "azimuth" in channel else 1.6
+        unit = "deg" if upper_quantile > threshold else "rad"
     elif expected == "rad/s":
         # a turn round in two seconds
-        unit = "deg/s" if largest > np.pi else "rad/s"
+        unit = "deg/s" if upper_quantile > np.pi else "rad/s"
     elif expected == "1/s":
-        unit = "rpm" if largest > 60.0 else "1/s"
+        unit = "rpm" if upper_quantile > 60.0 else "1/s"
     else:
         unit = expected
-    return unit, f"the header has no unit; values up to {largest:.3g} would be {unit}"
+    return unit, f"the header has no unit; values up to {upper_quantile:.3g} would be {unit}"
 
 
 class Scaling(NamedTuple):
@@ -112,58 +116,63 @@ class Scaling(NamedTuple):
     reason: str
 
 
-def unit_of(channel: str, column: str, values: np.ndarray) -> Scaling:
+def infer_unit(channel: str, column: str, values: np.ndarray) -> Scaling:
     """Return the unit of a column by its name, else by the size of its values [T]."""
-    unit, reason = written_unit(column, si_of(channel)), ""
+    unit, reason = parse_header_unit(column, get_si_unit(channel)), ""
     if unit is None:
-        unit, reason = unit_by_size(channel, values)
+        unit, reason = guess_unit_from_size(channel, values)
     return Scaling({"unit": unit}, reason)
 
 
-def thrown(channel: str, column: str, values: np.ndarray) -> Scaling | None:
+def guess_scaling(channel: str, column: str, values: np.ndarray) -> Scaling | None:
     """Return how pulses, per cent or shares become a channel; None where its unit is a plain one.
 
     Args:
         values: of the column [T], of all logs together.
     """
-    rudder = channel.removeprefix("cmd_").startswith("delta")
-    if rudder and written_unit(column, "rad") is not None:
+    is_rudder = channel.removeprefix("cmd_").startswith("delta")
+    if is_rudder and parse_header_unit(column, "rad") is not None:
         return None
-    unit, all_the_way, told = ("deg", _FULL, f", {_FULL:g} deg") if rudder else ("-", 1.0, "")
+    unit, full_value, full_text = (
+        ("deg", _FULL_RUDDER_DEG, f", {_FULL_RUDDER_DEG:g} deg") if is_rudder else ("-", 1.0, "")
+    )
     if is_pulse(channel, values):
-        settings = {"unit": unit, "offset": 1500, "scale": all_the_way / 500.0}
+        settings = {"unit": unit, "offset": 1500, "scale": full_value / 500.0}
         reason = "pulses of a servo; 1500 us are taken as neutral, 500 us as all the way"
-        return Scaling(settings, reason + told)
-    if not rudder or not (whole := _whole(column, values)):
+        return Scaling(settings, reason + full_text)
+    if not is_rudder or not (full_count := _full_scale(column, values)):
         return None
-    reason = f"{whole:g} is taken as all the way{told}"
-    return Scaling({"unit": unit, "scale": all_the_way / whole}, reason)
+    reason = f"{full_count:g} is taken as all the way{full_text}"
+    return Scaling({"unit": unit, "scale": full_value / full_count}, reason)
 
 
-def _whole(column: str, values: np.ndarray) -> float:
+def _full_scale(column: str, values: np.ndarray) -> float:
     """Return the number that stands for a rudder that is hard over; 0 where it is an angle."""
-    written = written_unit(column, "-")
-    if written is not None:
-        return 100.0 if written == "%" else 1.0
-    largest = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
-    if largest > 180.0:
+    header_unit = parse_header_unit(column, "-")
+    if header_unit is not None:
+        return 100.0 if header_unit == "%" else 1.0
+    max_abs = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
+    if max_abs > 180.0:
         # no angle of a rudder: counts of a lever, to the power of ten above them
-        return float(10.0 ** np.ceil(np.log10(largest)))
+        return float(10.0 ** np.ceil(np.log10(max_abs)))
     # numbers that end at a round one are rather shares than angles
-    return next((whole for whole in (1.0, 100.0) if 0.995 * whole <= largest <= whole), 0.0)
+    return next(
+        (full_value for full_value in (1.0, 100.0) if 0.995 * full_value <= max_abs <= full_value),
+        0.0,
+    )
 
 
 def is_pulse(channel: str, values: np.ndarray) -> bool:
     """Return whether values are pulses of a servo, in us; revolutions may be as large."""
-    known = values[np.isfinite(values)]
-    if not known.size or re.match(r"(cmd_)?n(_|$)", channel):
+    finite_values = values[np.isfinite(values)]
+    if not finite_values.size or re.match(r"(cmd_)?n(_|$)", channel):
         return False
-    low, high = np.quantile(known, (0.01, 0.99))
-    return bool(low >= 800.0 and high <= 2300.0 and high > 1200.0)
+    lower, upper = np.quantile(finite_values, (0.01, 0.99))
+    return bool(lower >= 800.0 and upper <= 2300.0 and upper > 1200.0)
 
 
 # what a name may be about -> parts of words, and whole words behind a bar
-_ABOUT: dict[str, str] = {
+_CONCEPT_WORDS: dict[str, str] = {
     "time": "zeit timestamp tiempo temps tijd tidspunkt klockslag klokkeslett horodatage 時刻 時間"
     " 日時 micros millis czas время 时间 aika 시간 시각 | t time stamp tid sec secs seconds"
     " elapsed hora heure uhrzeit datum date datetime fecha utc dato tempo ora orario zaman"
@@ -259,300 +268,379 @@ _ABOUT: dict[str, str] = {
     "allocated": "alloc",
 }
 
-_WORDS = frozenset(
-    word for words in _ABOUT.values() for word in words.split() if len(word) > 2 and word.isascii()
+_COMPOUND_WORDS = frozenset(
+    word
+    for words in _CONCEPT_WORDS.values()
+    for word in words.split()
+    if len(word) > 2 and word.isascii()
 )
 """All words that compounds are made of."""
-MOTION = ("x", "y", "psi", "u", "v", "r", "p", "phi", "wind_speed", "wind_dir", *BOW_WIND)
+MOTION_CHANNELS = (
+    "x",
+    "y",
+    "psi",
+    "u",
+    "v",
+    "r",
+    "p",
+    "phi",
+    "wind_speed",
+    "wind_dir",
+    *BOW_WIND_CHANNELS,
+)
 """Channels of the motion and of the wind."""
-PLANES = re.compile(r"(cmd_)?delta_s(_|$)")
+PLANE_PATTERN = re.compile(r"(cmd_)?delta_s(_|$)")
 """How channels of planes begin, which turn a vessel down and not to a side."""
 
 
-class Words(NamedTuple):
+class ParsedName(NamedTuple):
     """What a column's name is about.
 
     Attributes:
         text: the name without units and punctuation, in lower case and plain letters.
-        about: what it is about.
+        concepts: what it is about.
         number: the number behind it, of several alike; None where there is none.
     """
 
     text: str
-    about: frozenset[str]
+    concepts: frozenset[str]
     number: int | None
 
-    def has(self, *names: str) -> bool:
+    def has_all(self, *names: str) -> bool:
         """Return whether the name is about all of these."""
-        return self.about.issuperset(names)
+        return self.concepts.issuperset(names)
 
-    def lacks(self, *names: str) -> bool:
+    def has_none(self, *names: str) -> bool:
         """Return whether the name is about none of these."""
-        return self.about.isdisjoint(names)
+        return self.concepts.isdisjoint(names)
 
 
-_LETTERS = str.maketrans({"ß": "ss", "ø": "o", "Ø": "O", "æ": "ae", "ł": "l", "ı": "i"})
-_SYMBOLS = {"ψ̇": "r", "ψ": "psi", "δ": "delta", "φ": "phi", "ϕ": "phi", "θ": "theta", "τ": "tau"}
+_LETTER_MAP = str.maketrans({"ß": "ss", "ø": "o", "Ø": "O", "æ": "ae", "ł": "l", "ı": "i"})
+_GREEK_NAMES = {
+    "ψ̇": "r",
+    "ψ": "psi",
+    "δ": "delta",
+    "φ": "phi",
+    "ϕ": "phi",
+    "θ": "theta",
+    "τ": "tau",
+}
 """Greek letters that stand alone."""
 
 
 @lru_cache(maxsize=4096)
-def plain(name: str) -> str:
+def normalize_name(name: str) -> str:
     """Return a name in lower case and plain letters, its words apart, its units left out."""
     text = _IN_BRACKETS.sub(" ", name)
-    for sign, word in _SYMBOLS.items():
-        text = re.sub(rf"(?<![^\W_]){sign}(?![^\W_\d])", word, text)
+    for sign, replacement in _GREEK_NAMES.items():
+        text = re.sub(rf"(?<![^\W_]){sign}(?![^\W_\d])", replacement, text)
     # StB is one word
     text = re.sub(r"(?<![^\W_])[A-Z][a-z][A-Z](?![^\W_])", lambda word: word[0].lower(), text)
     text = re.sub(r"([a-z])([A-Z])", r"\1 \2", text)
-    text = text.translate(_LETTERS)
+    text = text.translate(_LETTER_MAP)
     decomposed = unicodedata.normalize("NFKD", text)
     # voicing marks of kana are letters, not accents
     letters = "".join(c for c in decomposed if not unicodedata.combining(c) or c in "\u3099\u309a")
-    joined = unicodedata.normalize("NFC", letters).lower()
-    return " ".join(re.split(r"[\W_]+", joined)).strip()
+    normalized = unicodedata.normalize("NFC", letters).lower()
+    return " ".join(re.split(r"[\W_]+", normalized)).strip()
 
 
 @lru_cache(maxsize=4096)
-def words_of(name: str) -> Words:
+def parse_name(name: str) -> ParsedName:
     """Return what a column's name is about."""
-    tokens = [part for token in plain(name).split() for part in _sided(token)]
+    tokens = [part for token in normalize_name(name).split() for part in _split_side(token)]
     text = " ".join(tokens)
     if len(tokens) > 1 and re.search(r"[\s_][VAW]$", _IN_BRACKETS.sub(" ", name).strip()):
         # volts, amperes and watts are no names of channels
         tokens, text = tokens[:-1], text[:-2]
     number = next((int(token) for token in reversed(tokens) if token.isdigit()), None)
-    bare = [re.sub(r"\d+$", "", token) for token in tokens if not token.isdigit()]
+    tokens_without_digits = [re.sub(r"\d+$", "", token) for token in tokens if not token.isdigit()]
     if number is None:
         # `servo3_raw` counts as `servo_raw_3` does
-        tails = (re.search(r"[a-z](\d+)$", token) for token in reversed(tokens))
-        number = next((int(tail.group(1)) for tail in tails if tail), None)
-    bare += [piece for token in bare for piece in _pieces(token)]
-    about = {thing for thing in _ABOUT if _fits(thing, text, bare)}
-    return Words(text, frozenset(about), number)
+        trailing_numbers = (re.search(r"[a-z](\d+)$", token) for token in reversed(tokens))
+        number = next(
+            (int(number_match.group(1)) for number_match in trailing_numbers if number_match), None
+        )
+    tokens_without_digits += [
+        compound_part for token in tokens_without_digits for compound_part in _split_compound(token)
+    ]
+    concepts = {
+        concept
+        for concept in _CONCEPT_WORDS
+        if _mentions_concept(concept, text, tokens_without_digits)
+    }
+    return ParsedName(text, frozenset(concepts), number)
 
 
-_KNOWN = frozenset(
-    word for words in _ABOUT.values() for word in words.replace("|", " ").split() if word.isascii()
+_VOCABULARY = frozenset(
+    word
+    for words in _CONCEPT_WORDS.values()
+    for word in words.replace("|", " ").split()
+    if word.isascii()
 )
-_DRIVING = frozenset(
+_ACTUATOR_WORDS = frozenset(
     word
     for thing in ("rudder", "planes", "propeller", "engine", "revolutions", "throttle", "servo")
-    for word in _ABOUT[thing].replace("|", " ").split()
+    for word in _CONCEPT_WORDS[thing].replace("|", " ").split()
 )
 
 
-def _sided(token: str) -> tuple[str, ...]:
+def _split_side(token: str) -> tuple[str, ...]:
     """Return an actuator and its side, of `deltal` or `rpmr`; other tokens as they are."""
-    glued = token[-1:] in ("l", "r") and token not in _KNOWN and token[:-1] in _DRIVING
-    return (token[:-1], token[-1]) if glued else (token,)
+    is_glued = (
+        token[-1:] in ("l", "r") and token not in _VOCABULARY and token[:-1] in _ACTUATOR_WORDS
+    )
+    return (token[:-1], token[-1]) if is_glued else (token,)
 
 
-def _pieces(token: str) -> tuple[str, ...]:
+def _split_compound(token: str) -> tuple[str, ...]:
     """Return the two words that a compound is made of, `ost` and `position`; none for others."""
-    for cut in range(3, len(token) - 2):
-        first, second = token[:cut], token[cut:].removeprefix("s")
-        known = any(second.startswith(word) for word in _WORDS if len(word) > 3)
-        if first in _WORDS and (known or second in _WORDS):
-            return first, second
+    for split_position in range(3, len(token) - 2):
+        first_word, second_word = token[:split_position], token[split_position:].removeprefix("s")
+        is_known = any(
+            second_word.startswith(vocabulary_entry)
+            for vocabulary_entry in _COMPOUND_WORDS
+            if len(vocabulary_entry) > 3
+        )
+        if first_word in _COMPOUND_WORDS and (is_known or second_word in _COMPOUND_WORDS):
+            return first_word, second_word
     return ()
 
 
-def _fits(thing: str, text: str, tokens: list[str]) -> bool:
-    parts, _, whole = _ABOUT[thing].partition("|")
-    if set(whole.split()) & set(tokens):
+def _mentions_concept(concept: str, text: str, tokens: list[str]) -> bool:
+    word_parts, _, complete_words = _CONCEPT_WORDS[concept].partition("|")
+    if set(complete_words.split()) & set(tokens):
         return True
     # the German word for speed holds the wind
-    text = text.replace("geschwind", "") if thing == "wind" else text
+    text = text.replace("geschwind", "") if concept == "wind" else text
     return any(
-        part in text if len(part) > 3 or not part.isascii() else part in tokens
-        for part in parts.split()
+        word_part in text if len(word_part) > 3 or not word_part.isascii() else word_part in tokens
+        for word_part in word_parts.split()
     )
 
 
-class _Rule:
+class _ChannelRule:
     """A channel, and what a name is about that stands for it.
 
     Args:
         channel: its name; None where it is none.
-        about: things, of each of which one must be among them (`rate|speed`).
-        but: things that must not be.
-        text: pattern that the name must hold.
+        required: things, of each of which one must be among them (`rate|speed`).
+        excluded: things that must not be.
+        pattern: pattern that the name must hold.
     """
 
-    def __init__(self, channel: str | None, about: str, but: str = "", text: str = "") -> None:
-        self.channel, self._text = channel, re.compile(text)
-        self._about = [frozenset(things.split("|")) for things in about.split()]
-        self._but = frozenset(but.split())
+    def __init__(
+        self, channel: str | None, required: str, excluded: str = "", pattern: str = ""
+    ) -> None:
+        self.channel, self._pattern = channel, re.compile(pattern)
+        self._required = [frozenset(alternatives.split("|")) for alternatives in required.split()]
+        self._excluded = frozenset(excluded.split())
 
-    def fits(self, w: Words) -> bool:
+    def matches(self, parsed_name: ParsedName) -> bool:
         """Return whether a name stands for the channel."""
-        if not self._but.isdisjoint(w.about) or any(map(w.about.isdisjoint, self._about)):
+        if not self._excluded.isdisjoint(parsed_name.concepts) or any(
+            map(parsed_name.concepts.isdisjoint, self._required)
+        ):
             return False
-        return self._text.search(w.text) is not None
+        return self._pattern.search(parsed_name.text) is not None
 
 
-def _first(rules: tuple[_Rule, ...], words: Words) -> str | None:
-    return next((rule.channel for rule in rules if rule.fits(words)), None)
+def _match_rules(rules: tuple[_ChannelRule, ...], parsed_name: ParsedName) -> str | None:
+    return next((rule.channel for rule in rules if rule.matches(parsed_name)), None)
 
 
-_TWIST = (
+_TWIST_PATTERN = (
     r"\b(?:(?:twist|velocity) linear|linear velocity|v|vel|velo|velocity|speed|lin|linear)"
     r" ?{}(?: (?:m s|mps|ms))?$"
 )
-_AXES = (_Rule("u", "", "", _TWIST.format("x")), _Rule("v", "", "", _TWIST.format("y")))
+_AXIS_RULES = (
+    _ChannelRule("u", "", "", _TWIST_PATTERN.format("x")),
+    _ChannelRule("v", "", "", _TWIST_PATTERN.format("y")),
+)
 # what no channel of the motion is about, and what none is but a position along north, whose N
 # may be one of revolutions
-_NO_MOTION = (
+_NON_MOTION_CONCEPTS = (
     *("command", "acceleration", "rudder", "planes", "propeller", "current", "depth", "age"),
     "heave",
 )
-_POWERED = ("engine", "revolutions", "throttle", "azimuth", "servo", "thrust", "torque")
-_ALONG = "north east angular voltage"
-_STATES = (
-    _Rule("latitude", "latitude"),
-    _Rule("longitude", "longitude", "surge speed"),
-    _Rule("p", "roll rate|angular"),
-    _Rule("phi", "roll"),
-    _Rule("r", "turn_rate"),
-    _Rule("r", "heading|turn rate"),
-    _Rule("r", "", "", "^r( mid)?$"),
-    _Rule("r", "angular", "", r" [zr](?: (?:dps|degps|radps|rps|deg s|rad s))?$"),
+_DRIVE_CONCEPTS = ("engine", "revolutions", "throttle", "azimuth", "servo", "thrust", "torque")
+_EARTH_AXIS_CONCEPTS = "north east angular voltage"
+_STATE_RULES = (
+    _ChannelRule("latitude", "latitude"),
+    _ChannelRule("longitude", "longitude", "surge speed"),
+    _ChannelRule("p", "roll rate|angular"),
+    _ChannelRule("phi", "roll"),
+    _ChannelRule("r", "turn_rate"),
+    _ChannelRule("r", "heading|turn rate"),
+    _ChannelRule("r", "", "", "^r( mid)?$"),
+    _ChannelRule("r", "angular", "", r" [zr](?: (?:dps|degps|radps|rps|deg s|rad s))?$"),
     # of an axis that is not told: what turns is the vessel
-    _Rule("r", "angular rate", "x y pitch"),
-    *_AXES,
-    _Rule("psi", "heading", "ground"),
-    _Rule("psi", "", "", "^(gyro|gyro ?compass|compass)$"),
+    _ChannelRule("r", "angular rate", "x y pitch"),
+    *_AXIS_RULES,
+    _ChannelRule("psi", "heading", "ground"),
+    _ChannelRule("psi", "", "", "^(gyro|gyro ?compass|compass)$"),
     # some write 0 for what is fixed to the earth
     *(
-        _Rule(axis, about, "speed angle force", text)
+        _ChannelRule(axis, about, "speed angle force", text)
         for axis, way in (("x", "north"), ("y", "east"))
         for about, text in ((way, ""), (f"{axis} position", ""), (axis, r"^[xy](?: ?0)?(?: m)?$"))
     ),
-    _Rule("v", "sway", _ALONG),
-    _Rule("u", "surge|longitude", _ALONG),
-    _Rule("v", "speed port|starboard", _ALONG),
-    _Rule("speed", "speed", _ALONG),
+    _ChannelRule("v", "sway", _EARTH_AXIS_CONCEPTS),
+    _ChannelRule("u", "surge|longitude", _EARTH_AXIS_CONCEPTS),
+    _ChannelRule("v", "speed port|starboard", _EARTH_AXIS_CONCEPTS),
+    _ChannelRule("speed", "speed", _EARTH_AXIS_CONCEPTS),
 )
 """In the order in which they are asked."""
-_DEEP = (
-    _Rule("q", "pitch rate|speed|angular", "propeller heave"),
-    _Rule("theta", "pitch", "propeller heave"),
-    _Rule("w", "heave|depth rate|speed|angular"),
-    _Rule("z", "depth", "heave"),
+_DEPTH_RULES = (
+    _ChannelRule("q", "pitch rate|speed|angular", "propeller heave"),
+    _ChannelRule("theta", "pitch", "propeller heave"),
+    _ChannelRule("w", "heave|depth rate|speed|angular"),
+    _ChannelRule("z", "depth", "heave"),
 )
 
 
-_UNIT = re.compile(
+_VELOCITY_UNIT_SUFFIX = re.compile(
     r"(?<=\b[pqr]) (?:dps|degps|degs|radps|rads|rps|deg s|rad s)$|(?<=\b[uvw]) (?:mps|ms|kn|m s)$"
 )
 """What stands behind the letter of a velocity."""
 
 
 @lru_cache(maxsize=4096)
-def state_channel(words: Words) -> str | None:
+def match_state_channel(parsed_name: ParsedName) -> str | None:
     """Return the channel of the motion or of the wind that a name stands for; None for none.
 
     It is `speed` where only the size of a velocity is meant.
     """
-    w, name = words, words.text.replace(" ", "_")
-    if name in MOTION:
-        return name
-    if re.fullmatch(r"[pqr] rps", w.text):
+    parsed, normalized = parsed_name, parsed_name.text.replace(" ", "_")
+    if normalized in MOTION_CHANNELS:
+        return normalized
+    if re.fullmatch(r"[pqr] rps", parsed.text):
         # rad/s of a rate, not revolutions
-        return w.text[0] if w.text[0] != "q" else None
-    last = _UNIT.sub("", w.text).rpartition(" ")[2]
-    if last in ("psi", "u", "v", "r", "phi", "p") and w.about <= words_of(last).about:
+        return parsed.text[0] if parsed.text[0] != "q" else None
+    last_word = _VELOCITY_UNIT_SUFFIX.sub("", parsed.text).rpartition(" ")[2]
+    if (
+        last_word in ("psi", "u", "v", "r", "phi", "p")
+        and parsed.concepts <= parse_name(last_word).concepts
+    ):
         # what stands before it, as in `body.r`, says nothing
-        return last
-    if w.has("machinery") and w.lacks("speed", "surge"):
+        return last_word
+    if parsed.has_all("machinery") and parsed.has_none("speed", "surge"):
         return None
-    if w.has("wind"):
-        felt = "apparent_" if w.has("relative") and not w.has("true") else ""
-        if w.has("speed") and "dir" not in w.text.split():
-            return f"{felt}wind_speed"
-        return (f"{felt}wind_angle" if felt else "wind_dir") if w.has("direction") else None
-    moves = w.lacks(*_NO_MOTION) and (w.lacks(*_POWERED) or w.has("position", "north"))
-    return _first(_STATES, w) if moves else None
+    if parsed.has_all("wind"):
+        wind_prefix = (
+            "apparent_" if parsed.has_all("relative") and not parsed.has_all("true") else ""
+        )
+        if parsed.has_all("speed") and "dir" not in parsed.text.split():
+            return f"{wind_prefix}wind_speed"
+        return (
+            (f"{wind_prefix}wind_angle" if wind_prefix else "wind_dir")
+            if parsed.has_all("direction")
+            else None
+        )
+    can_be_motion = parsed.has_none(*_NON_MOTION_CONCEPTS) and (
+        parsed.has_none(*_DRIVE_CONCEPTS) or parsed.has_all("position", "north")
+    )
+    return _match_rules(_STATE_RULES, parsed) if can_be_motion else None
 
 
-def deep_channel(words: Words) -> str | None:
+def match_depth_channel(parsed_name: ParsedName) -> str | None:
     """Return w, q, z or theta of a vessel under water that a name stands for; None for others."""
-    bare = _UNIT.sub("", words.text)
+    bare_text = _VELOCITY_UNIT_SUFFIX.sub("", parsed_name.text)
     # a last w without a unit may be a quaternion's
-    bare = bare if bare == words.text or words.about else bare.rpartition(" ")[2]
-    if bare in ("w", "q", "z", "theta"):
-        return bare
-    none = ("command", "acceleration", "age", "index", "machinery", "thrust", "engine")
-    return _first(_DEEP, words) if words.lacks(*none) else None
+    bare_text = (
+        bare_text
+        if bare_text == parsed_name.text or parsed_name.concepts
+        else bare_text.rpartition(" ")[2]
+    )
+    if bare_text in ("w", "q", "z", "theta"):
+        return bare_text
+    excluded_concepts = ("command", "acceleration", "age", "index", "machinery", "thrust", "engine")
+    return (
+        _match_rules(_DEPTH_RULES, parsed_name)
+        if parsed_name.has_none(*excluded_concepts)
+        else None
+    )
 
 
-def axis_velocity(words: Words) -> str | None:
+def match_axis_velocity(parsed_name: ParsedName) -> str | None:
     """Return u or v of a velocity along an axis x or y, of whatever frame; None for others."""
-    return _first(_AXES, words)
+    return _match_rules(_AXIS_RULES, parsed_name)
 
 
-_GROUND = re.compile(r"\bvel\w* (?:n|e|d|north|east|down)\b")
+_EARTH_VELOCITY_PATTERN = re.compile(r"\bvel\w* (?:n|e|d|north|east|down)\b")
 """A velocity along north, east or down: its N is no propeller."""
-_LETTER = re.compile(r"(?<=\w) ([lr])(?= |$)")
+_SIDE_LETTER_PATTERN = re.compile(r"(?<=\w) ([lr])(?= |$)")
 """The side behind the name of an actuator."""
 
 
-_INPUTS = (
-    _Rule(None, "torque"),
-    _Rule("{cmd_}azimuth{side}", "azimuth"),
-    _Rule("{cmd_}delta_s{side}", "planes"),
-    _Rule("{cmd_}delta_rate{side}", "rudder rate"),
-    _Rule("{cmd_}delta{side}", "rudder"),
-    _Rule("throttle{side}", "propeller throttle|pitch", "revolutions"),
-    _Rule("throttle{side}", "engine throttle", "revolutions angle"),
-    _Rule("{cmd_}n{side}", "revolutions|propeller", "thrust"),
-    _Rule("{cmd_}n{side}", "engine", "thrust angle"),
-    _Rule("{cmd_}thrust{side}", "thrust"),
-    _Rule("servo{side}", "servo"),
-    _Rule("throttle{side}", "throttle"),
+_INPUT_RULES = (
+    _ChannelRule(None, "torque"),
+    _ChannelRule("{cmd_}azimuth{side}", "azimuth"),
+    _ChannelRule("{cmd_}delta_s{side}", "planes"),
+    _ChannelRule("{cmd_}delta_rate{side}", "rudder rate"),
+    _ChannelRule("{cmd_}delta{side}", "rudder"),
+    _ChannelRule("throttle{side}", "propeller throttle|pitch", "revolutions"),
+    _ChannelRule("throttle{side}", "engine throttle", "revolutions angle"),
+    _ChannelRule("{cmd_}n{side}", "revolutions|propeller", "thrust"),
+    _ChannelRule("{cmd_}n{side}", "engine", "thrust angle"),
+    _ChannelRule("{cmd_}thrust{side}", "thrust"),
+    _ChannelRule("servo{side}", "servo"),
+    _ChannelRule("throttle{side}", "throttle"),
 )
 """In the order in which they are asked."""
 
 
 @lru_cache(maxsize=4096)
-def input_channel(words: Words) -> str | None:
+def match_input_channel(parsed_name: ParsedName) -> str | None:
     """Return the channel of an actuator that a name stands for; None where it names none."""
-    w, name = words, words.text.replace(" ", "_")
-    if name in CHANNEL_UNITS and name not in (*MOTION, "t", *ACCELERATION):
-        return name
-    if not w.lacks("wind", "age", "index", "power", "voltage", "machinery"):
+    parsed, normalized = parsed_name, parsed_name.text.replace(" ", "_")
+    if normalized in CHANNEL_UNITS and normalized not in (
+        *MOTION_CHANNELS,
+        "t",
+        *ACCELERATION_NAMES,
+    ):
+        return normalized
+    if not parsed.has_none("wind", "age", "index", "power", "voltage", "machinery"):
         return None
-    if _GROUND.search(w.text):
+    if _EARTH_VELOCITY_PATTERN.search(parsed.text):
         return None
-    sides = {"port": "_port", "starboard": "_stbd", "bow": "_bow", "stern": "_stern"}
-    sides["difference"] = "_diff"
-    side = next((end for name, end in sides.items() if w.has(name)), "")
-    if lettered := _LETTER.search(w.text):
-        side = side or {"l": "_port", "r": "_stbd"}[lettered[1]]
-    side = side or (f"_{w.number}" if w.number is not None else "")
-    if w.has("force") and (forced := _force(w)):
-        return forced
-    found = _first(_INPUTS, w)
-    if found is None and w.about and w.about <= _ACTUATED:
-        return f"cmd{side}" if w.has("command") else f"n{side}"
-    if w.has("planes"):
-        side = side.removesuffix("_stern")
-    return found and found.format(side=side, cmd_="cmd_" if w.has("command") else "")
-
-
-_ACTUATED = frozenset({"port", "starboard", "command", "measured"})
-
-
-def _force(w: Words) -> str | None:
-    """Return the name of a force or moment in body axes, with what tells it from others alike."""
-    axis = next((axis for axis in ("x", "y", "n", "z") if axis in w.text.split()), None)
-    moment = w.has("torque")
-    if axis is None or not w.text.startswith("tau") or (moment and axis in "xy"):
-        return None
-    if axis == "z" and not moment and "force" in w.text:
-        return None
-    kind = next(
-        (f"_{name}" for name in ("command", "estimate", "measured", "allocated") if w.has(name)), ""
+    side_suffixes = {"port": "_port", "starboard": "_stbd", "bow": "_bow", "stern": "_stern"}
+    side_suffixes["difference"] = "_diff"
+    side_suffix = next(
+        (suffix for normalized, suffix in side_suffixes.items() if parsed.has_all(normalized)), ""
     )
-    return f"tau_{'n' if axis == 'z' else axis}{kind}"
+    if letter_match := _SIDE_LETTER_PATTERN.search(parsed.text):
+        side_suffix = side_suffix or {"l": "_port", "r": "_stbd"}[letter_match[1]]
+    side_suffix = side_suffix or (f"_{parsed.number}" if parsed.number is not None else "")
+    if parsed.has_all("force") and (force_channel := _match_force_channel(parsed)):
+        return force_channel
+    channel_template = _match_rules(_INPUT_RULES, parsed)
+    if channel_template is None and parsed.concepts and parsed.concepts <= _ACTUATOR_QUALIFIERS:
+        return f"cmd{side_suffix}" if parsed.has_all("command") else f"n{side_suffix}"
+    if parsed.has_all("planes"):
+        side_suffix = side_suffix.removesuffix("_stern")
+    return channel_template and channel_template.format(
+        side=side_suffix, cmd_="cmd_" if parsed.has_all("command") else ""
+    )
+
+
+_ACTUATOR_QUALIFIERS = frozenset({"port", "starboard", "command", "measured"})
+
+
+def _match_force_channel(parsed_name: ParsedName) -> str | None:
+    """Return the name of a force or moment in body axes, with what tells it from others alike."""
+    axis = next((axis for axis in ("x", "y", "n", "z") if axis in parsed_name.text.split()), None)
+    is_moment = parsed_name.has_all("torque")
+    if axis is None or not parsed_name.text.startswith("tau") or (is_moment and axis in "xy"):
+        return None
+    if axis == "z" and not is_moment and "force" in parsed_name.text:
+        return None
+    qualifier = next(
+        (
+            f"_{name}"
+            for name in ("command", "estimate", "measured", "allocated")
+            if parsed_name.has_all(name)
+        ),
+        "",
+    )
+    return f"tau_{'n' if axis == 'z' else axis}{qualifier}"

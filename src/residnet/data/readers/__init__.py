@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
-from residnet.core.registry import Kinds
+from residnet.core.registry import PluginUnion
 
 if TYPE_CHECKING:
     from residnet.data.readers.base import CanonicalConfig, ReaderKind
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 else:
     ReaderConfig = Annotated[
         Any,
-        Kinds(
+        PluginUnion(
             "residnet.readers",
             "residnet.data.readers.base:ReaderKind",
             {

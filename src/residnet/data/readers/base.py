@@ -15,27 +15,27 @@ from residnet.core.config import Config
 from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.files import sha256
 from residnet.core.log import Log
-from residnet.core.names import CHANNEL_UNITS, nearest, shown
-from residnet.core.progress import report
+from residnet.core.names import CHANNEL_UNITS, suggest_name, truncate
+from residnet.core.progress import report_progress
 
 # recordings below this size are read before anybody waits, bytes
-_LARGE = 50_000_000
-REPORT_EVERY = 5000
+_PROGRESS_MIN_BYTES = 50_000_000
+REPORT_INTERVAL = 5000
 """Messages or lines between two reports of a reader; chosen by hand: many a second of reading."""
-LARGE = 300_000_000
+LARGE_FOLDER_BYTES = 300_000_000
 """Bytes of a folder above which topics that nobody wants are not read."""
 
 
 class LogReader(ABC):
     """Reads one file format into the canonical `Log`."""
 
-    def logs_among(self, paths: Sequence[Path]) -> list[Path]:
+    def select_logs(self, paths: Sequence[Path]) -> list[Path]:
         """Return the files that are logs by themselves; others only belong to these."""
         return list(paths)
 
-    def files(self, path: Path) -> list[Path]:
+    def list_member_files(self, path: Path) -> list[Path]:
         """Return the files that a log is made of: itself, those below a folder, those beside it."""
-        return files_of(path)
+        return list_files(path)
 
     @abstractmethod
     def read(self, path: Path) -> Log:
@@ -80,42 +80,42 @@ def require_file(path: Path) -> None:
             f" '{path}/*.csv'"
         )
     if not path.is_file():
-        near = (
-            nearest(path.name, (other.name for other in path.parent.iterdir()))
+        hint = (
+            suggest_name(path.name, (sibling.name for sibling in path.parent.iterdir()))
             if path.parent.is_dir()
             else "; its folder does not exist either"
         )
-        raise UsageError(f"{path}: no such file{near}")
+        raise UsageError(f"{path}: no such file{hint}")
 
 
-def provenance(path: Path, rows_read: int, rows_dropped: int) -> dict[str, Any]:
+def describe_provenance(path: Path, rows_read: int, rows_dropped: int) -> dict[str, Any]:
     """Return where a log comes from: `source`, `sha256`, `rows_read`, `rows_dropped`.
 
     The SHA-256 is that of the file's bytes.
     """
     return {
         "source": str(path),
-        "sha256": digest([path]),
+        "sha256": hash_files([path]),
         "rows_read": rows_read,
         "rows_dropped": rows_dropped,
     }
 
 
-def unwrap(angle: np.ndarray) -> np.ndarray:
+def unwrap_angle(angle: np.ndarray) -> np.ndarray:
     """Return the angle [T] in rad made continuous over its finite samples; NaN stay where they are.
 
     A turn of more than half a circle between two finite samples is ambiguous.
     """
-    out = np.asarray(angle, dtype=np.float64).copy()
-    if out.size and np.abs(np.diff(out)).max(initial=0.0) < np.pi:
+    unwrapped = np.asarray(angle, dtype=np.float64).copy()
+    if unwrapped.size and np.abs(np.diff(unwrapped)).max(initial=0.0) < np.pi:
         # nothing to unwrap, and no sample missing
-        return out
-    known = np.isfinite(angle)
-    out[known] = np.unwrap(out[known])
-    return out
+        return unwrapped
+    is_finite = np.isfinite(angle)
+    unwrapped[is_finite] = np.unwrap(unwrapped[is_finite])
+    return unwrapped
 
 
-def turned(
+def rotate(
     x: np.ndarray | float, y: np.ndarray | float, angle: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return vectors [T] turned by angles [T]: from body axes to north and east by the heading.
@@ -132,15 +132,15 @@ def require_samples(path: Path, t: np.ndarray) -> None:
         raise DataError(f"{path}: {t.size} usable rows, at least 2 are needed; leave the file out")
 
 
-def require_increasing(path: Path, t: np.ndarray, row: Callable[[int], str]) -> None:
+def require_increasing(path: Path, t: np.ndarray, row_label: Callable[[int], str]) -> None:
     """Stop where time [T] in s repeats or runs backwards.
 
-    `row` names the row of a sample in the file.
+    `row_label` names the row of a sample in the file.
     """
-    bad = np.flatnonzero(~(np.diff(t) > 0.0))
-    if bad.size:
-        i = int(bad[0])
-        what = (
+    violations = np.flatnonzero(~(np.diff(t) > 0.0))
+    if violations.size:
+        i = int(violations[0])
+        problem = (
             "repeats"
             if t[i + 1] == t[i]
             else "runs backwards"
@@ -148,8 +148,8 @@ def require_increasing(path: Path, t: np.ndarray, row: Callable[[int], str]) -> 
             else "is not a number"
         )
         raise DataError(
-            f"{path}: time {what} from {row(i)} ({t[i]:.13g} s) to {row(i + 1)}"
-            f" ({t[i + 1]:.13g} s), {bad.size} such steps in all; delete the repeated rows, or"
+            f"{path}: time {problem} from {row_label(i)} ({t[i]:.13g} s) to {row_label(i + 1)}"
+            f" ({t[i + 1]:.13g} s), {violations.size} such steps in all; delete the repeated rows, or"
             " split the file where its clock restarts"
         )
 
@@ -163,64 +163,68 @@ def require_values(path: Path, channel: str, column: str, values: np.ndarray) ->
         )
 
 
-def digest(files: Sequence[Path]) -> str:
+def hash_files(files: Sequence[Path]) -> str:
     """Return the SHA-256 of one file's bytes, or of the digests of several in order, as hex."""
-    sums = [sha256(file) for file in files]
-    return sums[0] if len(sums) == 1 else hashlib.sha256("".join(sums).encode()).hexdigest()
+    checksums = [sha256(file) for file in files]
+    return (
+        checksums[0]
+        if len(checksums) == 1
+        else hashlib.sha256("".join(checksums).encode()).hexdigest()
+    )
 
 
-def files_of(path: Path) -> list[Path]:
+def list_files(path: Path) -> list[Path]:
     """Return a file itself, or all files below a folder, in order."""
     return sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
 
 
-def total_size(files: Iterable[Path]) -> int:
+def sum_file_sizes(files: Iterable[Path]) -> int:
     """Return the bytes of all files."""
     return sum(file.stat().st_size for file in files)
 
 
-Advance = Callable[[float], None]
+ProgressCallback = Callable[[float], None]
 """Reports how far a reader is, in the unit of its total."""
 
 
 @contextmanager
-def progress(name: str, size: int, total: float) -> Iterator[Advance]:
+def reading_progress(name: str, size: int, total: float) -> Iterator[ProgressCallback]:
     """Report the reading of a large recording to whoever listens to progress.
 
     Args:
         size: its bytes; nothing is reported of a small recording.
         total: what the reader counts to.
     """
-    if size < _LARGE:
+    if size < _PROGRESS_MIN_BYTES:
         yield lambda done: None
         return
-    stage = f"reading {name}, per cent"
-    yield lambda done: report(stage, 100.0 * done / total, 100.0)
-    report(stage, 100.0, 100.0)
+    stage_name = f"reading {name}, per cent"
+    yield lambda done: report_progress(stage_name, 100.0 * done / total, 100.0)
+    report_progress(stage_name, 100.0, 100.0)
 
 
 @contextmanager
-def package(extra: str, package: str, name: str) -> Iterator[None]:
+def optional_import(extra: str, package: str, feature: str) -> Iterator[None]:
     """Import the package of a format; where it is not installed, say which extra brings it."""
     try:
         yield
     except ImportError as error:
         raise UsageError(
-            f"{name} needs the package {package}, which is not installed; install it with: pip"
+            f"{feature} needs the package {package}, which is not installed; install it with: pip"
             f' install "residnet[{extra}]"'
         ) from error
 
 
 @contextmanager
-def readable(path: Path, what: str) -> Iterator[None]:
+def wrap_read_errors(path: Path, file_description: str) -> Iterator[None]:
     """Damaged files fail in every layer of a library: tell so in one line, as what they are not."""
     try:
         yield
     except ResidnetError:
         raise
     except Exception as error:
-        reason = shown(f"{type(error).__name__}: {' '.join(str(error).split())}", 200)
-        raise DataError(f"{path}: damaged or not {what} ({reason})") from error
+        reason = truncate(f"{type(error).__name__}: {' '.join(str(error).split())}", 200)
+        raise DataError(f"{path}: damaged or not {file_description} ({reason})") from error
 
 
 @final
@@ -255,6 +259,6 @@ class CanonicalConfig(ConfiguredReader):
         meta = {
             **log.meta,
             **({"origin": origin} if origin else {}),
-            **provenance(path, len(log), 0),
+            **describe_provenance(path, len(log), 0),
         }
         return log.replace(name=path.stem, t=t, meta=meta)

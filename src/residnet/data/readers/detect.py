@@ -17,12 +17,12 @@ from residnet.data.readers.formats.rosbag import RosbagConfig
 from residnet.data.readers.formats.topic_folder import TopicFolderConfig
 from residnet.data.readers.formats.trees import Hdf5Config, MatConfig
 from residnet.data.readers.formats.ulog import UlogConfig
-from residnet.data.readers.recording import Recording, Wanted
-from residnet.data.readers.tables import TABLES
-from residnet.data.readers.texts import first_rows
+from residnet.data.readers.recording import FieldFilter, Recording
+from residnet.data.readers.tables import TABLE_KINDS
+from residnet.data.readers.texts import read_table_head
 
 # in the order in which they are asked: content that cannot be mistaken first, endings last
-_RECORDINGS: tuple[type[RecordingConfig], ...] = (
+_RECORDING_CONFIGS: tuple[type[RecordingConfig], ...] = (
     RosbagConfig,
     TopicFolderConfig,
     UlogConfig,
@@ -33,11 +33,11 @@ _RECORDINGS: tuple[type[RecordingConfig], ...] = (
     Hdf5Config,
 )
 LOG_ENDINGS = (
-    *(ending for ending in TABLES if ending != ".json"),
-    *(ending for config in _RECORDINGS for ending in config.endings),
+    *(ending for ending in TABLE_KINDS if ending != ".json"),
+    *(ending for config in _RECORDING_CONFIGS for ending in config.endings),
 )
 """Endings of files that may be logs; a .json beside them rather tells of them."""
-_TABLE_OF = {
+_PANDAS_READERS = {
     **dict.fromkeys((".gz", ".zip", ".bz2", ".xz"), "pandas.read_csv(file)"),
     **dict.fromkeys((".xls", ".ods"), "pandas.read_excel(file)"),
     ".pkl": "pandas.read_pickle(file)",
@@ -53,19 +53,19 @@ _TABLE_OF = {
 
 
 @dataclass(frozen=True)
-class Format:
+class RecordingFormat:
     """A format of recordings, and its config for standard messages."""
 
     name: str
     config: type[RecordingConfig]
 
 
-def to_table(ending: str) -> str:
+def suggest_conversion(ending: str) -> str:
     """Return how a file with such an ending, which no reader knows, becomes a log."""
-    rows = _TABLE_OF.get(ending, "pandas.DataFrame(rows, columns=[...])")
+    pandas_call = _PANDAS_READERS.get(ending, "pandas.DataFrame(rows, columns=[...])")
     return (
         "write such rows as csv with a line of names, in Python"
-        f" {rows}.to_csv('log.csv', index=False)"
+        f" {pandas_call}.to_csv('log.csv', index=False)"
     )
 
 
@@ -74,7 +74,7 @@ def is_text_table(path: Path) -> bool:
     if path.suffix.lower() == ".json":
         return True
     try:
-        table, _ = first_rows(path, 20)
+        table, _ = read_table_head(path, 20)
     except DataError:
         return False
     return len(table.select_dtypes("number").columns) > 1
@@ -89,18 +89,18 @@ class AutoConfig(RecordingConfig):
 
     kind: Literal["auto"] = "auto"
 
-    def load(self, path: Path, wanted: Wanted) -> Recording:
-        found = format_of(path)
-        if found is None:
-            names = ", ".join(name for config in _RECORDINGS for name in config.formats)
+    def load(self, path: Path, field_filter: FieldFilter) -> Recording:
+        recording_format = detect_recording_format(path)
+        if recording_format is None:
+            names = ", ".join(name for config in _RECORDING_CONFIGS for name in config.formats)
             raise UsageError(
                 f"{path}: does not say what its columns are; give a channel map with --config"
                 f" (formats that need none: {names}, canonical Parquet)"
             )
-        return found.config().load(path, wanted)
+        return recording_format.config().load(path, field_filter)
 
 
-def format_of(path: Path) -> Format | None:
+def detect_recording_format(path: Path) -> RecordingFormat | None:
     """Return the format of a recording.
 
     None where it is none that describes itself (a csv table, a foreign Parquet file, anything
@@ -114,19 +114,21 @@ def format_of(path: Path) -> Format | None:
         require_file(path)
         with path.open("rb") as stream:
             head = stream.read(1024)
-    for config in _RECORDINGS:
-        for name, fits in config.formats.items():
-            if fits(path, head):
-                return Format(name, config)
+    for config in _RECORDING_CONFIGS:
+        for name, matches in config.formats.items():
+            if matches(path, head):
+                return RecordingFormat(name, config)
     return None
 
 
-def kind_of(path: Path) -> str:
+def detect_log_kind(path: Path) -> str:
     """Return the kind of a log: canonical, table, or the name of a format of recordings."""
-    if Log.recognises(path):
+    if Log.is_canonical_log(path):
         return "canonical"
-    recording = format_of(path)
+    recording = detect_recording_format(path)
     ending = path.suffix.lower()
-    if recording is None and ending not in TABLES and not is_text_table(path):
-        raise UsageError(f"{path}: is of no format that residnet knows; {to_table(ending)}")
+    if recording is None and ending not in TABLE_KINDS and not is_text_table(path):
+        raise UsageError(
+            f"{path}: is of no format that residnet knows; {suggest_conversion(ending)}"
+        )
     return "table" if recording is None else recording.name

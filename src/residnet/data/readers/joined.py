@@ -14,49 +14,49 @@ from pydantic import Field, model_validator
 from residnet.core.config import Seconds
 from residnet.core.errors import DataError, ResidnetError
 from residnet.core.log import Log
-from residnet.core.names import STATE
-from residnet.data.align import GridConfig, onto
+from residnet.core.names import STATE_NAMES
+from residnet.data.align import GridConfig, resample_at
 from residnet.data.motion import MotionConfig, complete_motion
-from residnet.data.readers.base import ConfiguredReader, digest, require_file
-from residnet.data.readers.recording import Level, Remark, remark
+from residnet.data.readers.base import ConfiguredReader, hash_files, require_file
+from residnet.data.readers.recording import Level, Remark, make_remark
 from residnet.data.readers.tables import (
-    TABLES,
+    TABLE_KINDS,
     CsvConfig,
     ExcelConfig,
     JsonLinesConfig,
     ParquetConfig,
 )
-from residnet.data.readers.written import unix_unit
-from residnet.data.statistics import Blocks
+from residnet.data.readers.written import detect_unix_unit
+from residnet.data.statistics import OverlappingBlocks
 
-_LEAST = 0.5
+_MIN_OVERLAP = 0.5
 """Share of the shorter log that two clocks must have in common while their shift is looked for."""
-_COARSE, _FINE = 0.5, 0.05
+_COARSE_STEP, _FINE_STEP = 0.5, 0.05
 """Steps in s by which the shift is looked for, and then around the best."""
-_SURE = 1.5
+_MIN_VARIANCE_RATIO = 1.5
 """How much more of the accelerations any shift far from the best one must leave unexplained."""
-_FAR = 3.0
+_MIN_ALTERNATIVE_OFFSET = 3.0
 """Time in s from which on a shift is another one."""
-_BLOCK = 2.5
+_BLOCK_SECONDS = 2.5
 """Time in s over which the velocities that are gained are explained: derivatives would be noise."""
-_SAMPLES = 3000
+_MAX_SAMPLES = 3000
 """Samples of the motion from which a shift is found."""
 
 TableKind = CsvConfig | ParquetConfig | ExcelConfig | JsonLinesConfig
 
 
-class Shift(NamedTuple):
+class ClockOffset(NamedTuple):
     """The time in s to add to a clock, and what it explains of what the motion alone leaves.
 
     Attributes:
         seconds: to add.
-        explained: share of the variance, from 0 to 1.
-        other: the same with the best shift that is far from it.
+        explained_share: share of the variance, from 0 to 1.
+        runner_up_share: the same with the best shift that is far from it.
     """
 
     seconds: float
-    explained: float
-    other: float
+    explained_share: float
+    runner_up_share: float
 
 
 @final
@@ -79,136 +79,166 @@ class JoinedConfig(ConfiguredReader):
     shift: dict[str, Seconds] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _known(self) -> JoinedConfig:
-        others = list(self.parts)[1:]
-        if wrong := set(self.shift) - set(others):
+    def _validate_shift_keys(self) -> JoinedConfig:
+        secondary_parts = list(self.parts)[1:]
+        if unknown_parts := set(self.shift) - set(secondary_parts):
             raise ValueError(
-                f"shift: '{min(wrong)}' is no part whose clock can be moved ({', '.join(others)})"
+                f"shift: '{min(unknown_parts)}' is no part whose clock can be moved ({', '.join(secondary_parts)})"
             )
         return self
 
-    def logs_among(self, paths: Sequence[Path]) -> list[Path]:
+    def select_logs(self, paths: Sequence[Path]) -> list[Path]:
         """Return the files of the motion."""
-        first, *others = self.parts
-        kind = self.parts[first].kind
+        main_word, *secondary_words = self.parts
+        reader_kind = self.parts[main_word].kind
         return [
             path
             for path in paths
-            if first in path.name
-            and not any(word in path.name for word in others)
-            and TABLES.get(path.suffix.lower(), "csv") == kind
+            if main_word in path.name
+            and not any(part_name in path.name for part_name in secondary_words)
+            and TABLE_KINDS.get(path.suffix.lower(), "csv") == reader_kind
         ]
 
-    def files(self, path: Path) -> list[Path]:
+    def list_member_files(self, path: Path) -> list[Path]:
         """Return the files of the trip that a file of the motion is of."""
-        return [*self.trip(path).values()]
+        return [*self.find_trip_files(path).values()]
 
-    def trip(self, path: Path) -> dict[str, Path]:
+    def find_trip_files(self, path: Path) -> dict[str, Path]:
         """Return word -> file of the trip that a file of the motion is of."""
         require_file(path)
-        first, *others = self.parts
-        before, found, after = path.name.rpartition(first)
-        if not found:
+        main_word, *secondary_words = self.parts
+        prefix, matched_word, suffix = path.name.rpartition(main_word)
+        if not matched_word:
             raise DataError(
-                f"{path}: its name holds no '{first}'; give the files of the motion, to which"
-                f" those of {', '.join(others)} belong"
+                f"{path}: its name holds no '{main_word}'; give the files of the motion, to which"
+                f" those of {', '.join(secondary_words)} belong"
             )
-        out = {first: path}
-        for word in others:
-            beside = path.with_name(f"{before}{word}{after}")
-            if not beside.is_file():
-                raise DataError(f"{path}: {beside.name} is not beside it; leave the trip out")
-            out[word] = beside
-        return out
+        trip_files = {main_word: path}
+        for part_name in secondary_words:
+            candidate = path.with_name(f"{prefix}{part_name}{suffix}")
+            if not candidate.is_file():
+                raise DataError(f"{path}: {candidate.name} is not beside it; leave the trip out")
+            trip_files[part_name] = candidate
+        return trip_files
 
     def read(self, path: Path) -> Log:
         """Return the log of one trip; see `LogReader.read`."""
-        files = self.trip(path)
-        logs = {word: self.parts[word].build().read(file) for word, file in files.items()}
-        first, *others = logs
-        log = logs[first]
+        files = self.find_trip_files(path)
+        logs = {
+            part_name: self.parts[part_name].build().read(file) for part_name, file in files.items()
+        }
+        main_word, *secondary_words = logs
+        log = logs[main_word]
         # what dates join may be what the shift of the others is found by
-        for word in sorted(others, key=lambda word: _by_dates(log, logs[word]) is None):
-            log = self._beside(log, logs[word], word)
-        sums = {word: digest([file]) for word, file in files.items()}
-        meta = {**log.meta, "sha256": digest(list(files.values())), "parts": sums}
+        for part_name in sorted(
+            secondary_words, key=lambda word: _offset_from_dates(log, logs[word]) is None
+        ):
+            log = self._merge_channels(log, logs[part_name], part_name)
+        checksums = {part_name: hash_files([file]) for part_name, file in files.items()}
+        meta = {**log.meta, "sha256": hash_files(list(files.values())), "parts": checksums}
         return log.replace(meta=meta)
 
-    def _beside(self, log: Log, other: Log, word: str) -> Log:
+    def _merge_channels(self, log: Log, other_log: Log, part_name: str) -> Log:
         """Return a log with the channels of another one, on its own clock."""
-        new = {n: values for n, values in other.channels.items() if n not in log.channels}
-        if not new:
+        new_channels = {
+            n: values for n, values in other_log.channels.items() if n not in log.channels
+        }
+        if not new_channels:
             raise DataError(
-                f"log {log.name}: {word} holds {', '.join(other.channels)}, which are there"
+                f"log {log.name}: {part_name} holds {', '.join(other_log.channels)}, which are there"
                 " already; leave this part out"
             )
-        shift, told = self._shift(log, other.replace(channels=new), word)
-        t = other.t + shift
+        shift, offset_remark = self._choose_clock_offset(
+            log, other_log.replace(channels=new_channels), part_name
+        )
+        t = other_log.t + shift
         step = float(np.median(np.diff(log.t)))
-        both = (log.t >= t[0]) & (log.t <= t[-1])
-        if both.sum() < 2:
+        in_overlap = (log.t >= t[0]) & (log.t <= t[-1])
+        if in_overlap.sum() < 2:
             raise DataError(
                 f"log {log.name}: its clock goes from {log.t[0]:.1f} to {log.t[-1]:.1f} s, that of"
-                f" {word} from {t[0]:.1f} to {t[-1]:.1f} s; give `shift: {{{word}: ...}}`"
+                f" {part_name} from {t[0]:.1f} to {t[-1]:.1f} s; give `shift: {{{part_name}: ...}}`"
             )
-        held = tuple(new) if float(np.median(np.diff(t))) > step else ()
-        moved = onto(other.replace(t=t, channels=new), GridConfig(step=step, held=held), log.t)
-        findings = [*log.meta.get("findings", ()), *other.meta.get("findings", ()), told]
+        hold_names = tuple(new_channels) if float(np.median(np.diff(t))) > step else ()
+        resampled = resample_at(
+            other_log.replace(t=t, channels=new_channels),
+            GridConfig(step=step, held=hold_names),
+            log.t,
+        )
+        findings = [
+            *log.meta.get("findings", ()),
+            *other_log.meta.get("findings", ()),
+            offset_remark,
+        ]
         return log.replace(
-            channels={**log.channels, **{name: moved[name] for name in new}},
-            units={**log.units, **{name: other.units[name] for name in new}},
+            channels={**log.channels, **{name: resampled[name] for name in new_channels}},
+            units={**log.units, **{name: other_log.units[name] for name in new_channels}},
             meta={**log.meta, "findings": findings},
         )
 
-    def _shift(self, log: Log, other: Log, word: str) -> tuple[float, Remark]:
+    def _choose_clock_offset(
+        self, log: Log, other_log: Log, part_name: str
+    ) -> tuple[float, Remark]:
         """Return what is added to the other clock, and how sure that is.
 
         Dates of both join them, unless what the channels explain is sure to say otherwise.
         """
-        given = self.shift.get(word)
-        if given is not None:
-            return given, remark("note", "joined", f"{word}: its clock is moved by {given:g} s")
-        dated, give = _by_dates(log, other), f"give `shift: {{{word}: ...}}`"
+        configured_shift = self.shift.get(part_name)
+        if configured_shift is not None:
+            return configured_shift, make_remark(
+                "note", "joined", f"{part_name}: its clock is moved by {configured_shift:g} s"
+            )
+        date_offset, advice = (
+            _offset_from_dates(log, other_log),
+            f"give `shift: {{{part_name}: ...}}`",
+        )
         try:
-            found = clock_shift(log, other)
+            estimate = estimate_clock_offset(log, other_log)
         except ResidnetError as error:
-            if dated is not None:
-                return dated, remark("note", "joined", f"{word}: joined by the dates of both")
-            text = f"{word}: its clock cannot be brought to that of the motion ({error}); both are"
-            text += f" taken to begin together: {give}"
-            return float(log.t[0] - other.t[0]), remark("will mislead", "joined", text)
-        figures = found._asdict()
-        sure = 1.0 - found.other >= _SURE * (1.0 - found.explained)
-        by = f"with which its channels explain {100 * found.explained:.0f} % of what the motion"
-        by += " alone leaves of the accelerations"
-        if dated is not None and (not sure or abs(found.seconds - dated) < _COARSE):
-            text = f"{word}: joined by the dates of both"
-            return dated, remark("note", "joined", text, **figures)
-        if dated is not None:
-            text = f"{word}: joined by the dates of both, which are {dated - found.seconds:+.2f} s"
-            text += f" from the shift {by}: one of the clocks is wrong, {give}"
-            return dated, remark("will mislead", "joined", text, **figures)
-        text = f"{word}: its clock is moved by {found.seconds:+.2f} s, {by}"
-        text += f" ({100 * found.other:.0f} % with any shift {_FAR:g} s from it)"
-        text += "" if sure else f"; that is not sure, {give}"
-        level: Level = "note" if sure else "will mislead"
-        return found.seconds, remark(level, "joined", text, **figures)
+            if date_offset is not None:
+                return date_offset, make_remark(
+                    "note", "joined", f"{part_name}: joined by the dates of both"
+                )
+            text = f"{part_name}: its clock cannot be brought to that of the motion ({error}); both are"
+            text += f" taken to begin together: {advice}"
+            return float(log.t[0] - other_log.t[0]), make_remark("will mislead", "joined", text)
+        offset_figures = estimate._asdict()
+        is_unambiguous = 1.0 - estimate.runner_up_share >= _MIN_VARIANCE_RATIO * (
+            1.0 - estimate.explained_share
+        )
+        explanation = f"with which its channels explain {100 * estimate.explained_share:.0f} % of what the motion"
+        explanation += " alone leaves of the accelerations"
+        if date_offset is not None and (
+            not is_unambiguous or abs(estimate.seconds - date_offset) < _COARSE_STEP
+        ):
+            text = f"{part_name}: joined by the dates of both"
+            return date_offset, make_remark("note", "joined", text, **offset_figures)
+        if date_offset is not None:
+            text = f"{part_name}: joined by the dates of both, which are {date_offset - estimate.seconds:+.2f} s"
+            text += f" from the shift {explanation}: one of the clocks is wrong, {advice}"
+            return date_offset, make_remark("will mislead", "joined", text, **offset_figures)
+        text = f"{part_name}: its clock is moved by {estimate.seconds:+.2f} s, {explanation}"
+        text += f" ({100 * estimate.runner_up_share:.0f} % with any shift {_MIN_ALTERNATIVE_OFFSET:g} s from it)"
+        text += "" if is_unambiguous else f"; that is not sure, {advice}"
+        level: Level = "note" if is_unambiguous else "will mislead"
+        return estimate.seconds, make_remark(level, "joined", text, **offset_figures)
 
 
-def _by_dates(log: Log, other: Log) -> float | None:
+def _offset_from_dates(log: Log, other_log: Log) -> float | None:
     """Return what brings another clock to that of a log by dates or Unix time that overlap."""
-    first, second = (
-        one.meta.get("epoch", one.t[0] if unix_unit(one.t) == "s" else None) for one in (log, other)
+    first_epoch, second_epoch = (
+        item.meta.get("epoch", item.t[0] if detect_unix_unit(item.t) == "s" else None)
+        for item in (log, other_log)
     )
-    if first is None or second is None:
+    if first_epoch is None or second_epoch is None:
         return None
-    apart = float(second) - float(first)
-    if not other.t[0] - other.t[-1] < apart < log.t[-1] - log.t[0]:
+    epoch_difference = float(second_epoch) - float(first_epoch)
+    if not other_log.t[0] - other_log.t[-1] < epoch_difference < log.t[-1] - log.t[0]:
         return None
-    return apart + float(log.t[0] - other.t[0])
+    return epoch_difference + float(log.t[0] - other_log.t[0])
 
 
-def clock_shift(log: Log, other: Log) -> Shift:
+def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
     """Return the shift of another log's clock with which its channels explain most accelerations.
 
     For each shift that leaves half of the shorter log, what u and r gain over blocks of time is
@@ -218,64 +248,97 @@ def clock_shift(log: Log, other: Log) -> Shift:
     Args:
         log: of the motion, measured or by position and heading.
     """
-    whole = complete_motion(log, MotionConfig())
-    every = max(1, len(whole) // _SAMPLES)
-    t = whole.t[::every]
-    size = max(4, round(_BLOCK / float(np.median(np.diff(t)))))
-    blocks = Blocks(t, np.arange(0, len(t) - size, max(1, size // 4)), size)
-    if not blocks.first.size:
+    motion_log = complete_motion(log, MotionConfig())
+    stride = max(1, len(motion_log) // _MAX_SAMPLES)
+    t = motion_log.t[::stride]
+    block_length = max(4, round(_BLOCK_SECONDS / float(np.median(np.diff(t)))))
+    blocks = OverlappingBlocks(
+        t, np.arange(0, len(t) - block_length, max(1, block_length // 4)), block_length
+    )
+    if not blocks.starts.size:
         raise DataError(f"log {log.name}: {t[-1] - t[0]:.1f} s are too short to tell")
 
-    def over(*columns: np.ndarray) -> np.ndarray:
+    def integrate_columns(*columns: np.ndarray) -> np.ndarray:
         """Return the integrals of columns [T] over the blocks [B, k]."""
-        return blocks.integrals(np.stack(columns, axis=1))(0)
+        return blocks.make_integrator(np.stack(columns, axis=1))(0)
 
-    known = {name: np.isfinite(whole[name]) for name in ("u", "r")}
-    u, r = (np.interp(t, whole.t[k], whole[n][k]) for n, k in known.items())
-    gained = blocks.change(np.stack((u, r), axis=1))
-    gained /= np.maximum(gained.std(axis=0), 1e-12)
-    own = over(np.ones_like(u), u, u * np.abs(u), r, r * np.abs(r), u * r)
+    is_finite = {name: np.isfinite(motion_log[name]) for name in ("u", "r")}
+    u, r = (np.interp(t, motion_log.t[k], motion_log[n][k]) for n, k in is_finite.items())
+    velocity_change = blocks.compute_changes(np.stack((u, r), axis=1))
+    velocity_change /= np.maximum(velocity_change.std(axis=0), 1e-12)
+    motion_regressors = integrate_columns(
+        np.ones_like(u), u, u * np.abs(u), r, r * np.abs(r), u * r
+    )
     # what the motion explains by itself, which says nothing of the commands
-    rest = gained - own @ np.linalg.lstsq(own, gained, rcond=1e-9)[0]
-    left_alone = (rest**2).sum(axis=1)
-    total = float(left_alone.sum())
-    driving = [values for name, values in other.channels.items() if name not in STATE]
+    motion_residual = (
+        velocity_change
+        - motion_regressors @ np.linalg.lstsq(motion_regressors, velocity_change, rcond=1e-9)[0]
+    )
+    squared_motion_residual = (motion_residual**2).sum(axis=1)
+    total_variance = float(squared_motion_residual.sum())
+    input_signals = [
+        values for name, values in other_log.channels.items() if name not in STATE_NAMES
+    ]
     # a velocity that the other one measured too gains what this one gains
-    gains = [values for name, values in other.channels.items() if name in ("u", "v", "r")]
-    least = _LEAST * min(t[-1] - t[0], other.t[-1] - other.t[0])
+    velocity_signals = [
+        values for name, values in other_log.channels.items() if name in ("u", "v", "r")
+    ]
+    min_overlap = _MIN_OVERLAP * min(t[-1] - t[0], other_log.t[-1] - other_log.t[0])
 
-    def explained(shift: float) -> float:
-        at = t - shift
-        begin, end = at[blocks.first], at[blocks.first + size]
-        inside = (begin >= other.t[0]) & (end <= other.t[-1])
-        if inside.sum() < 3 * (own.shape[1] + 3 * len(driving) + len(gains)) or not total:
+    def explained_share(shift: float) -> float:
+        shifted_times = t - shift
+        block_start, block_end = (
+            shifted_times[blocks.starts],
+            shifted_times[blocks.starts + block_length],
+        )
+        in_range = (block_start >= other_log.t[0]) & (block_end <= other_log.t[-1])
+        if (
+            in_range.sum()
+            < 3 * (motion_regressors.shape[1] + 3 * len(input_signals) + len(velocity_signals))
+            or not total_variance
+        ):
             return 0.0
 
-        def seen(values: np.ndarray) -> np.ndarray:
-            there = np.isfinite(values)
-            return np.asarray(np.interp(at, other.t[there], values[there]))
+        def interpolate_signal(values: np.ndarray) -> np.ndarray:
+            is_finite = np.isfinite(values)
+            return np.asarray(np.interp(shifted_times, other_log.t[is_finite], values[is_finite]))
 
-        columns = [own[inside]]
-        columns += [blocks.change(w)[inside, None] for w in map(seen, gains)]
-        columns += [over(w, w * np.abs(w), w * u)[inside] for w in map(seen, driving)]
-        x, y = np.concatenate(columns, axis=1), gained[inside]
-        x = x / np.maximum(np.abs(x).max(axis=0), 1e-12)
-        left = y - x @ np.linalg.lstsq(x, y, rcond=1e-9)[0]
+        columns = [motion_regressors[in_range]]
+        columns += [
+            blocks.compute_changes(w)[in_range, None]
+            for w in map(interpolate_signal, velocity_signals)
+        ]
+        columns += [
+            integrate_columns(w, w * np.abs(w), w * u)[in_range]
+            for w in map(interpolate_signal, input_signals)
+        ]
+        regressors, response = np.concatenate(columns, axis=1), velocity_change[in_range]
+        regressors = regressors / np.maximum(np.abs(regressors).max(axis=0), 1e-12)
+        residual = response - regressors @ np.linalg.lstsq(regressors, response, rcond=1e-9)[0]
         # blocks that the other log does not reach stay as the motion alone leaves them
-        return float((left_alone[inside].sum() - (left**2).sum()) / total)
+        return float(
+            (squared_motion_residual[in_range].sum() - (residual**2).sum()) / total_variance
+        )
 
-    low, high = t[0] - other.t[-1] + least, t[-1] - other.t[0] - least
-    coarse = np.arange(low, max(high, low + _COARSE), _COARSE)
-    scores = np.array([explained(shift) for shift in coarse.tolist()])
-    best = float(coarse[scores.argmax()])
-    fine = best + np.arange(-_COARSE, _COARSE + _FINE, _FINE)
-    found = np.array([explained(shift) for shift in fine.tolist()])
-    seconds = float(fine[found.argmax()])
-    far = scores[np.abs(coarse - seconds) > _FAR]
-    return Shift(seconds, float(found.max()), float(far.max(initial=0.0)))
+    lower_shift, upper_shift = (
+        t[0] - other_log.t[-1] + min_overlap,
+        t[-1] - other_log.t[0] - min_overlap,
+    )
+    coarse_shifts = np.arange(
+        lower_shift, max(upper_shift, lower_shift + _COARSE_STEP), _COARSE_STEP
+    )
+    scores = np.array([explained_share(shift) for shift in coarse_shifts.tolist()])
+    best_coarse_shift = float(coarse_shifts[scores.argmax()])
+    fine_shifts = best_coarse_shift + np.arange(
+        -_COARSE_STEP, _COARSE_STEP + _FINE_STEP, _FINE_STEP
+    )
+    fine_scores = np.array([explained_share(shift) for shift in fine_shifts.tolist()])
+    seconds = float(fine_shifts[fine_scores.argmax()])
+    is_alternative = scores[np.abs(coarse_shifts - seconds) > _MIN_ALTERNATIVE_OFFSET]
+    return ClockOffset(seconds, float(fine_scores.max()), float(is_alternative.max(initial=0.0)))
 
 
-def partners(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Path]]:
+def group_trip_files(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Path]]:
     """Return word -> files, where files come in groups whose names differ in that word alone.
 
     Empty where they do not: files of one group have the same columns, and some trips one of each.
@@ -287,20 +350,40 @@ def partners(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Path]]:
     groups: dict[tuple[str, ...], list[Path]] = {}
     for path, columns in paths.items():
         groups.setdefault(columns, []).append(path)
-    members = list(groups.values())
-    if not 2 <= len(members) <= 6:
+    file_groups = list(groups.values())
+    if not 2 <= len(file_groups) <= 6:
         return {}
-    named = [[set(re.findall(r"[^\W\d_]+", path.stem)) for path in group] for group in members]
+    file_words = [
+        [set(re.findall(r"[^\W\d_]+", path.stem)) for path in group] for group in file_groups
+    ]
     # the longest words that the names of all files of a group hold go first
-    held = [sorted(set.intersection(*one), key=lambda w: (-len(w), w)) for one in named]
-    shared = Counter(word for words in held for word in words)
-    words = [[word for word in own if shared[word] == 1] for own in held]
-    if not all(words):
+    common_words = [
+        sorted(set.intersection(*word_sets), key=lambda w: (-len(w), w)) for word_sets in file_words
+    ]
+    word_counts = Counter(
+        shared_word for distinctive_words in common_words for shared_word in distinctive_words
+    )
+    distinctive_words = [
+        [shared_word for shared_word in group_words if word_counts[shared_word] == 1]
+        for group_words in common_words
+    ]
+    if not all(distinctive_words):
         return {}
     trips = {
-        own[0]: {path.with_name(path.name.replace(own[0], "\0")): path for path in group}
-        for own, group in zip(words, members, strict=True)
+        group_words[0]: {
+            path.with_name(path.name.replace(group_words[0], "\0")): path for path in group
+        }
+        for group_words, group in zip(distinctive_words, file_groups, strict=True)
     }
-    first, *rest = trips.values()
-    whole = [trip for trip in first if all(trip in other for other in rest)]
-    return {word: [of[trip] for trip in whole] for word, of in trips.items()} if whole else {}
+    first_trips, *other_trips = trips.values()
+    complete_trips = [
+        trip for trip in first_trips if all(trip in other_trip for other_trip in other_trips)
+    ]
+    return (
+        {
+            shared_word: [trip_paths[trip] for trip in complete_trips]
+            for shared_word, trip_paths in trips.items()
+        }
+        if complete_trips
+        else {}
+    )

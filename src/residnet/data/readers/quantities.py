@@ -14,32 +14,35 @@ from pydantic import AfterValidator, Field
 from residnet.core.config import Config, Metres, Radians, Seconds
 from residnet.core.errors import UsageError
 from residnet.core.names import CHANNEL_UNITS
-from residnet.core.units import known_unit, si_unit, to_si
-from residnet.data.readers.base import package, unwrap
+from residnet.core.units import canonical_unit, si_unit, to_si
+from residnet.data.readers.base import optional_import, unwrap_angle
 from residnet.data.readers.recording import Remark
-from residnet.data.readers.written import Form, LetterO
+from residnet.data.readers.written import AngleForm, LetterO
 
 Frame = Literal["as_measured", "ned", "enu", "body_fsd", "body_fpu"]
 
-_SAME = (1.0, 0.0)
-_FLIP = (-1.0, 0.0)
-_FROM_EAST = (-1.0, math.pi / 2.0)
-_EARTH = ("x", "y", "z", "psi", "wind_dir", "current_north", "current_east")
+_IDENTITY = (1.0, 0.0)
+_NEGATE = (-1.0, 0.0)
+_EAST_TO_NORTH = (-1.0, math.pi / 2.0)
+_EARTH_CHANNELS = ("x", "y", "z", "psi", "wind_dir", "current_north", "current_east")
 QUATERNION = ("qx", "qy", "qz", "qw")
 """Channels of a table that become a heading together, where it has none."""
-COSINE, SINE = "_cos", "_sin"
+COSINE_SUFFIX, SINE_SUFFIX = "_cos", "_sin"
 """What stands behind an angle's name in those of its cosine and sine."""
-_FORWARD = ("u", "p", "phi", "u_dot", "tau_x")
-_SIDEWAYS_OR_DOWN = ("v", "r", "w", "q", "theta", "v_dot", "r_dot", "tau_y", "tau_n")
+_FORWARD_CHANNELS = ("u", "p", "phi", "u_dot", "tau_x")
+_STARBOARD_OR_DOWN_CHANNELS = ("v", "r", "w", "q", "theta", "v_dot", "r_dot", "tau_y", "tau_n")
 # frame -> channel -> (factor, offset [SI]) that brings the channel to residnet's frame.
 # x and y have no entry in enu: "x" there means east to some and the north column to others, so the
 # map must name the north column itself.
-_FRAMES: dict[str, dict[str, tuple[float, float]]] = {
-    "ned": dict.fromkeys((*_EARTH, "qw"), _SAME),
+_FRAME_CONVERSIONS: dict[str, dict[str, tuple[float, float]]] = {
+    "ned": dict.fromkeys((*_EARTH_CHANNELS, "qw"), _IDENTITY),
     # the frame of a quaternion is told at its scalar part
-    "enu": {"psi": _FROM_EAST, "wind_dir": _FROM_EAST, "z": _FLIP, "qw": _SAME},
-    "body_fsd": dict.fromkeys((*_FORWARD, *_SIDEWAYS_OR_DOWN), _SAME),
-    "body_fpu": {**dict.fromkeys(_FORWARD, _SAME), **dict.fromkeys(_SIDEWAYS_OR_DOWN, _FLIP)},
+    "enu": {"psi": _EAST_TO_NORTH, "wind_dir": _EAST_TO_NORTH, "z": _NEGATE, "qw": _IDENTITY},
+    "body_fsd": dict.fromkeys((*_FORWARD_CHANNELS, *_STARBOARD_OR_DOWN_CHANNELS), _IDENTITY),
+    "body_fpu": {
+        **dict.fromkeys(_FORWARD_CHANNELS, _IDENTITY),
+        **dict.fromkeys(_STARBOARD_OR_DOWN_CHANNELS, _NEGATE),
+    },
 }
 
 
@@ -63,7 +66,7 @@ class Conversion(Config):
     sign: Literal[1, -1] = 1
     frame: Frame = "as_measured"
 
-    def require_fit(self, name: str) -> None:
+    def require_valid_channel(self, name: str) -> None:
         """Stop where this cannot be the channel `name`.
 
         Raises:
@@ -75,87 +78,92 @@ class Conversion(Config):
         if self.scale == 0.0:
             raise ValueError(f"channel {name}: scale must not be zero, all would be the same")
         try:
-            factor(self.unit, CHANNEL_UNITS.get(name))
+            conversion_factor(self.unit, CHANNEL_UNITS.get(name))
         except ValueError as error:
             raise ValueError(f"channel {name}: {error}") from error
-        if self.frame != "as_measured" and name not in _FRAMES[self.frame]:
-            fitting = (
-                ", ".join(frame for frame, table in _FRAMES.items() if name in table) or "none"
+        if self.frame != "as_measured" and name not in _FRAME_CONVERSIONS[self.frame]:
+            valid_frames = (
+                ", ".join(frame for frame, table in _FRAME_CONVERSIONS.items() if name in table)
+                or "none"
             )
             raise ValueError(
                 f"channel {name}: frame '{self.frame}' says nothing about it (frames that do:"
-                f" {fitting}); map the column that already holds this quantity, with sign: -1 where"
+                f" {valid_frames}); map the column that already holds this quantity, with sign: -1 where"
                 " it points the other way"
             )
 
-    def si(self, name: str) -> str:
+    def si_unit_of(self, name: str) -> str:
         """Return the SI unit of channel `name`."""
-        return si_unit(known_unit(self.unit, CHANNEL_UNITS.get(name)))
+        return si_unit(canonical_unit(self.unit, CHANNEL_UNITS.get(name)))
 
-    def in_si(self, name: str, raw: np.ndarray) -> np.ndarray:
+    def magnitude_in_si(self, name: str, values: np.ndarray) -> np.ndarray:
         """Return the size of the values [T] of channel `name` in SI, whatever their frame."""
         gain = to_si(self.unit, CHANNEL_UNITS.get(name)) * self.scale
-        size: np.ndarray = np.abs(gain * (raw - self.offset))
-        return size
+        magnitude: np.ndarray = np.abs(gain * (values - self.offset))
+        return magnitude
 
-    def convert(self, name: str, raw: np.ndarray) -> np.ndarray:
+    def convert(self, name: str, raw_values: np.ndarray) -> np.ndarray:
         """Return the values [T] of channel `name` in residnet's unit, sign and frame.
 
         psi unwrapped.
         """
-        turn, ahead = _FRAMES[self.frame][name] if self.frame != "as_measured" else _SAME
-        gain = turn * self.sign * to_si(self.unit, CHANNEL_UNITS.get(name)) * self.scale
-        values = gain * (raw - self.offset) + ahead
-        return true_headings(values) if name == "psi" else values
+        frame_factor, frame_offset = (
+            _FRAME_CONVERSIONS[self.frame][name] if self.frame != "as_measured" else _IDENTITY
+        )
+        gain = frame_factor * self.sign * to_si(self.unit, CHANNEL_UNITS.get(name)) * self.scale
+        values = gain * (raw_values - self.offset) + frame_offset
+        return mask_interpolated_headings(values) if name == "psi" else values
 
 
-_EVEN = 0.2
+_STEP_TOLERANCE = 0.2
 """Share by which the steps of an interpolation may differ, whose ends are rounded."""
-_SWEPT = 10.0
+_MIN_SWEEP_RATIO = 10.0
 """Times that a step of such an interpolation exceeds the steps of an ordinary turn."""
 
 
-def true_headings(psi: np.ndarray) -> np.ndarray:
+def mask_interpolated_headings(psi: np.ndarray) -> np.ndarray:
     """Return headings [T] in rad, unwrapped; NaN where the recorder made them up.
 
     A recorder that resamples by straight lines goes from 359 to 1 deg by way of 180. Such samples
     lie in a run of even steps from one edge of the circle to the other, far larger than the steps
     before and behind it: a vessel gathers and loses its rate of turn.
     """
-    out = unwrap(psi)
-    known = np.flatnonzero(np.isfinite(psi))
-    wrapped = np.remainder(psi[known], 2.0 * np.pi)
+    unwrapped = unwrap_angle(psi)
+    finite_indices = np.flatnonzero(np.isfinite(psi))
+    wrapped = np.remainder(psi[finite_indices], 2.0 * np.pi)
     step = np.diff(wrapped)
-    size = np.abs(np.where(np.abs(step) > np.pi, 2.0 * np.pi - np.abs(step), step))
-    if step.size < 3 or not size.any():
-        return out
-    swept = np.abs(step) > max(_SWEPT * float(np.median(size)), np.radians(5.0))
-    sense = np.sign(step) * swept
-    bounds = np.flatnonzero(np.diff(np.concatenate(([0.0], sense, [0.0]))))
-    usual = np.where(swept, np.median(size), size)
-    made = np.zeros(known.size, dtype=bool)
-    for begin, end in itertools.pairwise(bounds):
-        part = step[begin:end]
-        if part.size < 2 or not sense[begin]:
+    step_size = np.abs(np.where(np.abs(step) > np.pi, 2.0 * np.pi - np.abs(step), step))
+    if step.size < 3 or not step_size.any():
+        return unwrapped
+    is_sweep = np.abs(step) > max(_MIN_SWEEP_RATIO * float(np.median(step_size)), np.radians(5.0))
+    sweep_sign = np.sign(step) * is_sweep
+    bounds = np.flatnonzero(np.diff(np.concatenate(([0.0], sweep_sign, [0.0]))))
+    typical_step = np.where(is_sweep, np.median(step_size), step_size)
+    is_interpolated = np.zeros(finite_indices.size, dtype=bool)
+    for start, stop in itertools.pairwise(bounds):
+        sweep_steps = step[start:stop]
+        if sweep_steps.size < 2 or not sweep_sign[start]:
             continue
         # the steps into and out of the interpolation may be cut short
-        slope = np.abs(part).max()
-        even = np.abs(part[1:-1]) >= (1.0 - _EVEN) * slope
-        beside = np.append(usual[max(begin - 2, 0) : begin], usual[end : end + 2]).max(initial=0.0)
-        across = 2.0 * np.pi - abs(part.sum()) < slope + 2.0 * beside
+        largest_step = np.abs(sweep_steps).max()
+        is_even = np.abs(sweep_steps[1:-1]) >= (1.0 - _STEP_TOLERANCE) * largest_step
+        neighbour_step = np.append(
+            typical_step[max(start - 2, 0) : start], typical_step[stop : stop + 2]
+        ).max(initial=0.0)
+        spans_circle = 2.0 * np.pi - abs(sweep_steps.sum()) < largest_step + 2.0 * neighbour_step
         # the short way round goes on as the vessel turned, and the long way does not
-        short = (2.0 * np.pi - abs(part.sum())) / part.size
-        sudden = slope - beside > abs(short - beside)
-        if even.all() and across and sudden:
-            made[begin + 1 : end] = True
-    if not made.any():
-        return out
+        short_way_step = (2.0 * np.pi - abs(sweep_steps.sum())) / sweep_steps.size
+        is_sudden = largest_step - neighbour_step > abs(short_way_step - neighbour_step)
+        if is_even.all() and spans_circle and is_sudden:
+            is_interpolated[start + 1 : stop] = True
+    if not is_interpolated.any():
+        return unwrapped
     # where two follow each other, the sample between them lies on neither end
-    made[1:-1] |= made[:-2] & made[2:]
-    kept = known[~made]
-    out[known[made]] = np.nan
-    out[kept] = np.unwrap(psi[kept])
-    return out
+    is_interpolated[1:-1] |= is_interpolated[:-2] & is_interpolated[2:]
+    measured_indices = finite_indices[~is_interpolated]
+    unwrapped[finite_indices[is_interpolated]] = np.nan
+    unwrapped[measured_indices] = np.unwrap(psi[measured_indices])
+    return unwrapped
 
 
 class ChannelMap(Conversion):
@@ -175,7 +183,7 @@ class ChannelMap(Conversion):
     """
 
     column: str
-    form: Form = "number"
+    form: AngleForm = "number"
     hemisphere: str | None = None
     letter_o: LetterO | None = None
     hold: bool = False
@@ -185,20 +193,20 @@ class ChannelMap(Conversion):
         """Whether its cells may be degrees with minutes or letters."""
         return self.form != "number" or self.hemisphere is not None
 
-    def require_fit(self, name: str) -> None:
+    def require_valid_channel(self, name: str) -> None:
         """Stop where this cannot be the channel `name`; see `Conversion.require_fit`.
 
         Raises:
             ValueError: also where degrees with minutes are in another unit.
         """
-        super().require_fit(name)
-        if self.is_angle and known_unit(self.unit) != "deg":
+        super().require_valid_channel(name)
+        if self.is_angle and canonical_unit(self.unit) != "deg":
             raise ValueError(
                 f"channel {name}: `form` and `hemisphere` are for degrees; set unit: deg"
             )
 
 
-def factor(unit: str, expected: str | None) -> float:
+def conversion_factor(unit: str, expected: str | None) -> float:
     """Return `to_si` for validators: pydantic adds the key path to a ValueError only."""
     try:
         return to_si(unit, expected)
@@ -206,17 +214,17 @@ def factor(unit: str, expected: str | None) -> float:
         raise ValueError(str(error)) from error
 
 
-def _converts(si: str) -> AfterValidator:
-    def known(unit: str) -> str:
-        factor(unit, si)
-        return known_unit(unit, si)
+def _unit_validator(expected_unit: str) -> AfterValidator:
+    def validate_unit(unit: str) -> str:
+        conversion_factor(unit, expected_unit)
+        return canonical_unit(unit, expected_unit)
 
-    return AfterValidator(known)
+    return AfterValidator(validate_unit)
 
 
-AngleUnit = Annotated[str, _converts("rad")]
-LengthUnit = Annotated[str, _converts("m")]
-SpeedUnit = Annotated[str, _converts("m/s")]
+AngleUnit = Annotated[str, _unit_validator("rad")]
+LengthUnit = Annotated[str, _unit_validator("m")]
+SpeedUnit = Annotated[str, _unit_validator("m/s")]
 
 
 @final
@@ -268,7 +276,7 @@ class Origin(Config):
     longitude: Radians = Field(ge=-6.2832, le=6.2832)
 
 
-class Source(Config):
+class TopicSource(Config):
     """Fields of one topic.
 
     Attributes:
@@ -276,15 +284,15 @@ class Source(Config):
     """
 
     topic: str | None = None
-    names: ClassVar[tuple[str, ...]] = ()
+    field_keys: ClassVar[tuple[str, ...]] = ()
 
     @property
     def fields(self) -> tuple[str, ...]:
         """Fields that are read."""
-        return tuple(str(getattr(self, name)) for name in self.names)
+        return tuple(str(getattr(self, name)) for name in self.field_keys)
 
 
-class OfAntenna(Source):
+class AntennaSource(TopicSource):
     """What is measured at an antenna.
 
     Attributes:
@@ -296,7 +304,7 @@ class OfAntenna(Source):
 
 
 @final
-class Geodetic(OfAntenna):
+class GeodeticPosition(AntennaSource):
     """Latitude and longitude, brought to a local tangent plane (north, east) with PROJ.
 
     Attributes:
@@ -311,11 +319,11 @@ class Geodetic(OfAntenna):
     longitude: str = "longitude"
     unit: AngleUnit = "deg"
     origin: Origin | None = None
-    names: ClassVar[tuple[str, ...]] = ("latitude", "longitude")
+    field_keys: ClassVar[tuple[str, ...]] = ("latitude", "longitude")
 
 
 @final
-class Local(OfAntenna):
+class LocalPosition(AntennaSource):
     """Position in a local frame that the source made.
 
     Attributes:
@@ -328,15 +336,15 @@ class Local(OfAntenna):
     north: str
     east: str
     unit: LengthUnit = "m"
-    names: ClassVar[tuple[str, ...]] = ("north", "east")
+    field_keys: ClassVar[tuple[str, ...]] = ("north", "east")
 
 
-PositionConfig = Annotated[Geodetic | Local, Field(discriminator="kind")]
+PositionConfig = Annotated[GeodeticPosition | LocalPosition, Field(discriminator="kind")]
 """Where x and y come from."""
 
 
 @final
-class Quaternion(Source):
+class QuaternionHeading(TopicSource):
     """Heading from a quaternion; its sign, which flips in many sources, does not matter.
 
     Attributes:
@@ -349,11 +357,11 @@ class Quaternion(Source):
     field: str
     frame: Literal["ned", "enu"]
     roll: bool = False
-    names: ClassVar[tuple[str, ...]] = ("field",)
+    field_keys: ClassVar[tuple[str, ...]] = ("field",)
 
 
 @final
-class Angle(Source):
+class AngleHeading(TopicSource):
     """Heading as an angle; wraps are taken out.
 
     Attributes:
@@ -369,15 +377,15 @@ class Angle(Source):
     unit: AngleUnit = "rad"
     frame: Literal["ned", "enu"] = "ned"
     offset: Radians = 0.0
-    names: ClassVar[tuple[str, ...]] = ("field",)
+    field_keys: ClassVar[tuple[str, ...]] = ("field",)
 
 
-HeadingConfig = Annotated[Quaternion | Angle, Field(discriminator="kind")]
+HeadingConfig = Annotated[QuaternionHeading | AngleHeading, Field(discriminator="kind")]
 """Where psi comes from."""
 
 
 @final
-class Derived(Config):
+class DerivedVelocity(Config):
     """u, v, r from position and heading, by Savitzky-Golay polynomials at the positions' rate.
 
     Position and heading are smoothed by them too.
@@ -395,7 +403,7 @@ class Derived(Config):
 
 
 @final
-class EarthFixed(OfAntenna):
+class EarthFixedVelocity(AntennaSource):
     """u, v from northward and eastward velocity of the antenna.
 
     They are turned into body axes and moved to the vessel's centre.
@@ -410,11 +418,11 @@ class EarthFixed(OfAntenna):
     north: str
     east: str
     unit: SpeedUnit = "m/s"
-    names: ClassVar[tuple[str, ...]] = ("north", "east")
+    field_keys: ClassVar[tuple[str, ...]] = ("north", "east")
 
 
 @final
-class CourseSpeed(OfAntenna):
+class CourseSpeedVelocity(AntennaSource):
     """u, v from course and speed over ground of the antenna.
 
     They are turned into body axes and moved to the vessel's centre.
@@ -431,14 +439,16 @@ class CourseSpeed(OfAntenna):
     speed: str
     course_unit: AngleUnit = "deg"
     speed_unit: SpeedUnit = "m/s"
-    names: ClassVar[tuple[str, ...]] = ("course", "speed")
+    field_keys: ClassVar[tuple[str, ...]] = ("course", "speed")
 
 
-VelocityConfig = Annotated[Derived | EarthFixed | CourseSpeed, Field(discriminator="kind")]
+VelocityConfig = Annotated[
+    DerivedVelocity | EarthFixedVelocity | CourseSpeedVelocity, Field(discriminator="kind")
+]
 """Where u, v (and r) come from; velocities in body axes are plain channels."""
 
 
-def given_by(
+def source_channels(
     position: PositionConfig | None, heading: HeadingConfig | None, velocity: VelocityConfig | None
 ) -> list[str]:
     """Return the channels that sources give."""
@@ -447,7 +457,7 @@ def given_by(
 
 
 @final
-class Uniform(Config):
+class UniformClock(Config):
     """A uniform grid; where the recording has dates, on whole multiples of its step in Unix time.
 
     Attributes:
@@ -459,7 +469,7 @@ class Uniform(Config):
 
 
 @final
-class OfTopic(Config):
+class TopicClock(Config):
     """The samples of one topic, whatever its rate.
 
     Attributes:
@@ -470,12 +480,12 @@ class OfTopic(Config):
     topic: str | None = None
 
 
-ClockConfig = Annotated[Uniform | OfTopic, Field(discriminator="kind")]
+ClockConfig = Annotated[UniformClock | TopicClock, Field(discriminator="kind")]
 """The clock of the log."""
 
 
 @dataclass(frozen=True)
-class Plan:
+class ChannelPlan:
     """Which parts of a recording become which channels.
 
     Attributes:
@@ -495,7 +505,7 @@ class Plan:
     remarks: tuple[Remark, ...] = ()
 
 
-def tangent_plane(
+def project_to_tangent_plane(
     latitude: np.ndarray, longitude: np.ndarray, latitude_0: float, longitude_0: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return north and east [T] in m of points of the WGS 84 ellipsoid.
@@ -514,24 +524,24 @@ def tangent_plane(
     Raises:
         UsageError: where pyproj is not installed.
     """
-    with package("geo", "pyproj", "a position in latitude and longitude"):
+    with optional_import("geo", "pyproj", "a position in latitude and longitude"):
         from pyproj import Transformer
     origin = (
         f"+lat_0={float(np.degrees(latitude_0))!r} +lon_0={float(np.degrees(longitude_0))!r} +h_0=0"
     )
-    plane = Transformer.from_pipeline(
+    transformer = Transformer.from_pipeline(
         "+proj=pipeline +step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84"
         f" {origin}"
     )
-    known = np.isfinite(latitude) & np.isfinite(longitude)
+    is_finite = np.isfinite(latitude) & np.isfinite(longitude)
     north, east = np.full(latitude.shape, np.nan), np.full(latitude.shape, np.nan)
-    east[known], north[known], _ = plane.transform(
-        longitude[known], latitude[known], np.zeros(int(known.sum())), radians=True
+    east[is_finite], north[is_finite], _ = transformer.transform(
+        longitude[is_finite], latitude[is_finite], np.zeros(int(is_finite.sum())), radians=True
     )
     return north, east
 
 
-def fixes_on_plane(
+def project_fixes(
     latitude: np.ndarray, longitude: np.ndarray, origin: tuple[float, float] | None = None
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float] | None, int]:
     """Return north and east [T] in m, the origin, and how many fixes were none.
@@ -544,28 +554,28 @@ def fixes_on_plane(
         longitude: [T] rad.
         origin: of the plane, rad; None takes the first fix.
     """
-    none = (latitude == 0.0) & (longitude == 0.0)
-    known = np.isfinite(latitude) & np.isfinite(longitude) & ~none
-    if not known.any() or float(np.abs(latitude[known]).max()) > np.pi / 2:
-        return latitude, longitude, None, int(none.sum())
-    first = int(np.argmax(known))
-    at = origin or (float(latitude[first]), float(longitude[first]))
-    phi, lam = (np.where(known, angle, np.nan) for angle in (latitude, longitude))
-    north, east = tangent_plane(phi, lam, *at)
-    return north, east, at, int(none.sum())
+    is_null_fix = (latitude == 0.0) & (longitude == 0.0)
+    is_valid = np.isfinite(latitude) & np.isfinite(longitude) & ~is_null_fix
+    if not is_valid.any() or float(np.abs(latitude[is_valid]).max()) > np.pi / 2:
+        return latitude, longitude, None, int(is_null_fix.sum())
+    first_index = int(np.argmax(is_valid))
+    plane_origin = origin or (float(latitude[first_index]), float(longitude[first_index]))
+    phi, lam = (np.where(is_valid, angle, np.nan) for angle in (latitude, longitude))
+    north, east = project_to_tangent_plane(phi, lam, *plane_origin)
+    return north, east, plane_origin, int(is_null_fix.sum())
 
 
-def unit_quaternion(
+def normalize_quaternion(
     x: np.ndarray, y: np.ndarray, z: np.ndarray, w: np.ndarray
 ) -> tuple[np.ndarray, ...]:
     """Return quaternions [T] of length one, x, y, z, w; NaN where they are empty."""
     norm = np.sqrt(x * x + y * y + z * z + w * w)
-    known = np.isfinite(norm) & (norm > 0.5)
-    length = np.where(known, norm, 1.0)
-    return tuple(np.where(known, part / length, np.nan) for part in (x, y, z, w))
+    is_valid = np.isfinite(norm) & (norm > 0.5)
+    safe_norm = np.where(is_valid, norm, 1.0)
+    return tuple(np.where(is_valid, component / safe_norm, np.nan) for component in (x, y, z, w))
 
 
-def yaw_of(x: np.ndarray, y: np.ndarray, z: np.ndarray, w: np.ndarray) -> np.ndarray:
+def quaternion_yaw(x: np.ndarray, y: np.ndarray, z: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Return the rotation [T] about the vertical axis in rad of quaternions of length one."""
     yaw: np.ndarray = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return yaw

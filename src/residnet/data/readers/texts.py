@@ -16,24 +16,24 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TextIO
 import numpy as np
 
 from residnet.core.errors import DataError, UsageError
-from residnet.core.names import nearest, shown
-from residnet.core.units import is_unit, known_unit
-from residnet.data.readers.base import Advance
+from residnet.core.names import suggest_name, truncate
+from residnet.core.units import canonical_unit, is_unit
+from residnet.data.readers.base import ProgressCallback
 
 if TYPE_CHECKING:
     import pandas as pd
 
-BLANKS = " "
+WHITESPACE_DELIMITER = " "
 """Stands for any number of blanks and tabulators between cells."""
 # lines among which names are looked for: of a described table, and of one that nobody described
-_SEARCHED, _GUESSED = 200, 60
-_BELOW = 3
+_HEADER_SEARCH_LINES, _SNIFFED_LINES = 200, 60
+_MAX_UNIT_LINES = 3
 """Most lines with units and the like between names and values."""
 # pieces of this many rows stay in the cache while they are parsed
-_PIECE = 20_000
-_HEAD, _BLOCK, _SCANNED = 1 << 16, 1 << 18, 1 << 20
-_COMMENT = (b"#", b"%", b"//")
-_COMMENTED = re.compile(r"\s*(?:#|%|//)\s+")
+_CHUNK_ROWS = 20_000
+_HEAD_BYTES, _BLOCK_BYTES, _SCAN_BYTES = 1 << 16, 1 << 18, 1 << 20
+_COMMENT_SIGNS = (b"#", b"%", b"//")
+_COMMENT_PREFIX = re.compile(r"\s*(?:#|%|//)\s+")
 _NUMBER = re.compile(
     r"[-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf)", re.IGNORECASE
 )
@@ -42,11 +42,11 @@ _UNIT = r"(?:[^\W\d_]|[°%µ])\S*"
 _FRACTION = rf"\s*-?\d+{{}}\d+(?:[eE][-+]?\d+)?\s*(?:{_UNIT})?"
 _WITH_UNIT = re.compile(rf"(?P<number>[-+]?[\d.,'’ \u00a0\u202f]*\d)\s*(?P<unit>{_UNIT})")
 """A number with its unit behind it, as in `1450 rpm`."""
-_SIDES = frozenset("NSEW")
+_HEMISPHERES = frozenset("NSEW")
 """Behind a number they rather tell the side of the globe than newtons or seconds."""
-_BEYOND = "beyond the last column"
+_EXTRA_COLUMN = "beyond the last column"
 # the longer marks first: one of UTF-32 begins as one of UTF-16 does
-_MARKS = {
+_BYTE_ORDER_MARKS = {
     codecs.BOM_UTF8: "utf-8",
     codecs.BOM_UTF32_LE: "utf-32",
     codecs.BOM_UTF32_BE: "utf-32",
@@ -60,7 +60,10 @@ _CHINESE = re.compile(r"[\u4e00-\u9fa5]{2}")
 _KOREAN = re.compile(
     r"\A[\x00-\x7f°±²³µ·]*(?:[\uac00-\ud7a3]{2}[\x00-\x7f°±²³µ·\uac00-\ud7a3]*)+\Z"
 )
-_CYRILLIC, _RUN = re.compile(rb"[\xc0-\xff\xa8\xb0\xb8\xb9]+"), re.compile(rb"[\xc0-\xff]{4}")
+_CYRILLIC, _LETTER_RUN = (
+    re.compile(rb"[\xc0-\xff\xa8\xb0\xb8\xb9]+"),
+    re.compile(rb"[\xc0-\xff]{4}"),
+)
 _POLISH = re.compile(r"[a-z][³¹¿¼¾][a-z]")
 _LATIN = re.compile(r"[\x00-\x7fÀ-ÿ°º²³µ·±´×–’]*")
 _ASCII = bytes(range(128))
@@ -70,25 +73,25 @@ class Header(NamedTuple):
     """The names of a table's columns, and the number of lines above the first one with values."""
 
     names: tuple[str, ...]
-    above: int
+    n_lines_above: int
 
 
-def numbered(names: Sequence[str]) -> list[str]:
+def make_names_unique(names: Sequence[str]) -> list[str]:
     """Return names of which each stands once: copies are counted, nameless columns too."""
-    out: list[str] = []
-    for place, name in enumerate(names):
-        several = name and list(names).count(name) > 1
-        copy = f"{name}.{list(names[:place]).count(name)}"
-        unique = copy if several else name or f"Unnamed: {place}"
-        while unique in out:
+    unique_names: list[str] = []
+    for position, name in enumerate(names):
+        is_repeated = name and list(names).count(name) > 1
+        copy = f"{name}.{list(names[:position]).count(name)}"
+        unique = copy if is_repeated else name or f"Unnamed: {position}"
+        while unique in unique_names:
             unique += "_"
-        out.append(unique)
-    return out
+        unique_names.append(unique)
+    return unique_names
 
 
-def positions(path: Path, header: Sequence[str], columns: Sequence[str]) -> list[int]:
+def find_column_positions(path: Path, header: Sequence[str], columns: Sequence[str]) -> list[int]:
     """Return where the wanted columns stand in the header."""
-    names = numbered(header)
+    names = make_names_unique(header)
     for column in columns:
         if column in names:
             continue
@@ -98,7 +101,7 @@ def positions(path: Path, header: Sequence[str], columns: Sequence[str]) -> list
                 f"{path}: column '{column}' stands {count} times in the header; write"
                 f" '{column}.0' for the first, '{column}.1' for the second"
             )
-        raise UsageError(f"{path}: no column '{column}'{nearest(column, names)}")
+        raise UsageError(f"{path}: no column '{column}'{suggest_name(column, names)}")
     return [names.index(column) for column in columns]
 
 
@@ -108,11 +111,11 @@ def read_csv(
     delimiter: str,
     decimal: str,
     encoding: str | None,
-    advance: Advance,
+    advance: ProgressCallback,
 ) -> pd.DataFrame:
     """Return the wanted columns of a text table, in order.
 
-    Its `attrs` hold `above`, the number of lines above the values less one, `cut`, whether the last
+    Its `attrs` hold `n_lines_above`, the number of lines above the values less one, `is_truncated`, whether the last
     line was left out because the file ends within it, and `units`, those in the cells of each
     column.
 
@@ -123,23 +126,25 @@ def read_csv(
     """
     import pandas as pd
 
-    with as_utf8(path, encoding) as file:
+    with open_as_utf8(path, encoding) as file:
         try:
-            header = _header_with(path, delimiter, file, columns)
-            wide, size = len(header.names), max(1, file.stat().st_size)
+            header = _find_header_with_columns(path, delimiter, file, columns)
+            n_columns, size = len(header.names), max(1, file.stat().st_size)
             try:
-                where = positions(path, header.names, columns)
+                column_positions = find_column_positions(path, header.names, columns)
             except UsageError as error:
-                one = f" (only one column found; is the delimiter really '{delimiter}'?)"
-                raise UsageError(f"{error}{one if wide == 1 else ''}") from None
-            cut, comments = _check_lines(path, delimiter, header, file)
-            pieces: dict[int, list[pd.Series]] = {place: [] for place in where}
+                hint = f" (only one column found; is the delimiter really '{delimiter}'?)"
+                raise UsageError(f"{error}{hint if n_columns == 1 else ''}") from None
+            is_truncated, comments = _check_lines(path, delimiter, header, file)
+            chunks: dict[int, list[pd.Series]] = {position: [] for position in column_positions}
             with file.open("rb") as stream:
-                form = _form(delimiter, decimal, (header.above, comments), range(wide))
-                for piece in pd.read_csv(stream, **form, chunksize=_PIECE):
-                    for place, own in pieces.items():
+                pandas_options = _pandas_options(
+                    delimiter, decimal, (header.n_lines_above, comments), range(n_columns)
+                )
+                for chunk in pd.read_csv(stream, **pandas_options, chunksize=_CHUNK_ROWS):
+                    for position, column_chunks in chunks.items():
                         # a copy, or the other columns would stay
-                        own.append(piece[place].copy())
+                        column_chunks.append(chunk[position].copy())
                     advance(min(1.0, stream.tell() / size))
         except UnicodeDecodeError as error:
             raise DataError(
@@ -149,38 +154,44 @@ def read_csv(
         except pd.errors.EmptyDataError:
             pass
         except pd.errors.ParserError as error:
-            reason = shown(" ".join(str(error).split()), 200)
+            reason = truncate(" ".join(str(error).split()), 200)
             raise DataError(
-                f"{path}: not a regular table, its header has {wide} columns ({reason}); check"
+                f"{path}: not a regular table, its header has {n_columns} columns ({reason}); check"
                 " `delimiter` and `decimal`"
             ) from error
-    whole = {}
-    for place in [*pieces]:
-        parts = pieces.pop(place) or [pd.Series([])]
-        column = parts[0] if len(parts) == 1 else pd.concat(parts, ignore_index=True)
-        whole[place] = _plain(column, decimal)
-    table = pd.DataFrame({i: whole[place][0] for i, place in enumerate(where)}, copy=False)
-    table.columns = pd.Index(where)
-    table = table.iloc[: -1 if cut else None]
-    units = [whole[place][1] for place in where]
-    table.attrs |= {"above": header.above - 1, "cut": cut, "units": units}
+    parsed_columns = {}
+    for position in [*chunks]:
+        column_parts = chunks.pop(position) or [pd.Series([])]
+        column = (
+            column_parts[0]
+            if len(column_parts) == 1
+            else pd.concat(column_parts, ignore_index=True)
+        )
+        parsed_columns[position] = _coerce_column(column, decimal)
+    table = pd.DataFrame(
+        {i: parsed_columns[position][0] for i, position in enumerate(column_positions)}, copy=False
+    )
+    table.columns = pd.Index(column_positions)
+    table = table.iloc[: -1 if is_truncated else None]
+    units = [parsed_columns[position][1] for position in column_positions]
+    table.attrs |= {"above": header.n_lines_above - 1, "cut": is_truncated, "units": units}
     return table
 
 
-def _form(
-    delimiter: str, decimal: str, skipped: tuple[int, Iterable[int]], names: Iterable[Any]
+def _pandas_options(
+    delimiter: str, decimal: str, skipped_lines: tuple[int, Iterable[int]], names: Iterable[Any]
 ) -> dict[str, Any]:
     """Return how pandas reads the values of a table.
 
-    `skipped` are the number of lines above the values, and the numbers of lines of comments.
+    `skipped_lines` are the number of lines above the values, and the numbers of lines of comments.
     """
     return {
         # a byte order mark is no part of the first name
         "encoding": "utf-8-sig",
-        "sep": r"\s+" if delimiter == BLANKS else delimiter,
+        "sep": r"\s+" if delimiter == WHITESPACE_DELIMITER else delimiter,
         "decimal": decimal,
         "header": None,
-        "skiprows": [*range(skipped[0]), *skipped[1]],
+        "skiprows": [*range(skipped_lines[0]), *skipped_lines[1]],
         "names": list(names),
         "index_col": False,
         "skip_blank_lines": False,
@@ -189,25 +200,25 @@ def _form(
     }
 
 
-def plain(table: pd.DataFrame, decimal: str = ".") -> pd.DataFrame:
+def coerce_numeric(table: pd.DataFrame, decimal: str = ".") -> pd.DataFrame:
     """Return a table whose texts are numbers where they hold some; `attrs` hold `units` in cells.
 
     The units are those of each column, empty where its cells name none.
     """
     import pandas as pd
 
-    found = [_plain(cells, decimal) for _, cells in table.items()]
-    out = pd.DataFrame({i: cells for i, (cells, _) in enumerate(found)}, table.index)
-    out.columns = table.columns
-    out.attrs = {**table.attrs, "units": [unit for _, unit in found]}
-    return out
+    coerced = [_coerce_column(cells, decimal) for _, cells in table.items()]
+    coerced_table = pd.DataFrame({i: cells for i, (cells, _) in enumerate(coerced)}, table.index)
+    coerced_table.columns = table.columns
+    coerced_table.attrs = {**table.attrs, "units": [unit for _, unit in coerced]}
+    return coerced_table
 
 
 _LOOKED_AT = 100
 """Cells of a column that may show at once that it holds words."""
 
 
-def _plain(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
+def _coerce_column(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
     """Return a column whose numbers have no signs between thousands, and no marks for none (---).
 
     Where each cell names the same unit (`1450 rpm`), it is returned, and else nothing. A column
@@ -216,14 +227,16 @@ def _plain(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
     """
     import pandas as pd
 
-    between = rf"[ '’\u00a0\u202f{'.' if decimal == ',' else ','}]"
-    grouped = re.compile(rf"[-+]?[1-9]\d{{0,2}}(?:{between}\d{{3}})+(?:{re.escape(decimal)}\d+)?")
+    thousands_separator = rf"[ '’\u00a0\u202f{'.' if decimal == ',' else ','}]"
+    grouped_number = re.compile(
+        rf"[-+]?[1-9]\d{{0,2}}(?:{thousands_separator}\d{{3}})+(?:{re.escape(decimal)}\d+)?"
+    )
 
-    def number(cell: Any) -> Any:
+    def normalize_number(cell: Any) -> Any:
         if not isinstance(cell, str):
             return cell
-        if grouped.fullmatch(cell.strip()):
-            cell = re.sub(between, "", cell)
+        if grouped_number.fullmatch(cell.strip()):
+            cell = re.sub(thousands_separator, "", cell)
         return cell.replace(decimal, ".") if re.search(r"\w", cell) else np.nan
 
     if (
@@ -231,54 +244,58 @@ def _plain(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
         or not cells.dropna().map(lambda cell: isinstance(cell, str | float | int)).all()
     ):
         return cells, ""
-    unit, told = _without_unit(cells)
+    unit, unitless_cells = _strip_unit(cells)
     # where one of the first cells is a word, such as a date, so is the column: no copies of all
-    head = told.iloc[:_LOOKED_AT].map(number)
+    head = unitless_cells.iloc[:_LOOKED_AT].map(normalize_number)
     if pd.to_numeric(head, errors="coerce").isna().sum() != head.isna().sum():
         return cells, ""
-    signs = {len(re.findall(r"[^\d+-]", str(cell).strip())) for cell in told.dropna()}
-    bare = told.map(number)
-    values = pd.to_numeric(bare, errors="coerce")
-    plain = (unit or signs != {1}) and values.isna().sum() == bare.isna().sum()
-    return (values, unit) if plain else (cells, "")
+    separator_counts = {
+        len(re.findall(r"[^\d+-]", str(cell).strip())) for cell in unitless_cells.dropna()
+    }
+    normalized = unitless_cells.map(normalize_number)
+    values = pd.to_numeric(normalized, errors="coerce")
+    is_numeric = (
+        unit or separator_counts != {1}
+    ) and values.isna().sum() == normalized.isna().sum()
+    return (values, unit) if is_numeric else (cells, "")
 
 
-def _without_unit(cells: pd.Series) -> tuple[str, pd.Series]:
+def _strip_unit(cells: pd.Series) -> tuple[str, pd.Series]:
     """Return the unit that stands behind each number of a column, and the cells without it.
 
     The unit is empty, and the cells are as they were, where any cell is no number with that unit.
     """
-    written = cells.dropna()
-    told = _unit_behind(str(written.iloc[0]).strip()) if len(written) else ""
-    if not told:
+    filled_cells = cells.dropna()
+    unit_text = _parse_trailing_unit(str(filled_cells.iloc[0]).strip()) if len(filled_cells) else ""
+    if not unit_text:
         return "", cells
-    bare = written.astype("string").str.strip()
-    if not bare.str.endswith(told).all():
+    stripped_cells = filled_cells.astype("string").str.strip()
+    if not stripped_cells.str.endswith(unit_text).all():
         return "", cells
-    numbers = bare.str.removesuffix(told).str.strip().astype(object)
-    return known_unit(told), numbers.reindex(cells.index)
+    unitless_texts = stripped_cells.str.removesuffix(unit_text).str.strip().astype(object)
+    return canonical_unit(unit_text), unitless_texts.reindex(cells.index)
 
 
-def _unit_behind(cell: str) -> str:
+def _parse_trailing_unit(cell: str) -> str:
     """Return the unit behind a number, as it is written; empty for none."""
-    found = _WITH_UNIT.fullmatch(cell)
-    if found is None or found["unit"] in _SIDES or not is_unit(found["unit"]):
+    match = _WITH_UNIT.fullmatch(cell)
+    if match is None or match["unit"] in _HEMISPHERES or not is_unit(match["unit"]):
         return ""
-    return found["unit"]
+    return match["unit"]
 
 
-def first_rows(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
+def read_table_head(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Return the first rows of a text table whose form nobody described, and its reader's settings.
 
-    The `attrs` of the rows hold `between`: the cells of the lines between names and values.
+    The `attrs` of the rows hold `thousands_separator`: the cells of the lines between names and values.
     """
     import pandas as pd
 
-    with as_utf8(path) as file:
+    with open_as_utf8(path) as file:
         with file.open("rb") as stream:
-            head = stream.read(_HEAD)
+            head = stream.read(_HEAD_BYTES)
         lines = head.decode("utf-8-sig", errors="replace").splitlines()
-        lines = lines[:-1] if len(head) == _HEAD else lines
+        lines = lines[:-1] if len(head) == _HEAD_BYTES else lines
         if not any(line.strip() for line in lines) or b"\x00" in head:
             raise DataError(
                 f"{path}: the file is empty or no text; a table with a header line was expected"
@@ -289,74 +306,89 @@ def first_rows(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
                 " (`ros2 bag record`), or write them as csv, in Python pandas.json_normalize("
                 "list(yaml.safe_load_all(open(file)))).to_csv('log.csv', index=False)"
             )
-        delimiter, cells, (at, above) = _delimiter(path, lines)
+        delimiter, cells, (header_row, n_lines_above) = _detect_delimiter(path, lines)
         # a comma between cells is none within numbers
-        told = [cell for row in cells[1:50] for cell in row] if delimiter != "," else []
-        comma, point = (
-            sum(bool(re.fullmatch(_FRACTION.format(sign), cell)) for cell in told)
+        sampled_cells = [cell for row in cells[1:50] for cell in row] if delimiter != "," else []
+        n_decimal_commas, n_decimal_points = (
+            sum(bool(re.fullmatch(_FRACTION.format(sign), cell)) for cell in sampled_cells)
             for sign in (",", r"\.")
         )
-        decimal = "," if comma > point else "."
-        names = numbered(cells[at])
-        comments, held = [], 0
-        for line, block, _ in _blocks(file):
-            said = _passed(block, delimiter, cells[at], above - line)
-            comments += [line + i for i in said]
-            held += sum(bool(one.strip()) for one in _lines(block)) - len(said)
-            if held >= above + rows:
+        decimal = "," if n_decimal_commas > n_decimal_points else "."
+        names = make_names_unique(cells[header_row])
+        comments, n_rows_seen = [], 0
+        for line, block, _ in _iter_line_blocks(file):
+            skipped_lines = _find_comment_lines(
+                block, delimiter, cells[header_row], n_lines_above - line
+            )
+            comments += [line + i for i in skipped_lines]
+            n_rows_seen += sum(bool(text.strip()) for text in _split_lines(block)) - len(
+                skipped_lines
+            )
+            if n_rows_seen >= n_lines_above + rows:
                 # behind the rows that are read nothing has to be passed over
                 break
-        form = _form(delimiter, decimal, (above, comments), [*names, _BEYOND])
+        pandas_options = _pandas_options(
+            delimiter, decimal, (n_lines_above, comments), [*names, _EXTRA_COLUMN]
+        )
         try:
-            table = pd.read_csv(file, **form | {"skip_blank_lines": True}, nrows=rows)[names]
+            table = pd.read_csv(file, **pandas_options | {"skip_blank_lines": True}, nrows=rows)[
+                names
+            ]
         except (ValueError, csv.Error) as error:
-            reason = shown(" ".join(str(error).split()), 200)
+            reason = truncate(" ".join(str(error).split()), 200)
             raise DataError(f"{path}: not a regular table ({reason})") from error
-    table = plain(table, decimal)
-    table.attrs["between"] = cells[at + 1 : above]
-    about = {"kind": "csv"} | ({"delimiter": delimiter} if delimiter != "," else {})
-    return table, about | ({"decimal": ","} if decimal == "," else {})
+    table = coerce_numeric(table, decimal)
+    table.attrs["between"] = cells[header_row + 1 : n_lines_above]
+    reader_settings = {"kind": "csv"} | ({"delimiter": delimiter} if delimiter != "," else {})
+    return table, reader_settings | ({"decimal": ","} if decimal == "," else {})
 
 
-def _delimiter(path: Path, lines: list[str]) -> tuple[str, list[list[str]], tuple[int, int]]:
+def _detect_delimiter(path: Path, lines: list[str]) -> tuple[str, list[list[str]], tuple[int, int]]:
     """Return the delimiter whose cells are names over values in most lines, and where they stand.
 
     Returns:
         The delimiter, the cells of the first lines, and the places of the names and first values.
     """
-    found: list[tuple[int, int, tuple[str, list[list[str]], tuple[int, int]]]] = []
-    text = "".join(lines[:_GUESSED])
-    for sign in (",", ";", "\t", "|", BLANKS):
-        if found if sign == BLANKS else sign not in text:
+    candidates: list[tuple[int, int, tuple[str, list[list[str]], tuple[int, int]]]] = []
+    text = "".join(lines[:_SNIFFED_LINES])
+    for delimiter in (",", ";", "\t", "|", WHITESPACE_DELIMITER):
+        if candidates if delimiter == WHITESPACE_DELIMITER else delimiter not in text:
             continue
-        rows = [_cells(_COMMENTED.sub("", line, count=1), sign) for line in lines[:_GUESSED]]
-        place = found_header(rows)
-        if place is None:
+        rows = [
+            _split_line(_COMMENT_PREFIX.sub("", line, count=1), delimiter)
+            for line in lines[:_SNIFFED_LINES]
+        ]
+        header_position = find_header(rows)
+        if header_position is None:
             continue
-        names = rows[place[0]]
-        wide, named = len(names), max((i for i, name in enumerate(names, 1) if name), default=0)
-        below = [row for row in rows[place[1] :] if any(row)]
-        alike = sum(
-            named <= len(row) <= wide or (len(row) == wide + 1 and not row[-1]) for row in below
+        names = rows[header_position[0]]
+        n_columns, n_named_columns = (
+            len(names),
+            max((i for i, name in enumerate(names, 1) if name), default=0),
         )
-        if wide > 1 and 2 * alike > len(below):
-            found.append((alike, wide, (sign, rows, place)))
-    if not found and sum(map(bool, map(str.strip, lines))) == 1:
+        value_rows = [row for row in rows[header_position[1] :] if any(row)]
+        n_regular_rows = sum(
+            n_named_columns <= len(row) <= n_columns or (len(row) == n_columns + 1 and not row[-1])
+            for row in value_rows
+        )
+        if n_columns > 1 and 2 * n_regular_rows > len(value_rows):
+            candidates.append((n_regular_rows, n_columns, (delimiter, rows, header_position)))
+    if not candidates and sum(map(bool, map(str.strip, lines))) == 1:
         raise DataError(
-            f"{path}: holds one line ('{shown(lines[0], 60)}') and no row of numbers below it; was"
+            f"{path}: holds one line ('{truncate(lines[0], 60)}') and no row of numbers below it; was"
             " the recording stopped at once? Leave the file out"
         )
-    if not found:
+    if not candidates:
         raise DataError(
             f"{path}: no line holds names of columns above its numbers; write one, with the sign"
-            f" between them that stands between numbers (its first line: '{shown(lines[0], 60)}')"
+            f" between them that stands between numbers (its first line: '{truncate(lines[0], 60)}')"
         )
-    return max(found, key=lambda entry: entry[:2])[2]
+    return max(candidates, key=lambda entry: entry[:2])[2]
 
 
-def _cells(line: str, delimiter: str) -> list[str]:
+def _split_line(line: str, delimiter: str) -> list[str]:
     """Return the cells of one line; a line that is no table's is one cell."""
-    if delimiter == BLANKS:
+    if delimiter == WHITESPACE_DELIMITER:
         return line.split()
     try:
         row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
@@ -365,17 +397,19 @@ def _cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in row]
 
 
-def _measures(cell: str) -> bool:
+def _is_value(cell: str) -> bool:
     """Return whether a cell holds a number, with or without its unit, a date or a time of day."""
-    return bool(_NUMBER.fullmatch(cell) or _TIME.match(cell) or _unit_behind(cell))
+    return bool(_NUMBER.fullmatch(cell) or _TIME.match(cell) or _parse_trailing_unit(cell))
 
 
-def _header_with(path: Path, delimiter: str, file: Path, columns: Sequence[str]) -> Header:
+def _find_header_with_columns(
+    path: Path, delimiter: str, file: Path, columns: Sequence[str]
+) -> Header:
     """Return the first line of a text table that holds all the names; else its first line."""
-    wanted = set(columns)
+    required_names = set(columns)
 
-    def lines(stream: TextIO) -> Iterator[tuple[int, list[str]]]:
-        if delimiter == BLANKS:
+    def iter_rows(stream: TextIO) -> Iterator[tuple[int, list[str]]]:
+        if delimiter == WHITESPACE_DELIMITER:
             yield from enumerate((line.split() for line in stream), start=1)
             return
         reader = csv.reader(stream, delimiter=delimiter, skipinitialspace=True)
@@ -387,14 +421,20 @@ def _header_with(path: Path, delimiter: str, file: Path, columns: Sequence[str])
     rows: list[tuple[int, list[str], list[str]]] = []
     with file.open(newline="", encoding="utf-8-sig") as stream:
         try:
-            for number, row in islice(lines(stream), _SEARCHED):
-                said = _COMMENTED.sub("", delimiter.join(row), count=1).split(delimiter)
-                rows.append((number, row, said))
+            for number, row in islice(iter_rows(stream), _HEADER_SEARCH_LINES):
+                uncommented_cells = _COMMENT_PREFIX.sub("", delimiter.join(row), count=1).split(
+                    delimiter
+                )
+                rows.append((number, row, uncommented_cells))
                 if names is None:
-                    held = (one for one in (said, row) if wanted <= {*one, *numbered(one)})
-                    names = next(held, None)
+                    matching_rows = (
+                        cells
+                        for cells in (uncommented_cells, row)
+                        if required_names <= {*cells, *make_names_unique(cells)}
+                    )
+                    names = next(matching_rows, None)
                     rows = rows if names is None else rows[-1:]
-                elif len(rows) > _BELOW:
+                elif len(rows) > _MAX_UNIT_LINES:
                     break
         except csv.Error as error:
             if names is None:
@@ -409,24 +449,24 @@ def _header_with(path: Path, delimiter: str, file: Path, columns: Sequence[str])
         )
     if names is None:
         return Header(tuple(rows[0][2]), rows[0][0])
-    called = numbered(names)
-    where = [called.index(column) for column in columns if column in called]
-    below = _without_values([row for _, row, _ in rows[1:]], where)
-    return Header(tuple(names), rows[below][0])
+    unique_names = make_names_unique(names)
+    column_positions = [unique_names.index(column) for column in columns if column in unique_names]
+    n_unit_lines = _count_unit_lines([row for _, row, _ in rows[1:]], column_positions)
+    return Header(tuple(names), rows[n_unit_lines][0])
 
 
-def _without_values(rows: Sequence[Sequence[str]], where: Iterable[int]) -> int:
+def _count_unit_lines(rows: Sequence[Sequence[str]], column_positions: Iterable[int]) -> int:
     """Return how many of the first rows hold words, such as units, where values are wanted."""
-    where, count = list(where), 0
-    for row in rows[:_BELOW]:
-        cells = [row[i] for i in where if i < len(row)]
-        if not any(cells) or any(map(_measures, cells)):
+    column_positions, count = list(column_positions), 0
+    for row in rows[:_MAX_UNIT_LINES]:
+        cells = [row[i] for i in column_positions if i < len(row)]
+        if not any(cells) or any(map(_is_value, cells)):
             break
         count += 1
     return count
 
 
-def found_header(rows: Sequence[Sequence[str]]) -> tuple[int, int] | None:
+def find_header(rows: Sequence[Sequence[str]]) -> tuple[int, int] | None:
     """Return which of the first rows holds names, and which is the first with values.
 
     None where no row above the values can be one of names.
@@ -434,36 +474,48 @@ def found_header(rows: Sequence[Sequence[str]]) -> tuple[int, int] | None:
     Args:
         rows: cells of the first rows, without the blanks around them.
     """
-    filled = [sum(map(bool, row)) for row in rows]
-    valued = [sum(map(_measures, row)) for row in rows]
+    n_filled = [sum(map(bool, row)) for row in rows]
+    n_values = [sum(map(_is_value, row)) for row in rows]
     # what most rows look like is the table
-    later = sorted(filled[len(filled) // 2 :])
-    usual = later[len(later) // 2] if rows else 0
-    for at, row in enumerate(rows):
-        words = filled[at] - valued[at]
-        if filled[at] < max(2, 0.8 * usual) or words <= valued[at]:
+    later_counts = sorted(n_filled[len(n_filled) // 2 :])
+    typical_count = later_counts[len(later_counts) // 2] if rows else 0
+    for header_row, row in enumerate(rows):
+        n_words = n_filled[header_row] - n_values[header_row]
+        if n_filled[header_row] < max(2, 0.8 * typical_count) or n_words <= n_values[header_row]:
             continue
-        values = at + 1 + _without_values(rows[at + 1 :], range(len(row)))
+        first_value_row = (
+            header_row + 1 + _count_unit_lines(rows[header_row + 1 :], range(len(row)))
+        )
         # a title of several cells has names beneath it, a table has values
-        after = rows[values : values + 3]
-        if after and not any(sum(map(_measures, cells)) >= 0.3 * usual for cells in after):
+        following_rows = rows[first_value_row : first_value_row + 3]
+        if following_rows and not any(
+            sum(map(_is_value, cells)) >= 0.3 * typical_count for cells in following_rows
+        ):
             continue
         # groups above the names are passed over
-        while at + 1 < values and _repeats(rows[at]) and not _repeats(rows[at + 1]):
-            at += 1
+        while (
+            header_row + 1 < first_value_row
+            and _has_repeated_cells(rows[header_row])
+            and not _has_repeated_cells(rows[header_row + 1])
+        ):
+            header_row += 1
         # so is a table about the columns that stands above theirs
-        theirs = found_header(rows[values:])
-        if theirs is not None:
-            names = rows[values + theirs[0]]
-            if names != rows[at] and not any(map(_measures, names)) and not _repeats(names):
-                return values + theirs[0], values + theirs[1]
-        return at, values
+        nested_header = find_header(rows[first_value_row:])
+        if nested_header is not None:
+            names = rows[first_value_row + nested_header[0]]
+            if (
+                names != rows[header_row]
+                and not any(map(_is_value, names))
+                and not _has_repeated_cells(names)
+            ):
+                return first_value_row + nested_header[0], first_value_row + nested_header[1]
+        return header_row, first_value_row
     return None
 
 
-def _repeats(row: Sequence[str]) -> bool:
-    filled = [cell for cell in row if cell]
-    return len(set(filled)) < len(filled)
+def _has_repeated_cells(row: Sequence[str]) -> bool:
+    filled_cells = [cell for cell in row if cell]
+    return len(set(filled_cells)) < len(filled_cells)
 
 
 def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tuple[bool, list[int]]:
@@ -476,54 +528,62 @@ def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tupl
         Whether the file ends within its last line, and the numbers of lines, from 0, that hold
         none: they begin with `#`, `%` or `//`, or repeat the names.
     """
-    wide, above = len(header.names), header.above
+    n_columns, n_lines_above = len(header.names), header.n_lines_above
     # names that are missing at the end are those of cells that are not there
-    named = max((i for i, name in enumerate(header.names, start=1) if name), default=wide)
-    cut, lines = _cut_short(file, delimiter, named), 0
+    n_named_columns = max(
+        (i for i, name in enumerate(header.names, start=1) if name), default=n_columns
+    )
+    is_truncated, n_lines = _is_truncated(file, delimiter, n_named_columns), 0
     comments: list[int] = []
-    for line, block, last in _blocks(file):
+    for first_line, block, is_last_block in _iter_line_blocks(file):
         if b"\x00" in block:
-            at = line + block[: block.index(b"\x00")].count(b"\n") + 1
+            line_index = first_line + block[: block.index(b"\x00")].count(b"\n") + 1
             raise DataError(
-                f"{path}: line {at} holds a zero byte, which no text has; the file is damaged or"
+                f"{path}: line {line_index} holds a zero byte, which no text has; the file is damaged or"
                 " not UTF-8, write it again"
             )
-        cells = _counted(block, delimiter, wide)
-        odd = (cells != wide) & (cells != 0)
-        odd[: max(above - line, 0)] = False
-        said = _passed(block, delimiter, header.names, above - line)
-        comments += [line + i for i in said]
-        odd[[i for i in said if i < odd.size]] = False
-        if odd.any():
+        cells = _count_cells(block, delimiter, n_columns)
+        is_irregular = (cells != n_columns) & (cells != 0)
+        is_irregular[: max(n_lines_above - first_line, 0)] = False
+        skipped_lines = _find_comment_lines(
+            block, delimiter, header.names, n_lines_above - first_line
+        )
+        comments += [first_line + i for i in skipped_lines]
+        is_irregular[[i for i in skipped_lines if i < is_irregular.size]] = False
+        if is_irregular.any():
             # rarely so: an empty cell more at the end of lines, or without names
-            rows = _lines(block)
+            rows = _split_lines(block)
             sign = delimiter.encode()
-            ended = np.array([row.rstrip(b" ").endswith(sign) for row in rows])
-            odd &= ~((cells >= named) & (cells < wide))
-            odd &= ~((cells == wide + 1) & ended) if ended.size == cells.size else True
-        if last and cut:
-            odd[-1:] = False
-        if odd.any():
-            at = int(np.argmax(odd))
+            has_trailing_delimiter = np.array([row.rstrip(b" ").endswith(sign) for row in rows])
+            is_irregular &= ~((cells >= n_named_columns) & (cells < n_columns))
+            is_irregular &= (
+                ~((cells == n_columns + 1) & has_trailing_delimiter)
+                if has_trailing_delimiter.size == cells.size
+                else True
+            )
+        if is_last_block and is_truncated:
+            is_irregular[-1:] = False
+        if is_irregular.any():
+            line_index = int(np.argmax(is_irregular))
             raise DataError(
-                f"{path}: line {line + at + 1} has {cells[at]} cells, the header {wide}"
-                f" ({int(odd.sum())} such lines nearby); check `delimiter` and `decimal`, or delete"
+                f"{path}: line {first_line + line_index + 1} has {cells[line_index]} cells, the header {n_columns}"
+                f" ({int(is_irregular.sum())} such lines nearby); check `delimiter` and `decimal`, or delete"
                 " the damaged lines"
             )
-        lines = line + cells.size
-    return cut and lines - 1 not in comments[-1:], comments
+        n_lines = first_line + cells.size
+    return is_truncated and n_lines - 1 not in comments[-1:], comments
 
 
-def _blocks(path: Path) -> Iterator[tuple[int, bytes, bool]]:
+def _iter_line_blocks(path: Path) -> Iterator[tuple[int, bytes, bool]]:
     """Yield blocks of whole lines: the number of the first, its bytes, and whether it is the last.
 
     Line ends are one byte each, and an open quote takes its line ends along.
     """
     with path.open("rb") as stream:
-        rest, line = b"", 0
+        pending, line_number = b"", 0
         while True:
-            block = stream.read(_BLOCK)
-            text, tail = rest + block, b""
+            block = stream.read(_BLOCK_BYTES)
+            text, tail = pending + block, b""
             if b"\r" in text:
                 # the other half of a line end may stand in the next block
                 if block and text.endswith(b"\r"):
@@ -531,41 +591,49 @@ def _blocks(path: Path) -> Iterator[tuple[int, bytes, bool]]:
                 text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
             if not block:
                 if text:
-                    yield line, text, True
+                    yield line_number, text, True
                 return
-            end = text.rfind(b"\n") + 1 if text.count(b'"') % 2 == 0 else 0
-            if end:
-                yield line, text[:end], False
-                line += text.count(b"\n", 0, end)
-            rest = text[end:] + tail
+            block_end = text.rfind(b"\n") + 1 if text.count(b'"') % 2 == 0 else 0
+            if block_end:
+                yield line_number, text[:block_end], False
+                line_number += text.count(b"\n", 0, block_end)
+            pending = text[block_end:] + tail
 
 
-def _lines(block: bytes) -> list[bytes]:
+def _split_lines(block: bytes) -> list[bytes]:
     lines = block.split(b"\n")
     return lines if lines[-1] else lines[:-1]
 
 
-def _passed(block: bytes, delimiter: str, names: Sequence[str], above: int) -> list[int]:
-    """Return which lines below those `above` are comments, or the names again."""
-    again, telling = list(names), max(names, key=len, default="").encode() or _COMMENT[0]
-    begin = 0
-    for _ in range(above):
-        begin = block.find(b"\n", begin) + 1 or len(block)
-    block = block[begin:]
-    if not any(sign in block for sign in (*_COMMENT, telling)):
+def _find_comment_lines(
+    block: bytes, delimiter: str, names: Sequence[str], n_lines_above: int
+) -> list[int]:
+    """Return which lines below those `n_lines_above` are comments, or the names again."""
+    header_cells, longest_name = (
+        list(names),
+        max(names, key=len, default="").encode() or _COMMENT_SIGNS[0],
+    )
+    offset = 0
+    for _ in range(n_lines_above):
+        offset = block.find(b"\n", offset) + 1 or len(block)
+    block = block[offset:]
+    if not any(sign in block for sign in (*_COMMENT_SIGNS, longest_name)):
         return []
     return [
         i
-        for i, line in enumerate(_lines(block), max(above, 0))
-        if line.lstrip().startswith(_COMMENT)
-        or (telling in line and _cells(line.decode("utf-8", "replace"), delimiter) == again)
+        for i, line in enumerate(_split_lines(block), max(n_lines_above, 0))
+        if line.lstrip().startswith(_COMMENT_SIGNS)
+        or (
+            longest_name in line
+            and _split_line(line.decode("utf-8", "replace"), delimiter) == header_cells
+        )
     ]
 
 
-def _counted(block: bytes, delimiter: str, wide: int) -> np.ndarray:
+def _count_cells(block: bytes, delimiter: str, n_columns: int) -> np.ndarray:
     """Return the number of cells of each line, usually `wide`; 0 where it is blank."""
-    if delimiter == BLANKS:
-        return np.array([len(line.split()) for line in _lines(block)], dtype=np.int64)
+    if delimiter == WHITESPACE_DELIMITER:
+        return np.array([len(line.split()) for line in _split_lines(block)], dtype=np.int64)
     if b'"' in block:
         text = io.StringIO(block.decode("utf-8", errors="replace"), newline="")
         reader = csv.reader(text, delimiter=delimiter, skipinitialspace=True)
@@ -574,61 +642,72 @@ def _counted(block: bytes, delimiter: str, wide: int) -> np.ndarray:
         except csv.Error:
             # a cell of more than 128 kB: an open quote has swallowed the lines after it
             return np.ones(1, dtype=np.int64)
-    sign = delimiter.encode()
-    if wide > 1 and len(sign) == 1:
+    delimiter_bytes = delimiter.encode()
+    if n_columns > 1 and len(delimiter_bytes) == 1:
         # the usual block: every so many marks one is the end of a line, the others are delimiters
-        marks = block.translate(None, bytes({*range(256)} - {sign[0], ord("\n")}))
-        if marks == (sign * (wide - 1) + b"\n") * (len(marks) // wide):
-            return np.full(len(marks) // wide, wide)
-    lines = _lines(block)
-    cells = np.array([line.count(sign) for line in lines], dtype=np.int64) + 1
+        separator_bytes = block.translate(
+            None, bytes({*range(256)} - {delimiter_bytes[0], ord("\n")})
+        )
+        if separator_bytes == (delimiter_bytes * (n_columns - 1) + b"\n") * (
+            len(separator_bytes) // n_columns
+        ):
+            return np.full(len(separator_bytes) // n_columns, n_columns)
+    lines = _split_lines(block)
+    cells = np.array([line.count(delimiter_bytes) for line in lines], dtype=np.int64) + 1
     for i in np.flatnonzero(cells == 1):
         cells[i] = bool(lines[i].strip())
     return cells
 
 
-def _cut_short(path: Path, delimiter: str, wide: int) -> bool:
+def _is_truncated(path: Path, delimiter: str, n_columns: int) -> bool:
     """Return whether the file ends within its last line.
 
     It has no end, and too few cells or a last cell shorter than any in that column shortly before.
     """
     with path.open("rb") as stream:
         size = stream.seek(0, io.SEEK_END)
-        stream.seek(max(0, size - _HEAD))
+        stream.seek(max(0, size - _HEAD_BYTES))
         tail = stream.read()
     if not tail or tail.endswith((b"\n", b"\r")):
         return False
     lines = [line for line in tail.replace(b"\r", b"\n").split(b"\n") if line.strip()]
-    mark = None if delimiter == BLANKS else delimiter.encode()
-    last, before = lines[-1].split(mark), [line.split(mark) for line in lines[-51:-1]]
+    delimiter_bytes = None if delimiter == WHITESPACE_DELIMITER else delimiter.encode()
+    last_cells, previous_lines = (
+        lines[-1].split(delimiter_bytes),
+        [line.split(delimiter_bytes) for line in lines[-51:-1]],
+    )
     # the first of several lines may itself be cut, by the tail, or be the header
-    known = [
-        len(cells[-1].strip()) for cells in before[1:] if len(cells) == wide and cells[-1].strip()
+    last_cell_lengths = [
+        len(cells[-1].strip())
+        for cells in previous_lines[1:]
+        if len(cells) == n_columns and cells[-1].strip()
     ]
-    if size <= _HEAD and len(lines) < 2:
+    if size <= _HEAD_BYTES and len(lines) < 2:
         return False
-    return len(last) < wide or (
-        bool(known) and len(last) == wide and len(last[-1].strip()) < min(known)
+    return len(last_cells) < n_columns or (
+        bool(last_cell_lengths)
+        and len(last_cells) == n_columns
+        and len(last_cells[-1].strip()) < min(last_cell_lengths)
     )
 
 
-def encoding_of(path: Path) -> str:
+def detect_encoding(path: Path) -> str:
     """Return the encoding of a text file: by its byte order mark, else by what its bytes can be.
 
     Text without a mark is UTF-8 where all of it can be, else UTF-16, Russian (cp1251), Polish
     (cp1250), Western European (cp1252), Japanese (cp932), Korean (cp949) or Chinese (gb18030).
     """
     with path.open("rb") as stream:
-        told = _told(stream.read(_HEAD))
-        if told is not None:
-            return told
+        bom_encoding = _encoding_from_bom(stream.read(_HEAD_BYTES))
+        if bom_encoding is not None:
+            return bom_encoding
         stream.seek(0)
-        block = _first_beyond_utf8(stream)
+        block = _find_non_utf8_block(stream)
         if not block:
             return "utf-8"
-        beyond = block.translate(None, _ASCII)
+        non_ascii = block.translate(None, _ASCII)
         # words of Cyrillic are runs of such letters; a Latin one stands among plain letters
-        if _CYRILLIC.fullmatch(beyond) and _RUN.search(block):
+        if _CYRILLIC.fullmatch(non_ascii) and _LETTER_RUN.search(block):
             return "cp1251"
         western = block.decode("cp1252", errors="replace")
         if _POLISH.search(western):
@@ -636,26 +715,26 @@ def encoding_of(path: Path) -> str:
         # a Latin letter and the next one may look like one Japanese sign, but not the other way
         if _LATIN.fullmatch(western):
             return "cp1252"
-        for name, likely in (
+        for name, pattern in (
             ("cp932", _JAPANESE),
             ("cp949", _KOREAN),
             ("gb18030", _CHINESE),
             ("cp1252", re.compile("")),
         ):
             with suppress(UnicodeDecodeError):
-                if likely.search(block.decode(name)):
+                if pattern.search(block.decode(name)):
                     return name
         # it gives every byte a sign: numbers can be read, and names stay names
         return "latin-1"
 
 
-def encoding_of_head(head: bytes) -> str:
+def detect_encoding_of_head(head: bytes) -> str:
     """Return the encoding of a text from its first bytes alone."""
-    return _told(head) or "utf-8"
+    return _encoding_from_bom(head) or "utf-8"
 
 
 @contextmanager
-def as_utf8(path: Path, encoding: str | None = None) -> Iterator[Path]:
+def open_as_utf8(path: Path, encoding: str | None = None) -> Iterator[Path]:
     """Yield a file that holds the text of `path` in UTF-8, perhaps behind a byte order mark.
 
     It is `path` itself where that is UTF-8, or else a temporary one, gone after the context. Zero
@@ -664,49 +743,49 @@ def as_utf8(path: Path, encoding: str | None = None) -> Iterator[Path]:
     Args:
         encoding: its name; None finds it.
     """
-    name = codecs.lookup(encoding or encoding_of(path)).name
-    wide = name.startswith(("utf-16", "utf-32"))
+    name = codecs.lookup(encoding or detect_encoding(path)).name
+    is_multibyte = name.startswith(("utf-16", "utf-32"))
     with path.open("rb") as stream:
         stream.seek(max(0, path.stat().st_size - 1))
-        zeros = not wide and stream.read() == b"\0"
-    if name in ("utf-8", "utf-8-sig", "ascii") and not zeros:
+        has_trailing_zeros = not is_multibyte and stream.read() == b"\0"
+    if name in ("utf-8", "utf-8-sig", "ascii") and not has_trailing_zeros:
         yield path
         return
     content = path.read_bytes()
-    content = content.rstrip(b"\0") if zeros else content
+    content = content.rstrip(b"\0") if has_trailing_zeros else content
     try:
         # half a sign at the end is left out
         text = codecs.getincrementaldecoder(name)().decode(content)
     except UnicodeError as error:
-        at = getattr(error, "start", 0)
+        error_position = getattr(error, "start", 0)
         raise DataError(
-            f"{path}: not {name.upper()} text (near byte {at}); save the file as UTF-8, or give its"
+            f"{path}: not {name.upper()} text (near byte {error_position}); save the file as UTF-8, or give its"
             " `encoding`"
         ) from error
     with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / path.name
-        copy.write_bytes(text.encode("utf-8"))
-        yield copy
+        utf8_copy = Path(folder) / path.name
+        utf8_copy.write_bytes(text.encode("utf-8"))
+        yield utf8_copy
 
 
-def _told(head: bytes) -> str | None:
+def _encoding_from_bom(head: bytes) -> str | None:
     """Return the encoding that a mark, or the zeros of wide signs, tell; None for neither."""
-    for mark, name in _MARKS.items():
+    for mark, name in _BYTE_ORDER_MARKS.items():
         if head.startswith(mark):
             return name
     if len(head) < 4 or b"\x00" not in head:
         return None
-    values = np.frombuffer(head[: len(head) // 2 * 2], dtype=np.uint8).reshape(-1, 2)
-    first, second = (values == 0).mean(axis=0)
-    if second > 0.5 and first < 0.01:
+    byte_pairs = np.frombuffer(head[: len(head) // 2 * 2], dtype=np.uint8).reshape(-1, 2)
+    even_zero_share, odd_zero_share = (byte_pairs == 0).mean(axis=0)
+    if odd_zero_share > 0.5 and even_zero_share < 0.01:
         return "utf-16-le"
-    return "utf-16-be" if first > 0.5 and second < 0.01 else None
+    return "utf-16-be" if even_zero_share > 0.5 and odd_zero_share < 0.01 else None
 
 
-def _first_beyond_utf8(stream: BinaryIO) -> bytes:
+def _find_non_utf8_block(stream: BinaryIO) -> bytes:
     """Return the first block that is no UTF-8, whole lines of it; empty where all of it is."""
     decoder = codecs.getincrementaldecoder("utf-8")()
-    while block := stream.read(_SCANNED):
+    while block := stream.read(_SCAN_BYTES):
         try:
             if not (block.isascii() and decoder.getstate()[0] == b""):
                 decoder.decode(block)

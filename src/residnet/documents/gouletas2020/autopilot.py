@@ -14,11 +14,11 @@ import torch
 from torch import Tensor, nn
 
 from residnet.control.base import Policy
-from residnet.control.heading.controllers import Steering
+from residnet.control.heading.controllers import ControlTask
 from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.errors import UsageError
-from residnet.core.format import DEG
-from residnet.core.progress import begin, say
+from residnet.core.format import DEGREES_PER_RADIAN
+from residnet.core.progress import begin_stage, log_message
 from residnet.data.module import RowsDataModule
 from residnet.documents.gouletas2020.law import (
     NetworkPredictor,
@@ -28,11 +28,11 @@ from residnet.documents.gouletas2020.law import (
 )
 from residnet.dynamics.rollout import Rollout
 from residnet.runs.folder import RunFolder
-from residnet.runs.model_store import FolderStore
+from residnet.runs.model_store import RunModelStore
 from residnet.training.trainer import EpochTraining, run_epochs
 
 
-class Answers(NamedTuple):
+class RudderResponses(NamedTuple):
     """The simulated changes [S, 2, C] that each of C rudder angles brings to states [S, nx].
 
     Changes are of heading [rad] and yaw rate [rad/s].
@@ -42,14 +42,14 @@ class Answers(NamedTuple):
     change: Tensor
 
 
-def simulate_answers(
+def simulate_rudder_responses(
     vessel: SteeredVessel,
-    exact: SimulatedPredictor,
+    exact_predictor: SimulatedPredictor,
     rudder: Tensor,
     settings: PredictorTraining,
     states: int,
     seed: int,
-) -> Answers:
+) -> RudderResponses:
     """Return the data of section 6.1.1: random states, simulated under all rudder angles.
 
     The states are those that the vessel comes through under random angles, since few combinations
@@ -59,27 +59,31 @@ def simulate_answers(
         vessel: in calm water.
         rudder: angles [C] in rad.
     """
-    random = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
     dt = min(settings.hold / 10.0, 0.25)
     steps = math.ceil(settings.wander / dt)
-    x, w = vessel.start(torch.ones(states, dtype=torch.float64))
+    x, w = vessel.straight_course(torch.ones(states, dtype=torch.float64))
     # each angle is held for a random time: an angle that was drawn at a step stays until the next
     # drawing
-    drawn = torch.rand(states, steps, generator=random) < dt / settings.hold
-    drawn[:, 0] = True
-    last = torch.where(drawn, torch.arange(steps), 0).cummax(1).values
-    angles = rudder[torch.randint(len(rudder), (states, steps), generator=random)].gather(1, last)
-    given = torch.cat((angles.unsqueeze(-1), w[:, None, 1:].expand(-1, steps, -1)), dim=-1)
+    is_switch = torch.rand(states, steps, generator=generator) < dt / settings.hold
+    is_switch[:, 0] = True
+    last_switch = torch.where(is_switch, torch.arange(steps), 0).cummax(1).values
+    angles = rudder[torch.randint(len(rudder), (states, steps), generator=generator)].gather(
+        1, last_switch
+    )
+    inputs = torch.cat((angles.unsqueeze(-1), w[:, None, 1:].expand(-1, steps, -1)), dim=-1)
     nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(states, -1)
     with torch.no_grad():
-        tracks = Rollout(vessel.model(dt))(x, given, vessel.memory(nominal))[0]
-        taken = torch.randint(steps + 1, (states,), generator=random)
-        x = tracks[torch.arange(states), taken]
+        trajectories = Rollout(vessel.model(dt))(x, inputs, vessel.memory(nominal))[0]
+        sample_steps = torch.randint(steps + 1, (states,), generator=generator)
+        x = trajectories[torch.arange(states), sample_steps]
         x = x + settings.scatter * x.std(0) * torch.randn(
-            x.shape, generator=random, dtype=torch.float64
+            x.shape, generator=generator, dtype=torch.float64
         )
-        error, rate = exact(x, x[:, vessel.column("psi")], rudder)
-    return Answers(x, torch.stack((-error, rate - x[:, vessel.column("r"), None]), dim=1))
+        error, rate = exact_predictor(x, x[:, vessel.state_column("psi")], rudder)
+    return RudderResponses(
+        x, torch.stack((-error, rate - x[:, vessel.state_column("r"), None]), dim=1)
+    )
 
 
 @final
@@ -91,11 +95,15 @@ class PredictorFit(EpochTraining):
     """
 
     def __init__(
-        self, predictor: NetworkPredictor, kept: Answers, settings: PredictorTraining, seed: int
+        self,
+        predictor: NetworkPredictor,
+        validation_set: RudderResponses,
+        settings: PredictorTraining,
+        seed: int,
     ) -> None:
         super().__init__(settings, seed)
         self.predictor = predictor
-        self.kept = kept
+        self.validation_set = validation_set
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Return Adam, as in the source."""
@@ -108,12 +116,12 @@ class PredictorFit(EpochTraining):
 
     def training_step(self, rows: tuple[Tensor, Tensor], batch_index: int) -> Tensor:
         """Return the mean squared error of one batch of states and their changes."""
-        loss = self._misses(Answers(*rows)).square().mean()
+        loss = self._scaled_errors(RudderResponses(*rows)).square().mean()
         self._losses.append(float(loss.detach()))
         return loss
 
-    def _misses(self, answers: Answers) -> Tensor:
-        return (self.predictor.changes(answers.x) - answers.change) / self.predictor.scale
+    def _scaled_errors(self, answers: RudderResponses) -> Tensor:
+        return (self.predictor.predict_changes(answers.x) - answers.change) / self.predictor.scale
 
     def validated(self) -> tuple[nn.Module, float]:
         """Return the predictor and its error on fresh states, as a share of the spread.
@@ -121,14 +129,16 @@ class PredictorFit(EpochTraining):
         The error is the root of the mean square.
         """
         with torch.no_grad():
-            return self.predictor, float(self._misses(self.kept).square().mean().sqrt())
+            return self.predictor, float(
+                self._scaled_errors(self.validation_set).square().mean().sqrt()
+            )
 
 
 def train_predictor(
     name: str,
     predictor: NetworkPredictor,
     config: PredictiveConfig,
-    steering: Steering,
+    task: ControlTask,
     seed: int,
     folder: Path,
 ) -> dict[str, Any]:
@@ -138,7 +148,7 @@ def train_predictor(
 
     Args:
         config: of the controller and of the training.
-        steering: the vessel in calm water and the limit of its rudder.
+        task: the vessel in calm water and the limit of its rudder.
 
     Returns:
         The curve by epoch, the best score, the number of parameters, and on states kept back the
@@ -147,30 +157,41 @@ def train_predictor(
     Raises:
         FitError: where no epoch gave a finite error.
     """
-    settings, exact = config.training, config.exact(steering)
-    rudder = config.law(predictor, steering).rudder
-    train, kept = (
-        simulate_answers(steering.vessel, exact, rudder, settings, states, of)
-        for states, of in ((settings.states, 2 * seed), (settings.states // 5, 2 * seed + 1))
+    settings, exact_predictor = config.training, config.build_exact_predictor(task)
+    rudder = config.build_law(predictor, task).rudder
+    train, validation_set = (
+        simulate_rudder_responses(
+            task.vessel, exact_predictor, rudder, settings, states, state_seed
+        )
+        for states, state_seed in (
+            (settings.states, 2 * seed),
+            (settings.states // 5, 2 * seed + 1),
+        )
     )
     predictor = predictor.double()
     predictor.calibrate(*train)
-    fit = PredictorFit(predictor, kept, settings, seed)
+    fit = PredictorFit(predictor, validation_set, settings, seed)
     data = RowsDataModule((train.x, train.change), settings.batch, seed, lambda: fit.epoch)
     notes = run_epochs(name, fit, data, predictor, predictor, folder)
     with torch.no_grad():
-        missed = (predictor.changes(kept.x) - kept.change).square().mean((0, 2)).sqrt().tolist()
-    return notes | dict(zip(("rms_heading", "rms_yaw_rate"), missed, strict=True))
+        rms_errors = (
+            (predictor.predict_changes(validation_set.x) - validation_set.change)
+            .square()
+            .mean((0, 2))
+            .sqrt()
+            .tolist()
+        )
+    return notes | dict(zip(("rms_heading", "rms_yaw_rate"), rms_errors, strict=True))
 
 
-def predictive(
-    name: str, config: PredictiveConfig, steering: Steering, seed: int, folder: RunFolder
+def train_or_resume_controller(
+    name: str, config: PredictiveConfig, task: ControlTask, seed: int, folder: RunFolder
 ) -> tuple[Policy, dict[str, Any]]:
     """Train a controller, or take up the one that an interrupted run has trained.
 
     Args:
         config: how it predicts and how it is trained.
-        steering: the vessel in calm water and the limit of its rudder.
+        task: the vessel in calm water and the limit of its rudder.
         seed: seed of the weights, the states and the batches.
 
     Returns:
@@ -180,34 +201,34 @@ def predictive(
         FitError: where training fails.
     """
     torch.manual_seed(seed)
-    spec, store = config.spec(steering), FolderStore(folder)
+    spec, store = config.predictor_spec(task), RunModelStore(folder)
     network = spec.build()
-    notes = store.finished_module(name, network)
+    notes = store.restore_module(name, network)
     if notes is None:
-        started = time.time()
-        begin(f"training {name}")
-        notes = train_predictor(name, network, config, steering, seed, folder.path)
-        notes["seconds"] = round(time.time() - started, 1)
-        store.keep_module(name, spec, network, notes)
-    degrees = [DEG * notes[key] for key in ("rms_heading", "rms_yaw_rate")]
-    say(
+        start_time = time.time()
+        begin_stage(f"training {name}")
+        notes = train_predictor(name, network, config, task, seed, folder.path)
+        notes["seconds"] = round(time.time() - start_time, 1)
+        store.save_module(name, spec, network, notes)
+    degrees = [DEGREES_PER_RADIAN * notes[key] for key in ("rms_heading", "rms_yaw_rate")]
+    log_message(
         f"  {name}: predicts {config.horizon:g} s ahead within {degrees[0]:.2g} deg and"
         f" {degrees[1]:.2g} deg/s (rms), {notes['seconds']:.0f} s"
     )
-    return config.law(network, steering), {"config": config.model_dump(mode="json")} | {
+    return config.build_law(network, task), {"config": config.model_dump(mode="json")} | {
         key: value for key, value in notes.items() if key != "curve"
     }
 
 
-def load_predictive(
-    name: str, config: PredictiveConfig, steering: Steering, folder: RunFolder
+def load_predictive_controller(
+    name: str, config: PredictiveConfig, task: ControlTask, folder: RunFolder
 ) -> Policy:
     """Return the controller that a finished run has trained.
 
     Raises:
         UsageError: where the run lacks it.
     """
-    network = config.spec(steering).build()
-    if FolderStore(folder).finished_module(name, network) is None:
+    network = config.predictor_spec(task).build()
+    if RunModelStore(folder).restore_module(name, network) is None:
         raise UsageError(f"{folder.path}: no trained '{name}' (models/{name}/model.json)")
-    return config.law(network, steering)
+    return config.build_law(network, task)

@@ -16,11 +16,11 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.control.base import Policy
-from residnet.control.heading.controllers import ControllerConfig, Steering
+from residnet.control.heading.controllers import ControllerConfig, ControlTask
 from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError
-from residnet.core.frames import wrap
+from residnet.core.frames import wrap_angle
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.store import Stored
 from residnet.training.config import OneStage
@@ -54,11 +54,11 @@ class SimulatedPredictor(Predictor):
         model: with the columns of the controlled vessel's state; its commands begin with the rudder
             angle.
         steps: of the model, which make the horizon.
-        others: its inputs beside the rudder command [m - 1], held over the horizon.
+        other_inputs: its inputs beside the rudder command [m - 1], held over the horizon.
     """
 
     def __init__(
-        self, model: Dynamics, state: Sequence[str], steps: int, others: Tensor | None = None
+        self, model: Dynamics, state: Sequence[str], steps: int, other_inputs: Tensor | None = None
     ) -> None:
         super().__init__()
         if steps < 1:
@@ -67,20 +67,24 @@ class SimulatedPredictor(Predictor):
         self.steps = steps
         self.psi, self.r = state.index("psi"), state.index("r")
         self.register_buffer(
-            "others", torch.zeros(0) if others is None else others, persistent=False
+            "other_inputs",
+            torch.zeros(0) if other_inputs is None else other_inputs,
+            persistent=False,
         )
-        self.others: Tensor
+        self.other_inputs: Tensor
 
     def forward(self, x: Tensor, heading: Tensor, rudder: Tensor) -> tuple[Tensor, Tensor]:
-        rows, candidates = x.shape[0], rudder.shape[0]
-        command = rudder.to(x.dtype).repeat(rows).unsqueeze(-1)
-        w = torch.cat((command, self.others.to(x.dtype).expand(rows * candidates, -1)), dim=-1)
-        ahead = x.repeat_interleave(candidates, dim=0)
-        memory = ahead[:, :0]
+        n_rows, n_candidates = x.shape[0], rudder.shape[0]
+        command = rudder.to(x.dtype).repeat(n_rows).unsqueeze(-1)
+        w = torch.cat(
+            (command, self.other_inputs.to(x.dtype).expand(n_rows * n_candidates, -1)), dim=-1
+        )
+        predicted_state = x.repeat_interleave(n_candidates, dim=0)
+        memory = predicted_state[:, :0]
         for _ in range(self.steps):
-            ahead, memory = self.model.step(ahead, w, memory)
-        error = heading.unsqueeze(-1) - ahead[:, self.psi].reshape(rows, candidates)
-        return error, ahead[:, self.r].reshape(rows, candidates)
+            predicted_state, memory = self.model.step(predicted_state, w, memory)
+        error = heading.unsqueeze(-1) - predicted_state[:, self.psi].reshape(n_rows, n_candidates)
+        return error, predicted_state[:, self.r].reshape(n_rows, n_candidates)
 
 
 @final
@@ -103,15 +107,17 @@ class NetworkPredictor(Predictor):
     ) -> None:
         super().__init__()
         self.psi, self.r = state.index("psi"), state.index("r")
-        self.take = [place for place, name in enumerate(state) if name not in ("x", "y", "psi")]
+        self.input_columns = [
+            column for column, name in enumerate(state) if name not in ("x", "y", "psi")
+        ]
         layers: list[nn.Module] = []
-        width = len(self.take)
+        width = len(self.input_columns)
         for units in hidden:
             layers += [nn.Linear(width, units), *([] if linear else [nn.Tanh()])]
             width = units
         self.network = nn.Sequential(*layers, nn.Linear(width, 2 * candidates))
-        self.register_buffer("centre", torch.zeros(len(self.take)))
-        self.register_buffer("spread", torch.ones(len(self.take)))
+        self.register_buffer("centre", torch.zeros(len(self.input_columns)))
+        self.register_buffer("spread", torch.ones(len(self.input_columns)))
         self.register_buffer("offset", torch.zeros(2, candidates))
         self.register_buffer("scale", torch.ones(2, 1))
         self.centre: Tensor
@@ -121,27 +127,33 @@ class NetworkPredictor(Predictor):
 
     def calibrate(self, x: Tensor, change: Tensor) -> None:
         """Take the scales from states [S, nx] and their changes [S, 2, C]."""
-        inputs = x[:, self.take]
+        inputs = x[:, self.input_columns]
         self.centre.copy_(inputs.mean(0))
-        spread = inputs.std(0)
+        standard_deviation = inputs.std(0)
         # what does not vary says nothing; Nomoto's speed is one
-        self.spread.copy_(torch.where(spread > 1e-9 * (1.0 + self.centre.abs()), spread, 1.0))
+        self.spread.copy_(
+            torch.where(
+                standard_deviation > 1e-9 * (1.0 + self.centre.abs()), standard_deviation, 1.0
+            )
+        )
         self.offset.copy_(change.mean(0))
         self.scale.copy_(
             (change - change.mean(0)).square().mean((0, 2)).sqrt().unsqueeze(-1).clamp(min=1e-12)
         )
 
-    def changes(self, x: Tensor) -> Tensor:
+    def predict_changes(self, x: Tensor) -> Tensor:
         """Return the changes of heading and yaw rate [B, 2, C] over the horizon."""
-        out: Tensor = self.network((x[:, self.take] - self.centre) / self.spread)
-        return out.reshape(len(x), 2, -1) * self.scale + self.offset
+        network_output: Tensor = self.network(
+            (x[:, self.input_columns] - self.centre) / self.spread
+        )
+        return network_output.reshape(len(x), 2, -1) * self.scale + self.offset
 
     def forward(self, x: Tensor, heading: Tensor, rudder: Tensor) -> tuple[Tensor, Tensor]:
         """Return the heading errors and yaw rates [B, C].
 
         The angles are those that it was trained for.
         """
-        change = self.changes(x)
+        change = self.predict_changes(x)
         return (heading - x[:, self.psi]).unsqueeze(-1) - change[:, 0], x[:, self.r].unsqueeze(
             -1
         ) + change[:, 1]
@@ -192,8 +204,11 @@ class DocumentAutopilot(Policy):
         """
         error, rate = self.predictor(x, reference[:, 0], self.rudder)
         rudder = self.rudder.to(x.dtype)
-        toward, calm = rudder[wrap(error).abs().argmin(-1)], rudder[rate.abs().argmin(-1)]
-        return (self.weight * toward + (1.0 - self.weight) * calm).unsqueeze(-1), s
+        heading_rudder, rate_rudder = (
+            rudder[wrap_angle(error).abs().argmin(-1)],
+            rudder[rate.abs().argmin(-1)],
+        )
+        return (self.weight * heading_rudder + (1.0 - self.weight) * rate_rudder).unsqueeze(-1), s
 
 
 @final
@@ -201,45 +216,47 @@ class NominalSteering(Dynamics):
     """The vessel without variation, and without memory, as predictors expect it.
 
     Attributes:
-        others: inputs beside the rudder command at service speed [m - 1].
+        other_inputs: inputs beside the rudder command at service speed [m - 1].
     """
 
     def __init__(self, vessel: SteeredVessel, dt: float) -> None:
         super().__init__(dt, "rk4")
-        self.inner = vessel.model(dt)
-        self.others = vessel.start(torch.ones(1, dtype=torch.float64))[1][0, 1:]
+        self.nominal_model = vessel.model(dt)
+        self.other_inputs = vessel.straight_course(torch.ones(1, dtype=torch.float64))[1][0, 1:]
         nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
-        self.register_buffer("nominal", vessel.memory(nominal), persistent=False)
-        self.nominal: Tensor
+        self.register_buffer("nominal_memory", vessel.memory(nominal), persistent=False)
+        self.nominal_memory: Tensor
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        return self.inner.step(x, w, self.nominal.to(x.dtype).expand(x.shape[0], -1))[0], s
+        return self.nominal_model.step(
+            x, w, self.nominal_memory.to(x.dtype).expand(x.shape[0], -1)
+        )[0], s
 
 
-class _Law(Config):
+class _PredictiveLawConfig(Config):
     """The settings of the law (6.4)."""
 
     horizon: Seconds = Field(gt=0)
     candidates: int = Field(default=41, ge=3, le=10_001)
     weight: float = Field(default=0.2, ge=0, le=1)
 
-    def exact(self, steering: Steering) -> SimulatedPredictor:
+    def build_exact_predictor(self, task: ControlTask) -> SimulatedPredictor:
         """Return the exact predictor: a simulation of the nominal vessel.
 
         Long horizons are predicted in steps of at most a twentieth of T.
         """
-        steps = math.ceil(self.horizon / max(steering.turning.time / 20.0, steering.dt))
-        model = NominalSteering(steering.vessel, self.horizon / steps)
-        return SimulatedPredictor(model, steering.vessel.state, steps, model.others)
+        steps = math.ceil(self.horizon / max(task.nomoto.time / 20.0, task.dt))
+        model = NominalSteering(task.vessel, self.horizon / steps)
+        return SimulatedPredictor(model, task.vessel.state, steps, model.other_inputs)
 
-    def law(self, predictor: Predictor, steering: Steering) -> DocumentAutopilot:
+    def build_law(self, predictor: Predictor, task: ControlTask) -> DocumentAutopilot:
         """Return the controller with some predictor of this horizon."""
         return DocumentAutopilot(
-            predictor, limit=steering.limit, candidates=self.candidates, weight=self.weight
+            predictor, limit=task.limit, candidates=self.candidates, weight=self.weight
         )
 
 
-class DocumentConfig(_Law, ControllerConfig):
+class DocumentConfig(_PredictiveLawConfig, ControllerConfig):
     """The predictive law of document 004 with an exact predictor of the nominal vessel.
 
     Attributes:
@@ -250,8 +267,8 @@ class DocumentConfig(_Law, ControllerConfig):
 
     kind: Literal["document"] = "document"
 
-    def build(self, steering: Steering) -> Policy:
-        return self.law(self.exact(steering), steering)
+    def build(self, task: ControlTask) -> Policy:
+        return self.build_law(self.build_exact_predictor(task), task)
 
 
 class PredictorSpec(Stored):
@@ -306,7 +323,7 @@ class PredictorTraining(OneStage):
     gradient_clip: float = Field(default=10.0, gt=0)
 
 
-class PredictiveConfig(_Law):
+class PredictiveConfig(_PredictiveLawConfig):
     """The predictive autopilot of document 004: a trained predictor and the control law (6.4).
 
     The predictor is a perceptron. It says which heading error and yaw rate each candidate rudder
@@ -328,10 +345,10 @@ class PredictiveConfig(_Law):
     linear: bool = False
     training: PredictorTraining = PredictorTraining()
 
-    def spec(self, steering: Steering) -> PredictorSpec:
+    def predictor_spec(self, task: ControlTask) -> PredictorSpec:
         """Return the description of the perceptron for a vessel."""
         return PredictorSpec(
-            state=tuple(steering.vessel.state),
+            state=tuple(task.vessel.state),
             candidates=self.candidates,
             hidden=tuple(self.hidden),
             linear=self.linear,

@@ -11,29 +11,29 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from residnet.core import progress
-from residnet.core.config import Config, Seconds, apply_override, validate
+from residnet.core.config import Config, Seconds, apply_override, validate_config
 from residnet.core.errors import ConfigError, require_package
-from residnet.core.format import DASH, number
-from residnet.documents.study import Results, Study, pictures
+from residnet.core.format import DASH, format_number
+from residnet.documents.study import StudyResults, StudyTask, find_figures
 from residnet.heads.genetic import GeneticConfig
-from residnet.regression.expressions import Algebra, term
-from residnet.regression.genetic import breed, limits_of, validating
-from residnet.report.blocks import Cell, Section, Text, table_of
-from residnet.report.figure import COLORS, Case, Figure, Look, Panel, names_of
+from residnet.regression.expressions import Algebra, format_product
+from residnet.regression.genetic import evolve_equation, expression_limits, validation_mask
+from residnet.report.blocks import Cell, Section, Text, build_table
+from residnet.report.figure import COLORS, Case, Figure, GlyphStyle, Panel, tick_labels
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import MainFigure
+from residnet.runs.task import SummaryMetric
 
-Value = int | float | str
+SettingValue = int | float | str
 Matrix = tuple[tuple[float | None, ...], ...]
-Record = dict[str, np.ndarray]
+SignalRecord = dict[str, np.ndarray]
 CHANNELS = ("x", "u", "tau_x")
 MASS, DAMPING, STIFFNESS = 10.0, 13.0, 5.0
 """The system m x_ddot + d x_dot + k x = tau (4.1) in kg, kg/s and N/m (section 5.3, (5.13)); that
 of (4.3) is another one: 20 kg, 10 kg/s, 12 N/m (correction H24).
 """
-TRUTH = {"tau_x": 1.0 / MASS, "u": -DAMPING / MASS, "x": -STIFFNESS / MASS}
+TRUE_COEFFICIENTS = {"tau_x": 1.0 / MASS, "u": -DAMPING / MASS, "x": -STIFFNESS / MASS}
 """True coefficients of u_dot (4.2) by term."""
-_LEAST = 1e-34
+_MIN_PLOTTED_ERROR = 1e-34
 """Least error in the picture, in (m/s^2)^2: what rounding leaves is less."""
 _PUBLISHED_RUNS = 10
 """Number of runs of each combination in Tables 5.2 and 5.3."""
@@ -61,7 +61,7 @@ class RecordConfig(Config):
     delay: Seconds = Field(default=0.0, ge=0)
     corrected: Seconds = Field(default=0.0, ge=0)
 
-    def record(self, period: float) -> Record:
+    def simulate(self, period: float) -> SignalRecord:
         """Return a record without noise.
 
         Args:
@@ -74,21 +74,24 @@ class RecordConfig(Config):
         from scipy.linalg import expm
 
         t = self.step * np.arange(round(self.length / self.step))
-        given = np.where(np.mod(t, period) < period / 2, 1.0, -1.0)
+        nominal_force = np.where(np.mod(t, period) < period / 2, 1.0, -1.0)
         # later than recorded, with its first value before
-        force, told = (
-            np.concatenate((np.full(steps, given[0]), given))[: len(given)]
+        force, recorded_force = (
+            np.concatenate((np.full(steps, nominal_force[0]), nominal_force))[: len(nominal_force)]
             for steps in (round(seconds / self.step) for seconds in (self.delay, self.corrected))
         )
-        block = np.zeros((3, 3))
-        block[:2] = [[0.0, 1.0, 0.0], [TRUTH["x"], TRUTH["u"], TRUTH["tau_x"]]]
-        transition = expm(block * self.step)[:2]
+        continuous_matrix = np.zeros((3, 3))
+        continuous_matrix[:2] = [
+            [0.0, 1.0, 0.0],
+            [TRUE_COEFFICIENTS["x"], TRUE_COEFFICIENTS["u"], TRUE_COEFFICIENTS["tau_x"]],
+        ]
+        transition = expm(continuous_matrix * self.step)[:2]
         state = np.zeros((len(t), 2))
         for i in range(1, len(t)):
             state[i] = transition @ [*state[i - 1], force[i - 1]]
         x, u = state.T
         u_dot = (force - DAMPING * u - STIFFNESS * x) / MASS
-        return {"x": x, "u": u, "tau_x": told, "u_dot": u_dot}
+        return {"x": x, "u": u, "tau_x": recorded_force, "u_dot": u_dot}
 
 
 class NoiseConfig(Config):
@@ -103,13 +106,13 @@ class NoiseConfig(Config):
     on: Literal["output", "inputs", "all", "none"] = "all"
     factor: float = Field(default=0.0, ge=0)
 
-    def added(self, record: Record, random: np.random.Generator) -> Record:
+    def add_noise(self, record: SignalRecord, generator: np.random.Generator) -> SignalRecord:
         """Return the record with noise."""
         signals = {"output": ("u_dot",), "inputs": CHANNELS, "all": tuple(record)}
         noisy = signals.get(self.on, ())
         return {
             name: (
-                values + self.factor * np.ptp(values) * random.uniform(-1, 1, len(values))
+                values + self.factor * np.ptp(values) * generator.uniform(-1, 1, len(values))
                 if name in noisy
                 else values
             )
@@ -117,7 +120,7 @@ class NoiseConfig(Config):
         }
 
 
-class Axis(Config):
+class StudyAxis(Config):
     """One setting of the study and the values that it takes.
 
     Attributes:
@@ -126,7 +129,7 @@ class Axis(Config):
     """
 
     key: str = Field(pattern=r"^(head|noise|record)\.[a-z_.]+$")
-    values: Annotated[tuple[Value, ...], Field(min_length=1)]
+    values: Annotated[tuple[SettingValue, ...], Field(min_length=1)]
 
 
 class SearchConfig(Config):
@@ -145,7 +148,7 @@ class SearchConfig(Config):
 
 
 @final
-class BreedingTaskConfig(Study, SearchConfig):
+class BreedingTaskConfig(StudyTask, SearchConfig):
     """A search for the equation with every combination of two settings, several times each.
 
     Attributes:
@@ -161,31 +164,31 @@ class BreedingTaskConfig(Study, SearchConfig):
     """
 
     task: Literal["breeding"]
-    rows: Axis
-    columns: Axis
+    rows: StudyAxis
+    columns: StudyAxis
     repeats: int = Field(default=10, ge=1, le=10_000)
     threshold: float = Field(default=5e-6, gt=0)
     published: Matrix | None = None
     published_error: Matrix | None = None
 
     @model_validator(mode="after")
-    def _grid(self) -> BreedingTaskConfig:
-        high, wide = len(self.rows.values), len(self.columns.values)
+    def _check_grid(self) -> BreedingTaskConfig:
+        n_rows, n_columns = len(self.rows.values), len(self.columns.values)
         for name in ("published", "published_error"):
             table = getattr(self, name)
-            if table is not None and [len(row) for row in table] != [wide] * high:
+            if table is not None and [len(row) for row in table] != [n_columns] * n_rows:
                 raise ValueError(
-                    f"{name}: expected {high} rows of {wide} numbers, as rows and columns have"
+                    f"{name}: expected {n_rows} rows of {n_columns} numbers, as rows and columns have"
                     " values"
                 )
-        for row, column in self.cells():
+        for row, column in self.combinations():
             try:
-                self.cell(row, column)
+                self.combination_config(row, column)
             except ConfigError as error:
                 raise ValueError(str(error)) from None
         return self
 
-    def cells(self) -> list[tuple[int, int]]:
+    def combinations(self) -> list[tuple[int, int]]:
         """Return row and column of each combination that is run."""
         return [
             (i, j)
@@ -194,43 +197,45 @@ class BreedingTaskConfig(Study, SearchConfig):
             if self.published is None or self.published[i][j] is not None
         ]
 
-    def cell(self, row: int, column: int) -> SearchConfig:
+    def combination_config(self, row: int, column: int) -> SearchConfig:
         """Return the settings of one combination.
 
         Raises:
             ConfigError: where a key of the two settings does not exist, or a value is not allowed.
         """
-        parts = {name: getattr(self, name).model_dump() for name in SearchConfig.model_fields}
+        config_parts = {
+            name: getattr(self, name).model_dump() for name in SearchConfig.model_fields
+        }
         pairs = ((self.rows, row), (self.columns, column))
-        changes = [f"{axis.key}={axis.values[place]}" for axis, place in pairs]
+        changes = [f"{axis.key}={axis.values[value_index]}" for axis, value_index in pairs]
         for change in changes:
-            apply_override(parts, change)
-        return validate(parts, SearchConfig, ", ".join(changes))
+            apply_override(config_parts, change)
+        return validate_config(config_parts, SearchConfig, ", ".join(changes))
 
     def check(self) -> None:
         require_package("deap", "genetic programming", "gp")
 
-    def results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
-        rows, cells = [], self.cells()
-        for done, (i, j) in enumerate(cells):
-            progress.report("searching equations", done, len(cells))
-            settings, started = self.cell(i, j), time.process_time()
-            trials = [attempt(settings, seed) for seed in range(self.repeats)]
-            errors, equations = ([*part] for part in zip(*trials, strict=True))
+    def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
+        rows, cells = [], self.combinations()
+        for n_done, (i, j) in enumerate(cells):
+            progress.report_progress("searching equations", n_done, len(cells))
+            settings, start_time = self.combination_config(i, j), time.process_time()
+            trials = [run_search_trial(settings, seed) for seed in range(self.repeats)]
+            errors, equations = ([*values] for values in zip(*trials, strict=True))
             rows.append(
                 {
                     "row": self.rows.values[i],
                     "column": self.columns.values[j],
                     "found": sum(error < self.threshold for error in errors),
                     "published_found": self.published and self.published[i][j],
-                    "right": sum(set(equation) == set(TRUTH) for equation in equations),
+                    "right": sum(set(equation) == set(TRUE_COEFFICIENTS) for equation in equations),
                     "error": sum(errors) / len(errors),
                     "published_error": self.published_error and self.published_error[i][j],
-                    "seconds": (time.process_time() - started) / self.repeats,
+                    "seconds": (time.process_time() - start_time) / self.repeats,
                     "equations": equations,
                 }
             )
-        progress.report("searching equations", len(cells), len(cells))
+        progress.report_progress("searching equations", len(cells), len(cells))
         content = {
             "schema": "residnet.breeding/1",
             "run": self.name,
@@ -244,43 +249,50 @@ class BreedingTaskConfig(Study, SearchConfig):
                 for value in self.rows.values
             },
         }
-        return content, [_drawing(self, rows)]
+        return content, [_result_figure(self, rows)]
 
-    def main_figures(self, results: Results) -> dict[str, MainFigure]:
+    def main_figures(self, results: StudyResults) -> dict[str, SummaryMetric]:
         rows = results["rows"]
-        words = {"found": "that find the equation", "right": "with the true terms"}
+        descriptions = {"found": "that find the equation", "right": "with the true terms"}
         return {
-            f"share of runs {what}": MainFigure(
+            f"share of runs {description}": SummaryMetric(
                 sum(row[key] for row in rows) / (self.repeats * len(rows))
             )
-            for key, what in words.items()
+            for key, description in descriptions.items()
         }
 
-    def verdict(self, results: Results) -> list[str]:
+    def summarize(self, results: StudyResults) -> list[str]:
         rows = results["rows"]
         runs = self.repeats * len(rows)
         sentences = [
             f"The equation is found in {sum(row['found'] for row in rows)} of {runs} runs: their"
             f" mean square error on the test record is below {self.threshold:g} (m/s^2)^2."
         ]
-        printed = [row for row in rows if row["published_found"] is not None]
-        if printed:
-            ours, theirs = (
-                sum(row[key] for row in printed) for key in ("found", "published_found")
+        published_rows = [row for row in rows if row["published_found"] is not None]
+        if published_rows:
+            n_found, n_published = (
+                sum(row[key] for row in published_rows) for key in ("found", "published_found")
             )
             sentences.append(
-                f"Document 000 finds it in {theirs:g} of the {_PUBLISHED_RUNS * len(printed)} runs"
-                f" of the same table; here it is {ours} of {self.repeats * len(printed)}."
+                f"Document 000 finds it in {n_published:g} of the {_PUBLISHED_RUNS * len(published_rows)} runs"
+                f" of the same table; here it is {n_found} of {self.repeats * len(published_rows)}."
             )
-        best = [f"{_text(column)} ({row})" for row, column in results["least"].items()]
-        sentences.append(f"The mean error is least at {self.columns.key} = {', '.join(best)}.")
-        right = sum(row["right"] for row in rows)
-        return [*sentences, f"In {right} of {runs} runs the terms are exactly the true ones."]
+        best_columns = [
+            f"{_format_value(column)} ({row})" for row, column in results["least"].items()
+        ]
+        sentences.append(
+            f"The mean error is least at {self.columns.key} = {', '.join(best_columns)}."
+        )
+        n_true_terms = sum(row["right"] for row in rows)
+        return [
+            *sentences,
+            f"In {n_true_terms} of {runs} runs the terms are exactly the true ones.",
+        ]
 
-    def sections(self, results: Results, run: Path) -> list[Section]:
+    def build_sections(self, results: StudyResults, run: Path) -> list[Section]:
         rows = results["rows"]
-        about = Text(
-            quiet=True,
+        explanation = Text(
+            is_secondary=True,
             paragraphs=[
                 f"Each cell shows in how many of {self.repeats} runs the mean square error on the"
                 f" test record is below {self.threshold:g} (m/s^2)^2. In small print stand the"
@@ -291,49 +303,64 @@ class BreedingTaskConfig(Study, SearchConfig):
         )
         cells = {(row["row"], row["column"]): row for row in rows}
 
-        def cell(value: Value, other: Value) -> Cell:
-            row = cells.get((value, other))
+        def cell(value: SettingValue, column_value: SettingValue) -> Cell:
+            row = cells.get((value, column_value))
             if row is None:
                 return Cell(DASH)
-            found = row["published_found"]
-            printed = "" if found is None else f"published {found:g}; "
-            said = f"{printed}{row['right']} true; {number(row['error'], 2)}"
-            return Cell(str(row["found"]), said)
+            n_published = row["published_found"]
+            published_text = "" if n_published is None else f"published {n_published:g}; "
+            note = f"{published_text}{row['right']} true; {format_number(row['error'], 2)}"
+            return Cell(str(row["found"]), note)
 
-        table = table_of(
+        table = build_table(
             self.rows.values,
             [
-                (self.rows.key, _text),
+                (self.rows.key, _format_value),
                 *(
-                    (_text(other), lambda value, other=other: cell(value, other))
-                    for other in self.columns.values
+                    (
+                        _format_value(column_value),
+                        lambda value, other=column_value: cell(value, other),
+                    )
+                    for column_value in self.columns.values
                 ),
             ],
         )
-        every = [
+        all_equations = [
             (row, seed, equation) for row in rows for seed, equation in enumerate(row["equations"])
         ]
 
-        def written(row: Any) -> str:
-            terms = [f"{number(value, 4)} {name}" for name, value in row[2].items()]
+        def equation_text(row: Any) -> str:
+            terms = [f"{format_number(value, 4)} {name}" for name, value in row[2].items()]
             return " + ".join(terms) or DASH
 
-        equations = table_of(
-            every,
+        equations = build_table(
+            all_equations,
             [
-                ("setting", lambda row: f"{_text(row[0]['row'])}, {_text(row[0]['column'])}"),
+                (
+                    "setting",
+                    lambda row: (
+                        f"{_format_value(row[0]['row'])}, {_format_value(row[0]['column'])}"
+                    ),
+                ),
                 ("seed", lambda row: Cell(str(row[1]))),
-                ("equation of the acceleration", written),
+                ("equation of the acceleration", equation_text),
             ],
         )
         return [
-            Section("", [*(one.part() for one in pictures(run, "study")), table, about]),
-            Section("Found by setting", pictures(run, "study")),
-            Section("All equations", [equations], folded=True),
+            Section(
+                "",
+                [
+                    *(picture.preview() for picture in find_figures(run, "study")),
+                    table,
+                    explanation,
+                ],
+            ),
+            Section("Found by setting", find_figures(run, "study")),
+            Section("All equations", [equations], is_folded=True),
         ]
 
 
-def attempt(settings: SearchConfig, seed: int) -> tuple[float, dict[str, float]]:
+def run_search_trial(settings: SearchConfig, seed: int) -> tuple[float, dict[str, float]]:
     """Search the equation of u_dot once.
 
     Args:
@@ -348,57 +375,64 @@ def attempt(settings: SearchConfig, seed: int) -> tuple[float, dict[str, float]]
         UsageError: where DEAP is not installed.
     """
     record, head = settings.record, settings.head
-    clean = record.record(record.period)
-    data = settings.noise.added(clean, np.random.default_rng(seed))
-    algebra = Algebra(CHANNELS, limits_of(head.evolution))
-    train = ~validating(np.zeros(len(clean["x"]), dtype=int), head.validate_every)
-    bred = breed(algebra, data, data["u_dot"], train, head, seed)
-    test = record.record(record.test_period)
-    predicted = np.zeros(len(test["x"]))
-    if bred.products:
-        predicted = np.array(bred.values) @ algebra.values(bred.products, test)
-    names = [term(algebra, product) for product in bred.products]
-    error = float(np.square(predicted - test["u_dot"]).mean())
-    return error, dict(zip(names, bred.values, strict=True))
+    clean_record = record.simulate(record.period)
+    noisy_record = settings.noise.add_noise(clean_record, np.random.default_rng(seed))
+    algebra = Algebra(CHANNELS, expression_limits(head.evolution))
+    train = ~validation_mask(np.zeros(len(clean_record["x"]), dtype=int), head.validate_every)
+    best_individual = evolve_equation(
+        algebra, noisy_record, noisy_record["u_dot"], train, head, seed
+    )
+    test_record = record.simulate(record.test_period)
+    predicted = np.zeros(len(test_record["x"]))
+    if best_individual.products:
+        predicted = np.array(best_individual.values) @ algebra.evaluate_products(
+            best_individual.products, test_record
+        )
+    term_names = [format_product(algebra, product) for product in best_individual.products]
+    error = float(np.square(predicted - test_record["u_dot"]).mean())
+    return error, dict(zip(term_names, best_individual.values, strict=True))
 
 
-def _text(value: Value) -> str:
+def _format_value(value: SettingValue) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _drawing(config: BreedingTaskConfig, rows: Sequence[Mapping[str, Any]]) -> Figure:
+def _result_figure(config: BreedingTaskConfig, rows: Sequence[Mapping[str, Any]]) -> Figure:
     columns = list(config.columns.values)
-    looks: dict[str, Look] = {}
-    found: dict[str, Any] = {}
-    errors: dict[str, Any] = {}
-    for place, value in enumerate(config.rows.values):
-        members = [row for row in rows if row["row"] == value]
-        x = np.array([columns.index(row["column"]) for row in members], dtype=float)
-        name, color = _text(value), COLORS[place % len(COLORS)]
-        looks[name] = Look(f"{config.rows.key} {name}", color)
-        looks[f"{name} points"] = Look("", color, kind="points", size=3)
-        looks[f"{name} published"] = Look("", color, "dotted")
-        found[name] = found[f"{name} points"] = (x, np.array([row["found"] for row in members]))
-        error = np.array([max(row["error"], _LEAST) for row in members])
-        errors[name] = errors[f"{name} points"] = (x, error)
-        if all(row["published_found"] is not None for row in members):
-            printed = np.array([row["published_found"] for row in members])
-            found[f"{name} published"] = (x, printed)
-    shared: Any = {
+    styles: dict[str, GlyphStyle] = {}
+    counts: dict[str, Any] = {}
+    mean_errors: dict[str, Any] = {}
+    for row_index, value in enumerate(config.rows.values):
+        setting_rows = [row for row in rows if row["row"] == value]
+        x = np.array([columns.index(row["column"]) for row in setting_rows], dtype=float)
+        name, color = _format_value(value), COLORS[row_index % len(COLORS)]
+        styles[name] = GlyphStyle(f"{config.rows.key} {name}", color)
+        styles[f"{name} points"] = GlyphStyle("", color, kind="points", size=3)
+        styles[f"{name} published"] = GlyphStyle("", color, "dotted")
+        counts[name] = counts[f"{name} points"] = (
+            x,
+            np.array([row["found"] for row in setting_rows]),
+        )
+        error = np.array([max(row["error"], _MIN_PLOTTED_ERROR) for row in setting_rows])
+        mean_errors[name] = mean_errors[f"{name} points"] = (x, error)
+        if all(row["published_found"] is not None for row in setting_rows):
+            published_counts = np.array([row["published_found"] for row in setting_rows])
+            counts[f"{name} published"] = (x, published_counts)
+    panel_settings: Any = {
         "x_label": config.columns.key,
         "height": 330,
-        "x_names": names_of(map(_text, columns)),
+        "x_names": tick_labels(map(_format_value, columns)),
     }
     return Figure(
         "study",
         "Equations found",
         "Left: number of runs below the error threshold, ours (lines) and the document's"
         " (dotted). Right: mean of the mean square errors on the test record.",
-        looks,
+        styles,
         [
-            Panel(f"found, of {config.repeats}", **shared),
-            Panel("mean square error [(m/s^2)^2]", y_log=True, **shared),
+            Panel(f"found, of {config.repeats}", **panel_settings),
+            Panel("mean square error [(m/s^2)^2]", y_log=True, **panel_settings),
         ],
-        [Case("", [found, errors])],
+        [Case("", [counts, mean_errors])],
         columns=2,
     )

@@ -16,17 +16,17 @@ from pydantic import Field, model_validator
 
 from residnet.core.config import Config
 from residnet.core.errors import FitError
-from residnet.documents import published
-from residnet.physics.hull import OdinConfig, values
-from residnet.regression.equation_rows import correlation_time
+from residnet.documents import load_published
+from residnet.physics.hull import AccelerationHullConfig, coefficient_rows
+from residnet.regression.equation_rows import effective_correlation_length
 
-_RANK = 1e-6
+_RANK_TOLERANCE = 1e-6
 """Singular values below this share of the largest mark directions that the data leave open."""
-_LEAST_DETERMINANT = 1e-3
+_MIN_DETERMINANT = 1e-3
 """Least determinant of the sway and yaw inertia, as a share of the product of typical inertias."""
-_OPEN_SHARE = 0.1
+_MAX_OPEN_COMPONENT = 0.1
 """A parameter with a larger component in an open direction counts as undetermined."""
-_OPEN_COMBINATION = 1e-3
+_MAX_OPEN_COMBINATION = 1e-3
 """A combination with a larger share in the open directions has no finite standard error."""
 
 
@@ -51,9 +51,9 @@ PARAMETERS: dict[str, tuple[float, float, float]] = {
 """Lower bound, upper bound and typical size in SI units by name; the values before the fit stand in
 published.yaml.
 """
-NAMES = tuple(PARAMETERS)
-LOW, HIGH, SCALE = np.array(list(PARAMETERS.values())).T
-SUMS: dict[str, tuple[float, dict[str, float]]] = {
+STANDARD_PARAMETER_NAMES = tuple(PARAMETERS)
+LOWER, UPPER, SCALE = np.array(list(PARAMETERS.values())).T
+INERTIA_SUMS: dict[str, tuple[float, dict[str, float]]] = {
     "m - X_udot": (1.0, {"X_udot": -1.0}),
     "m - Y_vdot": (1.0, {"Y_vdot": -1.0}),
     "I_z - N_rdot": (0.0, {"I_z": 1.0, "N_rdot": -1.0}),
@@ -61,11 +61,12 @@ SUMS: dict[str, tuple[float, dict[str, float]]] = {
 """Inertias as the equations contain them: factors of the mass and of parameters."""
 
 
-def sums(values: Mapping[str, float], mass: float) -> dict[str, float]:
+def inertia_sums(values: Mapping[str, float], mass: float) -> dict[str, float]:
     """Return the inertias as the equations contain them, from parameters by name."""
     return {
-        name: share * mass + sum(factor * values[part] for part, factor in parts.items())
-        for name, (share, parts) in SUMS.items()
+        name: mass_factor * mass
+        + sum(factor * values[parameter] for parameter, factor in parameter_factors.items())
+        for name, (mass_factor, parameter_factors) in INERTIA_SUMS.items()
     }
 
 
@@ -89,54 +90,60 @@ class StandardFitConfig(Config):
     thin: int = Field(default=2, ge=1)
 
     @model_validator(mode="after")
-    def _known(self) -> StandardFitConfig:
+    def _check_weights(self) -> StandardFitConfig:
         if min(self.weights) <= 0:
             raise ValueError(f"weights: all must be positive, given {list(self.weights)}")
         return self
 
     def starting_points(self) -> list[np.ndarray]:
         """Return the values [14] that the searches start from, inside the bounds."""
-        random = np.random.default_rng([self.seed, 14])
-        start = np.array([published("halvorsen2019")["start"][name] for name in NAMES])
-        inside = 1e-9 * (HIGH - LOW)
+        generator = np.random.default_rng([self.seed, 14])
+        start = np.array(
+            [load_published("halvorsen2019")["start"][name] for name in STANDARD_PARAMETER_NAMES]
+        )
+        bound_margin = 1e-9 * (UPPER - LOWER)
         points = [
             start,
-            *(start + SCALE * random.normal(size=len(start)) for _ in range(self.starts - 1)),
+            *(start + SCALE * generator.normal(size=len(start)) for _ in range(self.starts - 1)),
         ]
-        return [np.clip(values, LOW + inside, HIGH - inside) for values in points]
+        return [np.clip(values, LOWER + bound_margin, UPPER - bound_margin) for values in points]
 
 
-def accelerations(p: np.ndarray, mass: float, nu: np.ndarray, tau: np.ndarray) -> np.ndarray:
+def standard_accelerations(
+    p: np.ndarray, mass: float, nu: np.ndarray, tau: np.ndarray
+) -> np.ndarray:
     """Return nu_dot = M^-1 (tau - C nu - D nu), [N, 3].
 
     M_A(3,2) = -N_vdot and M_A(3,3) = -N_rdot (correction H18), C is skew-symmetric (corrections H4,
     H19), and D = -diag(...) (correction H1).
 
     Args:
-        p: parameters [14] in SI units, in the order of `NAMES`.
+        p: parameters [14] in SI units, in the order of `STANDARD_PARAMETER_NAMES`.
         mass: known mass in kg.
         nu: velocities u, v, r [N, 3].
         tau: forces [N, 3] in N, N, N m.
     """
     i_z, x_udot, y_vdot, y_rdot, n_vdot, n_rdot, x_u, y_v, y_r, n_v, n_r, x_uu, y_vv, n_rr = p
     u, v, r = nu.T
-    sway, yaw = (mass - y_vdot) * v - y_rdot * r, (mass - x_udot) * u
-    x = tau[:, 0] + sway * r + (x_u + x_uu * np.abs(u)) * u
-    y = tau[:, 1] - yaw * r + (y_v + y_vv * np.abs(v)) * v + y_r * r
-    n = tau[:, 2] - sway * u + yaw * v + n_v * v + (n_r + n_rr * np.abs(r)) * r
-    across, about = mass - y_vdot, i_z - n_rdot
-    determinant = max(across * about - y_rdot * n_vdot, _LEAST_DETERMINANT * mass * _INERTIA)
+    sway_momentum, surge_momentum = (mass - y_vdot) * v - y_rdot * r, (mass - x_udot) * u
+    x = tau[:, 0] + sway_momentum * r + (x_u + x_uu * np.abs(u)) * u
+    y = tau[:, 1] - surge_momentum * r + (y_v + y_vv * np.abs(v)) * v + y_r * r
+    n = tau[:, 2] - sway_momentum * u + surge_momentum * v + n_v * v + (n_r + n_rr * np.abs(r)) * r
+    sway_inertia, yaw_inertia = mass - y_vdot, i_z - n_rdot
+    determinant = max(
+        sway_inertia * yaw_inertia - y_rdot * n_vdot, _MIN_DETERMINANT * mass * _INERTIA
+    )
     return np.stack(
         (
             x / (mass - x_udot),
-            (about * y + y_rdot * n) / determinant,
-            (across * n + n_vdot * y) / determinant,
+            (yaw_inertia * y + y_rdot * n) / determinant,
+            (sway_inertia * n + n_vdot * y) / determinant,
         ),
         axis=1,
     )
 
 
-def fit(
+def fit_standard_model(
     nu: np.ndarray, tau: np.ndarray, nu_dot: np.ndarray, config: StandardFitConfig
 ) -> dict[str, Any]:
     """Fit the parameters with the least weighted squared error.
@@ -151,7 +158,7 @@ def fit(
 
     Returns:
         The fit as study.json holds it. By name `values` and `standard_errors` (None in directions
-        that the data leave open) of the parameters in SI units, and `sums`, pairs of estimate and
+        that the data leave open) of the parameters in SI units, and `inertia_sums`, pairs of estimate and
         standard error of the inertias; names of parameters that are `undetermined` but in
         combinations, or end `at_bound`; `condition`, the condition number of the scaled Jacobian
         without the open directions; `cost`, half the weighted sum of squared errors of each
@@ -163,79 +170,99 @@ def fit(
     from scipy.optimize import least_squares
 
     nu, tau, nu_dot = nu[:: config.thin], tau[:: config.thin], nu_dot[:: config.thin]
-    if 3 * len(nu) <= len(NAMES):
+    if 3 * len(nu) <= len(STANDARD_PARAMETER_NAMES):
         raise FitError(
-            f"the standard model's {len(NAMES)} parameters need more than {len(nu)} samples; give a"
+            f"the standard model's {len(STANDARD_PARAMETER_NAMES)} parameters need more than {len(nu)} samples; give a"
             " longer trial"
         )
-    root = np.sqrt(config.weights)
+    root_weights = np.sqrt(config.weights)
 
     def weighted_errors(p: np.ndarray) -> np.ndarray:
         return np.asarray(
-            ((nu_dot - accelerations(p * SCALE, config.mass, nu, tau)) * root).ravel()
+            (
+                (nu_dot - standard_accelerations(p * SCALE, config.mass, nu, tau)) * root_weights
+            ).ravel()
         )
 
-    found = [
+    solutions = [
         least_squares(
             weighted_errors,
             p / SCALE,
             jac="3-point",
-            bounds=(LOW / SCALE, HIGH / SCALE),
+            bounds=(LOWER / SCALE, UPPER / SCALE),
             method="trf",
         )
         for p in config.starting_points()
     ]
-    best = min(found, key=lambda answer: float(answer.cost))
-    if not np.isfinite(best.cost):
+    best_solution = min(solutions, key=lambda answer: float(answer.cost))
+    if not np.isfinite(best_solution.cost):
         raise FitError("the standard model's fit does not stay finite")
-    values = best.x * SCALE
-    near = np.minimum(values - LOW, HIGH - values) <= 1e-6 * SCALE
+    values = best_solution.x * SCALE
+    is_at_bound = np.minimum(values - LOWER, UPPER - values) <= 1e-6 * SCALE
     # a bound fixes what the data leave open: what the data determine is judged without bounds
-    jacobian, errors = np.asarray(best.jac), best.fun.reshape(-1, 3)
+    jacobian, errors = np.asarray(best_solution.jac), best_solution.fun.reshape(-1, 3)
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
-    kept = singular > _RANK * singular[0]
-    left_open = directions[~kept].T
-    noise = np.square(errors).mean(axis=0) * correlation_time(errors)
-    inner = jacobian[:, ~near]
-    inverse = np.linalg.pinv(inner.T @ inner, rcond=_RANK**2, hermitian=True)
-    middle = sum(noise[k] * inner[k::3].T @ inner[k::3] for k in range(3))
-    covariance = np.zeros((len(NAMES), len(NAMES)))
-    covariance[np.ix_(~near, ~near)] = inverse @ middle @ inverse
+    is_determined = singular > _RANK_TOLERANCE * singular[0]
+    open_directions = directions[~is_determined].T
+    noise = np.square(errors).mean(axis=0) * effective_correlation_length(errors)
+    free_jacobian = jacobian[:, ~is_at_bound]
+    bread = np.linalg.pinv(
+        free_jacobian.T @ free_jacobian, rcond=_RANK_TOLERANCE**2, hermitian=True
+    )
+    meat = sum(noise[k] * free_jacobian[k::3].T @ free_jacobian[k::3] for k in range(3))
+    covariance = np.zeros((len(STANDARD_PARAMETER_NAMES), len(STANDARD_PARAMETER_NAMES)))
+    covariance[np.ix_(~is_at_bound, ~is_at_bound)] = bread @ meat @ bread
 
-    def error(parts: Mapping[str, float]) -> float | None:
+    def sum_standard_error(factors: Mapping[str, float]) -> float | None:
         """Return the standard error of a sum of parameters; None where the data leave it open."""
-        along = np.array([parts.get(name, 0.0) for name in NAMES]) * SCALE
-        if np.linalg.norm(left_open.T @ along) > _OPEN_COMBINATION * np.linalg.norm(along):
+        combination = (
+            np.array([factors.get(name, 0.0) for name in STANDARD_PARAMETER_NAMES]) * SCALE
+        )
+        if np.linalg.norm(open_directions.T @ combination) > _MAX_OPEN_COMBINATION * np.linalg.norm(
+            combination
+        ):
             return None
-        return float(np.sqrt(max(along @ covariance @ along, 0.0)))
+        return float(np.sqrt(max(combination @ covariance @ combination, 0.0)))
 
-    by_name = dict(zip(NAMES, values.tolist(), strict=True))
-    loads = np.abs(left_open).max(axis=1, initial=0.0)
+    estimates = dict(zip(STANDARD_PARAMETER_NAMES, values.tolist(), strict=True))
+    open_components = np.abs(open_directions).max(axis=1, initial=0.0)
     return {
-        "values": by_name,
-        "standard_errors": {name: error({name: 1.0}) for name in NAMES},
-        "sums": {
-            name: [estimate, error(SUMS[name][1])]
-            for name, estimate in sums(by_name, config.mass).items()
+        "values": estimates,
+        "standard_errors": {
+            name: sum_standard_error({name: 1.0}) for name in STANDARD_PARAMETER_NAMES
         },
-        "undetermined": [NAMES[i] for i in np.flatnonzero(loads > _OPEN_SHARE)],
-        "at_bound": [NAMES[i] for i in np.flatnonzero(near)],
-        "condition": float(singular[0] / singular[kept][-1]),
-        "cost": sorted(float(answer.cost) for answer in found),
+        "sums": {
+            name: [estimate, sum_standard_error(INERTIA_SUMS[name][1])]
+            for name, estimate in inertia_sums(estimates, config.mass).items()
+        },
+        "undetermined": [
+            STANDARD_PARAMETER_NAMES[i]
+            for i in np.flatnonzero(open_components > _MAX_OPEN_COMPONENT)
+        ],
+        "at_bound": [STANDARD_PARAMETER_NAMES[i] for i in np.flatnonzero(is_at_bound)],
+        "condition": float(singular[0] / singular[is_determined][-1]),
+        "cost": sorted(float(solution.cost) for solution in solutions),
     }
 
 
-def truth(vessel: OdinConfig, mass: float) -> dict[str, float]:
+def true_parameters(vessel: AccelerationHullConfig, mass: float) -> dict[str, float]:
     """Return the true parameters of a vessel whose accelerations are known as terms.
 
     Terms that the standard model does not have are left out. The result is exact for a vessel
     without added mass and with the Coriolis terms v r and -u r, as in document 000.
     """
     gain = [1.0 / parameter.value for parameter in (vessel.gains.x, vessel.gains.y, vessel.gains.n)]
-    rows = values(vessel.terms)
-    places = {"X_u": (0, "u"), "Y_v": (1, "v"), "Y_r": (1, "r"), "N_v": (2, "v"), "N_r": (2, "r")}
-    places |= {"X_|u|u": (0, "u|u|"), "Y_|v|v": (1, "v|v|"), "N_|r|r": (2, "r|r|")}
-    parameters = dict.fromkeys(NAMES, 0.0) | {
-        name: gain[axis] * rows[axis].get(term, 0.0) for name, (axis, term) in places.items()
+    acceleration_terms = coefficient_rows(vessel.terms)
+    term_of_parameter = {
+        "X_u": (0, "u"),
+        "Y_v": (1, "v"),
+        "Y_r": (1, "r"),
+        "N_v": (2, "v"),
+        "N_r": (2, "r"),
+    }
+    term_of_parameter |= {"X_|u|u": (0, "u|u|"), "Y_|v|v": (1, "v|v|"), "N_|r|r": (2, "r|r|")}
+    parameters = dict.fromkeys(STANDARD_PARAMETER_NAMES, 0.0) | {
+        name: gain[axis] * acceleration_terms[axis].get(term, 0.0)
+        for name, (axis, term) in term_of_parameter.items()
     }
     return parameters | {"I_z": gain[2], "X_udot": mass - gain[0], "Y_vdot": mass - gain[1]}

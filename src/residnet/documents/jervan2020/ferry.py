@@ -23,100 +23,113 @@ from residnet.control.motion import ReferenceFilterConfig
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError, FitError, UsageError
 from residnet.core.files import read_json
-from residnet.core.format import DEG, number
-from residnet.core.frames import wrap
+from residnet.core.format import DEGREES_PER_RADIAN, format_number
+from residnet.core.frames import wrap_angle
 from residnet.core.layout import ACCELERATIONS, HEADING, POSE, POSITION, VELOCITIES
-from residnet.core.names import STATE, nearest
-from residnet.data.simulated import SimulatedTrials, fly_trials
+from residnet.core.names import STATE_NAMES, suggest_name
+from residnet.data.simulated import SimulatedTrials, simulate_trials
 from residnet.documents.jervan2020.ferry_loop import (
     Disturbance,
-    Feed,
-    Ferry,
-    Flight,
+    FeedForwardModel,
+    FerryRun,
+    FerrySimulation,
     LoopConfig,
     MotionNoise,
-    force_hull,
+    load_force_vessel,
 )
 from residnet.documents.jervan2020.residual import (
     AXES,
-    FittedModel,
-    Record,
+    ForceRecord,
+    ResidualForceModel,
     ResidualModelConfig,
-    as_baseline_yaml,
-    fit_as_json,
+    derive_forward_equations,
     fit_model,
-    forward_equations,
+    fit_to_json,
     missing_coefficients,
     model_figures,
     model_sections,
-    refitted,
+    refit_with_settings,
+    to_baseline_yaml,
 )
-from residnet.documents.study import Results, Study, compared, joined, notes_text, pictures
+from residnet.documents.study import (
+    StudyResults,
+    StudyTask,
+    comparison_columns,
+    find_figures,
+    format_notes,
+    join_numbers,
+)
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.export.feed_forward import ExportedForce, RequiredForce
 from residnet.heads.base import ZeroHead
-from residnet.judge.autopilots import mse
+from residnet.judge.autopilots import mean_squares_by_axis
 from residnet.manoeuvres.closed_loop import ZigzagFamily
-from residnet.physics.force_model import Correction, ForceModel
+from residnet.physics.force_model import ForceCorrection, ForceModel
 from residnet.physics.signals import FORCE_CHANNELS, SignalsConfig
-from residnet.report.blocks import Block, Cell, Section, Table, table_of
-from residnet.report.figure import DASHED, SOLID, Case, Figure, Panel, family
+from residnet.report.blocks import Block, Cell, Section, Table, build_table
+from residnet.report.figure import DASHED_STYLE, SOLID_STYLE, Case, Figure, Panel, style_family
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, ExportRequest, Exports, MainFigure, PartName
+from residnet.runs.task import ComputingTask, ExportRequest, ExportWriters, PartName, SummaryMetric
 
-_WORSE, _MATTERS, _MOST = 4.0, 0.02, 0.5
+_MAX_RESIDUAL_GROWTH, _MIN_VARIANCE_SHARE, _MIN_SEGMENT_SHARE = 4.0, 0.02, 0.5
 """A model no longer fits an axis where the mean square residual of a share of the segments, so that
 one gust or one wake is no reason, and of the whole log is so many times what it was, and more than
 a trifle of the force's variance. Chosen by hand.
 """
 
 
-def still_fits(then: Tensor, now: Tensor, force: Tensor, fold: Tensor) -> dict[str, Any]:
+def compare_residuals(
+    accepted_residual: Tensor, new_residual: Tensor, force: Tensor, fold: Tensor
+) -> dict[str, Any]:
     """Return whether a model still fits, by comparing residuals.
 
     Args:
-        then: residual on data that the model was accepted on [N, 3].
-        now: residual on new data [M, 3].
+        accepted_residual: residual on data that the model was accepted on [N, 3].
+        new_residual: residual on new data [M, 3].
         force: of the new data [M, 3].
         fold: segment of each new sample [M].
 
     Returns:
-        Whether the model `fits`; by axis `growth` (mean square residual now over then), `share` of
+        Whether the model `fits`; by axis `growth` (mean square residual now over then), `worse_share` of
         the force's variance, and `segments`, the share of those that show a worse fit.
     """
-    variance, before = force.var(0), then.square().mean(0)
-    segments = [now[fold == one].square().mean(0) for one in torch.unique(fold)]
+    variance, accepted_mse = force.var(0), accepted_residual.square().mean(0)
+    segments = [new_residual[fold == segment].square().mean(0) for segment in torch.unique(fold)]
     # the segments, and the whole log as the last row
-    squares = torch.stack([*segments, now.square().mean(0)])
-    worse = ((squares > _WORSE * before) & (squares > _MATTERS * variance)).to(torch.float64)
-    share = worse[:-1].mean(0)
+    squares = torch.stack([*segments, new_residual.square().mean(0)])
+    is_worse = (
+        (squares > _MAX_RESIDUAL_GROWTH * accepted_mse) & (squares > _MIN_VARIANCE_SHARE * variance)
+    ).to(torch.float64)
+    worse_share = is_worse[:-1].mean(0)
     return {
-        "fits": not bool((worse[-1].bool() & (share >= _MOST)).any()),
-        "growth": (squares[-1] / before.clamp(min=1e-300)).tolist(),
+        "fits": not bool((is_worse[-1].bool() & (worse_share >= _MIN_SEGMENT_SHARE)).any()),
+        "growth": (squares[-1] / accepted_mse.clamp(min=1e-300)).tolist(),
         "share": (squares[-1] / variance).tolist(),
-        "segments": share.tolist(),
+        "segments": worse_share.tolist(),
     }
 
 
-def _verdict_text(found: Results) -> str:
+def _verdict_text(comparison: StudyResults) -> str:
     growth, share = (
-        "/".join(f"{value:.3g}" for value in part)
-        for part in (found["growth"], [100 * value for value in found["share"]])
+        "/".join(f"{value:.3g}" for value in values)
+        for values in (comparison["growth"], [100 * value for value in comparison["share"]])
     )
-    sentence = "still fits" if found["fits"] else "no longer fits: identify it again from this log"
+    sentence = (
+        "still fits" if comparison["fits"] else "no longer fits: identify it again from this log"
+    )
     return (
         f"{sentence} (residual {growth} times what it was, {share} % of the force's variance;"
         " surge/sway/yaw)"
     )
 
 
-_BELIEVED = "believed"
-_FARTHEST = 3.0
+_BELIEVED_NAME = "believed"
+_DIVERGENCE_FACTOR = 3.0
 """Velocities of a free run in largest velocities of the true ferry from which it has diverged."""
 
 
-class Published(Config):
+class PublishedFigures(Config):
     """Figures that document 002 prints for one model, to stand beside the figures of a run.
 
     The numbers stand as printed, except where a correction of the document says otherwise. A figure
@@ -141,7 +154,7 @@ class Published(Config):
             (Table 4.11), by basis function.
     """
 
-    mse: tuple[float, float, float] | None = None
+    mean_squares_by_axis: tuple[float, float, float] | None = None
     position_mae: float | None = None
     position_mse: float | None = None
     heading_mae: float | None = None
@@ -155,7 +168,7 @@ class Published(Config):
     coefficients: dict[str, tuple[float, float, float]] = Field(default_factory=dict)
 
 
-_FORWARD: Mapping[str, Any] = {
+_FREE_RUN_TRIALS: Mapping[str, Any] = {
     "trials": (
         ZigzagFamily(count=6, drive=(0.03, 0.07), steer=(0.01, 0.03), heading=(0.17, 0.35)),
     ),
@@ -184,11 +197,11 @@ class FerryModelConfig(ResidualModelConfig):
     smooth: bool | None = None
     on: str = ""
     fly: bool = False
-    published: Published = Published()
+    published: PublishedFigures = PublishedFigures()
 
 
 @final
-class FerryStudyConfig(Study, ComputingTask):
+class FerryStudyConfig(StudyTask, ComputingTask):
     """A course with the believed model, residual models identified from it, and the course again.
 
     Attributes:
@@ -220,267 +233,312 @@ class FerryStudyConfig(Study, ComputingTask):
     disturbance: Disturbance = Disturbance()
     feed_forward_alone: bool = False
     models: dict[PartName, FerryModelConfig] = Field(min_length=1)
-    published: Published = Published()
+    published: PublishedFigures = PublishedFigures()
     later: str | None = None
     seed: int = Field(default=0, ge=0)
 
-    verbs: ClassVar[tuple[str, ...]] = ("report", "export")
+    supported_commands: ClassVar[tuple[str, ...]] = ("report", "export")
 
     @model_validator(mode="after")
-    def _combination(self) -> FerryStudyConfig:
-        known: list[str] = []
+    def _check_combination(self) -> FerryStudyConfig:
+        previous_names: list[str] = []
         for name, model in self.models.items():
-            if name == _BELIEVED:
+            if name == _BELIEVED_NAME:
                 raise ValueError("'believed' cannot name a model: it is the controller's own")
-            if model.on and model.on not in known:
+            if model.on and model.on not in previous_names:
                 raise ValueError(
                     f"models.{name}.on: no model before it is named"
-                    f" '{model.on}'{nearest(model.on, known)}"
+                    f" '{model.on}'{suggest_name(model.on, previous_names)}"
                 )
-            below = self.models.get(model.on)
-            if below and (below.searched or bool(below.lag) != bool(model.lag)):
+            base_model = self.models.get(model.on)
+            if base_model and (
+                base_model.searches_settings or bool(base_model.lag) != bool(model.lag)
+            ):
                 raise ValueError(
                     f"models.{name}.on: '{model.on}' and it must both be with lag or without; say"
                     " which of both by 'lag'"
                 )
-            known.append(name)
+            previous_names.append(name)
         if len(self.course.waypoints) < 4:
             raise ValueError(
                 "course: at least four waypoints; half of them identify, segment by segment, and"
                 " half test"
             )
         try:
-            for true in (self.true, self.later or self.true):
-                self.ferry(true)
+            for plant_name in (self.true, self.later or self.true):
+                self.build_loop(plant_name)
             self.course.build(self.loop.step)
         except ConfigError as error:
             raise ValueError(str(error)) from None
         return self
 
-    def recorded_seed(self) -> int:
+    def provenance_seed(self) -> int:
         return self.seed
 
-    def ferry(self, true: str) -> Ferry:
+    def build_loop(self, true: str) -> FerrySimulation:
         """Return the loop with one vessel as the true one."""
-        return Ferry(true, self.believed, self.loop, self.noise, self.disturbance, self.seed)
+        return FerrySimulation(
+            true, self.believed, self.loop, self.noise, self.disturbance, self.seed
+        )
 
-    def results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
-        return written(self, study(self), folder)
+    def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
+        return write_results(self, run_ferry_study(self), folder)
 
-    def exports(self, folder: RunFolder) -> Exports:
+    def exports(self, folder: RunFolder) -> ExportWriters:
         return {
             name: partial(self.export_model, ExportRequest(folder, name)) for name in self.models
         }
 
-    def export_model(self, asked: ExportRequest) -> Path:
+    def export_model(self, request: ExportRequest) -> Path:
         """Write the feed-forward of a model; `selected` leaves the least of the residual force."""
-        run, results = asked.run, read_json(asked.run.path / self.results_file)
-        name = best_model(results) if asked.model == "selected" else asked.model
+        run, results = request.run, read_json(request.run.path / self.results_file)
+        name = find_best_model(results) if request.model == "selected" else request.model
         if name not in self.models:
-            raise UsageError(f"{run.path}: no model '{name}'{nearest(name, self.models)}")
+            raise UsageError(f"{run.path}: no model '{name}'{suggest_name(name, self.models)}")
         chain = [name]
-        while below := self.models[chain[0]].on:
-            chain.insert(0, below)
-        rows = [results["models"][one]["exported"] for one in chain]
-        force = ForceModel(force_hull(self.believed)[0].hull)
-        for row in rows:
-            numbers = (torch.tensor(row[key]).double() for key in ("coefficients", "intercept"))
-            force = force.extended(Correction(row["terms"], *numbers))
-        ranges = [(low, high) for low, high in rows[-1]["range"]]
-        made = RequiredForce(*force.parts(), mirrored=True)
-        exported = ExportedForce(name, made, ranges, rows[-1]["notes"].get("lag"))
-        return asked.write(exported, objections(name, results), f"{name}_feed_forward")
+        while base_name := self.models[chain[0]].on:
+            chain.insert(0, base_name)
+        chain_rows = [results["models"][name_in_chain]["exported"] for name_in_chain in chain]
+        force = ForceModel(load_force_vessel(self.believed)[0].hull)
+        for row in chain_rows:
+            tensors = (torch.tensor(row[key]).double() for key in ("coefficients", "intercept"))
+            force = force.with_correction(ForceCorrection(row["terms"], *tensors))
+        ranges = [(lower, upper) for lower, upper in chain_rows[-1]["range"]]
+        required_force = RequiredForce(*force.split_corrections(), is_mirrored=True)
+        exported = ExportedForce(name, required_force, ranges, chain_rows[-1]["notes"].get("lag"))
+        return request.write(
+            exported, list_feed_forward_objections(name, results), f"{name}_feed_forward"
+        )
 
-    def verdict(self, results: Results) -> list[str]:
-        models, best = results["models"], best_model(results)
-        left = joined([100 * share for share in models[best]["share_left"]])
+    def summarize(self, results: StudyResults) -> list[str]:
+        models, best_name = results["models"], find_best_model(results)
+        remaining_text = join_numbers([100 * share for share in models[best_name]["share_left"]])
         sentences = [
-            f"Of {len(models)} residual models, {best} leaves the least of the residual force on"
-            f" the unseen half of the course: {left} % of its mean square in surge, sway and yaw."
+            f"Of {len(models)} residual models, {best_name} leaves the least of the residual force on"
+            f" the unseen half of the course: {remaining_text} % of its mean square in surge, sway and yaw."
         ]
-        for kind in ("course", "crossing"):
-            missed = {name: flight["position_mae"] for name, flight in results[kind].items()}
-            before = missed.pop(_BELIEVED, None)
-            if missed:
-                closest = min(missed, key=missed.__getitem__)
-                moves = "falls" if missed[closest] < before else "does NOT fall: it goes"
+        for run_kind in ("course", "crossing"):
+            position_errors = {name: run["position_mae"] for name, run in results[run_kind].items()}
+            believed_error = position_errors.pop(_BELIEVED_NAME, None)
+            if position_errors:
+                closest_model = min(position_errors, key=position_errors.__getitem__)
+                change_text = (
+                    "falls"
+                    if position_errors[closest_model] < believed_error
+                    else "does NOT fall: it goes"
+                )
                 sentences.append(
-                    f"With {closest} as feed-forward, the mean position error in the {kind} {moves}"
-                    f" from {number(before)} m to {number(missed[closest])} m."
+                    f"With {closest_model} as feed-forward, the mean position error in the {run_kind} {change_text}"
+                    f" from {format_number(believed_error)} m to {format_number(position_errors[closest_model])} m."
                 )
         return sentences + [
             f"On the vessel as it is later, {name} {update['text']}."
             for name, update in results["later"].items()
         ]
 
-    def main_figures(self, results: Results) -> dict[str, MainFigure]:
-        best = best_model(results)
-        shares = zip(AXES, results["models"][best]["share_left"], strict=True)
-        return {f"residual left by {best}, {axis}": MainFigure(share) for axis, share in shares} | {
-            f"mean position error on the course with {name}": MainFigure(
-                flight["position_mae"], "m"
+    def main_figures(self, results: StudyResults) -> dict[str, SummaryMetric]:
+        best_name = find_best_model(results)
+        shares = zip(AXES, results["models"][best_name]["share_left"], strict=True)
+        return {
+            f"residual left by {best_name}, {axis}": SummaryMetric(share) for axis, share in shares
+        } | {
+            f"mean position error on the course with {name}": SummaryMetric(
+                run["position_mae"], "m"
             )
-            for name, flight in results["course"].items()
+            for name, run in results["course"].items()
         }
 
-    def sections(self, results: Results, run: Path) -> list[Section]:
-        left = _residuals(self, results)
-        drawn = [one.part() for one in pictures(run, "errors_course", "errors_crossing")]
-        out = [
-            Section("", [*drawn[:1], left.part(3, 6)]),
-            Section("Residual force on the unseen half", [left]),
+    def build_sections(self, results: StudyResults, run: Path) -> list[Section]:
+        residual_table = _residual_table(self, results)
+        run_pictures = [
+            picture.preview() for picture in find_figures(run, "errors_course", "errors_crossing")
         ]
-        for kind, title in (
+        sections_written = [
+            Section("", [*run_pictures[:1], residual_table.select_columns(3, 6)]),
+            Section("Residual force on the unseen half", [residual_table]),
+        ]
+        for run_kind, title in (
             ("course", "Course in closed loop"),
             ("crossing", "Operational crossing"),
             ("feed_forward_alone", "Feed-forward without feedback"),
         ):
-            if results[kind]:
-                drawn = pictures(run, f"errors_{kind}", f"forces_{kind}")
-                out.append(Section(title, [*_flown(self, results[kind], kind), *drawn]))
+            if results[run_kind]:
+                run_pictures = find_figures(run, f"errors_{run_kind}", f"forces_{run_kind}")
+                sections_written.append(
+                    Section(
+                        title, [*_tracking_tables(self, results[run_kind], run_kind), *run_pictures]
+                    )
+                )
         if results["later"]:
-            out.append(Section("The vessel as it is later", [_later(results["later"])]))
-        out.append(Section("Forward in time", [_forward(results["forward"])]))
+            sections_written.append(
+                Section("The vessel as it is later", [_update_table(results["later"])])
+            )
+        sections_written.append(Section("Forward in time", [_free_run_table(results["forward"])]))
         # Table 4.11
-        others = {
+        comparisons = {
             name: {
                 "true": {} if model.on else results["true_coefficients"],
                 "published": model.published.coefficients,
             }
             for name, model in self.models.items()
         }
-        return out + model_sections("Coefficients", results["models"], run, "notes", others)
+        return sections_written + model_sections(
+            "Coefficients", results["models"], run, "notes", comparisons
+        )
 
 
-def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> FittedModel:
+def identify_model(
+    config: FerryModelConfig, record: ForceRecord, base: ForceModel
+) -> ResidualForceModel:
     """Fit one model on the training samples.
 
     Raises:
         FitError: where the data do not determine the model.
     """
-    return fit_model(config, smoothed(config, record), base)
+    return fit_model(config, smooth_for_fit(config, record), base)
 
 
-def smoothed(config: FerryModelConfig, record: Record) -> Record:
+def smooth_for_fit(config: FerryModelConfig, record: ForceRecord) -> ForceRecord:
     """Return the record as a model is identified from it."""
-    wanted = config.searched if config.smooth is None else config.smooth
-    return record.smoothed() if wanted and any(record.noise) else record
+    should_smooth = config.searches_settings if config.smooth is None else config.smooth
+    return record.smooth() if should_smooth and any(record.noise) else record
 
 
 @dataclass(frozen=True)
-class Flown:
+class FerryStudy:
     """Everything that was flown and fitted.
 
     Attributes:
-        first: the course with the believed model, from which the models are identified.
+        believed_run: the course with the believed model, from which the models are identified.
         record: its log, of which one half identifies the models and the other tests them.
-        unmodelled: mean square of the believed model's residual on the test half, by axis in N^2,
+        unmodelled_mse: mean square of the believed model's residual on the test half, by axis in N^2,
             N^2, (N m)^2.
         models: fitted models by name, each from one half of the course.
-        whole: those that search their settings, fitted to the whole course as they are exported.
-        flights: by model, `believed` first, of the `course`, the `crossing`, and the course without
+        whole_course_models: those that search their settings, fitted to the whole course as they are exported.
+        runs: by model, `believed` first, of the `course`, the `crossing`, and the course without
             feedback (`feed_forward_alone`); empty where they were not flown.
-        later: each model that flies, on the vessel as it is later: whether it still fits, and how
+        updates: each model that flies, on the vessel as it is later: whether it still fits, and how
             the course is followed before and after it was identified again where it does not.
     """
 
-    first: Flight
-    record: Record
-    unmodelled: list[float]
-    models: dict[str, FittedModel]
-    whole: dict[str, FittedModel]
-    flights: dict[str, dict[str, Flight]]
-    later: dict[str, dict[str, Any]]
+    believed_run: FerryRun
+    record: ForceRecord
+    unmodelled_mse: list[float]
+    models: dict[str, ResidualForceModel]
+    whole_course_models: dict[str, ResidualForceModel]
+    runs: dict[str, dict[str, FerryRun]]
+    updates: dict[str, dict[str, Any]]
 
 
-def record_of(flight: Flight, interval: float, noise: MotionNoise | None) -> Record:
+def build_record(run: FerryRun, interval: float, noise: MotionNoise | None) -> ForceRecord:
     """Return the log of a course with a fold for each segment; its first half identifies.
 
     Args:
-        flight: the course as it was flown.
+        run: the course as it was flown.
         interval: time from one waypoint to the next in s.
         noise: what is known of the sensors; None for none.
     """
-    return Record(
-        flight.t,
-        flight.measured[:, POSE],
-        flight.measured[:, VELOCITIES],
-        flight.measured[:, ACCELERATIONS],
-        flight.command,
-        flight.averaged,
-        torch.div(flight.t + 1e-9, interval, rounding_mode="floor").long(),
-        torch.arange(len(flight.t)) < len(flight.t) // 2,
-        (noise or MotionNoise()).spread(),
+    return ForceRecord(
+        run.t,
+        run.measured[:, POSE],
+        run.measured[:, VELOCITIES],
+        run.measured[:, ACCELERATIONS],
+        run.command,
+        run.averaged_command,
+        torch.div(run.t + 1e-9, interval, rounding_mode="floor").long(),
+        torch.arange(len(run.t)) < len(run.t) // 2,
+        (noise or MotionNoise()).standard_deviations(),
     )
 
 
-def study(config: FerryStudyConfig) -> Flown:
+def run_ferry_study(config: FerryStudyConfig) -> FerryStudy:
     """Fly with the believed model, identify residual models, and fly with these.
 
     Raises:
         ResidnetError: where a model cannot be identified or flown.
     """
-    ferry = config.ferry(config.true)
-    believed = ForceModel(ferry.believed)
-    first = ferry.fly(config.course, [(believed, None)])[0]
-    record = record_of(first, config.course.interval, config.noise)
-    residual = believed.residual(record.command, record.nu_dot, record.nu, record.pose[:, HEADING])
-    models: dict[str, FittedModel] = {}
+    ferry = config.build_loop(config.true)
+    believed = ForceModel(ferry.believed_hull)
+    believed_run = ferry.simulate(config.course, [(believed, None)])[0]
+    record = build_record(believed_run, config.course.interval, config.noise)
+    residual = believed.force_residual(
+        record.command, record.nu_dot, record.nu, record.pose[:, HEADING]
+    )
+    models: dict[str, ResidualForceModel] = {}
     for name, model in config.models.items():
-        models[name] = identify(model, record, models[model.on].force if model.on else believed)
-    every_sample = replace(record, train=torch.ones_like(record.train))
+        models[name] = identify_model(
+            model, record, models[model.on].force if model.on else believed
+        )
+    whole_record = replace(record, is_training=torch.ones_like(record.is_training))
     # what a half chose and the other judged leaves with the coefficients of both
-    whole = {
-        name: refitted(model, models[name], smoothed(model, every_sample), believed)
+    whole_course_models = {
+        name: refit_with_settings(
+            model, models[name], smooth_for_fit(model, whole_record), believed
+        )
         for name, model in config.models.items()
-        if model.searched and not model.on and models[name].fit.notes["order"] > 0
+        if model.searches_settings and not model.on and models[name].fit.notes["order"] > 0
     }
-    flying = {name: models[name] for name, model in config.models.items() if model.fly}
-    every: dict[str, Feed] = {_BELIEVED: (believed, None)}
-    every |= {name: (model.force, model.lag) for name, model in flying.items()}
+    feed_forward_models = {name: models[name] for name, model in config.models.items() if model.fly}
+    feeds_by_name: dict[str, FeedForwardModel] = {_BELIEVED_NAME: (believed, None)}
+    feeds_by_name |= {name: (model.force, model.lag) for name, model in feed_forward_models.items()}
 
-    def flown(
-        craft: Ferry,
+    def simulate_runs(
+        loop: FerrySimulation,
         path: ReferenceFilterConfig | CrossingConfig,
         names: Iterable[str],
-        **how: bool,
-    ) -> dict[str, Flight]:
-        feeds = {name: every[name] for name in names}
+        **options: bool,
+    ) -> dict[str, FerryRun]:
+        feeds = {name: feeds_by_name[name] for name in names}
         if not feeds:
             return {}
-        return dict(zip(feeds, craft.fly(path, list(feeds.values()), **how), strict=True))
+        return dict(zip(feeds, loop.simulate(path, list(feeds.values()), **options), strict=True))
 
-    later: dict[str, dict[str, Any]] = {}
+    updates: dict[str, dict[str, Any]] = {}
     if config.later is not None:
-        changed = config.ferry(config.later)
-        for name, flight in flown(changed, config.course, flying).items():
-            log = record_of(flight, config.course.interval, config.noise)
-            before, now = (flying[name].remaining(of) for of in (record, log))
-            verdict = still_fits(before[~record.train], now, log.command, log.fold)
-            after = flight
+        changed_loop = config.build_loop(config.later)
+        for name, run in simulate_runs(changed_loop, config.course, feed_forward_models).items():
+            log = build_record(run, config.course.interval, config.noise)
+            previous_residual, new_residual = (
+                feed_forward_models[name].residual_along(compared_record)
+                for compared_record in (record, log)
+            )
+            verdict = compare_residuals(
+                previous_residual[~record.is_training], new_residual, log.command, log.fold
+            )
+            updated_run = run
             if not verdict["fits"]:
-                again = identify(config.models[name], log, believed)
-                after = changed.fly(config.course, [(again.force, again.lag)])[0]
-            later[name] = {
+                updated_model = identify_model(config.models[name], log, believed)
+                updated_run = changed_loop.simulate(
+                    config.course, [(updated_model.force, updated_model.lag)]
+                )[0]
+            updates[name] = {
                 "verdict": verdict,
                 "text": _verdict_text(verdict),
-                "before": flight.tracking.row(),
-                "after": after.tracking.row(),
+                "before": run.tracking_metrics.to_json(),
+                "after": updated_run.tracking_metrics.to_json(),
             }
-    return Flown(
-        first,
+    return FerryStudy(
+        believed_run,
         record,
-        mse(residual[~record.train]),
+        mean_squares_by_axis(residual[~record.is_training]),
         models,
-        whole,
+        whole_course_models,
         {
-            "course": {_BELIEVED: first, **flown(ferry, config.course, flying)},
-            "crossing": flown(ferry, config.crossing, every) if config.crossing else {},
-            "feed_forward_alone": flown(
-                ferry, config.course, every if config.feed_forward_alone else (), feedback=False
+            "course": {
+                _BELIEVED_NAME: believed_run,
+                **simulate_runs(ferry, config.course, feed_forward_models),
+            },
+            "crossing": simulate_runs(ferry, config.crossing, feeds_by_name)
+            if config.crossing
+            else {},
+            "feed_forward_alone": simulate_runs(
+                ferry,
+                config.course,
+                feeds_by_name if config.feed_forward_alone else (),
+                feedback=False,
             ),
         },
-        later,
+        updates,
     )
 
 
@@ -497,39 +555,39 @@ def forward_runs(
         By model, `believed` first: `rmse` of u, v, r in m/s, m/s, rad/s over the runs that did not
         diverge (None without any), `runs`, and `diverged`, how many of them did.
     """
-    trials = SimulatedTrials(vessel=config.true, **_FORWARD)
-    logs = [flight.motion for flight in fly_trials(trials.draw(), trials)]
+    trials = SimulatedTrials(vessel=config.true, **_FREE_RUN_TRIALS)
+    logs = [flight.true_log for flight in simulate_trials(trials.draw_manoeuvres(), trials)]
     # one that ended early shows no free run
     logs = [log for log in logs if len(log) == max(map(len, logs))]
-    thrusters = force_hull(config.true)[1]
+    thrusters = load_force_vessel(config.true)[1]
     x, commands = (
         torch.from_numpy(
             np.stack([np.stack([log.channels[name] for name in names], 1) for log in logs])
         )
-        for names in (STATE, thrusters.commands)
+        for names in (STATE_NAMES, thrusters.command_names)
     )
-    w = thrusters.asked(commands)[:, :-1]
-    limit = _FARTHEST * x[..., VELOCITIES].abs().amax(dim=(0, 1))
-    known = BelievedConfig(vessel=config.believed).equations()
-    signals, out = SignalsConfig(inputs=FORCE_CHANNELS).build(), {}
-    for name, equations in {_BELIEVED: known, **models}.items():
+    w = thrusters.requested_force(commands)[:, :-1]
+    velocity_limit = _DIVERGENCE_FACTOR * x[..., VELOCITIES].abs().amax(dim=(0, 1))
+    believed_equations = BelievedConfig(vessel=config.believed).hull_equations()
+    signals, rows = SignalsConfig(inputs=FORCE_CHANNELS).build(), {}
+    for name, equations in {_BELIEVED_NAME: believed_equations, **models}.items():
         baseline = BelievedConfig(vessel=equations).build(signals.names)
         model = HybridDynamics(signals, baseline, ZeroHead(), trials.step).double()
         with torch.no_grad():
-            ran = Rollout(model)(x[:, 0], w, x[:, 0, :0])[0]
-        beyond = (ran[..., VELOCITIES].abs() > limit).any(dim=-1)
-        away = (~torch.isfinite(ran).all(dim=-1) | beyond).any(dim=-1)
-        kept = (ran - x)[~away][..., VELOCITIES]
-        out[name] = {
-            "rmse": kept.square().mean(dim=(0, 1)).sqrt().tolist() if len(kept) else None,
+            trajectories = Rollout(model)(x[:, 0], w, x[:, 0, :0])[0]
+        is_outside = (trajectories[..., VELOCITIES].abs() > velocity_limit).any(dim=-1)
+        has_diverged = (~torch.isfinite(trajectories).all(dim=-1) | is_outside).any(dim=-1)
+        errors = (trajectories - x)[~has_diverged][..., VELOCITIES]
+        rows[name] = {
+            "rmse": errors.square().mean(dim=(0, 1)).sqrt().tolist() if len(errors) else None,
             "runs": len(x),
-            "diverged": int(away.sum()),
+            "diverged": int(has_diverged.sum()),
         }
-    return out
+    return rows
 
 
-def written(
-    config: FerryStudyConfig, found: Flown, folder: RunFolder
+def write_results(
+    config: FerryStudyConfig, study_result: FerryStudy, folder: RunFolder
 ) -> tuple[dict[str, Any], list[Figure]]:
     """Return the contents of ferry.json and the figures of a study.
 
@@ -537,243 +595,274 @@ def written(
     """
     figures: list[Figure] = []
     equations: dict[str, HullEquations] = {}
-    refused = dict.fromkeys(found.models, "")
-    for name, model in found.models.items():
-        figures += model_figures(name, config.models[name], model.fit, found.unmodelled)
+    refusals = dict.fromkeys(study_result.models, "")
+    for name, model in study_result.models.items():
+        figures += model_figures(name, config.models[name], model.fit, study_result.unmodelled_mse)
         try:
-            equations[name] = forward_equations(config.believed, model.force, f"model {name}")
+            equations[name] = derive_forward_equations(
+                config.believed, model.force, f"model {name}"
+            )
         except (ConfigError, FitError) as error:
-            refused[name] = str(error)
+            refusals[name] = str(error)
     forward = forward_runs(config, equations)
-    for name, of_model in equations.items():
+    for name, model_equations in equations.items():
         if forward[name]["diverged"]:
-            refused[name] = (
+            refusals[name] = (
                 f"model {name}: it diverges in {forward[name]['diverged']} of"
                 f" {forward[name]['runs']} free runs beside the true ferry, so its equations are"
                 " not written; take a model with fewer terms or with lag"
             )
         else:
-            text = as_baseline_yaml(of_model, f"run {config.name}, model {name}")
+            text = to_baseline_yaml(model_equations, f"run {config.name}, model {name}")
             folder.write(folder.path / "models" / f"{name}_forward.yaml", text)
     models = {}
-    for name, model in found.models.items():
-        left = model.test_mse(found.record)
+    for name, model in study_result.models.items():
+        test_mse = model.test_mse(study_result.record)
         models[name] = {
-            "test_mse": left,
-            "share_left": [a / b for a, b in zip(left, found.unmodelled, strict=True)],
+            "test_mse": test_mse,
+            "share_left": [
+                a / b for a, b in zip(test_mse, study_result.unmodelled_mse, strict=True)
+            ],
             "notes": model.fit.notes,
-            "not_forward": refused[name],
-            **fit_as_json(config.models[name].terms, model.fit),
-            "exported": _exported(config.models[name].terms, found, name),
+            "not_forward": refusals[name],
+            **fit_to_json(config.models[name].terms, model.fit),
+            "exported": _exported_model(config.models[name].terms, study_result, name),
         }
-    for kind, flown in found.flights.items():
-        figures += _flights(flown, kind) if flown else []
+    for run_kind, runs in study_result.runs.items():
+        figures += _run_figures(runs, run_kind) if runs else []
     content = {
         "schema": "residnet.ferry/1",
         "run": config.name,
-        "unmodelled_test_mse": found.unmodelled,
+        "unmodelled_test_mse": study_result.unmodelled_mse,
         "true_coefficients": missing_coefficients(config.true, config.believed),
         "models": models,
         **{
-            kind: {name: flight.tracking.row() for name, flight in flown.items()}
-            for kind, flown in found.flights.items()
+            run_kind: {name: run.tracking_metrics.to_json() for name, run in runs.items()}
+            for run_kind, runs in study_result.runs.items()
         },
-        "later": found.later,
+        "later": study_result.updates,
         "forward": forward,
     }
     return content, figures
 
 
-def _exported(terms: Sequence[str], found: Flown, name: str) -> dict[str, Any]:
+def _exported_model(terms: Sequence[str], study_result: FerryStudy, name: str) -> dict[str, Any]:
     """Return a model as it is exported, with the range of what it was fitted to."""
-    record, model = found.record, found.models[name]
-    if name in found.whole:
-        record, model = replace(record, train=torch.ones_like(record.train)), found.whole[name]
-    ranges = record.ranges(mirror=bool(model.fit.notes.get("mirror")))
-    return {**fit_as_json(terms, model.fit), "notes": model.fit.notes, "range": ranges}
+    record, model = study_result.record, study_result.models[name]
+    if name in study_result.whole_course_models:
+        record, model = (
+            replace(record, is_training=torch.ones_like(record.is_training)),
+            study_result.whole_course_models[name],
+        )
+    ranges = record.motion_ranges(mirror=bool(model.fit.notes.get("mirror")))
+    return {**fit_to_json(terms, model.fit), "notes": model.fit.notes, "range": ranges}
 
 
-def _flights(flights: Mapping[str, Flight], kind: str) -> list[Figure]:
-    t = next(iter(flights.values())).t.numpy()
-    apart = {name: flight.desired - flight.pose for name, flight in flights.items()}
+def _run_figures(runs: Mapping[str, FerryRun], run_kind: str) -> list[Figure]:
+    t = next(iter(runs.values())).t.numpy()
+    pose_errors = {name: run.desired_pose - run.pose for name, run in runs.items()}
     # the scales are logarithmic, since models differ by orders of magnitude
     position = {
-        name: (t, off[:, POSITION].norm(dim=-1).clamp(min=1e-5).numpy())
-        for name, off in apart.items()
+        name: (t, pose_error[:, POSITION].norm(dim=-1).clamp(min=1e-5).numpy())
+        for name, pose_error in pose_errors.items()
     }
     heading = {
-        name: (t, (DEG * wrap(off[:, HEADING]).abs()).clamp(min=1e-4).numpy())
-        for name, off in apart.items()
+        name: (
+            t,
+            (DEGREES_PER_RADIAN * wrap_angle(pose_error[:, HEADING]).abs()).clamp(min=1e-4).numpy(),
+        )
+        for name, pose_error in pose_errors.items()
     }
-    shared: Any = {"x_label": "time [s]", "height": 210, "group": "t", "y_log": True}
+    panel_settings: Any = {"x_label": "time [s]", "height": 210, "group": "t", "y_log": True}
     errors = Figure(
-        f"errors_{kind}",
+        f"errors_{run_kind}",
         "Errors in closed loop",
         "Distance to the desired position and magnitude of the heading error over time, by"
         " model of the feed-forward.",
-        family(flights, width=1.1),
-        [Panel("position error [m]", **shared), Panel("heading error [deg]", **shared)],
+        style_family(runs, width=1.1),
+        [
+            Panel("position error [m]", **panel_settings),
+            Panel("heading error [deg]", **panel_settings),
+        ],
         [Case("", [position, heading])],
     )
-    if not any(bool(flight.feedback.any()) for flight in flights.values()):
+    if not any(bool(run.feedback.any()) for run in runs.values()):
         return [errors]
-    shown = dict(list(flights.items())[:3])
+    shown_runs = dict(list(runs.items())[:3])
     units = ("surge [N]", "sway [N]", "yaw [N m]")
     forces = Figure(
-        f"forces_{kind}",
+        f"forces_{run_kind}",
         "Forces in closed loop",
         "Commanded force and the part of it that is feedback, by model of the feed-forward.",
         {
-            "command": replace(SOLID, label="commanded force", width=1.0),
-            "feedback": replace(DASHED, label="feedback part", width=1.0),
+            "command": replace(SOLID_STYLE, label="commanded force", width=1.0),
+            "feedback": replace(DASHED_STYLE, label="feedback part", width=1.0),
         },
         [
             Panel(unit, "time [s]", name if not axis else "", height=165, group=name)
             for axis, unit in enumerate(units)
-            for name in shown
+            for name in shown_runs
         ],
         [
             Case(
                 "",
                 [
                     {
-                        part: (t, getattr(flight, part)[:, axis].numpy())
+                        part: (t, getattr(run, part)[:, axis].numpy())
                         for part in ("command", "feedback")
                     }
                     for axis in range(3)
-                    for flight in shown.values()
+                    for run in shown_runs.values()
                 ],
             )
         ],
-        columns=len(shown),
+        columns=len(shown_runs),
     )
     return [errors, forces]
 
 
-def objections(name: str, results: Results) -> list[str]:
+def list_feed_forward_objections(name: str, results: StudyResults) -> list[str]:
     """Return what speaks against a feed-forward rather than the believed one.
 
     That is what it leaves of the residual force on the unseen half, mean over the axes, and the
     position error of every flight with it.
     """
     shares = results["models"][name]["share_left"]
-    out = []
+    reasons = []
     if sum(shares) > len(shares):
-        left = joined([100 * share for share in shares])
-        out.append(
-            f"on the unseen half it leaves {left} % of the residual force in surge, sway and yaw"
+        remaining_text = join_numbers([100 * share for share in shares])
+        reasons.append(
+            f"on the unseen half it leaves {remaining_text} % of the residual force in surge, sway and yaw"
         )
-    for kind in ("course", "crossing", "feed_forward_alone"):
-        if name in (flights := results[kind]):
-            own, known = (flights[one]["position_mae"] for one in (name, _BELIEVED))
-            if own > known:
-                out.append(
-                    f"its mean position error in the {kind.replace('_', ' ')} is {number(own)} m,"
-                    f" the believed model's {number(known)} m"
+    for run_kind in ("course", "crossing", "feed_forward_alone"):
+        if name in (runs := results[run_kind]):
+            model_error, believed_error = (
+                runs[model_name]["position_mae"] for model_name in (name, _BELIEVED_NAME)
+            )
+            if model_error > believed_error:
+                reasons.append(
+                    f"its mean position error in the {run_kind.replace('_', ' ')} is {format_number(model_error)} m,"
+                    f" the believed model's {format_number(believed_error)} m"
                 )
-    return out
+    return reasons
 
 
-def best_model(results: Results) -> str:
+def find_best_model(results: StudyResults) -> str:
     """Return the model that leaves the least of the residual."""
-    models: Results = results["models"]
+    models: StudyResults = results["models"]
     return min(models, key=lambda name: float(sum(models[name]["share_left"])))
 
 
-def _residuals(config: FerryStudyConfig, results: Results) -> Table:
+def _residual_table(config: FerryStudyConfig, results: StudyResults) -> Table:
     """Return the table of the remaining residual (Tables 4.2, 4.5, 4.7 and 4.15)."""
-    unmodelled, base = results["unmodelled_test_mse"], config.published.mse
+    unmodelled, published_base = results["unmodelled_test_mse"], config.published.mse
     rows = []
-    first = {"test_mse": unmodelled, "notes": {}}
-    for name, model in {_BELIEVED: first, **results["models"]}.items():
-        given = config.published if name == _BELIEVED else config.models[name].published
-        both = {"ours": (model["test_mse"], unmodelled), "published": (given.mse, base)}
-        left = {
-            who: [100 * a / b for a, b in zip(mine, of, strict=True)] if mine and of else None
-            for who, (mine, of) in both.items()
+    believed_row = {"test_mse": unmodelled, "notes": {}}
+    for name, model in {_BELIEVED_NAME: believed_row, **results["models"]}.items():
+        published_figures = (
+            config.published if name == _BELIEVED_NAME else config.models[name].published
+        )
+        compared_values = {
+            "ours": (model["test_mse"], unmodelled),
+            "published": (published_figures.mse, published_base),
+        }
+        remaining_percent = {
+            origin: [100 * a / b for a, b in zip(model_mse, base_mse, strict=True)]
+            if model_mse and base_mse
+            else None
+            for origin, (model_mse, base_mse) in compared_values.items()
         }
         rows.append(
             {
                 "name": name,
                 "mse": model["test_mse"],
-                "left": left["ours"],
-                "published": {"mse": given.mse, "left": left["published"]},
-                "notes": notes_text(model["notes"]),
+                "left": remaining_percent["ours"],
+                "published": {"mse": published_figures.mse, "left": remaining_percent["published"]},
+                "notes": format_notes(model["notes"]),
             }
         )
-    return table_of(
+    return build_table(
         rows,
         [
             ("model", "name"),
-            *compared("mse", ("surge N^2", "sway N^2", "yaw (N m)^2")),
-            *compared("left", AXES, 3),
+            *comparison_columns("mse", ("surge N^2", "sway N^2", "yaw (N m)^2")),
+            *comparison_columns("left", AXES, 3),
             ("chosen by the estimator", "notes"),
         ],
         caption="Mean square of the residual, and what is left of the believed model's.",
         groups=[("mean square", 3), ("% left of the residual force", 3)],
-        selected=lambda row: row["name"] == best_model(results),
+        is_selected=lambda row: row["name"] == find_best_model(results),
     )
 
 
-def _flown(config: FerryStudyConfig, flights: Mapping[str, Results], kind: str) -> list[Block]:
+def _tracking_tables(
+    config: FerryStudyConfig, runs: Mapping[str, StudyResults], run_kind: str
+) -> list[Block]:
     """Return how well a course is followed and with which forces.
 
     Tables 4.4, 4.8, 4.10, 4.12 and 4.13 of the document; Tables 4.3 and 4.9.
     """
     rows = []
-    for name, metrics in flights.items():
-        given = config.published if name == _BELIEVED else config.models[name].published
-        printed = given.model_dump()
-        if kind == "crossing":
-            crossing = {key.partition("crossing_")[2]: value for key, value in printed.items()}
-            printed = {key: value for key, value in crossing.items() if key}
-        elif kind == "feed_forward_alone":
-            printed = {"motion_mse": given.alone}
-        rows.append({"name": name, **metrics, "published": printed})
-    first = ("feed-forward", "name")
-    alone = table_of(
+    for name, metrics in runs.items():
+        published_figures = (
+            config.published if name == _BELIEVED_NAME else config.models[name].published
+        )
+        published_values = published_figures.model_dump()
+        if run_kind == "crossing":
+            crossing = {
+                key.partition("crossing_")[2]: value for key, value in published_values.items()
+            }
+            published_values = {key: value for key, value in crossing.items() if key}
+        elif run_kind == "feed_forward_alone":
+            published_values = {"motion_mse": published_figures.alone}
+        rows.append({"name": name, **metrics, "published": published_values})
+    name_column = ("feed-forward", "name")
+    open_loop_table = build_table(
         rows,
-        [first, *compared("motion_mse", ("u", "v", "r", "u_dot", "v_dot", "r_dot"))],
+        [
+            name_column,
+            *comparison_columns("motion_mse", ("u", "v", "r", "u_dot", "v_dot", "r_dot")),
+        ],
         caption="Mean square error against the desired motion without feedback, in (m/s)^2,"
         " (m/s)^2, (rad/s)^2, and the same per second squared.",
     )
-    errors = table_of(
+    errors = build_table(
         rows,
         [
-            first,
-            *compared("position_mae", "mean position error m"),
-            *compared("position_mse", "mean square m^2"),
-            *compared("heading_mae", "mean heading error deg", factor=DEG),
-            *compared("power", ("power, position W", "power, heading W")),
-            *compared("iaew", ("IAEW, position m s J", "IAEW, heading rad s J")),
+            name_column,
+            *comparison_columns("position_mae", "mean position error m"),
+            *comparison_columns("position_mse", "mean square m^2"),
+            *comparison_columns("heading_mae", "mean heading error deg", factor=DEGREES_PER_RADIAN),
+            *comparison_columns("power", ("power, position W", "power, heading W")),
+            *comparison_columns("iaew", ("IAEW, position m s J", "IAEW, heading rad s J")),
         ],
         caption="IAEW is the integral of the error times the work (3.18).",
     )
     units = ("surge N", "sway N", "yaw N m")
-    forces = table_of(
+    forces = build_table(
         rows,
-        [first, *compared("tau", units), *compared("feedback", units)],
+        [name_column, *comparison_columns("tau", units), *comparison_columns("feedback", units)],
         groups=[("mean absolute force", 3), ("mean absolute feedback", 3)],
     )
-    return [*([alone] if kind == "feed_forward_alone" else []), errors, forces]
+    return [*([open_loop_table] if run_kind == "feed_forward_alone" else []), errors, forces]
 
 
-def _forward(rows: Mapping[str, Results]) -> Table:
+def _free_run_table(rows: Mapping[str, StudyResults]) -> Table:
     """Return the table of free runs beside manoeuvres of the true ferry (3.22)."""
-    shown = [
+    free_run_rows = [
         {
             "name": name,
             **row,
-            "rmse": row["rmse"] and [*row["rmse"][:2], DEG * row["rmse"][2]],
+            "rmse": row["rmse"] and [*row["rmse"][:2], DEGREES_PER_RADIAN * row["rmse"][2]],
             "published": {},
         }
         for name, row in rows.items()
     ]
-    return table_of(
-        shown,
+    return build_table(
+        free_run_rows,
         [
             ("model", "name"),
-            *compared("rmse", ("u m/s", "v m/s", "r deg/s"), 3),
+            *comparison_columns("rmse", ("u m/s", "v m/s", "r deg/s"), 3),
             ("diverged", lambda row: Cell(f"{row['diverged']} of {row['runs']}")),
         ],
         caption="Root mean square errors of free runs from the commanded forces, over the runs that"
@@ -781,18 +870,18 @@ def _forward(rows: Mapping[str, Results]) -> Table:
     )
 
 
-def _later(later: Mapping[str, Results]) -> Table:
+def _update_table(updates: Mapping[str, StudyResults]) -> Table:
     """Return the table of models on the changed vessel (section 3.7)."""
 
-    def short(value: float) -> str:
-        return number(value, 4)
+    def format_short(value: float) -> str:
+        return format_number(value, 4)
 
-    return table_of(
-        [{"name": name, **row} for name, row in later.items()],
+    return build_table(
+        [{"name": name, **row} for name, row in updates.items()],
         [
             ("model", "name"),
-            ("mean position error m", "before.position_mae", short),
-            ("after the update m", "after.position_mae", short),
+            ("mean position error m", "before.position_mae", format_short),
+            ("after the update m", "after.position_mae", format_short),
             ("on the new log", "text"),
         ],
         caption="A model that no longer fits is identified again from the log of one course.",

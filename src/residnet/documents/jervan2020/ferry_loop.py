@@ -14,20 +14,20 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.control.base import ClosedLoop, Followed
+from residnet.control.base import ClosedLoop, ReferenceInInputs
 from residnet.control.guidance import Crossing, CrossingConfig
-from residnet.control.heading.conditions import quickly
+from residnet.control.heading.conditions import compile_or_fallback
 from residnet.control.motion import (
-    Allocated,
-    Assisted,
+    ActuatorLag,
+    AllocatedPolicy,
     Gain,
-    Lag,
+    LagCompensatedPID,
     MotionPID,
     MotionPIDConfig,
     ReferenceFilterConfig,
-    course,
-    needed_force,
-    reference_row,
+    required_force,
+    sample_filtered_course,
+    stack_reference,
 )
 from residnet.core.config import (
     Config,
@@ -37,23 +37,23 @@ from residnet.core.config import (
     Radians,
     RadiansPerSecond,
     Seconds,
-    quantity,
+    quantity_type,
 )
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.layout import ACTUATORS, MOTION, POSE, VELOCITIES
 from residnet.dynamics.compiled import CompiledRollout
 from residnet.dynamics.rollout import FreeRun, Rollout, Source
 from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics
-from residnet.judge.autopilots import Tracking, tracking
+from residnet.judge.autopilots import TrackingMetrics, compute_tracking_metrics
 from residnet.physics.actuators import ForceActuators
 from residnet.physics.force_model import ForceModel
 from residnet.physics.hull import HullConfig
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 
-_WORTH_COMPILING = 2500
+_MIN_COMPILED_STEPS = 2500
 """Steps of a flight that take about as long as compiling it does."""
-Feed = tuple[ForceModel, Lag | None]
+FeedForwardModel = tuple[ForceModel, ActuatorLag | None]
 """A model as feed-forward, and the lag of the thrusters that it leads."""
 
 
@@ -67,21 +67,25 @@ class LoopConfig(Config):
         frequency: omega of surge, sway and yaw in rad/s.
         integral: share of omega Kp that is the integral gain, without unit.
         step: time step of controller and plant in s.
-        every: number of steps from one sample of the log to the next.
+        steps_per_sample: number of steps from one sample of the log to the next.
     """
 
     frequency: tuple[RadiansPerSecond, RadiansPerSecond, RadiansPerSecond]
     integral: Gain = 0.1
     step: Seconds = Field(default=0.02, gt=0)
-    every: int = Field(default=5, ge=1)
+    steps_per_sample: int = Field(default=5, ge=1)
 
-    def pid(self, hull_mass: Tensor) -> MotionPID:
+    def build_pid(self, hull_mass: Tensor) -> MotionPID:
         """Return the feedback for a hull's mass matrix [3, 3] in SI units."""
         mass, omega = hull_mass.diagonal(), torch.tensor(self.frequency, dtype=torch.float64)
         proportional = mass * omega**2
         gains = [
-            tuple(part.tolist())
-            for part in (proportional, self.integral * omega * proportional, 2.0 * mass * omega)
+            tuple(gain_values.tolist())
+            for gain_values in (
+                proportional,
+                self.integral * omega * proportional,
+                2.0 * mass * omega,
+            )
         ]
         return MotionPIDConfig(proportional=gains[0], integral=gains[1], derivative=gains[2]).build(
             self.step
@@ -104,20 +108,20 @@ class MotionNoise(Config):
     heading: Radians = Field(default=0.0, ge=0)
     velocity: MetresPerSecond = Field(default=0.0, ge=0)
     yaw_rate: RadiansPerSecond = Field(default=0.0, ge=0)
-    acceleration: quantity("m/s^2") = 0.0  # type: ignore[valid-type]
-    yaw_acceleration: quantity("rad/s^2") = 0.0  # type: ignore[valid-type]
+    acceleration: quantity_type("m/s^2") = 0.0  # type: ignore[valid-type]
+    yaw_acceleration: quantity_type("rad/s^2") = 0.0  # type: ignore[valid-type]
 
-    def spread(self) -> tuple[float, ...]:
+    def standard_deviations(self) -> tuple[float, ...]:
         """Return the standard deviations of pose, velocities and accelerations, nine numbers."""
         linear = (self.position, self.velocity, self.acceleration)
         angular = (self.heading, self.yaw_rate, self.yaw_acceleration)
         return tuple(value for a, b in zip(linear, angular, strict=True) for value in (a, a, b))
 
-    def draw(self, shape: Sequence[int], seed: int) -> Tensor:
+    def sample_noise(self, shape: Sequence[int], seed: int) -> Tensor:
         """Return noise [..., 9] on pose, velocities and accelerations, float64."""
         generator = torch.Generator().manual_seed(seed)
         return torch.randn(*shape, 9, generator=generator, dtype=torch.float64) * torch.tensor(
-            self.spread(), dtype=torch.float64
+            self.standard_deviations(), dtype=torch.float64
         )
 
 
@@ -139,7 +143,7 @@ def measured(x: Tensor, noise: Tensor) -> Tensor:
 
 
 @final
-class Sensed(Source):
+class NoisyLoop(Source):
     """A closed loop that sees noise [B, 6] on pose and velocities, which is behind its inputs."""
 
     def __init__(self, loop: Source) -> None:
@@ -155,7 +159,7 @@ class Sensed(Source):
 
 
 @dataclass(frozen=True)
-class Flight:
+class FerryRun:
     """One simulated run, sampled as its log is; SI units, forces in N, N, N m.
 
     Attributes:
@@ -165,12 +169,12 @@ class Flight:
         nu_dot: true accelerations [N, 3].
         measured: pose, nu and nu_dot as measured [N, 9].
         command: commanded force tau_c at the samples [N, 3].
-        averaged: tau_c averaged over the steps around each sample [N, 3], so that noise between the
+        averaged_command: tau_c averaged over the steps around each sample [N, 3], so that noise between the
             samples does not alias.
         feedback: force of the feedback tau_FB [N, 3].
-        acting: force of the thrusters [N, 3].
-        desired: desired pose eta_d [N, 3].
-        tracking: metrics over every step.
+        thruster_force: force of the thrusters [N, 3].
+        desired_pose: desired pose eta_d [N, 3].
+        tracking_metrics: metrics over every step.
     """
 
     t: Tensor
@@ -179,14 +183,14 @@ class Flight:
     nu_dot: Tensor
     measured: Tensor
     command: Tensor
-    averaged: Tensor
+    averaged_command: Tensor
     feedback: Tensor
-    acting: Tensor
-    desired: Tensor
-    tracking: Tracking
+    thruster_force: Tensor
+    desired_pose: Tensor
+    compute_tracking_metrics: TrackingMetrics
 
 
-def force_hull(name: str) -> tuple[HullPlant, ForceActuators]:
+def load_force_vessel(name: str) -> tuple[HullPlant, ForceActuators]:
     """Return a vessel by name or file, and its actuators, which make all three forces.
 
     Raises:
@@ -204,7 +208,7 @@ def force_hull(name: str) -> tuple[HullPlant, ForceActuators]:
 
 
 @final
-class Ferry:
+class FerrySimulation:
     """The true plant, the believed hull and the control loop between them.
 
     Args:
@@ -217,31 +221,31 @@ class Ferry:
 
     def __init__(
         self,
-        true: str,
-        believed: str,
+        plant_name: str,
+        believed_name: str,
         loop: LoopConfig,
         noise: MotionNoise | None,
         disturbance: Disturbance,
         seed: int,
     ) -> None:
         self.loop, self.noise, self.disturbance, self.seed = loop, noise, disturbance, seed
-        self.true, self.thrusters = force_hull(true)
-        self.believed = force_hull(believed)[0].hull
-        if not self.thrusters.state:
+        self.plant, self.thrusters = load_force_vessel(plant_name)
+        self.believed_hull = load_force_vessel(believed_name)[0].hull
+        if not self.thrusters.state_names:
             raise ConfigError(
-                f"vessel '{true}': its forces follow at once; the study is about thrusters that"
+                f"vessel '{plant_name}': its forces follow at once; the study is about thrusters that"
                 " lag, give actuators.response"
             )
         if disturbance == Disturbance():
-            self.true.in_calm_water()
+            self.plant.without_environment()
 
-    def fly(
+    def simulate(
         self,
         path: ReferenceFilterConfig | CrossingConfig,
-        feeds: Sequence[Feed],
+        feeds: Sequence[FeedForwardModel],
         *,
         feedback: bool = True,
-    ) -> list[Flight]:
+    ) -> list[FerryRun]:
         """Fly a course or a crossing with each model as feed-forward, all in one batch.
 
         Raises:
@@ -250,79 +254,101 @@ class Ferry:
         gains, step, lags = self.loop, self.loop.step, [lag for _, lag in feeds]
         if not feedback:
             gains = gains.model_copy(update={"frequency": (0.0, 0.0, 0.0)})
-        pid = gains.pid(self.believed.mass)
-        policy = Allocated(Assisted(pid, lags, step), self.thrusters.allocate)
-        inputs = len(self.true.inputs)
-        asked = torch.zeros(len(feeds), 0, 0, dtype=torch.float64)
+        pid = gains.build_pid(self.believed_hull.mass)
+        policy = AllocatedPolicy(LagCompensatedPID(pid, lags, step), self.thrusters.allocate)
+        n_inputs = len(self.plant.input_names)
+        references = torch.zeros(len(feeds), 0, 0, dtype=torch.float64)
         if isinstance(path, CrossingConfig):
             steps = round(path.duration / step)
         else:
-            motion = course(path, step)
+            motion = sample_filtered_course(path, step)
             steps = len(motion.pose)
-            needed = [needed_force(model, motion, lag, step) for model, lag in feeds]
-            asked = torch.stack([reference_row(motion, force) for force in needed])
-        w = torch.zeros(len(feeds), steps, inputs, dtype=torch.float64)
+            required_forces = [required_force(model, motion, lag, step) for model, lag in feeds]
+            references = torch.stack([stack_reference(motion, force) for force in required_forces])
+        w = torch.zeros(len(feeds), steps, n_inputs, dtype=torch.float64)
         if self.disturbance != Disturbance():
             for key, force in self.disturbance:
-                w[:, :, self.true.inputs.index(f"force_{key}")] = force
-        noise = (self.noise or MotionNoise()).draw((len(feeds), steps), self.seed)
-        x0 = torch.zeros(len(feeds), len(self.true.state), dtype=torch.float64)
+                w[:, :, self.plant.input_names.index(f"force_{key}")] = force
+        noise = (self.noise or MotionNoise()).sample_noise((len(feeds), steps), self.seed)
+        x0 = torch.zeros(len(feeds), len(self.plant.state_names), dtype=torch.float64)
         with torch.no_grad():
             if isinstance(path, CrossingConfig):
                 guidance = Crossing(path, step, feeds)
-                plant, loop = RecordedPlantDynamics(self.true, step), ClosedLoop(policy, guidance)
-                model: FreeRun = Rollout(plant, Sensed(loop))
-                given = (x0, torch.cat((w, noise[..., MOTION]), dim=2), x0[:, :0])
+                plant, loop = RecordedPlantDynamics(self.plant, step), ClosedLoop(policy, guidance)
+                model: FreeRun = Rollout(plant, NoisyLoop(loop))
+                rollout_arguments = (x0, torch.cat((w, noise[..., MOTION]), dim=2), x0[:, :0])
             else:
-                model = Rollout(PlantDynamics(self.true, step), Sensed(Followed(policy, inputs)))
-                given = (x0, torch.cat((w, asked, noise[..., MOTION]), dim=2), x0[:, :0])
-                if steps > _WORTH_COMPILING:
-                    own = [f"source.loop.policy.policy.{name}" for name in ("lag", "step")]
-                    model = quickly(model, partial(CompiledRollout, own=own), given)
-            states, acted, _ = model(*given)
+                model = Rollout(
+                    PlantDynamics(self.plant, step), NoisyLoop(ReferenceInInputs(policy, n_inputs))
+                )
+                rollout_arguments = (
+                    x0,
+                    torch.cat((w, references, noise[..., MOTION]), dim=2),
+                    x0[:, :0],
+                )
+                if steps > _MIN_COMPILED_STEPS:
+                    per_row_names = [
+                        f"source.loop.policy.policy.{name}" for name in ("lag", "step")
+                    ]
+                    model = compile_or_fallback(
+                        model, partial(CompiledRollout, own=per_row_names), rollout_arguments
+                    )
+            states, applied_inputs, _ = model(*rollout_arguments)
             states = states[:, :-1]
             if not bool(torch.isfinite(states).all()):
                 raise DataError(
                     "the ferry left all bounds in closed loop: with these gains and models the loop"
                     " is unstable"
                 )
-            seen = measured(states, noise[..., MOTION])
+            measured_states = measured(states, noise[..., MOTION])
             if isinstance(path, CrossingConfig):
                 memory, rows = guidance.initial_state(states[:, 0]), []
                 for k in range(steps):
-                    reference, memory = guidance(seen[:, k], k, memory)
+                    reference, memory = guidance(measured_states[:, k], k, memory)
                     rows.append(reference)
-                asked = torch.stack(rows, dim=1)
+                references = torch.stack(rows, dim=1)
             return [
-                self._flight(states[i], acted[i], asked[i], seen[i], noise[i], pid)
+                self._build_run(
+                    states[i], applied_inputs[i], references[i], measured_states[i], noise[i], pid
+                )
                 for i in range(len(feeds))
             ]
 
-    def _flight(
-        self, x: Tensor, w: Tensor, reference: Tensor, seen: Tensor, noise: Tensor, pid: MotionPID
-    ) -> Flight:
-        loop, given = self.loop, w[:, : self.true.commands]
-        command, desired = self.thrusters.asked(given), reference[:, :9]
-        error = pid.error(seen, reference)
-        feedback, _ = pid(seen, desired, (error.cumsum(0) - error) * loop.step)
-        rate = self.true.rate(x, w)
+    def _build_run(
+        self,
+        x: Tensor,
+        w: Tensor,
+        reference: Tensor,
+        measured_states: Tensor,
+        noise: Tensor,
+        pid: MotionPID,
+    ) -> FerryRun:
+        loop, commands = self.loop, w[:, : self.plant.n_commands]
+        command, desired = self.thrusters.requested_force(commands), reference[:, :9]
+        error = pid.body_error(measured_states, reference)
+        feedback, _ = pid(measured_states, desired, (error.cumsum(0) - error) * loop.step)
+        rate = self.plant.derivative(x, w)
         motion = torch.cat((x[:, VELOCITIES], rate[:, VELOCITIES]), dim=-1)
-        metrics = tracking(x[:, POSE], motion, desired, command, feedback, loop.step)
-        every, half = slice(None, None, loop.every), loop.every // 2
-        ends = torch.cat((command[:1].expand(half, 3), command, command[-1:].expand(half, 3)))
+        metrics = compute_tracking_metrics(
+            x[:, POSE], motion, desired, command, feedback, loop.step
+        )
+        stride, half_window = slice(None, None, loop.steps_per_sample), loop.steps_per_sample // 2
+        padded_command = torch.cat(
+            (command[:1].expand(half_window, 3), command, command[-1:].expand(half_window, 3))
+        )
         t = torch.arange(len(x), dtype=torch.float64) * loop.step
-        acting = self.thrusters.force(x[:, ACTUATORS], given, x[:, VELOCITIES])
-        logged = torch.cat((x[:, MOTION], rate[:, VELOCITIES]), dim=-1) + noise
-        return Flight(
-            t[every],
-            x[every, POSE],
-            x[every, VELOCITIES],
-            rate[every, VELOCITIES],
-            logged[every],
-            command[every],
-            ends.unfold(0, 2 * half + 1, 1).mean(-1)[every],
-            feedback[every],
-            acting[every],
-            reference[every, POSE],
+        thruster_force = self.thrusters.force(x[:, ACTUATORS], commands, x[:, VELOCITIES])
+        measured_motion = torch.cat((x[:, MOTION], rate[:, VELOCITIES]), dim=-1) + noise
+        return FerryRun(
+            t[stride],
+            x[stride, POSE],
+            x[stride, VELOCITIES],
+            rate[stride, VELOCITIES],
+            measured_motion[stride],
+            command[stride],
+            padded_command.unfold(0, 2 * half_window + 1, 1).mean(-1)[stride],
+            feedback[stride],
+            thruster_force[stride],
+            reference[stride, POSE],
             metrics,
         )

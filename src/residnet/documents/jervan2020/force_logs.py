@@ -16,24 +16,24 @@ from torch import Tensor
 
 from residnet.core.config import Config, ConfigPath, Seconds
 from residnet.core.errors import ConfigError, DataError, FitError
-from residnet.core.layout import ACCELERATIONS, PLANAR, POSE, VELOCITIES
-from residnet.data.prepare import PrepareConfig, prepare
+from residnet.core.layout import ACCELERATIONS, PLANAR_LAYOUT, POSE, VELOCITIES
+from residnet.data.prepare import PrepareConfig, prepare_log
 from residnet.data.readers import ReaderConfig
-from residnet.data.split import check_leaks, log_names, matches
-from residnet.documents.jervan2020.residual import AXES, Record
-from residnet.judge.metrics import Blocks, blocks, intervals
+from residnet.data.split import assign_log_names, check_leaks, match_patterns
+from residnet.documents.jervan2020.residual import AXES, ForceRecord
+from residnet.judge.metrics import ResamplingBlocks, bootstrap_intervals, make_resampling_blocks
 from residnet.training.lag import fit_lag, followed
 
-_Channels = tuple[str, str, str]
-_LOGS_FOR_FOLDS = 3
+_ChannelTriple = tuple[str, str, str]
+_MIN_LOGS_FOR_FOLDS = 3
 """Number of logs from which on whole logs are left out instead of stretches of time."""
-_LOGS_FOR_INTERVALS = 5
+_MIN_LOGS_FOR_INTERVALS = 5
 """Number of logs from which on intervals resample logs instead of segments."""
-_LEAST_SEGMENTS = 5
+_MIN_SEGMENTS = 5
 """Least number of segments for intervals."""
 
 
-class ForceLogs(Config):
+class ForceLogsConfig(Config):
     """Measured logs; `validation` says which part of them tests.
 
     Attributes:
@@ -46,7 +46,7 @@ class ForceLogs(Config):
     root: ConfigPath
     logs: tuple[str, ...] = Field(min_length=1)
 
-    def files(self) -> list[Path]:
+    def find_paths(self) -> list[Path]:
         """Return the paths of all logs, each once.
 
         Raises:
@@ -54,10 +54,10 @@ class ForceLogs(Config):
         """
         if not self.root.is_dir():
             raise ConfigError(f"data: root {self.root} is not a folder; correct `root`")
-        return matches(self.root, self.logs, "data: logs")
+        return match_patterns(self.root, self.logs, "data: logs")
 
 
-class ForceChannels(Config):
+class ForceChannelsConfig(Config):
     """Names of the channels of force and acceleration, beside x, y, psi, u, v and r.
 
     Attributes:
@@ -68,9 +68,9 @@ class ForceChannels(Config):
             are none.
     """
 
-    actual: _Channels
-    commanded: _Channels
-    acceleration: _Channels | None = None
+    actual: _ChannelTriple
+    commanded: _ChannelTriple
+    acceleration: _ChannelTriple | None = None
 
 
 class FoldsConfig(Config):
@@ -90,7 +90,7 @@ class FoldsConfig(Config):
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredForceLogs:
     """All logs one after another, N samples; forces in N, N, N m.
 
     Attributes:
@@ -98,26 +98,26 @@ class Measured:
         record: motion and commanded force, smoothed as `prepare` says; NaN where masked. Its folds
             are the segments.
         forces: `commanded` and `actual` forces [N, 3].
-        good: samples that models may be fitted to and judged on [N] bool.
-        part: number of the fold of the outer cross-validation [N].
-        parts: what a fold consists of: `logs` or `stretches`.
-        masked: share of the samples that each mask excludes, by log and mask.
+        usable: samples that models may be fitted to and judged on [N] bool.
+        fold_index: number of the fold of the outer cross-validation [N].
+        fold_unit: what a fold consists of: `logs` or `stretches`.
+        masked_shares: share of the samples that each mask excludes, by log and mask.
         accelerations: as measured and as derived from the velocities [N, 3], by what they are;
             empty where none were measured.
-        acceleration: comparison of the two by axis; empty where no acceleration was measured.
+        acceleration_comparison: comparison of the two by axis; empty where no acceleration was measured.
     """
 
     names: tuple[str, ...]
-    record: Record
+    record: ForceRecord
     forces: dict[str, Tensor]
-    good: Tensor
-    part: Tensor
-    parts: str
-    masked: dict[str, dict[str, float]]
+    usable: Tensor
+    fold_index: Tensor
+    fold_unit: str
+    masked_shares: dict[str, dict[str, float]]
     accelerations: dict[str, Tensor]
-    acceleration: dict[str, Any]
+    acceleration_comparison: dict[str, Any]
 
-    def split(self, part: int, gap: float) -> tuple[Record, Tensor]:
+    def split_fold(self, fold_index: int, gap: float) -> tuple[ForceRecord, Tensor]:
         """Return the record without a fold for training, and the samples [N] of the fold.
 
         Args:
@@ -126,59 +126,67 @@ class Measured:
         Raises:
             DataError: where either has no samples.
         """
-        inside_fold = self.part == part
-        reach = round(gap / self.record.dt)
-        flags = inside_fold.to(torch.float64)[None, None].split(list(self.record.runs), dim=-1)
-        near = torch.cat(
-            [torch.nn.functional.max_pool1d(of, 2 * reach + 1, 1, reach)[0, 0] > 0 for of in flags]
+        inside_fold = self.fold_index == fold_index
+        gap_samples = round(gap / self.record.dt)
+        fold_flags = inside_fold.to(torch.float64)[None, None].split(
+            list(self.record.run_lengths), dim=-1
         )
-        train, test = self.good & ~near, self.good & inside_fold
-        for what, samples in (
+        is_near_fold = torch.cat(
+            [
+                torch.nn.functional.max_pool1d(log_flags, 2 * gap_samples + 1, 1, gap_samples)[0, 0]
+                > 0
+                for log_flags in fold_flags
+            ]
+        )
+        train, test = self.usable & ~is_near_fold, self.usable & inside_fold
+        for problem, samples in (
             ("nothing left to fit to beside", train),
             ("no sample to judge on in", test),
         ):
             if not bool(samples.any()):
                 raise DataError(
-                    f"validation: {what} fold {part + 1}; check the masks, or lower"
+                    f"validation: {problem} fold {fold_index + 1}; check the masks, or lower"
                     " validation.folds or validation.gap"
                 )
-        return replace(self.record, train=train), test
+        return replace(self.record, is_training=train), test
 
-    def segments(self) -> list[Tensor]:
+    def usable_segments(self) -> list[Tensor]:
         """Return the indices of the good samples of each segment.
 
         A segment with less than half of the largest number of good samples is left out.
         """
         segments = [
-            ((self.record.fold == number) & self.good).nonzero()[:, 0]
+            ((self.record.fold == number) & self.usable).nonzero()[:, 0]
             for number in torch.unique(self.record.fold)
         ]
-        least = max(len(segment) for segment in segments) / 2
-        return [segment for segment in segments if len(segment) >= least]
+        min_length = max(len(segment) for segment in segments) / 2
+        return [segment for segment in segments if len(segment) >= min_length]
 
-    def blocks(self) -> Blocks | None:
+    def resampling_blocks(self) -> ResamplingBlocks | None:
         """Return what the intervals resample: logs from five on, segments for fewer.
 
         None where there are fewer than five segments.
         """
-        log = torch.repeat_interleave(torch.arange(len(self.names)), torch.tensor(self.record.runs))
-        log_of_segment = [int(log[segment[0]]) for segment in self.segments()]
-        if len(self.names) >= _LOGS_FOR_INTERVALS:
-            return blocks(log_of_segment)
+        log = torch.repeat_interleave(
+            torch.arange(len(self.names)), torch.tensor(self.record.run_lengths)
+        )
+        log_of_segment = [int(log[segment[0]]) for segment in self.usable_segments()]
+        if len(self.names) >= _MIN_LOGS_FOR_INTERVALS:
+            return make_resampling_blocks(log_of_segment)
         return _segment_blocks(len(log_of_segment))
 
 
-def _segment_blocks(count: int) -> Blocks | None:
+def _segment_blocks(count: int) -> ResamplingBlocks | None:
     """Return segments as blocks of a bootstrap; None where there are too few."""
-    return Blocks(np.arange(count), "segments", count) if count >= _LEAST_SEGMENTS else None
+    return ResamplingBlocks(np.arange(count), "segments", count) if count >= _MIN_SEGMENTS else None
 
 
-def read_measured(
-    data: ForceLogs,
-    channels: ForceChannels,
+def read_force_logs(
+    data: ForceLogsConfig,
+    channels: ForceChannelsConfig,
     preparation: PrepareConfig,
     validation: FoldsConfig,
-) -> Measured:
+) -> MeasuredForceLogs:
     """Read, mask, smooth and differentiate all logs.
 
     Raises:
@@ -186,37 +194,43 @@ def read_measured(
     """
     import pandas as pd
 
-    reader, paths = data.reader.build(), log_names(data.files())
-    recorded = [reader.read(path).replace(name=name) for path, name in paths.items()]
+    reader, paths = data.reader.build(), assign_log_names(data.find_paths())
+    raw_logs = [reader.read(path).replace(name=name) for path, name in paths.items()]
     # a model would be fitted to the very samples that judge it
-    check_leaks({log.name: [log] for log in recorded})
+    check_leaks({log.name: [log] for log in raw_logs})
     columns = (*channels.commanded, *channels.actual, *(channels.acceleration or ()))
-    logs = [prepare(log, "all", columns, preparation) for log in recorded]
+    logs = [prepare_log(log, "all", columns, preparation) for log in raw_logs]
     names, lengths = [log.log.name for log in logs], [len(log) for log in logs]
     step = preparation.grid.step
     # whole logs are folds where there are enough; no segment reaches across logs
-    of_logs = len(logs) >= _LOGS_FOR_FOLDS
-    parts, segments, commands, masked, count = [], [], [], {}, 0
-    for place, (log, name, length) in enumerate(zip(logs, names, lengths, strict=True)):
-        if not log.good.any():
+    uses_log_folds = len(logs) >= _MIN_LOGS_FOR_FOLDS
+    fold_parts, segments, commands, masked, n_segments_total = [], [], [], {}, 0
+    for log_index, (log, name, length) in enumerate(zip(logs, names, lengths, strict=True)):
+        if not log.trainable.any():
             raise DataError(
                 f"log {name}: no stretch is as long as the derivative's window; leave it out or"
                 " shorten prepare.derivative"
             )
-        at = torch.arange(length)
-        folds = min(validation.folds, len(logs)) if of_logs else validation.folds
-        parts.append(0 * at + place * folds // len(logs) if of_logs else at * folds // length)
-        of_log = max(round(length * step / validation.segment), 1)
-        segments.append(count + at * of_log // length)
-        count += of_log
+        sample_index = torch.arange(length)
+        n_folds = min(validation.folds, len(logs)) if uses_log_folds else validation.folds
+        fold_parts.append(
+            0 * sample_index + log_index * n_folds // len(logs)
+            if uses_log_folds
+            else sample_index * n_folds // length
+        )
+        n_segments = max(round(length * step / validation.segment), 1)
+        segments.append(n_segments_total + sample_index * n_segments // length)
+        n_segments_total += n_segments
         # commands hold their last value over gaps, and are zero before the first
-        given = pd.DataFrame(log.recorded[:, : PLANAR.dof]).ffill().fillna(0.0)
-        commands.append(torch.from_numpy(np.array(given)))
+        filled_commands = (
+            pd.DataFrame(log.rate_inputs[:, : PLANAR_LAYOUT.n_dof]).ffill().fillna(0.0)
+        )
+        commands.append(torch.from_numpy(np.array(filled_commands)))
         shares = {reason: float(mask.mean()) for reason, mask in log.log.masks.items()}
         masked[name] = {reason: share for reason, share in shares.items() if share}
-    smooth, nu_dot, measured, good = (
-        torch.from_numpy(np.concatenate([getattr(log, what) for log in logs]))
-        for what in ("smooth", "nu_dot", "recorded", "good")
+    smooth, nu_dot, measured, usable = (
+        torch.from_numpy(np.concatenate([getattr(log, attribute) for log in logs]))
+        for attribute in ("smooth", "nu_dot", "recorded", "good")
     )
     fold = torch.cat(segments)
     accelerations: dict[str, Tensor] = {}
@@ -224,9 +238,9 @@ def read_measured(
     if channels.acceleration is not None:
         sensed = measured[:, ACCELERATIONS]
         accelerations = {"measured acceleration": sensed, "derivative of velocity": nu_dot}
-        acceleration = compare_accelerations(nu_dot[good], sensed[good], fold[good])
+        acceleration = compare_accelerations(nu_dot[usable], sensed[usable], fold[usable])
     command = torch.cat(commands)
-    record = Record(
+    record = ForceRecord(
         step * torch.arange(len(fold), dtype=torch.float64),
         smooth[:, POSE],
         smooth[:, VELOCITIES],
@@ -234,17 +248,17 @@ def read_measured(
         command,
         command,
         fold,
-        good,
+        usable,
         (0.0,) * 9,
         tuple(lengths),
     )
-    return Measured(
+    return MeasuredForceLogs(
         tuple(names),
         record,
         {"commanded": command, "actual": measured[:, VELOCITIES]},
-        good,
-        torch.cat(parts),
-        "logs" if of_logs else "stretches",
+        usable,
+        torch.cat(fold_parts),
+        "logs" if uses_log_folds else "stretches",
         masked,
         accelerations,
         acceleration,
@@ -266,49 +280,53 @@ def compare_accelerations(derived: Tensor, measured: Tensor, segment: Tensor) ->
     means = np.stack(
         [difference[segment == number].mean(0).numpy() for number in torch.unique(segment)]
     )
-    within = intervals(means, _segment_blocks(len(means)))
-    out: dict[str, Any] = {}
+    confidence_intervals = bootstrap_intervals(means, _segment_blocks(len(means)))
+    comparison: dict[str, Any] = {}
     for axis, name in enumerate(AXES):
-        both = torch.corrcoef(torch.stack((derived[:, axis], measured[:, axis])))
-        out[name] = {
+        correlation_matrix = torch.corrcoef(torch.stack((derived[:, axis], measured[:, axis])))
+        comparison[name] = {
             "offset": float(difference[:, axis].mean()),
-            "offset_ci95": within[axis],
+            "offset_ci95": confidence_intervals[axis],
             "rms_without_offset": float(difference[:, axis].std()),
             "rms": float(derived[:, axis].std()),
-            "correlation": float(torch.nan_to_num(both[0, 1])),
+            "correlation": float(torch.nan_to_num(correlation_matrix[0, 1])),
         }
-    return out
+    return comparison
 
 
-def compare_forces(measured: Measured) -> dict[str, Any]:
+def compare_forces(measured: MeasuredForceLogs) -> dict[str, Any]:
     """Compare commanded and actual force: the thrusters' lag, and what the command explains.
 
     Returns:
         `lag` (its parameters, or why it is not determined), and by axis the share of the actual
         force's variance that the command explains, without and with the lag.
     """
-    record, good = measured.record, measured.good
-    out: dict[str, Any] = {}
+    record, usable = measured.record, measured.usable
+    comparison: dict[str, Any] = {}
     try:
         lag = fit_lag(
             record.command,
             torch.nan_to_num(measured.forces["actual"]),
             torch.zeros_like(record.command),
             record.dt,
-            good,
-            record.runs,
+            usable,
+            record.run_lengths,
         )
-        out["lag"] = lag.model_dump()
-        after = followed(record.command, lag, record.dt, record.runs)
+        comparison["lag"] = lag.model_dump()
+        lagged_command = followed(record.command, lag, record.dt, record.run_lengths)
     except FitError as error:
-        out["lag"], after = str(error), record.command
-    actual, commanded, late = measured.forces["actual"][good], record.command[good], after[good]
-    total = (actual - actual.mean(0)).square().mean(0)
-    unexplained, unexplained_late = (
-        (actual - force).square().mean(0) / total for force in (commanded, late)
+        comparison["lag"], lagged_command = str(error), record.command
+    actual, commanded, lagged_force = (
+        measured.forces["actual"][usable],
+        record.command[usable],
+        lagged_command[usable],
     )
-    gain = (late * actual).sum(0) / late.square().sum(0).clamp(min=1e-300)
-    columns = {
+    force_variance = (actual - actual.mean(0)).square().mean(0)
+    unexplained, unexplained_late = (
+        (actual - force).square().mean(0) / force_variance for force in (commanded, lagged_force)
+    )
+    gain = (lagged_force * actual).sum(0) / lagged_force.square().sum(0).clamp(min=1e-300)
+    statistics = {
         "rms_commanded": commanded.square().mean(0).sqrt(),
         "rms_actual": actual.square().mean(0).sqrt(),
         "explained": 1 - unexplained,
@@ -316,5 +334,7 @@ def compare_forces(measured: Measured) -> dict[str, Any]:
         "gain_with_lag": gain,
     }
     for axis, name in enumerate(AXES):
-        out[name] = {what: float(values[axis]) for what, values in columns.items()}
-    return out
+        comparison[name] = {
+            quantity: float(values[axis]) for quantity, values in statistics.items()
+        }
+    return comparison

@@ -17,53 +17,67 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.core.errors import ConfigError, FitError
-from residnet.core.format import fixed, interval, listed, number, plural, signed
+from residnet.core.format import (
+    format_count,
+    format_fixed,
+    format_interval,
+    format_number,
+    format_signed,
+    join_list,
+)
 from residnet.core.layout import HEADING
-from residnet.core.stretches import stretches
+from residnet.core.stretches import find_runs
 from residnet.data.prepare import PrepareConfig
 from residnet.documents.jervan2020.force_logs import (
     FoldsConfig,
-    ForceChannels,
-    ForceLogs,
-    Measured,
+    ForceChannelsConfig,
+    ForceLogsConfig,
+    MeasuredForceLogs,
     compare_forces,
-    read_measured,
+    read_force_logs,
 )
 from residnet.documents.jervan2020.residual import (
     AXES,
-    Fit,
+    RegressionFit,
     ResidualModelConfig,
-    fit_as_json,
+    derive_forward_equations,
     fit_model,
-    forward_equations,
+    fit_to_json,
     model_figures,
     model_sections,
 )
-from residnet.documents.study import Results, Study, compared, histories, notes_text, pictures
-from residnet.judge.metrics import intervals
+from residnet.documents.study import (
+    StudyResults,
+    StudyTask,
+    comparison_columns,
+    find_figures,
+    format_notes,
+    plot_time_series,
+)
+from residnet.judge.metrics import bootstrap_intervals
 from residnet.physics.force_model import ForceModel
 from residnet.physics.hull import HullConfig
 from residnet.physics.plant import Hull, HullPlant
 from residnet.physics.vessel import load_vessel
-from residnet.report.blocks import Bullets, Cell, Section, Table, Text, table_of
+from residnet.report.blocks import Bullets, Cell, Section, Table, Text, build_table
 from residnet.report.figure import (
     BLUE,
-    DASHED,
+    DASHED_STYLE,
     GREY,
-    MASKED,
-    SOLID,
-    ZERO,
+    MASKED_STYLE,
+    SOLID_STYLE,
+    ZERO_LINE_STYLE,
     Case,
     Figure,
-    Look,
+    GlyphStyle,
     Panel,
-    names_of,
-    whiskers,
+    error_bars,
+    tick_labels,
 )
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, MainFigure, PartName
+from residnet.runs.task import ComputingTask, PartName, SummaryMetric
 
-_NULLS = {"zero": "no force at all", "believed": "the believed model alone"}
+_REFERENCE_MODELS = {"zero": "no force at all", "believed": "the believed model alone"}
 """What needs no regression."""
 _FORCE_UNITS = tuple((label, 1.0) for label in ("surge [N]", "sway [N]", "yaw [N m]"))
 _ACCELERATION_UNITS = tuple(
@@ -86,7 +100,7 @@ class MeasuredModelConfig(ResidualModelConfig):
     published: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
 
     @property
-    def judged_on(self) -> Literal["actual", "commanded"]:
+    def evaluation_force(self) -> Literal["actual", "commanded"]:
         """The force that judges the model.
 
         A lag alone could make the residual of a command small: a model with lag is judged on the
@@ -95,7 +109,7 @@ class MeasuredModelConfig(ResidualModelConfig):
         return "actual" if self.lag else self.force
 
     @model_validator(mode="after")
-    def _combination(self) -> MeasuredModelConfig:
+    def _check_combination(self) -> MeasuredModelConfig:
         if self.lag and self.force != "commanded":
             raise ValueError(
                 "lag: forces lag behind commands; set force to 'commanded', or leave lag out"
@@ -109,7 +123,7 @@ class MeasuredModelConfig(ResidualModelConfig):
 
 
 @final
-class ForceResidualConfig(Study, ComputingTask):
+class ForceResidualConfig(StudyTask, ComputingTask):
     """Regressions of the residual force of a believed hull on measured logs, cross-validated.
 
     Attributes:
@@ -126,16 +140,18 @@ class ForceResidualConfig(Study, ComputingTask):
 
     task: Literal["force_residual"]
     believed: str
-    data: ForceLogs
+    data: ForceLogsConfig
     prepare: PrepareConfig
-    channels: ForceChannels
+    channels: ForceChannelsConfig
     validation: FoldsConfig = FoldsConfig()
     models: dict[PartName, MeasuredModelConfig] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _combination(self) -> ForceResidualConfig:
-        if taken := sorted(set(_NULLS) & set(self.models)):
-            raise ValueError(f"'{taken[0]}' cannot name a model: it stands beside all of them")
+    def _check_combination(self) -> ForceResidualConfig:
+        if reserved_names := sorted(set(_REFERENCE_MODELS) & set(self.models)):
+            raise ValueError(
+                f"'{reserved_names[0]}' cannot name a model: it stands beside all of them"
+            )
         if self.prepare.hold != "start":
             raise ValueError("prepare.hold: nothing runs forward here, leave it out")
         if (
@@ -146,12 +162,12 @@ class ForceResidualConfig(Study, ComputingTask):
                 "validation: gap holds at least one step of the grid, segment at least ten"
             )
         try:
-            self.hull()
+            self.believed_hull()
         except ConfigError as error:
             raise ValueError(str(error)) from None
         return self
 
-    def hull(self) -> Hull:
+    def believed_hull(self) -> Hull:
         """Return the known hull.
 
         Raises:
@@ -167,33 +183,33 @@ class ForceResidualConfig(Study, ComputingTask):
         return vessel.hull
 
     def check(self) -> None:
-        measured = self.measured()
-        for part in measured.part.unique().tolist():
-            measured.split(part, self.validation.gap)
+        measured = self.read_logs()
+        for part in measured.fold_index.unique().tolist():
+            measured.split_fold(part, self.validation.gap)
 
     def input_files(self) -> Sequence[Path]:
-        return self.data.files()
+        return self.data.find_paths()
 
-    def measured(self) -> Measured:
+    def read_logs(self) -> MeasuredForceLogs:
         """Return what the logs hold."""
-        return read_measured(self.data, self.channels, self.prepare, self.validation)
+        return read_force_logs(self.data, self.channels, self.prepare, self.validation)
 
-    def results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
-        return force_study(self)
+    def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
+        return run_force_study(self)
 
-    def main_figures(self, results: Results) -> dict[str, MainFigure]:
-        figures: dict[str, MainFigure] = {}
-        for force, rows in _groups(results).items():
-            best = min(rows.values(), key=lambda row: sum(row["of_zero"]))
-            for row in (rows["believed"], best):
+    def main_figures(self, results: StudyResults) -> dict[str, SummaryMetric]:
+        figures: dict[str, SummaryMetric] = {}
+        for force, rows in _rows_by_force(results).items():
+            best_row = min(rows.values(), key=lambda row: sum(row["of_zero"]))
+            for row in (rows["believed"], best_row):
                 name = f"share of the {force} force left by {row['model']}"
-                figures[name] = MainFigure(sum(row["of_zero"]) / 3)
+                figures[name] = SummaryMetric(sum(row["of_zero"]) / 3)
         return figures
 
-    def verdict(self, results: Results) -> list[str]:
+    def summarize(self, results: StudyResults) -> list[str]:
         """Return the sentences that say for each force whether a regression gained anything."""
         sentences: list[str] = []
-        for force, rows in _groups(results).items():
+        for force, rows in _rows_by_force(results).items():
             if results["intervals"] is None:
                 sentences.append(
                     f"{force.capitalize()} force: there are too few segments to say whether one"
@@ -202,49 +218,57 @@ class ForceResidualConfig(Study, ComputingTask):
                 continue
             believed = rows["believed"]
             bounds = believed["minus_zero"]["ci95"][:3]
-            worse = [axis for axis, limits in zip(AXES, bounds, strict=True) if limits[0] > 0]
+            worse_axes = [axis for axis, limits in zip(AXES, bounds, strict=True) if limits[0] > 0]
             sentences.append(
                 f"{force.capitalize()} force: the believed model is better than no force"
-                f" {_where(better(believed, 'zero'))}"
-                + (f", and worse than no force in {listed(worse)}." if worse else ".")
+                f" {_axes_text(is_significantly_better(believed, 'zero'))}"
+                + (f", and worse than no force in {join_list(worse_axes)}." if worse_axes else ".")
             )
-            sentences += _gains([row for name, row in rows.items() if name not in _NULLS])
+            sentences += _gain_sentences(
+                [row for name, row in rows.items() if name not in _REFERENCE_MODELS]
+            )
         thrusters = results["forces"]["lag"]
         lags = {name: model["all"].get("lag") for name, model in results["models"].items()}
-        each = [
-            f"{number(lag['frequency'])} rad/s and {number(lag['delay'], 2)} s for {name}"
+        lag_texts = [
+            f"{format_number(lag['frequency'])} rad/s and {format_number(lag['delay'], 2)} s for {name}"
             for name, lag in lags.items()
             if lag
         ]
-        if each and not isinstance(thrusters, str):
+        if lag_texts and not isinstance(thrusters, str):
             sentences.append(
-                f"The lag fitted together with the residual is {listed(each)}; the actual forces"
-                f" follow the commands with {number(thrusters['frequency'])} rad/s and"
-                f" {number(thrusters['delay'], 2)} s."
+                f"The lag fitted together with the residual is {join_list(lag_texts)}; the actual forces"
+                f" follow the commands with {format_number(thrusters['frequency'])} rad/s and"
+                f" {format_number(thrusters['delay'], 2)} s."
             )
         return sentences
 
-    def sections(self, results: Results, run: Path) -> list[Section]:
-        drawn = [one.part() for one in pictures(run, "scores")]
-        first = next(iter(_groups(results).values()))
-        out = [
-            Section("", [*drawn, _models(self, results, first).part(3, 6)]),
-            _data(self, results),
-            _forces(results, run),
+    def build_sections(self, results: StudyResults, run: Path) -> list[Section]:
+        previews = [picture.preview() for picture in find_figures(run, "scores")]
+        first_group = next(iter(_rows_by_force(results).values()))
+        sections_written = [
+            Section("", [*previews, _model_table(self, results, first_group).select_columns(3, 6)]),
+            _data_section(self, results),
+            _force_section(results, run),
         ]
         if results["acceleration"]:
-            out.append(_accelerations(results, run))
-        for force, rows in _groups(results).items():
-            out.append(Section(f"Residual of the {force} force", [_models(self, results, rows)]))
-        out.append(Section("Errors and residuals", pictures(run, "scores", "residual_")))
+            sections_written.append(_acceleration_section(results, run))
+        for force, rows in _rows_by_force(results).items():
+            sections_written.append(
+                Section(f"Residual of the {force} force", [_model_table(self, results, rows)])
+            )
+        sections_written.append(
+            Section("Errors and residuals", find_figures(run, "scores", "residual_"))
+        )
         if results["failed"]:
-            causes = list(results["failed"].values())
-            out.append(Section("Not determined by these logs", [Bullets(causes)]))
+            failure_reasons = list(results["failed"].values())
+            sections_written.append(
+                Section("Not determined by these logs", [Bullets(failure_reasons)])
+            )
         title = "Coefficients of models fitted to all samples"
-        return out + model_sections(title, results["models"], run, "all", {})
+        return sections_written + model_sections(title, results["models"], run, "all", {})
 
 
-class Model(NamedTuple):
+class CrossValidatedModel(NamedTuple):
     """A model that the logs determine.
 
     Attributes:
@@ -257,11 +281,11 @@ class Model(NamedTuple):
 
     error: Tensor
     folds: list[dict[str, Any]]
-    fit: Fit
+    fit: RegressionFit
     not_forward: str
 
 
-def force_study(config: ForceResidualConfig) -> tuple[dict[str, Any], list[Figure]]:
+def run_force_study(config: ForceResidualConfig) -> tuple[dict[str, Any], list[Figure]]:
     """Read the logs, fit and judge every model; return what force_residual.json holds, and figures.
 
     A model that the logs do not determine is set aside with the reason.
@@ -269,44 +293,45 @@ def force_study(config: ForceResidualConfig) -> tuple[dict[str, Any], list[Figur
     Raises:
         ResidnetError: where a log cannot be used or no model is determined.
     """
-    measured, believed = config.measured(), ForceModel(config.hull())
-    models, failed = dict[str, Model](), dict[str, str]()
-    for name, of_model in config.models.items():
+    measured, believed = config.read_logs(), ForceModel(config.believed_hull())
+    models, failures = dict[str, CrossValidatedModel](), dict[str, str]()
+    for name, model_config in config.models.items():
         try:
-            models[name] = _judged(config, name, of_model, measured, believed)
+            models[name] = _cross_validate(config, name, model_config, measured, believed)
         except FitError as error:
-            failed[name] = f"model {name}: {error}"
+            failures[name] = f"model {name}: {error}"
     if not models:
-        raise FitError(next(iter(failed.values())))
-    record, parts = measured.record, measured.blocks()
+        raise FitError(next(iter(failures.values())))
+    record, resampling_blocks = measured.record, measured.resampling_blocks()
     motion = record.nu_dot, record.nu, record.pose[:, HEADING]
     unmodelled = {
-        which: believed.residual(force, *motion) for which, force in measured.forces.items()
+        force_kind: believed.force_residual(force, *motion)
+        for force_kind, force in measured.forces.items()
     }
-    rows = _rows(config, measured, models, unmodelled)
+    rows = _evaluation_rows(config, measured, models, unmodelled)
     content = {
         "schema": "residnet.force_residual/1",
         "run": config.name,
         "logs": [
             {"name": name, "samples": count, "seconds": count * record.dt}
-            for name, count in zip(measured.names, record.runs, strict=True)
+            for name, count in zip(measured.names, record.run_lengths, strict=True)
         ],
-        "samples": len(measured.good),
-        "used": int(measured.good.sum()),
-        "masked": measured.masked,
-        "folds": {"of": measured.parts, "count": int(measured.part.max()) + 1},
-        "intervals": None if parts is None else parts.row(),
+        "samples": len(measured.usable),
+        "used": int(measured.usable.sum()),
+        "masked": measured.masked_shares,
+        "folds": {"of": measured.fold_unit, "count": int(measured.fold_index.max()) + 1},
+        "intervals": None if resampling_blocks is None else resampling_blocks.to_row(),
         "forces": compare_forces(measured),
-        "acceleration": measured.acceleration,
+        "acceleration": measured.acceleration_comparison,
         "rows": rows,
-        "failed": failed,
+        "failed": failures,
         "models": {
             name: {
                 "folds": model.folds,
                 "all": model.fit.notes,
                 "runs_forward": not model.not_forward,
                 "not_forward": model.not_forward,
-                **fit_as_json(config.models[name].terms, model.fit),
+                **fit_to_json(config.models[name].terms, model.fit),
             }
             for name, model in models.items()
         },
@@ -321,62 +346,72 @@ def force_study(config: ForceResidualConfig) -> tuple[dict[str, Any], list[Figur
         ),
     ]
     # of the models of the actual force, the one with the least cross-validated error
-    of_actual = {
+    actual_force_errors = {
         row["model"]: row["minus_believed"]["mean"][3]
         for row in rows
         if row["force"] == "actual" and row["model"] in models
     }
-    if of_actual:
-        best, residual = min(of_actual, key=of_actual.__getitem__), unmodelled["actual"]
-        both = {"residual of the believed model": residual}
-        both[f"predicted by {best}"] = residual - models[best].error
-        title = f"Residual of the believed model and what {best} predicts on left-out folds"
-        signals.append(("residual", title, both, _FORCE_UNITS))
-    figures, start = [_scores(rows)], 0
-    for name, length in zip(measured.names, record.runs, strict=True):
-        inside = slice(start, start + length)
-        figures += [_pair(measured, name, inside, *pair) for pair in signals if pair[2]]
+    if actual_force_errors:
+        best_name, residual = (
+            min(actual_force_errors, key=actual_force_errors.__getitem__),
+            unmodelled["actual"],
+        )
+        compared_signals = {"residual of the believed model": residual}
+        compared_signals[f"predicted by {best_name}"] = residual - models[best_name].error
+        title = f"Residual of the believed model and what {best_name} predicts on left-out folds"
+        signals.append(("residual", title, compared_signals, _FORCE_UNITS))
+    figures, start = [_score_figure(rows)], 0
+    for name, length in zip(measured.names, record.run_lengths, strict=True):
+        log_samples = slice(start, start + length)
+        figures += [
+            _signal_figure(measured, name, log_samples, *signal) for signal in signals if signal[2]
+        ]
         start += length
-    before = {row["force"]: row["mse"] for row in rows if row["model"] == "believed"}
+    believed_mse = {row["force"]: row["mse"] for row in rows if row["model"] == "believed"}
     for name, model in models.items():
-        of_model = config.models[name]
-        figures += model_figures(name, of_model, model.fit, before[of_model.judged_on])
+        model_config = config.models[name]
+        figures += model_figures(
+            name, model_config, model.fit, believed_mse[model_config.evaluation_force]
+        )
     return content, figures
 
 
-def _judged(
+def _cross_validate(
     config: ForceResidualConfig,
     name: str,
-    of_model: MeasuredModelConfig,
-    measured: Measured,
+    model_config: MeasuredModelConfig,
+    measured: MeasuredForceLogs,
     believed: ForceModel,
-) -> Model:
+) -> CrossValidatedModel:
     """Fit a model for each fold on the samples outside and away from it, and to all of them.
 
     Raises:
         FitError: where the training samples do not determine the model.
     """
-    target, command = measured.forces[of_model.judged_on], measured.forces[of_model.force]
+    target, command = (
+        measured.forces[model_config.evaluation_force],
+        measured.forces[model_config.force],
+    )
     error, folds = torch.full_like(target, torch.nan), []
-    for part in range(int(measured.part.max()) + 1):
-        record, test = measured.split(part, config.validation.gap)
-        model = fit_model(of_model, replace(record, command=command), believed)
+    for fold_index in range(int(measured.fold_index.max()) + 1):
+        record, test = measured.split_fold(fold_index, config.validation.gap)
+        model = fit_model(model_config, replace(record, command=command), believed)
         motion = record.nu_dot[test], record.nu[test], record.pose[test, HEADING]
-        error[test] = model.force.residual(target[test], *motion)
+        error[test] = model.force.force_residual(target[test], *motion)
         folds.append(model.fit.notes)
-    model = fit_model(of_model, replace(measured.record, command=command), believed)
+    model = fit_model(model_config, replace(measured.record, command=command), believed)
     not_forward = ""
     try:
-        forward_equations(config.believed, model.force, f"model {name}")
-    except (ConfigError, FitError) as refusal:
-        not_forward = str(refusal)
-    return Model(error, folds, model.fit, not_forward)
+        derive_forward_equations(config.believed, model.force, f"model {name}")
+    except (ConfigError, FitError) as forward_error:
+        not_forward = str(forward_error)
+    return CrossValidatedModel(error, folds, model.fit, not_forward)
 
 
-def _rows(
+def _evaluation_rows(
     config: ForceResidualConfig,
-    measured: Measured,
-    models: Mapping[str, Model],
+    measured: MeasuredForceLogs,
+    models: Mapping[str, CrossValidatedModel],
     unmodelled: Mapping[str, Tensor],
 ) -> list[dict[str, Any]]:
     """Return the rows of all models, grouped by the force that judges them.
@@ -387,116 +422,135 @@ def _rows(
     """
     groups: dict[str, list[str]] = {}
     for name in models:
-        groups.setdefault(config.models[name].judged_on, []).append(name)
-    segments, parts = measured.segments(), measured.blocks()
+        groups.setdefault(config.models[name].evaluation_force, []).append(name)
+    segments, resampling_blocks = measured.usable_segments(), measured.resampling_blocks()
     rows: list[dict[str, Any]] = []
     for force, names in groups.items():
-        left = {"zero": measured.forces[force], "believed": unmodelled[force]}
-        left |= {name: models[name].error for name in names}
+        residuals = {"zero": measured.forces[force], "believed": unmodelled[force]}
+        residuals |= {name: models[name].error for name in names}
         errors = {
             name: np.stack([error[segment].square().mean(0).numpy() for segment in segments])
-            for name, error in left.items()
+            for name, error in residuals.items()
         }
-        choice = [min(_NULLS, key=lambda name: float(errors[name][:, a].mean())) for a in range(3)]
-        others = {name: errors[name] for name in _NULLS}
-        others["reference"] = np.stack(
-            [errors[name][:, a] for a, name in enumerate(choice)], axis=1
+        best_reference = [
+            min(_REFERENCE_MODELS, key=lambda name: float(errors[name][:, a].mean()))
+            for a in range(3)
+        ]
+        reference_errors = {name: errors[name] for name in _REFERENCE_MODELS}
+        reference_errors["reference"] = np.stack(
+            [errors[name][:, a] for a, name in enumerate(best_reference)], axis=1
         )
-        level = np.maximum(errors["zero"].mean(0), 1e-300)
+        zero_error = np.maximum(errors["zero"].mean(0), 1e-300)
         for name, error in errors.items():
             row = {
                 "force": force,
                 "model": name,
                 "mse": error.mean(0).tolist(),
-                "of_zero": (error.mean(0) / level).tolist(),
+                "of_zero": (error.mean(0) / zero_error).tolist(),
                 "segments": len(segments),
-                "reference": choice,
+                "reference": best_reference,
             }
-            for other, theirs in others.items():
-                if other != name:
+            for reference_name, reference_error in reference_errors.items():
+                if reference_name != name:
                     # by axis, and for their mean
-                    apart = (error - theirs) / level
-                    columns = np.concatenate((apart, apart.mean(1, keepdims=True)), axis=1)
-                    row[f"minus_{other}"] = {
+                    relative_difference = (error - reference_error) / zero_error
+                    columns = np.concatenate(
+                        (relative_difference, relative_difference.mean(1, keepdims=True)), axis=1
+                    )
+                    row[f"minus_{reference_name}"] = {
                         "mean": columns.mean(0).tolist(),
-                        "ci95": intervals(columns, parts),
+                        "ci95": bootstrap_intervals(columns, resampling_blocks),
                         "segments_below": (columns < 0).mean(0).tolist(),
                     }
             rows.append(row)
     return rows
 
 
-def better(row: Mapping[str, Any], than: str) -> list[bool]:
+def is_significantly_better(row: Mapping[str, Any], reference: str) -> list[bool]:
     """Return whether a model's error lies below another's with 95 % confidence.
 
     Args:
-        than: `zero`, `believed`, or `reference`, the better of the two on each axis.
+        reference: `zero`, `believed`, or `reference`, the better of the two on each axis.
 
     Returns:
         One flag each for surge, sway, yaw and the mean over the axes.
     """
-    return [interval is not None and interval[1] < 0 for interval in row[f"minus_{than}"]["ci95"]]
+    return [
+        interval is not None and interval[1] < 0 for interval in row[f"minus_{reference}"]["ci95"]
+    ]
 
 
-def _pair(
-    measured: Measured,
+def _signal_figure(
+    measured: MeasuredForceLogs,
     log: str,
-    inside: slice,
-    kind: str,
+    log_samples: slice,
+    figure_kind: str,
     title: str,
     signals: Mapping[str, Tensor],
     units: Sequence[tuple[str, float]],
 ) -> Figure:
     """Return two signals along one log, masked stretches in grey."""
-    t = (measured.record.t[inside] - measured.record.t[inside.start]).numpy()
-    starts, stops = stretches(~measured.good[inside].numpy())
+    t = (measured.record.t[log_samples] - measured.record.t[log_samples.start]).numpy()
+    starts, stops = find_runs(~measured.usable[log_samples].numpy())
     first, second = signals
-    looks = {"masked": MASKED, first: DASHED, second: SOLID}
+    styles = {"masked": MASKED_STYLE, first: DASHED_STYLE, second: SOLID_STYLE}
     for label in signals:
-        looks[label] = replace(looks[label], label=label, width=1.1)
-    words = (f"{title}, log {log}", f"{title}, log {log}; {first} (dashed) and {second} (solid).")
-    paths = {label: signal[inside].numpy() for label, signal in signals.items()}
+        styles[label] = replace(styles[label], label=label, width=1.1)
+    title_and_caption = (
+        f"{title}, log {log}",
+        f"{title}, log {log}; {first} (dashed) and {second} (solid).",
+    )
+    paths = {label: signal[log_samples].numpy() for label, signal in signals.items()}
     masked = {"masked": (t[starts], t[stops - 1])}
-    return histories(f"{kind}_{log}", words, looks, t, paths, units, shared=masked)
+    return plot_time_series(
+        f"{figure_kind}_{log}", title_and_caption, styles, t, paths, units, shared_traces=masked
+    )
 
 
-def _scores(rows: Sequence[Results]) -> Figure:
+def _score_figure(rows: Sequence[StudyResults]) -> Figure:
     """Return every model's error less that of the believed model, with intervals.
 
     There is a panel for each force; errors are in % of its mean square.
     """
-    looks = {
-        "zero": replace(ZERO, kind="upright"),
-        "better interval": Look("", BLUE),
-        "better": Look("better than the believed model", BLUE, kind="points", size=4.5),
-        "other interval": Look("", GREY),
-        "other": Look("no better", GREY, kind="points", marker="s", size=4.5),
+    styles = {
+        "zero": replace(ZERO_LINE_STYLE, kind="upright"),
+        "better interval": GlyphStyle("", BLUE),
+        "better": GlyphStyle("better than the believed model", BLUE, kind="points", size=4.5),
+        "other interval": GlyphStyle("", GREY),
+        "other": GlyphStyle("no better", GREY, kind="points", marker="s", size=4.5),
     }
-    panels, shown = [], []
+    panels, panel_traces = [], []
     for force in dict.fromkeys(row["force"] for row in rows):
-        members = [row for row in rows if row["force"] == force and row["model"] != "believed"][
+        force_rows = [row for row in rows if row["force"] == force and row["model"] != "believed"][
             ::-1
         ]
         points: dict[str, list[tuple[float, ...]]] = {"better": [], "other": []}
-        for place, row in enumerate(members):
-            mean, within = row["minus_believed"]["mean"][3], row["minus_believed"]["ci95"][3]
-            ends = (np.nan, np.nan) if within is None else within
-            kind = "better" if within is not None and within[1] < 0 else "other"
-            points[kind].append((place, 100 * mean, 100 * ends[0], 100 * ends[1]))
-        curves = {"zero": (np.zeros(1), np.zeros(1))}
-        for kind, found in points.items():
-            if found:
-                at, mean, low, high = np.array(found).T
-                curves[kind] = (mean, at)
-                curves[f"{kind} interval"] = whiskers(at, low, high)[::-1]
-        shown.append(curves)
+        for row_index, row in enumerate(force_rows):
+            mean, confidence_interval = (
+                row["minus_believed"]["mean"][3],
+                row["minus_believed"]["ci95"][3],
+            )
+            limits = (np.nan, np.nan) if confidence_interval is None else confidence_interval
+            point_kind = (
+                "better"
+                if confidence_interval is not None and confidence_interval[1] < 0
+                else "other"
+            )
+            points[point_kind].append((row_index, 100 * mean, 100 * limits[0], 100 * limits[1]))
+        traces = {"zero": (np.zeros(1), np.zeros(1))}
+        for point_kind, kind_points in points.items():
+            if kind_points:
+                positions, mean, lower, upper = np.array(kind_points).T
+                traces[point_kind] = (mean, positions)
+                traces[f"{point_kind} interval"] = error_bars(positions, lower, upper)[::-1]
+        panel_traces.append(traces)
         panels.append(
             Panel(
                 "",
                 "squared error less the believed model's, mean over axes [% of the mean square]",
                 f"{force} force",
-                height=50 + 31 * len(members),
-                y_names=names_of(row["model"] for row in members),
+                height=50 + 31 * len(force_rows),
+                y_names=tick_labels(row["model"] for row in force_rows),
             )
         )
     return Figure(
@@ -504,89 +558,101 @@ def _scores(rows: Sequence[Results]) -> Figure:
         "Errors beside the believed model",
         "Squared error of each model less that of the believed model where neither saw the"
         " data, with 95 % intervals.",
-        looks,
+        styles,
         panels,
-        [Case("", shown)],
+        [Case("", panel_traces)],
     )
 
 
-def _where(flags: Sequence[bool]) -> str:
-    names = [name for name, yes in zip((*AXES, "the mean over axes"), flags, strict=False) if yes]
-    return f"in {listed(names)}" if names else "on no axis"
+def _axes_text(flags: Sequence[bool]) -> str:
+    names = [
+        name for name, is_true in zip((*AXES, "the mean over axes"), flags, strict=False) if is_true
+    ]
+    return f"in {join_list(names)}" if names else "on no axis"
 
 
-def _gains(fits: Sequence[Results]) -> list[str]:
+def _gain_sentences(regression_rows: Sequence[StudyResults]) -> list[str]:
     """Return what the regressions of one force gain, and what to use on each axis.
 
     A regression is recommended where it is reliably better on that axis; of several, the one with
     the least error. Otherwise it is the better of no force and the believed model.
     """
-    best = "the better of no force and the believed model on each axis"
-    sure = {row["model"]: better(row, "reference") for row in fits}
-    winners = [row for row in fits if sure[row["model"]][3]]
-    if not winners:
+    reference_text = "the better of no force and the believed model on each axis"
+    flags_by_model = {
+        row["model"]: is_significantly_better(row, "reference") for row in regression_rows
+    }
+    better_models = [row for row in regression_rows if flags_by_model[row["model"]][3]]
+    if not better_models:
         sentences = [
-            f"None of the {len(fits)} regressions is better than {best}: every interval of the mean"
+            f"None of the {len(regression_rows)} regressions is better than {reference_text}: every interval of the mean"
             " over the axes reaches zero."
         ]
     else:
-        gain = -100 * min(row["minus_reference"]["mean"][3] for row in winners)
+        gain = -100 * min(row["minus_reference"]["mean"][3] for row in better_models)
         sentences = [
-            f"Of {len(fits)} regressions, these are better than {best} in the mean over the axes:"
-            f" {listed([row['model'] for row in winners])}. The largest gain is {fixed(gain, 1)} %"
+            f"Of {len(regression_rows)} regressions, these are better than {reference_text} in the mean over the axes:"
+            f" {join_list([row['model'] for row in better_models])}. The largest gain is {format_fixed(gain, 1)} %"
             " of the force's mean square."
         ]
-    single = [f"{name} ({_where(flags[:3])})" for name, flags in sure.items() if any(flags[:3])]
-    if single:
+    single_axis_texts = [
+        f"{name} ({_axes_text(flags[:3])})"
+        for name, flags in flags_by_model.items()
+        if any(flags[:3])
+    ]
+    if single_axis_texts:
         sentences.append(
-            f"Better on single axes: {listed(single)}; of {3 * len(fits)} such comparisons, one in"
+            f"Better on single axes: {join_list(single_axis_texts)}; of {3 * len(regression_rows)} such comparisons, one in"
             " forty comes out so by chance."
         )
-    worse = [row["model"] for row in fits if row["minus_reference"]["ci95"][3][0] > 0]
-    if worse:
-        sentences.append(f"Worse than that: {listed(worse)}.")
-    chosen: dict[str, list[str]] = {}
+    worse_models = [
+        row["model"] for row in regression_rows if row["minus_reference"]["ci95"][3][0] > 0
+    ]
+    if worse_models:
+        sentences.append(f"Worse than that: {join_list(worse_models)}.")
+    axes_by_model: dict[str, list[str]] = {}
     for axis, name in enumerate(AXES):
-        able = [row for row in fits if sure[row["model"]][axis]]
-        use = _NULLS[fits[0]["reference"][axis]]
-        if able:
-            use = min(able, key=lambda row: float(row["mse"][axis]))["model"]
-        chosen.setdefault(use, []).append(name)
-    parts = [f"{use} in {listed(axes)}" for use, axes in chosen.items()]
-    return [*sentences, f"Recommended: {', '.join(parts)}."]
+        better_rows = [row for row in regression_rows if flags_by_model[row["model"]][axis]]
+        recommended = _REFERENCE_MODELS[regression_rows[0]["reference"][axis]]
+        if better_rows:
+            recommended = min(better_rows, key=lambda row: float(row["mse"][axis]))["model"]
+        axes_by_model.setdefault(recommended, []).append(name)
+    recommendations = [
+        f"{recommended} in {join_list(axes)}" for recommended, axes in axes_by_model.items()
+    ]
+    return [*sentences, f"Recommended: {', '.join(recommendations)}."]
 
 
-def _groups(results: Results) -> dict[str, dict[str, Results]]:
+def _rows_by_force(results: StudyResults) -> dict[str, dict[str, StudyResults]]:
     """Return the rows by force and model."""
-    out: dict[str, dict[str, Results]] = {}
+    rows_by_force: dict[str, dict[str, StudyResults]] = {}
     for row in results["rows"]:
-        out.setdefault(row["force"], {})[row["model"]] = row
-    return out
+        rows_by_force.setdefault(row["force"], {})[row["model"]] = row
+    return rows_by_force
 
 
-def _data(config: ForceResidualConfig, results: Results) -> Section:
-    lengths = [f"{log['name']} ({log['seconds']:.0f} s)" for log in results["logs"]]
-    masks = [
+def _data_section(config: ForceResidualConfig, results: StudyResults) -> Section:
+    log_texts = [f"{log['name']} ({log['seconds']:.0f} s)" for log in results["logs"]]
+    mask_texts = [
         f"{100 * share:.1f} % of {log} by {reason}"
         for log, reasons in results["masked"].items()
         for reason, share in reasons.items()
     ]
     folds, validation, blocks = results["folds"], config.validation, results["intervals"]
-    each = (
+    fold_text = (
         "each consists of whole logs"
         if folds["of"] == "logs"
         else "each is a stretch of time of every log"
     )
     paragraphs = [
-        f"Logs: {', '.join(lengths)}. Masked: {', '.join(masks) or 'nothing'}; {results['used']} of"
+        f"Logs: {', '.join(log_texts)}. Masked: {', '.join(mask_texts) or 'nothing'}; {results['used']} of"
         f" {results['samples']} samples are used.",
-        f"There are {folds['count']} folds; {each}. No model is fitted to data within"
+        f"There are {folds['count']} folds; {fold_text}. No model is fitted to data within"
         f" {validation.gap:g} s of what it predicts. Orders and penalties are chosen inside the"
         f" training part, on left-out segments of {validation.segment:g} s. Errors are means over"
         " segments.",
         "There are no intervals, because there are fewer than five segments."
         if blocks is None
-        else f"Intervals (95 %) come from resampling {plural(blocks['count'], blocks['of'][:-1])}."
+        else f"Intervals (95 %) come from resampling {format_count(blocks['count'], blocks['of'][:-1])}."
         + (
             ""
             if blocks["of"] == "logs"
@@ -598,85 +664,111 @@ def _data(config: ForceResidualConfig, results: Results) -> Section:
     return Section("Data and cross-validation", [Text(paragraphs)])
 
 
-def _forces(results: Results, run: Path) -> Section:
+def _force_section(results: StudyResults, run: Path) -> Section:
     lag = results["forces"]["lag"]
     text = (
         f"The thrusters' lag is not determined: {lag}."
         if isinstance(lag, str)
-        else f"The actual force follows the command with a lag of {number(lag['frequency'])} rad/s,"
-        f" a damping ratio of {number(lag['damping'])} and a delay of {number(lag['delay'])} s."
+        else f"The actual force follows the command with a lag of {format_number(lag['frequency'])} rad/s,"
+        f" a damping ratio of {format_number(lag['damping'])} and a delay of {format_number(lag['delay'])} s."
     )
-    table = table_of(
+    table = build_table(
         [{"axis": axis, **results["forces"][axis]} for axis in AXES],
         [
             ("axis", "axis"),
-            ("rms commanded", "rms_commanded", lambda value: number(value, 4)),
-            ("rms actual", "rms_actual", lambda value: number(value, 4)),
+            ("rms commanded", "rms_commanded", lambda value: format_number(value, 4)),
+            ("rms actual", "rms_actual", lambda value: format_number(value, 4)),
             ("explained by the command %", "explained", 1, 100),
             ("explained through the lag %", "explained_with_lag", 1, 100),
             ("gain through the lag", "gain_with_lag", 3),
         ],
         caption="Forces in N, N and N m; a share is of the variance of the actual force.",
     )
-    return Section("Commanded and actual force", [Text(text), table, *pictures(run, "forces_")])
+    return Section("Commanded and actual force", [Text(text), table, *find_figures(run, "forces_")])
 
 
-def _accelerations(results: Results, run: Path) -> Section:
-    table = table_of(
+def _acceleration_section(results: StudyResults, run: Path) -> Section:
+    table = build_table(
         [{"axis": axis, **results["acceleration"][axis]} for axis in AXES],
         [
             ("axis", "axis"),
-            ("offset", "offset", lambda value: number(value, 2)),
-            ("95 % interval", "offset_ci95", lambda value: interval(value, digits=2)),
-            ("rms difference", "rms_without_offset", number),
-            ("rms of the derivative", "rms", number),
+            ("offset", "offset", lambda value: format_number(value, 2)),
+            ("95 % interval", "offset_ci95", lambda value: format_interval(value, digits=2)),
+            ("rms difference", "rms_without_offset", format_number),
+            ("rms of the derivative", "rms", format_number),
             ("correlation", "correlation", 4),
         ],
         caption="In m/s^2, m/s^2 and rad/s^2; the models use the derivative of the velocity.",
     )
     title = "Measured accelerations and derivatives of velocity"
-    return Section(title, [table, *pictures(run, "accelerations_")])
+    return Section(title, [table, *find_figures(run, "accelerations_")])
 
 
-def _models(config: ForceResidualConfig, results: Results, group: Mapping[str, Results]) -> Table:
+def _model_table(
+    config: ForceResidualConfig, results: StudyResults, group: Mapping[str, StudyResults]
+) -> Table:
     """Return the table of the models that are judged on one force (Tables 5.1, 5.2, 5.4, 5.5)."""
-    base, rows = group["believed"]["mse"], []
+    believed_mse, rows = group["believed"]["mse"], []
     for name, row in group.items():
-        of_model, printed, notes = config.models.get(name), None, ""
-        if of_model is not None:
-            notes = notes_text(results["models"][name]["all"])
-            if of_model.published is not None:
-                printed = [
-                    100 * after / before for before, after in zip(*of_model.published, strict=True)
+        model_config, published_share, notes = config.models.get(name), None, ""
+        if model_config is not None:
+            notes = format_notes(results["models"][name]["all"])
+            if model_config.published is not None:
+                published_share = [
+                    100 * mse_with / mse_without
+                    for mse_without, mse_with in zip(*model_config.published, strict=True)
                 ]
-        left = [100 * a / b for a, b in zip(row["mse"], base, strict=True)]
-        rows.append({**row, "left": left, "published": {"left": printed}, "notes": notes})
+        remaining_percent = [100 * a / b for a, b in zip(row["mse"], believed_mse, strict=True)]
+        rows.append(
+            {
+                **row,
+                "left": remaining_percent,
+                "published": {"left": published_share},
+                "notes": notes,
+            }
+        )
 
-    def apart(other: str) -> list[Any]:
-        def cell(row: Any) -> Cell:
-            bounds = row[other]["ci95"][3] if other in row else None
-            return Cell(" to ".join(signed(100 * bound, 1) for bound in bounds or ()))
+    def difference_columns(difference_key: str) -> list[Any]:
+        def interval_cell(row: Any) -> Cell:
+            bounds = row[difference_key]["ci95"][3] if difference_key in row else None
+            return Cell(" to ".join(format_signed(100 * bound, 1) for bound in bounds or ()))
 
-        def mean(row: Any) -> Cell:
-            return Cell(signed(100 * row[other]["mean"][3], 1) if other in row else "")
+        def mean_cell(row: Any) -> Cell:
+            return Cell(
+                format_signed(100 * row[difference_key]["mean"][3], 1)
+                if difference_key in row
+                else ""
+            )
 
-        def below(row: Any) -> Cell:
-            return Cell(fixed(100 * row[other]["segments_below"][3], 0) if other in row else "")
+        def share_below(row: Any) -> Cell:
+            return Cell(
+                format_fixed(100 * row[difference_key]["segments_below"][3], 0)
+                if difference_key in row
+                else ""
+            )
 
-        return [("mean", mean), ("95 % interval", cell), ("segments better %", below)]
+        return [
+            ("mean", mean_cell),
+            ("95 % interval", interval_cell),
+            ("segments better %", share_below),
+        ]
 
-    def each(key: str, titles: Sequence[str], text: Any) -> list[Any]:
+    def axis_columns(key: str, titles: Sequence[str], text: Any) -> list[Any]:
         return [(title, lambda row, i=i: Cell(text(row[key][i]))) for i, title in enumerate(titles)]
 
-    return table_of(
+    return build_table(
         rows,
         [
             ("model", "model"),
-            *each("mse", ("surge N^2", "sway N^2", "yaw (N m)^2"), lambda value: number(value, 4)),
-            *each("of_zero", AXES, lambda value: fixed(100 * value, 0)),
-            *compared("left", AXES, 3),
-            *apart("minus_believed"),
-            *apart("minus_reference"),
+            *axis_columns(
+                "mse",
+                ("surge N^2", "sway N^2", "yaw (N m)^2"),
+                lambda value: format_number(value, 4),
+            ),
+            *axis_columns("of_zero", AXES, lambda value: format_fixed(100 * value, 0)),
+            *comparison_columns("left", AXES, 3),
+            *difference_columns("minus_believed"),
+            *difference_columns("minus_reference"),
             ("chosen by the estimator", "notes"),
         ],
         caption="Published: the share that the document's model of that kind left of its believed"
@@ -688,13 +780,17 @@ def _models(config: ForceResidualConfig, results: Results, group: Mapping[str, R
             ("mean over axes less believed, % of zero", 3),
             ("the same less the better of zero and believed on each axis", 3),
         ],
-        selected=lambda row: row["model"] == _recommended(rows),
+        is_selected=lambda row: row["model"] == _recommended_model(rows),
     )
 
 
-def _recommended(rows: Sequence[Any]) -> str:
+def _recommended_model(rows: Sequence[Any]) -> str:
     """Return the best of the models surely better than no regression, else of these."""
-    sure = [row for row in rows if row["model"] not in _NULLS and better(row, "reference")[3]]
-    nulls = [row for row in rows if row["model"] in _NULLS]
-    best = min(sure or nulls or rows, key=lambda row: sum(row["of_zero"]))
-    return str(best["model"])
+    better_rows = [
+        row
+        for row in rows
+        if row["model"] not in _REFERENCE_MODELS and is_significantly_better(row, "reference")[3]
+    ]
+    reference_rows = [row for row in rows if row["model"] in _REFERENCE_MODELS]
+    best_row = min(better_rows or reference_rows or rows, key=lambda row: sum(row["of_zero"]))
+    return str(best_row["model"])

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from residnet.physics.actuators.base import ActuatorConfig, Actuators, ForceActuators
+from residnet.physics.actuators.base import ActuatorConfig, ActuatorSystem, ForceActuators
 from residnet.physics.actuators.rudders import (
     FoilRuddersConfig,
     LinearRuddersConfig,
@@ -45,7 +45,7 @@ SubmergedActuatorsConfig = Annotated[
 
 __all__ = [
     "ActuatorConfig",
-    "Actuators",
+    "ActuatorSystem",
     "ActuatorsConfig",
     "AzimuthThrusters",
     "AzimuthThrustersConfig",

@@ -28,12 +28,12 @@ class ResponseConfig(Config, ABC):
         kind: kind of the lag.
     """
 
-    suffixes: ClassVar[tuple[str, ...]]
+    state_suffixes: ClassVar[tuple[str, ...]]
     """Of the actuator's name, one for each state of the lag."""
     kind: str
 
     @abstractmethod
-    def rate(self, a: Tensor, target: Tensor, fastest: float) -> Tensor:
+    def derivative(self, states: Tensor, target: Tensor, rate_limit: float) -> Tensor:
         """Return the derivative of the states a [..., k c], towards target [..., c]."""
 
 
@@ -41,12 +41,12 @@ class ResponseConfig(Config, ABC):
 class ImmediateConfig(ResponseConfig):
     """A position that follows at once, or as fast as the rate limit allows."""
 
-    suffixes = ()
+    state_suffixes = ()
     kind: Literal["immediate"] = "immediate"
 
-    def rate(self, a: Tensor, target: Tensor, fastest: float) -> Tensor:
+    def derivative(self, states: Tensor, target: Tensor, rate_limit: float) -> Tensor:
         """Return zeros: the position moves once per step."""
-        return torch.zeros_like(a)
+        return torch.zeros_like(states)
 
 
 @final
@@ -57,12 +57,12 @@ class FirstOrderConfig(ResponseConfig):
         time: time constant in s.
     """
 
-    suffixes = ("",)
+    state_suffixes = ("",)
     kind: Literal["first_order"] = "first_order"
     time: Seconds = Field(gt=0)
 
-    def rate(self, a: Tensor, target: Tensor, fastest: float) -> Tensor:
-        return ((target - a) / self.time).clamp(-fastest, fastest)
+    def derivative(self, states: Tensor, target: Tensor, rate_limit: float) -> Tensor:
+        return ((target - states) / self.time).clamp(-rate_limit, rate_limit)
 
 
 @final
@@ -76,18 +76,27 @@ class SecondOrderConfig(ResponseConfig):
         damping: relative damping.
     """
 
-    suffixes = ("", "_rate")
+    state_suffixes = ("", "_rate")
     kind: Literal["second_order"] = "second_order"
     frequency: RadiansPerSecond = Field(gt=0)
     damping: float = Field(gt=0)
 
-    def rate(self, a: Tensor, target: Tensor, fastest: float) -> Tensor:
+    def derivative(self, states: Tensor, target: Tensor, rate_limit: float) -> Tensor:
         """Return the derivatives of the positions, then of their rates."""
-        position, moving = a.chunk(2, dim=-1)
-        speed = moving.clamp(-fastest, fastest)
-        pull = self.frequency**2 * (target - position) - 2.0 * self.damping * self.frequency * speed
-        held = (moving.abs() >= fastest) & (pull * moving > 0)
-        return torch.cat((speed, torch.where(held, torch.zeros_like(pull), pull)), dim=-1)
+        position, velocity = states.chunk(2, dim=-1)
+        limited_velocity = velocity.clamp(-rate_limit, rate_limit)
+        acceleration = (
+            self.frequency**2 * (target - position)
+            - 2.0 * self.damping * self.frequency * limited_velocity
+        )
+        is_rate_limited = (velocity.abs() >= rate_limit) & (acceleration * velocity > 0)
+        return torch.cat(
+            (
+                limited_velocity,
+                torch.where(is_rate_limited, torch.zeros_like(acceleration), acceleration),
+            ),
+            dim=-1,
+        )
 
 
 class ServoConfig(Config):
@@ -109,7 +118,7 @@ class ServoConfig(Config):
     delay_step: Seconds | None = Field(default=None, gt=0)
 
     @model_validator(mode="after")
-    def _delay(self) -> ServoConfig:
+    def _validate_delay(self) -> ServoConfig:
         if (self.dead_time > 0) != (self.delay_step is not None):
             raise ValueError(
                 "dead_time and delay_step belong together: delay_step is the step of the plant"
@@ -124,9 +133,9 @@ class ServoConfig(Config):
                 )
         return self
 
-    def follow(self, limit: float, rate: float | None, *names: str) -> Servo:
+    def build_limited_servo(self, limit: float, rate_limit: float | None, *names: str) -> Servo:
         """Return the servo of actuators that are alike, within their limits."""
-        return Servo(self, limit, rate, names)
+        return Servo(self, limit, rate_limit, names)
 
 
 class SteeringGearConfig(ServoConfig):
@@ -140,9 +149,9 @@ class SteeringGearConfig(ServoConfig):
     limit: Radians = Field(gt=0, lt=1.5707)
     rate: RadiansPerSecond | None = Field(default=None, gt=0)
 
-    def servo(self, *names: str) -> Servo:
+    def build_servo(self, *names: str) -> Servo:
         """Return the servo of rudders by name."""
-        return self.follow(self.limit, self.rate, *names)
+        return self.build_limited_servo(self.limit, self.rate, *names)
 
 
 class ShaftConfig(ServoConfig):
@@ -156,9 +165,9 @@ class ShaftConfig(ServoConfig):
     n_max: RevsPerSecond = Field(gt=0)
     n_rate: RevRate | None = Field(default=None, gt=0)
 
-    def servo(self, *names: str) -> Servo:
+    def build_servo(self, *names: str) -> Servo:
         """Return the servo of shafts by name."""
-        return self.follow(self.n_max, self.n_rate, *names)
+        return self.build_limited_servo(self.n_max, self.n_rate, *names)
 
 
 @final
@@ -170,141 +179,162 @@ class Servo(nn.Module):
     """
 
     def __init__(
-        self, config: ServoConfig, limit: float, rate: float | None, names: Sequence[str]
+        self, config: ServoConfig, limit: float, rate_limit: float | None, names: Sequence[str]
     ) -> None:
         super().__init__()
-        self.response, self.limit, self.count = config.response, limit, len(names)
-        self.lags = len(config.response.suffixes) > 0
-        self.fastest = float("inf") if rate is None else rate
-        suffixes = config.response.suffixes or (() if rate is None else ("",))
-        self.width = len(suffixes) * self.count
+        self.response, self.limit, self.n_actuators = config.response, limit, len(names)
+        self.has_lag = len(config.response.state_suffixes) > 0
+        self.rate_limit = float("inf") if rate_limit is None else rate_limit
+        suffixes = config.response.state_suffixes or (() if rate_limit is None else ("",))
+        self.n_lag_states = len(suffixes) * self.n_actuators
         self.delay_step = config.delay_step or 0.0
-        self.taps = round(config.dead_time / self.delay_step) if self.delay_step else 0
-        self.state = (
-            *(f"{'_' if end else ''}{name}{end}" for end in suffixes for name in names),
-            *(f"_{name}_delay{i + 1}" for i in range(self.taps) for name in names),
+        self.n_delay_steps = round(config.dead_time / self.delay_step) if self.delay_step else 0
+        self.state_names = (
+            *(f"{'_' if suffix else ''}{name}{suffix}" for suffix in suffixes for name in names),
+            *(f"_{name}_delay{i + 1}" for i in range(self.n_delay_steps) for name in names),
         )
 
-    def target(self, a: Tensor, command: Tensor) -> Tensor:
+    def current_target(self, states: Tensor, command: Tensor) -> Tensor:
         """Return what the actuators follow now, [..., c]."""
-        if self.taps == 0:
+        if self.n_delay_steps == 0:
             return command.clamp(-self.limit, self.limit)
-        return a[..., -self.count :]
+        return states[..., -self.n_actuators :]
 
-    def value(self, a: Tensor, command: Tensor) -> Tensor:
+    def position(self, states: Tensor, command: Tensor) -> Tensor:
         """Return the positions [..., c], within the limit."""
-        if self.width == 0:
-            return self.target(a, command)
-        return a[..., : self.count].clamp(-self.limit, self.limit)
+        if self.n_lag_states == 0:
+            return self.current_target(states, command)
+        return states[..., : self.n_actuators].clamp(-self.limit, self.limit)
 
-    def rate(self, a: Tensor, command: Tensor) -> Tensor:
+    def derivative(self, states: Tensor, command: Tensor) -> Tensor:
         """Return the derivative [..., k c] of the states."""
-        if not self.lags:
-            return torch.zeros_like(a)
-        moving = self.response.rate(a[..., : self.width], self.target(a, command), self.fastest)
-        return torch.cat((moving, torch.zeros_like(a[..., self.width :])), dim=-1)
+        if not self.has_lag:
+            return torch.zeros_like(states)
+        lag_derivative = self.response.derivative(
+            states[..., : self.n_lag_states], self.current_target(states, command), self.rate_limit
+        )
+        return torch.cat(
+            (lag_derivative, torch.zeros_like(states[..., self.n_lag_states :])), dim=-1
+        )
 
-    def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
+    def advance_step(self, states: Tensor, command: Tensor, dt: float) -> Tensor:
         """Return the states [..., k c] after a step of dt seconds: rate limits and delay lines.
 
         Raises:
             ConfigError: where the delay line does not move by dt.
         """
-        moved = a[..., : self.width]
-        if self.width > 0 and not self.lags:
-            step = self.fastest * dt
-            moved = moved + (self.target(a, command) - moved).clamp(-step, step)
-        if self.taps == 0:
-            return moved
+        lag_states = states[..., : self.n_lag_states]
+        if self.n_lag_states > 0 and not self.has_lag:
+            max_change = self.rate_limit * dt
+            lag_states = lag_states + (self.current_target(states, command) - lag_states).clamp(
+                -max_change, max_change
+            )
+        if self.n_delay_steps == 0:
+            return lag_states
         if abs(dt - self.delay_step) > 1e-9:
             raise ConfigError(
                 f"actuator with dead time: its delay_step is {self.delay_step:g} s, but the plant"
                 f" steps by {dt:g} s; set delay_step to the step of the plant (data.step over"
                 " data.substeps)"
             )
-        newest = command.clamp(-self.limit, self.limit)
-        return torch.cat((moved, newest, a[..., self.width : -self.count]), dim=-1)
+        newest_command = command.clamp(-self.limit, self.limit)
+        return torch.cat(
+            (lag_states, newest_command, states[..., self.n_lag_states : -self.n_actuators]), dim=-1
+        )
 
 
-class Actuators(nn.Module, ABC):
+class ActuatorSystem(nn.Module, ABC):
     """All actuators of a vessel: commands move their states, and the states push the hull.
 
     Commands are [..., c], states a [..., k].
 
     A state may move continuously (`rate`, integrated with the hull: lags) or once per step
-    (`advance`, after the hull has moved with the states held: rate limits).
+    (`advance_step`, after the hull has moved with the states held: rate limits).
 
     Attributes:
-        state: names of the states; empty where the commands act at once. What no sensor measures
+        state_names: names of the states; empty where the commands act at once. What no sensor measures
             begins with `_` and enters no log.
-        commands: names of the commands.
-        in_flow: whether forces depend on the vessel's speed.
-        held: whether forces stay the same over a step.
-        diving: commands [c] that dive with full force; None where nothing does.
+        command_names: names of the commands.
+        depends_on_speed: whether forces depend on the vessel's speed.
+        is_force_constant_in_step: whether forces stay the same over a step.
+        dive_commands: commands [c] that dive with full force; None where nothing does.
     """
 
-    commands: tuple[str, ...] = ()
-    diving: Tensor | None = None
-    in_flow: bool = True
+    command_names: tuple[str, ...] = ()
+    dive_commands: Tensor | None = None
+    depends_on_speed: bool = True
 
     def __init__(self, *servos: Servo) -> None:
         super().__init__()
         self.servos = nn.ModuleList(servos)
-        self.state = tuple(name for servo in servos for name in servo.state)
-        self.widths = [len(servo.state) for servo in servos]
-        self.counts = [servo.count for servo in servos]
-        self.held = not (self.in_flow or any(servo.lags for servo in servos))
+        self.state_names = tuple(name for servo in servos for name in servo.state_names)
+        self.state_counts = [len(servo.state_names) for servo in servos]
+        self.command_counts = [servo.n_actuators for servo in servos]
+        self.is_force_constant_in_step = not (
+            self.depends_on_speed or any(servo.has_lag for servo in servos)
+        )
 
     @abstractmethod
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+    def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the commands [..., c] for a manoeuvre's drive and steer [...], each within +-1."""
 
     @abstractmethod
-    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+    def force(self, states: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         """Return the forces tau [..., n] on the hull in N and N m.
 
         Args:
-            a: states [..., k].
+            states: states [..., k].
             command: commands [..., c].
             nu: velocities through the water [..., n].
         """
 
-    def followed(self, command: Tensor) -> Tensor:
+    def servo_commands(self, command: Tensor) -> Tensor:
         """Return the commands [..., c] that servos follow, in their order."""
         return command
 
-    def _each(self, a: Tensor, command: Tensor) -> Iterator[tuple[Servo, Tensor, Tensor]]:
-        parts = torch.split(a, self.widths, dim=-1)
-        wanted = torch.split(self.followed(command), self.counts, dim=-1)
-        yield from zip(self.servos, parts, wanted, strict=True)
+    def _iterate_servos(
+        self, states: Tensor, command: Tensor
+    ) -> Iterator[tuple[Servo, Tensor, Tensor]]:
+        servo_states = torch.split(states, self.state_counts, dim=-1)
+        servo_commands = torch.split(self.servo_commands(command), self.command_counts, dim=-1)
+        yield from zip(self.servos, servo_states, servo_commands, strict=True)
 
-    def positions(self, a: Tensor, command: Tensor) -> Tensor:
+    def servo_positions(self, states: Tensor, command: Tensor) -> Tensor:
         """Return where all servos stand, [..., c]."""
-        each = [servo.value(part, wanted) for servo, part, wanted in self._each(a, command)]
-        return torch.cat(each, dim=-1)
+        positions = [
+            servo.position(servo_state, servo_command)
+            for servo, servo_state, servo_command in self._iterate_servos(states, command)
+        ]
+        return torch.cat(positions, dim=-1)
 
-    def rate(self, a: Tensor, command: Tensor) -> Tensor:
+    def derivative(self, states: Tensor, command: Tensor) -> Tensor:
         """Return the derivative [..., k] of the states."""
-        each = [servo.rate(part, wanted) for servo, part, wanted in self._each(a, command)]
-        return torch.cat(each, dim=-1)
+        derivatives = [
+            servo.derivative(servo_state, servo_command)
+            for servo, servo_state, servo_command in self._iterate_servos(states, command)
+        ]
+        return torch.cat(derivatives, dim=-1)
 
-    def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
+    def advance_step(self, states: Tensor, command: Tensor, dt: float) -> Tensor:
         """Return the states [..., k] after a step of dt seconds, of what moves once per step."""
-        each = [servo.advance(part, wanted, dt) for servo, part, wanted in self._each(a, command)]
-        return torch.cat(each, dim=-1)
+        next_states = [
+            servo.advance_step(servo_state, servo_command, dt)
+            for servo, servo_state, servo_command in self._iterate_servos(states, command)
+        ]
+        return torch.cat(next_states, dim=-1)
 
 
-class ForceActuators(Actuators, ABC):
+class ForceActuators(ActuatorSystem, ABC):
     """Actuators that push a hull in surge, sway and yaw, each as asked for, within their limits."""
 
-    in_flow = False
+    depends_on_speed = False
 
     @abstractmethod
-    def allocate(self, tau: Tensor) -> Tensor:
+    def allocate(self, force: Tensor) -> Tensor:
         """Return the commands [..., c] that ask for forces tau [..., 3] in N, N, N m."""
 
     @abstractmethod
-    def asked(self, command: Tensor) -> Tensor:
+    def requested_force(self, command: Tensor) -> Tensor:
         """Return the forces tau [..., 3] that commands [..., c] ask for, before any lag."""
 
 
@@ -320,42 +350,44 @@ class ActuatorConfig(Config, ABC):
     source: str
 
     @abstractmethod
-    def build(self) -> Actuators:
+    def build(self) -> ActuatorSystem:
         """Build the module that turns commands into forces."""
 
 
-class Command(NamedTuple):
+class CommandSpec(NamedTuple):
     """One command of steered actuators.
 
     Attributes:
         name: of the command.
-        by: what a manoeuvre sets it by.
-        largest: value of a whole share.
-        least: least share; 0 for what pushes one way.
+        demand_axis: what a manoeuvre sets it by.
+        max_value: value of a whole share.
+        min_share: least share; 0 for what pushes one way.
     """
 
     name: str
-    by: Literal["drive", "steer", "dive"]
-    largest: float
-    least: float = -1.0
+    demand_axis: Literal["drive", "steer", "dive"]
+    max_value: float
+    min_share: float = -1.0
 
 
-def demanded(commands: Sequence[Command], drive: Tensor, steer: Tensor) -> Tensor:
+def commands_from_demand(specs: Sequence[CommandSpec], drive: Tensor, steer: Tensor) -> Tensor:
     """Return commands [..., c] for drive and steer [...], shares of what is largest."""
-    given = {"drive": drive, "steer": steer, "dive": torch.zeros_like(steer)}
-    parts = [given[c.by].clamp(c.least, 1.0) * c.largest for c in commands]
-    return torch.stack(parts, dim=-1)
+    demand = {"drive": drive, "steer": steer, "dive": torch.zeros_like(steer)}
+    shares = [
+        demand[spec.demand_axis].clamp(spec.min_share, 1.0) * spec.max_value for spec in specs
+    ]
+    return torch.stack(shares, dim=-1)
 
 
 class SteeredConfig(ActuatorConfig, ABC):
     """Actuators whose config says what they do."""
 
     @abstractmethod
-    def commanded(self) -> tuple[Command, ...]:
+    def command_specs(self) -> tuple[CommandSpec, ...]:
         """Return the commands, those that servos follow first."""
 
     @abstractmethod
-    def servos(self) -> tuple[Servo, ...]:
+    def build_servos(self) -> tuple[Servo, ...]:
         """Return the servos, in the order of the commands."""
 
     @abstractmethod
@@ -368,7 +400,7 @@ class SteeredConfig(ActuatorConfig, ABC):
             nu: velocities through the water [..., n].
         """
 
-    def followed(self, command: Tensor) -> Tensor:
+    def servo_commands(self, command: Tensor) -> Tensor:
         """Return the commands [..., c] that servos follow, in their order."""
         return command
 
@@ -378,24 +410,28 @@ class SteeredConfig(ActuatorConfig, ABC):
 
 
 @final
-class SteeredActuators(Actuators):
+class SteeredActuators(ActuatorSystem):
     """Rudders, fins and jets with their propellers, as their config has them."""
 
     def __init__(self, config: SteeredConfig) -> None:
-        super().__init__(*config.servos())
-        self.config, self.commanded = config, config.commanded()
-        self.commands = tuple(command.name for command in self.commanded)
-        dive = [command.largest * (command.by == "dive") for command in self.commanded]
-        self.diving = torch.tensor(dive, dtype=torch.float64) if any(dive) else None
+        super().__init__(*config.build_servos())
+        self.config, self.command_specs = config, config.command_specs()
+        self.command_names = tuple(command.name for command in self.command_specs)
+        dive_values = [
+            command.max_value * (command.demand_axis == "dive") for command in self.command_specs
+        ]
+        self.dive_commands = (
+            torch.tensor(dive_values, dtype=torch.float64) if any(dive_values) else None
+        )
 
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        return demanded(self.commanded, drive, steer)
+    def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        return commands_from_demand(self.command_specs, drive, steer)
 
-    def followed(self, command: Tensor) -> Tensor:
-        return self.config.followed(command)
+    def servo_commands(self, command: Tensor) -> Tensor:
+        return self.config.servo_commands(command)
 
-    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        return self.config.force(self.positions(a, command), command, nu)
+    def force(self, states: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        return self.config.force(self.servo_positions(states, command), command, nu)
 
 
 Coefficients = tuple[float, float, float]
@@ -403,16 +439,16 @@ CurveRange = tuple[RevsPerSecond, RevsPerSecond]
 """Revolutions (astern, ahead) between which a curve was measured."""
 
 
-def require_range(curve_range: CurveRange | None, n_max: float) -> None:
+def require_curve_covers_range(curve_range: CurveRange | None, n_max: float) -> None:
     """Stop where a shaft may turn faster than its thrust curve is known.
 
     Raises:
         ValueError: naming both.
     """
-    low, high = curve_range or (-n_max, n_max)
-    if low > -n_max or high < n_max:
+    lower, upper = curve_range or (-n_max, n_max)
+    if lower > -n_max or upper < n_max:
         raise ValueError(
-            f"curve_range {low * 60:g} to {high * 60:g} rpm does not reach n_max"
+            f"curve_range {lower * 60:g} to {upper * 60:g} rpm does not reach n_max"
             f" (+-{n_max * 60:g} rpm); lower n_max or measure the curve further"
         )
 
@@ -434,6 +470,6 @@ class ThrustConfig(Config):
     curve_range: CurveRange | None = None
 
     @model_validator(mode="after")
-    def _range(self) -> Self:
-        require_range(self.curve_range, self.n_max)
+    def _validate_curve_range(self) -> Self:
+        require_curve_covers_range(self.curve_range, self.n_max)
         return self

@@ -13,7 +13,7 @@ import numpy as np
 from residnet.core.errors import FitError
 
 
-class Estimate(NamedTuple):
+class IntervalEstimate(NamedTuple):
     """A number with its 95 % interval, in `unit`."""
 
     value: float
@@ -28,9 +28,9 @@ class ThrottleMap(NamedTuple):
     n_max is the largest value measured where nothing saturated.
     """
 
-    slope: Estimate
-    offset: Estimate
-    n_max: Estimate
+    slope: IntervalEstimate
+    offset: IntervalEstimate
+    n_max: IntervalEstimate
     saturated: bool
 
     def __call__(self, throttle: np.ndarray) -> np.ndarray:
@@ -40,11 +40,11 @@ class ThrottleMap(NamedTuple):
         )
 
 
-class StepAnswer(NamedTuple):
+class StepResponse(NamedTuple):
     """Rate limit [1/s^2] and dead time [s] of a shaft."""
 
-    rate: Estimate
-    dead_time: Estimate
+    rate: IntervalEstimate
+    dead_time: IntervalEstimate
 
 
 class ThrustFit(NamedTuple):
@@ -53,23 +53,23 @@ class ThrustFit(NamedTuple):
     The coefficients are c0 [N], c1 [N s], c2 [N s^2]; the residual is in N.
     """
 
-    coefficients: tuple[Estimate, Estimate, Estimate]
+    coefficients: tuple[IntervalEstimate, IntervalEstimate, IntervalEstimate]
     low: float
     high: float
     rms: float
 
     def __call__(self, n: np.ndarray) -> np.ndarray:
         """Return the thrust [N] per thruster at n [1/s]."""
-        c = [estimate.value for estimate in self.coefficients]
-        out: np.ndarray = c[0] + n * (c[1] + n * c[2])
-        return out
+        coefficients = [estimate.value for estimate in self.coefficients]
+        thrust: np.ndarray = coefficients[0] + n * (coefficients[1] + n * coefficients[2])
+        return thrust
 
 
 _SATURATION_POINTS = 3
 """Points at the same revolutions from which a bound is believed."""
 
 
-def fit_throttle(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:
+def fit_throttle_map(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:
     """Fit the steady revolutions n [N] in 1/s over the throttle [N]: a line with a bound.
 
     Slope, offset and bound are found together by least squares.
@@ -93,71 +93,88 @@ def fit_throttle(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:
             "throttle test: revolutions do not rise with the throttle; check the columns, their"
             " signs and units"
         )
-    reach, top = float(np.abs(throttle).max()), float(np.abs(n).max())
-    slope = top / reach
-    flat = np.abs(n) > 0.97 * top
-    saturated = flat.sum() >= _SATURATION_POINTS and np.ptp(np.abs(throttle[flat])) > 0.05 * reach
-    start, scale = [slope, 0.0], [slope, 0.1 * top]
-    if saturated:
-        free = ~flat
-        if np.unique(throttle[free]).size >= 2:
-            start[0] = scale[0] = float(np.polyfit(throttle[free], n[free], 1)[0])
-        start, scale = [*start, float(np.median(np.abs(n[flat])))], [*scale, top]
-
-    def residual(p: np.ndarray) -> np.ndarray:
-        most = p[2] if saturated else np.inf
-        return np.asarray(np.clip(p[0] * throttle + p[1], -most, most) - n)
-
-    value, error = _least_squares(residual, start, scale, n.size)
-    if not saturated:
-        value, error = [*value, top], [*error, 0.0]
-    slope_, offset, n_max = (
-        Estimate(v, v - e, v + e, "1/s") for v, e in zip(value, error, strict=True)
+    max_throttle, max_n = float(np.abs(throttle).max()), float(np.abs(n).max())
+    slope = max_n / max_throttle
+    at_bound = np.abs(n) > 0.97 * max_n
+    is_saturated = (
+        at_bound.sum() >= _SATURATION_POINTS
+        and np.ptp(np.abs(throttle[at_bound])) > 0.05 * max_throttle
     )
-    return ThrottleMap(slope_, offset, n_max, bool(saturated))
+    initial, scale = [slope, 0.0], [slope, 0.1 * max_n]
+    if is_saturated:
+        below_bound = ~at_bound
+        if np.unique(throttle[below_bound]).size >= 2:
+            initial[0] = scale[0] = float(np.polyfit(throttle[below_bound], n[below_bound], 1)[0])
+        initial, scale = [*initial, float(np.median(np.abs(n[at_bound])))], [*scale, max_n]
+
+    def residual(parameters: np.ndarray) -> np.ndarray:
+        bound = parameters[2] if is_saturated else np.inf
+        return np.asarray(np.clip(parameters[0] * throttle + parameters[1], -bound, bound) - n)
+
+    estimates, half_width = _fit_with_intervals(residual, initial, scale, n.size)
+    if not is_saturated:
+        estimates, half_width = [*estimates, max_n], [*half_width, 0.0]
+    slope_estimate, offset, n_max = (
+        IntervalEstimate(value_k, value_k - half_width_k, value_k + half_width_k, "1/s")
+        for value_k, half_width_k in zip(estimates, half_width, strict=True)
+    )
+    return ThrottleMap(slope_estimate, offset, n_max, bool(is_saturated))
 
 
-def follow_command(
-    t: np.ndarray, command: np.ndarray, rate: float, dead_time: float, start: float
+def simulate_shaft(
+    t: np.ndarray, command: np.ndarray, rate_limit: float, dead_time: float, initial_n: float
 ) -> np.ndarray:
     """Return the revolutions [T] that follow a command with dead time and rate limit.
 
     Args:
         t: times [T] in s.
         command: commanded revolutions [T] in 1/s, held between samples.
-        rate: largest change in 1/s^2.
+        rate_limit: largest change in 1/s^2.
         dead_time: between a command and its first effect, in s.
-        start: revolutions at the first sample in 1/s.
+        initial_n: revolutions at the first sample in 1/s.
     """
-    late = t - dead_time
-    index = np.searchsorted(t, late, side="right") - 1
+    delayed_t = t - dead_time
+    command_index = np.searchsorted(t, delayed_t, side="right") - 1
     n = np.empty_like(t)
-    n[0] = start
-    step = rate * np.diff(t)
+    n[0] = initial_n
+    max_change = rate_limit * np.diff(t)
     for k in range(1, t.size):
         # the command that acted over the interval, with its share where it changed inside
-        before, after = command[max(index[k - 1], 0)], command[max(index[k], 0)]
-        share = (
-            1.0 if before == after else (late[k] - t[max(index[k], 0)]) / (late[k] - late[k - 1])
+        previous_command, next_command = (
+            command[max(command_index[k - 1], 0)],
+            command[max(command_index[k], 0)],
         )
-        first = n[k - 1] + np.clip(
-            before - n[k - 1], -step[k - 1] * (1 - share), step[k - 1] * (1 - share)
+        new_command_share = (
+            1.0
+            if previous_command == next_command
+            else (delayed_t[k] - t[max(command_index[k], 0)]) / (delayed_t[k] - delayed_t[k - 1])
         )
-        n[k] = first + np.clip(after - first, -step[k - 1] * share, step[k - 1] * share)
+        n_before_change = n[k - 1] + np.clip(
+            previous_command - n[k - 1],
+            -max_change[k - 1] * (1 - new_command_share),
+            max_change[k - 1] * (1 - new_command_share),
+        )
+        n[k] = n_before_change + np.clip(
+            next_command - n_before_change,
+            -max_change[k - 1] * new_command_share,
+            max_change[k - 1] * new_command_share,
+        )
     return n
 
 
-def fit_step(runs: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> StepAnswer:
+def fit_step_response(
+    responses: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+) -> StepResponse:
     """Fit rate limit and dead time to step responses.
 
     Args:
-        runs: for each response t [T] in s, command [T] and n [T] in 1/s.
+        responses: for each response t [T] in s, command [T] and n [T] in 1/s.
 
     Raises:
         FitError: where a run is too short, its command does not step, or the revolutions do not
             follow.
     """
-    for t, command, n in runs:
+    for t, command, n in responses:
         if t.size < 20:
             raise FitError(f"step test: {t.size} samples; at least 20 are needed")
         if np.ptp(command) == 0:
@@ -167,36 +184,53 @@ def fit_step(runs: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> StepA
                 "step test: the revolutions hardly follow the command; check columns and units, and"
                 " log until they settle"
             )
-    t, command, n = max(runs, key=lambda run: np.ptp(run[1]))
-    steep = float(np.percentile(np.abs(np.gradient(n, t)), 95))
-    moved = t[np.flatnonzero(np.abs(command - command[0]) > 0.5 * np.ptp(command))[0]]
-    rise = np.flatnonzero((np.abs(n - n[0]) > 0.1 * np.ptp(n)) & (t >= moved))
-    delay = max(float(t[rise[0]] - moved) - 0.1 * np.ptp(n) / steep, 0.0) if rise.size else 0.0
+    t, command, n = max(responses, key=lambda run: np.ptp(run[1]))
+    max_slope = float(np.percentile(np.abs(np.gradient(n, t)), 95))
+    step_time = t[np.flatnonzero(np.abs(command - command[0]) > 0.5 * np.ptp(command))[0]]
+    response_index = np.flatnonzero((np.abs(n - n[0]) > 0.1 * np.ptp(n)) & (t >= step_time))
+    initial_delay = (
+        max(float(t[response_index[0]] - step_time) - 0.1 * np.ptp(n) / max_slope, 0.0)
+        if response_index.size
+        else 0.0
+    )
 
-    def residual(p: np.ndarray) -> np.ndarray:
+    def residual(parameters: np.ndarray) -> np.ndarray:
         return np.concatenate(
             [
-                follow_command(t, c, abs(p[0]), max(p[1], 0.0), float(n[:3].mean())) - n
-                for t, c, n in runs
+                simulate_shaft(
+                    t,
+                    command_samples,
+                    abs(parameters[0]),
+                    max(parameters[1], 0.0),
+                    float(n[:3].mean()),
+                )
+                - n
+                for t, command_samples, n in responses
             ]
         )
 
-    size = sum(run[0].size for run in runs)
-    value, error = _least_squares(
+    n_samples = sum(response[0].size for response in responses)
+    estimates, half_widths = _fit_with_intervals(
         residual,
-        [steep, delay],
-        [steep, max(delay, 10 * float(np.median(np.diff(t))))],
-        size,
-        serial=True,
+        [max_slope, initial_delay],
+        [max_slope, max(initial_delay, 10 * float(np.median(np.diff(t))))],
+        n_samples,
+        is_serial=True,
     )
-    rate, dead = abs(value[0]), max(value[1], 0.0)
-    return StepAnswer(
-        Estimate(rate, rate - error[0], rate + error[0], "1/s^2"),
-        Estimate(dead, max(dead - error[1], 0.0), dead + error[1], "s"),
+    rate_limit, dead_time = abs(estimates[0]), max(estimates[1], 0.0)
+    return StepResponse(
+        IntervalEstimate(
+            rate_limit, rate_limit - half_widths[0], rate_limit + half_widths[0], "1/s^2"
+        ),
+        IntervalEstimate(
+            dead_time, max(dead_time - half_widths[1], 0.0), dead_time + half_widths[1], "s"
+        ),
     )
 
 
-def fit_thrust(n: np.ndarray, pull: np.ndarray, thrusters: int) -> tuple[ThrustFit, ThrustFit]:
+def fit_thrust_curves(
+    n: np.ndarray, pull: np.ndarray, n_thrusters: int
+) -> tuple[ThrustFit, ThrustFit]:
     """Fit the thrust per thruster over revolutions, ahead and astern, to a bollard pull.
 
     Args:
@@ -207,66 +241,76 @@ def fit_thrust(n: np.ndarray, pull: np.ndarray, thrusters: int) -> tuple[ThrustF
         FitError: where a direction has fewer than five points or four revolutions, or pulls the
             wrong way.
     """
-    return _direction(n[n > 0], pull[n > 0] / thrusters, "ahead"), _direction(
-        n[n < 0], pull[n < 0] / thrusters, "astern"
+    return _fit_thrust_curve(n[n > 0], pull[n > 0] / n_thrusters, "ahead"), _fit_thrust_curve(
+        n[n < 0], pull[n < 0] / n_thrusters, "astern"
     )
 
 
-def _direction(n: np.ndarray, thrust: np.ndarray, name: str) -> ThrustFit:
-    from scipy.stats import t as student
+def _fit_thrust_curve(n: np.ndarray, thrust: np.ndarray, direction: str) -> ThrustFit:
 
-    levels = np.unique(np.round(n / max(float(np.abs(n).max(initial=0.0)), 1e-9), 2)).size
-    if n.size < 5 or levels < 4:
+    n_levels = np.unique(np.round(n / max(float(np.abs(n).max(initial=0.0)), 1e-9), 2)).size
+    if n.size < 5 or n_levels < 4:
         raise FitError(
-            f"bollard pull {name}: {n.size} points at {levels} revolutions; a quadratic with"
+            f"bollard pull {direction}: {n.size} points at {n_levels} revolutions; a quadratic with"
             " intervals needs 5 at 4 revolutions in each direction"
         )
-    sign = 1.0 if name == "ahead" else -1.0
+    sign = 1.0 if direction == "ahead" else -1.0
     if float(np.sum(thrust * np.abs(n))) * sign < 0:
         raise FitError(
-            f"bollard pull {name}: the pull has the wrong sign; thrust is positive ahead and"
+            f"bollard pull {direction}: the pull has the wrong sign; thrust is positive ahead and"
             " negative astern"
         )
     scale = float(np.abs(n).max())
-    columns = np.stack((np.ones_like(n), n / scale, (n / scale) ** 2), axis=1)
-    solution, *_ = np.linalg.lstsq(columns, thrust, rcond=None)
-    residual = thrust - columns @ solution
+    design_matrix = np.stack((np.ones_like(n), n / scale, (n / scale) ** 2), axis=1)
+    solution, *_ = np.linalg.lstsq(design_matrix, thrust, rcond=None)
+    residual = thrust - design_matrix @ solution
     variance = float(residual @ residual) / (n.size - 3)
-    spread = np.sqrt(np.diag(np.linalg.inv(columns.T @ columns)) * variance) * float(
-        student.ppf(0.975, n.size - 3)
-    )
+    half_widths = np.sqrt(
+        np.diag(np.linalg.inv(design_matrix.T @ design_matrix)) * variance
+    ) * float(student_t.ppf(0.975, n.size - 3))
     factors = np.array([1.0, scale, scale**2])
-    parts = zip(solution / factors, spread / factors, ("N", "N s", "N s^2"), strict=True)
-    first, second, third = (
-        Estimate(float(v), float(v - e), float(v + e), unit) for v, e, unit in parts
+    estimates = zip(solution / factors, half_widths / factors, ("N", "N s", "N s^2"), strict=True)
+    c0, c1, c2 = (
+        IntervalEstimate(float(value), float(value - half_width), float(value + half_width), unit)
+        for value, half_width, unit in estimates
     )
-    return ThrustFit(
-        (first, second, third), float(n.min()), float(n.max()), float(np.sqrt(variance))
-    )
+    return ThrustFit((c0, c1, c2), float(n.min()), float(n.max()), float(np.sqrt(variance)))
 
 
-def _least_squares(
+def _fit_with_intervals(
     residual: Callable[[np.ndarray], np.ndarray],
-    start: list[float],
+    initial: list[float],
     scale: list[float],
-    size: int,
+    n_samples: int,
     *,
-    serial: bool = False,
+    is_serial: bool = False,
 ) -> tuple[list[float], list[float]]:
     """Return the parameters and half widths of their 95 % intervals.
 
     Widened for residuals that follow each other where they are a series.
     """
     from scipy.optimize import least_squares
-    from scipy.stats import t as student
 
-    found = least_squares(residual, start, x_scale=np.abs(scale), diff_step=[1e-3] * len(start))
-    variance = 2 * float(found.cost) / (size - len(start))
-    if serial:
-        e = found.fun - found.fun.mean()
-        keep = float(np.clip(np.sum(e[1:] * e[:-1]) / max(float(np.sum(e * e)), 1e-300), 0.0, 0.99))
-        variance *= (1 + keep) / (1 - keep)
-    slopes = np.asarray(found.jac)
-    covariance = np.linalg.pinv(slopes.T @ slopes) * variance
-    half = np.sqrt(np.diag(covariance)) * float(student.ppf(0.975, size - len(start)))
-    return [float(v) for v in found.x], [float(h) for h in half]
+    solution = least_squares(
+        residual, initial, x_scale=np.abs(scale), diff_step=[1e-3] * len(initial)
+    )
+    variance = 2 * float(solution.cost) / (n_samples - len(initial))
+    if is_serial:
+        centred_residual = solution.fun - solution.fun.mean()
+        autocorrelation = float(
+            np.clip(
+                np.sum(centred_residual[1:] * centred_residual[:-1])
+                / max(float(np.sum(centred_residual * centred_residual)), 1e-300),
+                0.0,
+                0.99,
+            )
+        )
+        variance *= (1 + autocorrelation) / (1 - autocorrelation)
+    jacobian = np.asarray(solution.jac)
+    covariance = np.linalg.pinv(jacobian.T @ jacobian) * variance
+    half_widths = np.sqrt(np.diag(covariance)) * float(
+        student_t.ppf(0.975, n_samples - len(initial))
+    )
+    return [float(parameter) for parameter in solution.x], [
+        float(half_width) for half_width in half_widths
+    ]

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from residnet.core.config import Config, Metres, Newtons, Radians, RevsPerSecond
 from residnet.physics.actuators.base import (
-    Command,
+    CommandSpec,
     Servo,
     ServoConfig,
     ShaftConfig,
@@ -24,7 +24,13 @@ from residnet.physics.actuators.base import (
     SteeringGearConfig,
     ThrustConfig,
 )
-from residnet.physics.parameters import Density, Parameter, Positive, SquareMetres, of_dimension
+from residnet.physics.parameters import (
+    Density,
+    Parameter,
+    Positive,
+    SquareMetres,
+    require_dimension,
+)
 
 
 class RudderConfig(SteeringGearConfig):
@@ -48,7 +54,7 @@ class RudderConfig(SteeringGearConfig):
     straightening: float = Field(default=1.0, ge=0, le=1)
 
 
-class PropellerConfig(ShaftConfig, ThrustConfig):
+class PropellerShaftConfig(ShaftConfig, ThrustConfig):
     """A propeller on its shaft.
 
     Attributes:
@@ -62,13 +68,15 @@ class PropellerConfig(ShaftConfig, ThrustConfig):
     advance_loss: float = Field(default=0.0, ge=0)
     thrust_deduction: float = Field(default=0.0, ge=0, lt=1)
 
-    def thrust(self, n: Tensor, u: Tensor) -> Tensor:
+    def thrust_at(self, n: Tensor, u: Tensor) -> Tensor:
         """Return the thrust [N] at n [1/s] and speed through the water u [m/s], any shape."""
-        f, b = self.forward, self.reverse
-        ahead = (f[0] + n * (f[1] + n * f[2])).clamp(min=0.0)
-        astern = (b[0] + n * (b[1] + n * b[2])).clamp(max=0.0)
-        curve = torch.where(n > 0, ahead, torch.where(n < 0, astern, torch.zeros_like(n)))
-        return curve - self.advance_loss * n.abs() * u.clamp(min=0.0)
+        forward, reverse = self.forward, self.reverse
+        forward_thrust = (forward[0] + n * (forward[1] + n * forward[2])).clamp(min=0.0)
+        reverse_thrust = (reverse[0] + n * (reverse[1] + n * reverse[2])).clamp(max=0.0)
+        static_thrust = torch.where(
+            n > 0, forward_thrust, torch.where(n < 0, reverse_thrust, torch.zeros_like(n))
+        )
+        return static_thrust - self.advance_loss * n.abs() * u.clamp(min=0.0)
 
 
 @final
@@ -92,35 +100,40 @@ class RudderPropellerConfig(SteeredConfig):
 
     kind: Literal["rudder_propeller"] = "rudder_propeller"
     rudder: RudderConfig
-    propeller: PropellerConfig
+    propeller: PropellerShaftConfig
     density: Density = Field(default=1025.0, gt=0)
 
-    def commanded(self) -> tuple[Command, ...]:
+    def command_specs(self) -> tuple[CommandSpec, ...]:
         """Return the rudder angle from steer, to starboard, and revolutions from drive."""
         return (
-            Command("cmd_delta", "steer", self.rudder.limit),
-            Command("cmd_n", "drive", self.propeller.n_max),
+            CommandSpec("cmd_delta", "steer", self.rudder.limit),
+            CommandSpec("cmd_n", "drive", self.propeller.n_max),
         )
 
-    def servos(self) -> tuple[Servo, ...]:
-        return self.rudder.servo("delta"), self.propeller.servo("n")
+    def build_servos(self) -> tuple[Servo, ...]:
+        return self.rudder.build_servo("delta"), self.propeller.build_servo("n")
 
     def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         rudder, propeller = self.rudder, self.propeller
         delta, u = position[..., 0], nu[..., 0]
-        lift = 0.5 * self.density * rudder.area
-        lift *= 6.13 * rudder.aspect_ratio / (rudder.aspect_ratio + 2.25)
-        disc = 0.25 * math.pi * propeller.diameter**2
-        thrust = propeller.thrust(position[..., 1], u)
-        race = rudder.race_share * 2.0 / (self.density * disc)
-        square = u * u.abs() + race * thrust.clamp(min=0.0)
-        across = rudder.straightening * (nu[..., 1] + rudder.x * nu[..., 2])
+        lift_factor = 0.5 * self.density * rudder.area
+        lift_factor *= 6.13 * rudder.aspect_ratio / (rudder.aspect_ratio + 2.25)
+        disc_area = 0.25 * math.pi * propeller.diameter**2
+        thrust = propeller.thrust_at(position[..., 1], u)
+        race_factor = rudder.race_share * 2.0 / (self.density * disc_area)
+        signed_inflow_squared = u * u.abs() + race_factor * thrust.clamp(min=0.0)
+        cross_flow = rudder.straightening * (nu[..., 1] + rudder.x * nu[..., 2])
         # the offset keeps the gradient finite at rest
-        inflow = torch.sqrt(square.abs() + 1e-8)
-        normal = lift * (square * torch.sin(delta) + inflow * across * torch.cos(delta))
-        side = -normal * torch.cos(delta)
-        ahead = (1.0 - propeller.thrust_deduction) * thrust
-        return torch.stack((ahead - normal * torch.sin(delta), side, rudder.x * side), dim=-1)
+        inflow = torch.sqrt(signed_inflow_squared.abs() + 1e-8)
+        normal_force = lift_factor * (
+            signed_inflow_squared * torch.sin(delta) + inflow * cross_flow * torch.cos(delta)
+        )
+        side_force = -normal_force * torch.cos(delta)
+        net_thrust = (1.0 - propeller.thrust_deduction) * thrust
+        return torch.stack(
+            (net_thrust - normal_force * torch.sin(delta), side_force, rudder.x * side_force),
+            dim=-1,
+        )
 
 
 class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
@@ -144,7 +157,9 @@ class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
     thrust: Newtons = Field(gt=0)
 
     @abstractmethod
-    def foil(self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor) -> tuple[Tensor, Tensor]:
+    def lift_and_drag(
+        self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return the lift and drag [...] in N of all rudders.
 
         Args:
@@ -154,24 +169,24 @@ class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
             thrust: of all propellers [...] in N.
         """
 
-    def commanded(self) -> tuple[Command, ...]:
+    def command_specs(self) -> tuple[CommandSpec, ...]:
         """Return rudder angle and thrust; there is none astern."""
         return (
-            Command("cmd_delta", "steer", self.limit),
-            Command("cmd_thrust", "drive", self.thrust, 0.0),
+            CommandSpec("cmd_delta", "steer", self.limit),
+            CommandSpec("cmd_thrust", "drive", self.thrust, 0.0),
         )
 
-    def servos(self) -> tuple[Servo, ...]:
-        return (self.servo("delta"),)
+    def build_servos(self) -> tuple[Servo, ...]:
+        return (self.build_servo("delta"),)
 
-    def followed(self, command: Tensor) -> Tensor:
+    def servo_commands(self, command: Tensor) -> Tensor:
         """Return the rudder's command [..., 1]; thrust acts at once."""
         return command[..., :1]
 
     @final
     def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         thrust = command[..., 1].clamp(0.0, self.thrust)
-        lift, drag = self.foil(position[..., 0], nu[..., 0], nu[..., 1], thrust)
+        lift, drag = self.lift_and_drag(position[..., 0], nu[..., 0], nu[..., 1], thrust)
         return torch.stack((thrust - drag, -lift, self.z * lift, -self.x * lift), dim=-1)
 
 
@@ -203,20 +218,27 @@ class FoilRuddersConfig(SternRuddersConfig):
     diameter: Metres = Field(gt=0)
     density: Density = Field(gt=0)
 
-    def foil(self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor) -> tuple[Tensor, Tensor]:
-        disc = 0.25 * math.pi * self.diameter**2
+    def lift_and_drag(
+        self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        disc_area = 0.25 * math.pi * self.diameter**2
         # C_Th V^2 per newton of total thrust: each propeller has its share
-        loading = 2.0 / (self.propellers * self.density * disc)
-        angle = delta.clamp(-self.stall, self.stall)
-        square = u * u + v * v
+        thrust_loading = 2.0 / (self.propellers * self.density * disc_area)
+        angle_of_attack = delta.clamp(-self.stall, self.stall)
+        speed_squared = u * u + v * v
         # 1/sqrt(1 + C_Th); the offset keeps it and its gradient finite at rest
-        share = torch.sqrt((square + 1e-20) / (square + loading * thrust + 1e-20))
-        race = thrust * (1.0 + share)
-        coefficient = self.lift_slope * angle
-        flow = 0.5 * self.density * self.area * self.rudders * square
-        induced = 1.0 / (0.9 * math.pi * self.aspect_ratio)
-        lift = flow * coefficient + race * torch.sin(angle)
-        drag = flow * induced * coefficient * coefficient + race * (1.0 - torch.cos(angle))
+        slipstream_ratio = torch.sqrt(
+            (speed_squared + 1e-20) / (speed_squared + thrust_loading * thrust + 1e-20)
+        )
+        race_force = thrust * (1.0 + slipstream_ratio)
+        lift_coefficient = self.lift_slope * angle_of_attack
+        dynamic_force = 0.5 * self.density * self.area * self.rudders * speed_squared
+        induced_drag_factor = 1.0 / (0.9 * math.pi * self.aspect_ratio)
+        lift = dynamic_force * lift_coefficient + race_force * torch.sin(angle_of_attack)
+        drag = (
+            dynamic_force * induced_drag_factor * lift_coefficient * lift_coefficient
+            + race_force * (1.0 - torch.cos(angle_of_attack))
+        )
         return lift, drag
 
 
@@ -233,16 +255,18 @@ class LinearRuddersConfig(SternRuddersConfig):
     kind: Literal["linear_rudders"] = "linear_rudders"
     Y_delta_uu: float = Field(gt=0)
 
-    def foil(self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor) -> tuple[Tensor, Tensor]:
+    def lift_and_drag(
+        self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor
+    ) -> tuple[Tensor, Tensor]:
         return self.Y_delta_uu * u * u * delta, torch.zeros_like(delta)
 
 
-Force = Annotated[Parameter, AfterValidator(of_dimension(1, 1, -2))]
-ForcePerSpeed = Annotated[Parameter, AfterValidator(of_dimension(1, 0, -1))]
-ForcePerSquaredSpeed = Annotated[Parameter, AfterValidator(of_dimension(1, -1, 0))]
-Ratio = Annotated[Parameter, AfterValidator(of_dimension(0, 0, 0))]
-PerRevolutions = Annotated[Parameter, AfterValidator(of_dimension(0, 0, 1))]
-PerSquaredRevolutions = Annotated[Parameter, AfterValidator(of_dimension(0, 0, 2))]
+Force = Annotated[Parameter, AfterValidator(require_dimension(1, 1, -2))]
+ForcePerSpeed = Annotated[Parameter, AfterValidator(require_dimension(1, 0, -1))]
+ForcePerSquaredSpeed = Annotated[Parameter, AfterValidator(require_dimension(1, -1, 0))]
+Ratio = Annotated[Parameter, AfterValidator(require_dimension(0, 0, 0))]
+PerRevolutions = Annotated[Parameter, AfterValidator(require_dimension(0, 0, 1))]
+PerSquaredRevolutions = Annotated[Parameter, AfterValidator(require_dimension(0, 0, 2))]
 
 
 class SpeedCurve(Config):
@@ -299,36 +323,43 @@ class WaterJetsConfig(SteeredConfig):
     motor: ShaftConfig
     nozzle: SteeringGearConfig
 
-    def commanded(self) -> tuple[Command, ...]:
+    def command_specs(self) -> tuple[CommandSpec, ...]:
         """Return revolutions, since jets do not push astern, and the yaw moment's sense."""
-        side = self.nozzle.limit if self.x > 0 else -self.nozzle.limit
+        max_nozzle_angle = self.nozzle.limit if self.x > 0 else -self.nozzle.limit
         return (
-            Command("cmd_n", "drive", self.motor.n_max, 0.0),
-            Command("cmd_nozzle", "steer", side),
+            CommandSpec("cmd_n", "drive", self.motor.n_max, 0.0),
+            CommandSpec("cmd_nozzle", "steer", max_nozzle_angle),
         )
 
-    def servos(self) -> tuple[Servo, ...]:
-        return self.motor.servo("n"), self.nozzle.servo("nozzle")
+    def build_servos(self) -> tuple[Servo, ...]:
+        return self.motor.build_servo("n"), self.nozzle.build_servo("nozzle")
 
-    def followed(self, command: Tensor) -> Tensor:
+    def servo_commands(self, command: Tensor) -> Tensor:
         """Return the commands [..., 2] without negative revolutions."""
         return torch.stack((command[..., 0].clamp(min=0.0), command[..., 1]), dim=-1)
 
-    def thrust(self, n: Tensor, u: Tensor) -> Tensor:
+    def jet_thrust(self, n: Tensor, u: Tensor) -> Tensor:
         """Return the thrust [N] of one jet at revolutions n [1/s] and speed u [m/s], any shape.
 
         Source: document 000 eq. (6.16).
         """
-        a, r = self.speed, self.revolutions
-        by_speed = a.a0.value + u * (a.a1.value + u * a.a2.value)
-        share = (r.r0.value + n * (r.r1.value + n * r.r2.value)) / r.reference.value
-        return by_speed * share
+        speed_curve, revolutions_curve = self.speed, self.revolutions
+        reference_thrust = speed_curve.a0.value + u * (
+            speed_curve.a1.value + u * speed_curve.a2.value
+        )
+        revolutions_share = (
+            revolutions_curve.r0.value
+            + n * (revolutions_curve.r1.value + n * revolutions_curve.r2.value)
+        ) / revolutions_curve.reference.value
+        return reference_thrust * revolutions_share
 
     def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         n, angle = position.unbind(-1)
-        total = self.jets * self.thrust(n, nu[..., 0])
-        across = total * torch.sin(angle)
-        return torch.stack((total * torch.cos(angle), across, self.x * across), dim=-1)
+        total_thrust = self.jets * self.jet_thrust(n, nu[..., 0])
+        side_force = total_thrust * torch.sin(angle)
+        return torch.stack(
+            (total_thrust * torch.cos(angle), side_force, self.x * side_force), dim=-1
+        )
 
 
 @final
@@ -368,29 +399,39 @@ class TorpedoFinsConfig(ServoConfig, SteeredConfig):
     wake: float = Field(gt=0, le=1)
     thrust_deduction: float = Field(ge=0, lt=1)
 
-    def commanded(self) -> tuple[Command, ...]:
+    def command_specs(self) -> tuple[CommandSpec, ...]:
         """Return rudder, planes and revolutions; there are none astern."""
         return (
-            Command("cmd_delta", "steer", self.limit),
-            Command("cmd_delta_s", "dive", self.limit),
-            Command("cmd_n", "drive", self.n_max, 0.0),
+            CommandSpec("cmd_delta", "steer", self.limit),
+            CommandSpec("cmd_delta_s", "dive", self.limit),
+            CommandSpec("cmd_n", "drive", self.n_max, 0.0),
         )
 
-    def servos(self) -> tuple[Servo, ...]:
+    def build_servos(self) -> tuple[Servo, ...]:
         return (
-            self.follow(self.limit, None, "delta", "delta_s"),
-            self.follow(self.n_max, None, "n"),
+            self.build_limited_servo(self.limit, None, "delta", "delta_s"),
+            self.build_limited_servo(self.n_max, None, "n"),
         )
 
     def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        delta, dive, n = position.unbind(-1)
-        square = 0.5 * self.density * nu[..., 0].square()
-        side, lift = -square * self.rudder * delta, -square * self.planes * dive
-        drag = -side * delta - lift * dive
-        advance = self.wake * nu[..., 0] / self.diameter * n.clamp(min=0.0)
-        thrust, torque = (
-            self.density * self.diameter**power * (rest * n * n.abs() + slope * advance)
-            for power, (rest, slope) in ((4, self.K_T), (5, self.K_Q))
+        delta, delta_s, n = position.unbind(-1)
+        dynamic_pressure = 0.5 * self.density * nu[..., 0].square()
+        side_force, lift = (
+            -dynamic_pressure * self.rudder * delta,
+            -dynamic_pressure * self.planes * delta_s,
         )
-        ahead = (1.0 - self.thrust_deduction) * thrust - drag
-        return torch.stack((ahead, side, lift, torque, -self.x * lift, self.x * side), dim=-1)
+        drag = -side_force * delta - lift * delta_s
+        advance_product = self.wake * nu[..., 0] / self.diameter * n.clamp(min=0.0)
+        thrust, torque = (
+            self.density
+            * self.diameter**diameter_power
+            * (static_coefficient * n * n.abs() + advance_slope * advance_product)
+            for diameter_power, (static_coefficient, advance_slope) in (
+                (4, self.K_T),
+                (5, self.K_Q),
+            )
+        )
+        surge_force = (1.0 - self.thrust_deduction) * thrust - drag
+        return torch.stack(
+            (surge_force, side_force, lift, torque, -self.x * lift, self.x * side_force), dim=-1
+        )

@@ -22,7 +22,7 @@ from residnet.core.config import (
 )
 from residnet.physics.actuators.base import (
     ActuatorConfig,
-    Actuators,
+    ActuatorSystem,
     CurveRange,
     FirstOrderConfig,
     ForceActuators,
@@ -32,21 +32,21 @@ from residnet.physics.actuators.base import (
     ServoConfig,
     ShaftConfig,
     ThrustConfig,
-    require_range,
+    require_curve_covers_range,
 )
 
-_TABLE = 401
+_TABLE_POINTS = 401
 """Points of the thrust curve from which its inverse starts; between them it is known to rise."""
 _NEWTON_STEPS = 4
 """Steps of Newton's method; each doubles the digits that a line between two points has."""
 
 
-def _different(names: Sequence[str]) -> None:
-    if repeated := [name for name in names if names.count(name) > 1]:
-        raise ValueError(f"two thrusters are named '{repeated[0]}'")
+def _require_unique_names(names: Sequence[str]) -> None:
+    if duplicates := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"two thrusters are named '{duplicates[0]}'")
 
 
-class PlaceConfig(Config):
+class ThrusterPositionConfig(Config):
     """The name and place of one thruster.
 
     Attributes:
@@ -60,7 +60,7 @@ class PlaceConfig(Config):
     y: Metres = 0.0
 
 
-class ThrusterConfig(PlaceConfig, ShaftConfig, ThrustConfig):
+class ThrusterConfig(ThrusterPositionConfig, ShaftConfig, ThrustConfig):
     """One fixed thruster of several.
 
     Attributes:
@@ -86,13 +86,15 @@ class ThrustersConfig(ActuatorConfig):
     thrusters: Annotated[tuple[ThrusterConfig, ...], Field(min_length=1)]
 
     @model_validator(mode="after")
-    def _names(self) -> ThrustersConfig:
-        _different([thruster.name for thruster in self.thrusters])
+    def _validate_names(self) -> ThrustersConfig:
+        _require_unique_names([thruster.name for thruster in self.thrusters])
         return self
 
     def build(self) -> Thrusters:
-        units = self.thrusters
-        return Thrusters(units, [unit.servo(f"n_{unit.name}") for unit in units])
+        thrusters = self.thrusters
+        return Thrusters(
+            thrusters, [thruster.build_servo(f"n_{thruster.name}") for thruster in thrusters]
+        )
 
 
 class DifferentialThrustConfig(ThrustConfig, ActuatorConfig):
@@ -112,13 +114,16 @@ class DifferentialThrustConfig(ThrustConfig, ActuatorConfig):
 
     def build(self) -> Thrusters:
         """Build the module of a thruster to port and one to starboard, in this order."""
-        units = [
+        thrusters = [
             ThrusterConfig(
                 name=name, y=y, n_max=self.n_max, forward=self.forward, reverse=self.reverse
             )
             for name, y in (("port", -0.5 * self.spacing), ("stbd", 0.5 * self.spacing))
         ]
-        return Thrusters(units, [units[0].follow(self.n_max, self.n_rate, "n_port", "n_stbd")])
+        return Thrusters(
+            thrusters,
+            [thrusters[0].build_limited_servo(self.n_max, self.n_rate, "n_port", "n_stbd")],
+        )
 
 
 @final
@@ -128,56 +133,64 @@ class ThrusterForces(nn.Module):
     Source: document 003 eqs. (6), (21), (22), clipped as in correction W5.
     """
 
-    def __init__(self, units: Sequence[ThrusterConfig]) -> None:
+    def __init__(self, thrusters: Sequence[ThrusterConfig]) -> None:
         super().__init__()
-        curves = torch.tensor([[u.forward, u.reverse] for u in units], dtype=torch.float64)
-        self.curves = nn.Buffer(curves.permute(1, 2, 0).contiguous(), persistent=False)
-        rows = [[unit.x, unit.y, unit.angle] for unit in units]
-        x, y, angle = torch.tensor(rows, dtype=torch.float64).unbind(-1)
-        along, across = torch.cos(angle), torch.sin(angle)
-        lever = x * across - y * along
-        self.map = nn.Buffer(torch.stack((along, across, lever), dim=-1), persistent=False)
+        coefficient_table = torch.tensor(
+            [[thruster.forward, thruster.reverse] for thruster in thrusters], dtype=torch.float64
+        )
+        self.curve_coefficients = nn.Buffer(
+            coefficient_table.permute(1, 2, 0).contiguous(), persistent=False
+        )
+        geometry = [[thruster.x, thruster.y, thruster.angle] for thruster in thrusters]
+        x, y, angle = torch.tensor(geometry, dtype=torch.float64).unbind(-1)
+        surge_share, sway_share = torch.cos(angle), torch.sin(angle)
+        lever = x * sway_share - y * surge_share
+        self.thrust_configuration = nn.Buffer(
+            torch.stack((surge_share, sway_share, lever), dim=-1), persistent=False
+        )
 
-    def thrust(self, n: Tensor) -> Tensor:
+    def thrust_at(self, n: Tensor) -> Tensor:
         """Return the thrusts [N] at revolutions n [..., c] in 1/s."""
-        f, b = self.curves.to(n.dtype).unbind(0)
-        ahead = (f[0] + n * (f[1] + n * f[2])).clamp(min=0.0)
-        astern = (b[0] + n * (b[1] + n * b[2])).clamp(max=0.0)
-        return torch.where(n > 0, ahead, torch.where(n < 0, astern, torch.zeros_like(n)))
+        forward, reverse = self.curve_coefficients.to(n.dtype).unbind(0)
+        forward_thrust = (forward[0] + n * (forward[1] + n * forward[2])).clamp(min=0.0)
+        reverse_thrust = (reverse[0] + n * (reverse[1] + n * reverse[2])).clamp(max=0.0)
+        return torch.where(
+            n > 0, forward_thrust, torch.where(n < 0, reverse_thrust, torch.zeros_like(n))
+        )
 
     def forward(self, n: Tensor) -> Tensor:
         """Return tau [..., 3] of revolutions n [..., c]."""
-        return self.thrust(n) @ self.map.to(n.dtype)
+        return self.thrust_at(n) @ self.thrust_configuration.to(n.dtype)
 
 
 @final
-class Thrusters(Actuators):
+class Thrusters(ActuatorSystem):
     """Fixed thrusters, each on a shaft of its own or on equal ones."""
 
-    in_flow = False
+    depends_on_speed = False
 
-    def __init__(self, units: Sequence[ThrusterConfig], servos: Sequence[Servo]) -> None:
+    def __init__(self, thrusters: Sequence[ThrusterConfig], servos: Sequence[Servo]) -> None:
         super().__init__(*servos)
-        self.commands = tuple(f"cmd_{unit.name}" for unit in units)
-        self.forces = ThrusterForces(units)
-        along, _, lever = self.forces.map.unbind(-1)
+        self.command_names = tuple(f"cmd_{thruster.name}" for thruster in thrusters)
+        self.thruster_forces = ThrusterForces(thrusters)
+        surge_share, _, lever = self.thruster_forces.thrust_configuration.unbind(-1)
         # what a thruster adds to surge and yaw as far as it does so at all
-        wish = torch.stack((along, torch.sign(lever)))
-        small = torch.stack((along, lever)).abs() < 1e-9
-        n_max = torch.tensor([unit.n_max for unit in units], dtype=torch.float64)
-        self.wish = nn.Buffer(torch.where(small, 0.0, wish), persistent=False)
+        demand_map = torch.stack((surge_share, torch.sign(lever)))
+        is_negligible = torch.stack((surge_share, lever)).abs() < 1e-9
+        n_max = torch.tensor([thruster.n_max for thruster in thrusters], dtype=torch.float64)
+        self.demand_map = nn.Buffer(torch.where(is_negligible, 0.0, demand_map), persistent=False)
         self.n_max = nn.Buffer(n_max, persistent=False)
 
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+    def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the revolutions [..., c]: each thruster's share of drive and steer, within +-1.
 
         Of two side by side these are mean and difference (document 003 eqs. (30), (31)).
         """
-        both = torch.stack((drive, steer), dim=-1) @ self.wish.to(drive.dtype)
-        return both.clamp(-1.0, 1.0) * self.n_max.to(drive.dtype)
+        shares = torch.stack((drive, steer), dim=-1) @ self.demand_map.to(drive.dtype)
+        return shares.clamp(-1.0, 1.0) * self.n_max.to(drive.dtype)
 
-    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        force: Tensor = self.forces(self.positions(a, command))
+    def force(self, states: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        force: Tensor = self.thruster_forces(self.servo_positions(states, command))
         return force
 
 
@@ -208,24 +221,27 @@ class AzimuthThrustersConfig(ActuatorConfig):
     """
 
     kind: Literal["azimuth_thrusters"]
-    places: Annotated[tuple[PlaceConfig, ...], Field(min_length=1)]
+    places: Annotated[tuple[ThrusterPositionConfig, ...], Field(min_length=1)]
     thrust: Annotated[tuple[float, ...], Field(min_length=2)]
     curve_range: CurveRange | None = None
     shaft: ShaftConfig
     azimuth: AzimuthConfig = AzimuthConfig()
 
     @model_validator(mode="after")
-    def _consistent(self) -> AzimuthThrustersConfig:
-        _different([place.name for place in self.places])
-        require_range(self.curve_range, self.shaft.n_max)
-        n = np.linspace(-self.shaft.n_max, self.shaft.n_max, _TABLE)
-        falling = n[np.polynomial.Polynomial(self.thrust).deriv()(n) <= 0]
-        if len(falling):
+    def _validate_thrusters(self) -> AzimuthThrustersConfig:
+        _require_unique_names([thruster_position.name for thruster_position in self.places])
+        require_curve_covers_range(self.curve_range, self.shaft.n_max)
+        n = np.linspace(-self.shaft.n_max, self.shaft.n_max, _TABLE_POINTS)
+        decreasing = n[np.polynomial.Polynomial(self.thrust).deriv()(n) <= 0]
+        if len(decreasing):
             raise ValueError(
-                f"thrust falls with the revolutions at {falling[0] * 60:.0f} rpm: a force has no"
+                f"thrust falls with the revolutions at {decreasing[0] * 60:.0f} rpm: a force has no"
                 " one speed there; lower n_max"
             )
-        if len({(place.x, place.y) for place in self.places}) == 1:
+        if (
+            len({(thruster_position.x, thruster_position.y) for thruster_position in self.places})
+            == 1
+        ):
             raise ValueError(
                 "thrusters at one place cannot make surge, sway and yaw independently; give two"
                 " places"
@@ -242,47 +258,62 @@ class AzimuthThrusters(ForceActuators):
 
     def __init__(self, config: AzimuthThrustersConfig) -> None:
         shaft, azimuth = config.shaft, config.azimuth
-        names = [place.name for place in config.places]
+        names = [thruster_position.name for thruster_position in config.places]
         super().__init__(
-            shaft.servo(*(f"n_{name}" for name in names)),
-            azimuth.follow(azimuth.limit, azimuth.rate, *(f"alpha_{name}" for name in names)),
+            shaft.build_servo(*(f"n_{name}" for name in names)),
+            azimuth.build_limited_servo(
+                azimuth.limit, azimuth.rate, *(f"alpha_{name}" for name in names)
+            ),
         )
-        self.commands = tuple(f"cmd_{kind}_{name}" for kind in ("n", "alpha") for name in names)
-        self.count = len(names)
+        self.command_names = tuple(
+            f"cmd_{quantity}_{name}" for quantity in ("n", "alpha") for name in names
+        )
+        self.n_thrusters = len(names)
         self.coefficients = list(config.thrust)
-        self.slope = [i * c for i, c in enumerate(config.thrust)][1:]
+        self.slope_coefficients = [i * c for i, c in enumerate(config.thrust)][1:]
         # tau = map [3, 2k] of the components forward, then to starboard, of every thruster
-        ones, zeros = [1.0] * self.count, [0.0] * self.count
-        rows = [
-            ones + zeros,
-            zeros + ones,
-            [-place.y for place in config.places] + [place.x for place in config.places],
+        unit_row, zero_row = [1.0] * self.n_thrusters, [0.0] * self.n_thrusters
+        matrix_rows = [
+            unit_row + zero_row,
+            zero_row + unit_row,
+            [-thruster_position.y for thruster_position in config.places]
+            + [thruster_position.x for thruster_position in config.places],
         ]
-        self.map = nn.Buffer(torch.tensor(rows, dtype=torch.float64), persistent=False)
-        self.share = nn.Buffer(torch.linalg.pinv(self.map), persistent=False)
-        grid = torch.linspace(-shaft.n_max, shaft.n_max, _TABLE, dtype=torch.float64)
-        self.table = nn.Buffer(torch.stack((grid, self.thrust(grid))), persistent=False)
-        self.strongest = float(self.table[1, -1])
+        self.thrust_configuration = nn.Buffer(
+            torch.tensor(matrix_rows, dtype=torch.float64), persistent=False
+        )
+        self.allocation_matrix = nn.Buffer(
+            torch.linalg.pinv(self.thrust_configuration), persistent=False
+        )
+        revolutions_grid = torch.linspace(
+            -shaft.n_max, shaft.n_max, _TABLE_POINTS, dtype=torch.float64
+        )
+        self.thrust_table = nn.Buffer(
+            torch.stack((revolutions_grid, self.thrust_at(revolutions_grid))), persistent=False
+        )
+        self.max_thrust = float(self.thrust_table[1, -1])
 
-    def thrust(self, n: Tensor) -> Tensor:
+    def thrust_at(self, n: Tensor) -> Tensor:
         """Return the force [N] of one thruster along its axis at revolutions n [1/s], any shape."""
-        return _polynomial(self.coefficients, n)
+        return _evaluate_polynomial(self.coefficients, n)
 
-    def revolutions(self, force: Tensor) -> Tensor:
+    def revolutions_for_thrust(self, force: Tensor) -> Tensor:
         """Return the revolutions n [1/s] within +-n_max that make a force [N], any shape.
 
         Without gradient.
         """
         # Newton's method from a table of the curve, which rises, within the table's interval
-        table = self.table.to(force.dtype)
-        after = torch.searchsorted(table[1].contiguous(), force.contiguous())
-        after = after.clamp(1, table.shape[1] - 1)
-        low, high = table[0][after - 1], table[0][after]
-        share = (force - table[1][after - 1]) / (table[1][after] - table[1][after - 1])
-        n = low + share.clamp(0.0, 1.0) * (high - low)
+        thrust_table = self.thrust_table.to(force.dtype)
+        upper_index = torch.searchsorted(thrust_table[1].contiguous(), force.contiguous())
+        upper_index = upper_index.clamp(1, thrust_table.shape[1] - 1)
+        lower, upper = thrust_table[0][upper_index - 1], thrust_table[0][upper_index]
+        fraction = (force - thrust_table[1][upper_index - 1]) / (
+            thrust_table[1][upper_index] - thrust_table[1][upper_index - 1]
+        )
+        n = lower + fraction.clamp(0.0, 1.0) * (upper - lower)
         for _ in range(_NEWTON_STEPS):
-            n = n - (self.thrust(n) - force) / _polynomial(self.slope, n)
-            n = torch.minimum(torch.maximum(n, low), high)
+            n = n - (self.thrust_at(n) - force) / _evaluate_polynomial(self.slope_coefficients, n)
+            n = torch.minimum(torch.maximum(n, lower), upper)
         return n
 
     def allocate(self, tau: Tensor) -> Tensor:
@@ -290,38 +321,50 @@ class AzimuthThrusters(ForceActuators):
 
         The sum of squared thrusts is smallest; thrusts beyond the largest saturate.
         """
-        along, across = (tau @ self.share.to(tau.dtype).T).chunk(2, dim=-1)
-        size = torch.hypot(along, across)
-        angle = torch.where(size > 0, torch.atan2(across, along), torch.zeros_like(size))
-        return torch.cat((self.revolutions(size.clamp(max=self.strongest)), angle), dim=-1)
+        thrust_x, thrust_y = (tau @ self.allocation_matrix.to(tau.dtype).T).chunk(2, dim=-1)
+        thrust_magnitude = torch.hypot(thrust_x, thrust_y)
+        angle = torch.where(
+            thrust_magnitude > 0,
+            torch.atan2(thrust_y, thrust_x),
+            torch.zeros_like(thrust_magnitude),
+        )
+        return torch.cat(
+            (self.revolutions_for_thrust(thrust_magnitude.clamp(max=self.max_thrust)), angle),
+            dim=-1,
+        )
 
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+    def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the commands [..., 2k] for drive and steer, each within +-1.
 
         Drive is surge force and steer the yaw moment, as shares of what the thrusters make
         together; each thruster saturates.
         """
-        lever = self.map[2].abs().sum() / 2.0
-        surge, yaw = drive.clamp(-1, 1) * self.count, steer.clamp(-1, 1) * lever.to(drive.dtype)
-        both = torch.stack((surge, torch.zeros_like(drive), yaw), dim=-1)
-        return self.allocate(both * self.strongest)
+        lever = self.thrust_configuration[2].abs().sum() / 2.0
+        surge_share, yaw_share = (
+            drive.clamp(-1, 1) * self.n_thrusters,
+            steer.clamp(-1, 1) * lever.to(drive.dtype),
+        )
+        normalised_force = torch.stack((surge_share, torch.zeros_like(drive), yaw_share), dim=-1)
+        return self.allocate(normalised_force * self.max_thrust)
 
-    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        return self.asked(self.positions(a, command))
+    def force(self, states: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        return self.requested_force(self.servo_positions(states, command))
 
-    def asked(self, command: Tensor) -> Tensor:
+    def requested_force(self, command: Tensor) -> Tensor:
         n, angle = command.chunk(2, dim=-1)
-        thrust = self.thrust(n)
-        parts = torch.cat((thrust * torch.cos(angle), thrust * torch.sin(angle)), dim=-1)
-        return parts @ self.map.to(parts.dtype).T
+        thrust = self.thrust_at(n)
+        thrust_components = torch.cat(
+            (thrust * torch.cos(angle), thrust * torch.sin(angle)), dim=-1
+        )
+        return thrust_components @ self.thrust_configuration.to(thrust_components.dtype).T
 
 
-def _polynomial(coefficients: Sequence[float], x: Tensor) -> Tensor:
+def _evaluate_polynomial(coefficients: Sequence[float], x: Tensor) -> Tensor:
     """Return c0 + c1 x + c2 x^2 + ..., any shape."""
-    out = torch.full_like(x, coefficients[-1])
-    for c in coefficients[-2::-1]:
-        out = c + x * out
-    return out
+    value = torch.full_like(x, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        value = coefficient + x * value
+    return value
 
 
 class ForceCommandsConfig(ActuatorConfig):
@@ -353,37 +396,39 @@ class ForceCommands(ForceActuators):
     With a lag the states are the forces, then what else the response needs.
     """
 
-    commands = ("tau_x", "tau_y", "tau_n")
+    command_names = ("tau_x", "tau_y", "tau_n")
 
     def __init__(self, config: ForceCommandsConfig) -> None:
         # a lag of second order may overshoot the limits of the commands
         servo = ServoConfig(response=config.response)
         super().__init__(
-            servo.follow(math.inf, None, *(f"acting_{name}" for name in self.commands))
+            servo.build_limited_servo(
+                math.inf, None, *(f"acting_{name}" for name in self.command_names)
+            )
         )
         limit = torch.tensor([config.x_max, config.y_max, config.n_max], dtype=torch.float64)
         self.limit = nn.Buffer(limit, persistent=False)
 
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+    def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return tau [..., 3] for drive (surge force) and steer (yaw moment), each within +-1."""
-        both = torch.stack((drive, torch.zeros_like(drive), steer), dim=-1)
-        return both.clamp(-1.0, 1.0) * self.limit.to(drive.dtype)
+        shares = torch.stack((drive, torch.zeros_like(drive), steer), dim=-1)
+        return shares.clamp(-1.0, 1.0) * self.limit.to(drive.dtype)
 
     def allocate(self, tau: Tensor) -> Tensor:
         return tau
 
-    def asked(self, command: Tensor) -> Tensor:
+    def requested_force(self, command: Tensor) -> Tensor:
         return command
 
-    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        return self.positions(a, command)
+    def force(self, states: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        return self.servo_positions(states, command)
 
-    def followed(self, command: Tensor) -> Tensor:
+    def servo_commands(self, command: Tensor) -> Tensor:
         limit = self.limit.to(command.dtype)
         return torch.maximum(torch.minimum(command, limit), -limit)
 
 
-class VectoredThrusterConfig(PlaceConfig):
+class VectoredThrusterConfig(ThrusterPositionConfig):
     """One of several fixed thrusters that push in any direction, its thrust commanded.
 
     Attributes:
@@ -411,8 +456,8 @@ class VectoredThrustersConfig(ActuatorConfig):
     limit: Newtons = Field(gt=0)
 
     @model_validator(mode="after")
-    def _names(self) -> VectoredThrustersConfig:
-        _different([thruster.name for thruster in self.thrusters])
+    def _validate_names(self) -> VectoredThrustersConfig:
+        _require_unique_names([thruster.name for thruster in self.thrusters])
         return self
 
     def build(self) -> VectoredThrusters:
@@ -420,32 +465,41 @@ class VectoredThrustersConfig(ActuatorConfig):
 
 
 @final
-class VectoredThrusters(Actuators):
+class VectoredThrusters(ActuatorSystem):
     """Thrusts T [..., c] in N make forces and moments tau [..., 6] = T map.
 
     Source: Fossen 2021, section 9.4 (thrust configuration matrix).
     """
 
-    in_flow = False
+    depends_on_speed = False
 
     def __init__(self, config: VectoredThrustersConfig) -> None:
-        names = [f"thrust_{one.name}" for one in config.thrusters]
-        super().__init__(ServoConfig().follow(config.limit, None, *names))
-        self.commands = tuple(f"cmd_{name}" for name in names)
-        place = torch.tensor([[t.x, t.y, t.z] for t in config.thrusters], dtype=torch.float64)
-        push = torch.tensor([t.push for t in config.thrusters], dtype=torch.float64)
-        push = nn.functional.normalize(push, dim=-1)
-        effect = torch.cat((push, torch.linalg.cross(place, push)), dim=-1)
-        self.map = nn.Buffer(effect, persistent=False)
+        names = [f"thrust_{thruster.name}" for thruster in config.thrusters]
+        super().__init__(ServoConfig().build_limited_servo(config.limit, None, *names))
+        self.command_names = tuple(f"cmd_{name}" for name in names)
+        position = torch.tensor(
+            [[thruster.x, thruster.y, thruster.z] for thruster in config.thrusters],
+            dtype=torch.float64,
+        )
+        thrust_direction = torch.tensor(
+            [thruster.push for thruster in config.thrusters], dtype=torch.float64
+        )
+        thrust_direction = nn.functional.normalize(thrust_direction, dim=-1)
+        configuration = torch.cat(
+            (thrust_direction, torch.linalg.cross(position, thrust_direction)), dim=-1
+        )
+        self.thrust_configuration = nn.Buffer(configuration, persistent=False)
         # ahead, about the vertical and down, as far as a thruster does any of it
-        wish = torch.stack((effect[:, 0], effect[:, 5], effect[:, 2]))
-        wish = torch.where(wish.abs() < 1e-9, 0.0, torch.sign(wish)) * config.limit
-        self.wish = nn.Buffer(wish[:2], persistent=False)
-        self.diving = wish[2]
+        demand_rows = torch.stack((configuration[:, 0], configuration[:, 5], configuration[:, 2]))
+        demand_rows = (
+            torch.where(demand_rows.abs() < 1e-9, 0.0, torch.sign(demand_rows)) * config.limit
+        )
+        self.demand_map = nn.Buffer(demand_rows[:2], persistent=False)
+        self.dive_commands = demand_rows[2]
 
-    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+    def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the thrusts [..., c]: each thruster's share of drive and steer; servos limit."""
-        return torch.stack((drive, steer), dim=-1) @ self.wish.to(drive.dtype)
+        return torch.stack((drive, steer), dim=-1) @ self.demand_map.to(drive.dtype)
 
-    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        return self.positions(a, command) @ self.map.to(command.dtype)
+    def force(self, states: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        return self.servo_positions(states, command) @ self.thrust_configuration.to(command.dtype)

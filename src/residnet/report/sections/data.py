@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from residnet.core.format import DASH, DEG, minus, number
+from residnet.core.format import DASH, DEGREES_PER_RADIAN, format_minus_signs, format_number
 from residnet.report.blocks import (
     Block,
     Bullets,
@@ -16,77 +16,81 @@ from residnet.report.blocks import (
     Section,
     Table,
     Text,
-    bad_where,
-    table_of,
+    build_table,
+    flag_cell,
 )
-from residnet.report.run_reader import Content, RunFiles
+from residnet.report.run_reader import JsonObject, RunFiles
 
-_LEVELS = ("fatal", "will mislead")
+_SEVERE_LEVELS = ("fatal", "will mislead")
 """Levels above a note, the worst first."""
 
 
-def fitted_on_what(run: RunFiles) -> Section | None:
+def fit_data_section(run: RunFiles) -> Section | None:
     """Return the section on the data, None where the folder says nothing about them."""
-    baseline = run.resolved.get("baseline") or {}
-    samples = run.fit(run.baseline or "baseline").get("samples")
-    logs: dict[str, list[Content]] = {}
+    baseline = run.resolved_config.get("baseline") or {}
+    samples = run.fit_notes(run.baseline or "baseline").get("samples")
+    logs: dict[str, list[JsonObject]] = {}
     for entry in run.quality:
         logs.setdefault(entry["split"], []).append(entry)
-    splits = [
+    split_texts = [
         f"{split} {len(members)} logs, {sum(log['seconds'] for log in members) / 60:.1f} min"
         for split, members in logs.items()
     ]
-    scales = [
-        f"{name} {number(run.unit(name)[1] * value)} {run.unit(name)[0]}"
+    scale_texts = [
+        f"{name} {format_number(run.display_unit(name)[1] * value)} {run.display_unit(name)[0]}"
         for name, value in (run.metrics.get("scales") or {}).items()
     ]
-    signals = run.resolved.get("signals") or {}
+    signals = run.resolved_config.get("signals") or {}
     forces = signals.get("forces")
     thrusters = f"the thrusters of {forces}" if isinstance(forces, str) else "given thrusters"
-    inputs = (
+    input_texts = (
         ", ".join(signals.get("inputs") or []),
         "exogenous: " + ", ".join(signals["exogenous"]) if signals.get("exogenous") else "",
         f"forces from {thrusters}" if forces else "",
     )
-    fit = f", fitted on {samples} samples" if samples else ""
+    fit_text = f", fitted on {samples} samples" if samples else ""
     facts = {
-        "data": _data(run),
-        "splits": "; ".join(splits),
-        "inputs": "; ".join(filter(None, inputs)),
-        "velocities": run.live.text,
-        **_model(run),
-        "baseline": str(baseline.get("kind", "")) + fit if baseline else "",
+        "data": _data_text(run),
+        "splits": "; ".join(split_texts),
+        "inputs": "; ".join(filter(None, input_texts)),
+        "velocities": run.dof.description,
+        **_model_facts(run),
+        "baseline": str(baseline.get("kind", "")) + fit_text if baseline else "",
         **{
-            f"protocol {name}": _protocol(protocol)
+            f"protocol {name}": _protocol_text(protocol)
             + ("; selects the model" if name == run.evaluation.get("selection") else "")
             for name, protocol in (run.evaluation.get("protocols") or {}).items()
         },
-        "NRMSE divides by": ", ".join(scales),
+        "NRMSE divides by": ", ".join(scale_texts),
     }
-    known = [(name, text) for name, text in facts.items() if text]
-    blocks: list[Block] = [Facts(known)] if known else []
+    stated_facts = [(name, text) for name, text in facts.items() if text]
+    blocks: list[Block] = [Facts(stated_facts)] if stated_facts else []
     if run.quality:
-        short, full = quality_tables(run)
-        short.caption = (
+        summary_table, log_table = quality_tables(run)
+        summary_table.caption = (
             "Scored: share of the samples on which u and v are compared. Learned from: share on"
             " which smoothed states and accelerations are defined."
         )
-        blocks += [Section("Data quality", [short, Section("Log by log", [full], folded=True)])]
-    if found := run.json("currents.json"):
-        blocks.append(Section("Currents", [_currents(run, found)], folded=True))
+        blocks += [
+            Section(
+                "Data quality", [summary_table, Section("Log by log", [log_table], is_folded=True)]
+            )
+        ]
+    if currents := run.read_json("currents.json"):
+        blocks.append(Section("Currents", [_currents_table(run, currents)], is_folded=True))
     return Section("What was fitted on what", blocks) if blocks else None
 
 
-def _currents(run: RunFiles, found: Any) -> Table:
+def _currents_table(run: RunFiles, currents: Any) -> Table:
     """Return the estimated current of each log, in the unit of speeds."""
-    unit, factor = run.unit("u")
+    unit, factor = run.display_unit("u")
 
-    def component(row: Content, key: str, place: int) -> Cell:
-        error = number(factor * row["standard_error"][place], 2)
-        return Cell(f"{number(factor * row[key], 2)} ± {error}")
+    def component(row: JsonObject, key: str, index: int) -> Cell:
+        error = format_number(factor * row["standard_error"][index], 2)
+        return Cell(f"{format_number(factor * row[key], 2)} ± {error}")
 
-    return table_of(
-        found,
+    return build_table(
+        currents,
         [
             ("log", lambda row: row["log"]),
             (f"north [{unit}]", lambda row: component(row, "current_north", 0)),
@@ -99,8 +103,8 @@ def _currents(run: RunFiles, found: Any) -> Table:
     )
 
 
-def _data(run: RunFiles) -> str:
-    data = run.resolved.get("data") or {}
+def _data_text(run: RunFiles) -> str:
+    data = run.resolved_config.get("data") or {}
     if not data:
         return ""
     if data.get("kind") != "simulated":
@@ -112,25 +116,31 @@ def _data(run: RunFiles) -> str:
     noise = data.get("noise") or {}
     if noise:
         text += (
-            f", noise u {number(noise.get('u'), 2)} m/s, v {number(noise.get('v'), 2)} m/s, r"
-            f" {number(DEG * noise.get('r', 0), 2)} deg/s"
+            f", noise u {format_number(noise.get('u'), 2)} m/s, v {format_number(noise.get('v'), 2)} m/s, r"
+            f" {format_number(DEGREES_PER_RADIAN * noise.get('r', 0), 2)} deg/s"
         )
     return text + f"; data seed {data.get('seed')}"
 
 
-def _model(run: RunFiles) -> dict[str, str]:
-    card = run.card(run.baseline or "baseline")
+def _model_facts(run: RunFiles) -> dict[str, str]:
+    card = run.model_card(run.baseline or "baseline")
     if not card:
         return {}
     signals = card.get("signals") or {}
-    names = [*run.live.moving, *(signals.get("inputs") or []), *(signals.get("exogenous") or [])]
+    names = [
+        *run.dof.dynamic_states,
+        *(signals.get("inputs") or []),
+        *(signals.get("exogenous") or []),
+    ]
     ranges = []
-    for name, low, high in zip(names, card["low"], card["high"], strict=False):
-        if name in run.live.dead:
+    for name, lower, upper in zip(names, card["low"], card["high"], strict=False):
+        if name in run.dof.fixed_states:
             continue
-        unit, factor = run.unit(name)
+        unit, factor = run.display_unit(name)
         ranges.append(
-            f"{name} {number(factor * low)} to {number(factor * high)} {unit}".removesuffix(" -")
+            f"{name} {format_number(factor * lower)} to {format_number(factor * upper)} {unit}".removesuffix(
+                " -"
+            )
         )
     return {
         "model step": f"{card['dt']:g} s, {card['integrator']}; inputs held over a step",
@@ -138,7 +148,7 @@ def _model(run: RunFiles) -> dict[str, str]:
     }
 
 
-def _protocol(protocol: Content) -> str:
+def _protocol_text(protocol: JsonObject) -> str:
     if protocol.get("kind") == "windows":
         return (
             f"back-to-back windows of {protocol['length']:g} s, the first from"
@@ -154,94 +164,105 @@ def _protocol(protocol: Content) -> str:
 
 def quality_tables(run: RunFiles) -> tuple[Table, Table]:
     """Return what the logs hold: by split and kind of manoeuvre, and log by log."""
-    groups: dict[tuple[str, str], list[Content]] = {}
+    groups: dict[tuple[str, str], list[JsonObject]] = {}
     for entry in run.quality:
         groups.setdefault((entry["split"], entry.get("manoeuvre") or DASH), []).append(entry)
 
-    def label(members: Sequence[Content]) -> str:
+    def label(members: Sequence[JsonObject]) -> str:
         return f"{members[0]['split']}: {(members[0].get('manoeuvre') or DASH).replace('_', ' ')}"
 
     columns: list[Column] = [
         ("seconds", lambda logs: f"{sum(log['seconds'] for log in logs):.0f}", str),
         ("samples", lambda logs: sum(log["samples"] for log in logs), str),
-        ("scored [%]", lambda logs: _mean(logs, "usable"), number),
-        ("learned from [%]", lambda logs: _mean(logs, "learned_from"), number),
-        ("masked", _masked),
+        ("scored [%]", lambda logs: _mean_percentage(logs, "usable"), format_number),
+        ("learned from [%]", lambda logs: _mean_percentage(logs, "learned_from"), format_number),
+        ("masked", _masked_text),
         *(
             (
                 f"largest |{name}| [{unit}]",
-                lambda logs, name=name: _largest(logs, name),
-                number,
+                lambda logs, name=name: _largest_value(logs, name),
+                format_number,
                 factor,
             )
-            for name in run.live.channels
-            for unit, factor in [run.unit(name)]
+            for name in run.dof.active_states
+            for unit, factor in [run.display_unit(name)]
         ),
     ]
-    short: list[Column] = [("split, manoeuvre", label), ("logs", len, str), *columns]
+    summary_columns: list[Column] = [("split, manoeuvre", label), ("logs", len, str), *columns]
     return (
-        table_of(groups.values(), short, rule=lambda logs: logs[0]["split"]),
-        table_of([[log] for log in run.quality], [("log", lambda logs: logs[0]["log"]), *columns]),
+        build_table(groups.values(), summary_columns, group_key=lambda logs: logs[0]["split"]),
+        build_table(
+            [[log] for log in run.quality], [("log", lambda logs: logs[0]["log"]), *columns]
+        ),
     )
 
 
-def _mean(logs: Sequence[Content], key: str) -> float:
+def _mean_percentage(logs: Sequence[JsonObject], key: str) -> float:
     samples = sum(log["samples"] for log in logs)
     return float(100 * sum(log[key] * log["samples"] for log in logs) / samples)
 
 
-def _largest(logs: Sequence[Content], channel: str) -> float:
+def _largest_value(logs: Sequence[JsonObject], channel: str) -> float:
     return float(max((log.get("largest") or {}).get(channel, math.nan) for log in logs))
 
 
-def _masked(logs: Sequence[Content]) -> str:
+def _masked_text(logs: Sequence[JsonObject]) -> str:
     samples = sum(log["samples"] for log in logs)
-    masked: dict[str, float] = {}
+    masked_shares: dict[str, float] = {}
     for log in logs:
         for reason, share in (log.get("masked") or {}).items():
-            masked[reason] = masked.get(reason, 0.0) + share * log["samples"] / samples
-    shown = ", ".join(f"{reason} {100 * share:.2g} %" for reason, share in masked.items())
-    return shown or "nothing"
+            masked_shares[reason] = (
+                masked_shares.get(reason, 0.0) + share * log["samples"] / samples
+            )
+    text = ", ".join(f"{reason} {100 * share:.2g} %" for reason, share in masked_shares.items())
+    return text or "nothing"
 
 
-def doctor(run: RunFiles) -> Section | None:
+def quality_section(run: RunFiles) -> Section | None:
     """Return the findings by kind and the notes by log, None where the run has no doctor.json."""
-    inspection = run.json("doctor.json")
-    logs = inspection.get("logs") or []
+    report = run.read_json("doctor.json")
+    logs = report.get("logs") or []
     if not logs:
         return None
     findings = [(str(log["name"]), finding) for log in logs for finding in log["findings"]]
-    findings += [("together", finding) for finding in inspection.get("together") or []]
-    severe = [(name, finding) for name, finding in findings if finding["level"] != "note"]
-    beyond = "What the masks of this run leave out does not count."
-    if severe:
-        misled = len({name for name, _ in severe} - {"together"})
-        held = "log holds" if len(logs) == 1 else "logs hold"
-        about = f"{misled} of {len(logs)} {held} something that would mislead a fit. {beyond}"
+    findings += [("together", finding) for finding in report.get("together") or []]
+    severe_findings = [(name, finding) for name, finding in findings if finding["level"] != "note"]
+    mask_note = "What the masks of this run leave out does not count."
+    if severe_findings:
+        n_misled = len({name for name, _ in severe_findings} - {"together"})
+        logs_verb = "log holds" if len(logs) == 1 else "logs hold"
+        summary = (
+            f"{n_misled} of {len(logs)} {logs_verb} something that would mislead a fit. {mask_note}"
+        )
     else:
-        count = "the log" if len(logs) == 1 else f"the {len(logs)} logs"
-        about = f"Nothing in {count} would mislead a fit. {beyond}"
-    blocks: list[Block] = [Text(about)]
-    if severe:
+        logs_text = "the log" if len(logs) == 1 else f"the {len(logs)} logs"
+        summary = f"Nothing in {logs_text} would mislead a fit. {mask_note}"
+    blocks: list[Block] = [Text(summary)]
+    if severe_findings:
         # one row for each kind of finding, the worst first
-        kinds: dict[tuple[int, str], list[tuple[str, Content]]] = {}
-        for name, finding in severe:
-            key = (_LEVELS.index(finding["level"]), str(finding["code"]))
-            kinds.setdefault(key, []).append((name, finding))
+        findings_by_kind: dict[tuple[int, str], list[tuple[str, JsonObject]]] = {}
+        for name, finding in severe_findings:
+            key = (_SEVERE_LEVELS.index(finding["level"]), str(finding["code"]))
+            findings_by_kind.setdefault(key, []).append((name, finding))
         columns: list[Column] = [
             ("finding", lambda row: row[0][1].replace("_", " ")),
-            ("level", lambda row: bad_where(_LEVELS[row[0][0]], row[0][0] == 0)),
+            ("level", lambda row: flag_cell(_SEVERE_LEVELS[row[0][0]], row[0][0] == 0)),
             ("logs", lambda row: len({name for name, _ in row[1]}), str),
-            ("for example", lambda row: Cell(minus(row[1][0][1]["text"]), row[1][0][0], "text")),
+            (
+                "for example",
+                lambda row: Cell(format_minus_signs(row[1][0][1]["text"]), row[1][0][0], "text"),
+            ),
             ("what to do", lambda row: row[1][0][1]["action"]),
         ]
-        blocks.append(table_of(sorted(kinds.items(), key=lambda row: row[0]), columns))
+        blocks.append(
+            build_table(sorted(findings_by_kind.items(), key=lambda row: row[0]), columns)
+        )
     notes: dict[str, list[str]] = {}
     for name, finding in findings:
         if finding["level"] == "note":
             action = f"; {finding['action']}" if finding["action"] else ""
-            notes.setdefault(name, []).append(minus(f"{finding['text']}{action}"))
+            notes.setdefault(name, []).append(format_minus_signs(f"{finding['text']}{action}"))
     if notes:
         by_log = [Section(name, [Bullets(texts)]) for name, texts in notes.items()]
-        blocks.append(Section("Notes, log by log", by_log, folded=True))
+        blocks.append(Section("Notes, log by log", by_log, is_folded=True))
     return Section("Data doctor", blocks)

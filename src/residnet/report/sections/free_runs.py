@@ -8,16 +8,16 @@ from typing import Any
 
 from residnet.core.format import (
     DASH,
-    change,
-    fixed,
-    listed,
-    number,
-    percent,
-    plural,
-    signed,
-    title_of,
+    channel_title,
+    format_count,
+    format_fixed,
+    format_number,
+    format_percent_change,
+    format_relative_change,
+    format_signed,
+    join_list,
 )
-from residnet.judge.verdict import diverged_note, sized
+from residnet.judge.verdict import describe_divergence, format_pose_error
 from residnet.report.blocks import (
     Block,
     Bullets,
@@ -26,90 +26,100 @@ from residnet.report.blocks import (
     Section,
     Table,
     Text,
-    bad_where,
-    paired_interval,
-    table_of,
+    build_table,
+    flag_cell,
+    format_paired_interval,
 )
 from residnet.report.figure import Figure
-from residnet.report.run_reader import Content, RunFiles
+from residnet.report.run_reader import JsonObject, RunFiles
 
 
-def distinct(run: RunFiles, split: str, protocol: str) -> list[str]:
+def distinct_manoeuvres(run: RunFiles, split: str, protocol: str) -> list[str]:
     """Return kinds and groups of manoeuvres without those that hold the same runs as one before.
 
     A group of a single kind holds the same runs as that kind.
     """
-    seen: list[Any] = []
-    out: list[str] = []
-    for kind in run.manoeuvres(split, protocol):
-        rows = [run.row(model, split, protocol, kind) for model in run.kinds]
-        errors = [(row["windows"], row["rmse"]) for row in rows if row is not None]
-        if errors not in seen:
-            seen.append(errors)
-            out.append(kind)
-    return out
+    seen_errors: list[Any] = []
+    manoeuvre_kinds: list[str] = []
+    for manoeuvre_kind in run.manoeuvre_kinds(split, protocol):
+        rows = [run.find_row(model, split, protocol, manoeuvre_kind) for model in run.model_kinds]
+        error_values = [(row["windows"], row["rmse"]) for row in rows if row is not None]
+        if error_values not in seen_errors:
+            seen_errors.append(error_values)
+            manoeuvre_kinds.append(manoeuvre_kind)
+    return manoeuvre_kinds
 
 
-def errors(run: RunFiles) -> Section:
+def errors_section(run: RunFiles) -> Section:
     """Return the section on free runs: for each protocol all models, then kind by kind."""
-    where = (
-        f"The splits {' and '.join(run.sides)} stand side by side."
-        if len(run.sides) > 1
-        else f"The data are those of the split {run.focus}."
+    splits_text = (
+        f"The splits {' and '.join(run.report_splits)} stand side by side."
+        if len(run.report_splits) > 1
+        else f"The data are those of the split {run.report_split}."
     )
-    small = "the 95 % interval of NRMSE"
+    small_print = "the 95 % interval of NRMSE"
     if run.baseline is not None:
-        small = f"the change against the baseline on the same data, and {small}"
-    about = (
+        small_print = f"the change against the baseline on the same data, and {small_print}"
+    introduction = (
         "The tables give the root mean square error of each free run, averaged over the runs."
-        f" {where} Small print gives {small}. A run that diverged counts with the error of held"
+        f" {splits_text} Small print gives {small_print}. A run that diverged counts with the error of held"
         " velocities, and its number stands beside the score."
     )
-    blocks: list[Block] = [Text(about)]
+    blocks: list[Block] = [Text(introduction)]
     for protocol in run.protocols:
-        sides = [
-            side for side in run.sides if any(run.row(one, side, protocol) for one in run.kinds)
+        present_splits = [
+            split
+            for split in run.report_splits
+            if any(run.find_row(model, split, protocol) for model in run.model_kinds)
         ]
-        if not sides:
+        if not present_splits:
             continue
-        parts: list[Block] = [_side_by_side(run, protocol, sides)]
-        kinds = by_manoeuvre(run, protocol, run.focus)
-        if kinds is not None:
-            title = f"By kind of manoeuvre, {run.focus} data"
-            parts.append(Section(title, [kinds], folded=protocol != run.protocols[0]))
-        blocks.append(Section(f"Protocol {protocol}", parts))
+        protocol_blocks: list[Block] = [_split_comparison_table(run, protocol, present_splits)]
+        manoeuvre_table = errors_by_manoeuvre(run, protocol, run.report_split)
+        if manoeuvre_table is not None:
+            title = f"By kind of manoeuvre, {run.report_split} data"
+            protocol_blocks.append(
+                Section(title, [manoeuvre_table], is_folded=protocol != run.protocols[0])
+            )
+        blocks.append(Section(f"Protocol {protocol}", protocol_blocks))
     return Section("Free runs", blocks)
 
 
-def _quantities(run: RunFiles, nrmse: str = "NRMSE [-]") -> dict[str, str]:
+def _quantity_titles(run: RunFiles, nrmse_title: str = "NRMSE [-]") -> dict[str, str]:
     """Return the titles of what tables of errors show."""
     return {
-        **{channel: f"{title_of(channel)} [{run.unit(channel)[0]}]" for channel in run.channels},
-        "nrmse": nrmse,
-        **{end: "{}, end [{}]".format(*run.end(end)) for end in run.ends},
+        **{
+            channel: f"{channel_title(channel)} [{run.display_unit(channel)[0]}]"
+            for channel in run.channels
+        },
+        "nrmse": nrmse_title,
+        **{
+            pose_error: "{}, end [{}]".format(*run.pose_error_unit(pose_error))
+            for pose_error in run.pose_errors
+        },
         "diverged": "diverged",
     }
 
 
-def _side_by_side(run: RunFiles, protocol: str, sides: Sequence[str]) -> Table:
+def _split_comparison_table(run: RunFiles, protocol: str, splits: Sequence[str]) -> Table:
     """Return the errors of all models, the splits side by side for each quantity."""
 
     def cell(model: str, key: str, split: str) -> Cell:
-        return _quantity(run, key, run.row(model, split, protocol))
+        return _quantity_cell(run, key, run.find_row(model, split, protocol))
 
-    quantities = _quantities(run, "NRMSE, mean [-]")
-    return table_of(
-        run.kinds,
+    quantities = _quantity_titles(run, "NRMSE, mean [-]")
+    return build_table(
+        run.model_kinds,
         [
-            ("model", run.label),
+            ("model", run.model_label),
             *(
                 (split, lambda model, key=key, split=split: cell(model, key, split))
                 for key in quantities
-                for split in sides
+                for split in splits
             ),
         ],
-        groups=[(title, len(sides)) for title in quantities.values()],
-        selected=lambda model: model == run.selected,
+        groups=[(title, len(splits)) for title in quantities.values()],
+        is_selected=lambda model: model == run.selected,
     )
 
 
@@ -118,107 +128,128 @@ def errors_table(run: RunFiles, split: str) -> Table:
     rows = [
         row
         for protocol in run.protocols
-        for model in run.kinds
-        if (row := run.row(model, split, protocol))
+        for model in run.model_kinds
+        if (row := run.find_row(model, split, protocol))
     ]
 
-    def cell(row: Content, key: str) -> Cell:
-        found = _quantity(run, key, row)
+    def cell(row: JsonObject, key: str) -> Cell:
+        quantity_cell = _quantity_cell(run, key, row)
         # a terminal has no room for what stands in small print, but for what diverged
-        note = diverged_note(row) if key == "nrmse" else ""
-        return Cell(found.text, note, "" if key in run.channels else found.mark)
+        note = describe_divergence(row) if key == "nrmse" else ""
+        return Cell(quantity_cell.text, note, "" if key in run.channels else quantity_cell.mark)
 
-    return table_of(
+    return build_table(
         rows,
         [
-            ("model", lambda row: run.label(row["model"])),
+            ("model", lambda row: run.model_label(row["model"])),
             ("protocol", "protocol"),
             *(
                 (title, lambda row, key=key: cell(row, key))
-                for key, title in _quantities(run).items()
+                for key, title in _quantity_titles(run).items()
             ),
         ],
         caption=f"Free-run errors on {split} data, mean over windows.",
-        selected=lambda row: row["model"] == run.selected,
-        rule=lambda row: row["protocol"],
+        is_selected=lambda row: row["model"] == run.selected,
+        group_key=lambda row: row["protocol"],
     )
 
 
-def by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | None:
+def errors_by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | None:
     """Return the errors of one split by kind of manoeuvre, None where there is a single kind."""
-    kinds = distinct(run, split, protocol)
-    if len(kinds) < 2:
+    manoeuvre_kinds = distinct_manoeuvres(run, split, protocol)
+    if len(manoeuvre_kinds) < 2:
         return None
-    models = [model for model, role in run.kinds.items() if role != "zero"]
-    rows = [row for kind in kinds for one in models if (row := run.row(one, split, protocol, kind))]
+    models = [model for model, role in run.model_kinds.items() if role != "zero"]
+    rows = [
+        row
+        for manoeuvre_kind in manoeuvre_kinds
+        for name in models
+        if (row := run.find_row(name, split, protocol, manoeuvre_kind))
+    ]
 
-    def label(row: Content) -> str:
+    def label(row: JsonObject) -> str:
         # the kind stands once, before its first model
-        first = f"{row['manoeuvre'].replace('_', ' ')}: " if row["model"] == models[0] else ""
-        return first + run.label(row["model"])
+        prefix = f"{row['manoeuvre'].replace('_', ' ')}: " if row["model"] == models[0] else ""
+        return prefix + run.model_label(row["model"])
 
-    return table_of(
+    return build_table(
         rows,
         [
             ("manoeuvre, model", label),
             ("runs", "windows", str),
             *(
-                (title, lambda row, key=key: _quantity(run, key, row))
-                for key, title in _quantities(run).items()
+                (title, lambda row, key=key: _quantity_cell(run, key, row))
+                for key, title in _quantity_titles(run).items()
             ),
         ],
-        selected=lambda row: row["model"] == run.selected,
-        rule=lambda row: row["manoeuvre"],
+        is_selected=lambda row: row["model"] == run.selected,
+        group_key=lambda row: row["manoeuvre"],
     )
 
 
-def _quantity(run: RunFiles, key: str, row: Content | None) -> Cell:
+def _quantity_cell(run: RunFiles, key: str, row: JsonObject | None) -> Cell:
     """Return what a row says of a quantity, and its change against the baseline's on its data."""
     if row is None:
         return Cell(DASH)
     if key == "diverged":
         return Cell(f"{row['diverged']}/{row['windows']}", mark="bad" if row["diverged"] else "")
-    if key in run.ends:
-        return Cell(number(run.end(key)[2] * row.get(f"{key}_error_end", math.nan), 2))
-    lost = diverged_note(row)
+    if key in run.pose_errors:
+        return Cell(
+            format_number(run.pose_error_unit(key)[2] * row.get(f"{key}_error_end", math.nan), 2)
+        )
+    diverged_text = describe_divergence(row)
     if key == "nrmse":
         interval = row.get("nrmse_mean_ci95")
-        small = f"{number(interval[0])}–{number(interval[1])}" if interval else ""
-        value, worse, factor = row["nrmse"]["mean"], False, 1.0
+        small_print = (
+            f"{format_number(interval[0])}–{format_number(interval[1])}" if interval else ""
+        )
+        value, is_worse, factor = row["nrmse"]["mean"], False, 1.0
     else:
-        value, factor = row["rmse"].get(key), run.unit(key)[1]
+        value, factor = row["rmse"].get(key), run.display_unit(key)[1]
         if value is None:
             return Cell(DASH)
-        where = (row["split"], row["protocol"], row.get("manoeuvre", "all"))
-        own = run.kinds[row["model"]] in ("zero", "baseline")
-        base = None if own else run.row(run.baseline, *where)
-        worse = base is not None and value > 1.005 * base["rmse"][key]
-        small = change(value, base["rmse"][key]) if base is not None else ""
-    note = "; ".join(text for text in (small, lost) if text)
-    si = f"{number(value)} {run.si(key)}" if factor != 1.0 else ""
-    return Cell(number(factor * value), note, "bad" if worse or row["diverged"] else "", si)
+        row_key = (row["split"], row["protocol"], row.get("manoeuvre", "all"))
+        is_reference = run.model_kinds[row["model"]] in ("zero", "baseline")
+        baseline_row = None if is_reference else run.find_row(run.baseline, *row_key)
+        is_worse = baseline_row is not None and value > 1.005 * baseline_row["rmse"][key]
+        small_print = (
+            format_relative_change(value, baseline_row["rmse"][key])
+            if baseline_row is not None
+            else ""
+        )
+    note = "; ".join(text for text in (small_print, diverged_text) if text)
+    si = f"{format_number(value)} {run.si_unit(key)}" if factor != 1.0 else ""
+    return Cell(
+        format_number(factor * value), note, "bad" if is_worse or row["diverged"] else "", si
+    )
 
 
-def limits(run: RunFiles) -> Section | None:
+def limits_section(run: RunFiles) -> Section | None:
     """Return for each protocol errors by manoeuvre and band, worst windows and what limits them.
 
     None where the selected model has no row.
     """
-    lead = run.lead
-    parts: list[Block] = []
+    main_model = run.main_model
+    protocol_sections: list[Block] = []
     for protocol in run.protocols:
-        row = run.row(lead, run.focus, protocol)
+        row = run.find_row(main_model, run.report_split, protocol)
         if row is not None:
-            known = (run.limits.get("splits") or {}).get(run.focus, {}).get(protocol, {})
-            repeats = (run.limits.get("repeatability") or {}).get(protocol)
+            protocol_limits = (
+                (run.limits.get("splits") or {}).get(run.report_split, {}).get(protocol, {})
+            )
+            repeatability = (run.limits.get("repeatability") or {}).get(protocol)
             blocks = [
-                _where(run, lead, protocol, known),
-                None if protocol == run.main else _worst(run, lead, known),
-                Text(_repeatability(run, repeats)) if repeats else None,
+                _error_breakdown_table(run, main_model, protocol, protocol_limits),
+                None
+                if protocol == run.main_protocol
+                else _worst_windows_table(run, main_model, protocol_limits),
+                Text(_repeatability_text(run, repeatability)) if repeatability else None,
             ]
-            title = f"Protocol {protocol}" + ("" if parts else f", {run.focus} data")
-            parts.append(Section(title, blocks, folded=bool(parts)))
-    if not parts:
+            title = f"Protocol {protocol}" + (
+                "" if protocol_sections else f", {run.report_split} data"
+            )
+            protocol_sections.append(Section(title, blocks, is_folded=bool(protocol_sections)))
+    if not protocol_sections:
         return None
     notes = (
         "Intervals are percentiles of a block bootstrap. For few blocks they are widened as"
@@ -227,64 +258,89 @@ def limits(run: RunFiles) -> Section | None:
         " windows are left out."
     )
     title = "How good, where it fails, what limits it"
-    return Section(title, [*parts, Text(notes, quiet=True)])
+    return Section(title, [*protocol_sections, Text(notes, is_secondary=True)])
 
 
-def _where(run: RunFiles, lead: str, protocol: str, known: Content) -> Table:
+def _error_breakdown_table(
+    run: RunFiles, main_model: str, protocol: str, protocol_limits: JsonObject
+) -> Table:
     """Return the errors by kind of manoeuvre, speed and wind."""
-    lines: list[Content] = []
-    for kind in ["all", *distinct(run, run.focus, protocol)]:
-        if row := run.row(lead, run.focus, protocol, kind):
-            about = {"by": "kind", "label": kind.replace("_", " "), "windows": row["windows"]}
-            apart = row.get("difference") or {}
-            lines.append({**about, "value": row["nrmse"]["mean"], "apart": apart})
-    for band in known.get("bands") or []:
-        if found := band["models"].get(lead):
-            label = f"{band['by']} {number(band['low'], 2)} to {number(band['high'], 2)} m/s"
-            about = {"by": band["by"], "label": label, "windows": band["windows"]}
-            apart = found["difference"] or {}
-            lines.append({**about, "value": found["nrmse_mean"], "apart": apart})
-    reference = next((line["apart"]["to"] for line in lines if line["apart"]), None)
+    breakdown_rows: list[JsonObject] = []
+    for manoeuvre_kind in ["all", *distinct_manoeuvres(run, run.report_split, protocol)]:
+        if row := run.find_row(main_model, run.report_split, protocol, manoeuvre_kind):
+            row_fields = {
+                "by": "kind",
+                "label": manoeuvre_kind.replace("_", " "),
+                "windows": row["windows"],
+            }
+            difference = row.get("difference") or {}
+            breakdown_rows.append(
+                {**row_fields, "value": row["nrmse"]["mean"], "apart": difference}
+            )
+    for band in protocol_limits.get("bands") or []:
+        if model_band := band["models"].get(main_model):
+            label = f"{band['by']} {format_number(band['low'], 2)} to {format_number(band['high'], 2)} m/s"
+            row_fields = {"by": band["by"], "label": label, "windows": band["windows"]}
+            difference = model_band["difference"] or {}
+            breakdown_rows.append(
+                {**row_fields, "value": model_band["nrmse_mean"], "apart": difference}
+            )
+    reference = next((line["apart"]["to"] for line in breakdown_rows if line["apart"]), None)
 
-    def ratio(line: Content) -> Cell:
+    def ratio_cell(line: JsonObject) -> Cell:
         value = line["apart"].get("ratio")
-        text = DASH if value is None else percent(100 * (value - 1))
-        return bad_where(text, line["apart"].get("worse"))
+        text = DASH if value is None else format_percent_change(100 * (value - 1))
+        return flag_cell(text, line["apart"].get("worse"))
 
-    def less(line: Content) -> float:
+    def reference_nrmse(line: JsonObject) -> float:
         return float(line["value"] - line["apart"].get("nrmse_mean", math.nan))
 
     columns: list[Column] = [
         ("windows of", "label"),
         ("windows", "windows", str),
-        (f"NRMSE of {lead}", "value", number),
+        (f"NRMSE of {main_model}", "value", format_number),
     ]
     if reference:
         columns += [
-            (f"NRMSE of {reference}", less, number),
-            ("change", ratio),
-            ("difference", "apart.nrmse_mean", lambda by: DASH if by is None else signed(by)),
-            ("paired 95 % interval", lambda line: paired_interval(line["apart"].get("ci95"))),
+            (f"NRMSE of {reference}", reference_nrmse, format_number),
+            ("change", ratio_cell),
+            (
+                "difference",
+                "apart.nrmse_mean",
+                lambda by: DASH if by is None else format_signed(by),
+            ),
+            (
+                "paired 95 % interval",
+                lambda line: format_paired_interval(line["apart"].get("ci95")),
+            ),
         ]
-    return table_of(lines, columns, rule=lambda line: line["by"])
+    return build_table(breakdown_rows, columns, group_key=lambda line: line["by"])
 
 
-def worst(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
+def worst_runs_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
     """Return the worst free runs of the main protocol, and a figure to look into them with."""
-    known = (run.limits.get("splits") or {}).get(run.focus, {}).get(run.main, {})
-    shown = [block for block in (_worst(run, run.lead, known), *figures) if block is not None]
-    return Section("Worst runs", shown) if shown else None
+    protocol_limits = (
+        (run.limits.get("splits") or {}).get(run.report_split, {}).get(run.main_protocol, {})
+    )
+    blocks = [
+        block
+        for block in (_worst_windows_table(run, run.main_model, protocol_limits), *figures)
+        if block is not None
+    ]
+    return Section("Worst runs", blocks) if blocks else None
 
 
-def _worst(run: RunFiles, lead: str, known: Content) -> Table | None:
+def _worst_windows_table(
+    run: RunFiles, main_model: str, protocol_limits: JsonObject
+) -> Table | None:
     """Return the windows with the largest errors of a model, None where none are recorded."""
-    entries = (known.get("worst") or {}).get(lead) or []
+    entries = (protocol_limits.get("worst") or {}).get(main_model) or []
     if not entries:
         return None
     channels = [name for name in run.channels if name in entries[0]["rmse"]]
-    first = run.ends[0]
-    factor = run.end(first)[2]
-    return table_of(
+    pose_error = run.pose_errors[0]
+    factor = run.pose_error_unit(pose_error)[2]
+    return build_table(
         entries,
         [
             (
@@ -292,128 +348,166 @@ def _worst(run: RunFiles, lead: str, known: Content) -> Table | None:
                 lambda entry: f"{entry['log']} ({entry['manoeuvre'].replace('_', ' ')})",
             ),
             ("log time at start [s]", "t", 1),
-            ("NRMSE", "nrmse", number),
-            *((_quantities(run)[c], f"rmse.{c}", number, run.unit(c)[1]) for c in channels),
-            (_quantities(run)[first], lambda e: number(factor * e[f"{first}_error_end"], 2), str),
+            ("NRMSE", "nrmse", format_number),
+            *(
+                (_quantity_titles(run)[c], f"rmse.{c}", format_number, run.display_unit(c)[1])
+                for c in channels
+            ),
+            (
+                _quantity_titles(run)[pose_error],
+                lambda e: format_number(factor * e[f"{pose_error}_error_end"], 2),
+                str,
+            ),
         ],
     )
 
 
-def _repeatability(run: RunFiles, found: Content) -> str:
-    tolerance = found["tolerance"]
+def _repeatability_text(run: RunFiles, repeatability: JsonObject) -> str:
+    tolerance = repeatability["tolerance"]
 
-    def told(values: Mapping[str, float], *digits: int) -> str:
+    def format_velocities(values: Mapping[str, float], *digits: int) -> str:
         return ", ".join(
-            f"{name} {number(run.unit(name)[1] * values[name], *digits)} {run.unit(name)[0]}"
+            f"{name} {format_number(run.display_unit(name)[1] * values[name], *digits)} {run.display_unit(name)[0]}"
             for name in tolerance["start"]
         )
 
-    rule = (
+    criterion = (
         f"commands within {100 * tolerance['command_share_of_range']:.0f} % of their range (root"
         " mean square over the window) and initial velocities within"
-        f" {told(tolerance['start'], 2)}"
+        f" {format_velocities(tolerance['start'], 2)}"
     )
-    where = "the logs evaluated here" if run.focus == "external" else "the logs of all splits"
-    if not found["pairs"]:
+    logs_text = (
+        "the logs evaluated here" if run.report_split == "external" else "the logs of all splits"
+    )
+    if not repeatability["pairs"]:
         return (
-            f"Repeatability: {where} hold no two stretches as long as a window with {rule}. How"
+            f"Repeatability: {logs_text} hold no two stretches as long as a window with {criterion}. How"
             " well the vessel repeats itself is not known."
         )
-    share = 1 / math.sqrt(2)
-    kinds = ", ".join(
-        f"{name.replace('_', ' ')} {part['pairs']}" for name, part in found["manoeuvres"].items()
+    single_run_factor = 1 / math.sqrt(2)
+    pairs_text = ", ".join(
+        f"{name.replace('_', ' ')} {part['pairs']}"
+        for name, part in repeatability["manoeuvres"].items()
     )
-    ends = listed([sized(end, found[end]) for end in run.ends if end in found])
-    place = f" and {number(share * found['position'], 2)} m" if "position" in run.ends else ""
-    exogenous = (run.resolved.get("signals") or {}).get("exogenous")
-    wind = " A model that knows the wind, as these do, can do better." if exogenous else ""
+    pose_error_text = join_list(
+        [
+            format_pose_error(pose_error, repeatability[pose_error])
+            for pose_error in run.pose_errors
+            if pose_error in repeatability
+        ]
+    )
+    position_text = (
+        f" and {format_number(single_run_factor * repeatability['position'], 2)} m"
+        if "position" in run.pose_errors
+        else ""
+    )
+    exogenous = (run.resolved_config.get("signals") or {}).get("exogenous")
+    wind_text = " A model that knows the wind, as these do, can do better." if exogenous else ""
     return (
-        f"Repeatability: {plural(found['pairs'], 'pair')} of stretches ({kinds}) in"
-        f" {found['logs']} of {where} have {rule}. Their measured motions differ by"
-        f" {told(found)} (root"
-        f" mean square), and by {ends} at the end. Each motion is off their mean by"
-        f" 1/√2 of that: an NRMSE of {number(share * found['nrmse'])}{place}."
+        f"Repeatability: {format_count(repeatability['pairs'], 'pair')} of stretches ({pairs_text}) in"
+        f" {repeatability['logs']} of {logs_text} have {criterion}. Their measured motions differ by"
+        f" {format_velocities(repeatability)} (root"
+        f" mean square), and by {pose_error_text} at the end. Each motion is off their mean by"
+        f" 1/√2 of that: an NRMSE of {format_number(single_run_factor * repeatability['nrmse'])}{position_text}."
         " The remaining differences of commands and"
         " starts are part of it. A model that knows only commands and initial velocities is left"
-        f" with an error of this order in such runs, whatever its form.{wind}"
+        f" with an error of this order in such runs, whatever its form.{wind_text}"
     )
 
 
-def bands(run: RunFiles) -> Section | None:
+def bands_section(run: RunFiles) -> Section | None:
     """Return how wide bands are, what they held and what they do not promise; None without any."""
-    models: Content = run.json("bands.json").get("models") or {}
+    models: JsonObject = run.read_json("bands.json").get("models") or {}
     if not models:
         return None
     band = next(iter(next(iter(models.values())).values()))
     level = f"{100 * band['level']:.0f} %"
-    about = [
+    introduction = [
         f"A band is to hold {level} of the errors of a free run on logs that nobody has seen. It"
         " grows with the horizon, and is wider where the predicted run is livelier or the models"
         " disagree. It was calibrated over logs that its model was not fitted on: training logs,"
         " predicted by models that leave them out, and validation logs that no fit has seen.",
-        f"The tables say what the bands held of the {run.focus} data. Whole: share of the runs that"
+        f"The tables say what the bands held of the {run.report_split} data. Whole: share of the runs that"
         f" a band holds from beginning to end, each channel for itself, where it is widened to hold"
         f" {level} of them. Score: mean width, and {2 / (1 - band['level']):.0f} times what lies"
         " outside, in units of the error of zero; less is better. Beside it stands a band of one"
         " width at all horizons.",
     ]
-    blocks: list[Block] = [Text(about)]
-    if told := cautions(run, run.lead):
-        blocks.append(Bullets(told, warning=True))
+    blocks: list[Block] = [Text(introduction)]
+    if warnings := band_cautions(run, run.main_model):
+        blocks.append(Bullets(warnings, is_warning=True))
     for protocol in run.protocols:
-        models_rows = [run.row(model, run.focus, protocol) for model in run.kinds]
-        known = [row for row in models_rows if row and "band_coverage" in row]
-        if not known:
+        models_rows = [run.find_row(model, run.report_split, protocol) for model in run.model_kinds]
+        rows_with_bands = [row for row in models_rows if row and "band_coverage" in row]
+        if not rows_with_bands:
             continue
-        parts = [_coverage(known, "model", lambda row: run.label(row["model"]), run.selected)]
-        of_kinds = [
-            run.row(run.lead, run.focus, protocol, kind)
-            for kind in distinct(run, run.focus, protocol)
+        coverage_tables = [
+            _coverage_table(
+                rows_with_bands, "model", lambda row: run.model_label(row["model"]), run.selected
+            )
         ]
-        kinds = [row for row in of_kinds if row and "band_coverage" in row]
-        if len(kinds) > 1:
-            title = f"manoeuvre, {run.lead}"
-            parts.append(_coverage(kinds, title, lambda row: row["manoeuvre"].replace("_", " ")))
-        blocks.append(Section(f"Protocol {protocol}", parts, folded=protocol != run.protocols[0]))
+        manoeuvre_rows = [
+            run.find_row(run.main_model, run.report_split, protocol, kind)
+            for kind in distinct_manoeuvres(run, run.report_split, protocol)
+        ]
+        manoeuvre_rows_with_bands = [
+            row for row in manoeuvre_rows if row and "band_coverage" in row
+        ]
+        if len(manoeuvre_rows_with_bands) > 1:
+            title = f"manoeuvre, {run.main_model}"
+            coverage_tables.append(
+                _coverage_table(
+                    manoeuvre_rows_with_bands, title, lambda row: row["manoeuvre"].replace("_", " ")
+                )
+            )
+        blocks.append(
+            Section(f"Protocol {protocol}", coverage_tables, is_folded=protocol != run.protocols[0])
+        )
     return Section("Bands", blocks)
 
 
-def cautions(run: RunFiles, model: str) -> list[str]:
+def band_cautions(run: RunFiles, model: str) -> list[str]:
     """Return whole sentences about what the bands of a model do not promise."""
-    known: Content = (run.json("bands.json").get("models") or {}).get(model) or {}
-    windows = run.windows(run.focus) if known else []
-    out: list[str] = []
-    for protocol, band in known.items():
-        out += [text for text in band["cautions"] if text not in out]
+    bands_by_protocol: JsonObject = (run.read_json("bands.json").get("models") or {}).get(
+        model
+    ) or {}
+    windows = run.read_split_windows(run.report_split) if bands_by_protocol else []
+    sentences: list[str] = []
+    for protocol, band in bands_by_protocol.items():
+        sentences += [text for text in band["cautions"] if text not in sentences]
         lengths = [float(w.t[-1] - w.t[0]) for w in windows if w.protocol == protocol]
-        longest = max(lengths, default=0.0)
-        if longest > band["horizon"] + 1e-6:
-            out.append(
-                f"Runs of protocol {protocol} last up to {fixed(longest, 0)} s, and the band is"
-                f" calibrated up to {fixed(band['horizon'], 0)} s only; beyond, it grows in"
+        max_duration = max(lengths, default=0.0)
+        if max_duration > band["horizon"] + 1e-6:
+            sentences.append(
+                f"Runs of protocol {protocol} last up to {format_fixed(max_duration, 0)} s, and the band is"
+                f" calibrated up to {format_fixed(band['horizon'], 0)} s only; beyond, it grows in"
                 " proportion to time, without any promise."
             )
-    return out
+    return sentences
 
 
-def _coverage(
-    rows: Sequence[Content], title: str, label: Any, selected: str | None = None
+def _coverage_table(
+    rows: Sequence[JsonObject], title: str, label: Any, selected_model: str | None = None
 ) -> Table:
-    def beside(row: Content, name: str) -> Cell:
-        value, own = row.get(name), row["band_score"]
-        note = percent(100 * (value / own - 1)) if value is not None and own > 0 else ""
-        return Cell(number(value), note)
+    def comparison_cell(row: JsonObject, name: str) -> Cell:
+        value, band_score = row.get(name), row["band_score"]
+        note = (
+            format_percent_change(100 * (value / band_score - 1))
+            if value is not None and band_score > 0
+            else ""
+        )
+        return Cell(format_number(value), note)
 
-    shown = [name for name in rows[0]["band_coverage"] if name not in ("mean", "whole")]
+    channels = [name for name in rows[0]["band_coverage"] if name not in ("mean", "whole")]
 
-    return table_of(
+    return build_table(
         rows,
         [
             (title, label),
-            *((name, f"band_coverage.{name}", 2) for name in (*shown, "mean", "whole")),
-            ("bands", "band_score", number),
-            ("one width", lambda row: beside(row, "band_score_constant")),
+            *((name, f"band_coverage.{name}", 2) for name in (*channels, "mean", "whole")),
+            ("bands", "band_score", format_number),
+            ("one width", lambda row: comparison_cell(row, "band_score_constant")),
         ],
-        groups=[("coverage", len(shown) + 2), ("score", 2)],
-        selected=lambda row: row["model"] == selected,
+        groups=[("coverage", len(channels) + 2), ("score", 2)],
+        is_selected=lambda row: row["model"] == selected_model,
     )

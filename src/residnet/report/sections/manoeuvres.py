@@ -10,9 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from residnet.core.format import DASH, DEG, fixed, interval, number, plural, shown_unit
+from residnet.core.format import (
+    DASH,
+    DEGREES_PER_RADIAN,
+    display_unit,
+    format_count,
+    format_fixed,
+    format_interval,
+    format_number,
+)
 from residnet.core.log import Log
-from residnet.data.simulated import Flight
+from residnet.data.simulated import ManoeuvreRun
 from residnet.manoeuvres.closed_loop import Spiral, Zigzag
 from residnet.manoeuvres.courses import Waypoints
 from residnet.manoeuvres.open_loop import Replay
@@ -24,43 +32,43 @@ from residnet.report.blocks import (
     Section,
     Table,
     Text,
-    bad_where,
-    table_of,
+    build_table,
+    flag_cell,
 )
 from residnet.report.figure import (
-    DASHED,
+    DASHED_STYLE,
     GREY,
-    MEASURED,
-    SOLID,
-    START,
-    ZERO,
+    MEASURED_STYLE,
+    SOLID_STYLE,
+    START_STYLE,
+    ZERO_LINE_STYLE,
     Case,
     Curve,
     Figure,
-    Look,
+    GlyphStyle,
     Panel,
-    band,
-    joined,
-    steps,
+    band_outline,
+    join_with_gaps,
+    step_curve,
 )
 from residnet.report.figure_files import figures_section, read_figures
-from residnet.report.run_reader import Content, RunFiles
+from residnet.report.run_reader import JsonObject, RunFiles
 
-_EACH = 12
+_MAX_SEPARATE_FLIGHTS = 12
 """Most flights that have a table and a picture each; of more, the first of each kind has."""
-_MOST_CASES, _MOST_PANELS, _MOST_ZIGZAGS = 30, 12, 6
+_MAX_CASES, _MAX_PANELS, _MAX_ZIGZAGS = 30, 12, 6
 """Flights and panels of the figure that is looked into, and zigzags of a picture.
 
 Chosen by hand: the page stays a few megabytes, and a picture a page.
 """
-_TITLES = {
+_INDEX_TITLES = {
     "time_90": "time to 90 deg",
     "time_180": "time to 180 deg",
     "steady_speed_ratio": "steady speed over approach speed",
     "pull_out_yaw_rate": "yaw rate after pull-out",
 }
 """Names of indices that are not their key with spaces."""
-_COMPARED = (
+_COMPARED_INDICES = (
     "first_overshoot",
     "second_overshoot",
     "initial_turning_time",
@@ -68,7 +76,7 @@ _COMPARED = (
     "period",
     "largest_yaw_rate",
 )
-_TELLING = (
+_MAIN_INDICES = (
     "tactical_diameter",
     "first_overshoot",
     "track_reach",
@@ -76,241 +84,283 @@ _TELLING = (
     "largest_cross_track_error",
 )
 """The index of each kind of manoeuvre that stands on the first screen."""
-_CHANNELS = {
+_CHANNEL_TITLES = {
     "u": "surge velocity\nu", "v": "sway velocity\nv", "r": "yaw rate\nr", "p": "roll rate\np",
     "psi": "heading\n", "phi": "roll angle\n", "w": "heave velocity\nw", "q": "pitch rate\nq",
     "z": "depth\n", "theta": "pitch angle\n",
     "cmd_delta": "rudder\ncommand", "cmd_n": "revolutions\ncommand", "cmd_port": "port command\n",
     "cmd_stbd": "starboard\ncommand",
 }  # fmt: skip
-_SHOWN = ("u", "v", "r", "p", "psi", "phi", "w", "q", "z", "theta")
+_PLOTTED_CHANNELS = ("u", "v", "r", "p", "psi", "phi", "w", "q", "z", "theta")
 
 
 def index_title(name: str) -> str:
     """Return a manoeuvring index in words."""
-    return _TITLES.get(name, name.replace("_", " "))
+    return _INDEX_TITLES.get(name, name.replace("_", " "))
 
 
 def sections(run: RunFiles) -> list[Section]:
     """Return the manoeuvring indices and the figures that stand in the folder."""
-    content = run.json("indices.json")
-    flown = read_figures(run.path / "figures", "manoeuvres")
-    out = []
+    content = run.read_json("indices.json")
+    figures = read_figures(run.path / "figures", "manoeuvres")
+    sections_written = []
     if content.get("rows"):
-        out.append(Section("", [*(one.part() for one in flown), _flights(content)]))
-        blocks: list[Block] = [Text(_about(content), quiet=True)]
+        sections_written.append(
+            Section("", [*(figure.preview() for figure in figures), _trials_table(content)])
+        )
+        blocks: list[Block] = [Text(_introduction(content), is_secondary=True)]
         blocks += [Section(title, [table]) for title, table in index_tables(content)]
-        out.append(Section("Manoeuvring indices", blocks))
-    return [*out, *figures_section(run.path / "figures")]
+        sections_written.append(Section("Manoeuvring indices", blocks))
+    return [*sections_written, *figures_section(run.path / "figures")]
 
 
-def _flights(content: Content) -> Table:
+def _trials_table(content: JsonObject) -> Table:
     """Return a row for each flight: what went wrong, else the most telling of its indices."""
 
-    def telling(row: Content) -> str:
-        return next((name for name in _TELLING if name in row["indices"]), "")
+    def main_index(row: JsonObject) -> str:
+        return next((name for name in _MAIN_INDICES if name in row["indices"]), "")
 
-    def outcome(row: Content) -> Cell | str:
+    def outcome(row: JsonObject) -> Cell | str:
         if row["fault"]:
-            return bad_where(row["fault"], True)
-        return index_title(telling(row)) or "ended as it should"
+            return flag_cell(row["fault"], True)
+        return index_title(main_index(row)) or "ended as it should"
 
-    def value(row: Content) -> str:
-        found = _entries(row).get(telling(row))
-        return DASH if found is None else "{} {}".format(*_shown(content, telling(row), found))
+    def value(row: JsonObject) -> str:
+        entry = _scalar_indices(row).get(main_index(row))
+        return (
+            DASH
+            if entry is None
+            else "{} {}".format(*_format_index(content, main_index(row), entry))
+        )
 
     rows = sorted(content["rows"], key=lambda row: not row["fault"])
-    several = len({row["craft"] for row in rows}) > 1
+    has_several = len({row["craft"] for row in rows}) > 1
     columns: list[Column] = [("flight", "log")]
-    return table_of(
-        rows[: max(_EACH, sum(bool(row["fault"]) for row in rows))],
+    return build_table(
+        rows[: max(_MAX_SEPARATE_FLIGHTS, sum(bool(row["fault"]) for row in rows))],
         [
             *columns,
-            *([("vessel", "craft")] if several else []),
+            *([("vessel", "craft")] if has_several else []),
             ("outcome", outcome),
             ("value", value, str),
         ],
     )
 
 
-def _about(content: Content) -> str:
+def _introduction(content: JsonObject) -> str:
     length = content.get("length")
     if length is None:
         text = "The length of the hull is not known, so there are no values in hull lengths."
     else:
         text = (
-            f"L: hull lengths of {number(length)} m. The limits are those of IMO resolution"
+            f"L: hull lengths of {format_number(length)} m. The limits are those of IMO resolution"
             " MSC.137(76), where they apply to a manoeuvre."
         )
-    without = dict.fromkeys(
+    kinds_without_indices = dict.fromkeys(
         str(row["manoeuvre"]).replace("_", " ") for row in content["rows"] if not row["indices"]
     )
-    return text + (f" Flights without indices: {', '.join(without)}." if without else "")
+    return text + (
+        f" Flights without indices: {', '.join(kinds_without_indices)}."
+        if kinds_without_indices
+        else ""
+    )
 
 
-def indices_text(content: Content) -> str:
+def indices_text(content: JsonObject) -> str:
     """Return the contents of indices.json for the terminal."""
-    return "\n\n".join(f"{title}\n{table.text()}" for title, table in index_tables(content))
+    return "\n\n".join(f"{title}\n{table.to_text()}" for title, table in index_tables(content))
 
 
-def _entries(row: Content) -> dict[str, Content]:
+def _scalar_indices(row: JsonObject) -> dict[str, JsonObject]:
     """Return the indices of a flight that are one number, with lengths and limits beside them."""
-    found: Content = row["indices"]
+    indices: JsonObject = row["indices"]
     return {
         name: {
             "value": value,
-            "lengths": found.get(f"{name}_lengths"),
+            "lengths": indices.get(f"{name}_lengths"),
             **row["limits"].get(name, {}),
         }
-        for name, value in found.items()
+        for name, value in indices.items()
         if not isinstance(value, list) and not name.endswith("_lengths")
     }
 
 
-def _shown(content: Content, name: str, entry: Content, key: str = "value") -> tuple[str, str]:
+def _format_index(
+    content: JsonObject, name: str, entry: JsonObject, key: str = "value"
+) -> tuple[str, str]:
     """Return a number of an index and its unit, as they are shown."""
-    unit, factor = shown_unit(str(content["units"].get(name, "-")))
+    unit, factor = display_unit(str(content["units"].get(name, "-")))
     value = entry.get(key)
-    return number(None if value is None else factor * value, 4), unit
+    return format_number(None if value is None else factor * value, 4), unit
 
 
-def index_tables(content: Content) -> list[tuple[str, Table]]:
+def index_tables(content: JsonObject) -> list[tuple[str, Table]]:
     """Return titles and tables of the manoeuvring indices of indices.json.
 
     Few flights have a table each, with a row for each index; more stand in one table for each kind
     of manoeuvre, with a row for each flight.
     """
-    groups: dict[str, list[Content]] = {}
-    few = len({row["log"] for row in content["rows"]}) <= _EACH
+    groups: dict[str, list[JsonObject]] = {}
+    is_separate = len({row["log"] for row in content["rows"]}) <= _MAX_SEPARATE_FLIGHTS
     for row in content["rows"]:
-        if _entries(row):
-            groups.setdefault(str(row["log" if few else "manoeuvre"]), []).append(row)
+        if _scalar_indices(row):
+            groups.setdefault(str(row["log" if is_separate else "manoeuvre"]), []).append(row)
     return [
         (
             name.replace("_", " "),
-            _by_index(content, {row["craft"]: _entries(row) for row in rows})
-            if few
-            else _by_flight(content, rows),
+            _table_by_index(content, {row["craft"]: _scalar_indices(row) for row in rows})
+            if is_separate
+            else _table_by_trial(content, rows),
         )
         for name, rows in groups.items()
     ]
 
 
-def _by_index(content: Content, crafts: Mapping[str, Mapping[str, Content]]) -> Table:
+def _table_by_index(content: JsonObject, crafts: Mapping[str, Mapping[str, JsonObject]]) -> Table:
     """Return a row for each index of one manoeuvre; of two crafts the second is compared to the
     first.
 
     Args:
         content: whose `units` are those of the indices.
         crafts: of what flew it `value` by index, and what there is of `lengths`, `interval` over
-            draws, `ship` at full scale, `limit`, `kept` and `kept_share` of the draws.
+            draws, `scale_text` at full scale, `limit_cell`, `is_met` and `kept_share` of the draws.
     """
-    every = [entry for of in crafts.values() for entry in of.values()]
+    entries = [entry for craft_indices in crafts.values() for entry in craft_indices.values()]
 
-    def shown(craft: str, key: str, name: str) -> str:
-        return _shown(content, name, crafts[craft].get(name, {}), key)[0]
+    def format_value(craft: str, key: str, name: str) -> str:
+        return _format_index(content, name, crafts[craft].get(name, {}), key)[0]
 
     def lengths(craft: str, name: str) -> str:
-        found = crafts[craft].get(name, {}).get("lengths")
-        return "" if found is None else fixed(found, 2)
+        n_lengths = crafts[craft].get(name, {}).get("lengths")
+        return "" if n_lengths is None else format_fixed(n_lengths, 2)
 
-    def apart(name: str) -> str:
-        values: list[Any] = [of.get(name, {}).get("value") for of in crafts.values()]
-        return _shown(content, name, {} if None in values else {"value": values[1] - values[0]})[0]
+    def difference_text(name: str) -> str:
+        values: list[Any] = [
+            craft_indices.get(name, {}).get("value") for craft_indices in crafts.values()
+        ]
+        return _format_index(
+            content, name, {} if None in values else {"value": values[1] - values[0]}
+        )[0]
 
-    def limit(name: str) -> Cell:
-        found = [of[name] for of in crafts.values() if "limit" in of.get(name, {})]
-        if not found:
+    def limit_cell(name: str) -> Cell:
+        limited_entries = [
+            craft_indices[name]
+            for craft_indices in crafts.values()
+            if "limit" in craft_indices.get(name, {})
+        ]
+        if not limited_entries:
             return Cell("")
-        kept = all(entry["kept"] for entry in found)
-        share = found[0].get("kept_share")
-        note = ("kept" if kept else "exceeded") if share is None else f"kept by {100 * share:.0f} %"
-        return Cell(_shown(content, name, found[0], "limit")[0], note, "" if kept else "bad")
+        is_met = all(entry["kept"] for entry in limited_entries)
+        share_met = limited_entries[0].get("kept_share")
+        note = (
+            ("kept" if is_met else "exceeded")
+            if share_met is None
+            else f"kept by {100 * share_met:.0f} %"
+        )
+        return Cell(
+            _format_index(content, name, limited_entries[0], "limit")[0],
+            note,
+            "" if is_met else "bad",
+        )
 
-    def within(name: str) -> str:
-        (of,) = crafts.values()
-        return interval(of[name].get("interval"), shown_unit(content["units"][name])[1])
+    def interval_text(name: str) -> str:
+        (craft_indices,) = crafts.values()
+        return format_interval(
+            craft_indices[name].get("interval"), display_unit(content["units"][name])[1]
+        )
 
     columns: list[Column] = [
         ("index", index_title),
-        ("unit", lambda name: _shown(content, name, {})[1], str),
-        *((craft, partial(shown, craft, "value"), str) for craft in crafts),
-        *([("difference", apart, str)] if len(crafts) == 2 else []),
+        ("unit", lambda name: _format_index(content, name, {})[1], str),
+        *((craft, partial(format_value, craft, "value"), str) for craft in crafts),
+        *([("difference", difference_text, str)] if len(crafts) == 2 else []),
     ]
-    if any("interval" in entry for entry in every):
-        columns.append((f"{100 * content['level']:.0f} % interval", within, str))
-    if any(entry.get("lengths") is not None for entry in every):
+    if any("interval" in entry for entry in entries):
+        columns.append((f"{100 * content['level']:.0f} % interval", interval_text, str))
+    if any(entry.get("lengths") is not None for entry in entries):
         columns += [(f"{craft} [L]", partial(lengths, craft), str) for craft in crafts]
     if float(content.get("scale", 1)) != 1:
-        columns += [("ship", partial(shown, craft, "ship"), str) for craft in crafts]
-    if any("limit" in entry for entry in every):
-        columns.append(("IMO limit", limit))
-    return table_of(dict.fromkeys(name for of in crafts.values() for name in of), columns)
+        columns += [("ship", partial(format_value, craft, "ship"), str) for craft in crafts]
+    if any("limit" in entry for entry in entries):
+        columns.append(("IMO limit", limit_cell))
+    return build_table(
+        dict.fromkeys(name for craft_indices in crafts.values() for name in craft_indices), columns
+    )
 
 
-def _by_flight(content: Content, rows: Sequence[Content]) -> Table:
+def _table_by_trial(content: JsonObject, rows: Sequence[JsonObject]) -> Table:
     """Return a row for each flight of one kind of manoeuvre."""
-    several = len({row["craft"] for row in rows}) > 1
+    has_several = len({row["craft"] for row in rows}) > 1
 
-    def cell(row: Content, name: str) -> Cell:
-        entry = _entries(row).get(name, {})
-        text, _ = _shown(content, name, entry)
+    def cell(row: JsonObject, name: str) -> Cell:
+        entry = _scalar_indices(row).get(name, {})
+        text, _ = _format_index(content, name, entry)
         return Cell(text) if entry.get("kept", True) else Cell(text, "beyond the IMO limit", "bad")
 
     columns: list[Column] = [
-        ("log", lambda row: f"{row['log']} ({row['craft']})" if several else row["log"])
+        ("log", lambda row: f"{row['log']} ({row['craft']})" if has_several else row["log"])
     ]
-    for name in dict.fromkeys(name for row in rows for name in _entries(row)):
-        title = f"{index_title(name)} [{_shown(content, name, {})[1]}]"
+    for name in dict.fromkeys(name for row in rows for name in _scalar_indices(row)):
+        title = f"{index_title(name)} [{_format_index(content, name, {})[1]}]"
         columns.append((title, lambda row, name=name: cell(row, name)))
-    return table_of(rows, columns)
+    return build_table(rows, columns)
 
 
-def flight_figures(flown: Mapping[str, Sequence[Flight]]) -> Iterator[Figure]:
+def trial_figures(trials_by_craft: Mapping[str, Sequence[ManoeuvreRun]]) -> Iterator[Figure]:
     """Draw track, motion and commands of flights and, of spirals, yaw rate over helm.
 
     Of many flights, only the first of each kind of manoeuvre has a still picture.
 
     Args:
-        flown: flights of the same manoeuvres by what flew them; of two, the first is the solid line
+        trials_by_craft: flights of the same manoeuvres by what flew them; of two, the first is the solid line
             and the second the dashed one.
     """
-    groups: list[Sequence[Flight]] = list(zip(*flown.values(), strict=True))
-    kinds: dict[str, Sequence[Flight]] = {}
+    groups: list[Sequence[ManoeuvreRun]] = list(zip(*trials_by_craft.values(), strict=True))
+    first_of_kind: dict[str, Sequence[ManoeuvreRun]] = {}
     for group in groups:
-        kinds.setdefault(group[0].manoeuvre.kind, group)
-    stills = groups if len(groups) <= _EACH else list(kinds.values())
-    looks = {"recorded": Look("recorded", GREY, width=2.2, order=2)}
-    looks |= {
-        craft: replace(DASHED if place else SOLID, label=craft) for place, craft in enumerate(flown)
+        first_of_kind.setdefault(group[0].manoeuvre.kind, group)
+    static_groups = groups if len(groups) <= _MAX_SEPARATE_FLIGHTS else list(first_of_kind.values())
+    styles = {"recorded": GlyphStyle("recorded", GREY, width=2.2, z_order=2)}
+    styles |= {
+        craft: replace(DASHED_STYLE if index else SOLID_STYLE, label=craft)
+        for index, craft in enumerate(trials_by_craft)
     }
-    looks["way-point"] = Look("way-point", "#666666", kind="points", marker="s", size=5, order=5)
-    looks["reversals"] = replace(ZERO, label="heading of reversals", dash="dotted")
-    looks["start"] = START
-    shown = [*stills, *(one for one in groups if one not in stills)][:_MOST_CASES]
-    logs = [flight.motion for group in shown for flight in group]
+    styles["way-point"] = GlyphStyle(
+        "way-point", "#666666", kind="points", marker="s", size=5, z_order=5
+    )
+    styles["reversals"] = replace(ZERO_LINE_STYLE, label="heading of reversals", dash="dotted")
+    styles["start"] = START_STYLE
+    shown_groups = [
+        *static_groups,
+        *(group_of_trials for group_of_trials in groups if group_of_trials not in static_groups),
+    ][:_MAX_CASES]
+    logs = [trial.true_log for group in shown_groups for trial in group]
     present = dict.fromkeys(name for log in logs for name in log.channels)
-    channels: list[str] = [name for name in _SHOWN if name in present]
+    channels: list[str] = [name for name in _PLOTTED_CHANNELS if name in present]
     channels += [name for name in present if name.startswith("cmd_")]
-    channels = channels[:_MOST_PANELS]
-    units = {name: shown_unit(log.units[name]) for log in logs for name in log.channels}
+    channels = channels[:_MAX_PANELS]
+    units = {name: display_unit(log.units[name]) for log in logs for name in log.channels}
     units |= {name: ("rpm", 60.0) for log in logs for name in log.units if log.units[name] == "1/s"}
     panels = [Panel("north [m]", "east [m]", kind="map", height=380)]
     panels += [
-        Panel(f"{_CHANNELS.get(name, name)} [{units[name][0]}]".replace("\n ", "\n"), height=145)
+        Panel(
+            f"{_CHANNEL_TITLES.get(name, name)} [{units[name][0]}]".replace("\n ", "\n"), height=145
+        )
         for name in channels
     ]
     panels[-1] = replace(panels[-1], x_label="time [s]")
     cases = []
-    for group in [one for one in groups if one in shown]:
-        motion = group[0].motion
-        length = max(float(flight.motion.t[-1]) for flight in group)
+    for group in [group_of_trials for group_of_trials in groups if group_of_trials in shown_groups]:
+        motion = group[0].true_log
+        length = max(float(trial.true_log.t[-1]) for trial in group)
         cases.append(
             Case(
                 motion.name.replace("_", " "),
-                _flight_curves(list(flown), group, {name: units[name][1] for name in channels}),
+                _trial_curves(
+                    list(trials_by_craft), group, {name: units[name][1] for name in channels}
+                ),
                 f"{group[0].manoeuvre.kind.replace('_', ' ')}, {length:.0f} s",
-                group in stills,
+                group in static_groups,
             )
         )
     yield Figure(
@@ -318,140 +368,152 @@ def flight_figures(flown: Mapping[str, Sequence[Flight]]) -> Iterator[Figure]:
         "Manoeuvres",
         "North is up, scales of the track are equal, and each track begins at its start. Below,"
         " the motion itself, without the noise of sensors, and the commands over time.",
-        looks,
+        styles,
         panels,
         cases,
         "Manoeuvre",
     )
-    for group in stills:
+    for group in static_groups:
         if isinstance(group[0].manoeuvre, Spiral):
-            yield _spiral(list(flown), group, looks)
+            yield _spiral_figure(list(trials_by_craft), group, styles)
 
 
-def _flight_curves(
-    crafts: Sequence[str], group: Sequence[Flight], factors: Mapping[str, float]
+def _trial_curves(
+    crafts: Sequence[str], group: Sequence[ManoeuvreRun], factors: Mapping[str, float]
 ) -> list[dict[str, Curve]]:
-    manoeuvre, first = group[0].manoeuvre, group[0].motion
-    x0, y0 = (float(first[name][0]) for name in ("x", "y"))
-    drawn: dict[str, Log] = {}
+    manoeuvre, first_motion = group[0].manoeuvre, group[0].true_log
+    x0, y0 = (float(first_motion[name][0]) for name in ("x", "y"))
+    logs: dict[str, Log] = {}
     if isinstance(manoeuvre, Replay):
-        drawn["recorded"] = manoeuvre.recorded
-    drawn |= {craft: flight.motion for craft, flight in zip(crafts, group, strict=True)}
+        logs["recorded"] = manoeuvre.recorded
+    logs |= {craft: trial.true_log for craft, trial in zip(crafts, group, strict=True)}
     track: dict[str, Curve] = {}
-    out: list[dict[str, Curve]] = [track, *({} for _ in factors)]
-    for name, log in drawn.items():
+    panels: list[dict[str, Curve]] = [track, *({} for _ in factors)]
+    for name, log in logs.items():
         # a recording, as far as it was flown
-        known = log.t - log.t[0] <= first.t[-1] if name == "recorded" else slice(None)
-        time = (log.t - log.t[0])[known] if name == "recorded" else log.t
+        was_simulated = (
+            log.t - log.t[0] <= first_motion.t[-1] if name == "recorded" else slice(None)
+        )
+        time = (log.t - log.t[0])[was_simulated] if name == "recorded" else log.t
         if "x" in log.channels and "y" in log.channels:
-            track[name] = (log["y"][known] - y0, log["x"][known] - x0)
-        for panel, (channel, factor) in zip(out[1:], factors.items(), strict=True):
+            track[name] = (log["y"][was_simulated] - y0, log["x"][was_simulated] - x0)
+        for panel, (channel, factor) in zip(panels[1:], factors.items(), strict=True):
             if channel in log.channels:
-                curve = (time, factor * np.asarray(log[channel][known], dtype=float))
-                panel[name] = steps(*curve) if channel.startswith("cmd_") else curve
+                curve = (time, factor * np.asarray(log[channel][was_simulated], dtype=float))
+                panel[name] = step_curve(*curve) if channel.startswith("cmd_") else curve
     track["start"] = (np.zeros(1), np.zeros(1))
     if isinstance(manoeuvre, Waypoints):
         north, east = np.array(manoeuvre.points).T
         track["way-point"] = (east - y0, north - x0)
     if isinstance(manoeuvre, Zigzag) and "psi" in factors:
-        turn = np.array([-1.0, 1.0]) * manoeuvre.heading
-        heading = factors["psi"] * (first["psi"][0] + turn)
-        out[1 + list(factors).index("psi")]["reversals"] = (np.zeros(2), heading)
-    return out
+        reversal_changes = np.array([-1.0, 1.0]) * manoeuvre.heading
+        heading = factors["psi"] * (first_motion["psi"][0] + reversal_changes)
+        panels[1 + list(factors).index("psi")]["reversals"] = (np.zeros(2), heading)
+    return panels
 
 
-def _spiral(crafts: Sequence[str], group: Sequence[Flight], looks: Mapping[str, Look]) -> Figure:
-    name, manoeuvre = group[0].motion.name, group[0].manoeuvre
+def _spiral_figure(
+    crafts: Sequence[str], group: Sequence[ManoeuvreRun], styles: Mapping[str, GlyphStyle]
+) -> Figure:
+    name, manoeuvre = group[0].true_log.name, group[0].manoeuvre
     by_angle = isinstance(manoeuvre, Spiral) and len(manoeuvre.rudders) > 0
     panel: dict[str, Curve] = {}
-    for craft, flight in zip(crafts, group, strict=True):
-        found = flight.manoeuvre.indices(flight.motion)
-        helm = (DEG if by_angle else 1.0) * np.asarray(found["steers"])
-        panel[craft] = panel[f"{craft} steady"] = (helm, np.degrees(found["yaw_rates"]))
+    for craft, trial in zip(crafts, group, strict=True):
+        indices = trial.manoeuvre.compute_indices(trial.true_log)
+        helm = (DEGREES_PER_RADIAN if by_angle else 1.0) * np.asarray(indices["steers"])
+        panel[craft] = panel[f"{craft} steady"] = (helm, np.degrees(indices["yaw_rates"]))
     label = "rudder [deg]" if by_angle else "helm [share of full steer]"
     return Figure(
         f"spiral_{name}",
         f"Spiral: {name}",
         "Steady yaw rate over helm; a loop about 0 shows an unstable vessel.",
-        {craft: looks[craft] for craft in crafts}
-        | {f"{craft} steady": replace(looks[craft], kind="points") for craft in crafts},
+        {craft: styles[craft] for craft in crafts}
+        | {f"{craft} steady": replace(styles[craft], kind="points") for craft in crafts},
         [Panel("steady yaw rate [deg/s]", label, name, height=360)],
         [Case("", [panel])],
     )
 
 
-def booklet(run: RunFiles) -> Section | None:
+def booklet_section(run: RunFiles) -> Section | None:
     """Return a table for each standard manoeuvre and one that compares measured zigzags.
 
     None where the run has no booklet.json.
     """
-    content = run.json("booklet.json")
+    content = run.read_json("booklet.json")
     if not content:
         return None
     scale = float(content["scale"])
-    hull = f"a hull of {number(float(content['length']))} m"
-    hull += f", a model at 1:{number(scale)}" if scale != 1 else ""
-    ship = " The column ship scales the values by Froude's law." if scale != 1 else ""
-    about = (
-        f"Model {content['model']} ran these manoeuvres for {hull}.{ship} The intervals"
+    hull_text = f"a hull of {format_number(float(content['length']))} m"
+    hull_text += f", a model at 1:{format_number(scale)}" if scale != 1 else ""
+    scale_text = " The column ship scales the values by Froude's law." if scale != 1 else ""
+    introduction = (
+        f"Model {content['model']} ran these manoeuvres for {hull_text}.{scale_text} The intervals"
         f" ({100 * content['level']:.0f} %) come from {content['draws']} draws of the parameters"
         " from their uncertainty after the trials. They assume that the model's form is right."
     )
-    blocks: list[Block] = [Text(about)]
+    blocks: list[Block] = [Text(introduction)]
     for page in content["pages"]:
         if not page["split"]:
-            parts: list[Block] = [_by_index(content, {content["model"]: page["indices"]})]
+            page_blocks: list[Block] = [
+                _table_by_index(content, {content["model"]: page["indices"]})
+            ]
             if page["faults"]:
-                draws = plural(page["faults"], "draw")
-                text = f"The intervals leave out {draws} that did not end the manoeuvre."
-                parts.append(Bullets([text], warning=True))
-            blocks.append(Section(page_title(page), parts))
-    repeated = [page for page in content["pages"] if page["split"]]
-    if repeated:
-        firsts = [page["indices"].get("first_overshoot", {}) for page in repeated]
-        apart = [abs(found["difference"]) for found in firsts if "difference" in found]
-        about = (
+                draws = format_count(page["faults"], "draw")
+                warning = f"The intervals leave out {draws} that did not end the manoeuvre."
+                page_blocks.append(Bullets([warning], is_warning=True))
+            blocks.append(Section(page_title(page), page_blocks))
+    repeated_pages = [page for page in content["pages"] if page["split"]]
+    if repeated_pages:
+        first_overshoots = [page["indices"].get("first_overshoot", {}) for page in repeated_pages]
+        differences = [
+            abs(overshoot["difference"])
+            for overshoot in first_overshoots
+            if "difference" in overshoot
+        ]
+        introduction = (
             "The model steers the rudder angle of each trial and reverses it at the trial's"
             " headings, from the state that the trial began with."
         )
-        if apart:
-            worst = number(math.degrees(max(apart)), 2)
-            about += f" First overshoots differ by at most {worst} deg."
+        if differences:
+            largest_difference = format_number(math.degrees(max(differences)), 2)
+            introduction += f" First overshoots differ by at most {largest_difference} deg."
         title = "Measured zigzags, repeated in closed loop"
-        blocks.append(Section(title, [Text(about), _repeated(content, repeated)]))
+        blocks.append(
+            Section(title, [Text(introduction), _repeated_zigzag_table(content, repeated_pages)])
+        )
     return Section("Manoeuvring booklet", blocks)
 
 
-def page_title(page: Content) -> str:
+def page_title(page: JsonObject) -> str:
     """Return the name of a page, with the split of a measured log."""
     name = str(page["name"])
     return f"{name} ({page['split']})" if page["split"] else name.replace("_", " ")
 
 
-def _repeated(content: Content, pages: Sequence[Content]) -> Table:
+def _repeated_zigzag_table(content: JsonObject, pages: Sequence[JsonObject]) -> Table:
     """Return measured and predicted indices of the repeated zigzags, a row for each."""
-    used = {
-        name: shown_unit(content["units"][name])
-        for name in _COMPARED
+    index_units = {
+        name: display_unit(content["units"][name])
+        for name in _COMPARED_INDICES
         if any("measured" in page["indices"].get(name, {}) for page in pages)
     }
 
-    def cell(page: Content, name: str, key: str) -> Cell:
-        found, factor = page["indices"].get(name, {}), used[name][1]
-        if "measured" not in found:
+    def cell(page: JsonObject, name: str, key: str) -> Cell:
+        entry, factor = page["indices"].get(name, {}), index_units[name][1]
+        if "measured" not in entry:
             return Cell(DASH)
         if key == "difference":
-            return Cell(number(factor * found[key], 2))
-        note = interval(found.get("interval"), factor) if key == "value" else ""
-        return Cell(number(factor * found[key]), note)
+            return Cell(format_number(factor * entry[key], 2))
+        note = format_interval(entry.get("interval"), factor) if key == "value" else ""
+        return Cell(format_number(factor * entry[key]), note)
 
-    return table_of(
+    return build_table(
         pages,
         [
             ("log", page_title),
             *(
                 (title, lambda page, name=name, key=key: cell(page, name, key))
-                for name in used
+                for name in index_units
                 for title, key in (
                     ("measured", "measured"),
                     ("model", "value"),
@@ -459,79 +521,94 @@ def _repeated(content: Content, pages: Sequence[Content]) -> Table:
                 )
             ),
         ],
-        groups=[(f"{index_title(name)} [{unit}]", 3) for name, (unit, _) in used.items()],
+        groups=[(f"{index_title(name)} [{unit}]", 3) for name, (unit, _) in index_units.items()],
     )
 
 
 def booklet_figures(run: RunFiles) -> Iterator[Figure]:
     """Draw the turning circles with all draws and the repeated zigzags of a booklet."""
-    content, frame = run.json("booklet.json"), run.frame("booklet.parquet")
+    content, frame = run.read_json("booklet.json"), run.read_parquet("booklet.parquet")
     if not content or frame is None:
         return
     by_page = {str(name): rows for name, rows in frame.groupby("page", sort=False)}
     pages: list[Mapping[str, Any]] = content["pages"]
-    circles = [page for page in pages if page["manoeuvre"] == "turning_circle"]
-    if circles:
-        yield _circles(by_page, circles, content)
-    zigzags = [page for page in pages if page["manoeuvre"] == "zigzag"]
-    for place in range(0, len(zigzags), _MOST_ZIGZAGS):
-        chosen = zigzags[place : place + _MOST_ZIGZAGS]
+    circle_pages = [page for page in pages if page["manoeuvre"] == "turning_circle"]
+    if circle_pages:
+        yield _turning_circle_figure(by_page, circle_pages, content)
+    zigzag_pages = [page for page in pages if page["manoeuvre"] == "zigzag"]
+    for first_index in range(0, len(zigzag_pages), _MAX_ZIGZAGS):
+        figure_pages = zigzag_pages[first_index : first_index + _MAX_ZIGZAGS]
         panels = [
             Panel("heading, rudder [deg]", "time [s]", page_title(page), height=200, group=str(i))
-            for i, page in enumerate(chosen)
+            for i, page in enumerate(figure_pages)
         ]
         yield Figure(
-            f"booklet_zigzags_{place // _MOST_ZIGZAGS + 1}",
+            f"booklet_zigzags_{first_index // _MAX_ZIGZAGS + 1}",
             "Zigzags in closed loop",
             "The model steers by its own heading with the rudder angle and the reversals of"
             " each trial; the rudder is dotted. Look for the height of the peaks (overshoot)"
             f" and for periods that run apart. The band holds {100 * content['level']:.0f} % of the"
             " draws at each instant.",
             {
-                "band": Look("band of the draws", SOLID.color, kind="fill", alpha=0.22, order=1),
-                "model": replace(SOLID, label="model"),
-                "rudder": Look("rudder", "#737373", "dotted", 1.0, order=1),
-                "measured": replace(MEASURED, width=1.1, order=5),
+                "band": GlyphStyle(
+                    "band of the draws", SOLID_STYLE.color, kind="fill", alpha=0.22, z_order=1
+                ),
+                "model": replace(SOLID_STYLE, label="model"),
+                "rudder": GlyphStyle("rudder", "#737373", "dotted", 1.0, z_order=1),
+                "measured": replace(MEASURED_STYLE, width=1.1, z_order=5),
             },
             panels,
-            [Case("", [_zigzag(by_page[page["name"]], content["level"]) for page in chosen])],
-            columns=min(2, len(chosen)),
+            [
+                Case(
+                    "",
+                    [
+                        _zigzag_curves(by_page[page["name"]], content["level"])
+                        for page in figure_pages
+                    ],
+                )
+            ],
+            columns=min(2, len(figure_pages)),
         )
 
 
-def _circles(
-    by_page: Mapping[str, Any], pages: Sequence[Mapping[str, Any]], content: Content
+def _turning_circle_figure(
+    by_page: Mapping[str, Any], pages: Sequence[Mapping[str, Any]], content: JsonObject
 ) -> Figure:
     length = float(content["length"])
     panel: dict[str, Curve] = {}
-    looks = {
-        "draws": Look("draws", SOLID.color, width=0.7, alpha=0.12, order=1),
-        "model": replace(SOLID, label="model"),
+    styles = {
+        "draws": GlyphStyle("draws", SOLID_STYLE.color, width=0.7, alpha=0.12, z_order=1),
+        "model": replace(SOLID_STYLE, label="model"),
     }
-    of_draws: dict[bool, list[Curve]] = {True: [], False: []}
+    curves_by_role: dict[bool, list[Curve]] = {True: [], False: []}
     for page in pages:
-        rows, found = by_page[page["name"]], page["indices"]
-        for draw, part in rows[rows["draw"] >= 0].groupby("draw"):
-            of_draws[draw == 0].append((part["y"] / length, part["x"] / length))
-        if "tactical_diameter" in found:
-            side = 1.0 if rows[rows["draw"] == 0]["psi"].iloc[-1] > 0 else -1.0
+        rows, indices = by_page[page["name"]], page["indices"]
+        for draw_number, draw_rows in rows[rows["draw"] >= 0].groupby("draw"):
+            curves_by_role[draw_number == 0].append(
+                (draw_rows["y"] / length, draw_rows["x"] / length)
+            )
+        if "tactical_diameter" in indices:
+            turn_sign = 1.0 if rows[rows["draw"] == 0]["psi"].iloc[-1] > 0 else -1.0
             advance, transfer, diameter = (
-                found[name]["lengths"] for name in ("advance", "transfer", "tactical_diameter")
+                indices[name]["lengths"] for name in ("advance", "transfer", "tactical_diameter")
             )
             name = page_title(page)
-            panel[name] = joined(
+            panel[name] = join_with_gaps(
                 [
-                    ([0.0, side * transfer], [advance, advance]),
-                    ([side * diameter] * 2, [0.0, advance]),
+                    ([0.0, turn_sign * transfer], [advance, advance]),
+                    ([turn_sign * diameter] * 2, [0.0, advance]),
                 ]
             )
-            looks[name] = Look(
+            styles[name] = GlyphStyle(
                 f"{name}: advance {advance:.2f}, tactical diameter {diameter:.2f}",
                 width=0.8,
-                dash="solid" if side > 0 else "dashed",
-                order=4,
+                dash="solid" if turn_sign > 0 else "dashed",
+                z_order=4,
             )
-    panel |= {"draws": joined(of_draws[False]), "model": joined(of_draws[True])}
+    panel |= {
+        "draws": join_with_gaps(curves_by_role[False]),
+        "model": join_with_gaps(curves_by_role[True]),
+    }
     panel["start"] = (np.zeros(1), np.zeros(1))
     return Figure(
         "booklet_circles",
@@ -539,30 +616,37 @@ def _circles(
         "North is up; distances are in hull lengths from the place of the order. Thin"
         f" lines are {content['draws']} draws of the model's parameters. Black lines mark"
         " advance (to 90 deg) and tactical diameter (to 180 deg) of the fitted model.",
-        looks | {"start": START},
+        styles | {"start": START_STYLE},
         [Panel("north [hull lengths]", "east [hull lengths]", kind="map", height=380)],
         [Case("", [panel])],
     )
 
 
-def _zigzag(rows: Any, level: float) -> dict[str, Curve]:
-    def heading(part: Any) -> np.ndarray:
-        turned: np.ndarray = DEG * (part["psi"] - part["psi"].iloc[0]).to_numpy()
-        return turned
+def _zigzag_curves(rows: Any, level: float) -> dict[str, Curve]:
+    def relative_heading_deg(draw_rows: Any) -> np.ndarray:
+        heading_change: np.ndarray = (
+            DEGREES_PER_RADIAN * (draw_rows["psi"] - draw_rows["psi"].iloc[0]).to_numpy()
+        )
+        return heading_change
 
-    fitted, measured = rows[rows["draw"] == 0], rows[rows["draw"] == -1]
-    t = fitted["t"].to_numpy()
-    out = {"model": (t, heading(fitted)), "rudder": (t, DEG * fitted["rudder"].to_numpy())}
-    drawn = [heading(part) for _, part in rows[rows["draw"] > 0].groupby("draw")]
-    first = rows[rows["draw"] == 1]["t"].to_numpy()
-    if drawn and first.size:
+    fitted_rows, measured_rows = rows[rows["draw"] == 0], rows[rows["draw"] == -1]
+    t = fitted_rows["t"].to_numpy()
+    traces = {
+        "model": (t, relative_heading_deg(fitted_rows)),
+        "rudder": (t, DEGREES_PER_RADIAN * fitted_rows["rudder"].to_numpy()),
+    }
+    draw_headings = [
+        relative_heading_deg(part) for _, part in rows[rows["draw"] > 0].groupby("draw")
+    ]
+    first_draw_times = rows[rows["draw"] == 1]["t"].to_numpy()
+    if draw_headings and first_draw_times.size:
         # flights that end at their stop condition are of different length: the band ends with the
         # shortest
-        size = min(map(len, drawn))
-        ends = np.quantile(
-            [line[:size] for line in drawn], (0.5 - level / 2, 0.5 + level / 2), axis=0
+        n_common = min(map(len, draw_headings))
+        band_limits = np.quantile(
+            [line[:n_common] for line in draw_headings], (0.5 - level / 2, 0.5 + level / 2), axis=0
         )
-        out["band"] = band(first[:size], *ends)
-    if len(measured):
-        out["measured"] = (measured["t"].to_numpy(), heading(measured))
-    return out
+        traces["band"] = band_outline(first_draw_times[:n_common], *band_limits)
+    if len(measured_rows):
+        traces["measured"] = (measured_rows["t"].to_numpy(), relative_heading_deg(measured_rows))
+    return traces

@@ -4,245 +4,326 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from residnet.core.format import DASH, minus, number, percent, plural, title_of
-from residnet.data.doctor import summary
-from residnet.judge.soundness import CHECKS, Finding
-from residnet.judge.verdict import UNSEEN, Evidence, diverged_note
-from residnet.judge.verdict import level as judged_level
-from residnet.judge.verdict import verdict as judged
-from residnet.report.blocks import Bullets, Cell, Facts, Section, Text, table_of
+from residnet.core.format import (
+    DASH,
+    channel_title,
+    format_count,
+    format_minus_signs,
+    format_number,
+    format_percent_change,
+)
+from residnet.data.doctor import summarize_inspection
+from residnet.judge.soundness import CHECKS, SanityFinding
+from residnet.judge.verdict import UNSEEN_SPLITS, VerdictEvidence, describe_divergence
+from residnet.judge.verdict import rate_model as judged_level
+from residnet.judge.verdict import write_verdict as judged
+from residnet.report.blocks import Bullets, Cell, Facts, Section, Text, build_table
 from residnet.report.figure import Figure
-from residnet.report.run_reader import Content, RunFiles
-from residnet.report.sections.free_runs import distinct
+from residnet.report.run_reader import JsonObject, RunFiles
+from residnet.report.sections.free_runs import distinct_manoeuvres
 
 
-def verdict(run: RunFiles) -> list[str]:
+def verdict_sentences(run: RunFiles) -> list[str]:
     """Return how good the selected model is, sentence by sentence.
 
     Raises:
         UsageError: where the folder holds no metrics.json.
     """
-    lead = run.lead
-    if run.row(lead, run.focus, run.protocols[0]) is None:
+    main_model = run.main_model
+    if run.find_row(main_model, run.report_split, run.protocols[0]) is None:
         return [
-            f"The run holds no free runs of its selected model on {run.focus} data; see the tables."
+            f"The run holds no free runs of its selected model on {run.report_split} data; see the tables."
         ]
-    return judged(evidence(run, lead))
+    return judged(collect_evidence(run, main_model))
 
 
-_MEASURED = "measurements"
+_MEASUREMENT_ROW = "measurements"
 """Row of what the measured velocities leave, integrated."""
-_NO_PLACE = (
+_NO_POSE_TEXT = (
     "The logs hold no {}: judge the model by its velocities, for errors of position and heading are"
     " those of integrated velocities."
 )
 
 
-def evidence(run: RunFiles, selected: str) -> Evidence:
+def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
     """Return what the folder holds that a verdict on its selected model is passed on."""
-    protocol, split = run.protocols[0], run.focus
-    rows = {model: row for model in run.kinds if (row := run.row(model, split, protocol))}
-    inspection = run.json("doctor.json")
-    doctor = summary(inspection).tally if inspection.get("logs") else ""
-    told = run.live.text
-    if made := next((log["integrated"] for log in run.quality if log.get("integrated")), None):
-        doctor = f"{_NO_PLACE.format(', '.join(made))} {doctor}".strip() if not told else doctor
-        told += "; no heading was measured" if told and run.live.turns and "psi" in made else ""
-    doctor = f"{told[0].upper()}{told[1:]}. {doctor}".strip() if told else doctor
-    sides = (one for one in inspection.get("together") or [] if one["code"] == "one_side")
-    return Evidence(
+    protocol, split = run.protocols[0], run.report_split
+    rows = {
+        model: row for model in run.model_kinds if (row := run.find_row(model, split, protocol))
+    }
+    quality_report = run.read_json("doctor.json")
+    quality_summary = (
+        summarize_inspection(quality_report).tally if quality_report.get("logs") else ""
+    )
+    dof_text = run.dof.description
+    if integrated_channels := next(
+        (log["integrated"] for log in run.quality if log.get("integrated")), None
+    ):
+        quality_summary = (
+            f"{_NO_POSE_TEXT.format(', '.join(integrated_channels))} {quality_summary}".strip()
+            if not dof_text
+            else quality_summary
+        )
+        dof_text += (
+            "; no heading was measured"
+            if dof_text and run.dof.has_heading and "psi" in integrated_channels
+            else ""
+        )
+    quality_summary = (
+        f"{dof_text[0].upper()}{dof_text[1:]}. {quality_summary}".strip()
+        if dof_text
+        else quality_summary
+    )
+    one_sided_findings = (
+        finding for finding in quality_report.get("together") or [] if finding["code"] == "one_side"
+    )
+    return VerdictEvidence(
         selected,
         split,
         rows,
         run.baseline or "",
-        run.json("selection.json"),
+        run.read_json("selection.json"),
         (run.limits.get("splits") or {}).get(split, {}),
-        doctor,
+        quality_summary,
         protocol,
-        next((one["text"] for one in sides if one["level"] != "note"), ""),
+        next((finding["text"] for finding in one_sided_findings if finding["level"] != "note"), ""),
     )
 
 
-def level(run: RunFiles) -> str:
+def verdict_level(run: RunFiles) -> str:
     """Return the level of the verdict on the selected model, empty where it has no free runs."""
-    return judged_level(evidence(run, run.lead))
+    return judged_level(collect_evidence(run, run.main_model))
 
 
-def opening(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
+def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
     """Return the rest of the first screen: a run of median error beside the models' errors.
 
     The rows: what predicts, what was selected, the baseline, zero, what the measurements themselves
     leave, then the others, the nearest first. None where there is no free run.
     """
-    rows = {one: row for one in run.kinds if (row := run.row(one, run.focus, run.main))}
-    if run.lead not in rows or not run.ends:
+    rows = {
+        model_name: row
+        for model_name in run.model_kinds
+        if (row := run.find_row(model_name, run.report_split, run.main_protocol))
+    }
+    if run.main_model not in rows or not run.pose_errors:
         return None
-    known = {entry["model"]: entry for entry in run.json("selection.json").get("models") or []}
-    limits = (run.limits.get("splits") or {}).get(run.focus, {}).get(run.main, {})
-    first = [run.lead, run.selected, run.baseline, "zero"]
-    table: list[Content] = [rows[one] for one in dict.fromkeys(first) if one in rows]
-    floor = limits.get("kinematics") or {}
-    ends = {f"{of}_error_end": floor[f"{of}_mean"] for of in run.ends if floor}
+    selection_by_model = {
+        entry["model"]: entry for entry in run.read_json("selection.json").get("models") or []
+    }
+    limits = (run.limits.get("splits") or {}).get(run.report_split, {}).get(run.main_protocol, {})
+    leading_models = [run.main_model, run.selected, run.baseline, "zero"]
+    table: list[JsonObject] = [
+        rows[model_name] for model_name in dict.fromkeys(leading_models) if model_name in rows
+    ]
+    kinematic_floor = limits.get("kinematics") or {}
+    end_errors = {
+        f"{pose_error}_error_end": kinematic_floor[f"{pose_error}_mean"]
+        for pose_error in run.pose_errors
+        if kinematic_floor
+    }
     # a pose that was integrated from the velocities has no floor but rounding
-    if measured := any(end > 1e-9 for end in ends.values()):
-        table.append({"model": _MEASURED, "diverged": 0, **ends})
+    if measured := any(end_error > 1e-9 for end_error in end_errors.values()):
+        table.append({"model": _MEASUREMENT_ROW, "diverged": 0, **end_errors})
     table += sorted(
-        (row for one, row in rows.items() if one not in first),
-        key=lambda row: float(row[f"{run.ends[0]}_error_end"]),
+        (row for model_name, row in rows.items() if model_name not in leading_models),
+        key=lambda row: float(row[f"{run.pose_errors[0]}_error_end"]),
     )
 
-    def error(row: Content, key: str, factor: float) -> Cell:
-        span = row.get(f"{key}_ci95")
-        least = min(rows[one][key] for one in rows if one != run.truth)
-        note = "–".join(number(factor * end, 2) for end in span) if span else ""
-        return Cell(number(factor * row[key], 2), note, "best" if row[key] == least else "")
+    def error_cell(row: JsonObject, key: str, factor: float) -> Cell:
+        confidence_interval = row.get(f"{key}_ci95")
+        minimum = min(rows[name][key] for name in rows if name != run.plant)
+        note = (
+            "–".join(format_number(factor * bound, 2) for bound in confidence_interval)
+            if confidence_interval
+            else ""
+        )
+        return Cell(
+            format_number(factor * row[key], 2), note, "best" if row[key] == minimum else ""
+        )
 
-    def fault(row: Content) -> str:
-        return next(iter((known.get(row["model"]) or {}).get("faults") or []), "")
+    def fault_text(row: JsonObject) -> str:
+        return next(iter((selection_by_model.get(row["model"]) or {}).get("faults") or []), "")
 
-    def sound(row: Content) -> Cell:
-        if fault(row) or diverged_note(row):
-            return Cell("✗", diverged_note(row), "text")
-        return Cell("✓" if row["model"] in known else DASH, mark="text")
+    def soundness_cell(row: JsonObject) -> Cell:
+        if fault_text(row) or describe_divergence(row):
+            return Cell("✗", describe_divergence(row), "text")
+        return Cell("✓" if row["model"] in selection_by_model else DASH, mark="text")
 
-    elsewhere = run.main != run.protocols[0]
-    told = [
-        f"Mean of {plural(rows[run.lead]['windows'], 'free run')} on {run.focus} data"
-        f" ({run.main}"
-        + f", which start elsewhere than those of {run.protocols[0]} above" * elsewhere
+    is_other_protocol = run.main_protocol != run.protocols[0]
+    notes = [
+        f"Mean of {format_count(rows[run.main_model]['windows'], 'free run')} on {run.report_split} data"
+        f" ({run.main_protocol}"
+        + f", which start elsewhere than those of {run.protocols[0]} above" * is_other_protocol
         + ")"
         + (
             "; small: 95 % interval of this mean (above: of as many new runs)."
-            if rows[run.lead].get(f"{run.ends[0]}_error_end_ci95")
+            if rows[run.main_model].get(f"{run.pose_errors[0]}_error_end_ci95")
             else "."
         ),
-        "" if run.focus in UNSEEN else "These data are not unseen: read with care.",
+        "" if run.report_split in UNSEEN_SPLITS else "These data are not unseen: read with care.",
         "Zero: no model at all, the first velocities are held." if "zero" in rows else "",
         "Measurements: where the measured velocities themselves lead." if measured else "",
-        *(f"✗ {run.label(row['model'])}: {why}." for row in table if (why := fault(row))),
+        *(
+            f"✗ {run.label(row['model'])}: {reason}."
+            for row in table
+            if (reason := fault_text(row))
+        ),
     ]
-    shown = table_of(
+    error_table = build_table(
         table,
         [
             (
                 "model",
-                lambda row: _MEASURED if row["model"] == _MEASURED else run.label(row["model"]),
+                lambda row: (
+                    _MEASUREMENT_ROW
+                    if row["model"] == _MEASUREMENT_ROW
+                    else run.model_label(row["model"])
+                ),
             ),
             *(
-                (f"{name} [{unit}]", lambda row, of=of, f=f: error(row, f"{of}_error_end", f))
-                for of, (name, unit, f) in ((of, run.end(of)) for of in run.ends)
+                (
+                    f"{name} [{unit}]",
+                    lambda row, of=pose_error, f=f: error_cell(row, f"{of}_error_end", f),
+                )
+                for pose_error, (name, unit, f) in (
+                    (pose_error, run.pose_error_unit(pose_error)) for pose_error in run.pose_errors
+                )
             ),
-            ("sound", sound),
+            ("sound", soundness_cell),
         ],
-        groups=[(f"error {run.horizon}", len(run.ends))],
-        selected=lambda row: row["model"] == run.lead,
+        groups=[(f"error {run.horizon_text}", len(run.pose_errors))],
+        is_selected=lambda row: row["model"] == run.main_model,
     )
-    return Section("", [*figures, shown, Text(" ".join(filter(None, told)), quiet=True)])
+    return Section(
+        "", [*figures, error_table, Text(" ".join(filter(None, notes)), is_secondary=True)]
+    )
 
 
-def cautions(run: RunFiles, findings: Sequence[Finding]) -> Section | None:
+def cautions_section(run: RunFiles, findings: Sequence[SanityFinding]) -> Section | None:
     """Return what speaks against using the model reported first, None where nothing does."""
-    out = []
-    lead = run.predictor
+    sentences = []
+    main_model = run.predictor
     for protocol in run.protocols:
-        row, base = run.row(lead, run.focus, protocol), run.row(run.baseline, run.focus, protocol)
-        seen = run.row(lead, "train", protocol)
+        row, baseline_row = (
+            run.find_row(main_model, run.report_split, protocol),
+            run.find_row(run.baseline, run.report_split, protocol),
+        )
+        training_row = run.find_row(main_model, "train", protocol)
         if row is None:
             continue
-        worse = [
-            title_of(c)
+        worse_channels = [
+            channel_title(c)
             for c in run.channels
-            if base is not None
-            and lead != run.baseline
-            and row["rmse"][c] > 1.005 * base["rmse"][c]
+            if baseline_row is not None
+            and main_model != run.baseline
+            and row["rmse"][c] > 1.005 * baseline_row["rmse"][c]
         ]
-        if worse:
-            out.append(
-                f"Protocol {protocol}: {lead} is worse than the baseline in {', '.join(worse)}."
+        if worse_channels:
+            sentences.append(
+                f"Protocol {protocol}: {main_model} is worse than the baseline in {', '.join(worse_channels)}."
             )
         if (
-            seen is not None
-            and seen is not row
-            and row["nrmse"]["mean"] > 1.5 * seen["nrmse"]["mean"]
+            training_row is not None
+            and training_row is not row
+            and row["nrmse"]["mean"] > 1.5 * training_row["nrmse"]["mean"]
         ):
-            times = f"{row['nrmse']['mean'] / seen['nrmse']['mean']:.1f} times its training error"
-            out.append(
-                f"Protocol {protocol}: the {run.focus} error of {lead} is {times}; it may be"
-                f" overfitted, or the {run.focus} data differ."
+            ratio_text = f"{row['nrmse']['mean'] / training_row['nrmse']['mean']:.1f} times its training error"
+            sentences.append(
+                f"Protocol {protocol}: the {run.report_split} error of {main_model} is {ratio_text}; it may be"
+                f" overfitted, or the {run.report_split} data differ."
             )
-    out += [
-        text for text in (worse_than_reference(run, protocol) for protocol in run.protocols) if text
+    sentences += [
+        text
+        for text in (worse_than_reference_sentence(run, protocol) for protocol in run.protocols)
+        if text
     ]
     # the first sentence; the figures stand in the section on sanity
-    failed = [finding for finding in findings if finding.ok is False and finding.model == lead]
-    out += [
-        f"{finding.model}, {finding.check}: {finding.text.partition('. ')[0].rstrip('.')}."
-        for finding in failed
+    failed_findings = [
+        finding for finding in findings if finding.ok is False and finding.model == main_model
     ]
-    told = [Bullets([minus(text) for text in out], warning=True)]
-    return Section("Before you use it", told) if out else None
+    sentences += [
+        f"{finding.model}, {finding.check}: {finding.text.partition('. ')[0].rstrip('.')}."
+        for finding in failed_findings
+    ]
+    blocks = [Bullets([format_minus_signs(text) for text in sentences], is_warning=True)]
+    return Section("Before you use it", blocks) if sentences else None
 
 
-def worse_than_reference(run: RunFiles, protocol: str) -> str:
+def worse_than_reference_sentence(run: RunFiles, protocol: str) -> str:
     """Return which heads and ensembles are worse than their reference by more than 5 %, and where.
 
     The sentence names the kinds of manoeuvre; it is empty where no model is worse.
     """
-    lost = []
+    model_texts = []
     for model in run.heads:
         rows = [
             row
-            for kind in distinct(run, run.focus, protocol)
-            if (row := run.row(model, run.focus, protocol, kind))
+            for manoeuvre_kind in distinct_manoeuvres(run, run.report_split, protocol)
+            if (row := run.find_row(model, run.report_split, protocol, manoeuvre_kind))
         ]
-        bad = [
+        worse_rows = [
             row
             for row in rows
             if (row.get("difference") or {}).get("worse")
-            and run.kinds[model] in ("head", "ensemble")
+            and run.model_kinds[model] in ("head", "ensemble")
         ]
-        if bad:
-            where = ", ".join(
+        if worse_rows:
+            kinds_text = ", ".join(
                 f"{row['manoeuvre'].replace('_', ' ')}"
-                f" {percent(100 * (row['difference']['ratio'] - 1))}"
-                for row in bad
+                f" {format_percent_change(100 * (row['difference']['ratio'] - 1))}"
+                for row in worse_rows
             )
-            lost.append(f"{model} against {bad[0]['difference']['to']} ({where})")
+            model_texts.append(
+                f"{model} against {worse_rows[0]['difference']['to']} ({kinds_text})"
+            )
     return (
-        f"Protocol {protocol}: worse by more than 5 % in NRMSE on {run.focus} data:"
-        f" {'; '.join(lost)}."
-        if lost
+        f"Protocol {protocol}: worse by more than 5 % in NRMSE on {run.report_split} data:"
+        f" {'; '.join(model_texts)}."
+        if model_texts
         else ""
     )
 
 
-def sanity(run: RunFiles, findings: Sequence[Finding]) -> Section | None:
+def sanity_section(run: RunFiles, findings: Sequence[SanityFinding]) -> Section | None:
     """Return a table of all checks and what each found, None where no model was checked."""
     if not findings:
         return None
-    of: dict[str, dict[str, Finding]] = {}
+    findings_by_model: dict[str, dict[str, SanityFinding]] = {}
     for finding in findings:
-        of.setdefault(finding.model, {})[finding.check] = finding
-    looks = {None: Cell("n/a", mark="weak"), True: Cell("✓ ok"), False: Cell("✗ look", mark="bad")}
-    table = table_of(
-        of,
+        findings_by_model.setdefault(finding.model, {})[finding.check] = finding
+    result_cells = {
+        None: Cell("n/a", mark="weak"),
+        True: Cell("✓ ok"),
+        False: Cell("✗ look", mark="bad"),
+    }
+    table = build_table(
+        findings_by_model,
         [
             ("model", str),
-            *((check, lambda model, check=check: looks[of[model][check].ok]) for check in CHECKS),
+            *(
+                (check, lambda model, check=check: result_cells[findings_by_model[model][check].ok])
+                for check in CHECKS
+            ),
         ],
-        selected=lambda model: model == run.selected,
+        is_selected=lambda model: model == run.selected,
     )
     details = [
         Section(
-            run.label(model),
+            run.model_label(model),
             [
                 Facts(
-                    [(check, minus(finding.text)) for check, finding in found.items()],
-                    failed=[check for check, finding in found.items() if finding.ok is False],
+                    [
+                        (check, format_minus_signs(finding.text))
+                        for check, finding in model_findings.items()
+                    ],
+                    failed=[
+                        check for check, finding in model_findings.items() if finding.ok is False
+                    ],
                 )
             ],
-            folded=model != run.selected,
+            is_folded=model != run.selected,
         )
-        for model, found in of.items()
+        for model, model_findings in findings_by_model.items()
     ]
     return Section("Physical sanity", [table, *details])

@@ -11,20 +11,20 @@ import torch
 from torch import Tensor, nn
 
 from residnet.control.heading.conditions import (
+    ClosedLoopSimulation,
+    ClosedLoopTrajectories,
     Compiler,
-    ConditionedRun,
     ConditionsConfig,
-    Flights,
-    HeadingChanges,
-    SteadyTest,
-    nominal,
-    quickly,
-    too_many,
+    HeadingStepBatch,
+    LimitCycleTest,
+    compile_or_fallback,
+    count_excess_overshoots,
+    with_nominal_rows,
 )
 from residnet.control.heading.policies import HeadingPolicy
 from residnet.control.heading.vessels import SteeredVessel
 from residnet.core.errors import ExportError
-from residnet.core.progress import say
+from residnet.core.progress import log_message
 from residnet.data.module import EpochDataModule
 from residnet.dynamics.rollout import FreeRun
 from residnet.training.policies.config import PolicyTraining
@@ -72,20 +72,20 @@ class PolicyFit(EpochTraining):
         lengths = {"hold": min(settings.hold, conditions.hold), "duration": duration}
         self.drawn = conditions.model_copy(update=lengths)
         self.vessel, self.compiler = vessel, compiler
-        self._loops: dict[float, tuple[ConditionedRun, FreeRun]] = {}
+        self._loops: dict[float, tuple[ClosedLoopSimulation, FreeRun]] = {}
         self._at(settings.dt)
         random = torch.Generator().manual_seed(seed + 1_000_003)
-        self.unseen = conditions.draw(settings.validation, conditions.dt, random)
+        self.unseen = conditions.sample_steps(settings.validation, conditions.dt, random)
         self.steady = None
         if settings.steady is not None:
-            self.steady = SteadyTest(settings.steady, conditions, seed + 1_500_007)
-        self.test = ConditionedRun(
+            self.steady = LimitCycleTest(settings.steady, conditions, seed + 1_500_007)
+        self.test = ClosedLoopSimulation(
             vessel,
             policy,
             conditions.dt,
             dtype=torch.float32,
             compiler=compiler,
-            longest=max(math.ceil(conditions.delay[1] / conditions.dt), 1),
+            max_delay=max(math.ceil(conditions.delay[1] / conditions.dt), 1),
         )
 
     def _step(self) -> float:
@@ -96,13 +96,17 @@ class PolicyFit(EpochTraining):
     def _at(self, dt: float) -> None:
         """Fly at a step of dt seconds from now on."""
         self.step_size = dt
-        self.policy.at(dt)
+        self.policy.set_step(dt)
         if dt in self._loops:
             return
         settings = self.settings
-        loop = ConditionedRun(self.vessel, self.policy, dt, settings.integrator, torch.float32)
+        loop = ClosedLoopSimulation(
+            self.vessel, self.policy, dt, settings.integrator, torch.float32
+        )
         rollout = loop.rollout(max(math.ceil(self.conditions.delay[1] / dt), 1))
-        fly = quickly(rollout, self.compiler, loop.given(self._batch(0.0, 2)), _slow)
+        fly = compile_or_fallback(
+            rollout, self.compiler, loop.rollout_arguments(self._batch(0.0, 2)), _slow
+        )
         self._loops[dt] = loop, fly
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -139,7 +143,7 @@ class PolicyFit(EpochTraining):
         ]
         return sum(not cost <= _FAR * start for cost in costs)
 
-    def batch(self, number: int) -> HeadingChanges:
+    def batch(self, number: int) -> HeadingStepBatch:
         """Return the heading changes of a batch of the present epoch, drawn anew."""
         settings = self.settings
         share = settings.share(self._progress(number))
@@ -153,7 +157,7 @@ class PolicyFit(EpochTraining):
         """Return the batch as it is: policies are trained on the CPU."""
         return batch
 
-    def training_step(self, changes: HeadingChanges, number: int) -> Tensor:
+    def training_step(self, changes: HeadingStepBatch, number: int) -> Tensor:
         """Return the loss of one batch of heading changes."""
         settings, progress = self.settings, self._progress(number)
         cosine = 0.5 * (1.0 + math.cos(math.pi * progress))
@@ -162,11 +166,11 @@ class PolicyFit(EpochTraining):
             group["lr"] = rate * (settings.final + (1.0 - settings.final) * cosine)
         quiet = round(settings.quiet * settings.batch)
         loop, fly = self._loops[self.step_size]
-        flown = loop.flights(changes, *fly(*loop.given(changes))[:2])
-        found = flown.measured(self.conditions)
+        flown = loop.to_trajectories(changes, *fly(*loop.rollout_arguments(changes))[:2])
+        found = flown.step_metrics(self.conditions)
         loss: Tensor = (
             found["cost"].mean()
-            + settings.guiding(progress) / self.conditions.unit * found["iae"].mean()
+            + settings.guiding(progress) / self.conditions.overshoot_unit * found["iae"].mean()
         )
         if quiet > 0:
             loss = loss + self._strict() * self._unsteady(flown, found["overshoot"], quiet)
@@ -174,19 +178,22 @@ class PolicyFit(EpochTraining):
         self._losses.append(float(found["cost"].detach().mean()))
         return loss
 
-    def _unsteady(self, flown: Flights, overshoot: Tensor, quiet: int) -> Tensor:
+    def _unsteady(self, flown: ClosedLoopTrajectories, overshoot: Tensor, quiet: int) -> Tensor:
         """Return what the quiet flights of a batch cost in s for swing and overshoot."""
         settings, steady = self.settings, self.settings.steady
         # the standard deviation of a sine is its movement peak to peak over two roots of two
         free = 0.0 if steady is None else (_FREE * steady.rudder_swing) ** 2 / 8.0
-        swing = (flown.late_swing(_LATE)[:quiet] - free).clamp(min=0.0)
+        swing = (flown.late_command_variance(_LATE)[:quiet] - free).clamp(min=0.0)
         first, last = quiet // 2, quiet // 2 + quiet // 4
         # large changes of the nominal vessel may still be under way
         swing = torch.cat((swing[:first], swing[last:]))
         worst = swing.topk(math.ceil(quiet / 4)).values.mean()
         cost: Tensor = math.degrees(math.degrees(settings.calm)) * worst
         if last > first:
-            cost = cost + settings.exact / self.conditions.unit * overshoot[first:last].mean()
+            cost = (
+                cost
+                + settings.exact / self.conditions.overshoot_unit * overshoot[first:last].mean()
+            )
         return cost
 
     def _beyond(self, overshoot: Tensor) -> Tensor:
@@ -194,7 +201,7 @@ class PolicyFit(EpochTraining):
         steady = self.settings.steady
         limit = math.inf if steady is None else steady.of(self.conditions.axis)[2]
         beyond: Tensor = (overshoot - limit).clamp(min=0.0).mean()
-        cost: Tensor = self.settings.excess / self.conditions.unit * beyond
+        cost: Tensor = self.settings.excess / self.conditions.overshoot_unit * beyond
         return cost
 
     def _strict(self) -> float:
@@ -205,7 +212,7 @@ class PolicyFit(EpochTraining):
         refused = sum(0 < entry.get("diverged", 0.0) < _ALL for entry in self.history)
         return float(self.settings.stricter**refused * _LESS ** self._spoilt(self.history))
 
-    def _batch(self, share: float, rows: int, quiet: int = 0) -> HeadingChanges:
+    def _batch(self, share: float, rows: int, quiet: int = 0) -> HeadingStepBatch:
         """Return heading changes drawn anew, under a share of the conditions.
 
         The first `quiet` of them are without noise and slow push: first half of these at a corner
@@ -215,15 +222,15 @@ class PolicyFit(EpochTraining):
         changes that does not swing behind small ones.
         """
         random = torch.Generator().manual_seed(int(torch.randint(2**62, (1,))))
-        changes = self.drawn.draw(rows, self.step_size, random, share)
+        changes = self.drawn.sample_steps(rows, self.step_size, random, share)
         changes.noise[:quiet], changes.push[:quiet] = 0.0, 0.0
         first, number = quiet // 2, quiet // 4
-        least = self.drawn.span[0] * changes.heading.sign()
-        small = least + _LITTLE * (changes.heading - least)
+        least = self.drawn.step_range[0] * changes.target.sign()
+        small = least + _LITTLE * (changes.target - least)
         for some in (slice(0, first), slice(first + number, quiet)):
-            changes.heading[some] = small[some]
-        changes = nominal(changes, first, number)
-        return self.drawn.at_corners(changes, first, random, share)
+            changes.target[some] = small[some]
+        changes = with_nominal_rows(changes, first, number)
+        return self.drawn.with_corner_rows(changes, first, random, share)
 
     def on_after_backward(self) -> None:
         """Reset the gradient of a batch where it is no number."""
@@ -241,7 +248,7 @@ class PolicyFit(EpochTraining):
 
         A refused flight counts twice.
         """
-        flights = 0 if self.steady is None else self.steady.flights + self.settings.validation
+        flights = 0 if self.steady is None else self.steady.n_simulations + self.settings.validation
         share = refused / max(flights, 1)
         return refused > 0, cost * (1.0 + share)
 
@@ -252,15 +259,15 @@ class PolicyFit(EpochTraining):
         epoch that costs more than the start counts as if more of them swung than there are, so
         that it never takes the start's place.
         """
-        self.policy.at(self.unseen.dt)
-        found = self.test.fly(self.unseen).measured(self.conditions)
+        self.policy.set_step(self.unseen.dt)
+        found = self.test.simulate(self.unseen).step_metrics(self.conditions)
         score = float(found["cost"].mean())
         if self.steady is not None:
             worse = self.start_score is not None and score > self.start_score
-            limit = self.steady.limits.of(self.conditions.axis)[2]
-            often = too_many(found["overshoot"], limit)
-            self.diverged = _ALL if worse else self.steady.refused(self.test) + often
-        self.policy.at(self.step_size)
+            limit = self.steady.limits.limits_for(self.conditions.axis)[2]
+            often = count_excess_overshoots(found["overshoot"], limit)
+            self.diverged = _ALL if worse else self.steady.count_failures(self.test) + often
+        self.policy.set_step(self.step_size)
         return self.policy, score
 
 
@@ -273,15 +280,15 @@ class HeadingChangesData(EpochDataModule):
         self.fit = fit
 
     @property
-    def steps(self) -> int:
+    def n_batches(self) -> int:
         return int(self.fit.settings.steps)
 
-    def batches(self, epoch: int) -> Iterator[HeadingChanges]:
-        return (self.fit.batch(number) for number in range(self.steps))
+    def iterate_batches(self, epoch: int) -> Iterator[HeadingStepBatch]:
+        return (self.fit.batch(number) for number in range(self.n_batches))
 
 
 def _slow(error: ExportError) -> None:
-    say(f"  the flights are not compiled, training is much slower: {error}")
+    log_message(f"  the flights are not compiled, training is much slower: {error}")
 
 
 def train_policy(
@@ -309,5 +316,5 @@ def train_policy(
     fit = PolicyFit(policy.float(), vessel, settings, conditions, seed, compiler)
     notes = run_epochs(name, fit, HeadingChangesData(fit), policy, policy, folder)
     notes |= {"unsteady": fit.best_diverged}
-    policy.at(conditions.dt)
+    policy.set_step(conditions.dt)
     return notes

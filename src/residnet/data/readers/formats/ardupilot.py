@@ -12,28 +12,28 @@ from typing import ClassVar, Literal, final
 
 from residnet.core.errors import DataError, UsageError
 from residnet.data.readers.base import (
-    REPORT_EVERY,
-    package,
-    progress,
-    readable,
+    REPORT_INTERVAL,
+    optional_import,
+    reading_progress,
     require_file,
+    wrap_read_errors,
 )
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.readers.recording import (
-    EVERYTHING,
-    Columns,
+    ALL_FIELDS,
+    FieldFilter,
+    MessageBuffer,
+    RawSeries,
     Recording,
-    Rows,
-    Stamps,
-    Wanted,
-    recording_of,
+    TimeStamps,
+    build_recording,
 )
 
-_BINARY, _TEXT = b"\xa3\x95\x80", b"FMT,"
+_BINARY_MAGIC, _TEXT_MAGIC = b"\xa3\x95\x80", b"FMT,"
 """How the two kinds of logs begin: with the message that describes messages."""
-_TICKS = {"TimeUS": 1_000, "TimeMS": 1_000_000, "T": 1_000_000}
+_CLOCK_FIELDS_NS = {"TimeUS": 1_000, "TimeMS": 1_000_000, "T": 1_000_000}
 """Field of the time since boot -> its unit in ns."""
-_DATED = 100_000_000.0
+_MIN_UNIX_TIME = 100_000_000.0
 """Unix time in s, of 1973: a clock below it counts from the start, since it had no GPS."""
 
 
@@ -48,85 +48,107 @@ class ArduPilotConfig(RecordingConfig):
     kind: Literal["ardupilot"] = "ardupilot"
     endings: ClassVar = (".bin",)
     formats: ClassVar = {
-        "ArduPilot log": lambda path, head: head.lstrip().startswith((_BINARY, _TEXT))
+        "ArduPilot log": lambda path, head: head.lstrip().startswith((_BINARY_MAGIC, _TEXT_MAGIC))
     }
 
-    def load(self, path: Path, wanted: Wanted = EVERYTHING) -> Recording:
+    def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
         """Read the wanted messages of a dataflash log, on the boot clock (TimeUS).
 
         Dated by the receiver's GPS time where it logged one.
         """
         require_file(path)
-        with package("ardupilot", "pymavlink", "an ArduPilot log"):
+        with optional_import("ardupilot", "pymavlink", "an ArduPilot log"):
             from pymavlink.DFReader import DFReader_binary, DFReader_text
-        columns: dict[str, Columns] = {}
+        columns: dict[str, MessageBuffer] = {}
         kinds: dict[str, str] = {}
-        count, quiet = 0, io.StringIO()
+        n_messages, discarded_output = 0, io.StringIO()
         # pymavlink fails in its own ways on damaged bytes
         with (
-            readable(path, "an ArduPilot log"),
-            progress(path.name, path.stat().st_size, 100.0) as advance,
+            wrap_read_errors(path, "an ArduPilot log"),
+            reading_progress(path.name, path.stat().st_size, 100.0) as advance,
         ):
-            with _silence(), path.open("rb") as stream:
-                text = stream.read(100).lstrip().startswith(_TEXT)
-                reader = (DFReader_text if text else DFReader_binary)(str(path))
+            with _silence_output(), path.open("rb") as stream:
+                is_text = stream.read(100).lstrip().startswith(_TEXT_MAGIC)
+                reader = (DFReader_text if is_text else DFReader_binary)(str(path))
             while True:
                 # what cannot be parsed is skipped, and printed
-                with contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet):
+                with (
+                    contextlib.redirect_stdout(discarded_output),
+                    contextlib.redirect_stderr(discarded_output),
+                ):
                     message = reader.recv_msg()
                 if message is None:
                     break
-                count += 1
-                if count % REPORT_EVERY == 0:
+                n_messages += 1
+                if n_messages % REPORT_INTERVAL == 0:
                     advance(reader.percent)
                 fields = message.get_fieldnames()
-                kind, instance = message.get_type(), message.fmt.instance_field
+                message_type, instance = message.get_type(), message.fmt.instance_field
                 # logs of 2014 count milliseconds, which a fix of theirs holds at its end
-                clock = fields[0] if fields else ""
-                clock = "T" if kind == "GPS" and clock not in _TICKS and "T" in fields else clock
-                if clock not in _TICKS:
+                clock_field = fields[0] if fields else ""
+                clock_field = (
+                    "T"
+                    if message_type == "GPS"
+                    and clock_field not in _CLOCK_FIELDS_NS
+                    and "T" in fields
+                    else clock_field
+                )
+                if clock_field not in _CLOCK_FIELDS_NS:
                     continue
                 number = int(getattr(message, instance)) if instance in fields else 0
-                name = f"{kind}_{number}" if number else kind
-                kinds[name] = kind
-                if not wanted(name):
+                name = f"{message_type}_{number}" if number else message_type
+                kinds[name] = message_type
+                if not field_filter(name):
                     continue
                 if name not in columns:
-                    values = {field: getattr(message, field) for field in fields if field != clock}
-                    numbers = [f for f, v in values.items() if isinstance(v, int | float)]
-                    columns[name] = Columns(f for f in numbers if wanted.field(name, f))
-                one = columns[name]
-                ns = int(getattr(message, clock)) * _TICKS[clock]
-                one.add(ns, [getattr(message, field) for field in one.names])
-            base = float(reader.clock.timebase or 0.0)
+                    field_values = {
+                        field: getattr(message, field) for field in fields if field != clock_field
+                    }
+                    numeric_fields = [
+                        f for f, v in field_values.items() if isinstance(v, int | float)
+                    ]
+                    columns[name] = MessageBuffer(
+                        f for f in numeric_fields if field_filter.accepts_field(name, f)
+                    )
+                buffer = columns[name]
+                ns = int(getattr(message, clock_field)) * _CLOCK_FIELDS_NS[clock_field]
+                buffer.add(ns, [getattr(message, field) for field in buffer.names])
+            boot_seconds = float(reader.clock.timebase or 0.0)
         if not columns:
             if kinds:
                 raise UsageError(
                     f"{path}: none of its messages is wanted (it holds {', '.join(sorted(kinds))})"
                 )
             raise DataError(f"{path}: holds no message with a time; is it an ArduPilot log?")
-        boot = round(base * 1e6) * 1000 if base > _DATED else 0
+        boot_ns = round(boot_seconds * 1e6) * 1000 if boot_seconds > _MIN_UNIX_TIME else 0
         topics = {
-            name: Rows(f"ardupilot/{kinds[name]}", one.fields, Stamps(one.times + boot, boot > 0))
-            for name, one in sorted(columns.items())
+            name: RawSeries(
+                f"ardupilot/{kinds[name]}",
+                buffer.fields,
+                TimeStamps(buffer.times + boot_ns, boot_ns > 0),
+            )
+            for name, buffer in sorted(columns.items())
         }
-        return recording_of(path, topics, (path,), listed=sorted(kinds.keys() - topics))
+        return build_recording(path, topics, (path,), unread_series=sorted(kinds.keys() - topics))
 
 
 @contextlib.contextmanager
-def _silence() -> Iterator[None]:
+def _silence_output() -> Iterator[None]:
     """Keeps the indexer of pymavlink, which is compiled, from printing every byte that it skips."""
     sys.stdout.flush()
     sys.stderr.flush()
-    saved = [(number, os.dup(number)) for number in (1, 2)]
-    quiet = io.StringIO()
-    with Path(os.devnull).open("wb") as nowhere:
-        for number, _ in saved:
-            os.dup2(nowhere.fileno(), number)
+    saved_descriptors = [(descriptor, os.dup(descriptor)) for descriptor in (1, 2)]
+    discarded_output = io.StringIO()
+    with Path(os.devnull).open("wb") as null_device:
+        for descriptor, _ in saved_descriptors:
+            os.dup2(null_device.fileno(), descriptor)
         try:
-            with contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet):
+            with (
+                contextlib.redirect_stdout(discarded_output),
+                contextlib.redirect_stderr(discarded_output),
+            ):
                 yield
         finally:
-            for number, copy in saved:
-                os.dup2(copy, number)
-                os.close(copy)
+            for descriptor, saved_copy in saved_descriptors:
+                os.dup2(saved_copy, descriptor)
+                os.close(saved_copy)

@@ -11,12 +11,14 @@ from typing import ClassVar, Literal, final
 import numpy as np
 
 from residnet.core.errors import DataError
-from residnet.data.readers.base import REPORT_EVERY, progress, require_file
+from residnet.data.readers.base import REPORT_INTERVAL, reading_progress, require_file
 from residnet.data.readers.compose import RecordingConfig
-from residnet.data.readers.recording import EVERYTHING, Recording, Series, Wanted
+from residnet.data.readers.recording import ALL_FIELDS, FieldFilter, Recording, Series
 
-_LINE = re.compile(rb"^\s*(?P<time>[-+\d.eE]+)\s+(?P<name>\S+)\s+(?P<source>\S+)\s+(?P<value>\S+)")
-_START = re.compile(rb"^%%\s*LOGSTART\s+(?P<start>\d+(?:\.\d+)?)")
+_VALUE_LINE = re.compile(
+    rb"^\s*(?P<time>[-+\d.eE]+)\s+(?P<name>\S+)\s+(?P<source>\S+)\s+(?P<value>\S+)"
+)
+_START_LINE = re.compile(rb"^%%\s*LOGSTART\s+(?P<start>\d+(?:\.\d+)?)")
 
 
 @final
@@ -34,39 +36,46 @@ class MoosConfig(RecordingConfig):
         "MOOS alog": lambda path, head: path.suffix.lower() == ".alog" or b"%% LOGSTART" in head
     }
 
-    def load(self, path: Path, wanted: Wanted = EVERYTHING) -> Recording:
+    def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
         """Read the variables that hold numbers."""
         require_file(path)
         times: dict[tuple[str, str], array[float]] = defaultdict(lambda: array("d"))
         values: dict[tuple[str, str], array[float]] = defaultdict(lambda: array("d"))
-        epoch, done, size = None, 0, path.stat().st_size
-        with path.open("rb") as stream, progress(path.name, size, size) as advance:
+        epoch, bytes_read, size = None, 0, path.stat().st_size
+        with path.open("rb") as stream, reading_progress(path.name, size, size) as advance:
             for count, line in enumerate(stream):
-                done += len(line)
-                if count % REPORT_EVERY == 0:
-                    advance(min(done, size))
-                if begun := _START.match(line):
-                    epoch = round(float(begun["start"]) * 1e9)
-                match = None if line.startswith(b"%") else _LINE.match(line)
+                bytes_read += len(line)
+                if count % REPORT_INTERVAL == 0:
+                    advance(min(bytes_read, size))
+                if start_match := _START_LINE.match(line):
+                    epoch = round(float(start_match["start"]) * 1e9)
+                match = None if line.startswith(b"%") else _VALUE_LINE.match(line)
                 if match is None:
                     continue
                 try:
-                    at, value = float(match["time"]), float(match["value"])
+                    time, value = float(match["time"]), float(match["value"])
                 except ValueError:
                     continue
-                key = match["source"].decode(errors="replace"), match["name"].decode("latin-1")
-                times[key].append(at)
-                values[key].append(value)
+                source_and_name = (
+                    match["source"].decode(errors="replace"),
+                    match["name"].decode("latin-1"),
+                )
+                times[source_and_name].append(time)
+                values[source_and_name].append(value)
         if not times:
             raise DataError(f"{path}: holds no line of time, variable, source and a number")
         series: dict[str, Series] = {}
         for (source, name), clock in times.items():
-            stamp, numbers = np.array(clock), np.array(values[source, name])
-            like = series.get(source)
-            if like is None or np.array_equal(like.clock, stamp):
-                fields = {**(like.fields if like else {}), name: numbers}
+            stamp, samples = np.array(clock), np.array(values[source, name])
+            same_source = series.get(source)
+            if same_source is None or np.array_equal(same_source.clock, stamp):
+                fields = {**(same_source.fields if same_source else {}), name: samples}
                 series[source] = Series(source, "moos/Variables", fields, stamp)
             else:
-                series[name] = Series(name, "moos/Variables", {name: numbers}, stamp)
-        kept = {name: one for name, one in series.items() if wanted(name)}
-        return Recording(path, kept, epoch, (path,), listed=tuple(set(series) - set(kept)))
+                series[name] = Series(name, "moos/Variables", {name: samples}, stamp)
+        selected = {
+            name: source_series for name, source_series in series.items() if field_filter(name)
+        }
+        return Recording(
+            path, selected, epoch, (path,), unread_series=tuple(set(series) - set(selected))
+        )

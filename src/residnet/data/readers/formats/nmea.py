@@ -12,40 +12,45 @@ from typing import Any, ClassVar, Literal, final
 import numpy as np
 
 from residnet.core.errors import DataError
-from residnet.core.stretches import stretch_bounds
-from residnet.data.readers.base import REPORT_EVERY, package, progress, require_file
+from residnet.core.stretches import find_run_bounds
+from residnet.data.readers.base import (
+    REPORT_INTERVAL,
+    optional_import,
+    reading_progress,
+    require_file,
+)
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.readers.recording import (
-    EVERYTHING,
-    Columns,
+    ALL_FIELDS,
+    FieldFilter,
+    MessageBuffer,
+    RawSeries,
     Recording,
     Remark,
-    Rows,
-    Stamps,
-    Wanted,
-    recording_of,
-    remark,
+    TimeStamps,
+    build_recording,
+    make_remark,
 )
-from residnet.data.readers.texts import as_utf8, encoding_of_head
+from residnet.data.readers.texts import detect_encoding_of_head, open_as_utf8
 from residnet.data.readers.written import parse_texts
 
 _SENTENCE = re.compile(rb"^(?P<before>[^$!]*)(?P<sentence>[$!][A-Z]{2}[A-Z0-9]{2,4},[\x20-\x7e]*)")
 # a sentence, to its checksum where it has one, at the start of a line or behind a time
-_WHOLE = re.compile(rb"(?m)^[^$!\n]{0,40}[$!][A-Z]{2}[A-Z]{3},[\x20-\x7e]*\s*$")
+_SENTENCE_LINE = re.compile(rb"(?m)^[^$!\n]{0,40}[$!][A-Z]{2}[A-Z]{3},[\x20-\x7e]*\s*$")
 # a date with a time, a time of day or Unix time, among what else a recorder writes
-_STAMP = re.compile(
+_TIME_PREFIX = re.compile(
     r"\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[T ,_]+\d{1,2}:\d\d[\d:.,]*(?:Z|[-+]\d\d:?\d\d)?"
     r"|\d{1,2}:\d\d:\d\d[\d.,]*|\d{9,}(?:\.\d+)?"
 )
-_PER_MINUTE = {"rate_of_turn": 1.0 / 60.0}
-_DAY = 86_400 * 10**9
-_HEAD = 1024
+_UNIT_FACTORS = {"rate_of_turn": 1.0 / 60.0}
+_DAY_NS = 86_400 * 10**9
+_HEAD_BYTES = 1024
 """Bytes that tell the encoding: a dozen sentences."""
 
 
-def _holds_sentence(path: Path, head: bytes) -> bool:
-    text = head.decode(encoding_of_head(head), errors="replace").encode("utf-8")
-    return _WHOLE.search(text) is not None
+def _contains_sentence(path: Path, head: bytes) -> bool:
+    text = head.decode(detect_encoding_of_head(head), errors="replace").encode("utf-8")
+    return _SENTENCE_LINE.search(text) is not None
 
 
 @final
@@ -60,9 +65,9 @@ class NmeaConfig(RecordingConfig):
 
     kind: Literal["nmea"] = "nmea"
     endings: ClassVar = (".nmea", ".log")
-    formats: ClassVar = {"NMEA 0183": _holds_sentence}
+    formats: ClassVar = {"NMEA 0183": _contains_sentence}
 
-    def load(self, path: Path, wanted: Wanted = EVERYTHING) -> Recording:
+    def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
         """Read the wanted sentences of a text file.
 
         Sentences with a time of day are dated by the last RMC or ZDA; those without a time lie
@@ -70,159 +75,170 @@ class NmeaConfig(RecordingConfig):
         of its own.
         """
         require_file(path)
-        with package("nmea", "pynmea2", "a file of NMEA 0183 sentences"):
+        with optional_import("nmea", "pynmea2", "a file of NMEA 0183 sentences"):
             import pynmea2
-        lines = _Lines()
-        size, done, bad = path.stat().st_size, 0, 0
+        collector = _SentenceCollector()
+        size, bytes_read, n_invalid = path.stat().st_size, 0, 0
         # a shell of Windows may have written them as UTF-16
         with path.open("rb") as stream:
-            encoding = encoding_of_head(stream.read(_HEAD))
+            encoding = detect_encoding_of_head(stream.read(_HEAD_BYTES))
         with (
-            as_utf8(path, encoding) as file,
+            open_as_utf8(path, encoding) as file,
             file.open("rb") as stream,
-            progress(path.name, size, size) as advance,
+            reading_progress(path.name, size, size) as advance,
         ):
             for count, line in enumerate(stream):
-                done += len(line)
-                if count % REPORT_EVERY == 0:
-                    advance(min(done, size))
+                bytes_read += len(line)
+                if count % REPORT_INTERVAL == 0:
+                    advance(min(bytes_read, size))
                 match = _SENTENCE.match(line)
                 if match is None:
-                    bad += bool(line.strip())
+                    n_invalid += bool(line.strip())
                     continue
-                before = match["before"].decode("ascii", errors="replace").strip(" ,;\t[]")
-                stamp = _STAMP.search(before)
-                before = stamp[0].rstrip(".,:") if stamp else before
+                prefix = match["before"].decode("ascii", errors="replace").strip(" ,;\t[]")
+                stamp = _TIME_PREFIX.search(prefix)
+                prefix = stamp[0].rstrip(".,:") if stamp else prefix
                 try:
                     message = pynmea2.parse(match["sentence"].decode("ascii").strip())
-                    lines.add(message, before, wanted)
+                    collector.add_sentence(message, prefix, field_filter)
                 except (pynmea2.ParseError, ValueError):
-                    bad += 1
-        if not lines.series:
+                    n_invalid += 1
+        if not collector.buffers:
             raise DataError(
-                f"{path}: holds no NMEA 0183 sentence ({bad} lines are none, or fail their"
+                f"{path}: holds no NMEA 0183 sentence ({n_invalid} lines are none, or fail their"
                 " checksum)"
             )
-        return lines.recording(path, bad)
+        return collector.to_recording(path, n_invalid)
 
 
 @final
-class _Sentence:
+class _SentenceBuffer:
     """The sentences of one kind: their numbers and times.
 
     A time is the sentence's own or -1; beside it stands how many timed sentences went before.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
-        self.columns, self.after = Columns(names), array("q")
-        self.before: list[str] = []
+        self.buffer, self.preceding_tick = MessageBuffer(names), array("q")
+        self.prefixes: list[str] = []
 
 
 @final
-class _Lines:
+class _SentenceCollector:
     """All sentences of a file, and its clock: the times that sentences tell."""
 
     def __init__(self) -> None:
-        self.series: dict[str, _Sentence] = {}
+        self.buffers: dict[str, _SentenceBuffer] = {}
         self._ticks = array("q")
-        self._day: int | None = None
-        self._dated = False
+        self._day_ns: int | None = None
+        self._has_date = False
 
-    def add(self, message: Any, before: str, wanted: Wanted) -> None:
+    def add_sentence(self, message: Any, prefix: str, field_filter: FieldFilter) -> None:
         """Take one more sentence with the text before it."""
-        at = self._tick(message)
+        time_ns = self._parse_time(message)
         # positions in signed degrees, NaN where the receiver says that there is no fix
-        out: dict[str, float] = {}
+        values: dict[str, float] = {}
         names = [str(entry[1]) for entry in message.fields]
         for name, cell in zip(names, message.data, strict=False):
             if name in ("timestamp", "datestamp", "lat", "lon"):
                 continue
             try:
-                out[name] = float(cell) * _PER_MINUTE.get(name, 1.0)
+                values[name] = float(cell) * _UNIT_FACTORS.get(name, 1.0)
             except ValueError:
                 if not cell:
-                    out[name] = float("nan")
+                    values[name] = float("nan")
         if {"lat", "lon"} <= set(names):
-            fix = bool(message.lat and message.lon) and getattr(message, "status", "A") != "V"
-            fix = fix and str(getattr(message, "gps_qual", "1")) != "0"
-            here = (message.latitude, message.longitude) if fix else (float("nan"), float("nan"))
-            out["latitude"], out["longitude"] = here
+            has_fix = bool(message.lat and message.lon) and getattr(message, "status", "A") != "V"
+            has_fix = has_fix and str(getattr(message, "gps_qual", "1")) != "0"
+            position = (
+                (message.latitude, message.longitude) if has_fix else (float("nan"), float("nan"))
+            )
+            values["latitude"], values["longitude"] = position
         name = str(message.sentence_type)
-        if not wanted(name) or not out:
+        if not field_filter(name) or not values:
             return
-        one = self.series.setdefault(name, _Sentence(out))
-        numbers = [out.get(field, np.nan) for field in one.columns.names]
-        one.columns.add(-1 if at is None else at, numbers)
-        one.after.append(len(self._ticks) - 1)
-        one.before.append(before)
+        buffer = self.buffers.setdefault(name, _SentenceBuffer(values))
+        field_values = [values.get(field, np.nan) for field in buffer.buffer.names]
+        buffer.buffer.add(-1 if time_ns is None else time_ns, field_values)
+        buffer.preceding_tick.append(len(self._ticks) - 1)
+        buffer.prefixes.append(prefix)
 
-    def _tick(self, message: Any) -> int | None:
+    def _parse_time(self, message: Any) -> int | None:
         """Return the time of a sentence in ns (Unix time once a date is known), else None."""
         try:
-            moment, date = message.timestamp, _date(message)
+            time_of_day, date = message.timestamp, _sentence_date(message)
         except (AttributeError, ValueError, TypeError):
             return None
-        if not isinstance(moment, datetime.time):
+        if not isinstance(time_of_day, datetime.time):
             return None
-        seconds = (moment.hour * 60 + moment.minute) * 60 + moment.second
-        ns = seconds * 10**9 + moment.microsecond * 1000
+        seconds = (time_of_day.hour * 60 + time_of_day.minute) * 60 + time_of_day.second
+        ns = seconds * 10**9 + time_of_day.microsecond * 1000
         if date is not None:
-            self._day, self._dated = (date - datetime.date(1970, 1, 1)).days * _DAY, True
-        day = self._day or 0
-        if self._ticks and date is None and day + ns < self._ticks[-1] - _DAY // 2:
+            self._day_ns, self._has_date = (date - datetime.date(1970, 1, 1)).days * _DAY_NS, True
+        day = self._day_ns or 0
+        if self._ticks and date is None and day + ns < self._ticks[-1] - _DAY_NS // 2:
             # past midnight, and the date has not come yet
-            day = self._day = day + _DAY
+            day = self._day_ns = day + _DAY_NS
         if not self._ticks or day + ns != self._ticks[-1]:
             self._ticks.append(day + ns)
         return day + ns
 
-    def recording(self, path: Path, bad: int) -> Recording:
+    def to_recording(self, path: Path, n_invalid: int) -> Recording:
         """Return the recording of what was added."""
         ticks = np.frombuffer(self._ticks, dtype=np.int64)
-        stamped = all(all(one.before) for one in self.series.values())
-        if not ticks.size and not stamped:
+        has_prefix_times = all(all(buffer.prefixes) for buffer in self.buffers.values())
+        if not ticks.size and not has_prefix_times:
             raise DataError(
                 f"{path}: no sentence tells the time (RMC, GGA, ZDA, ...), and the lines do not"
                 " begin with one"
             )
         remarks: list[Remark] = []
-        if bad:
-            text = f"{bad} lines are no NMEA sentence or fail their checksum; left out"
-            remarks.append(remark("note", "bad_lines", text, lines=bad))
+        if n_invalid:
+            text = f"{n_invalid} lines are no NMEA sentence or fail their checksum; left out"
+            remarks.append(make_remark("note", "bad_lines", text, lines=n_invalid))
         arrivals = {
-            name: parse_texts(np.array(one.before, dtype=object))
-            for name, one in self.series.items()
-            if stamped
+            name: parse_texts(np.array(buffer.prefixes, dtype=object))
+            for name, buffer in self.buffers.items()
+            if has_prefix_times
         }
-        begun, day = [int(one.ns.min()) for one in arrivals.values() if one.absolute], 0
-        if ticks.size and not self._dated:
-            if begun:
+        prefix_starts, day_offset = (
+            [int(buffer.ns.min()) for buffer in arrivals.values() if buffer.is_absolute],
+            0,
+        )
+        if ticks.size and not self._has_date:
+            if prefix_starts:
                 # the times before the lines tell the day that the sentences do not
-                day = round((min(begun) - int(ticks[0])) / _DAY) * _DAY
+                day_offset = round((min(prefix_starts) - int(ticks[0])) / _DAY_NS) * _DAY_NS
             else:
                 text = "no sentence tells the date; time counts from midnight"
-                remarks.append(remark("note", "undated", text))
+                remarks.append(make_remark("note", "undated", text))
         topics = {}
-        for name, one in sorted(self.series.items()):
-            times, said = one.columns.times, tuple[Remark, ...]()
-            timed = bool((times >= 0).all())
-            if not timed and not stamped:
-                times = _between(np.frombuffer(one.after, dtype=np.int64), ticks)
+        for name, buffer in sorted(self.buffers.items()):
+            times, time_remarks = buffer.buffer.times, tuple[Remark, ...]()
+            is_timed = bool((times >= 0).all())
+            if not is_timed and not has_prefix_times:
+                times = _interpolate_times(
+                    np.frombuffer(buffer.preceding_tick, dtype=np.int64), ticks
+                )
                 text = (
                     f"topic {name}: its sentences tell no time; they are spread between the timed"
                     " ones before and after"
                 )
-                said = (remark("note", "estimated_times", text, rows=times.size),)
+                time_remarks = (make_remark("note", "estimated_times", text, rows=times.size),)
             stamp = (
-                Stamps(times + day, self._dated or bool(begun)) if timed or not stamped else None
+                TimeStamps(times + day_offset, self._has_date or bool(prefix_starts))
+                if is_timed or not has_prefix_times
+                else None
             )
-            fields = one.columns.fields
-            sender = _senders(fields)
-            topics[name] = Rows(f"nmea/{name}", fields, stamp, arrivals.get(name), sender, said)
-        return recording_of(path, topics, (path,), remarks)
+            fields = buffer.buffer.fields
+            sender = _engine_numbers(fields)
+            topics[name] = RawSeries(
+                f"nmea/{name}", fields, stamp, arrivals.get(name), sender, time_remarks
+            )
+        return build_recording(path, topics, (path,), remarks)
 
 
-def _senders(fields: dict[str, np.ndarray]) -> np.ndarray | None:
+def _engine_numbers(fields: dict[str, np.ndarray]) -> np.ndarray | None:
     """Return the number of the engine that each row [T] is about; None where there is none."""
     number = fields.get("engine_no")
     if number is None or not np.isfinite(number).all():
@@ -230,21 +246,23 @@ def _senders(fields: dict[str, np.ndarray]) -> np.ndarray | None:
     return np.array([f"{value:g}" for value in number.tolist()], dtype=object)
 
 
-def _between(number: np.ndarray, ticks: np.ndarray) -> np.ndarray:
+def _interpolate_times(tick_index: np.ndarray, ticks: np.ndarray) -> np.ndarray:
     """Return the times [T] of sentences without a time, evenly between the timed ones.
 
-    `number` says after which timed sentence each came.
+    `tick_index` says after which timed sentence each came.
     """
-    number = np.clip(number, 0, ticks.size - 1)
-    order = np.arange(number.size) - stretch_bounds(number)[0]
-    _, group, count = np.unique(number, return_inverse=True, return_counts=True)
-    usual = np.median(np.diff(ticks)) if ticks.size > 1 else 10**9
-    length = np.append(np.diff(ticks), usual)[number]
-    out: np.ndarray = ticks[number] + np.rint(length * order / count[group]).astype(np.int64)
-    return out
+    tick_index = np.clip(tick_index, 0, ticks.size - 1)
+    order_in_group = np.arange(tick_index.size) - find_run_bounds(tick_index)[0]
+    _, group, count = np.unique(tick_index, return_inverse=True, return_counts=True)
+    median_tick = np.median(np.diff(ticks)) if ticks.size > 1 else 10**9
+    interval = np.append(np.diff(ticks), median_tick)[tick_index]
+    times: np.ndarray = ticks[tick_index] + np.rint(
+        interval * order_in_group / count[group]
+    ).astype(np.int64)
+    return times
 
 
-def _date(message: Any) -> datetime.date | None:
+def _sentence_date(message: Any) -> datetime.date | None:
     if message.sentence_type == "RMC":
         day = message.datestamp
         return day if isinstance(day, datetime.date) else None

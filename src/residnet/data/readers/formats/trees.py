@@ -13,38 +13,38 @@ from pydantic import Field, field_validator
 from residnet.core.config import Config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import to_si
-from residnet.data.readers.base import package, readable, require_file
+from residnet.data.readers.base import optional_import, require_file, wrap_read_errors
 from residnet.data.readers.compose import RecordingConfig
-from residnet.data.readers.quantities import factor
+from residnet.data.readers.quantities import conversion_factor
 from residnet.data.readers.recording import (
-    EVERYTHING,
+    ALL_FIELDS,
+    FieldFilter,
+    RawSeries,
     Recording,
     Remark,
-    Rows,
-    Stamps,
-    Wanted,
-    recording_of,
-    remark,
+    TimeStamps,
+    build_recording,
+    make_remark,
 )
 from residnet.data.readers.written import parse_numbers, parse_texts
 
 if TYPE_CHECKING:
     import h5py
 
-_TIMES = (
+_CLOCK_NAMES = (
     *("t", "time", "Time", "timestamp", "TIME", "T", "stamp", "time_s", "t_s", "utc", "datenum"),
     *("Zeit", "zeit", "tiempo", "temps", "tijd", "tempo", "tid"),
 )
 # MATLAB's day 719529 is 1 January 1970
-_DATENUM_1970, _DAY = 719_529.0, 86_400.0
-_MOST_COLUMNS = 64
+_DATENUM_1970, _SECONDS_PER_DAY = 719_529.0, 86_400.0
+_MAX_COLUMNS = 64
 """Columns of an array that may be channels; chosen by hand: pictures and clouds have more."""
-_FEWEST = 20
+_MIN_SAMPLES = 20
 """Fewest samples of a vector that is timed by another group's time."""
 _HDF5 = b"\x89HDF\r\n\x1a\n"
-_ALWAYS_HELD = 200_000_000
+_MAX_UNCHECKED_BYTES = 200_000_000
 """Bytes that any dataset may claim; chosen by hand: so many fit into memory."""
-_MOST_COMPRESSED = 1000
+_MAX_COMPRESSION_RATIO = 1000
 """Bytes of a dataset for each byte of its file at most; a constant channel has some 900."""
 
 
@@ -66,12 +66,12 @@ class TreeTime(Config):
 
     @field_validator("unit")
     @classmethod
-    def _measures_time(cls, unit: str | None) -> str | None:
+    def _validate_time_unit(cls, unit: str | None) -> str | None:
         if unit is not None and unit != "datenum":
-            factor(unit, "s")
+            conversion_factor(unit, "s")
         return unit
 
-    def parse(self, values: np.ndarray) -> Stamps:
+    def parse(self, values: np.ndarray) -> TimeStamps:
         """Return the times from one vector.
 
         Raises:
@@ -82,8 +82,13 @@ class TreeTime(Config):
         if self.unit != "datenum":
             return parse_numbers(values, None if self.unit is None else to_si(self.unit))
         days = np.floor(values)
-        whole, rest = (days - _DATENUM_1970) * _DAY * 1e9, (values - days) * _DAY * 1e9
-        return Stamps(whole.astype(np.int64) + np.rint(rest).astype(np.int64), True)
+        whole_days_ns, fraction_ns = (
+            (days - _DATENUM_1970) * _SECONDS_PER_DAY * 1e9,
+            (values - days) * _SECONDS_PER_DAY * 1e9,
+        )
+        return TimeStamps(
+            whole_days_ns.astype(np.int64) + np.rint(fraction_ns).astype(np.int64), True
+        )
 
 
 class _TreeConfig(RecordingConfig):
@@ -98,48 +103,51 @@ class _TreeConfig(RecordingConfig):
     time: TreeTime = Field(default_factory=TreeTime)
     table: str | None = Field(default=None, min_length=1)
 
-    def load(self, path: Path, wanted: Wanted = EVERYTHING) -> Recording:
+    def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
         """Read the wanted groups of a file."""
         require_file(path)
-        wanted = wanted if self.table is None else Wanted([(self.table, "")])
+        field_filter = field_filter if self.table is None else FieldFilter([(self.table, "")])
         if not is_hdf5(path) and isinstance(self, MatConfig):
             from scipy.io import loadmat
 
             # SciPy's parser fails in its own ways on damaged bytes
-            with readable(path, "a MATLAB file"):
-                content = dict(_below(loadmat(path, simplify_cells=True), ""))
-            return _tree_recording(path, content, self.time, wanted)
-        what = "an HDF5 file" if isinstance(self, Hdf5Config) else "a MATLAB 7.3 file"
-        with package("hdf5", "h5py", what):
+            with wrap_read_errors(path, "a MATLAB file"):
+                content = dict(_iter_arrays(loadmat(path, simplify_cells=True), ""))
+            return _build_tree_recording(path, content, self.time, field_filter)
+        file_description = "an HDF5 file" if isinstance(self, Hdf5Config) else "a MATLAB 7.3 file"
+        with optional_import("hdf5", "h5py", file_description):
             import h5py
-        with readable(path, what), h5py.File(path, "r") as file:
-            found: list[h5py.Dataset] = []
+        with wrap_read_errors(path, file_description), h5py.File(path, "r") as file:
+            datasets: list[h5py.Dataset] = []
 
             def visit(name: str, node: Any) -> None:
                 if isinstance(node, h5py.Dataset) and not name.startswith("#"):
-                    found.append(node)
+                    datasets.append(node)
 
             file.visititems(visit)
             leaves: dict[str, _Vector] = {}
-            for dataset in found:
+            for dataset in datasets:
                 name, names = dataset.name.strip("/"), dataset.dtype.names
-                claimed, held = dataset.size * dataset.dtype.itemsize, path.stat().st_size
-                if claimed > max(_ALWAYS_HELD, _MOST_COMPRESSED * held):
+                claimed_bytes, file_bytes = (
+                    dataset.size * dataset.dtype.itemsize,
+                    path.stat().st_size,
+                )
+                if claimed_bytes > max(_MAX_UNCHECKED_BYTES, _MAX_COMPRESSION_RATIO * file_bytes):
                     # a size is only a number in the file
                     raise DataError(
-                        f"{path}: {dataset.name} claims {claimed / 1e9:.3g} GB in a file of"
-                        f" {held / 1e6:.3g} MB; the file is damaged, or was made and never filled"
+                        f"{path}: {dataset.name} claims {claimed_bytes / 1e9:.3g} GB in a file of"
+                        f" {file_bytes / 1e6:.3g} MB; the file is damaged, or was made and never filled"
                     )
                 if names and dataset.ndim == 1:
                     for column in names:
                         if not dataset.dtype[column].shape:
-                            leaves[f"{name}/{column}"] = _Column(dataset, column)
+                            leaves[f"{name}/{column}"] = _LazyColumn(dataset, column)
                     continue
-                text = dataset.attrs.get("MATLAB_class") in (b"char", b"cell")
-                if not names and dataset.ndim and dataset.size and not text:
-                    words = dataset.dtype.kind in "SO" and dataset.ndim == 1
-                    leaves[name] = _plain(dataset[()]) if words else dataset
-            return _tree_recording(path, leaves, self.time, wanted)
+                is_matlab_text = dataset.attrs.get("MATLAB_class") in (b"char", b"cell")
+                if not names and dataset.ndim and dataset.size and not is_matlab_text:
+                    is_text = dataset.dtype.kind in "SO" and dataset.ndim == 1
+                    leaves[name] = _decode_bytes(dataset[()]) if is_text else dataset
+            return _build_tree_recording(path, leaves, self.time, field_filter)
 
 
 @final
@@ -174,24 +182,24 @@ def is_hdf5(path: Path) -> bool:
     return head.startswith(_HDF5) or head[512:520] == _HDF5
 
 
-def _below(node: Any, prefix: str) -> Iterator[tuple[str, np.ndarray]]:
+def _iter_arrays(node: Any, prefix: str) -> Iterator[tuple[str, np.ndarray]]:
     if isinstance(node, dict):
         for name, value in node.items():
             if not name.startswith("__"):
-                yield from _below(value, f"{prefix}/{name}" if prefix else name)
+                yield from _iter_arrays(value, f"{prefix}/{name}" if prefix else name)
     elif (isinstance(node, np.ndarray) and node.dtype == object) or isinstance(node, list):
         parts = list(node)
         if parts and all(isinstance(part, str) for part in parts):
             yield prefix, np.array(parts, dtype=object)
             return
         for i, part in enumerate(parts):
-            yield from _below(part, f"{prefix}/{i}")
+            yield from _iter_arrays(part, f"{prefix}/{i}")
     elif isinstance(node, np.ndarray) and node.ndim:
         yield prefix, node
 
 
 @final
-class _Column:
+class _LazyColumn:
     """One column of a table, read when it is used."""
 
     def __init__(self, dataset: h5py.Dataset, name: str) -> None:
@@ -199,11 +207,11 @@ class _Column:
         self.shape, self.size, self.dtype = dataset.shape, dataset.size, dataset.dtype[name]
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
-        values = _plain(self._dataset.fields(self._name)[()])
+        values = _decode_bytes(self._dataset.fields(self._name)[()])
         return values if dtype is None else values.astype(dtype)
 
 
-def _plain(values: np.ndarray) -> np.ndarray:
+def _decode_bytes(values: np.ndarray) -> np.ndarray:
     """Return bytes as text, everything else as it is."""
     if values.dtype.kind not in "SO" or values.ndim != 1:
         return values
@@ -211,8 +219,8 @@ def _plain(values: np.ndarray) -> np.ndarray:
     return np.array(list(texts), dtype=object)
 
 
-def _tree_recording(
-    path: Path, leaves: Mapping[str, _Vector], time: TreeTime, wanted: Wanted
+def _build_tree_recording(
+    path: Path, leaves: Mapping[str, _Vector], time: TreeTime, field_filter: FieldFilter
 ) -> Recording:
     """Return the recording of vectors by their path (`trial/u`).
 
@@ -222,68 +230,80 @@ def _tree_recording(
     Args:
         leaves: path -> array [T], [T, 1], [1, T] or [T, k] (whose columns become `name.0`,
             `name.1`, ...).
-        wanted: whether a group is to be read.
+        field_filter: whether a group is to be read.
     """
-    clocks = _clocks(leaves, time)
+    clocks = _find_clocks(leaves, time)
     if not clocks:
-        named = f"'{time.column}'" if time.column else "of time (t, time, timestamp, ...)"
-        near = ", ".join(list(leaves)[:12]) or "nothing"
+        clock_description = (
+            f"'{time.column}'" if time.column else "of time (t, time, timestamp, ...)"
+        )
+        available = ", ".join(list(leaves)[:12]) or "nothing"
         raise UsageError(
-            f"{path}: no vector {named} in it; name it with time: {{column: ...}} (the file holds"
-            f" {near})"
+            f"{path}: no vector {clock_description} in it; name it with time: {{column: ...}} (the file holds"
+            f" {available})"
         )
     fields: dict[str, dict[str, np.ndarray]] = {group: {} for group in clocks}
     remarks: list[Remark] = []
-    left, adopted = [], []
+    unassigned, assigned_by_length = [], []
     for name, values in leaves.items():
-        group = _home(name, values, clocks)
+        group = _find_clock_group(name, values, clocks)
         if group is None:
-            left.append(f"{name} {list(values.shape)}")
+            unassigned.append(f"{name} {list(values.shape)}")
             continue
         clock, t = clocks[group]
-        above = os.path.commonpath([name.rpartition("/")[0], group])
-        inside = name.removeprefix(above).lstrip("/")
-        if name != clock and wanted(group or "/") and wanted.field(group or "/", inside):
-            fields[group] |= _columns(inside, values, len(t))
+        common_group = os.path.commonpath([name.rpartition("/")[0], group])
+        relative_path = name.removeprefix(common_group).lstrip("/")
+        if (
+            name != clock
+            and field_filter(group or "/")
+            and field_filter.accepts_field(group or "/", relative_path)
+        ):
+            fields[group] |= _split_matrix(relative_path, values, len(t))
             if not name.startswith(f"{group}/" if group else ""):
-                adopted.append(f"{name} by {clock}")
-    for code, names, what in (
-        ("no_time", left, "belong to no time ({}); left out"),
+                assigned_by_length.append(f"{name} by {clock}")
+    for code, names, reason in (
+        ("no_time", unassigned, "belong to no time ({}); left out"),
         (
             "time_of_others",
-            adopted,
+            assigned_by_length,
             "without a time beside them are timed by the only one of their length ({})",
         ),
     ):
         if names:
-            shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
-            text = f"{len(names)} arrays {what.format(shown)}"
-            remarks.append(remark("note", code, text, arrays=len(names)))
-    topics: dict[str, Rows] = {}
+            name_list = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
+            text = f"{len(names)} arrays {reason.format(name_list)}"
+            remarks.append(make_remark("note", code, text, arrays=len(names)))
+    topics: dict[str, RawSeries] = {}
     for group, (name, values) in clocks.items():
-        if wanted(group or "/") and fields[group]:
+        if field_filter(group or "/") and fields[group]:
             try:
-                topics[group or "/"] = Rows("", fields[group], time.parse(values))
+                topics[group or "/"] = RawSeries("", fields[group], time.parse(values))
             except DataError as error:
                 raise DataError(f"{path}: {name}: {error}") from error
-    listed = [group or "/" for group in clocks if (group or "/") not in topics]
+    unread_groups = [group or "/" for group in clocks if (group or "/") not in topics]
     if not topics:
-        raise UsageError(f"{path}: none of its groups is wanted (it holds {', '.join(listed)})")
-    return recording_of(path, topics, (path,), remarks, listed)
+        raise UsageError(
+            f"{path}: none of its groups is wanted (it holds {', '.join(unread_groups)})"
+        )
+    return build_recording(path, topics, (path,), remarks, unread_groups)
 
 
-def _clocks(leaves: Mapping[str, _Vector], time: TreeTime) -> dict[str, tuple[str, np.ndarray]]:
+def _find_clocks(
+    leaves: Mapping[str, _Vector], time: TreeTime
+) -> dict[str, tuple[str, np.ndarray]]:
     """Return group -> path of its time and the time itself."""
-    out = {}
-    for rank in _TIMES if time.column is None else (time.column,):
+    clocks = {}
+    for clock_name in _CLOCK_NAMES if time.column is None else (time.column,):
         for path, values in leaves.items():
-            group, _, last = path.rpartition("/")
-            if last == rank and values.size > 1 and values.size == max(values.shape):
-                out[group] = (path, np.asarray(values).reshape(-1))
-    return out
+            group, _, vector_name = path.rpartition("/")
+            if vector_name == clock_name and values.size > 1 and values.size == max(values.shape):
+                clocks[group] = (path, np.asarray(values).reshape(-1))
+    return clocks
 
 
-def _home(path: str, values: _Vector, clocks: Mapping[str, tuple[str, np.ndarray]]) -> str | None:
+def _find_clock_group(
+    path: str, values: _Vector, clocks: Mapping[str, tuple[str, np.ndarray]]
+) -> str | None:
     """Return the nearest group above whose time has the length of `values`.
 
     Where there is none, and all times of this length in the file are the same, the first of their
@@ -292,29 +312,31 @@ def _home(path: str, values: _Vector, clocks: Mapping[str, tuple[str, np.ndarray
     group = path
     while group:
         group = group.rpartition("/")[0]
-        if group in clocks and _time_axis(values, clocks[group][1].size) is not None:
+        if group in clocks and _find_time_axis(values, clocks[group][1].size) is not None:
             return group
     length = max(values.shape, default=0)
-    alike = [name for name, (_, t) in clocks.items() if length == t.size]
-    if length < _FEWEST or not alike or _time_axis(values, length) is None:
+    same_length = [name for name, (_, t) in clocks.items() if length == t.size]
+    if length < _MIN_SAMPLES or not same_length or _find_time_axis(values, length) is None:
         return None
-    same = all(np.array_equal(clocks[name][1], clocks[alike[0]][1]) for name in alike)
-    return alike[0] if same else None
+    are_identical = all(
+        np.array_equal(clocks[name][1], clocks[same_length[0]][1]) for name in same_length
+    )
+    return same_length[0] if are_identical else None
 
 
-def _time_axis(values: _Vector, length: int) -> int | None:
+def _find_time_axis(values: _Vector, length: int) -> int | None:
     """Return which axis of an array runs over time; None where none does."""
     if values.dtype.kind not in "biuf":
         return 0 if values.size == length else None
-    if len(values.shape) > 2 or values.size > _MOST_COLUMNS * length:
+    if len(values.shape) > 2 or values.size > _MAX_COLUMNS * length:
         return None
     return next((i for i, size in enumerate(values.shape) if size == length), None)
 
 
-def _columns(name: str, values: _Vector, length: int) -> dict[str, np.ndarray]:
+def _split_matrix(name: str, values: _Vector, length: int) -> dict[str, np.ndarray]:
     if values.dtype.kind not in "biuf":
         return {}
-    table = np.moveaxis(np.asarray(values), _time_axis(values, length) or 0, 0)
+    table = np.moveaxis(np.asarray(values), _find_time_axis(values, length) or 0, 0)
     table = table.reshape(length, -1).astype(np.float64, copy=False)
     name = name.replace("/", ".")
     if table.shape[1] == 1:

@@ -10,17 +10,17 @@ from typing import ClassVar, Literal, final
 import numpy as np
 
 from residnet.core.errors import UsageError
-from residnet.data.readers.base import package, readable, require_file
+from residnet.data.readers.base import optional_import, require_file, wrap_read_errors
 from residnet.data.readers.compose import RecordingConfig
 from residnet.data.readers.recording import (
-    EVERYTHING,
+    ALL_FIELDS,
+    FieldFilter,
+    RawSeries,
     Recording,
     Remark,
-    Rows,
-    Stamps,
-    Wanted,
-    recording_of,
-    remark,
+    TimeStamps,
+    build_recording,
+    make_remark,
 )
 
 
@@ -39,63 +39,73 @@ class UlogConfig(RecordingConfig):
     endings: ClassVar = (".ulg",)
     formats: ClassVar = {"PX4 ULog": lambda path, head: head.startswith(b"ULog\x01\x12\x35")}
 
-    def load(self, path: Path, wanted: Wanted = EVERYTHING) -> Recording:
+    def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
         """Read the wanted messages of a ULog, on the boot clock.
 
         Dated by the receiver's UTC where it logged one.
         """
         require_file(path)
-        with package("px4", "pyulog", "a PX4 flight log"):
+        with optional_import("px4", "pyulog", "a PX4 flight log"):
             from pyulog import ULog
         # pyulog prints what it finds damaged, which the remarks say below
-        with readable(path, "a ULog file"), contextlib.redirect_stdout(io.StringIO()):
+        with wrap_read_errors(path, "a ULog file"), contextlib.redirect_stdout(io.StringIO()):
             log = ULog(str(path), None, disable_str_exceptions=True)
         data = {
-            one.name + (f"_{one.multi_id}" if one.multi_id else ""): one for one in log.data_list
+            dataset.name + (f"_{dataset.multi_id}" if dataset.multi_id else ""): dataset
+            for dataset in log.data_list
         }
-        chosen = {
-            name: one.data
-            for name, one in sorted(data.items())
-            if wanted(name) and len(one.data.get("timestamp", ()))
+        selected = {
+            name: dataset.data
+            for name, dataset in sorted(data.items())
+            if field_filter(name) and len(dataset.data.get("timestamp", ()))
         }
-        if not chosen:
+        if not selected:
             raise UsageError(
                 f"{path}: none of its messages is wanted (it holds"
                 f" {', '.join(sorted(data)) or 'none'})"
             )
-        boot = _boot_time([one.data for one in log.data_list])
+        boot_ns = _find_boot_time([dataset.data for dataset in log.data_list])
         topics = {}
-        for name, raw in chosen.items():
-            ns = raw["timestamp"].astype(np.int64) * 1000 + (boot or 0)
-            fields = {p: v for p, v in _fields(raw).items() if wanted.field(name, p)}
-            kind = f"px4/{data[name].name}"
-            topics[name] = Rows(kind, fields, Stamps(ns, boot is not None))
+        for name, raw_fields in selected.items():
+            ns = raw_fields["timestamp"].astype(np.int64) * 1000 + (boot_ns or 0)
+            fields = {
+                p: v
+                for p, v in _convert_fields(raw_fields).items()
+                if field_filter.accepts_field(name, p)
+            }
+            message_type = f"px4/{data[name].name}"
+            topics[name] = RawSeries(message_type, fields, TimeStamps(ns, boot_ns is not None))
         remarks: list[Remark] = []
         if log.file_corruption:
             text = "the file is damaged in places; messages there are lost"
-            remarks.append(remark("will mislead", "damaged", text))
+            remarks.append(make_remark("will mislead", "damaged", text))
         if log.dropouts:
-            lost, count = sum(one.duration for one in log.dropouts) * 1e-3, len(log.dropouts)
-            text = f"the logger dropped data {count} times, {lost:.3g} s in all; gaps stay gaps"
-            remarks.append(remark("note", "dropouts", text, dropouts=count, seconds=lost))
-        return recording_of(path, topics, (path,), remarks, sorted(data.keys() - topics))
+            lost_seconds, count = (
+                sum(dataset.duration for dataset in log.dropouts) * 1e-3,
+                len(log.dropouts),
+            )
+            text = f"the logger dropped data {count} times, {lost_seconds:.3g} s in all; gaps stay gaps"
+            remarks.append(
+                make_remark("note", "dropouts", text, dropouts=count, seconds=lost_seconds)
+            )
+        return build_recording(path, topics, (path,), remarks, sorted(data.keys() - topics))
 
 
-def _boot_time(messages: list[dict[str, np.ndarray]]) -> int | None:
+def _find_boot_time(messages: list[dict[str, np.ndarray]]) -> int | None:
     """Return Unix time of the boot in ns, from the first fix that has UTC."""
     for fields in messages:
         utc = fields.get("time_utc_usec")
-        known = np.flatnonzero(utc) if utc is not None else np.zeros(0, dtype=int)
-        if utc is not None and known.size:
-            return (int(utc[known[0]]) - int(fields["timestamp"][known[0]])) * 1000
+        valid_rows = np.flatnonzero(utc) if utc is not None else np.zeros(0, dtype=int)
+        if utc is not None and valid_rows.size:
+            return (int(utc[valid_rows[0]]) - int(fields["timestamp"][valid_rows[0]])) * 1000
     return None
 
 
-def _fields(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    out = {}
+def _convert_fields(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    fields = {}
     for name, values in data.items():
         if name != "timestamp":
-            whole = values.dtype.kind in "iu" and name in ("lat", "lon")
-            out[name] = values.astype(np.float64) * (1e-7 if whole else 1.0)
+            is_integer_degrees = values.dtype.kind in "iu" and name in ("lat", "lon")
+            fields[name] = values.astype(np.float64) * (1e-7 if is_integer_degrees else 1.0)
     parts = {f"q.{letter}": f"q[{i}]" for i, letter in enumerate("wxyz")}
-    return out | {part: out[name] for part, name in parts.items() if name in out}
+    return fields | {part: fields[name] for part, name in parts.items() if name in fields}
