@@ -147,7 +147,7 @@ class ClosedLoopSource(Source):
         super().__init__()
         self.manoeuvre_type = type(manoeuvres[0])
         manoeuvre_parameters = [manoeuvre.law_parameters(helm) for manoeuvre in manoeuvres]
-        self.parameters: BatchParameters = {
+        self.batch_parameters: BatchParameters = {
             name: torch.nn.utils.rnn.pad_sequence(
                 [torch.tensor(row[name], dtype=torch.float64) for row in manoeuvre_parameters],
                 batch_first=True,
@@ -156,7 +156,7 @@ class ClosedLoopSource(Source):
             else torch.tensor([row[name] for row in manoeuvre_parameters], dtype=torch.float64)
             for name in manoeuvre_parameters[0]
         }
-        self.parameters["dt"] = t[1] - t[0]
+        self.batch_parameters["dt"] = t[1] - t[0]
         self.state_columns = {
             name: helm.state_column(name) for name in self.manoeuvre_type.observed_states
         }
@@ -179,7 +179,7 @@ class ClosedLoopSource(Source):
 
     def _observe(self, x: Tensor) -> tuple[BatchParameters, BatchParameters]:
         motion = {name: x[:, column] for name, column in self.state_columns.items()}
-        return motion, {name: value.to(x.dtype) for name, value in self.parameters.items()}
+        return motion, {name: value.to(x.dtype) for name, value in self.batch_parameters.items()}
 
 
 @final

@@ -60,7 +60,7 @@ class SignalsConfig(Config):
     exogenous: tuple[str, ...] = ()
     forces: str | DifferentialThrustConfig | None = None
     pairs: tuple[tuple[str, str], ...] = ()
-    dynamic_states: tuple[Literal["u", "v", "r", "w", "p", "q"], ...] = Field(
+    velocities: tuple[Literal["u", "v", "r", "w", "p", "q"], ...] = Field(
         default=("u", "v", "r"), min_length=1
     )
 

@@ -471,7 +471,7 @@ class NextTrials:
     """
 
     model: str
-    plan_trials: TrialPlan
+    plan: TrialPlan
 
     @property
     def table(self) -> Table:

@@ -91,13 +91,12 @@ class SearchValues(Config):
 
     def to_distribution(self) -> Any:
         """Return the Optuna distribution; a choice is its JSON text there."""
+        from optuna import distributions
 
         if self.choices is not None:
-            return optuna_distributions.CategoricalDistribution(self._choice_texts)
+            return distributions.CategoricalDistribution(self._choice_texts)
         distribution_type: Any = (
-            optuna_distributions.IntDistribution
-            if self._is_integer
-            else optuna_distributions.FloatDistribution
+            distributions.IntDistribution if self._is_integer else distributions.FloatDistribution
         )
         return distribution_type(self.low, self.high, log=self.log)
 
@@ -400,12 +399,13 @@ class RayConfig(Config):
     @property
     def worker_lost_errors(self) -> tuple[type[Exception], ...]:
         """Errors with which a trial ends whose process, node or memory was lost."""
+        from ray import exceptions
 
         return (
-            ray_errors.WorkerCrashedError,
-            ray_errors.NodeDiedError,
-            ray_errors.OutOfMemoryError,
-            ray_errors.ObjectLostError,
+            exceptions.WorkerCrashedError,
+            exceptions.NodeDiedError,
+            exceptions.OutOfMemoryError,
+            exceptions.ObjectLostError,
         )
 
 

@@ -174,7 +174,7 @@ class PreparationConfig(Config):
         validate_every: number of stretches of which the last one validates.
     """
 
-    format_interval: tuple[Seconds, Seconds] = (0.03, 0.08)
+    interval: tuple[Seconds, Seconds] = (0.03, 0.08)
     step: Seconds = Field(default=0.05, gt=0)
     cutoff: float = Field(default=0.1, gt=0, lt=1)
     order: int = Field(default=2, ge=1, le=8)
@@ -286,7 +286,7 @@ class SeaTrialTaskConfig(StudyTask, ComputingTask):
     trials: dict[str, SeaTrialConfig] = Field(min_length=1)
     standard: StandardFitConfig = StandardFitConfig()
     equations: dict[str, EquationConfig] = Field(default_factory=dict)
-    load_published: dict[str, dict[str, Published]] = Field(default_factory=dict)
+    published: dict[str, dict[str, Published]] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _check_names(self) -> SeaTrialTaskConfig:
@@ -608,7 +608,8 @@ def run_trial(settings: SeaTrialTaskConfig, name: str) -> tuple[dict[str, Any], 
                 predicted[sets[phase]] = models[model, phase].predicted[sets[phase]]
                 count += models[model, phase].parameter_count
         models[model, SEPARATE] = FittedAccelerations(predicted, tuple(count), {})
-    true_parameters, acceleration_std = true_parameters(vessel, mass), a.std(axis=0)
+    parameter_values = true_parameters(vessel, mass)
+    acceleration_std = a.std(axis=0)
     content = {
         "samples": len(trial.phase),
         "seconds": len(trial.phase) * trial.step,
@@ -630,8 +631,8 @@ def run_trial(settings: SeaTrialTaskConfig, name: str) -> tuple[dict[str, Any], 
             phase: float((trial.phase == phase_index).mean())
             for phase_index, phase in enumerate(SPEED_REGIMES)
         },
-        "truth": true_parameters,
-        "true_sums": inertia_sums(true_parameters, mass),
+        "truth": parameter_values,
+        "true_sums": inertia_sums(parameter_values, mass),
         "standard": standard,
         "equations": {
             f"{model} on {fitted_set}": model_fit.equations
@@ -643,7 +644,7 @@ def run_trial(settings: SeaTrialTaskConfig, name: str) -> tuple[dict[str, Any], 
     figures = [
         _trial_figure(name, trial),
         _cutoff_figure(name, trials),
-        _parameters_figure(name, standard, true_parameters),
+        _parameters_figure(name, standard, parameter_values),
     ]
     return content, figures + [
         _excerpt_figure(name, trial, models, set_name) for set_name in standard

@@ -154,7 +154,7 @@ class PublishedFigures(Config):
             (Table 4.11), by basis function.
     """
 
-    mean_squares_by_axis: tuple[float, float, float] | None = None
+    mse: tuple[float, float, float] | None = None
     position_mae: float | None = None
     position_mse: float | None = None
     heading_mae: float | None = None

@@ -187,7 +187,7 @@ class FerryRun:
     feedback: Tensor
     thruster_force: Tensor
     desired_pose: Tensor
-    compute_tracking_metrics: TrackingMetrics
+    tracking_metrics: TrackingMetrics
 
 
 def load_force_vessel(name: str) -> tuple[HullPlant, ForceActuators]:

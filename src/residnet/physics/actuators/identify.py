@@ -248,6 +248,8 @@ def fit_thrust_curves(
 
 def _fit_thrust_curve(n: np.ndarray, thrust: np.ndarray, direction: str) -> ThrustFit:
 
+    from scipy import stats
+
     n_levels = np.unique(np.round(n / max(float(np.abs(n).max(initial=0.0)), 1e-9), 2)).size
     if n.size < 5 or n_levels < 4:
         raise FitError(
@@ -267,7 +269,7 @@ def _fit_thrust_curve(n: np.ndarray, thrust: np.ndarray, direction: str) -> Thru
     variance = float(residual @ residual) / (n.size - 3)
     half_widths = np.sqrt(
         np.diag(np.linalg.inv(design_matrix.T @ design_matrix)) * variance
-    ) * float(student_t.ppf(0.975, n.size - 3))
+    ) * float(stats.t.ppf(0.975, n.size - 3))
     factors = np.array([1.0, scale, scale**2])
     estimates = zip(solution / factors, half_widths / factors, ("N", "N s", "N s^2"), strict=True)
     c0, c1, c2 = (
@@ -289,6 +291,7 @@ def _fit_with_intervals(
 
     Widened for residuals that follow each other where they are a series.
     """
+    from scipy import stats
     from scipy.optimize import least_squares
 
     solution = least_squares(
@@ -308,9 +311,7 @@ def _fit_with_intervals(
         variance *= (1 + autocorrelation) / (1 - autocorrelation)
     jacobian = np.asarray(solution.jac)
     covariance = np.linalg.pinv(jacobian.T @ jacobian) * variance
-    half_widths = np.sqrt(np.diag(covariance)) * float(
-        student_t.ppf(0.975, n_samples - len(initial))
-    )
+    half_widths = np.sqrt(np.diag(covariance)) * float(stats.t.ppf(0.975, n_samples - len(initial)))
     return [float(parameter) for parameter in solution.x], [
         float(half_width) for half_width in half_widths
     ]

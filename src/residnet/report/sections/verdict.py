@@ -165,7 +165,7 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         "Zero: no model at all, the first velocities are held." if "zero" in rows else "",
         "Measurements: where the measured velocities themselves lead." if measured else "",
         *(
-            f"✗ {run.label(row['model'])}: {reason}."
+            f"✗ {run.model_label(row['model'])}: {reason}."
             for row in table
             if (reason := fault_text(row))
         ),
