@@ -17,11 +17,11 @@ from tiny import TINY, read_json
 import residnet
 from residnet.core.config import validate_config
 from residnet.core.errors import ResidnetError
-from residnet.data.prepare import PrepareConfig
+from residnet.evaluation.metrics import build_metrics_table
+from residnet.evaluation.protocol import EvaluationConfig
 from residnet.export import vessel
-from residnet.judge.metrics import build_metrics_table
-from residnet.judge.protocol import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
+from residnet.preprocessing.prepare import PrepareConfig
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "fifteen_lines.py"
 CHANNELS = {

@@ -75,7 +75,7 @@ def fly(
 
 def eager(folder: Path, card: dict[str, Any]) -> Any:
     """The policy without compilation: the same operations, called one by one from Python."""
-    from residnet.control.heading.controllers import (
+    from residnet.autopilot.heading.controllers import (
         NetworkPolicySpec,
         ObservedPolicySpec,
         load_recurrent,

@@ -32,13 +32,13 @@ import numpy as np
 from residnet.core.config import load_config
 from residnet.core.layout import PLANAR_LAYOUT
 from residnet.core.log import Log
-from residnet.data.simulated import simulate_trial_logs
+from residnet.evaluation.band import Band, interval_score, is_covered, largest_error_ratios
+from residnet.evaluation.bands import RunErrors, calibrate_band, compute_run_errors
 from residnet.identification.bands import assign_logs_to_folds
 from residnet.identification.fit import fit_models
 from residnet.identification.identified import SplitEvaluation, evaluate_splits, make_candidates
 from residnet.identification.prepared import prepare_splits
-from residnet.judge.band import Band, interval_score, is_covered, largest_error_ratios
-from residnet.judge.bands import RunErrors, calibrate_band, compute_run_errors
+from residnet.manoeuvres.trials import simulate_trial_logs
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import RunModelStore
 from residnet.tasks.fit import FitConfig

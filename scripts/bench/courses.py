@@ -21,17 +21,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from residnet.control.courses.config import (
+from residnet.autopilot.courses.config import (
     BuoyConfig,
     BuoyCourseConfig,
     PlannedCourse,
     plan_course,
     smallest_turn,
 )
-from residnet.control.guidance import CourseGuidance, DriftEstimate, TrackKeeping
-from residnet.control.heading.classical import HeadingPD
-from residnet.control.heading.controllers import ControlTask
-from residnet.control.heading.vessels import SteeredPlant
+from residnet.autopilot.guidance import CourseGuidance, DriftEstimate, TrackKeeping
+from residnet.autopilot.heading.classical import HeadingPD
+from residnet.autopilot.heading.controllers import ControlTask
+from residnet.autopilot.heading.vessels import SteeredPlant
 from residnet.core.errors import ResidnetError
 from residnet.dynamics.steering_variation import Vessels
 from residnet.physics.vessel import load_vessel

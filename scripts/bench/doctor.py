@@ -27,8 +27,8 @@ from random_vessels import KINDS, random_logs, ship_of
 
 from residnet.core.errors import ResidnetError
 from residnet.core.log import Log
-from residnet.data.doctor import Finding, inspect_log, inspect_log_set, statistics
-from residnet.data.masks import MaskRule
+from residnet.preprocessing.masks import MaskRule
+from residnet.quality import Finding, inspect_log, inspect_log_set, statistics
 
 _TOGETHER, _MEASURED = 3, 4
 """Measured logs that are looked at together, and how often."""

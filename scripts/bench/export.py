@@ -25,7 +25,7 @@ import exported_models
 import numpy as np
 import torch
 
-from residnet.dynamics.c_code import compiler
+from residnet.engine.c_code import compiler
 from residnet.export import get_exporter, vessel
 from residnet.export.c import CasadiModel
 from residnet.export.guard import GuardedDynamics

@@ -20,18 +20,18 @@ import torch
 import yaml
 from torch import Tensor, nn
 
-from residnet.documents.jervan2020.ferry import (
-    FerryStudyConfig,
-    list_feed_forward_objections,
-    run_ferry_study,
-    write_results,
-)
 from residnet.export.feed_forward import ExportedForce, RequiredForce
 from residnet.export.torchscript import TorchScriptExporter
 from residnet.physics.force_model import ForceModel
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
+from residnet.studies.jervan2020.ferry import (
+    FerryStudyConfig,
+    list_feed_forward_objections,
+    run_ferry_study,
+    write_results,
+)
 
 VESSEL = bench.CONFIGS / "vessels" / "milliampere.yaml"
 CONFIG = bench.CONFIGS / "studies" / "jervan2020" / "operation.yaml"

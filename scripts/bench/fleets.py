@@ -16,7 +16,7 @@ import bench
 import numpy as np
 from fleets import CONTRADICTIONS, SHARED, drawn
 
-from residnet.data.doctor import inspect_log_set
+from residnet.quality import inspect_log_set
 
 
 def main() -> None:

@@ -34,7 +34,7 @@ import yaml
 import residnet
 from residnet.core.config import validate_config
 from residnet.core.log import Log
-from residnet.data.readers import ReaderConfig
+from residnet.io.readers import ReaderConfig
 
 STEP, LOGS = 0.1, 1000
 _STEPS = {"steps": 100, "one_step": {"epochs": 1, "window": "2 s"}, "multi_step": []}

@@ -27,10 +27,10 @@ import pandas as pd
 from residnet.core.config import validate_config
 from residnet.core.errors import ResidnetError
 from residnet.core.log import Log
-from residnet.data.drafting.questions import DraftNotes
-from residnet.data.drafting.tables import draft_tables
-from residnet.data.readers import ReaderConfig
-from residnet.data.simulated import SimulatedTrials, simulate_trial_logs
+from residnet.io.drafting.questions import DraftNotes
+from residnet.io.drafting.tables import draft_tables
+from residnet.io.readers import ReaderConfig
+from residnet.manoeuvres.trials import SimulatedTrials, simulate_trial_logs
 from residnet.tasks.demo import DEMO_TRIALS
 
 DEG, KN = 180.0 / math.pi, 3600.0 / 1852.0

@@ -20,8 +20,6 @@ import numpy as np
 import yaml
 
 from residnet.core.log import Log
-from residnet.data.prepare import PreparedLog, prepare_log
-from residnet.data.simulated import simulate_trial_logs
 from residnet.identification.fit import fit_models
 from residnet.identification.fitter import FittedModel
 from residnet.identification.monitoring import (
@@ -32,6 +30,8 @@ from residnet.identification.monitoring import (
 )
 from residnet.identification.prepared import convert_to_motion_through_water, prepare_splits
 from residnet.identification.settings import FitSettings
+from residnet.manoeuvres.trials import simulate_trial_logs
+from residnet.preprocessing.prepare import PreparedLog, prepare_log
 
 PER_SEED = 5
 """Trials of 60 s that each seed sees."""

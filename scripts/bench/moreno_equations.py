@@ -21,7 +21,7 @@ from torch import Tensor
 
 from residnet.baselines.given import EquationsConfig
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
+from residnet.engine.rollout import Rollout
 from residnet.heads.base import ZeroHead
 from residnet.physics.signals import SignalsConfig
 from residnet.tasks.registry import load_task

@@ -22,10 +22,6 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import ResidnetError
-from residnet.data.prepare import PreparedLog, make_samples
-from residnet.data.simulated import simulate_trial_logs
-from residnet.data.windows import WindowStore
-from residnet.dynamics.actuated import InputShare
 from residnet.identification.fit import fit_models
 from residnet.identification.fitter import FittedModel
 from residnet.identification.planning import (
@@ -38,7 +34,11 @@ from residnet.identification.planning import (
 )
 from residnet.identification.prepared import compute_velocity_limits, prepare_splits
 from residnet.identification.settings import FitSettings
+from residnet.manoeuvres.actuated import InputShare
+from residnet.manoeuvres.trials import simulate_trial_logs
 from residnet.physics.vessel import load_vessel
+from residnet.preprocessing.prepare import PreparedLog, make_samples
+from residnet.preprocessing.windows import WindowStore
 from residnet.training.left_out import LeftOpen, left_open
 
 _HULL = ("u", "v", "r", "u|u|", "r|r|", "u v", "u r", "v r")

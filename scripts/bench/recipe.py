@@ -41,11 +41,11 @@ import residnet
 from residnet.core.config import load_mapping
 from residnet.core.layout import VELOCITIES
 from residnet.core.log import Log
-from residnet.data.prepare import PreparedLog
-from residnet.data.simulated import simulate_trial_logs
+from residnet.evaluation.freerun import FreeRunErrors
+from residnet.evaluation.protocol import Window
 from residnet.identification import fit, settings
-from residnet.judge.freerun import FreeRunErrors
-from residnet.judge.protocol import Window
+from residnet.manoeuvres.trials import simulate_trial_logs
+from residnet.preprocessing.prepare import PreparedLog
 
 SHIPPED: dict[str, dict[str, Any]] = {
     "wam_v_cal": {"step": 0.1, "push": (20.0, 20.0, 20.0), "unit": 3.0},

@@ -43,14 +43,14 @@ from torch.utils.data import DataLoader, TensorDataset
 from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
 from residnet.core.columns import all_but_pose
 from residnet.core.processes import retain_freed_memory
-from residnet.data.prepare import PrepareConfig, make_samples, prepare_log
-from residnet.data.windows import WindowSampler, WindowStore
-from residnet.dynamics.compiled import CompiledRollout
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import MANY, FreeRun, Rollout, trace_rollout
+from residnet.engine.compiled import CompiledRollout
+from residnet.engine.rollout import MANY, FreeRun, Rollout, trace_rollout
 from residnet.heads.base import ZeroHead
 from residnet.heads.lstm import LstmConfig
 from residnet.physics.signals import SignalsConfig
+from residnet.preprocessing.prepare import PrepareConfig, make_samples, prepare_log
+from residnet.preprocessing.windows import WindowSampler, WindowStore
 from residnet.training.refit import RefitConfig, problem_of, refit, simulate
 
 NAMES = ("u", "v", "r", "tau_x", "tau_n")

@@ -20,9 +20,9 @@ import torch
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.config import load_config
 from residnet.core.log import Log
-from residnet.data.simulated import ManoeuvreRun, SimulatedTrials, build_plant, simulate_trials
 from residnet.identification.fitter import FitStore, Fitter
 from residnet.identification.prepared import prepare_splits
+from residnet.manoeuvres.trials import ManoeuvreRun, SimulatedTrials, build_plant, simulate_trials
 from residnet.tasks.fit import FitConfig
 
 _DETERMINED, _ASKED, _NOTHING = 2.5, 5.0, 1e-9

@@ -18,7 +18,7 @@ import bench
 from fleets import drawn
 
 import residnet
-from residnet.judge.verdict import known_horizons, longest_good_horizon, rate_model
+from residnet.evaluation.verdict import known_horizons, longest_good_horizon, rate_model
 
 _FITTED, _NEW = 20, 8
 

@@ -21,7 +21,7 @@ from residnet.core.progress import Progress, ProgressCallback, on_progress
 from residnet.exits import run_cli
 
 if TYPE_CHECKING:
-    from residnet.data.drafting.questions import AnswerCallback, Question
+    from residnet.io.drafting.questions import AnswerCallback, Question
     from residnet.runs.task import FinishedRun
 
 

@@ -18,7 +18,7 @@ from residnet.baselines.steering import NomotoBaselineConfig, NomotoSideslipBase
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
+from residnet.engine.rollout import Rollout
 from residnet.heads.base import ZeroHead
 from residnet.physics.signals import SignalsConfig
 

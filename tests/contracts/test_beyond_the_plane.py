@@ -15,8 +15,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from residnet.autopilot.heading.vessels import SteeredModel, SteeredPlant
 from residnet.baselines.regressors import RegressorsConfig
-from residnet.control.heading.vessels import SteeredModel, SteeredPlant
 from residnet.core.config import validate_config
 from residnet.core.errors import ResidnetError, UsageError
 from residnet.core.frames import compose_rotation, rotation_angle_between, to_earth, to_level_axes
@@ -28,24 +28,12 @@ from residnet.core.layout import (
     to_horizontal_plane,
 )
 from residnet.core.log import Log
-from residnet.data.doctor import inspect_log
-from residnet.data.motion import MotionConfig, complete_motion
-from residnet.data.prepare import PrepareConfig, make_samples, prepare_log
-from residnet.data.simulated import (
-    DisturbanceConfig,
-    SensorsConfig,
-    SimulatedTrials,
-    SimulatedVessel,
-    TrialEnvironment,
-    simulate_manoeuvres,
-    simulate_trials,
-)
-from residnet.dynamics.actuated import ActuatedDynamics, PlantActuators
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.jacobian import StepJacobian
-from residnet.dynamics.rollout import Rollout, trace_rollout
 from residnet.dynamics.store import save_model
+from residnet.engine.jacobian import StepJacobian
+from residnet.engine.rollout import Rollout, trace_rollout
+from residnet.evaluation.freerun import compute_integration_errors, integrate_pose
 from residnet.heads.linear import RidgeConfig
 from residnet.heads.recurrent import GRUEnsembleConfig
 from residnet.identification.changes import PerturbedDynamics, SystemChange, make_fault_hypotheses
@@ -56,12 +44,24 @@ from residnet.identification.monitoring import (
     OnlineChangeDetector,
 )
 from residnet.identification.recipe import PreparationPlan, choose_integrator
-from residnet.judge.freerun import compute_integration_errors, integrate_pose
+from residnet.manoeuvres.actuated import ActuatedDynamics, PlantActuators
 from residnet.manoeuvres.base import Helm
 from residnet.manoeuvres.open_loop import ConstantInput
+from residnet.manoeuvres.trials import (
+    DisturbanceConfig,
+    SensorsConfig,
+    SimulatedTrials,
+    SimulatedVessel,
+    TrialEnvironment,
+    simulate_manoeuvres,
+    simulate_trials,
+)
 from residnet.physics.hull import SubmergedHullConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
+from residnet.preprocessing.motion import MotionConfig, complete_motion
+from residnet.preprocessing.prepare import PrepareConfig, make_samples, prepare_log
+from residnet.quality import inspect_log
 from residnet.simulators.ardupilot import ArduPilotBackend, assign_servos
 from residnet.simulators.vehicle import load_vehicle
 from residnet.testing import make_example_samples

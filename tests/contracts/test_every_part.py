@@ -22,15 +22,15 @@ from residnet.core.layout import VELOCITIES, DegreesOfFreedom
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.registry import load_kinds
-from residnet.data.readers import ReaderConfig
-from residnet.dynamics.compiled import CompiledRollout
-from residnet.dynamics.rollout import Rollout, trace_rollout
 from residnet.dynamics.store import ModelSpec, load_model, save_model
+from residnet.engine.compiled import CompiledRollout
+from residnet.engine.rollout import Rollout, trace_rollout
 from residnet.export import EXPORT_FORMATS, get_exporter, vessel
 from residnet.export.vessel import ExportedVessel
 from residnet.heads import HeadConfig
 from residnet.heads.base import Features
 from residnet.heads.linear import RidgeConfig
+from residnet.io.readers import ReaderConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import vessel_files

@@ -12,11 +12,11 @@ from sample_package import install
 from residnet.core import registry
 from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError
-from residnet.data.readers import ReaderConfig
 from residnet.exits import run_cli
 from residnet.export import EXPORT_FORMATS, get_exporter
 from residnet.heads import HeadConfig
 from residnet.heads.linear import PlsrConfig
+from residnet.io.readers import ReaderConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.physics.vessel import load_vessel
 from residnet.tasks.registry import list_catalogue

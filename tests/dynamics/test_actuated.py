@@ -12,11 +12,16 @@ from torch import Tensor
 
 from residnet.baselines.given import ZeroBaselineConfig
 from residnet.core.errors import ConfigError
-from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, PlantActuators
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
+from residnet.engine.rollout import Rollout
 from residnet.heads.base import ResidualHead, ZeroHead
+from residnet.manoeuvres.actuated import (
+    ActuatedDynamics,
+    GivenActuators,
+    InputShare,
+    PlantActuators,
+)
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 

@@ -13,10 +13,10 @@ from torch import Tensor, nn
 
 from residnet.core.errors import ExportError
 from residnet.core.processes import worker_limit
-from residnet.dynamics import c_code, compiled
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.compiled import CompiledRollout, _held
-from residnet.dynamics.rollout import Rollout, Source
+from residnet.engine import c_code, compiled
+from residnet.engine.compiled import CompiledRollout, _held
+from residnet.engine.rollout import Rollout, Source
 
 DT = 0.1
 

@@ -18,7 +18,7 @@ from residnet.core.layout import HEADING, MOTION, POSITION
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.ensemble import SampledDynamics
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
+from residnet.engine.rollout import Rollout
 from residnet.heads.base import ResidualHead, ZeroHead
 from residnet.heads.lstm import LstmConfig
 from residnet.heads.recurrent import GRUEnsembleConfig

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from residnet.dynamics import free_runs
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.rollout import MANY, Rollout, trace_rollout
+from residnet.engine import free_runs
+from residnet.engine.rollout import MANY, Rollout, trace_rollout
 
 DT = 0.1
 

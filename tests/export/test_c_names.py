@@ -18,12 +18,12 @@ from exported_models import built
 from residnet.core.errors import UsageError
 from residnet.core.progress import Progress, on_progress
 from residnet.core.version import __version__
-from residnet.dynamics import c_code
-from residnet.dynamics.c_code import compiler
+from residnet.engine import c_code
+from residnet.engine.c_code import compiler
+from residnet.evaluation.assessment import Assessment
 from residnet.export import c, get_exporter
 from residnet.export.c import STRICT_FLAGS, measure_footprint, to_c_identifier
 from residnet.export.vessel import ExportedVessel
-from residnet.judge.assessment import Assessment
 
 pytestmark = pytest.mark.usefixtures("short_parity")
 

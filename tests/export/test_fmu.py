@@ -19,8 +19,8 @@ from fmpy.fmi1 import FMICallException
 from fmpy.simulation import instantiate_fmu
 from fmpy.validation import validate_fmu
 
-from residnet.dynamics.c_code import compiler
-from residnet.dynamics.rollout import Rollout
+from residnet.engine.c_code import compiler
+from residnet.engine.rollout import Rollout
 from residnet.export import fmu, get_exporter
 from residnet.export.vessel import ExportedVessel
 

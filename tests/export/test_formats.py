@@ -24,11 +24,11 @@ import torch
 from exported_models import HIGH, LOW, VARIANTS, AsTensors, built, spec_of
 
 from residnet.core.errors import ExportError, ResidnetError, WithheldError
-from residnet.dynamics.c_code import compiler
 from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.lowering import lowered
 from residnet.dynamics.store import BandTable, ModelSpec
+from residnet.engine.c_code import compiler
+from residnet.engine.trace import lowered
 from residnet.export import EXPORT_FORMATS as REGISTERED
 from residnet.export import base, get_exporter, torchscript, vessel
 from residnet.export.base import LoadedExport, RoundingError, require_releasable

@@ -16,12 +16,12 @@ from exported_models import built
 from exported_policies import DEG, DT, LIMIT, SETTINGS, SPEED, observed
 from torch import Tensor
 
-from residnet.control.courses.course_plan import Course
-from residnet.control.guidance import CourseGuidance, DriftEstimate
-from residnet.control.heading.controllers import DepthPolicySpec, NetworkPolicySpec
-from residnet.control.heading.policies import OBSERVER_MEMORY
+from residnet.autopilot.courses.course_plan import Course
+from residnet.autopilot.guidance import CourseGuidance, DriftEstimate
+from residnet.autopilot.heading.controllers import DepthPolicySpec, NetworkPolicySpec
+from residnet.autopilot.heading.policies import OBSERVER_MEMORY
 from residnet.core.errors import UsageError
-from residnet.dynamics.rollout import Rollout
+from residnet.engine.rollout import Rollout
 from residnet.export import get_exporter, policy
 from residnet.export.base import Exportable
 from residnet.export.c import compile_shared_library

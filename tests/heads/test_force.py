@@ -15,8 +15,8 @@ from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
 from residnet.dynamics.ensemble import mean_of
-from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
+from residnet.engine.rollout import Rollout
 from residnet.export.feed_forward import BelievedForce, RequiredForce, ResidualForce
 from residnet.heads.force import ForceHead
 from residnet.heads.linear import PlsrConfig, RidgeConfig

@@ -17,16 +17,16 @@ from residnet.baselines.given import ZeroBaselineConfig
 from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError
 from residnet.core.samples import Samples
-from residnet.data.windows import WindowStore
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout, record_step
+from residnet.engine.rollout import Rollout, record_step
 from residnet.heads.base import ResidualHead
 from residnet.heads.lstm import LSTMCell, LstmConfig, LstmHead
 from residnet.heads.mirror import Tanh, fast_tanh
 from residnet.heads.mlp import MlpConfig
 from residnet.heads.recurrent import GRUEnsembleConfig, GRUEnsembleHead
 from residnet.physics.signals import SignalsConfig
+from residnet.preprocessing.windows import WindowStore
 
 
 def built(**config: object) -> LstmHead:

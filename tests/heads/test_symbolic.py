@@ -21,9 +21,9 @@ from made_samples import sampled
 from residnet.core.errors import FitError
 from residnet.core.names import ACCELERATION_NAMES
 from residnet.core.samples import Samples
-from residnet.data.derivatives import SavitzkyGolay
 from residnet.heads.symbolic import SegmentedSamples, SymbolicConfig, SymbolicHead, find_best_delay
 from residnet.physics.symmetry import compute_term_parity
+from residnet.preprocessing.derivatives import SavitzkyGolay
 
 FORCES, JETS = ("u", "v", "r", "tau_x", "tau_y", "tau_n"), ("u", "v", "r", "rpm", "nozzle")
 FORCE: dict[str, Any] = {"candidates": {"input_degree": 2, "coupling": ["u", "v", "r"]}}

@@ -18,8 +18,6 @@ from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.errors import DataError, FitError
 from residnet.core.processes import available_cores, worker_limit
 from residnet.core.progress import Progress, on_progress
-from residnet.data.prepare import compute_channels, make_samples
-from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.base import ZeroHead
 from residnet.identification import fit as parts
@@ -39,6 +37,8 @@ from residnet.identification.identified import (
 from residnet.identification.prepared import PreparedSplits
 from residnet.identification.settings import FitSettings
 from residnet.physics.signals import SignalsConfig
+from residnet.preprocessing.prepare import compute_channels, make_samples
+from residnet.preprocessing.windows import WindowStore
 from residnet.regression.estimator import Solution
 from residnet.training.score import Score
 

@@ -15,14 +15,14 @@ from tiny_fit import DATA, settings_of
 
 from residnet.core.arrays import paged
 from residnet.core.log import Log
-from residnet.data.sources import read_split_logs
-from residnet.data.windows import WindowStore
 from residnet.identification.fit import fit_models
 from residnet.identification.prepared import (
     convert_to_motion_through_water,
     prepare_splits,
     split_long_log,
 )
+from residnet.io.sources import read_split_logs
+from residnet.preprocessing.windows import WindowStore
 from residnet.regression.estimator import ChunkedRegressors, Estimator
 from residnet.regression.least_squares import LeastSquares
 from residnet.regression.shrinkage import PLSR, Ridge

@@ -11,10 +11,10 @@ import residnet
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.layout import DegreesOfFreedom
 from residnet.core.log import Log
-from residnet.data.motion import MotionConfig, complete_motion
 from residnet.identification.planning import TrialLimits, infer_input_shares, propose_manoeuvres
 from residnet.identification.settings import FitSettings
 from residnet.physics.signals import SignalsConfig
+from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.testing.checks import make_example_spec
 
 STEP = 0.2

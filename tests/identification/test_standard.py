@@ -18,7 +18,6 @@ from residnet.core.errors import ConfigError, FitError
 from residnet.core.layout import SURGE_SWAY_YAW
 from residnet.core.log import Log
 from residnet.core.samples import Samples
-from residnet.data.prepare import make_samples
 from residnet.dynamics.hybrid import Missed
 from residnet.identification.fit import Identified, fit_models
 from residnet.identification.fitter import FitStore, Fitter, find_harmful_member
@@ -32,6 +31,7 @@ from residnet.identification.recipe import (
 from residnet.identification.settings import FitSettings
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import acts_along_own_velocity
+from residnet.preprocessing.prepare import make_samples
 
 NAMES = ("hull", "hull_network", "mean")
 

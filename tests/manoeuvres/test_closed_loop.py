@@ -10,19 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from residnet.control.motion import MotionPIDConfig
+from residnet.autopilot.motion import MotionPIDConfig
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
-from residnet.data.simulated import (
-    DisturbanceConfig,
-    SensorsConfig,
-    SimulatedVessel,
-    TrialEnvironment,
-    simulate_manoeuvres,
-)
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.rollout import Rollout, Source
-from residnet.dynamics.simulated import RecordedPlantDynamics
+from residnet.engine.recorded_plant import RecordedPlantDynamics
+from residnet.engine.rollout import Rollout, Source
 from residnet.manoeuvres.base import Helm, StackedSource, StopRecorder
 from residnet.manoeuvres.closed_loop import (
     Spiral,
@@ -36,6 +29,13 @@ from residnet.manoeuvres.closed_loop import (
 )
 from residnet.manoeuvres.courses import SEGMENTS, FourCorner
 from residnet.manoeuvres.open_loop import MultiSine, RandomSteps
+from residnet.manoeuvres.trials import (
+    DisturbanceConfig,
+    SensorsConfig,
+    SimulatedVessel,
+    TrialEnvironment,
+    simulate_manoeuvres,
+)
 from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180

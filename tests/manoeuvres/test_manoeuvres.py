@@ -16,9 +16,8 @@ from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.log import Log
 from residnet.core.registry import load_kinds
-from residnet.data.simulated import SimulatedTrials
-from residnet.dynamics.rollout import Rollout, Source
-from residnet.dynamics.simulated import RecordedPlantDynamics
+from residnet.engine.recorded_plant import RecordedPlantDynamics
+from residnet.engine.rollout import Rollout, Source
 from residnet.manoeuvres import FamilyConfig, ManoeuvreConfig
 from residnet.manoeuvres.base import Helm, Manoeuvre, ScheduleSource, StackedSource
 from residnet.manoeuvres.closed_loop import Zigzag
@@ -29,6 +28,7 @@ from residnet.manoeuvres.open_loop import (
     MultiSine,
     ThreeTwoOneOne,
 )
+from residnet.manoeuvres.trials import SimulatedTrials
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from residnet.core.config import load_config
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
+from residnet.engine.rollout import Rollout
 from residnet.physics.abkowitz import AbkowitzConfig
 from residnet.physics.hull import SPEED_REGIMES, classify_speed_regime, compute_froude_number
 from residnet.physics.vessel import VesselConfig, load_vessel

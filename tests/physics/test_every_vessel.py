@@ -10,8 +10,9 @@ from torch import Tensor
 
 from residnet.core.config import load_config
 from residnet.core.names import CHANNEL_UNITS
-from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics
+from residnet.dynamics.simulated import PlantDynamics
+from residnet.engine.recorded_plant import RecordedPlantDynamics
+from residnet.engine.rollout import Rollout
 from residnet.physics.hull import SubmergedHullConfig
 from residnet.physics.plant import HullPlant, Plant
 from residnet.physics.vessel import VesselConfig, load_vessel

@@ -20,10 +20,14 @@ from read_page import Page, plain
 from residnet.core.errors import DataError, UsageError
 from residnet.core.format import format_interval, format_number
 from residnet.core.log import Log
-from residnet.data.doctor import build_inspection, inspect_log, inspect_log_set
-from residnet.judge.goodness import OneStepResiduals, build_goodness_content, build_goodness_table
-from residnet.judge.soundness import CHECKS, SanityFinding, build_sanity_content
-from residnet.judge.verdict import LEVEL_TEXTS
+from residnet.evaluation.goodness import (
+    OneStepResiduals,
+    build_goodness_content,
+    build_goodness_table,
+)
+from residnet.evaluation.soundness import CHECKS, SanityFinding, build_sanity_content
+from residnet.evaluation.verdict import LEVEL_TEXTS
+from residnet.quality import build_inspection, inspect_log, inspect_log_set
 from residnet.report.blocks import Section, Table, Text
 from residnet.report.fit import write_fit_figures
 from residnet.report.run_reader import RunFiles

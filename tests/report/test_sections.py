@@ -19,7 +19,7 @@ from tiny import write_yaml
 
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.judge.metrics import bootstrap_intervals, make_resampling_blocks
+from residnet.evaluation.metrics import bootstrap_intervals, make_resampling_blocks
 from residnet.report.blocks import Section
 from residnet.report.fit import fit_sections
 from residnet.report.page import write_page

@@ -10,9 +10,9 @@ import numpy as np
 
 from residnet.core.config import validate_config
 from residnet.core.log import Log
-from residnet.data.drafting.questions import DraftNotes
-from residnet.data.drafting.tables import draft_tables
-from residnet.data.readers import ReaderConfig
+from residnet.io.drafting.questions import DraftNotes
+from residnet.io.drafting.tables import draft_tables
+from residnet.io.readers import ReaderConfig
 
 
 def drafted(path: Path, **settings: Any) -> tuple[Log, dict[str, Any], DraftNotes]:

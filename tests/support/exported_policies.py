@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from residnet.control.heading.controllers import ObservedPolicySpec, PtosConfig
+from residnet.autopilot.heading.controllers import ObservedPolicySpec, PtosConfig
 
 DEG = math.pi / 180
 DT, GAIN, TIME, SPEED, LIMIT = 0.02, 3.47, 3.94, 3.2, 5 * DEG

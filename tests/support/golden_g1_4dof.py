@@ -15,8 +15,8 @@ import torch
 from golden_tables import beside, made_by, name_of, run
 from kinds import of_kind
 
-from residnet.dynamics.rollout import Source
-from residnet.dynamics.simulated import RecordedPlantDynamics
+from residnet.engine.recorded_plant import RecordedPlantDynamics
+from residnet.engine.rollout import Source
 from residnet.manoeuvres.base import Helm, ScheduleSource, StackedSource
 from residnet.manoeuvres.closed_loop import Zigzag
 from residnet.physics.plant import HullPlant

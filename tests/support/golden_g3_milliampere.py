@@ -20,7 +20,7 @@ from golden_tables import Row, accelerations, beside, name_of, rounding_bound, r
 from kinds import of_kind
 from torch import Tensor
 
-from residnet.control import (
+from residnet.autopilot import (
     ClosedLoop,
     HullFeedForward,
     MotionPID,
@@ -30,7 +30,7 @@ from residnet.control import (
     ReferenceFilterConfig,
 )
 from residnet.core.config import load_config
-from residnet.dynamics.simulated import RecordedPlantDynamics
+from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.physics.hull import MassMatrixConfig
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import vessel_files

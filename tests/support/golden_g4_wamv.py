@@ -19,7 +19,7 @@ from scipy.linalg import expm
 
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.simulated import RecordedPlantDynamics
+from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.heads.base import ZeroHead
 from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
 from residnet.manoeuvres.closed_loop import Zigzag

@@ -24,17 +24,17 @@ from golden_tables import made_by, name_of, run, table
 from kinds import of_kind
 from torch import Tensor
 
-from residnet.control import BangBangHeading, ClosedLoop, HeadingPD, Policy, RecordedReference
-from residnet.documents.gouletas2020.law import DocumentAutopilot, SimulatedPredictor
+from residnet.autopilot import BangBangHeading, ClosedLoop, HeadingPD, Policy, RecordedReference
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.rollout import Source
-from residnet.dynamics.simulated import RecordedPlantDynamics
+from residnet.engine.recorded_plant import RecordedPlantDynamics
+from residnet.engine.rollout import Source
 from residnet.manoeuvres.base import Helm, ScheduleSource
 from residnet.manoeuvres.closed_loop import Zigzag
 from residnet.physics.hull import RollingHullConfig
 from residnet.physics.nomoto import NomotoConfig, NomotoVessel
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
+from residnet.studies.gouletas2020.law import DocumentAutopilot, SimulatedPredictor
 
 GAIN, TIME = 3.47, 3.94
 LIMIT = float(np.radians(5.0))

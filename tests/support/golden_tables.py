@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.rollout import Rollout, Source
+from residnet.engine.rollout import Rollout, Source
 from residnet.physics.plant import Hull
 
 

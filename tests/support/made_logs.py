@@ -6,7 +6,7 @@ import numpy as np
 
 from residnet.core.log import Log
 from residnet.core.names import STATE_NAMES
-from residnet.data.prepare import PreparedLog
+from residnet.preprocessing.prepare import PreparedLog
 
 
 def made(

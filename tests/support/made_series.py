@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy.signal import lfilter
 
-from residnet.judge.goodness import block_bootstrap_interval, independent_confidence_interval
+from residnet.evaluation.goodness import block_bootstrap_interval, independent_confidence_interval
 
 
 def autoregressive(phi: float, count: int, length: int, seed: int) -> np.ndarray:

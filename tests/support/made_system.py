@@ -14,11 +14,11 @@ from torch import Tensor
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.log import Log
 from residnet.core.names import STATE_NAMES
-from residnet.data.prepare import PrepareConfig, PreparedLog, prepare_log
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
+from residnet.engine.rollout import Rollout
 from residnet.heads.base import ResidualHead, ZeroHead
 from residnet.physics.signals import SignalsConfig
+from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, prepare_log
 
 STEP = 0.1
 SIGNALS = SignalsConfig(inputs=("tau_x", "tau_n"))

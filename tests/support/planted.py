@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from residnet.core.log import Log
-from residnet.data.doctor.actuators import estimate_neutral_angle
-from residnet.data.doctor.effects import OneStepRegression
-from residnet.data.doctor.statistics import LogStatistics
-from residnet.data.simulated import SimulatedTrials, simulate_trial_logs
+from residnet.manoeuvres.trials import SimulatedTrials, simulate_trial_logs
+from residnet.quality.actuators import estimate_neutral_angle
+from residnet.quality.effects import OneStepRegression
+from residnet.quality.statistics import LogStatistics
 
 Random = np.random.Generator
 Range = tuple[float, float]

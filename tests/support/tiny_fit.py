@@ -7,10 +7,10 @@ from typing import Any
 from tiny import TINY
 
 from residnet.core.config import validate_config
-from residnet.data.simulated import SimulatedTrials
-from residnet.data.sources import read_split_logs
 from residnet.identification.prepared import PreparedSplits, prepare_splits
 from residnet.identification.settings import FitSettings
+from residnet.io.sources import read_split_logs
+from residnet.manoeuvres.trials import SimulatedTrials
 
 DATA = validate_config(TINY["data"], SimulatedTrials, "here")
 

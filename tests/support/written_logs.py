@@ -17,10 +17,10 @@ from scipy.io import savemat
 
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
-from residnet.data.readers.base import CanonicalConfig, LogReader
-from residnet.data.readers.detect import AutoConfig
-from residnet.data.readers.recording import ALL_FIELDS, Recording
-from residnet.data.readers.topics import align_clocks
+from residnet.io.readers.base import CanonicalConfig, LogReader
+from residnet.io.readers.detect import AutoConfig
+from residnet.io.readers.recording import ALL_FIELDS, Recording
+from residnet.io.readers.topics import align_clocks
 
 EPOCH = 1_744_362_945
 COMMANDS = ("cmd_port", "cmd_stbd")

@@ -13,7 +13,7 @@ from read_page import plain
 from tiny import call, read_json, write_yaml
 
 from residnet.core.config import load_config
-from residnet.judge.autopilots import describe_limit_cycles, list_policy_objections
+from residnet.evaluation.autopilots import describe_limit_cycles, list_policy_objections
 from residnet.report.sections.autopilot import cost_sentences
 from residnet.tasks.autopilot import AutopilotConfig
 from residnet.tasks.autopilot_run import load_trained_policy

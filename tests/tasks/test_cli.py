@@ -21,8 +21,8 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.files import find_shipped_configs
 from residnet.core.progress import log_message
 from residnet.core.version import __version__
-from residnet.data.drafting.reading import find_log_files
 from residnet.export import vessel
+from residnet.io.drafting.reading import find_log_files
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import TaskOutcome
 from residnet.tasks.simulate import SimulateConfig

@@ -19,9 +19,9 @@ import torch
 from tiny import TINY, Command, read_json, write_yaml
 
 from residnet.core.config import validate_config
-from residnet.data.simulated import SimulatedTrials
 from residnet.dynamics.store import load_model
-from residnet.judge.verdict import LEVEL_TEXTS
+from residnet.evaluation.verdict import LEVEL_TEXTS
+from residnet.manoeuvres.trials import SimulatedTrials
 
 ALONE: dict[str, Any] = {**TINY, "ensembles": {}, "training": {}, "export": {"models": []}}
 

@@ -10,7 +10,7 @@ import written_logs
 from tiny import Command, read_json, write_yaml
 
 from residnet.core.log import Log
-from residnet.data.readers.base import CanonicalConfig
+from residnet.io.readers.base import CanonicalConfig
 
 
 def config(folder: Path, logs: str) -> Path:

@@ -19,10 +19,10 @@ import residnet
 from residnet.core.config import validate_config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
-from residnet.data.readers import ReaderConfig
-from residnet.data.sources import read_split_logs
 from residnet.identification.prepared import prepare_splits
 from residnet.identification.recipe import choose_window_length, make_evaluation_settings
+from residnet.io.readers import ReaderConfig
+from residnet.io.sources import read_split_logs
 from residnet.tasks.drafting import write_new_config
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.registry import load_task

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from pydantic import ValidationError
 
-from residnet.control.heading.turning import NomotoModel
+from residnet.autopilot.heading.turning import NomotoModel
 from residnet.core.config import load_config, load_mapping
 from residnet.core.errors import UsageError
 from residnet.core.progress import on_progress

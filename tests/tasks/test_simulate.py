@@ -13,8 +13,8 @@ from read_page import plain
 from tiny import TINY, Command, call, read_json, write_yaml
 
 from residnet.core.log import Log
-from residnet.data.readers.base import CanonicalConfig
-from residnet.data.simulated import SimulatedTrials, simulate_trial_logs
+from residnet.io.readers.base import CanonicalConfig
+from residnet.manoeuvres.trials import SimulatedTrials, simulate_trial_logs
 from residnet.tasks.registry import load_task
 
 STEP = 0.1

@@ -7,14 +7,14 @@ import math
 import pytest
 import torch
 
-from residnet.control.heading.conditions import (
+from residnet.autopilot.heading.conditions import (
     ClosedLoopTrajectories,
     ConditionsConfig,
     SteadinessLimits,
 )
-from residnet.control.heading.controllers import ObservedPolicySpec, PtosConfig
-from residnet.control.heading.policies import ObservedPolicy
-from residnet.control.heading.vessels import SteeredPlant
+from residnet.autopilot.heading.controllers import ObservedPolicySpec, PtosConfig
+from residnet.autopilot.heading.policies import ObservedPolicy
+from residnet.autopilot.heading.vessels import SteeredPlant
 from residnet.dynamics.steering_variation import HEADING
 from residnet.physics.vessel import load_vessel
 from residnet.training.policies.config import PolicyTraining

@@ -14,9 +14,9 @@ import torch
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.config import validate_config
 from residnet.core.errors import FitError
-from residnet.data.prepare import PrepareConfig, PreparedLog, make_samples, prepare_log
-from residnet.data.simulated import SimulatedTrials, simulate_trial_logs
+from residnet.manoeuvres.trials import SimulatedTrials, simulate_trial_logs
 from residnet.physics.signals import SignalsConfig
+from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, make_samples, prepare_log
 from residnet.training import current as module
 from residnet.training.current import CurrentConfig, estimate_currents, through_water
 

@@ -21,13 +21,13 @@ from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, DataError, FitError, UsageError
 from residnet.core.samples import Samples
-from residnet.data.module import WindowBatch, WindowsDataModule
-from residnet.data.prepare import PreparedLog, make_samples
-from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
+from residnet.engine.rollout import Rollout
 from residnet.heads.lstm import LstmConfig
 from residnet.heads.mlp import MlpConfig, MlpHead
+from residnet.preprocessing.data_module import WindowBatch, WindowsDataModule
+from residnet.preprocessing.prepare import PreparedLog, make_samples
+from residnet.preprocessing.windows import WindowStore
 from residnet.training.config import MachineConfig, TrainingConfig
 from residnet.training.heads import HeadTraining, Validate, one_step_loss, rollout_loss, train
 from residnet.training.score import Score, Shown

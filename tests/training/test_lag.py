@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from residnet.control.motion import ActuatorLag
+from residnet.autopilot.motion import ActuatorLag
 from residnet.core.errors import FitError
 from residnet.training.lag import fit_lag, followed
 

@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from residnet.control.heading.controllers import ControlTask
-from residnet.control.heading.vessels import SteeredPlant
-from residnet.documents.gouletas2020.autopilot import simulate_rudder_responses, train_predictor
-from residnet.documents.gouletas2020.law import (
+from residnet.autopilot.heading.controllers import ControlTask
+from residnet.autopilot.heading.vessels import SteeredPlant
+from residnet.physics.vessel import load_vessel
+from residnet.studies.gouletas2020.autopilot import simulate_rudder_responses, train_predictor
+from residnet.studies.gouletas2020.law import (
     DocumentConfig,
     PredictiveConfig,
     PredictorTraining,
 )
-from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180
 LIMIT = 5 * DEG

@@ -28,13 +28,13 @@ from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
 from residnet.core.errors import DataError, FitError, ResidnetError
 from residnet.core.layout import HEADING
 from residnet.core.samples import Samples
-from residnet.data.prepare import PreparedLog, make_samples
-from residnet.data.windows import WindowStore
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
+from residnet.engine.rollout import Rollout
 from residnet.heads.base import ZeroHead
 from residnet.physics.signals import SignalsConfig
+from residnet.preprocessing.prepare import PreparedLog, make_samples
+from residnet.preprocessing.windows import WindowStore
 from residnet.training import refit as module
 from residnet.training.left_out import without_logs
 from residnet.training.refit import Problem, RefitConfig, refit, sensitivities

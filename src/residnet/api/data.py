@@ -24,21 +24,21 @@ from residnet.core.layout import DegreesOfFreedom
 from residnet.core.log import Log
 from residnet.core.names import suggest_name
 from residnet.core.progress import ProgressCallback, log_message, report_progress
-from residnet.data.doctor import inspect_log as examine
-from residnet.data.doctor import inspect_log_set
-from residnet.data.drafting.questions import DraftNotes, Question, dump_commented_yaml
-from residnet.data.drafting.reading import find_log_files, read_mixed_formats
-from residnet.data.motion import MotionConfig, complete_motion
-from residnet.data.prepare import PrepareConfig, PreparedLog
-from residnet.data.prepare import prepare_log as prepare_log
-from residnet.data.readers import ReaderConfig
-from residnet.data.simulated import SimulatedTrials
-from residnet.data.sources import DataConfig, MeasuredLogs
-from residnet.data.sources import read_split_logs as read_splits
-from residnet.data.split import SPLITS, assign_log_names, check_leaks, split_logs
+from residnet.evaluation.protocol import EvaluationConfig, longest_segment_length
 from residnet.identification.recipe import PreparationPlan, make_evaluation_settings
-from residnet.judge.protocol import EvaluationConfig, longest_segment_length
+from residnet.io.drafting.questions import DraftNotes, Question, dump_commented_yaml
+from residnet.io.drafting.reading import find_log_files, read_mixed_formats
+from residnet.io.readers import ReaderConfig
+from residnet.io.sources import DataConfig, MeasuredLogs
+from residnet.io.sources import read_split_logs as read_splits
+from residnet.io.split import SPLITS, assign_log_names, check_leaks, split_logs
+from residnet.manoeuvres.trials import SimulatedTrials
 from residnet.physics.signals import SignalsConfig
+from residnet.preprocessing.motion import MotionConfig, complete_motion
+from residnet.preprocessing.prepare import PrepareConfig, PreparedLog
+from residnet.preprocessing.prepare import prepare_log as prepare_log
+from residnet.quality import inspect_log as examine
+from residnet.quality import inspect_log_set
 from residnet.tasks.drafting import ConfigDraft, choose_inputs, draft_fit_config
 
 if TYPE_CHECKING:

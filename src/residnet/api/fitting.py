@@ -27,6 +27,9 @@ from residnet.core.names import suggest_name
 from residnet.core.processes import worker_limit
 from residnet.core.progress import ProgressCallback
 from residnet.core.trust import trusting
+from residnet.evaluation.metrics import build_metrics_table, iterate_rollout_columns
+from residnet.evaluation.selection import Selection
+from residnet.evaluation.verdict import VerdictEvidence, order_protocols, write_verdict
 from residnet.identification.fit import fit_models as identify
 from residnet.identification.identified import (
     IdentifiedModels,
@@ -41,9 +44,6 @@ from residnet.identification.prepared import (
 )
 from residnet.identification.recipe import choose_integrator
 from residnet.identification.settings import FitSettings, ModelPartsConfig
-from residnet.judge.metrics import build_metrics_table, iterate_rollout_columns
-from residnet.judge.selection import Selection
-from residnet.judge.verdict import VerdictEvidence, order_protocols, write_verdict
 from residnet.report.run_reader import StoredWindow, read_windows
 from residnet.runs.task import torch_threads
 

@@ -19,10 +19,12 @@ from residnet.core.files import read_json, stage_files
 from residnet.core.ownership import Manifest, record_folder
 from residnet.core.run_loader import accept_run, name_damaged_key
 from residnet.core.trust import trusting
-from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec, chosen_model, load_model, save_model
+from residnet.engine.free_runs import compiled
+from residnet.engine.rollout import Rollout
+from residnet.evaluation.band import read_bands
+from residnet.evaluation.verdict import UNSEEN_SPLITS, VerdictEvidence, list_model_objections
 from residnet.export import get_exporter
 from residnet.export.base import require_releasable
 from residnet.export.vessel import ExportedVessel
@@ -38,8 +40,6 @@ from residnet.identification.recursive_refit import (
     make_refitted_model,
     refit_recursively,
 )
-from residnet.judge.band import read_bands
-from residnet.judge.verdict import UNSEEN_SPLITS, VerdictEvidence, list_model_objections
 from residnet.runs.folder import verify_checksums
 
 if TYPE_CHECKING:

@@ -31,13 +31,13 @@ from residnet.core.ownership import read_regular_file, require_inside, resolve_n
 from residnet.core.progress import ProgressCallback
 from residnet.core.run_loader import SIZE_LIMITS
 from residnet.core.trust import trusting
-from residnet.data.simulated import ManoeuvreRun
+from residnet.evaluation.booklet import build_index_rows
+from residnet.evaluation.metrics import build_metrics_table
 from residnet.heads import HeadConfig
 from residnet.heads.base import FeatureConfig
-from residnet.judge.booklet import build_index_rows
-from residnet.judge.metrics import build_metrics_table
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.manoeuvres.base import Manoeuvre
+from residnet.manoeuvres.trials import ManoeuvreRun
 from residnet.physics.vessel import load_vessel
 from residnet.physics.vessel_file import VesselFile
 from residnet.runs.folder import RunFolder

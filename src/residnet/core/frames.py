@@ -144,3 +144,28 @@ def rotation_angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         Rotation.from_euler("ZYX", np.reshape(attitude, (-1, 3))[:, ::-1]) for attitude in (a, b)
     )
     return np.asarray((rotation_a.inv() * rotation_b).magnitude().reshape(np.shape(a)[:-1]))
+
+
+def unwrap_angle(angle: np.ndarray) -> np.ndarray:
+    """Return the angle [T] in rad made continuous over its finite samples; NaN stay where they are.
+
+    A turn of more than half a circle between two finite samples is ambiguous.
+    """
+    unwrapped = np.asarray(angle, dtype=np.float64).copy()
+    if unwrapped.size and np.abs(np.diff(unwrapped)).max(initial=0.0) < np.pi:
+        # nothing to unwrap, and no sample missing
+        return unwrapped
+    is_finite = np.isfinite(angle)
+    unwrapped[is_finite] = np.unwrap(unwrapped[is_finite])
+    return unwrapped
+
+
+def rotate(
+    x: np.ndarray | float, y: np.ndarray | float, angle: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return vectors [T] turned by angles [T]: from body axes to north and east by the heading.
+
+    Source: document 003 eq. (4); by minus the heading it is the way back.
+    """
+    c, s = np.cos(angle), np.sin(angle)
+    return c * x - s * y, s * x + c * y

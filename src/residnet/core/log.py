@@ -6,7 +6,7 @@ import dataclasses
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -27,6 +27,18 @@ _FIELD_TYPES: dict[str, type | tuple[type, ...]] = {
     **{"epoch": (int, float), "epoch_ns": int},
 }
 """What a file says of itself, and of its `meta` what residnet reads."""
+
+
+Level = Literal["note", "will mislead", "fatal"]
+Remark = dict[str, Any]
+
+
+def make_remark(level: Level, code: str, text: str, **figures: float) -> Remark:
+    """Return a finding of the reader as `Log.meta["findings"]` holds it.
+
+    It has level, code, text and figures (SI).
+    """
+    return {"level": level, "code": code, "text": text, "figures": figures}
 
 
 @dataclass(frozen=True)

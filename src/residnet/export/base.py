@@ -38,7 +38,7 @@ from torch import nn
 
 from residnet.core.errors import ExportError, WithheldError
 from residnet.core.version import __version__
-from residnet.judge.assessment import Assessment
+from residnet.evaluation.assessment import Assessment
 
 NumberArray = npt.NDArray[Any]
 SINGLE_TOLERANCE, DOUBLE_TOLERANCE = 1e-5, 1e-12

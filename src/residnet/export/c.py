@@ -25,9 +25,9 @@ import torch
 
 from residnet.core.errors import ExportError, UsageError
 from residnet.core.progress import log_message
-from residnet.dynamics.c_code import Body, Tables, compiler, literal
-from residnet.dynamics.lowering import in_numbers, lowered
 from residnet.dynamics.store import BandTable
+from residnet.engine.c_code import Body, Tables, compiler, literal
+from residnet.engine.trace import in_numbers, lowered
 from residnet.export.base import (
     Exportable,
     Exporter,

@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from residnet.control.courses.course_plan import Course
-from residnet.control.guidance import CourseGuidance, TrackKeeping
-from residnet.control.heading.policies import MAX_DEPTH, HeadingPolicy
+from residnet.autopilot.courses.course_plan import Course
+from residnet.autopilot.guidance import CourseGuidance, TrackKeeping
+from residnet.autopilot.heading.policies import MAX_DEPTH, HeadingPolicy
 from residnet.core.errors import ExportError
 from residnet.core.version import __version__
 from residnet.dynamics.steering_variation import DEPTH, HEADING

@@ -22,7 +22,7 @@ from torch.jit._trace import TracerWarning
 
 from residnet.core.errors import ExportError
 from residnet.core.files import atomic_write
-from residnet.dynamics.lowering import recorded
+from residnet.engine.trace import recorded
 from residnet.export.base import (
     Exportable,
     Exporter,

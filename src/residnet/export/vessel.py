@@ -20,8 +20,8 @@ from residnet.core.layout import SURGE
 from residnet.core.progress import log_message
 from residnet.core.version import __version__
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout, trace_rollout
 from residnet.dynamics.store import ModelSpec
+from residnet.engine.rollout import Rollout, trace_rollout
 from residnet.export import base
 from residnet.export.base import Exportable, LoadedExport, NumberArray, RoundingError
 from residnet.export.guard import GuardedDynamics, hold_measured

@@ -15,9 +15,23 @@ from residnet.core.arrays import paged
 from residnet.core.errors import FitError
 from residnet.core.progress import begin_stage
 from residnet.core.samples import Samples
-from residnet.data.prepare import PreparedLog, make_samples
-from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.evaluation.band import (
+    Band,
+    BandsConfig,
+    compute_run_weights,
+    conformal_level,
+    effective_sample_size,
+    weighted_quantile,
+)
+from residnet.evaluation.bands import (
+    RunErrors,
+    calibrate_band,
+    compute_run_errors,
+    describe_few_logs,
+)
+from residnet.evaluation.freerun import Candidate, run_free_runs
+from residnet.evaluation.protocol import Window
 from residnet.heads.base import ClosedFormHead
 from residnet.identification.fitter import (
     FittedModel,
@@ -30,17 +44,8 @@ from residnet.identification.identified import (
     spread_member_names,
     trajectory_member_names,
 )
-from residnet.judge.band import (
-    Band,
-    BandsConfig,
-    compute_run_weights,
-    conformal_level,
-    effective_sample_size,
-    weighted_quantile,
-)
-from residnet.judge.bands import RunErrors, calibrate_band, compute_run_errors, describe_few_logs
-from residnet.judge.freerun import Candidate, run_free_runs
-from residnet.judge.protocol import Window
+from residnet.preprocessing.prepare import PreparedLog, make_samples
+from residnet.preprocessing.windows import WindowStore
 from residnet.regression.estimator import Solution
 from residnet.training.left_out import without_logs
 from residnet.training.refit import parametric

@@ -23,7 +23,6 @@ from residnet.core.progress import (
     on_progress,
     report_progress,
 )
-from residnet.data.prepare import PreparedLog
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, restored
 from residnet.heads.base import ClosedFormHead
@@ -33,6 +32,7 @@ from residnet.identification.fitter import FitStore, FittedModel, Fitter
 from residnet.identification.identified import IdentifiedModels
 from residnet.identification.recipe import LONG_TRAINING_DURATION
 from residnet.identification.settings import FitSettings
+from residnet.preprocessing.prepare import PreparedLog
 from residnet.training.config import TrainingConfig
 
 Logs = Mapping[str, Sequence[PreparedLog]]

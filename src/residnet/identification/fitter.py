@@ -23,18 +23,18 @@ from residnet.core.arrays import paged
 from residnet.core.errors import FitError
 from residnet.core.progress import log_message
 from residnet.core.samples import Samples
-from residnet.data.prepare import PreparedLog, compute_training_ranges, make_samples
-from residnet.data.windows import WindowStore
 from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, rebuilt
+from residnet.evaluation.band import Band
+from residnet.evaluation.freerun import Candidate, FreeRunErrors, run_free_runs
+from residnet.evaluation.protocol import EvaluationConfig, make_windows
 from residnet.heads.base import ClosedFormHead
 from residnet.identification.prepared import PreparedSplits, compute_velocity_limits
 from residnet.identification.recipe import TrainingDataSummary
 from residnet.identification.settings import FitSettings
-from residnet.judge.band import Band
-from residnet.judge.freerun import Candidate, FreeRunErrors, run_free_runs
-from residnet.judge.protocol import EvaluationConfig, make_windows
+from residnet.preprocessing.prepare import PreparedLog, compute_training_ranges, make_samples
+from residnet.preprocessing.windows import WindowStore
 from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.sparse import coefficient_to_dict
 from residnet.training.config import TrainingConfig

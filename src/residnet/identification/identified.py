@@ -14,22 +14,15 @@ from torch import Tensor
 from residnet.core.arrays import paged
 from residnet.core.errors import UsageError
 from residnet.core.stretches import find_runs
-from residnet.data.prepare import PreparedLog, compute_channels
-from residnet.data.simulated import SimulatedTrials, build_plant
-from residnet.data.sources import MeasuredLogs
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.simulated import RecordedPlantDynamics
-from residnet.heads.base import ClosedFormHead, EquationHead
-from residnet.identification.fitter import FittedModel, find_reference_names
-from residnet.identification.recipe import ENSEMBLE_NAME, SINGLE_MODEL_NAME
-from residnet.identification.settings import FitSettings
-from residnet.judge.band import BandsByModel
-from residnet.judge.freerun import Candidate, FreeRun, run_free_runs
-from residnet.judge.goodness import OneStepResiduals, build_goodness_table
-from residnet.judge.metrics import ProtocolEvaluation, build_metrics_table
-from residnet.judge.protocol import EvaluationConfig
-from residnet.judge.selection import (
+from residnet.engine.recorded_plant import RecordedPlantDynamics
+from residnet.evaluation.band import BandsByModel
+from residnet.evaluation.freerun import Candidate, FreeRun, run_free_runs
+from residnet.evaluation.goodness import OneStepResiduals, build_goodness_table
+from residnet.evaluation.metrics import ProtocolEvaluation, build_metrics_table
+from residnet.evaluation.protocol import EvaluationConfig
+from residnet.evaluation.selection import (
     Selection,
     SelectionCandidate,
     block_error_shares,
@@ -37,7 +30,14 @@ from residnet.judge.selection import (
     make_selection_blocks,
     select_models,
 )
-from residnet.judge.soundness import SanityFinding, TrainingPoints, check_model
+from residnet.evaluation.soundness import SanityFinding, TrainingPoints, check_model
+from residnet.heads.base import ClosedFormHead, EquationHead
+from residnet.identification.fitter import FittedModel, find_reference_names
+from residnet.identification.recipe import ENSEMBLE_NAME, SINGLE_MODEL_NAME
+from residnet.identification.settings import FitSettings
+from residnet.io.sources import MeasuredLogs
+from residnet.manoeuvres.trials import SimulatedTrials, build_plant
+from residnet.preprocessing.prepare import PreparedLog, compute_channels
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -65,7 +65,7 @@ class SplitEvaluation:
 
     @property
     def metrics_table(self) -> pd.DataFrame:
-        """The rows as a table, see `residnet.judge.metrics.metrics_table`."""
+        """The rows as a table, see `residnet.evaluation.metrics.metrics_table`."""
         return build_metrics_table(self.rows)
 
 
@@ -202,7 +202,7 @@ _DIVERGENCE_CHECKED_SPLITS = ("train", "validation")
 
 
 def model_family(fitted_model: FittedModel) -> str:
-    """Return what a model is, in the words of `residnet.judge.selection.FAMILIES`."""
+    """Return what a model is, in the words of `residnet.evaluation.selection.FAMILIES`."""
     if isinstance(fitted_model.model, MeanOfTrajectories):
         return "ensemble"
     if fitted_model.spec.role != "head":

@@ -25,11 +25,10 @@ from torch import Tensor
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
 from residnet.core.layout import DYNAMIC_STATES, HEADING, DegreesOfFreedom
-from residnet.data.prepare import PreparedLog
-from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
+from residnet.engine.free_runs import compiled
+from residnet.engine.rollout import Rollout
 from residnet.identification.changes import (
     PerturbedDynamics,
     SystemChange,
@@ -38,6 +37,7 @@ from residnet.identification.changes import (
     make_nuisance_changes,
 )
 from residnet.physics.symmetry import get_dof
+from residnet.preprocessing.prepare import PreparedLog
 
 
 def innovation_columns(dof: DegreesOfFreedom) -> dict[str, int]:

@@ -22,7 +22,14 @@ from residnet.core.layout import (
     SWAY,
     DegreesOfFreedom,
 )
-from residnet.data.simulated import (
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec
+from residnet.identification.fitter import FittedModel
+from residnet.manoeuvres.actuated import ActuatedDynamics, GivenActuators, InputShare, commanded
+from residnet.manoeuvres.base import Helm, Manoeuvre
+from residnet.manoeuvres.closed_loop import TurningCircle, Zigzag
+from residnet.manoeuvres.open_loop import AccelerationDeceleration, MultiSine, ThreeTwoOneOne
+from residnet.manoeuvres.trials import (
     DisturbanceConfig,
     ManoeuvreRun,
     SensorsConfig,
@@ -30,13 +37,6 @@ from residnet.data.simulated import (
     TrialEnvironment,
     simulate_manoeuvres,
 )
-from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, commanded
-from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.store import ModelSpec
-from residnet.identification.fitter import FittedModel
-from residnet.manoeuvres.base import Helm, Manoeuvre
-from residnet.manoeuvres.closed_loop import TurningCircle, Zigzag
-from residnet.manoeuvres.open_loop import AccelerationDeceleration, MultiSine, ThreeTwoOneOne
 from residnet.physics.signals import SignalsConfig
 from residnet.training.left_out import LeftOpen
 from residnet.training.refit import RefitConfig, parametric, sensitivities

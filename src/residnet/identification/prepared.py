@@ -14,10 +14,10 @@ from residnet.core.errors import DataError
 from residnet.core.layout import DegreesOfFreedom
 from residnet.core.log import Log
 from residnet.core.progress import log_message
-from residnet.data.masks import UNEXPLAINED_IDLE
-from residnet.data.prepare import PreparedLog, prepare_log
+from residnet.evaluation.protocol import longest_segment_length
 from residnet.identification.settings import FitSettings
-from residnet.judge.protocol import longest_segment_length
+from residnet.preprocessing.masks import UNEXPLAINED_IDLE
+from residnet.preprocessing.prepare import PreparedLog, prepare_log
 from residnet.training.current import estimate_currents, through_water
 
 _MAX_SAMPLES = 500_000
@@ -39,8 +39,8 @@ def prepare_splits(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -
     if settings.prepare.dead_commands == "mask":
         # what explains motion is learned from training and validation logs
         # a config is checked without what only data need
-        from residnet.data.doctor.others import dead_commands
-        from residnet.data.doctor.statistics import LogStatistics
+        from residnet.quality.others import dead_commands
+        from residnet.quality.statistics import LogStatistics
 
         statistics_by_split = {
             split: [LogStatistics(log, signals.input_columns) for log in logs]
@@ -147,7 +147,7 @@ def compute_velocity_limits(
 
     Args:
         lower: smallest training velocities (and inputs, which are not used), [n + m], from robust
-            quantiles (`residnet.data.prepare.envelope`).
+            quantiles (`residnet.preprocessing.prepare.envelope`).
         upper: largest ones, [n + m].
         divergence_factor: the multiple of the largest training value.
     """

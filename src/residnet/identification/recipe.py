@@ -21,12 +21,12 @@ from residnet.core.log import Log
 from residnet.core.names import BOW_WIND_CHANNELS, CHANNEL_UNITS, WIND_INPUTS, azimuth_thrusters
 from residnet.core.samples import Samples
 from residnet.core.stretches import find_runs
-from residnet.data.motion import remove_pauses
-from residnet.data.prepare import PrepareConfig, PreparedLog, prepare_log
 from residnet.dynamics.base import Integrator
-from residnet.judge.protocol import EvaluationConfig, WindowProtocol, longest_segment_length
+from residnet.evaluation.protocol import EvaluationConfig, WindowProtocol, longest_segment_length
 from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
 from residnet.physics.symmetry import get_dof, mirror_channels, violates_symmetry
+from residnet.preprocessing.motion import remove_pauses
+from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, prepare_log
 
 _MIN_RELATIVE_SPREAD = 1e-3
 """Spread of a channel, as a share of its size, below which it tells nothing."""

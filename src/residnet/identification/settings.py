@@ -14,13 +14,13 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.config import Config, validate_config
 from residnet.core.errors import ConfigError
 from residnet.core.names import suggest_name
-from residnet.data.prepare import PrepareConfig
 from residnet.dynamics.base import Integrator
+from residnet.evaluation.band import BandsConfig
+from residnet.evaluation.protocol import EvaluationConfig
 from residnet.heads import HeadConfig
 from residnet.identification.recipe import PART_KEYS, TrainingDataSummary, make_portfolio
-from residnet.judge.band import BandsConfig
-from residnet.judge.protocol import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
+from residnet.preprocessing.prepare import PrepareConfig
 from residnet.training.config import TrainingConfig
 from residnet.training.current import CurrentConfig
 from residnet.training.refit import RefitConfig

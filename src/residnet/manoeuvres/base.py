@@ -21,7 +21,7 @@ from torch import Tensor
 from residnet.core.config import Config, Radians, Seconds
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
-from residnet.dynamics.rollout import Source
+from residnet.engine.rollout import Source
 from residnet.physics.actuators import ForceActuators, ForceCommands
 from residnet.physics.plant import HullPlant, Plant
 

@@ -11,10 +11,10 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.control.base import ClosedLoop
-from residnet.control.guidance import LookAheadLineOfSight, WaypointGuidance
-from residnet.control.heading.classical import HeadingPD
-from residnet.control.motion import (
+from residnet.autopilot.base import ClosedLoop
+from residnet.autopilot.guidance import LookAheadLineOfSight, WaypointGuidance
+from residnet.autopilot.heading.classical import HeadingPD
+from residnet.autopilot.motion import (
     AllocatedPolicy,
     MotionPIDConfig,
     ReferenceFilterConfig,
@@ -25,7 +25,7 @@ from residnet.core.errors import UsageError
 from residnet.core.frames import wrap_angle_array
 from residnet.core.layout import HEADING, MOTION, PLANAR_LAYOUT, POSE
 from residnet.core.log import Log
-from residnet.dynamics.rollout import Source
+from residnet.engine.rollout import Source
 from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
 
 _POSE = PLANAR_LAYOUT.pose

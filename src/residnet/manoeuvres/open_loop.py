@@ -20,7 +20,7 @@ from residnet.core.config import Config, ExistingPath, Hertz, Seconds
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import STATE_NAMES, VELOCITY_NAMES, suggest_name
-from residnet.dynamics.rollout import Source
+from residnet.engine.rollout import Source
 from residnet.manoeuvres.base import (
     Helm,
     Manoeuvre,

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from residnet.judge.soundness import read_sanity_findings
+from residnet.evaluation.soundness import read_sanity_findings
 from residnet.report.blocks import Section
 from residnet.report.figure import Figure
 from residnet.report.figure_files import read_figures, write_figures

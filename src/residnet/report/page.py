@@ -14,7 +14,7 @@ from markupsafe import Markup, escape
 
 from residnet.core.files import atomic_write
 from residnet.core.format import format_exponents
-from residnet.judge.verdict import LEVEL_TEXTS
+from residnet.evaluation.verdict import LEVEL_TEXTS
 from residnet.report.blocks import (
     EXPORTS,
     Block,

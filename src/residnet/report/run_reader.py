@@ -20,9 +20,9 @@ from residnet.core.layout import SIX_DOF_LAYOUT, SURGE_SWAY_YAW, DegreesOfFreedo
 from residnet.core.names import CHANNEL_UNITS, POSE_ERROR_UNITS, to_si
 from residnet.core.run_loader import read_json_value, require_listed
 from residnet.core.units import canonical_unit
-from residnet.judge.assessment import Assessment
-from residnet.judge.metrics import INPUT_PREFIX, state_column_names
-from residnet.judge.verdict import order_protocols
+from residnet.evaluation.assessment import Assessment
+from residnet.evaluation.metrics import INPUT_PREFIX, state_column_names
+from residnet.evaluation.verdict import order_protocols
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,8 +9,8 @@ from torch import nn
 
 from residnet.core.files import read_json
 from residnet.dynamics.store import Stored, load_model, model_names, read_weights, save_model
+from residnet.evaluation.band import read_bands
 from residnet.identification.fitter import FitStore, FittedModel
-from residnet.judge.band import read_bands
 from residnet.runs.folder import RunFolder, verify_checksums, write_checksums
 
 

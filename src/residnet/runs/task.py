@@ -141,7 +141,7 @@ class TaskOutcome:
         table: text for the terminal; empty for none.
         failure: a line where a result fails a check; the run is complete, and ends as a `DataError`
             with this line.
-        level: of the verdict, of `residnet.judge.verdict.LEVELS`; empty where none was passed.
+        level: of the verdict, of `residnet.evaluation.verdict.LEVELS`; empty where none was passed.
         exports: what writes each model for controllers once the report stands, by its name; one
             that fails is reported, and the complete run ends as an `ExportError`. One that is
             withheld is reported alone.

@@ -12,9 +12,9 @@ from residnet.core.errors import UsageError
 from residnet.core.layout import SURGE
 from residnet.core.names import STATE_NAMES
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import RecordedPlantDynamics
 from residnet.dynamics.store import chosen_model, load_model
+from residnet.engine.recorded_plant import RecordedPlantDynamics
+from residnet.engine.rollout import Rollout
 from residnet.export.guard import GuardedDynamics
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel

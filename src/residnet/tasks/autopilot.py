@@ -9,8 +9,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self, final
 import torch
 from pydantic import Field, model_validator
 
-from residnet.control.heading.conditions import ConditionsConfig, TuningConfig
-from residnet.control.heading.controllers import (
+from residnet.autopilot.heading.conditions import ConditionsConfig, TuningConfig
+from residnet.autopilot.heading.controllers import (
     BangBangConfig,
     ClassicalController,
     DepthConfig,
@@ -22,20 +22,20 @@ from residnet.control.heading.controllers import (
     TunableConfig,
     angle_law_of,
 )
-from residnet.control.heading.turning import NomotoModel
-from residnet.control.heading.vessels import SteeredModel, SteeredPlant
+from residnet.autopilot.heading.turning import NomotoModel
+from residnet.autopilot.heading.vessels import SteeredModel, SteeredPlant
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Seconds
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.progress import log_message
-from residnet.data.simulated import DisturbanceConfig, WindConfig
-from residnet.documents.gouletas2020.law import DocumentConfig, PredictiveConfig
 from residnet.dynamics.simulated import check_steps
 from residnet.dynamics.steering_variation import DEPTH, HEADING, Axis
 from residnet.dynamics.store import chosen_model, load_model
+from residnet.manoeuvres.trials import DisturbanceConfig, WindConfig
 from residnet.physics.environment import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, ExportRequest, PartName, TaskOutcome
+from residnet.studies.gouletas2020.law import DocumentConfig, PredictiveConfig
 from residnet.training.policies.config import PolicyTraining
 
 AnyController = Annotated[ClassicalController | DocumentConfig, Field(discriminator="kind")]

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 import torch
 
-from residnet.control.base import Policy
-from residnet.control.heading.conditions import (
+from residnet.autopilot.base import Policy
+from residnet.autopilot.heading.conditions import (
     ClosedLoopSimulation,
     ConditionsConfig,
     noise_free,
@@ -19,7 +19,7 @@ from residnet.control.heading.conditions import (
     simulate_heading_steps,
     tune_parameters,
 )
-from residnet.control.heading.controllers import (
+from residnet.autopilot.heading.controllers import (
     ControlTask,
     DepthConfig,
     ObservedConfig,
@@ -28,14 +28,12 @@ from residnet.control.heading.controllers import (
     angle_law_of,
     load_recurrent,
 )
-from residnet.control.heading.policies import SIGHT_CONSTANTS, DepthPolicy, ObservedPolicy
-from residnet.control.heading.vessels import SteeredPlant
+from residnet.autopilot.heading.policies import SIGHT_CONSTANTS, DepthPolicy, ObservedPolicy
+from residnet.autopilot.heading.vessels import SteeredPlant
 from residnet.core.progress import begin_stage, log_message, report_progress
-from residnet.documents.gouletas2020.autopilot import train_or_resume_controller
-from residnet.dynamics.compiled import CompiledRollout
 from residnet.dynamics.store import rebuilt
-from residnet.export.policy import ExportedHeading
-from residnet.judge.autopilots import (
+from residnet.engine.compiled import CompiledRollout
+from residnet.evaluation.autopilots import (
     METRIC_UNITS,
     N_QUIET_RUNS,
     build_sea_row,
@@ -54,7 +52,8 @@ from residnet.judge.autopilots import (
     simulate_steps_in_waves,
     simulate_steps_in_wind,
 )
-from residnet.judge.metrics import SCHEMA
+from residnet.evaluation.metrics import SCHEMA
+from residnet.export.policy import ExportedHeading
 from residnet.physics.vessel import load_vessel
 from residnet.report.sections.autopilot import (
     CONDITIONS_FILE,
@@ -69,6 +68,7 @@ from residnet.report.sections.autopilot import (
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import RunModelStore
 from residnet.runs.task import ExportRequest, SummaryMetric, TaskOutcome
+from residnet.studies.gouletas2020.autopilot import train_or_resume_controller
 from residnet.training.policies.fit import train_policy
 
 if TYPE_CHECKING:

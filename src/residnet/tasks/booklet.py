@@ -13,8 +13,14 @@ from residnet.core.errors import ConfigError, DataError
 from residnet.core.layout import ROLL_LAYOUT
 from residnet.core.log import Log
 from residnet.core.names import STATE_NAMES, suggest_name
-from residnet.data.prepare import PreparedLog
-from residnet.data.simulated import (
+from residnet.dynamics.ensemble import SampledDynamics
+from residnet.evaluation.booklet import BookletConfig, BookletPage, build_booklet
+from residnet.identification.fitter import FittedModel
+from residnet.manoeuvres.actuated import ActuatedDynamics, GivenActuators, InputShare
+from residnet.manoeuvres.base import Helm, Manoeuvre
+from residnet.manoeuvres.closed_loop import Zigzag
+from residnet.manoeuvres.indices import identify_zigzag
+from residnet.manoeuvres.trials import (
     DisturbanceConfig,
     ManoeuvreRun,
     SensorsConfig,
@@ -23,13 +29,7 @@ from residnet.data.simulated import (
     make_manoeuvre_source,
     simulate_manoeuvres,
 )
-from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare
-from residnet.dynamics.ensemble import SampledDynamics
-from residnet.identification.fitter import FittedModel
-from residnet.judge.booklet import BookletConfig, BookletPage, build_booklet
-from residnet.manoeuvres.base import Helm, Manoeuvre
-from residnet.manoeuvres.closed_loop import Zigzag
-from residnet.manoeuvres.indices import identify_zigzag
+from residnet.preprocessing.prepare import PreparedLog
 from residnet.runs.folder import RunFolder
 
 _PARAMETER_PATH = "model.baseline.theta"

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from pydantic import Field, model_validator
 
-from residnet.control.courses.config import BuoyCourseConfig, plan_course, smallest_turn
-from residnet.control.courses.course_check import Protocol
-from residnet.control.guidance import AnyLineOfSight
+from residnet.autopilot.courses.config import BuoyCourseConfig, plan_course, smallest_turn
+from residnet.autopilot.courses.course_check import Protocol
+from residnet.autopilot.guidance import AnyLineOfSight
 from residnet.core.config import (
     Config,
     ExistingPath,

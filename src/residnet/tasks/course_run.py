@@ -13,16 +13,16 @@ import torch
 from pydantic import TypeAdapter
 from torch import Tensor
 
-from residnet.control.base import ClosedLoop, Policy, Reference
-from residnet.control.courses.config import (
+from residnet.autopilot.base import ClosedLoop, Policy, Reference
+from residnet.autopilot.courses.config import (
     PlannedCourse,
     buoy_feasibility,
     plan_course,
     smallest_turn,
 )
-from residnet.control.courses.course_check import Protocol
-from residnet.control.courses.turns import SteadyTurn
-from residnet.control.guidance import (
+from residnet.autopilot.courses.course_check import Protocol
+from residnet.autopilot.courses.turns import SteadyTurn
+from residnet.autopilot.guidance import (
     AnyLineOfSight,
     CourseGuidance,
     DriftEstimate,
@@ -30,22 +30,22 @@ from residnet.control.guidance import (
     WaypointGuidance,
     WheelOver,
 )
-from residnet.control.heading.controllers import ControlTask
-from residnet.control.heading.policies import HeadingPolicy
-from residnet.control.heading.turning import NomotoModel
+from residnet.autopilot.heading.controllers import ControlTask
+from residnet.autopilot.heading.policies import HeadingPolicy
+from residnet.autopilot.heading.turning import NomotoModel
 from residnet.core.errors import ExportError
 from residnet.core.files import read_json
 from residnet.core.progress import log_message
-from residnet.documents.gouletas2020.autopilot import load_predictive_controller
-from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import InAmbientCurrent
 from residnet.dynamics.steering_variation import NOMINAL, Vessels
+from residnet.engine.rollout import Rollout
+from residnet.evaluation.autopilots import CourseRun, build_course_row, build_ensemble_row
+from residnet.evaluation.metrics import SCHEMA
 from residnet.export.policy import ExportedCoursePolicy
-from residnet.judge.autopilots import CourseRun, build_course_row, build_ensemble_row
-from residnet.judge.metrics import SCHEMA
 from residnet.report.sections.course import COURSES_FILE, SPREAD_FILE, TRACKS_FILE, tables_text
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ExportRequest, SummaryMetric, TaskOutcome
+from residnet.studies.gouletas2020.autopilot import load_predictive_controller
 from residnet.tasks.autopilot import AnyController, AutopilotConfig
 from residnet.tasks.autopilot_run import load_trained_policy
 

@@ -15,7 +15,7 @@ from residnet.core.files import atomic_write
 from residnet.core.log import Log
 from residnet.core.ownership import Manifest, record_folder
 from residnet.core.progress import report_progress
-from residnet.data.simulated import SimulatedTrials, simulate_trial_logs
+from residnet.manoeuvres.trials import SimulatedTrials, simulate_trial_logs
 
 if TYPE_CHECKING:
     import pandas as pd

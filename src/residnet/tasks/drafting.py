@@ -30,25 +30,25 @@ from residnet.core.names import (
 )
 from residnet.core.ownership import require_replaceable
 from residnet.core.progress import log_message
-from residnet.data.doctor import inspect_log
-from residnet.data.drafting.channels import CHANNELS_KEY
-from residnet.data.drafting.questions import AnswerCallback, DraftNotes, dump_commented_yaml
-from residnet.data.drafting.reading import INPUTS_KEY, find_log_files, read_drafted
-from residnet.data.drafting.words import (
-    PLANE_PATTERN,
-    match_input_channel,
-    match_state_channel,
-    parse_name,
-)
-from residnet.data.motion import MotionConfig, complete_motion
-from residnet.data.readers.quantities import COSINE_SUFFIX, QUATERNION, SINE_SUFFIX
-from residnet.data.split import (
+from residnet.io.drafting.channels import CHANNELS_KEY
+from residnet.io.drafting.questions import AnswerCallback, DraftNotes, dump_commented_yaml
+from residnet.io.drafting.reading import INPUTS_KEY, find_log_files, read_drafted
+from residnet.io.readers.quantities import COSINE_SUFFIX, QUATERNION, SINE_SUFFIX
+from residnet.io.split import (
     SPLITS,
     extract_segment,
     remove_copies,
     split_logs,
     splits_from_names,
 )
+from residnet.io.words import (
+    PLANE_PATTERN,
+    match_input_channel,
+    match_state_channel,
+    parse_name,
+)
+from residnet.preprocessing.motion import MotionConfig, complete_motion
+from residnet.quality import inspect_log
 
 _UNMATCHED_COLUMN_NOTES = (
     "columns that no channel takes",
@@ -370,8 +370,8 @@ class _DraftLogs:
         self, columns: Sequence[str], preparation: Mapping[str, Any]
     ) -> dict[Path, Log]:
         """Return the logs that can be prepared; the others are left out with the reason."""
-        from residnet.data.prepare import PrepareConfig
         from residnet.identification.recipe import longest_usable_duration
+        from residnet.preprocessing.prepare import PrepareConfig
 
         config = validate_config(dict(preparation), PrepareConfig, "draft")
         self.longest_gapless_time = lambda log: longest_usable_duration(

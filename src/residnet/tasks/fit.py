@@ -14,10 +14,14 @@ from residnet.core.config import Config, dump_config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import suggest_name
 from residnet.core.progress import begin_stage, log_message
-from residnet.data.simulated import SimulatedTrials, make_dummy_logs
-from residnet.data.sources import DataConfig, LogsBySplit, list_input_files, read_split_logs
-from residnet.documents import STUDY_MODELS, StudyName, build_study_sections
 from residnet.dynamics.store import load_model, model_names
+from residnet.evaluation.band import bands_content
+from residnet.evaluation.booklet import BookletConfig
+from residnet.evaluation.goodness import build_goodness_content
+from residnet.evaluation.soundness import build_sanity_content
+from residnet.evaluation.verdict import list_model_objections
+from residnet.evaluation.verdict import rate_model as verdict_level
+from residnet.evaluation.verdict import write_verdict as verdict_sentences
 from residnet.export.vessel import ExportedVessel
 from residnet.identification.fit import fit_models
 from residnet.identification.fitter import FittedModel, check_fit
@@ -34,19 +38,15 @@ from residnet.identification.prepared import (
     prepare_splits,
 )
 from residnet.identification.settings import FitSettings, check_known_names
-from residnet.judge.band import bands_content
-from residnet.judge.booklet import BookletConfig
-from residnet.judge.goodness import build_goodness_content
-from residnet.judge.soundness import build_sanity_content
-from residnet.judge.verdict import list_model_objections
-from residnet.judge.verdict import rate_model as verdict_level
-from residnet.judge.verdict import write_verdict as verdict_sentences
+from residnet.io.sources import DataConfig, LogsBySplit, list_input_files, read_split_logs
+from residnet.manoeuvres.trials import SimulatedTrials, make_dummy_logs
 from residnet.report.blocks import Section
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.verdict import collect_evidence
 from residnet.runs.folder import Provenance, RunFolder, require_apart
 from residnet.runs.model_store import RunModelStore
 from residnet.runs.task import ComputingTask, ExportRequest, FinishedRun, TaskOutcome
+from residnet.studies import STUDY_MODELS, StudyName, build_study_sections
 from residnet.tasks.booklet import require_flyable, write_booklet
 from residnet.tasks.fit_outcome import (
     EXTERNAL_SPLIT,

@@ -11,17 +11,17 @@ import numpy as np
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, POSE_ERROR_UNITS, si_unit
 from residnet.core.progress import begin_stage, log_message
-from residnet.data.drafting.reading import find_log_files
-from residnet.data.masks import SpikeMask
-from residnet.data.prepare import PreparedLog, prepare_log
-from residnet.data.readers.base import CanonicalConfig
-from residnet.data.simulated import SimulatedTrials
-from residnet.data.split import assign_log_names
 from residnet.dynamics.store import ModelSpec
+from residnet.evaluation.goodness import assess_repeatability
+from residnet.evaluation.metrics import LIMITS_SCHEMA, build_metrics_content, write_rollouts
 from residnet.identification.identified import SplitEvaluation
 from residnet.identification.prepared import compute_velocity_limits
-from residnet.judge.goodness import assess_repeatability
-from residnet.judge.metrics import LIMITS_SCHEMA, build_metrics_content, write_rollouts
+from residnet.io.drafting.reading import find_log_files
+from residnet.io.readers.base import CanonicalConfig
+from residnet.io.split import assign_log_names
+from residnet.manoeuvres.trials import SimulatedTrials
+from residnet.preprocessing.masks import SpikeMask
+from residnet.preprocessing.prepare import PreparedLog, prepare_log
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.free_runs import errors_table
 from residnet.report.sections.verdict import verdict_level, verdict_sentences
@@ -40,7 +40,7 @@ def write_inspection(
 ) -> None:
     """Write doctor.json: what the doctor finds in all logs as the run's masks leave them."""
     # a check does not wait for the doctor
-    from residnet.data.doctor import (
+    from residnet.quality import (
         build_inspection,
         inspect_log,
         inspect_log_set,

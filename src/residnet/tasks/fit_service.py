@@ -21,8 +21,7 @@ from residnet.core.layout import SIX_DOF_LAYOUT
 from residnet.core.names import suggest_name
 from residnet.core.ownership import record_folder
 from residnet.core.progress import log_message
-from residnet.data.prepare import make_samples
-from residnet.data.windows import WindowStore
+from residnet.evaluation.metrics import find_row
 from residnet.identification.identified import evaluate_splits, make_candidates
 from residnet.identification.monitoring import (
     ChangeDetector,
@@ -47,7 +46,8 @@ from residnet.identification.recursive_refit import (
     make_refitted_model,
     refit_recursively,
 )
-from residnet.judge.metrics import find_row
+from residnet.preprocessing.prepare import make_samples
+from residnet.preprocessing.windows import WindowStore
 from residnet.report.blocks import Section, Table, build_table, flag_cell
 from residnet.report.figure import (
     DASHED_STYLE,

@@ -17,9 +17,9 @@ from residnet.core.format import display_unit, format_integer, format_minus_sign
 from residnet.core.log import Log
 from residnet.core.names import suggest_name
 from residnet.core.progress import report_progress
-from residnet.data.readers import ReaderConfig
-from residnet.data.readers.base import list_files
-from residnet.data.split import assign_log_names
+from residnet.io.readers import ReaderConfig
+from residnet.io.readers.base import list_files
+from residnet.io.split import assign_log_names
 from residnet.report.blocks import Block, Bullets, Section, Table, Text, build_table, flag_cell
 from residnet.report.figure import (
     MAX_PREVIEW_HEIGHT,

@@ -14,7 +14,10 @@ from residnet.core.errors import ConfigError, DataError, ResidnetError, UsageErr
 from residnet.core.files import write_owned
 from residnet.core.log import Log
 from residnet.core.progress import report_progress
-from residnet.data.doctor import (
+from residnet.io.drafting.questions import dump_commented_yaml
+from residnet.io.drafting.reading import find_log_files, read_mixed_formats
+from residnet.io.split import assign_log_names
+from residnet.quality import (
     Finding,
     InspectionReport,
     build_inspection,
@@ -24,9 +27,6 @@ from residnet.data.doctor import (
     inspect_log_set,
     summarize_inspection,
 )
-from residnet.data.drafting.questions import dump_commented_yaml
-from residnet.data.drafting.reading import find_log_files, read_mixed_formats
-from residnet.data.split import assign_log_names
 
 if TYPE_CHECKING:
     from residnet.tasks.fit import FitConfig
@@ -147,7 +147,7 @@ def _load_logs_task(config: Path) -> tuple[Any, FitConfig | None]:
         ConfigError: where it is no config of logs.
     """
     # logs that need no config need neither models nor torch
-    from residnet.data.sources import MeasuredLogs
+    from residnet.io.sources import MeasuredLogs
     from residnet.tasks.fit import FitConfig
     from residnet.tasks.import_logs import ImportConfig
     from residnet.tasks.registry import load_task
@@ -164,7 +164,7 @@ def _load_logs_task(config: Path) -> tuple[Any, FitConfig | None]:
 
 def _split_of_logs(fit_config: FitConfig, names: Mapping[Path, str]) -> dict[str, str]:
     """Return the split of each log that the config names."""
-    from residnet.data.sources import MeasuredLogs
+    from residnet.io.sources import MeasuredLogs
 
     assert isinstance(fit_config.data, MeasuredLogs)
     try:
@@ -183,7 +183,7 @@ def _split_of_logs(fit_config: FitConfig, names: Mapping[Path, str]) -> dict[str
 def _check_regressor_conditioning(logs: Sequence[Log], fit_config: FitConfig) -> list[Finding]:
     """Return how well the prepared logs condition the regressors of each baseline."""
     from residnet.baselines.regressors import RegressorBaseline
-    from residnet.data.prepare import make_samples, prepare_log
+    from residnet.preprocessing.prepare import make_samples, prepare_log
 
     try:
         signals = fit_config.signals

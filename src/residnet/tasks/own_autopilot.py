@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 from pydantic import Field
 
-from residnet.control.heading.turning import (
+from residnet.autopilot.heading.turning import (
     ManoeuvreRecord,
     NomotoModel,
     SteeringResponse,
@@ -32,10 +32,10 @@ from residnet.core.files import write_owned
 from residnet.core.log import Log
 from residnet.core.ownership import require_replaceable
 from residnet.core.progress import log_message
-from residnet.data.channels import estimate_noise_std
-from residnet.data.drafting.questions import DraftNotes
-from residnet.data.drafting.reading import find_log_files, read_drafted
-from residnet.data.motion import MotionConfig, complete_motion
+from residnet.io.drafting.questions import DraftNotes
+from residnet.io.drafting.reading import find_log_files, read_drafted
+from residnet.preprocessing.channel_values import estimate_noise_std
+from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.tasks.autopilot import REFERENCE_STEERING, minimum_turn_time
 from residnet.tasks.registry import open_finished_task
 

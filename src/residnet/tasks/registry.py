@@ -31,15 +31,15 @@ from residnet.core.registry import (
     list_parts,
 )
 from residnet.core.run_loader import SIZE_LIMITS, name_damaged_key
-from residnet.data.readers import ReaderConfig
 from residnet.export import EXPORT_FORMATS
 from residnet.heads import HeadConfig
+from residnet.io.readers import ReaderConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.report.blocks import build_table
 from residnet.runs.folder import RunFolder, require_recorded, write_checksums
 from residnet.runs.task import Task
 
-_TASK_BASE, _DOCUMENTS = "residnet.runs.task:Task", "residnet.documents"
+_TASK_BASE, _DOCUMENTS = "residnet.runs.task:Task", "residnet.studies"
 SINGLE_TASKS = {
     "fit": "residnet.tasks.fit:FitConfig",
     "import": "residnet.tasks.import_logs:ImportConfig",

@@ -17,9 +17,22 @@ from residnet.core.errors import ConfigError, UsageError
 from residnet.core.files import make_file_stem
 from residnet.core.names import CHANNEL_UNITS, suggest_name
 from residnet.core.progress import log_message
-from residnet.data.readers import ReaderConfig
-from residnet.data.readers.base import CanonicalConfig
-from residnet.data.simulated import (
+from residnet.dynamics.simulated import check_steps
+from residnet.dynamics.store import chosen_model, load_model
+from residnet.engine.recorded_plant import RecordedPlantDynamics
+from residnet.evaluation.booklet import build_index_rows, build_index_table
+from residnet.io.readers import ReaderConfig
+from residnet.io.readers.base import CanonicalConfig
+from residnet.manoeuvres import FamilyConfig, ManoeuvreConfig
+from residnet.manoeuvres.actuated import (
+    ActuatedDynamics,
+    GivenActuators,
+    InputShare,
+    PlantActuators,
+)
+from residnet.manoeuvres.base import Helm, Manoeuvre
+from residnet.manoeuvres.open_loop import Replay
+from residnet.manoeuvres.trials import (
     DisturbanceConfig,
     ManoeuvreRun,
     SensorsConfig,
@@ -34,13 +47,6 @@ from residnet.data.simulated import (
     simulate_manoeuvres,
     simulate_trials,
 )
-from residnet.dynamics.actuated import ActuatedDynamics, GivenActuators, InputShare, PlantActuators
-from residnet.dynamics.simulated import RecordedPlantDynamics, check_steps
-from residnet.dynamics.store import chosen_model, load_model
-from residnet.judge.booklet import build_index_rows, build_index_table
-from residnet.manoeuvres import FamilyConfig, ManoeuvreConfig
-from residnet.manoeuvres.base import Helm, Manoeuvre
-from residnet.manoeuvres.open_loop import Replay
 from residnet.physics.vessel import load_vessel
 from residnet.report.figure_files import write_figures
 from residnet.report.sections.manoeuvres import indices_text, trial_figures

@@ -18,7 +18,7 @@ from residnet.core.format import format_count, format_signed
 from residnet.core.names import suggest_name
 from residnet.core.processes import process_pool
 from residnet.core.progress import report_progress
-from residnet.judge.metrics import bootstrap_intervals, make_resampling_blocks
+from residnet.evaluation.metrics import bootstrap_intervals, make_resampling_blocks
 from residnet.report.blocks import (
     Cell,
     Column,

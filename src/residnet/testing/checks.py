@@ -27,9 +27,23 @@ from residnet.core.log import Log
 from residnet.core.names import si_unit
 from residnet.core.registry import get_kind
 from residnet.core.samples import Samples
-from residnet.data.prepare import PrepareConfig, make_samples, prepare_log
-from residnet.data.readers.base import LogReader
-from residnet.data.simulated import (
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.simulated import PlantDynamics
+from residnet.dynamics.store import ModelSpec, load_model, save_model
+from residnet.engine.recorded_plant import RecordedPlantDynamics
+from residnet.engine.rollout import Rollout
+from residnet.export.base import Exporter
+from residnet.export.guard import GuardedDynamics
+from residnet.export.torchscript import trace_function
+from residnet.export.vessel import ExportedVessel
+from residnet.heads import HeadConfig
+from residnet.heads.base import ClosedFormHead, FeatureConfig
+from residnet.heads.linear import RidgeConfig
+from residnet.heads.lstm import LstmConfig
+from residnet.io.readers.base import LogReader
+from residnet.manoeuvres import ManoeuvreConfig
+from residnet.manoeuvres.base import Helm, Manoeuvre
+from residnet.manoeuvres.trials import (
     DisturbanceConfig,
     ManoeuvreRun,
     SensorsConfig,
@@ -40,23 +54,10 @@ from residnet.data.simulated import (
     simulate_manoeuvres,
     simulate_trials,
 )
-from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
-from residnet.dynamics.simulated import PlantDynamics, RecordedPlantDynamics
-from residnet.dynamics.store import ModelSpec, load_model, save_model
-from residnet.export.base import Exporter
-from residnet.export.guard import GuardedDynamics
-from residnet.export.torchscript import trace_function
-from residnet.export.vessel import ExportedVessel
-from residnet.heads import HeadConfig
-from residnet.heads.base import ClosedFormHead, FeatureConfig
-from residnet.heads.linear import RidgeConfig
-from residnet.heads.lstm import LstmConfig
-from residnet.manoeuvres import ManoeuvreConfig
-from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import get_dof
 from residnet.physics.vessel import load_vessel
+from residnet.preprocessing.prepare import PrepareConfig, make_samples, prepare_log
 
 EXAMPLE_SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").with_thrusters()
 """Inputs of the example models: the revolutions of two propellers, and the forces they make."""

@@ -11,7 +11,7 @@ from residnet.core.config import Config, Seconds
 from residnet.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from residnet.data.windows import WindowStage
+    from residnet.preprocessing.windows import WindowStage
 
 
 def falling(rate: float, final: float, epoch: int, epochs: int) -> float:
@@ -251,7 +251,7 @@ class TrainingConfig(MachineConfig):
 
     def windows(self, dt: float) -> list[WindowStage | None]:
         """Return the windows of each stage at a step of dt seconds; None for one without epochs."""
-        from residnet.data.windows import WindowStage
+        from residnet.preprocessing.windows import WindowStage
 
         def begun(batch: int) -> int:
             """Windows of a batch that begin with a stretch."""

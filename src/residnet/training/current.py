@@ -21,8 +21,8 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.config import Config, MetresPerSecond
 from residnet.core.errors import FitError
 from residnet.core.layout import HEADING, POSITION, VELOCITIES, YAW_RATE
-from residnet.data.prepare import PreparedLog, make_samples
 from residnet.physics.signals import Signals
+from residnet.preprocessing.prepare import PreparedLog, make_samples
 
 _ROUNDS = 4
 """Most rounds of search and descent; one that gains nothing ends them."""

@@ -14,15 +14,15 @@ from residnet.baselines.given import FixedBaseline
 from residnet.core.arrays import paged
 from residnet.core.columns import all_but_pose, dynamic_states, pose
 from residnet.core.samples import Samples
-from residnet.data.module import WindowBatch, WindowsDataModule
-from residnet.data.windows import WindowStore
 from residnet.dynamics.base import Integrator
-from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import MANY, FreeRun, Rollout
+from residnet.engine.free_runs import compiled
+from residnet.engine.rollout import MANY, FreeRun, Rollout
 from residnet.heads.recurrent import GRUEnsembleHead
 from residnet.physics.signals import Signals
 from residnet.physics.symmetry import get_axis_parities, mirror_channels
+from residnet.preprocessing.data_module import WindowBatch, WindowsDataModule
+from residnet.preprocessing.windows import WindowStore
 from residnet.training.config import TrainingConfig
 from residnet.training.score import Score
 from residnet.training.trainer import EpochTraining, run_epochs

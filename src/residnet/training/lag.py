@@ -12,7 +12,7 @@ import scipy
 import torch
 from torch import Tensor
 
-from residnet.control.motion import ActuatorLag
+from residnet.autopilot.motion import ActuatorLag
 from residnet.core.errors import FitError
 
 _LEAST, _MOST = np.array([0.1, 0.1, 0.0]), np.array([30.0, 3.0, 2.0])

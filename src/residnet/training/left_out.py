@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from residnet.core.samples import Samples
-from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.preprocessing.windows import WindowStore
 from residnet.training.refit import (
     Problem,
     RefitConfig,

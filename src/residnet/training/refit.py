@@ -23,12 +23,12 @@ from residnet.core.columns import all_but_pose, pose
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
-from residnet.data.channels import estimate_noise_std
-from residnet.data.windows import WindowStore
-from residnet.dynamics.free_runs import compiled
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.jacobian import StepJacobian
-from residnet.dynamics.rollout import Rollout
+from residnet.engine.free_runs import compiled
+from residnet.engine.jacobian import StepJacobian
+from residnet.engine.rollout import Rollout
+from residnet.preprocessing.channel_values import estimate_noise_std
+from residnet.preprocessing.windows import WindowStore
 from residnet.regression.least_squares import DescentResult, minimize_levenberg_marquardt
 
 _ROWS_PER_BATCH = 1_024  # Jacobians held in memory at once

@@ -25,7 +25,7 @@ from residnet.core.errors import FitError, UsageError
 from residnet.core.files import atomic_write
 from residnet.core.ownership import find_run_manifest, require_inside
 from residnet.core.progress import report_progress
-from residnet.data.module import EpochDataModule, compute_epoch_seed
+from residnet.preprocessing.data_module import EpochDataModule, compute_epoch_seed
 from residnet.training.config import MachineConfig, OneStage, TrainingConfig
 from residnet.training.score import Shown
 

@@ -11,8 +11,8 @@ import torch
 
 from residnet.core.errors import DataError
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
+from residnet.engine.rollout import Rollout
 from residnet.identification.changes import PerturbedDynamics, SystemChange
 from residnet.identification.monitoring import (
     ChangeDetector,

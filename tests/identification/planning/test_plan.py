@@ -9,9 +9,6 @@ from made_system import LINEAR, SCALES, STEP, model_of, trials
 
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.errors import DataError, UsageError
-from residnet.data.prepare import compute_training_ranges, make_samples
-from residnet.data.windows import WindowStore
-from residnet.dynamics.actuated import InputShare
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.fitter import FittedModel
 from residnet.identification.planning import (
@@ -24,8 +21,11 @@ from residnet.identification.planning import (
     plan_trials,
     update_covariance,
 )
+from residnet.manoeuvres.actuated import InputShare
 from residnet.manoeuvres.open_loop import ConstantInput
 from residnet.physics.signals import SignalsConfig
+from residnet.preprocessing.prepare import compute_training_ranges, make_samples
+from residnet.preprocessing.windows import WindowStore
 from residnet.training.left_out import LeftOpen, left_open
 from residnet.training.refit import RefitConfig, refit
 

@@ -9,15 +9,15 @@ from typing import Literal, final
 import numpy as np
 
 from residnet.core.errors import DataError
+from residnet.core.frames import unwrap_angle
 from residnet.core.log import Log
-from residnet.data.readers.base import (
+from residnet.io.readers.base import (
     LogReader,
     ReaderKind,
     describe_provenance,
     require_file,
     require_increasing,
     require_samples,
-    unwrap_angle,
 )
 
 _KNOT = 1852.0 / 3600.0

@@ -17,7 +17,7 @@ from residnet.core.format import (
     format_signed,
     join_list,
 )
-from residnet.judge.verdict import describe_divergence, format_pose_error
+from residnet.evaluation.verdict import describe_divergence, format_pose_error
 from residnet.report.blocks import (
     Block,
     Bullets,

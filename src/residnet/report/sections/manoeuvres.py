@@ -20,10 +20,10 @@ from residnet.core.format import (
     format_number,
 )
 from residnet.core.log import Log
-from residnet.data.simulated import ManoeuvreRun
 from residnet.manoeuvres.closed_loop import Spiral, Zigzag
 from residnet.manoeuvres.courses import Waypoints
 from residnet.manoeuvres.open_loop import Replay
+from residnet.manoeuvres.trials import ManoeuvreRun
 from residnet.report.blocks import (
     Block,
     Bullets,

@@ -20,7 +20,7 @@ from residnet.core.format import (
 )
 from residnet.core.format import format_integer as whole_number
 from residnet.core.names import CHANNEL_UNITS
-from residnet.judge.verdict import describe_divergence
+from residnet.evaluation.verdict import describe_divergence
 from residnet.physics.terms import parse_term
 from residnet.report.blocks import Block, Cell, CellMark, Code, Section, Table, Text, build_table
 from residnet.report.figure import BLUE, Case, Curve, Figure, GlyphStyle, Panel, style_family

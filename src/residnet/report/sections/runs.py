@@ -14,7 +14,7 @@ from residnet.core.format import DEGREES_PER_RADIAN, display_unit, format_count,
 from residnet.core.layout import DegreesOfFreedom
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.stretches import find_runs
-from residnet.judge.metrics import state_column_names
+from residnet.evaluation.metrics import state_column_names
 from residnet.report.figure import (
     COLORS,
     DASHED_STYLE,

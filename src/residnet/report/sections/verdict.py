@@ -12,11 +12,11 @@ from residnet.core.format import (
     format_number,
     format_percent_change,
 )
-from residnet.data.doctor import summarize_inspection
-from residnet.judge.soundness import CHECKS, SanityFinding
-from residnet.judge.verdict import UNSEEN_SPLITS, VerdictEvidence, describe_divergence
-from residnet.judge.verdict import rate_model as judged_level
-from residnet.judge.verdict import write_verdict as judged
+from residnet.evaluation.soundness import CHECKS, SanityFinding
+from residnet.evaluation.verdict import UNSEEN_SPLITS, VerdictEvidence, describe_divergence
+from residnet.evaluation.verdict import rate_model as judged_level
+from residnet.evaluation.verdict import write_verdict as judged
+from residnet.quality import summarize_inspection
 from residnet.report.blocks import Bullets, Cell, Facts, Section, Text, build_table
 from residnet.report.figure import Figure
 from residnet.report.run_reader import JsonObject, RunFiles

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from residnet.control.heading.conditions import SteadinessLimits
+from residnet.autopilot.heading.conditions import SteadinessLimits
 from residnet.core.config import Seconds
 from residnet.training.config import OneStage
 

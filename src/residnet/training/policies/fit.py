@@ -10,7 +10,7 @@ from typing import Any, final
 import torch
 from torch import Tensor, nn
 
-from residnet.control.heading.conditions import (
+from residnet.autopilot.heading.conditions import (
     ClosedLoopSimulation,
     ClosedLoopTrajectories,
     Compiler,
@@ -21,12 +21,12 @@ from residnet.control.heading.conditions import (
     count_excess_overshoots,
     with_nominal_rows,
 )
-from residnet.control.heading.policies import HeadingPolicy
-from residnet.control.heading.vessels import SteeredVessel
+from residnet.autopilot.heading.policies import HeadingPolicy
+from residnet.autopilot.heading.vessels import SteeredVessel
 from residnet.core.errors import ExportError
 from residnet.core.progress import log_message
-from residnet.data.module import EpochDataModule
-from residnet.dynamics.rollout import FreeRun
+from residnet.engine.rollout import FreeRun
+from residnet.preprocessing.data_module import EpochDataModule
 from residnet.training.policies.config import PolicyTraining
 from residnet.training.trainer import EpochTraining, run_epochs
 

@@ -1,0 +1,480 @@
+"""The lengths of a route's legs and turns that make it quickest and keep it right.
+
+What is asked of it has exact derivatives; sequential linear programs find the lengths.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any, NamedTuple, final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.optimize import linprog
+
+from residnet.autopilot.courses.course_check import first_counted_sample
+from residnet.autopilot.courses.outline import Circle
+from residnet.autopilot.courses.turns import LEG, POINTS, Array, Route, RouteGeometry
+
+_MAX_ITERATIONS = 45
+"""Most steps of a fit; those that settle take far fewer."""
+_ACTIVE_SET_INTERVAL = 8
+"""Steps after which the problem looks anew what it has to keep to."""
+_MIN_PREDICTED_GAIN = 2e-2
+"""Gain that a step promises below which none is made."""
+_TRUST_RADII = (5e-4, 0.3, 1.0)
+"""Least, first and largest reach of a step."""
+_GAIN_RATIOS = (0.05, 0.3, 0.7)
+"""Shares of the promised gain: from which a step is made, shortened below, lengthened above."""
+_HARD_PENALTY = 40.0
+"""Turning radii that a course may be longer by to miss what is asked by one less."""
+_SOFT_PENALTY = 4.0
+"""The same where a buoy's own turn is not to be the only one that comes as near."""
+_PASSING_MARGIN = 0.03
+"""Turning radii by which a buoy is farther off on the rest of the course than in its turn."""
+_ABEAM_SINE = 0.3
+"""Sine of the angle from ahead or astern below which a buoy is not yet on a side."""
+_OTHER_PART_RANGE, _OWN_PART_RANGE = 2.0, 0.7
+"""Turning radii from a circle within which other parts of the course, and the buoy's own turn, are
+kept an eye on.
+"""
+_PARTS_PER_TURN = 4
+"""Pieces of a turn that keep to circles each for itself."""
+MAX_PASSING_DISTANCE = 0.3
+"""How much farther off than its circle a buoy may be passed, in turning radii."""
+
+
+class LinearizedProblem(NamedTuple):
+    """A route at z as a linear problem, in turning radii and the time that one takes.
+
+    Attributes:
+        cost: the time, to make small.
+        cost_gradient: derivatives [nz] of it.
+        constraints: what must not be negative [m].
+        constraint_jacobian: derivatives [m, nz] of these.
+        penalties: of one that they are negative by [m].
+        buoy_numbers: of the buoys that they are for [m].
+        n_hard: how many of them, the first ones, a right course needs.
+    """
+
+    cost: float
+    cost_gradient: Array
+    constraints: Array
+    constraint_jacobian: Array
+    penalties: Array
+    buoy_numbers: list[int]
+    n_hard: int
+
+    def merit_value(self) -> float:
+        """Return the cost, and what is missed at its price."""
+        return self.cost + float((self.penalties * np.maximum(-self.constraints, 0.0)).sum())
+
+    def solve_linear_program(self, lower: Array, upper: Array) -> tuple[Array, float]:
+        """Return the best step within bounds where all is linear, and the merit it promises."""
+        # what cannot become negative within the bounds is left out
+        is_active = self.constraints < np.abs(self.constraint_jacobian) @ np.maximum(-lower, upper)
+        jacobian_rows, constraint_values = (
+            self.constraint_jacobian[is_active],
+            self.constraints[is_active],
+        )
+        n_variables, count = len(lower), len(constraint_values)
+        # its types know no sparse arrays
+        solve_program: Any = linprog
+        solution = solve_program(
+            np.concatenate((self.cost_gradient, self.penalties[is_active])),
+            sparse.hstack((sparse.csr_array(-jacobian_rows), -sparse.eye_array(count)))
+            if count
+            else None,
+            constraint_values if count else None,
+            bounds=np.concatenate(
+                (np.stack((lower, upper), axis=-1), np.tile([0.0, np.inf], (count, 1)))
+            ),
+            method="highs",
+        )
+        if solution.x is None:
+            return np.zeros(n_variables), 0.0
+        return solution.x[:n_variables], self.merit_value() - self.cost - float(solution.fun)
+
+
+class RouteSolution(NamedTuple):
+    """A fitted route: z, the time in s, and by how much it misses what is asked, in m."""
+
+    z: Array
+    time: float
+    max_violation: float
+    worst_buoy: int
+
+
+class _NearestPoints(NamedTuple):
+    """The nearest points of M parts of a route to a buoy each.
+
+    Attributes:
+        distance: [M] in m.
+        distance_jacobian: derivatives [M, nz] of the distances.
+        abeam_offset: [M] the same, positive to starboard and negative to port. It goes through zero
+            where the buoy comes to lie ahead or astern of the end of a part.
+        abeam_jacobian: derivatives [M, nz] of that.
+    """
+
+    distance: Array
+    distance_jacobian: Array
+    abeam_offset: Array
+    abeam_jacobian: Array
+
+
+@final
+class RouteProblem:
+    """A route past circles as a problem of least time.
+
+    Args:
+        circles: in their order.
+        passing_indices: points of the route [N] at which each is passed.
+        is_heading_free: whether the first heading is free.
+        max_offset: by how much in m the vessel may be displaced from the course; a buoy is farther off
+            by as much on the rest of the course than in its turn.
+    """
+
+    def __init__(
+        self,
+        route: Route,
+        circles: Sequence[Circle],
+        passing_indices: NDArray[np.intp],
+        is_heading_free: bool,
+        max_offset: float = 0.0,
+    ) -> None:
+        self.route, self.circles, self.is_heading_free, self.max_offset = (
+            route,
+            circles,
+            is_heading_free,
+            max_offset,
+        )
+        self.buoy_positions = np.array([circle.centre for circle in circles])
+        self.passing_sides = np.array([circle.turn_sign for circle in circles])
+        self.length_unit = route.turns.min_radius
+        window_boundaries = (passing_indices[1:] + passing_indices[:-1] + 1) // 2
+        self.window_edges = np.concatenate(([0], window_boundaries, [-1]))
+        self.other_parts: list[tuple[int, int, slice]] = []
+        self.passing_margins = [self._passing_margin(circle) for circle in circles]
+        self.soft_penalty, self.n_evaluations = _SOFT_PENALTY, 0
+        self.cached_linearization: tuple[Array, LinearizedProblem] | None = None
+        self.trust_region: tuple[Array, float] | None = None
+
+    def with_route(self, route: Route) -> RouteProblem:
+        """Return the same problem with other tables of turns."""
+        passing_indices = np.zeros(len(self.circles), dtype=np.intp)
+        problem = RouteProblem(
+            route, self.circles, passing_indices, self.is_heading_free, self.max_offset
+        )
+        problem.window_edges, problem.soft_penalty = self.window_edges, self.soft_penalty
+        return problem
+
+    def _passing_margin(self, circle: Circle) -> float:
+        """Return by how much farther a buoy is on the rest of the course, as its start allows."""
+        start_distance = abs(circle.centre - self.route.start) - circle.radius
+        margin = _PASSING_MARGIN * self.length_unit + self.max_offset
+        return margin if start_distance < 0 else min(margin, 0.5 * start_distance)
+
+    def turn_window(self, number: int, count: int) -> slice:
+        """Return the points of a buoy's turn."""
+        first = int(self.window_edges[number])
+        stop = count if number == len(self.circles) - 1 else int(self.window_edges[number + 1]) + 1
+        return slice(min(first, count - 2), max(stop, min(first, count - 2) + 2))
+
+    def select_constraints(self, z: Array) -> None:
+        """Choose which pieces of the course must keep clear of which buoys."""
+        geometry = self.route(z)
+        points, self.other_parts = geometry.points, []
+        # of a whole turn about a buoy, the nearest point jumps from its beginning to its end
+        count = len(points)
+        part_boundaries = {0, count - 1, *range(LEG, count, LEG + POINTS)}
+        for k in range(_PARTS_PER_TURN):
+            part_boundaries |= set(range(LEG + k * POINTS // _PARTS_PER_TURN, count, LEG + POINTS))
+        turn_windows = [self.turn_window(number, count) for number in range(len(self.circles))]
+        turn_parts = []
+        for i, turn_window in enumerate(turn_windows):
+            boundaries_inside = sorted(
+                {turn_window.start, turn_window.stop - 1, *part_boundaries}
+                & set(range(turn_window.start, turn_window.stop))
+            )
+            turn_parts += [
+                (i, slice(first, second + 1))
+                for first, second in itertools.pairwise(boundaries_inside)
+            ]
+        is_on_passing_side = (
+            self.passing_sides
+            * self._nearest_points(geometry, self._constrained_parts(points)).abeam_offset
+            > 0
+        )
+        for j, circle in enumerate(self.circles):
+            if circle.turn_sign == 0:
+                continue
+            first_counted, distance = (
+                self._first_counted_point(points, circle),
+                np.abs(points - circle.centre),
+            )
+            self.other_parts += [
+                (j, i, turn_part)
+                for i, turn_part in turn_parts
+                # from the wrong side the way to the right one leads through the circle
+                if (i != j or is_on_passing_side[j])
+                and turn_part.stop - max(turn_part.start, first_counted) > 1
+                and distance[max(turn_part.start, first_counted) : turn_part.stop].min()
+                < circle.radius
+                + (_OWN_PART_RANGE if i == j else _OTHER_PART_RANGE) * self.length_unit
+            ]
+
+    def _first_counted_point(self, points: np.ndarray, circle: Circle) -> int:
+        """Return the point from which a circle counts: `course_check.left_behind`."""
+        if circle.turn_sign == 0 or abs(circle.centre - points[0]) >= circle.radius:
+            return 0
+        return min(
+            first_counted_sample(np.abs(points - circle.centre), circle.radius), len(points) - 2
+        )
+
+    def _constrained_parts(self, points: np.ndarray) -> list[tuple[int, slice]]:
+        """Return the circles and the parts of the course that keep to them: own turns first."""
+        count, last = len(points), len(self.circles) - 1
+        first_counted = [self._first_counted_point(points, circle) for circle in self.circles]
+        constrained_parts: list[tuple[int, slice]] = []
+        for j, circle in enumerate(self.circles):
+            part = self.turn_window(j, count)
+            constrained_parts.append(
+                (j, slice(count - 2, count) if j == last and circle.turn_sign == 0 else part)
+            )
+        constrained_parts += [(j, part) for j, _, part in self.other_parts]
+        return [
+            (j, slice(max(part.start, min(first_counted[j], part.stop - 2)), part.stop))
+            for j, part in constrained_parts
+        ]
+
+    def _nearest_points(
+        self, geometry: RouteGeometry, constrained_parts: Sequence[tuple[int, slice]]
+    ) -> _NearestPoints:
+        """Return the points of parts of the course that are nearest to the middle of circles."""
+        edge_vectors = np.diff(geometry.points)
+        offsets_to_buoys = self.buoy_positions[:, None] - geometry.points[:-1]
+        edge_fraction = (offsets_to_buoys * edge_vectors.conj()).real / np.maximum(
+            np.abs(edge_vectors) ** 2, 1e-12
+        )
+        edge_fraction = np.clip(edge_fraction, 0.0, 1.0)
+        offsets = offsets_to_buoys - edge_fraction * edge_vectors
+        distances = np.abs(offsets)
+        buoy_index = np.array([j for j, _ in constrained_parts])
+        edge_index = np.array(
+            [
+                index_range.start + distances[j, index_range.start : index_range.stop - 1].argmin()
+                for j, index_range in constrained_parts
+            ]
+        )
+        fraction_at_edge, distance, offsets = (
+            edge_fraction[buoy_index, edge_index][:, None],
+            distances[buoy_index, edge_index],
+            offsets[buoy_index, edge_index],
+        )
+        start_jacobian, end_jacobian = (
+            geometry.point_jacobian(edge_index),
+            geometry.point_jacobian(edge_index + 1),
+        )
+        point_jacobian = (1.0 - fraction_at_edge) * start_jacobian + fraction_at_edge * end_jacobian
+        unit_offset = offsets / np.maximum(distance, 1e-9)
+        distance_jacobian = -(point_jacobian * unit_offset.conj()[:, None]).real
+        edge_length = np.maximum(np.abs(edge_vectors[edge_index]), 1e-9)
+        edge_direction = (edge_vectors[edge_index] / edge_length).conj()
+        abeam_offset = (edge_direction * offsets).imag / _ABEAM_SINE
+        rotation_jacobian = (
+            edge_direction[:, None] * (end_jacobian - start_jacobian)
+        ).imag / edge_length[:, None]
+        abeam_jacobian = (
+            -(
+                (edge_direction[:, None] * point_jacobian).imag
+                + (edge_direction * offsets).real[:, None] * rotation_jacobian
+            )
+            / _ABEAM_SINE
+        )
+        is_ahead_or_astern = np.abs(abeam_offset) < distance
+        sign = np.where(abeam_offset >= 0, 1.0, -1.0)
+        return _NearestPoints(
+            distance,
+            distance_jacobian,
+            np.where(is_ahead_or_astern, abeam_offset, sign * distance),
+            np.where(
+                is_ahead_or_astern[:, None], abeam_jacobian, sign[:, None] * distance_jacobian
+            ),
+        )
+
+    def linearize(self, z: Array) -> LinearizedProblem:
+        """Return the problem as it is linear at z."""
+        if self.cached_linearization is not None and np.array_equal(
+            self.cached_linearization[0], z
+        ):
+            return self.cached_linearization[1]
+        geometry = self.route(z)
+        self.n_evaluations += 1
+        last_circle, n_circles = self.circles[-1], len(self.circles)
+        constraints: list[tuple[int, float, Array]] = []
+        nearest_points = self._nearest_points(geometry, self._constrained_parts(geometry.points))
+        # on the wrong side, distances are negative
+        is_entered, side_column = self.passing_sides == 0, self.passing_sides[:, None]
+        passing_distance = np.where(
+            is_entered,
+            nearest_points.distance[:n_circles],
+            self.passing_sides * nearest_points.abeam_offset[:n_circles],
+        )
+        passing_jacobian = np.where(
+            side_column == 0,
+            nearest_points.distance_jacobian[:n_circles],
+            side_column * nearest_points.abeam_jacobian[:n_circles],
+        )
+        for j, circle in enumerate(self.circles):
+            if circle.turn_sign == 0:
+                constraints.append((j, circle.radius - passing_distance[j], -passing_jacobian[j]))
+            else:
+                excess_distance = (
+                    circle.radius + MAX_PASSING_DISTANCE * self.length_unit - passing_distance[j]
+                )
+                constraints += [
+                    (j, passing_distance[j] - circle.radius, passing_jacobian[j]),
+                    (j, excess_distance, -passing_jacobian[j]),
+                ]
+        for k, (j, _, _) in enumerate(self.other_parts, start=n_circles):
+            constraints.append(
+                (
+                    j,
+                    nearest_points.distance[k] - self.circles[j].radius,
+                    nearest_points.distance_jacobian[k],
+                )
+            )
+        if last_circle.turn_sign != 0:
+            # the end lies neither before nor behind the last buoy
+            final_direction = np.exp(1j * geometry.heading)
+            goal_offset = (last_circle.centre - geometry.points[-1]) * final_direction.conjugate()
+            endpoint_jacobian = geometry.point_jacobian(np.array([len(geometry.points) - 1]))[0]
+            alongside_jacobian = (
+                -(endpoint_jacobian * final_direction.conjugate()).real
+                + goal_offset.imag * geometry.d_heading
+            )
+            constraints += [
+                (n_circles - 1, goal_offset.real, alongside_jacobian),
+                (n_circles - 1, -goal_offset.real, -alongside_jacobian),
+            ]
+        n_hard = len(constraints)
+        for k, (j, i, _) in enumerate(self.other_parts, start=n_circles):
+            if i != j:
+                # where it lies on its side too, a buoy may be as near
+                margin = (
+                    self.passing_margins[j]
+                    if nearest_points.abeam_offset[k] * self.circles[j].turn_sign < 0
+                    else 0.0
+                )
+                constraints.append(
+                    (
+                        j,
+                        nearest_points.distance[k] - passing_distance[j] - margin,
+                        nearest_points.distance_jacobian[k] - passing_jacobian[j],
+                    )
+                )
+        time_unit = self.length_unit / self.route.turns.speed
+        linearized = LinearizedProblem(
+            geometry.time / time_unit,
+            geometry.d_time / time_unit,
+            np.array([value for _, value, _ in constraints]) / self.length_unit,
+            np.array([row for _, _, row in constraints]).reshape(-1, len(z)) / self.length_unit,
+            np.where(np.arange(len(constraints)) < n_hard, _HARD_PENALTY, self.soft_penalty),
+            [j for j, _, _ in constraints],
+            n_hard,
+        )
+        self.cached_linearization = z.copy(), linearized
+        return linearized
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Return the smallest and the largest z."""
+        lower, upper = self.route.lower_bounds(), self.route.upper_bounds()
+        if self.trust_region is None:
+            return lower, upper
+        z, trust_radius = self.trust_region
+        return np.maximum(lower, z - trust_radius), np.minimum(upper, z + trust_radius)
+
+    def refresh_constraints(self, z: Array) -> None:
+        """Look anew which parts of the course come near which buoys."""
+        self.cached_linearization = None
+        self.select_constraints(z)
+
+    def max_violation(self, z: Array) -> tuple[float, int]:
+        """Return by how much a route misses what is asked of it, in m, and at which buoy."""
+        linearized = self.linearize(z)
+        violations = np.maximum(-linearized.constraints[: linearized.n_hard], 0.0)
+        worst_constraint = int(violations.argmax())
+        return self.length_unit * float(violations[worst_constraint]), linearized.buoy_numbers[
+            worst_constraint
+        ]
+
+    def solve_with_hard_penalty(self, z: Array, trust_radius: float | None = None) -> RouteSolution:
+        """Return the route that is found where buoys are hardly approached out of their turns."""
+        self.soft_penalty = _HARD_PENALTY
+        return self.solve(z, trust_radius)
+
+    def solve(self, z: Array, trust_radius: float | None = None) -> RouteSolution:
+        """Return the route that is found from a start, not farther from it than a reach of z."""
+        self.trust_region = None if trust_radius is None else (z, trust_radius)
+        z = self._minimize_merit(np.clip(z, *self.bounds()))
+        violation, worst_buoy = self.max_violation(z)
+        return RouteSolution(
+            z,
+            self.linearize(z).cost * self.length_unit / self.route.turns.speed,
+            violation,
+            worst_buoy,
+        )
+
+    def _minimize_merit(self, z: Array) -> Array:
+        """Return the z of least merit near a start.
+
+        A step solves the problem as it is linear there, within a reach that follows how well this
+        holds. What is asked may be missed by a step, so that there always is one. Where the problem
+        bends too much for a step, it is corrected once for what that step has missed.
+        """
+        trust_radius, (lower, upper) = _TRUST_RADII[1], self.bounds()
+        self.refresh_constraints(z)
+        linearized = self.linearize(z)
+
+        def evaluate_step(step: Array) -> tuple[Array, LinearizedProblem, float]:
+            candidate_z = np.clip(z + step, lower, upper)
+            candidate = self.linearize(candidate_z)
+            return candidate_z, candidate, linearized.merit_value() - candidate.merit_value()
+
+        for iteration in range(1, _MAX_ITERATIONS + 1):
+            if iteration % _ACTIVE_SET_INTERVAL == 0:
+                self.refresh_constraints(z)
+                linearized = self.linearize(z)
+            step_lower, step_upper = (
+                np.maximum(lower - z, -trust_radius),
+                np.minimum(upper - z, trust_radius),
+            )
+            if not self.is_heading_free:
+                step_lower[0] = step_upper[0] = 0.0
+            step, predicted_gain = linearized.solve_linear_program(step_lower, step_upper)
+            if predicted_gain < _MIN_PREDICTED_GAIN:
+                break
+            candidate_z, candidate, actual_gain = evaluate_step(step)
+            if actual_gain < _GAIN_RATIOS[0] * predicted_gain:
+                corrected = linearized._replace(
+                    constraints=candidate.constraints
+                    - linearized.constraint_jacobian @ (candidate_z - z)
+                )
+                corrected_step = evaluate_step(
+                    corrected.solve_linear_program(step_lower, step_upper)[0]
+                )
+                if corrected_step[2] > actual_gain:
+                    candidate_z, candidate, actual_gain = corrected_step
+            step_size = float(np.abs(candidate_z - z).max())
+            if actual_gain > _GAIN_RATIOS[0] * predicted_gain:
+                z, linearized = candidate_z, candidate
+            if actual_gain < _GAIN_RATIOS[1] * predicted_gain:
+                trust_radius = 0.4 * min(trust_radius, step_size)
+            elif actual_gain > _GAIN_RATIOS[2] * predicted_gain:
+                trust_radius = min(2.0 * trust_radius, _TRUST_RADII[2])
+            if trust_radius < _TRUST_RADII[0]:
+                break
+        self.refresh_constraints(z)
+        return z

@@ -1,0 +1,562 @@
+"""The outline of a course past buoys: dynamic programming over the poses in which it passes them.
+
+Each buoy is passed in its turn, on its side. Between two buoys the course may go round others.
+Paths from pose to pose are of a turn, a straight line and a turn, many at once; positions are
+complex numbers, north + i east in m.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from residnet.autopilot.courses.turns import Array, RouteOutline, TurnSpec
+
+_ANGLES = 36
+"""Places about a circle at which it may be touched, ten degrees apart."""
+RINGS = (0.0, 0.25)
+"""How much farther off than its circle a buoy may be passed, in turning radii."""
+_MAX_CANDIDATE_PATHS = 24
+"""Paths to a pose that are looked at, the shortest first, before all are."""
+_CUT_TOLERANCE = 0.05
+"""Turning radii by which the outline may cut a circle; what it leads to is moved out of it."""
+_N_ENTRY_COURSES = 18
+"""Courses, 20 degrees apart, in which a circle may be entered."""
+_FULL_TURN = 2.0 * math.pi
+PATH_SIDES = ((1, 1), (-1, -1), (1, -1), (-1, 1))
+"""To which sides the first and the last turn of each kind of path go."""
+_FULL_ROOM_ANGLE = 0.6
+"""Angle in rad from which a turn needs all of the straight room before and behind it."""
+
+
+class TurnRoom(NamedTuple):
+    """What a turn needs: its radius, and straight parts before and behind it, all in m."""
+
+    radius: float
+    lead_in: float
+    lead_out: float
+
+
+class TurnPaths(NamedTuple):
+    """Paths [...] of two turns with a straight line between.
+
+    Attributes:
+        first, last: angles in rad.
+        straight_length: length of the line in m.
+        heading: of the line in rad.
+        length: in m; infinite where there is no such path.
+    """
+
+    first_angle: Array
+    last_angle: Array
+    straight_length: Array
+    heading: Array
+    length: Array
+
+
+def _turn_angles(turn_sign: int, start_heading: Array, end_heading: Array) -> Array:
+    """Return the angles from one heading to another on a side; no full turn for rounding errors."""
+    angle = (turn_sign * (end_heading - start_heading)) % _FULL_TURN
+    result: Array = np.where(angle > _FULL_TURN - 1e-6, 0.0, angle)
+    return result
+
+
+def find_paths(
+    positions: np.ndarray,
+    headings: Array,
+    target_positions: np.ndarray,
+    target_headings: Array,
+    turn_room: TurnRoom,
+) -> TurnPaths:
+    """Return the paths [4, ...] of `PATH_SIDES` from poses to poses, which broadcast.
+
+    The straight line leaves room to come out of the first turn and to go into the last one.
+    """
+    path_parts = []
+    for first_side, last_side in PATH_SIDES:
+        first_centre = positions + 1j * first_side * turn_room.radius * np.exp(1j * headings)
+        last_centre = target_positions + 1j * last_side * turn_room.radius * np.exp(
+            1j * target_headings
+        )
+        centre_distance, bearing = (
+            np.abs(last_centre - first_centre),
+            np.angle(last_centre - first_centre),
+        )
+        if first_side == last_side:
+            straight_length, heading = centre_distance, bearing
+        else:
+            straight_length = np.sqrt(
+                np.maximum(centre_distance**2 - 4.0 * turn_room.radius**2, 0.0)
+            )
+            heading = bearing + first_side * np.arctan2(2.0 * turn_room.radius, straight_length)
+        first_angle, last_angle = (
+            _turn_angles(first_side, headings, heading),
+            _turn_angles(last_side, heading, target_headings),
+        )
+        required_length = turn_room.lead_out * np.minimum(
+            first_angle / _FULL_ROOM_ANGLE, 1.0
+        ) + turn_room.lead_in * np.minimum(last_angle / _FULL_ROOM_ANGLE, 1.0)
+        is_possible = np.asarray(straight_length >= required_length - 1e-9)
+        if first_side != last_side:
+            is_possible = is_possible & (centre_distance >= 2.0 * turn_room.radius)
+        length = np.where(
+            is_possible, turn_room.radius * (first_angle + last_angle) + straight_length, np.inf
+        )
+        path_parts.append((first_angle, last_angle, straight_length, heading, length))
+    return TurnPaths(*(np.stack(part) for part in zip(*path_parts, strict=True)))
+
+
+def clear_of_circles(
+    positions: np.ndarray,
+    headings: Array,
+    target_positions: np.ndarray,
+    target_headings: Array,
+    path_types: NDArray[np.intp],
+    candidate_paths: TurnPaths,
+    radius: float,
+    centres: np.ndarray,
+    radii: Array,
+) -> NDArray[np.bool_]:
+    """Return which of K paths keep out of all circles.
+
+    Args:
+        positions: of the beginnings [K], as are the following.
+        path_types: numbers in `PATH_SIDES`.
+        candidate_paths: the paths, [K] each.
+        radius: of the turns in m.
+        centres: of the circles [C].
+        radii: of the circles [C] in m.
+    """
+    turn_signs = np.array(PATH_SIDES)[path_types]
+    first_centre = positions + 1j * turn_signs[:, 0] * radius * np.exp(1j * headings)
+    last_centre = target_positions + 1j * turn_signs[:, 1] * radius * np.exp(1j * target_headings)
+    line_direction = np.exp(1j * candidate_paths.heading)
+    line_start = first_centre - 1j * turn_signs[:, 0] * radius * line_direction
+    line_end = line_start + candidate_paths.straight_length * line_direction
+    distance = np.minimum(
+        _distance_from_arcs(
+            first_centre,
+            turn_signs[:, 0],
+            headings,
+            candidate_paths.first_angle,
+            positions,
+            line_start,
+            radius,
+            centres,
+        ),
+        _distance_from_arcs(
+            last_centre,
+            turn_signs[:, 1],
+            candidate_paths.heading,
+            candidate_paths.last_angle,
+            line_end,
+            target_positions,
+            radius,
+            centres,
+        ),
+    )
+    distance = np.minimum(distance, distance_from_lines(line_start, line_end, centres))
+    is_clear: NDArray[np.bool_] = np.all(np.asarray(distance >= radii), axis=1)
+    return is_clear
+
+
+def distance_from_lines(
+    line_starts: np.ndarray, line_ends: np.ndarray, centres: np.ndarray
+) -> Array:
+    """Return the distances [K, C] of points from straight lines [K]."""
+    line = (line_ends - line_starts)[:, None]
+    offsets = centres[None] - line_starts[:, None]
+    line_fraction = np.clip(
+        (offsets * line.conj()).real / np.maximum(np.abs(line) ** 2, 1e-12), 0.0, 1.0
+    )
+    distance: Array = np.abs(offsets - line_fraction * line)
+    return distance
+
+
+def _distance_from_arcs(
+    centre: np.ndarray,
+    turn_signs: NDArray[np.intp],
+    heading: Array,
+    angle: Array,
+    arc_start: np.ndarray,
+    arc_end: np.ndarray,
+    radius: float,
+    points: np.ndarray,
+) -> Array:
+    """Return the distances [K, C] of points from arcs [K]."""
+    offsets = points[None] - centre[:, None]
+    heading_at_point = np.angle(offsets) + turn_signs[:, None] * (0.5 * math.pi)
+    is_on_arc = (turn_signs[:, None] * (heading_at_point - heading[:, None])) % _FULL_TURN <= angle[
+        :, None
+    ]
+    endpoint_distance = np.minimum(
+        np.abs(points[None] - arc_start[:, None]), np.abs(points[None] - arc_end[:, None])
+    )
+    distance: Array = np.where(is_on_arc, np.abs(np.abs(offsets) - radius), endpoint_distance)
+    return distance
+
+
+@dataclass(frozen=True)
+class Circle:
+    """A circle about a buoy.
+
+    Attributes:
+        centre: complex, in m.
+        radius: in m.
+        turn_sign: +1 where the buoy is left to starboard, -1 to port, 0 where the circle is entered.
+        table: number of the table of turns that lead round it.
+    """
+
+    centre: complex
+    radius: float
+    turn_sign: int
+    table: int
+
+
+@final
+class _Poses:
+    """Poses [M] that a course may come through, the cost of coming there, and from where.
+
+    On the arc about a buoy the course may go on, from the pose where it joins the arc to any that
+    follows.
+    """
+
+    def __init__(self, positions: np.ndarray, headings: Array, buoy: int | None) -> None:
+        self.positions, self.headings, self.buoy = positions, headings, buoy
+        n_poses = len(positions)
+        self.cost = np.full(n_poses, np.inf)
+        self.predecessors: list[tuple[_Poses, NDArray[np.intp]] | None] = [None] * n_poses
+        self.origin = np.full((n_poses, 3), -1, dtype=np.intp)
+        """Group, pose in it, and kind of path that each pose is reached by."""
+        self.sources: list[_Poses] = []
+        self.arc: slice | None = None
+        self.turn_sign, self.table, self.arc_radius = 0, 0, 0.0
+        # where an arc is left to, the pose where it was joined
+        self.arc_entry = np.arange(n_poses)
+        self.departure_cost = self.cost
+
+    def with_arc(self, turn_sign: int, table: int, arc_radius: float) -> _Poses:
+        """Mark the last poses as those of an arc about the buoy."""
+        self.arc = slice(len(self.positions) - _ANGLES, len(self.positions))
+        self.turn_sign, self.table, self.arc_radius = turn_sign, table, arc_radius
+        return self
+
+    def update_departure_cost(self) -> None:
+        """Fill in the cost of leaving each pose: on an arc it may have been joined before."""
+        self.departure_cost = self.cost.copy()
+        if self.arc is None:
+            return
+        step = 2.0 * math.pi / _ANGLES
+        pose_index = np.arange(_ANGLES)
+        # round a buoy to starboard the place on the circle moves with growing angle
+        steps_on_arc = (self.turn_sign * (pose_index[None, :] - pose_index[:, None])) % _ANGLES
+        cost_via_entry = self.cost[self.arc][:, None] + self.arc_radius * step * steps_on_arc
+        best_entry = cost_via_entry.argmin(axis=0)
+        self.departure_cost[self.arc] = cost_via_entry[best_entry, pose_index]
+        self.arc_entry[self.arc] = self.arc.start + best_entry
+
+    def arc_angle(self, pose: int) -> float:
+        """Return the angle of the arc that is followed before a pose is left."""
+        if self.arc is None or pose < self.arc.start:
+            return 0.0
+        return (
+            (self.turn_sign * (pose - int(self.arc_entry[pose])) % _ANGLES)
+            * 2.0
+            * math.pi
+            / _ANGLES
+        )
+
+
+@final
+class RouteSearch:
+    """The search for outlines of a course.
+
+    Args:
+        start: complex, in m.
+        heading: at the start in rad; None for any.
+        circles: of the buoys in their order.
+        turn_rooms: the same for the turns round each buoy.
+        turning_radius: the turning radius in m.
+    """
+
+    def __init__(
+        self,
+        start: complex,
+        heading: float | None,
+        circles: Sequence[Circle],
+        turn_room: TurnRoom,
+        turn_rooms: Sequence[TurnRoom],
+        turning_radius: float,
+        ring_offsets: Sequence[float] = RINGS,
+    ) -> None:
+        self.start, self.heading, self.circles = start, heading, circles
+        self.turn_room, self.turn_rooms, self.turning_radius, self.ring_offsets = (
+            turn_room,
+            turn_rooms,
+            turning_radius,
+            ring_offsets,
+        )
+        self.passed_circles = [circle for circle in circles if circle.turn_sign != 0]
+        self.centres = np.array([circle.centre for circle in self.passed_circles])
+        self.radii = (
+            np.array([circle.radius for circle in self.passed_circles])
+            - _CUT_TOLERANCE * turning_radius
+        )
+
+    def find_outline(self) -> RouteOutline | None:
+        """Return the shortest outline; None where there is none."""
+        headings = (
+            np.linspace(-math.pi, math.pi, 2 * _ANGLES, endpoint=False)
+            if self.heading is None
+            else np.array([self.heading])
+        )
+        start_poses = _Poses(np.full(len(headings), self.start), headings, None)
+        start_poses.cost[:] = start_poses.departure_cost[:] = 0.0
+        groups = [start_poses]
+        for number in range(len(self.circles)):
+            target = self._buoy_poses(number)
+            reachable_groups = [groups[-1]]
+            if self.centres.size:
+                for circle_index in self._circles_between(number):
+                    for turn_sign in (1, -1):
+                        detour = self._poses_around(
+                            self.passed_circles[circle_index], turn_sign, None, ()
+                        )
+                        self._update_costs(reachable_groups, detour, number == 0)
+                        if np.isfinite(detour.departure_cost).any():
+                            reachable_groups.append(detour)
+            self._update_costs(reachable_groups, target, number == 0)
+            if not np.isfinite(target.departure_cost).any():
+                return None
+            groups.append(target)
+        return self._trace_outline(groups[-1])
+
+    def _buoy_poses(self, number: int) -> _Poses:
+        """Return the poses in which a buoy is passed, or in which its circle is entered."""
+        circle = self.circles[number]
+        if circle.turn_sign != 0:
+            return self._poses_around(circle, circle.turn_sign, number, self.ring_offsets)
+        courses = np.linspace(-math.pi, math.pi, _N_ENTRY_COURSES, endpoint=False)
+        positions = circle.centre + circle.radius * np.array(
+            [0.0, *np.exp(2j * math.pi * np.arange(8) / 8)]
+        )
+        return _Poses(np.repeat(positions, len(courses)), np.tile(courses, len(positions)), number)
+
+    def _poses_around(
+        self, circle: Circle, turn_sign: int, number: int | None, ring_offsets: Sequence[float]
+    ) -> _Poses:
+        """Return poses along circles about a buoy, the last ones on an arc about it."""
+        angle = 2.0 * math.pi * np.arange(_ANGLES) / _ANGLES
+        turn_room = self.turn_rooms[self.circles.index(circle)]
+        arc_radius = max(circle.radius, turn_room.radius)
+        radii = [circle.radius + ring_offset * self.turning_radius for ring_offset in ring_offsets]
+        positions = np.concatenate([radius * np.exp(1j * angle) for radius in (*radii, arc_radius)])
+        headings = np.tile(angle + turn_sign * 0.5 * math.pi, len(radii) + 1)
+        poses = _Poses(circle.centre + positions, headings, number)
+        return poses.with_arc(turn_sign, circle.table, arc_radius)
+
+    def _circles_between(self, number: int) -> list[int]:
+        """Return the circles that lie in the way to a buoy, the nearest first."""
+        start = self.start if number == 0 else self.circles[number - 1].centre
+        end = self.circles[number].centre
+        line_distances = distance_from_lines(np.array([start]), np.array([end]), self.centres)[0]
+        search_width = max(self.radii.max(), self.turning_radius) + self.turning_radius
+        blocking_circles = [
+            k
+            for k, circle in enumerate(self.passed_circles)
+            if line_distances[k] < self.radii[k] + search_width
+            and circle is not self.circles[number]
+            and (number == 0 or circle is not self.circles[number - 1])
+            and (number > 0 or abs(circle.centre - start) > circle.radius)
+        ]
+        line_direction = (end - start) / max(abs(end - start), 1e-9)
+        return sorted(
+            blocking_circles,
+            key=lambda k: (
+                ((self.passed_circles[k].centre - start) * line_direction.conjugate()).real
+            ),
+        )
+
+    def _path_ends(self, poses: _Poses, is_departure: bool) -> tuple[np.ndarray, Array]:
+        """Return where paths begin behind poses or end before them, and the lengths to there.
+
+        An arc about a buoy needs room to go into it and to come out of it.
+        """
+        lead_lengths = np.zeros(len(poses.positions))
+        if poses.arc is not None:
+            turn_room = self.turn_room
+            lead_lengths[poses.arc] = turn_room.lead_out if is_departure else turn_room.lead_in
+        pose_directions = np.exp(1j * poses.headings)
+        return poses.positions + (
+            lead_lengths if is_departure else -lead_lengths
+        ) * pose_directions, lead_lengths
+
+    def _update_costs(self, sources: Sequence[_Poses], target: _Poses, is_first: bool) -> None:
+        """Fill in the cheapest ways to the poses of a target."""
+        arrival_points, arrival_lengths = self._path_ends(target, is_departure=False)
+        radii = self.radii
+        if is_first and len(radii):
+            # a circle in which the course begins is left first
+            radii = np.where(np.abs(self.centres - self.start) < radii, 0.0, radii)
+        is_clear = (
+            (np.abs(target.positions[:, None] - self.centres) >= radii).all(axis=1)
+            if len(radii)
+            else np.ones(len(arrival_points), dtype=bool)
+        )
+        target.sources = list(sources)
+        for group, source in enumerate(sources):
+            departure_points, departure_lengths = self._path_ends(source, is_departure=True)
+            usable = np.flatnonzero(np.isfinite(source.departure_cost))
+            reachable = np.flatnonzero(is_clear)
+            if len(usable) == 0 or len(reachable) == 0:
+                continue
+            # straight parts before the first and behind the last turn
+            path_starts = departure_points[usable] + self.turn_room.lead_in * np.exp(
+                1j * source.headings[usable]
+            )
+            path_ends = arrival_points[reachable] - self.turn_room.lead_out * np.exp(
+                1j * target.headings[reachable]
+            )
+            candidate_paths = find_paths(
+                path_starts[:, None],
+                source.headings[usable][:, None],
+                path_ends[None],
+                target.headings[reachable][None],
+                self.turn_room,
+            )
+            cost = (
+                candidate_paths.length
+                + (source.departure_cost[usable] + departure_lengths[usable])[None, :, None]
+                + (arrival_lengths[reachable] + self.turn_room.lead_in + self.turn_room.lead_out)[
+                    None, None
+                ]
+            )
+            best, path_number = self._cheapest_clear_paths(
+                cost,
+                candidate_paths,
+                path_starts,
+                source.headings[usable],
+                path_ends,
+                target.headings[reachable],
+                radii,
+            )
+            is_cheaper = best < target.cost[reachable]
+            improved = reachable[is_cheaper]
+            target.cost[improved] = best[is_cheaper]
+            path_type, pose = np.divmod(path_number[is_cheaper], len(usable))
+            target.origin[improved] = np.stack(
+                (np.full(len(improved), group), usable[pose], path_type), axis=-1
+            )
+        target.update_departure_cost()
+
+    def _cheapest_clear_paths(
+        self,
+        cost: Array,
+        candidate_paths: TurnPaths,
+        path_starts: np.ndarray,
+        headings: Array,
+        path_ends: np.ndarray,
+        target_headings: Array,
+        radii: Array,
+    ) -> tuple[Array, NDArray[np.intp]]:
+        """Return the cost [M] of the cheapest path to each pose that is clear, and its number."""
+        flat_cost = cost.reshape(-1, cost.shape[-1])
+        best, path_number = (
+            np.full(flat_cost.shape[1], np.inf),
+            np.zeros(flat_cost.shape[1], dtype=np.intp),
+        )
+        if not len(radii):
+            path_number = flat_cost.argmin(axis=0)
+            return flat_cost[path_number, np.arange(flat_cost.shape[1])], path_number
+        n_sources = len(headings)
+        n_candidates = min(_MAX_CANDIDATE_PATHS, len(flat_cost) - 1)
+        order = np.argpartition(flat_cost, n_candidates, axis=0)[: n_candidates + 1]
+        column_grid = np.broadcast_to(np.arange(flat_cost.shape[1]), order.shape)
+        rows, columns = order.ravel(), column_grid.ravel()
+        finite = np.isfinite(flat_cost[rows, columns])
+        rows, columns = rows[finite], columns[finite]
+        path_types, source_poses = np.divmod(rows, n_sources)
+        selected_paths = TurnPaths(
+            *(value.reshape(-1, flat_cost.shape[1])[rows, columns] for value in candidate_paths)
+        )
+        is_clear = clear_of_circles(
+            path_starts[source_poses],
+            headings[source_poses],
+            path_ends[columns],
+            target_headings[columns],
+            path_types,
+            selected_paths,
+            self.turn_room.radius,
+            self.centres,
+            radii,
+        )
+        rows, columns = rows[is_clear], columns[is_clear]
+        values = flat_cost[rows, columns]
+        cost_order = np.argsort(-values, kind="stable")
+        best[columns[cost_order]], path_number[columns[cost_order]] = (
+            values[cost_order],
+            rows[cost_order],
+        )
+        return best, path_number
+
+    def _trace_outline(self, last_poses: _Poses) -> RouteOutline:
+        """Return the outline that leads to the cheapest of the last poses."""
+        pose = int(last_poses.cost.argmin())
+        group = last_poses
+        legs: list[float] = [0.0]
+        turn_specs: list[TurnSpec] = []
+        passed_buoys: list[tuple[int, ...]] = [()]
+        is_last_group = True
+        while group.sources:
+            buoy = () if group.buoy is None else (group.buoy,)
+            arc_angle = 0.0 if is_last_group else group.arc_angle(pose)
+            entry_pose = pose if is_last_group else int(group.arc_entry[pose])
+            on_arc = group.arc is not None and pose >= group.arc.start
+            if on_arc and arc_angle > 0.0:
+                legs[0] += self.turn_room.lead_out
+                turn_specs.insert(0, TurnSpec(group.turn_sign, arc_angle, group.table, buoy))
+                legs.insert(0, self.turn_room.lead_in)
+                passed_buoys.insert(0, ())
+            else:
+                passed_buoys[0] = (*buoy, *passed_buoys[0])
+                legs[0] += (
+                    self.turn_room.lead_in + (0.0 if is_last_group else self.turn_room.lead_out)
+                    if on_arc
+                    else 0.0
+                )
+            source_number, source_pose, path_type = (
+                int(value) for value in group.origin[entry_pose]
+            )
+            source = group.sources[source_number]
+            departure_points, _ = self._path_ends(source, is_departure=True)
+            arrival_points, _ = self._path_ends(group, is_departure=False)
+            path_start = departure_points[source_pose] + self.turn_room.lead_in * np.exp(
+                1j * source.headings[source_pose]
+            )
+            path_end = arrival_points[entry_pose] - self.turn_room.lead_out * np.exp(
+                1j * group.headings[entry_pose]
+            )
+            path = find_paths(
+                path_start,
+                source.headings[source_pose],
+                path_end,
+                group.headings[entry_pose],
+                self.turn_room,
+            )
+            first_side, last_side = PATH_SIDES[path_type]
+            legs[0] += self.turn_room.lead_out
+            turn_specs.insert(0, TurnSpec(last_side, float(path.last_angle[path_type]), 0))
+            legs.insert(0, float(path.straight_length[path_type]))
+            passed_buoys.insert(0, ())
+            turn_specs.insert(0, TurnSpec(first_side, float(path.first_angle[path_type]), 0))
+            legs.insert(0, self.turn_room.lead_in)
+            passed_buoys.insert(0, ())
+            group, pose, is_last_group = source, source_pose, False
+        return RouteOutline(
+            float(group.headings[pose]), tuple(legs), tuple(turn_specs), tuple(passed_buoys)
+        )

@@ -1,0 +1,955 @@
+"""Turns as a vessel makes them: rudder held, counter-rudder until the yaw stops, amidships.
+
+They begin with any motion. Tables hold those from straight ahead to straight ahead by how long the
+rudder is held, and routes join them by straight legs. Positions in tables are complex, north + i
+east in m.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import NamedTuple, final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline, PPoly
+
+from residnet.autopilot.heading.turning import NomotoModel
+from residnet.autopilot.heading.vessels import SteeredVessel
+from residnet.engine.rollout import Rollout
+
+Array = NDArray[np.float64]
+_COUNTER_RUDDER_TIME = 1.5
+"""Time constants within which counter-rudder stops a turn; T ln 2 by Nomoto's model."""
+_STEP_SEARCH = (0.25, 6)
+"""Longest step of simulated turns in time constants, and how often it is halved at most."""
+_STEP_TOLERANCE = 1e-3
+"""Turning radii, and rad, by which a turn may differ from one simulated with half the step."""
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A turn from the origin, heading north at first, and the leg behind it.
+
+    The rudder is amidships on the leg.
+
+    Attributes:
+        rudder: angle held in rad, positive to starboard; then the same to the other side.
+        hold_time: for how long, in s.
+        duration: until the counter-rudder ends and the leg begins, in s.
+        held, countered, leg: states of the vessel [nx] by the time in s since the rudder was laid,
+            since the counter-rudder was, and since the leg began.
+        pose_columns: of north, east and heading in those.
+    """
+
+    rudder: float
+    hold_time: float
+    duration: float
+    rudder_phase: PPoly
+    counter_rudder_phase: PPoly
+    leg_phase: PPoly
+    pose_columns: tuple[int, int, int]
+
+    def track_at(self, times: Array) -> tuple[Array, Array]:
+        """Return the track [M, 2] and heading [M] of the turn at times [M] in s."""
+        is_holding = (times <= self.hold_time)[:, None]
+        counter_rudder_states = self.counter_rudder_phase(np.maximum(times - self.hold_time, 0.0))
+        return self._pose_of(
+            np.where(
+                is_holding,
+                self.rudder_phase(np.minimum(times, self.hold_time)),
+                counter_rudder_states,
+            )
+        )
+
+    def leg_at(self, times: Array) -> tuple[Array, Array]:
+        """Return the track [M, 2] and heading [M] of the leg at times [M] in s since it began."""
+        return self._pose_of(self.leg_phase(times))
+
+    def _pose_of(self, states: Array) -> tuple[Array, Array]:
+        return states[:, list(self.pose_columns[:2])], states[:, self.pose_columns[2]]
+
+
+@final
+class TurnMaker:
+    """Simulated turns of the nominal vessel: rudder held, counter-rudder, rudder amidships.
+
+    The three follow from simulations that begin where they do, so that what comes of a turn changes
+    smoothly with its time.
+
+    Args:
+        dt: step of the simulations in s, shorter while a steering gear moves the rudder.
+    """
+
+    def __init__(self, vessel: SteeredVessel, nomoto: NomotoModel, dt: float) -> None:
+        self.vessel, self.nomoto, self.dt = vessel, nomoto, dt
+        self.pose_columns = (
+            vessel.state_column("x"),
+            vessel.state_column("y"),
+            vessel.state_column("psi"),
+        )
+        self.rollouts: dict[float, Rollout] = {}
+        x, self.nominal_inputs = vessel.straight_course(torch.ones(1, dtype=torch.float64))
+        self.straight_state: Array = x[0].numpy()
+
+    def __call__(
+        self, hold_times: Array, rudder: Array, initial_states: Sequence[Array], leg_time: float
+    ) -> list[list[Turn]]:
+        """Return the turns of n rudder angles, each held for K times.
+
+        Args:
+            hold_times: [n, K] in s.
+            rudder: [n] in rad, positive to starboard.
+            initial_states: state [nx] that each begins with; its place and heading do not matter.
+            leg_time: how much of the leg behind is simulated, in s.
+        """
+        n, k = hold_times.shape
+        x = np.stack(initial_states)
+        x[:, list(self.pose_columns)] = 0.0
+        largest = float(np.abs(rudder).max())
+        rudder_phase = self._simulate_phase(x, rudder, float(hold_times.max()), 2.0 * largest)
+        rows = np.repeat(np.arange(n), k)
+        counter_rudder_phase = self._simulate_phase(
+            _evaluate_rows(rudder_phase, hold_times.ravel(), rows),
+            -rudder[rows],
+            _COUNTER_RUDDER_TIME * self.nomoto.time,
+            2.0 * largest,
+        )
+        stop_times = self._stop_times(counter_rudder_phase, np.sign(rudder)[rows])
+        turn_index = np.arange(n * k)
+        leg_phase = self._simulate_phase(
+            _evaluate_rows(counter_rudder_phase, stop_times, turn_index),
+            np.zeros(n * k),
+            leg_time,
+            largest,
+        )
+        turns = [
+            Turn(
+                float(rudder[row]),
+                float(hold_time),
+                float(hold_time + stop),
+                _row_spline(rudder_phase, int(row)),
+                _row_spline(counter_rudder_phase, number),
+                _row_spline(leg_phase, number),
+                self.pose_columns,
+            )
+            for number, (row, hold_time, stop) in enumerate(
+                zip(rows, hold_times.ravel(), stop_times, strict=True)
+            )
+        ]
+        return [turns[k * i : k * i + k] for i in range(n)]
+
+    def _simulate_phase(
+        self, x: Array, rudder: Array, duration: float, rudder_change: float
+    ) -> CubicSpline:
+        """Return the states [B, nx] by the time from x [B, nx] on, under rudder angles [B].
+
+        `rudder_change` is what the rudder moves by at most, in rad.
+        """
+        w = self.nominal_inputs.unsqueeze(1).repeat(len(x), 1, 1)
+        w[:, 0, 0] = torch.from_numpy(rudder)
+        nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(len(x), -1)
+        times, state_parts = [np.zeros(1)], [torch.from_numpy(x).unsqueeze(1)]
+        step_plan, remaining_time = [], max(duration, 3.0 * self.dt)
+        if self.vessel.rate is not None:
+            rudder_travel_time = rudder_change / self.vessel.rate
+            # the rudder moves between steps, and lags behind by half of one
+            short_step = min(self.dt, 4.0 * _STEP_TOLERANCE / (self.nomoto.gain * rudder_change))
+            count = math.ceil(min(1.1 * rudder_travel_time, remaining_time) / short_step)
+            step_plan, remaining_time = [(short_step, count)], remaining_time - count * short_step
+        for dt, count in (
+            [*step_plan, (self.dt, math.ceil(remaining_time / self.dt))]
+            if remaining_time > 0
+            else step_plan
+        ):
+            if dt not in self.rollouts:
+                self.rollouts[dt] = Rollout(self.vessel.model(dt))
+            with torch.no_grad():
+                states, _, _ = self.rollouts[dt](
+                    state_parts[-1][:, -1], w.expand(-1, count, -1), nominal
+                )
+            state_parts.append(states[:, 1:])
+            times.append(times[-1][-1] + dt * np.arange(1, count + 1))
+        return CubicSpline(
+            np.concatenate(times), torch.cat(state_parts, dim=1).transpose(0, 1).numpy()
+        )
+
+    def _stop_times(self, countered: CubicSpline, turn_signs: Array) -> Array:
+        """Return the times [B] at which the yaw towards a side has stopped.
+
+        The end where it does not.
+        """
+        column, stop_times = self.vessel.state_column("r"), []
+        for row, initial_yaw_rate in enumerate(turn_signs * countered.c[-1, 0, :, column]):
+            yaw = PPoly(countered.c[:, :, row, column], countered.x)
+            roots = yaw.roots(extrapolate=False) if initial_yaw_rate > 0 else np.zeros(1)
+            stop_times.append(float(roots[0]) if len(roots) else float(countered.x[-1]))
+        return np.array(stop_times)
+
+
+def _evaluate_rows(states: CubicSpline, times: Array, rows: NDArray[np.intp]) -> Array:
+    """Return the states [M, nx] of rows [M] at times [M]."""
+    interval = np.clip(np.searchsorted(states.x, times, side="right") - 1, 0, len(states.x) - 2)
+    time_in_interval = (times - states.x[interval])[:, None]
+    row_states: Array = np.asarray(
+        np.polyval(states.c[:, interval, rows], time_in_interval), dtype=np.float64
+    )
+    return row_states
+
+
+def _row_spline(states: CubicSpline, row: int) -> PPoly:
+    """Return the states [nx] of one row by the time."""
+    return PPoly(states.c[:, :, row], states.x)
+
+
+def choose_time_step(vessel: SteeredVessel, nomoto: NomotoModel, rudder: float) -> float:
+    """Return the longest step in s that simulates turns at a rudder angle [rad] as half of it does.
+
+    Turns and the legs behind them are compared, at rudder angles held for several times.
+    """
+    hold_times = nomoto.time * np.array([[0.5, 1.5, 3.0]])
+    radius = nomoto.speed / (nomoto.gain * rudder)
+    dt, previous_ends = _STEP_SEARCH[0] * nomoto.time, None
+    for _ in range(_STEP_SEARCH[1]):
+        turn_maker = TurnMaker(vessel, nomoto, dt)
+        (turns,) = turn_maker(
+            hold_times, np.array([rudder]), [turn_maker.straight_state], nomoto.time
+        )
+        end_poses = []
+        for turn in turns:
+            track, heading = turn.leg_at(np.array([0.0, nomoto.time]))
+            end_poses.append(np.concatenate((track / radius, heading[:, None]), axis=1))
+        current_ends = np.stack(end_poses)
+        if (
+            previous_ends is not None
+            and np.abs(current_ends - previous_ends).max() < _STEP_TOLERANCE
+        ):
+            return 2.0 * dt
+        previous_ends, dt = current_ends, 0.5 * dt
+    return 2.0 * dt
+
+
+@dataclass(frozen=True)
+class SteadyTurn:
+    """At a held rudder: radius of the track [m], speed [m/s] and yaw rate [rad/s].
+
+    `step` is what it was simulated with, in s.
+    """
+
+    radius: float
+    speed: float
+    yaw_rate: float
+    step: float
+
+
+def simulate_steady_turn(
+    vessel: SteeredVessel, rudder: float, duration: float, dt: float
+) -> SteadyTurn:
+    """Return the steady turn after `duration` s of a held rudder angle in rad.
+
+    At the rudder's limit it is the smallest turn that the vessel makes.
+    """
+    x, w = vessel.straight_course(torch.ones(1, dtype=torch.float64))
+    w[:, 0] = rudder
+    variation = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
+    steps = math.ceil(duration / dt)
+    with torch.no_grad():
+        states, _, _ = Rollout(vessel.model(dt))(x, w.unsqueeze(1).expand(-1, steps, -1), variation)
+    psi = states[0, :, vessel.state_column("psi")]
+    track = states[0, :, [vessel.state_column("x"), vessel.state_column("y")]]
+    # over the last tenth
+    first_step = steps - max(steps // 10, 1)
+    distance = float((track[first_step + 1 :] - track[first_step:-1]).norm(dim=-1).sum())
+    heading_change = float((psi[-1] - psi[first_step]).abs())
+    # arcs are longer than their chords
+    half_step_angle = 0.5 * heading_change / (steps - first_step)
+    distance *= half_step_angle / math.sin(half_step_angle)
+    elapsed = (steps - first_step) * dt
+    return SteadyTurn(distance / heading_change, distance / elapsed, heading_change / elapsed, dt)
+
+
+POINTS = 28
+"""Points of a turn beside its beginning."""
+_MAX_TURN_ANGLE = math.radians(500.0)
+"""The largest angle of a turn in a table."""
+_N_HOLD_TIMES = 56
+"""Angles of turns in a table, nine degrees apart."""
+_RESIDUAL_MOTION_TOLERANCE = 2e-3
+"""Below it what a turn leaves does not count: shares of speed and radius, and rad."""
+_SETTLING_TIME = 4.0
+"""Time constants after which the vessel runs straight behind a turn."""
+
+
+class TrackPart(NamedTuple):
+    """Turns, or the legs behind them: points [n, K] complex, last headings [n], and times [n].
+
+    Also their derivatives.
+    """
+
+    points: np.ndarray
+    headings: Array
+    times: Array
+
+
+@final
+class TurnTable:
+    """Turns to starboard at one rudder angle, as smooth functions of the time it is held.
+
+    Args:
+        hold_times: [K] in s, from 0 on.
+        points: [K, POINTS] complex positions in m in the frame of the beginning; the last one is
+            where the straight leg behind the turn begins.
+        headings: [K, POINTS] of the vessel in rad; the last one is the direction of that leg.
+        times: [K] that the turns take, in s.
+        rudder: the angle that is held, in rad.
+        leg: north, east and heading of the leg behind by its length, in the frame of its beginning;
+            None for a straight one.
+    """
+
+    def __init__(
+        self,
+        hold_times: Array,
+        points: np.ndarray,
+        headings: Array,
+        times: Array,
+        rudder: float,
+        leg: CubicSpline | None = None,
+    ) -> None:
+        rows = np.concatenate((points.real, points.imag, headings, times[:, None]), axis=1)
+        self.rudder, self.max_hold_time = rudder, float(hold_times[-1])
+        self.leg, self.leg_derivative = leg, None if leg is None else leg.derivative()
+        self.spline = CubicSpline(hold_times, rows)
+        self.spline_derivative = self.spline.derivative()
+        self.angles, self.hold_times, self.end_positions = (
+            headings[:, -1],
+            hold_times,
+            points[:, -1],
+        )
+
+    def __call__(self, hold_time: float) -> tuple[np.ndarray, Array, float]:
+        """Return the points [POINTS], headings [POINTS] and the time of a turn."""
+        row = self.spline(hold_time)
+        return row[:POINTS] + 1j * row[POINTS : 2 * POINTS], row[2 * POINTS : -1], float(row[-1])
+
+    def leg_at(self, lengths: Array) -> tuple[TrackPart, TrackPart]:
+        """Return the leg behind at lengths [..., K] in m, and what it changes by with each."""
+        zero_angles = np.zeros(lengths.shape[:-1])
+        if self.leg is None or self.leg_derivative is None:
+            straight_points = lengths.astype(complex)
+            return TrackPart(straight_points, zero_angles, zero_angles), TrackPart(
+                np.ones_like(straight_points), zero_angles, zero_angles
+            )
+        clipped_lengths = np.minimum(lengths, self.leg.x[-1])
+        leg_rows, leg_slopes = self.leg(clipped_lengths), self.leg_derivative(clipped_lengths)
+        final_direction = np.exp(1j * leg_rows[..., 2])
+        is_tabulated = lengths <= self.leg.x[-1]
+        positions = (
+            leg_rows[..., 0] + 1j * leg_rows[..., 1] + (lengths - clipped_lengths) * final_direction
+        )
+        position_slopes = np.where(
+            is_tabulated, leg_slopes[..., 0] + 1j * leg_slopes[..., 1], final_direction
+        )
+        heading_slopes = np.where(is_tabulated, leg_slopes[..., 2], 0.0)
+        return TrackPart(positions, leg_rows[..., -1, 2], zero_angles), TrackPart(
+            position_slopes, heading_slopes[..., -1], zero_angles
+        )
+
+    def hold_time(self, angle: float) -> float:
+        """Return the time in s that a turn of an angle in rad is held for."""
+        return float(np.interp(angle, self.angles, self.hold_times))
+
+    @cached_property
+    def fitted_arc(self) -> tuple[float, float, float]:
+        """The radius of an arc, and the straight parts in m before and behind it.
+
+        Together they lead where the turns lead, by least squares over their angles.
+        """
+        is_usable = (self.angles > math.radians(20.0)) & (self.angles < math.radians(300.0))
+        turn_rotation, usable_ends = (
+            np.exp(1j * self.angles[is_usable]),
+            self.end_positions[is_usable],
+        )
+        columns = np.stack(
+            (1j * (1.0 - turn_rotation), np.ones_like(turn_rotation), turn_rotation), axis=1
+        )
+        coefficients = np.linalg.lstsq(
+            np.concatenate((columns.real, columns.imag)),
+            np.concatenate((usable_ends.real, usable_ends.imag)),
+            rcond=None,
+        )[0]
+        return (
+            float(coefficients[0]),
+            max(float(coefficients[1]), 0.0),
+            max(float(coefficients[2]), 0.0),
+        )
+
+
+@dataclass(frozen=True)
+class TurnTables:
+    """The tables of a vessel by rudder angle.
+
+    Attributes:
+        tables: of turns, that of the largest rudder angle first.
+        speed: on straight legs, in m/s.
+        min_radius: the smallest of a turn, in m.
+        is_settled: whether turns leave no motion that the turns behind them begin with.
+    """
+
+    tables: tuple[TurnTable, ...]
+    speed: float
+    min_radius: float
+    is_settled: bool = True
+
+    def turns_at(
+        self, table_numbers: Sequence[int], hold_times: Array
+    ) -> tuple[TrackPart, TrackPart]:
+        """Return turns of tables [n] held for [n] in s, to starboard, and their derivatives."""
+        rows, slopes = np.zeros((2, len(hold_times), 3 * POINTS + 1))
+        for number, turn_indices in _group_by_table(table_numbers):
+            rows[turn_indices] = self.tables[number].spline(hold_times[turn_indices])
+            slopes[turn_indices] = self.tables[number].spline_derivative(hold_times[turn_indices])
+        turn_parts, derivatives = (
+            TrackPart(
+                part[:, :POINTS] + 1j * part[:, POINTS : 2 * POINTS], part[:, -2], part[:, -1]
+            )
+            for part in (rows, slopes)
+        )
+        return turn_parts, derivatives
+
+    def legs_after(
+        self, table_numbers: Sequence[int], lengths: Array
+    ) -> tuple[TrackPart, TrackPart]:
+        """Return the legs behind such turns at lengths [n, K] in m, and their derivatives."""
+        count = len(lengths)
+        leg_and_derivative = [
+            TrackPart(np.zeros(lengths.shape, complex), np.zeros(count), np.zeros(count))
+            for _ in range(2)
+        ]
+        for number, turn_indices in _group_by_table(table_numbers):
+            for target_part, table_part in zip(
+                leg_and_derivative, self.tables[number].leg_at(lengths[turn_indices]), strict=True
+            ):
+                for target, source in zip(target_part, table_part, strict=True):
+                    target[turn_indices] = source
+        return leg_and_derivative[0], leg_and_derivative[1]
+
+
+def _group_by_table(table_indices: Sequence[int]) -> list[tuple[int, NDArray[np.intp]]]:
+    """Return each table's number and the turns that are of it."""
+    table_numbers = np.array(table_indices, dtype=np.intp)
+    return [
+        (int(number), np.flatnonzero(table_numbers == number))
+        for number in np.unique(table_numbers)
+    ]
+
+
+def arc_turns(radii: Array, speed: float) -> TurnTables:
+    """Return the turns of a vessel that yaws at once: arcs of the radii [n] in m."""
+    angles = np.linspace(0.0, _MAX_TURN_ANGLE, _N_HOLD_TIMES)
+    headings = angles[:, None] * np.linspace(0.0, 1.0, POINTS + 1)[1:]
+    tables = [
+        TurnTable(
+            angles * radius / speed,
+            1j * radius * (1.0 - np.exp(1j * headings)),
+            headings,
+            angles * radius / speed,
+            0.0,
+        )
+        for radius in radii
+    ]
+    return TurnTables(tuple(tables), speed, float(radii[0]))
+
+
+def simulate_turns(turn_maker: TurnMaker, rudder: Array, radius: float) -> TurnTables:
+    """Return the turns of a vessel at rudder angles [n] in rad, each from straight ahead.
+
+    Behind a turn the sway dies out. The leg is put where it ends up, and the last part of the turn
+    is bent towards it.
+
+    Args:
+        rudder: angles, the largest first.
+        radius: the vessel's smallest turning radius in m.
+    """
+    nomoto = turn_maker.nomoto
+    hold_grid = np.stack(
+        [_hold_times(np.linspace(0.0, 1.0, _N_HOLD_TIMES), angle, nomoto) for angle in rudder]
+    )
+    settling_time = _SETTLING_TIME * nomoto.time
+    simulated = turn_maker(
+        hold_grid[:, 1:], rudder, [turn_maker.straight_state] * len(rudder), settling_time
+    )
+    share = np.linspace(0.0, 1.0, POINTS + 1)[1:]
+    tables, residual_motion = [], 0.0
+    for angle, table_holds, group in zip(rudder, hold_grid, simulated, strict=True):
+        points, headings, times = _sample_turns(group)
+        for k, turn in enumerate(group):
+            track, course = turn.leg_at(np.linspace(0.0, settling_time, 60))
+            distance = float(np.hypot(*np.diff(track, axis=0).T).sum())
+            leg_origin = complex(*track[-1]) - distance * np.exp(1j * course[-1])
+            speed_change = abs(distance / (nomoto.speed * settling_time) - 1.0)
+            lateral_shift = abs(leg_origin - points[k, -1]) / radius
+            residual_motion = max(
+                residual_motion,
+                speed_change,
+                lateral_shift,
+                abs(float(course[-1]) - headings[k, -1]),
+            )
+            points[k] += share**3 * (leg_origin - points[k, -1])
+            headings[k] += share**3 * (course[-1] - headings[k, -1])
+        zero_row = np.zeros((1, POINTS))
+        tables.append(
+            TurnTable(
+                table_holds,
+                np.concatenate((zero_row, points)),
+                np.concatenate((zero_row, headings)),
+                np.concatenate(([0.0], times)),
+                float(angle),
+            )
+        )
+    return TurnTables(
+        tuple(tables), nomoto.speed, radius, residual_motion < _RESIDUAL_MOTION_TOLERANCE
+    )
+
+
+def simulate_following_turns(
+    turn_maker: TurnMaker,
+    hold_grid: Array,
+    rudder: Array,
+    initial_states: Sequence[Array],
+    radius: float,
+) -> tuple[TurnTables, list[Turn]]:
+    """Return tables of n turns, each from a motion of its own, and the middle one of each.
+
+    Args:
+        hold_grid: [n, K] in s, K odd.
+        rudder: [n] in rad, positive to starboard.
+        initial_states: state of the vessel [nx] that each begins with.
+        radius: the vessel's smallest turning radius in m.
+    """
+    settling_time = 2.0 * _SETTLING_TIME * turn_maker.nomoto.time
+    simulated = turn_maker(hold_grid, rudder, initial_states, settling_time)
+    tables, middles = [], []
+    for angle, table_holds, group in zip(rudder, hold_grid, simulated, strict=True):
+        points, headings, times = _sample_turns(group)
+        middle_turn = group[len(group) // 2]
+        track, course = middle_turn.leg_at(np.linspace(0.0, settling_time, 80))
+        positions = (track - track[0]) @ (1.0, 1j) * np.exp(-1j * course[0])
+        leg = np.stack((positions.real, positions.imag, course - course[0]), axis=-1)
+        if angle < 0:
+            points, headings = points.conj(), -headings
+            leg[:, 1:] *= -1.0
+        distance = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(positions)))))
+        tables.append(
+            TurnTable(
+                table_holds, points, headings, times, abs(float(angle)), CubicSpline(distance, leg)
+            )
+        )
+        middles.append(middle_turn)
+    return TurnTables(tuple(tables), turn_maker.nomoto.speed, radius), middles
+
+
+def state_after_turn(turn: Turn, length: float) -> Array:
+    """Return the state of the vessel [nx] after a length in m of the leg behind a turn."""
+    times = np.linspace(0.0, float(turn.leg_phase.x[-1]), 80)
+    track, _ = turn.leg_at(times)
+    distance = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(track, axis=0).T))))
+    state: Array = turn.leg_phase(float(np.interp(length, distance, times)))
+    return state
+
+
+def _sample_turns(group: Sequence[Turn]) -> tuple[np.ndarray, Array, Array]:
+    """Return points [K, POINTS], headings [K, POINTS] and times [K] of turns, even in time."""
+    share = np.linspace(0.0, 1.0, POINTS + 1)[1:]
+    points, headings = np.zeros((len(group), POINTS), dtype=complex), np.zeros((len(group), POINTS))
+    for k, turn in enumerate(group):
+        track, headings[k] = turn.track_at(share * turn.duration)
+        points[k] = track @ (1.0, 1j)
+    return points, headings, np.array([turn.duration for turn in group])
+
+
+def _hold_times(share: Array, rudder: float, nomoto: NomotoModel) -> Array:
+    """Return the times in s for which the rudder is held, up to the largest angle of a turn.
+
+    By Nomoto's model angles are K d (t1 - t2), t2 = T ln(2 - exp(-t1 / T)).
+    """
+    max_hold_time = _MAX_TURN_ANGLE / (nomoto.gain * rudder) + math.log(2.0) * nomoto.time
+    return share**1.3 * max_hold_time
+
+
+LEG = 12
+"""Points of a leg beside its beginning."""
+_OVERSAMPLING = 8
+"""Times as many points as a turn is searched with describe it in the end."""
+
+
+@dataclass(frozen=True)
+class TurnSpec:
+    """A turn of a route before its time is known.
+
+    Attributes:
+        turn_sign: +1 to starboard, -1 to port.
+        angle: in rad.
+        table: number of the table of turns.
+        passed_buoys: buoys that are passed in it.
+    """
+
+    turn_sign: int
+    angle: float
+    table: int
+    passed_buoys: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class RouteOutline:
+    """A route in outline.
+
+    Attributes:
+        heading: of the first leg in rad.
+        legs: [n + 1] lengths in m.
+        turns: [n] between the legs.
+        passed_on_legs: for each leg, the buoys that are passed on it.
+    """
+
+    heading: float
+    legs: tuple[float, ...]
+    turns: tuple[TurnSpec, ...]
+    passed_on_legs: tuple[tuple[int, ...], ...]
+
+    def simplify(self, min_leg: float, min_angle: float) -> RouteOutline:
+        """Return the outline with bends joined that turn to one side with a short leg between.
+
+        Bends below `min_angle` rad are left out.
+        """
+        sketch, k = self, 0
+        while k < len(sketch.turns):
+            turn = sketch.turns[k]
+            if turn.angle < min_angle:
+                sketch = sketch._remove_turn(k)
+                k = max(k - 1, 0)
+                continue
+            next_turn = sketch.turns[k + 1] if k + 1 < len(sketch.turns) else None
+            if next_turn and next_turn.turn_sign == turn.turn_sign and sketch.legs[k + 1] < min_leg:
+                sketch = sketch._merge_turns(k)
+                continue
+            k += 1
+        return sketch
+
+    def _remove_turn(self, k: int) -> RouteOutline:
+        """Return the outline without a bend: both legs beside it are one."""
+        legs = (*self.legs[:k], self.legs[k] + self.legs[k + 1], *self.legs[k + 2 :])
+        merged_passed = (
+            *self.passed_on_legs[k],
+            *self.turns[k].passed_buoys,
+            *self.passed_on_legs[k + 1],
+        )
+        passed_on_legs = (*self.passed_on_legs[:k], merged_passed, *self.passed_on_legs[k + 2 :])
+        return RouteOutline(
+            self.heading, legs, (*self.turns[:k], *self.turns[k + 1 :]), passed_on_legs
+        )
+
+    def _merge_turns(self, k: int) -> RouteOutline:
+        """Return the outline with a bend and the next as one."""
+        first, second = self.turns[k], self.turns[k + 1]
+        wider_turn = max(first, second, key=lambda bend: bend.angle)
+        merged_turn = replace(
+            wider_turn,
+            angle=first.angle + second.angle,
+            passed_buoys=(*first.passed_buoys, *self.passed_on_legs[k + 1], *second.passed_buoys),
+        )
+        half_leg = 0.5 * self.legs[k + 1]
+        legs = (
+            *self.legs[:k],
+            self.legs[k] + half_leg,
+            self.legs[k + 2] + half_leg,
+            *self.legs[k + 3 :],
+        )
+        passed_on_legs = (*self.passed_on_legs[: k + 1], *self.passed_on_legs[k + 2 :])
+        return RouteOutline(
+            self.heading, legs, (*self.turns[:k], merged_turn, *self.turns[k + 2 :]), passed_on_legs
+        )
+
+
+@dataclass(frozen=True)
+class RouteGeometry:
+    """A route's points, its length of time, and what they change by.
+
+    A point moves with a length of its own part of the route, and with those of all parts before
+    it: these shift it and turn it about where they end.
+
+    Attributes:
+        points: [S] complex in m, from the start on.
+        time: in s.
+        heading: of the last leg in rad.
+        d_time: derivatives [nz] of the time.
+        d_heading: derivatives [nz] of the last heading.
+        d_points: derivatives [S] of the points by the length of their own part.
+        part_index: number in z of that length [S].
+        first_point_after: first point [nz] behind the part of each length.
+        shift, turn, pivot: what each length does to the points behind its part [nz].
+        units: of z [nz].
+    """
+
+    points: np.ndarray
+    time: float
+    heading: float
+    d_time: Array
+    d_heading: Array
+    d_points: np.ndarray
+    part_index: NDArray[np.intp]
+    first_point_after: NDArray[np.intp]
+    d_shift: np.ndarray
+    d_rotation: Array
+    rotation_pivot: np.ndarray
+    units: Array
+
+    def point_jacobian(self, point_numbers: NDArray[np.intp]) -> np.ndarray:
+        """Return the derivatives [P, nz] of points with the numbers [P]."""
+        offsets = self.points[point_numbers][:, None] - self.rotation_pivot
+        rows = np.where(
+            point_numbers[:, None] >= self.first_point_after,
+            self.d_shift + 1j * self.d_rotation * offsets,
+            0.0,
+        )
+        own_parts = self.part_index[point_numbers]
+        movable = np.flatnonzero(own_parts > 0)
+        rows[movable, own_parts[movable]] = self.d_points[point_numbers[movable]]
+        result: np.ndarray = rows * self.units
+        return result
+
+
+def _mirror_to_side(points: np.ndarray, turn_signs: Array) -> np.ndarray:
+    """Return turns [n, K] to starboard as turns to their sides [n]: to port they are mirrored."""
+    result: np.ndarray = points.real + 1j * turn_signs[:, None] * points.imag
+    return result
+
+
+@final
+@dataclass
+class Route:
+    """A route as a function of z = (first heading, leg, hold, leg, hold, ..., leg).
+
+    Headings are in rad, legs in m and holds in s, each divided by its unit.
+
+    Attributes:
+        start: complex, in m.
+        turn_signs: [n] of the turns.
+        table_numbers: [n] of their tables.
+        turns: the tables.
+        units: [2 n + 2] of z.
+    """
+
+    start: complex
+    turn_signs: tuple[int, ...]
+    table_numbers: tuple[int, ...]
+    turns: TurnTables
+    units: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.units = np.ones(2 + 2 * len(self.turn_signs))
+        self.units[1::2] = self.turns.min_radius
+        self.units[2::2] = self.turns.min_radius / self.turns.speed
+
+    def initial_z(self, sketch: RouteOutline) -> Array:
+        """Return the z that an outline stands for; turns need room before and behind them."""
+        z = np.zeros(len(self.units))
+        z[0], legs = sketch.heading, np.array(sketch.legs)
+        for k, turn in enumerate(sketch.turns):
+            table = self.turns.tables[turn.table]
+            _, lead_in, lead_out = table.fitted_arc
+            z[2 + 2 * k] = table.hold_time(turn.angle)
+            room_share = min(turn.angle / 0.8, 1.0)
+            legs[k] -= room_share * lead_in
+            legs[k + 1] -= room_share * lead_out
+        z[1::2] = np.maximum(legs, 0.0)
+        result: Array = z / self.units
+        return result
+
+    def lower_bounds(self) -> Array:
+        """Return the smallest z."""
+        lower = np.zeros(len(self.units))
+        lower[0] = -np.inf
+        lower[2::2] = [self.turns.tables[number].hold_times[0] for number in self.table_numbers]
+        result: Array = lower / self.units
+        return result
+
+    def upper_bounds(self) -> Array:
+        """Return the largest z."""
+        upper = np.full(len(self.units), np.inf)
+        upper[2::2] = [self.turns.tables[number].max_hold_time for number in self.table_numbers]
+        result: Array = upper / self.units
+        return result
+
+    def passing_points(self, sketch: RouteOutline, buoys: np.ndarray) -> NDArray[np.intp]:
+        """Return the points [N] at which an outline passes its buoys, in their order."""
+        z = self.initial_z(sketch)
+        points = self(z).points
+        passing_indices, previous_index = np.zeros(len(buoys), dtype=np.intp), 0
+        point_ranges: list[tuple[int, int, Sequence[int]]] = []
+        first_point = 0
+        for k, on_leg in enumerate(sketch.passed_on_legs):
+            point_ranges.append((first_point, first_point + LEG, on_leg))
+            first_point += LEG
+            if k < len(sketch.turns):
+                point_ranges.append(
+                    (first_point, first_point + POINTS, sketch.turns[k].passed_buoys)
+                )
+                first_point += POINTS
+        for range_start, range_stop, passed_buoys in point_ranges:
+            for buoy in passed_buoys:
+                search_start = min(max(range_start, previous_index), range_stop)
+                nearest_index = search_start + int(
+                    np.abs(points[search_start : range_stop + 1] - buoys[buoy]).argmin()
+                )
+                passing_indices[buoy] = previous_index = nearest_index
+        return passing_indices
+
+    def __call__(self, z: Array) -> RouteGeometry:
+        """Return the points of z, the time, and what they change by."""
+        z = z * self.units
+        n_variables, n_turns, speed = len(z), len(self.turn_signs), self.turns.speed
+        signs, first_heading, first_length = (
+            np.array(self.turn_signs, dtype=float),
+            float(z[0]),
+            float(z[1]),
+        )
+        shares = np.linspace(0.0, 1.0, LEG + 1)[1:]
+        turn_parts, turn_derivatives = self.turns.turns_at(self.table_numbers, z[2::2])
+        leg_parts, leg_derivatives = self.turns.legs_after(
+            self.table_numbers, z[3::2, None] * shares
+        )
+        turn_parts, turn_derivatives, leg_parts, leg_derivatives = (
+            part._replace(points=_mirror_to_side(part.points, signs))
+            for part in (turn_parts, turn_derivatives, leg_parts, leg_derivatives)
+        )
+        turn_angles, leg_angles = signs * turn_parts.headings, signs * leg_parts.headings
+        headings = first_heading + np.concatenate(([0.0], np.cumsum(turn_angles + leg_angles)))
+        leg_directions, exit_directions = (
+            np.exp(1j * headings),
+            np.exp(1j * (headings[:-1] + turn_angles)),
+        )
+        track = leg_directions[:-1, None] * turn_parts.points
+        leg = exit_directions[:, None] * leg_parts.points
+        first_corner = self.start + first_length * leg_directions[0]
+        leg_ends = first_corner + np.cumsum(track[:, -1:] + leg[:, -1:])
+        turn_ends = np.concatenate(([first_corner], leg_ends))[:-1] + track[:, -1]
+        turn_starts = np.concatenate(([first_corner], leg_ends))[:-1]
+        track_points = np.concatenate(
+            (turn_starts[:, None] + track, turn_ends[:, None] + leg), axis=1
+        )
+        points = np.concatenate(
+            (
+                [self.start],
+                self.start + first_length * leg_directions[0] * shares,
+                track_points.ravel(),
+            )
+        )
+        d_points = np.concatenate(
+            (
+                leg_directions[:-1, None] * turn_derivatives.points,
+                shares * exit_directions[:, None] * leg_derivatives.points,
+            ),
+            axis=1,
+        )
+        d_shift, d_rotation, rotation_pivot = (
+            np.zeros(n_variables, complex),
+            np.zeros(n_variables),
+            np.full(n_variables, self.start),
+        )
+        d_rotation[0], d_shift[1], rotation_pivot[1] = 1.0, leg_directions[0], first_corner
+        d_rotation[2::2], d_rotation[3::2] = (
+            signs * turn_derivatives.headings,
+            signs * leg_derivatives.headings,
+        )
+        d_shift[2::2] = leg_directions[:-1] * turn_derivatives.points[:, -1]
+        d_shift[3::2] = exit_directions * leg_derivatives.points[:, -1]
+        rotation_pivot[2::2], rotation_pivot[3::2] = turn_ends, leg_ends
+        lengths = np.array([1, LEG, *(POINTS, LEG) * n_turns])
+        d_time = np.zeros(n_variables)
+        d_time[1::2], d_time[2::2] = 1.0 / speed, turn_derivatives.times
+        return RouteGeometry(
+            points,
+            float(z[1::2].sum()) / speed + float(turn_parts.times.sum()),
+            float(headings[-1]),
+            d_time * self.units,
+            d_rotation * self.units,
+            np.concatenate(([0.0], leg_directions[0] * shares, d_points.ravel())),
+            np.repeat(np.arange(n_variables), lengths),
+            np.concatenate(([0], np.cumsum(lengths)[1:])),
+            d_shift,
+            d_rotation,
+            rotation_pivot,
+            self.units,
+        )
+
+    def to_segments(self, z: Array) -> list[tuple[np.ndarray, Array, float]]:
+        """Return the parts of a route: points [K] complex, vessel's headings [K], and rudder."""
+        z = z * self.units
+        heading_offset, position = float(z[0]), self.start
+        direction = cmath.exp(1j * heading_offset)
+        segments = [
+            (
+                np.array([position, position + float(z[1]) * direction]),
+                np.full(2, heading_offset),
+                0.0,
+            )
+        ]
+        position += float(z[1]) * direction
+        for k, (turn_sign, number) in enumerate(
+            zip(self.turn_signs, self.table_numbers, strict=True)
+        ):
+            hold_time, leg_length, table = (
+                float(z[2 + 2 * k]),
+                float(z[3 + 2 * k]),
+                self.turns.tables[number],
+            )
+            track, heading, duration = table(hold_time)
+            share = min(hold_time / duration, 1.0) if duration > 0 else 1.0
+            switch_index = min(
+                max(round(share * _OVERSAMPLING * POINTS), 1), _OVERSAMPLING * POINTS
+            )
+            track, heading = (
+                np.concatenate(([0.0], track if turn_sign > 0 else track.conj())),
+                np.concatenate(([0.0], turn_sign * heading)),
+            )
+            uniform_grid = np.linspace(0.0, 1.0, POINTS + 1)
+            track_spline = CubicSpline(
+                uniform_grid, np.stack((track.real, track.imag, heading.real), axis=-1)
+            )
+            fine_track = track_spline(np.linspace(0.0, 1.0, _OVERSAMPLING * POINTS + 1))
+            points, heading = (
+                position + direction * (fine_track[:, 0] + 1j * fine_track[:, 1]),
+                fine_track[:, 2],
+            )
+            segments.append(
+                (
+                    points[: switch_index + 1],
+                    heading_offset + heading[: switch_index + 1],
+                    turn_sign * table.rudder,
+                )
+            )
+            segments.append(
+                (
+                    points[switch_index:],
+                    heading_offset + heading[switch_index:],
+                    -turn_sign * table.rudder,
+                )
+            )
+            heading_offset += float(heading[-1])
+            direction, position = cmath.exp(1j * heading_offset), complex(points[-1])
+            leg_part, _ = table.leg_at(leg_length * np.linspace(0.0, 1.0, 100)[:, None] ** 2)
+            leg_points = leg_part.points[:, 0] if turn_sign > 0 else leg_part.points[:, 0].conj()
+            segments.append(
+                (
+                    position + direction * leg_points,
+                    heading_offset + turn_sign * leg_part.headings,
+                    0.0,
+                )
+            )
+            heading_offset += turn_sign * float(leg_part.headings[-1])
+            direction, position = cmath.exp(1j * heading_offset), complex(segments[-1][0][-1])
+        return segments

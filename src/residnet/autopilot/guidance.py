@@ -1,0 +1,749 @@
+"""Guidance laws: from way-points or a planned course to a desired heading.
+
+The crossing of a ferry feeds a reference filter: document 002 section 2.2.2.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Annotated, Literal, final
+
+import numpy as np
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+
+from residnet.autopilot.base import Policy, Reference
+from residnet.autopilot.courses.course_plan import Course
+from residnet.autopilot.heading.turning import NomotoModel
+from residnet.autopilot.motion import (
+    ActuatorLag,
+    PoseDerivatives,
+    ReferenceFilterConfig,
+    filter_derivatives,
+    required_force,
+    stack_reference,
+)
+from residnet.core.columns import dynamic_states, heading, motion_accelerations, pose, position
+from residnet.core.config import Config, Metres, MetresPerSecond, RadiansPerSecond, Seconds
+from residnet.core.errors import ConfigError
+from residnet.core.frames import wrap_angle
+from residnet.physics.force_model import ForceModel
+
+_ANGLES = 181
+"""Changes of course in the table, one for each degree."""
+_SAMPLES = 100
+"""Points of the track of a turn."""
+_DISTANCES = 400
+"""Distances that are tried for each turn."""
+
+
+@final
+class WheelOver(nn.Module):
+    """Distance before a way-point at which the leg changes, by the change of course there.
+
+    A vessel T r_dot + r = K delta that puts its rudder over to the limit, and then back until the
+    yaw stops on the next leg, has turned about the corner of both legs from the distance where its
+    track begins to where it ends. In sharp corners that track would stay out of the way-point's
+    circle of acceptance; there the distance is the largest from which it still reaches into the
+    circle.
+
+    Args:
+        limit: of the rudder in rad.
+        acceptance: radius of the circle in m.
+        share: of that radius that the track keeps within.
+        rate: of the rudder in rad/s; None where it stands at its command at once. While it moves,
+            half of the way is lost.
+    """
+
+    def __init__(
+        self,
+        nomoto: NomotoModel,
+        limit: float,
+        acceptance: float,
+        *,
+        share: float = 0.6,
+        rate: float | None = None,
+    ) -> None:
+        super().__init__()
+        angles, corner_distances, tracks = _switching_turns(nomoto, limit)
+        max_miss = share * acceptance
+        radius = nomoto.speed / (nomoto.gain * limit)
+        # an arc without lag, then the lag
+        max_distance = math.sqrt(max_miss * (2.0 * radius + max_miss)) + nomoto.speed * nomoto.time
+        distance = np.linspace(0.0, max_distance, _DISTANCES)
+        miss_distance = np.stack(
+            [np.hypot(distance[:, None] - track[:, 0], track[:, 1]).min(axis=1) for track in tracks]
+        )
+        best_distance = np.where(
+            (distance <= corner_distances[:, None]) & (miss_distance <= max_miss), distance, 0.0
+        ).max(axis=1)
+        course_changes = np.linspace(0.0, math.pi, _ANGLES)
+        rudder_distance = 0.0 if rate is None else 0.5 * nomoto.speed * limit / rate
+        self.register_buffer(
+            "table",
+            torch.from_numpy(np.interp(course_changes, angles, best_distance) + rudder_distance),
+            persistent=False,
+        )
+        self.table: Tensor
+
+    def forward(self, change: Tensor) -> Tensor:
+        """Return the distance [B] in m for changes of course [B] in rad, within +-pi."""
+        table = self.table.to(change.dtype)
+        table_position = change.abs() * (float(table.shape[0] - 1) / math.pi)
+        lower_index = table_position.floor().clamp(max=float(table.shape[0] - 2))
+        row, fraction = lower_index.long(), table_position - lower_index
+        return (1.0 - fraction) * table[row] + fraction * table[row + 1]
+
+
+def _switching_turns(
+    nomoto: NomotoModel, limit: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return heading changes [N], distances to the corner [N] and tracks [N, M, 2] of turns.
+
+    The heading changes go from 0 to past pi in rad; a distance is from a turn's beginning to where
+    the lines before and after it meet, in m; tracks are ahead and aside, in m.
+    """
+    max_yaw_rate, time_constant = nomoto.gain * limit, nomoto.time
+    hold_times = np.concatenate(
+        (
+            [0.0],
+            np.geomspace(
+                1e-3 * time_constant, math.pi / max_yaw_rate + 2.0 * time_constant, 4 * _ANGLES
+            ),
+        )
+    )[:, None]
+    yaw_rate_at_reversal = max_yaw_rate * (1.0 - np.exp(-hold_times / time_constant))
+    share = np.linspace(0.0, 1.0, _SAMPLES)[None, :]
+    # over, then back until the yaw has stopped
+    hold_phase = hold_times * share
+    reversal_phase = time_constant * np.log1p(yaw_rate_at_reversal / max_yaw_rate) * share[:, 1:]
+    heading_at_reversal = max_yaw_rate * hold_times - time_constant * yaw_rate_at_reversal
+    rate = (yaw_rate_at_reversal + max_yaw_rate) * np.exp(
+        -reversal_phase / time_constant
+    ) - max_yaw_rate
+    heading = np.concatenate(
+        (
+            max_yaw_rate
+            * (hold_phase - time_constant * (1.0 - np.exp(-hold_phase / time_constant))),
+            heading_at_reversal
+            + time_constant * (yaw_rate_at_reversal - rate)
+            - max_yaw_rate * reversal_phase,
+        ),
+        axis=1,
+    )
+    phase_times = np.concatenate((hold_phase, hold_times + reversal_phase), axis=1)
+    step = nomoto.speed * np.diff(phase_times, axis=1)
+    mean_heading = 0.5 * (heading[:, 1:] + heading[:, :-1])
+    increments = np.stack((step * np.cos(mean_heading), step * np.sin(mean_heading)), axis=-1)
+    track = np.concatenate((np.zeros((len(increments), 1, 2)), increments.cumsum(axis=1)), axis=1)
+    final_heading = heading[:, -1]
+    sine = np.sin(final_heading)
+    corner_distance = np.where(
+        sine > 1e-9,
+        track[:, -1, 0] - track[:, -1, 1] * np.cos(final_heading) / np.maximum(sine, 1e-9),
+        math.inf,
+    )
+    return final_heading, np.where(final_heading == 0.0, 0.0, corner_distance), track
+
+
+_MAX_LEG_OFFSET = 0.4
+"""Share of the circle of acceptance that a vessel may be set off its leg by, at the wheel-over and
+on from there, for the turn to count on.
+"""
+
+
+@final
+class WaypointGuidance(Reference):
+    """Reference heading [B, 1] along straight legs between way-points.
+
+    It is the leg's direction and the angle by which a law of the line of sight steers back to it.
+
+    The leg changes when the vessel enters the circle of acceptance of its way-point, or has passed
+    it; with a wheel-over, before that, where the vessel runs along its leg: its cross-track error,
+    and what its heading aside of the leg would add on the way, are small against the circle. A crab
+    angle is such a heading, by as much as the current will set the vessel. Behind the last
+    way-point it has arrived. Memory [B, 3 + that of the law]: number of the way-point that is
+    steered for, and where the vessel began, which is the beginning of the first leg.
+
+    Args:
+        points: way-points (north, east) in m, in their order.
+        acceptance: radius of the circle in m.
+        wheel_over: how far before a way-point the leg changes; None for in its circle.
+    """
+
+    def __init__(
+        self,
+        points: Sequence[tuple[float, float]],
+        acceptance: float,
+        line_of_sight: LineOfSight,
+        state: Sequence[str],
+        wheel_over: WheelOver | None = None,
+    ) -> None:
+        super().__init__()
+        if not points or acceptance <= 0:
+            raise ConfigError(
+                "way-points: give at least one, and a circle of acceptance above zero; given"
+                f" {len(points)}, {acceptance:g} m"
+            )
+        self.register_buffer("points", torch.tensor(points, dtype=torch.float64), persistent=False)
+        self.points: Tensor
+        self.acceptance, self.line_of_sight, self.wheel_over = acceptance, line_of_sight, wheel_over
+        self.max_leg_offset = _MAX_LEG_OFFSET * acceptance
+        self.x, self.y, self.psi = state.index("x"), state.index("y"), state.index("psi")
+        self.n_state = 3 + line_of_sight.n_state
+        self.may_finish = True
+
+    def initial_state(self, x: Tensor) -> Tensor:
+        """Return the memory at the start of the first leg, which begins where the vessel is."""
+        law_memory = torch.zeros(x.shape[0], self.n_state - 3, dtype=x.dtype, device=x.device)
+        return torch.cat(
+            (
+                torch.zeros_like(x[:, :1]),
+                x[:, self.x : self.x + 1],
+                x[:, self.y : self.y + 1],
+                law_memory,
+            ),
+            dim=-1,
+        )
+
+    def leg_geometry(
+        self, x: Tensor, leg_number: Tensor, s: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return a leg's direction [B] in rad, distance left [B] and cross-track error [B] in m.
+
+        The distance is along the leg; the cross-track error is positive to starboard of it.
+        """
+        points = self.points.to(x.dtype)
+        target = points[leg_number.clamp(max=len(points) - 1)]
+        leg_start = torch.where(
+            (leg_number == 0).unsqueeze(-1),
+            s[:, 1:3],
+            points[(leg_number - 1).clamp(0, len(points) - 1)],
+        )
+        leg_vector = target - leg_start
+        direction = torch.atan2(leg_vector[:, 1], leg_vector[:, 0])
+        north, east = target[:, 0] - x[:, self.x], target[:, 1] - x[:, self.y]
+        remaining_distance = north * torch.cos(direction) + east * torch.sin(direction)
+        return (
+            direction,
+            remaining_distance,
+            north * torch.sin(direction) - east * torch.cos(direction),
+        )
+
+    def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
+        leg_number = s[:, 0].long()
+        direction, remaining_distance, error = self.leg_geometry(x, leg_number, s)
+        has_reached = (remaining_distance <= 0) | (
+            remaining_distance * remaining_distance + error * error <= self.acceptance**2
+        )
+        if self.wheel_over is not None:
+            change = self.leg_geometry(x, leg_number + 1, s)[0] - direction
+            switch_distance = self.wheel_over(wrap_angle(change))
+            offset_at_corner = (
+                error.abs() + switch_distance * torch.sin(x[:, self.psi] - direction).abs()
+            )
+            has_reached = has_reached | (
+                (remaining_distance <= switch_distance)
+                & (offset_at_corner <= self.max_leg_offset)
+                & (leg_number < len(self.points) - 1)
+            )
+        leg_number = (leg_number + has_reached.long()).clamp(max=self.points.shape[0])
+        direction, _, error = self.leg_geometry(x, leg_number, s)
+        angle, memory = self.line_of_sight(error, direction, s[:, 3:])
+        heading = wrap_angle(direction + angle).unsqueeze(-1)
+        return heading, torch.cat((leg_number.to(x.dtype).unsqueeze(-1), s[:, 1:3], memory), dim=-1)
+
+    def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
+        """Return the rows behind their last way-point."""
+        return s[:, 0] >= self.points.shape[0]
+
+
+_MAX_DRIFT_TANGENT = 1.0
+"""Tangent of the largest crab angle."""
+
+
+@final
+class DriftEstimate(nn.Module):
+    """An estimate of how a steady current sets the vessel across its way.
+
+    It is the integral of E. Borhaug, A. Pavlov and K. Y. Pettersen (Integral LOS control for path
+    following of underactuated marine surface vessels in the presence of constant ocean currents,
+    CDC 2008; T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, section
+    12.3).
+
+    heading_d = direction - atan(e / distance + D), dD/dt = gain e / (distance^2 + (e + distance
+    D)^2), their D being sigma e_int / distance. At rest e = 0 and D is the tangent of the crab
+    angle asin(V_c / U) for a current V_c across the way of a vessel at speed U.
+
+    A current keeps its direction over ground while the way bends. So D is kept as a vector, north
+    and east, that only its part across the way steers by and that grows only there: what one leg
+    has taught is known on the next.
+
+    Memory s [B, 2]: the vector, at most one long.
+
+    Args:
+        distance: look-ahead in m.
+        gain: sigma in m/s. With a quarter of the speed both poles of the error lie at U / (2
+            distance).
+        dt: step in s.
+
+    Raises:
+        ConfigError: where one of them is not above zero.
+    """
+
+    def __init__(self, distance: float, gain: float, dt: float) -> None:
+        super().__init__()
+        if distance <= 0 or gain <= 0 or dt <= 0:
+            raise ConfigError(
+                "integral line of sight: distance, gain and step must be above zero, given"
+                f" {distance:g} m, {gain:g} m/s, {dt:g} s"
+            )
+        self.distance, self.gain, self.dt = distance, gain, dt
+        self.max_drift = _MAX_DRIFT_TANGENT
+
+    def cross_component(self, direction: Tensor, s: Tensor) -> Tensor:
+        """Return the part [B] to starboard of a direction [B] in rad."""
+        return torch.cos(direction) * s[:, 1] - torch.sin(direction) * s[:, 0]
+
+    def along_component(self, direction: Tensor, s: Tensor) -> Tensor:
+        """Return the part [B] along a direction [B] in rad."""
+        return torch.cos(direction) * s[:, 0] + torch.sin(direction) * s[:, 1]
+
+    def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> Tensor:
+        """Return the memory after a step.
+
+        Args:
+            s: memory [B, 2].
+            error: cross-track error [B] in m.
+            direction: of the way [B] in rad.
+        """
+        steering_error = error + self.distance * self.cross_component(direction, s)
+        drift_increment = self.dt * self.gain * error / (self.distance**2 + steering_error.square())
+        s = s + drift_increment.unsqueeze(-1) * torch.stack(
+            (-torch.sin(direction), torch.cos(direction)), dim=-1
+        )
+        return s / (s.square().sum(dim=-1, keepdim=True).sqrt() / self.max_drift).clamp(min=1.0)
+
+
+class LineOfSight(nn.Module, ABC):
+    """The angle between a leg and the course that is steered."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.n_state = 0
+
+    @abstractmethod
+    def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the angle [B] in rad that is added to the leg's direction, and the memory.
+
+        Args:
+            error: cross-track error [B] in m, positive to starboard of the leg.
+            direction: of the leg [B] in rad.
+            s: memory [B, n_state], zeros at the start.
+        """
+
+
+@final
+class LookAheadLineOfSight(LineOfSight):
+    """Steering for the point of the leg a distance ahead: -atan(error / distance).
+
+    With an estimate of the drift D across the leg, -atan(error / distance + D), the crab angle that
+    a steady current needs. Source: T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion
+    Control, section 12.3. Memory: of `DriftEstimate`, where there is one.
+
+    Args:
+        distance: along the leg in m.
+        drift: None for none.
+    """
+
+    def __init__(self, distance: float, drift: DriftEstimate | None = None) -> None:
+        super().__init__()
+        self.distance, self.drift = distance, drift
+        self.n_state = 0 if drift is None else 2
+
+    def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        slope = error / self.distance
+        if self.drift is not None:
+            slope = slope + self.drift.cross_component(direction, s)
+            s = self.drift(error, direction, s)
+        return -torch.atan(slope), s
+
+
+@final
+class EnclosureLineOfSight(LineOfSight):
+    """Steering for the forward point where a circle about the vessel meets the leg.
+
+    The angle is -asin(error / radius) (Fossen, section 12.3).
+
+    Further from the leg than the radius there is none; the vessel then steers straight for the leg.
+
+    Args:
+        radius: of the circle in m.
+    """
+
+    def __init__(self, radius: float) -> None:
+        super().__init__()
+        self.radius = radius
+
+    def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        return -torch.asin((error / self.radius).clamp(-1.0, 1.0)), s
+
+
+class LookAheadConfig(Config):
+    """Look-ahead-based line of sight.
+
+    Attributes:
+        distance: along the leg.
+    """
+
+    kind: Literal["lookahead"] = "lookahead"
+    distance: Metres = Field(gt=0)
+
+    def build(self, dt: float) -> LineOfSight:
+        """Return the law, for steps of dt seconds."""
+        return LookAheadLineOfSight(self.distance)
+
+
+class EnclosureConfig(Config):
+    """Enclosure-based line of sight.
+
+    Attributes:
+        radius: of the circle about the vessel.
+    """
+
+    kind: Literal["enclosure"] = "enclosure"
+    radius: Metres = Field(gt=0)
+
+    def build(self, dt: float) -> LineOfSight:
+        """Return the law, for steps of dt seconds."""
+        return EnclosureLineOfSight(self.radius)
+
+
+class IntegralLookAheadConfig(Config):
+    """Look-ahead-based line of sight with integral action against a steady current.
+
+    Attributes:
+        distance: along the leg.
+        gain: sigma of the integral action, below speed less current; a quarter of the speed returns
+            to a leg without overshoot.
+    """
+
+    kind: Literal["integral"] = "integral"
+    distance: Metres = Field(gt=0)
+    gain: MetresPerSecond = Field(gt=0)
+
+    def build(self, dt: float) -> LineOfSight:
+        """Return the law, for steps of dt seconds."""
+        return LookAheadLineOfSight(self.distance, DriftEstimate(self.distance, self.gain, dt))
+
+
+AnyLineOfSight = Annotated[
+    LookAheadConfig | EnclosureConfig | IntegralLookAheadConfig, Field(discriminator="kind")
+]
+
+
+_MIN_CURVATURE_FACTOR = 0.3
+"""Of 1 - curvature x cross-track error: beyond, the centre of the turn is near and the nearest
+point no longer known.
+"""
+
+
+@final
+class CourseGuidance(Reference):
+    """Reference [B, 3] for a planned course: heading, yaw rate and rudder in rad, rad/s, rad.
+
+    Line of sight on a curved path: heading_d = heading of the course - atan(e / look-ahead), e the
+    cross-track error, positive to starboard, where the vessel makes way along the course's own
+    tangent. Yaw rate and rudder are those of the course at the present speed, so that turns begin
+    before the arc does. The place along the course moves by one Newton step of the nearest point
+    each time, never back.
+
+    With an estimate of the drift D, heading_d = heading of the course - atan(e / look-ahead + D
+    across), and the yaw rate takes the speed over ground from D; D turns with respect to
+    the course in its bends. Memory [B, 1 or 3]: place along the course in m, and D.
+
+    Args:
+        lookahead: distance in m.
+        drift: integral action against a steady current, at the same look-ahead; None for none.
+    """
+
+    def __init__(
+        self,
+        course: Course,
+        lookahead: float,
+        state: Sequence[str],
+        drift: DriftEstimate | None = None,
+    ) -> None:
+        super().__init__()
+        if lookahead <= 0:
+            raise ConfigError(f"look-ahead must be above zero, given {lookahead:g} m")
+        curvatures = (
+            np.gradient(course.direction, course.step),
+            np.gradient(course.heading, course.step),
+        )
+        columns = (*course.track.T, course.direction, course.heading, course.rudder, *curvatures)
+        self.register_buffer(
+            "table", torch.from_numpy(np.stack(columns, axis=-1)), persistent=False
+        )
+        self.table: Tensor
+        self.table_step, self.length, self.lookahead = course.step, course.length, lookahead
+        self.max_arc_length = course.step * (len(course.track) - 1)
+        self.x, self.y, self.psi = state.index("x"), state.index("y"), state.index("psi")
+        self.u, self.v = state.index("u"), state.index("v")
+        self.min_curvature_factor = _MIN_CURVATURE_FACTOR
+        self.drift = drift
+        self.n_state = 1 if drift is None else 3
+        self.may_finish = True
+
+    def plan_at(self, arc_length: Tensor) -> Tensor:
+        """Return the plan [B, 7] at places [B] in m along the course.
+
+        The columns are north, east, direction, heading, rudder, and the curvatures of direction and
+        heading.
+        """
+        table_position = (arc_length / self.table_step).clamp(
+            0.0, float(self.table.shape[0]) - 1.001
+        )
+        lower_index = table_position.floor()
+        fraction = (table_position - lower_index).unsqueeze(-1)
+        row = lower_index.long()
+        return (1.0 - fraction) * self.table[row].to(arc_length.dtype) + fraction * self.table[
+            row + 1
+        ].to(arc_length.dtype)
+
+    def track_error(self, x: Tensor, arc_length: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the distance ahead [B] of a place on the course and its cross-track error in m."""
+        planned = self.plan_at(arc_length)
+        north, east = x[:, self.x] - planned[:, 0], x[:, self.y] - planned[:, 1]
+        c, s = torch.cos(planned[:, 2]), torch.sin(planned[:, 2])
+        return c * north + s * east, c * east - s * north
+
+    def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
+        arc_length = s[:, 0]
+        along_track_error, cross_track_error = self.track_error(x, arc_length)
+        curvature_factor = (1.0 - self.plan_at(arc_length)[:, 5] * cross_track_error).clamp(
+            min=self.min_curvature_factor
+        )
+        arc_length = (
+            arc_length + (along_track_error / curvature_factor).clamp(0.0, self.lookahead)
+        ).clamp(max=self.max_arc_length)
+        planned = self.plan_at(arc_length)
+        _, cross_track_error = self.track_error(x, arc_length)
+        direction, heading = planned[:, 2], planned[:, 3]
+        slope, memory = cross_track_error / self.lookahead, s[:, 1:]
+        cross_drift, along_drift = (
+            torch.zeros_like(cross_track_error),
+            torch.zeros_like(cross_track_error),
+        )
+        if self.drift is not None:
+            cross_drift, along_drift = (
+                self.drift.cross_component(direction, memory),
+                self.drift.along_component(direction, memory),
+            )
+            memory = self.drift(cross_track_error, direction, memory)
+        slope = slope + cross_drift
+        speed = torch.sqrt(x[:, self.u].square() + x[:, self.v].square())
+        drift_speed = speed / torch.sqrt(1.0 + cross_drift.square())
+        heading_error = wrap_angle(x[:, self.psi] - heading)
+        curvature_factor = (1.0 - planned[:, 5] * cross_track_error).clamp(
+            min=self.min_curvature_factor
+        )
+        progress = (speed * torch.cos(heading_error) + drift_speed * along_drift).clamp(
+            min=0.0
+        ) / curvature_factor
+        slope_rate = (
+            speed * torch.sin(heading_error) + drift_speed * cross_drift
+        ) / self.lookahead - along_drift * planned[:, 5] * progress
+        yaw_rate = planned[:, 6] * progress - slope_rate / (1.0 + slope.square())
+        reference = torch.stack((heading - torch.atan(slope), yaw_rate, planned[:, 4]), dim=-1)
+        return reference, torch.cat((arc_length.unsqueeze(-1), memory), dim=-1)
+
+    def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
+        """Return the rows behind the end of the course."""
+        return s[:, 0] >= self.length
+
+
+@final
+class TrackKeeping(Policy):
+    """The law delta = delta_d + law(psi - psi_d, r - r_d), saturated.
+
+    Any heading controller follows turns with it as it holds a course.
+
+    T r_dot + r = K delta has the same form for the differences from a motion that fulfils it, so
+    that a law for steps of the heading corrects them and lags behind nothing. A law with an
+    observer gets the rudder angle less delta_d.
+
+    Reference [B, 3] as of `CourseGuidance`. Memory [B, 1 + n_state of the law]: the rudder angle
+    [rad] as the steering gear follows, then the law's.
+
+    Args:
+        limit: of the rudder in rad.
+        dt: step in s.
+        rate: of the rudder in rad/s; None where it stands at its command at once.
+    """
+
+    def __init__(
+        self,
+        law: Policy,
+        state: Sequence[str],
+        *,
+        limit: float,
+        dt: float,
+        rate: float | None = None,
+    ) -> None:
+        super().__init__()
+        self.law = law
+        self.limit = limit
+        self.max_rudder_step = 2.0 * limit if rate is None else min(rate * dt, 2.0 * limit)
+        self.n_state = 1 + law.n_state
+        self.psi, self.r = state.index("psi"), state.index("r")
+
+    def initial_state(self, x: Tensor) -> Tensor:
+        """Return the rudder amidships, then the law's memory."""
+        return torch.cat((torch.zeros_like(x[:, :1]), self.law.initial_state(x)), dim=-1)
+
+    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the rudder command [B, 1] in rad and the memory.
+
+        Args:
+            x: state [B, nx].
+            reference: reference [B, 3] as of `CourseGuidance`.
+            s: memory [B, 1 + n_state of the law].
+        """
+        planned_rudder = reference[:, 2:3]
+        relative_state = x.clone()
+        relative_state[:, self.psi] = x[:, self.psi] - reference[:, 0]
+        relative_state[:, self.r] = x[:, self.r] - reference[:, 1]
+        correction, memory = self.law(relative_state, torch.zeros_like(planned_rudder), s[:, 1:])
+        command = (planned_rudder + correction).clamp(-self.limit, self.limit)
+        rudder = s[:, 0:1] + (command - s[:, 0:1]).clamp(
+            -self.max_rudder_step, self.max_rudder_step
+        )
+        memory = self.law.with_applied_rudder(memory, rudder - planned_rudder)
+        return command, torch.cat((rudder, memory), dim=-1)
+
+
+class CrossingConfig(Config):
+    """Legs from the first point to the last, where the ferry stops.
+
+    Attributes:
+        points: (north, east) in m, where the ferry starts and then where each leg ends.
+        circle: radius around the ferry; it meets the leg at the point that is steered for
+            (2.16)-(2.18).
+        frequency: Omega of the filter, all axes.
+        damping: Delta of the filter.
+        duration: of the whole crossing with its stop.
+    """
+
+    kind: Literal["crossing"] = "crossing"
+    points: tuple[tuple[Metres, Metres], ...] = Field(min_length=2)
+    circle: Metres = Field(default=6.0, gt=0)
+    frequency: RadiansPerSecond = Field(default=0.5, gt=0)
+    damping: float = Field(default=0.7, gt=0)
+    duration: Seconds = Field(gt=0)
+
+    @model_validator(mode="after")
+    def _check_legs(self) -> CrossingConfig:
+        if any(a == b for a, b in zip(self.points, self.points[1:], strict=False)):
+            raise ValueError("points: two in a row are the same; a leg needs a direction")
+        return self
+
+    def filter_config(self) -> ReferenceFilterConfig:
+        """Return the filter behind the guidance."""
+        final_waypoint = (*self.points[-1], 0.0)
+        frequencies = (self.frequency,) * 3
+        return ReferenceFilterConfig(
+            waypoints=(final_waypoint,), frequency=frequencies, damping=(self.damping,) * 3
+        )
+
+
+@final
+class Crossing(Reference):
+    """Reference [B, 18] for `Assisted`: the filtered line-of-sight point and each model's force.
+
+    Memory [B, 13]: the filter's nine, the number of the leg, the point and heading that were
+    steered for last.
+    """
+
+    def __init__(
+        self,
+        config: CrossingConfig,
+        dt: float,
+        models: Sequence[tuple[ForceModel, ActuatorLag | None]],
+    ) -> None:
+        super().__init__()
+        self.n_state = 13
+        self.config, self.dt, self.models = config, dt, list(models)
+        self.filter_config = config.filter_config()
+        self.step_matrix = self.filter_config.build(dt).advance[0]
+        self.points = torch.tensor(config.points, dtype=torch.float64)
+
+    def initial_state(self, x: Tensor) -> Tensor:
+        """Return the memory at rest where the ferry is, on the first leg; NaN for no point yet."""
+        zero_column = torch.zeros_like(x[:, :1])
+        return torch.cat(
+            (pose(x), zero_column.expand(-1, 7), torch.full_like(pose(x), torch.nan)), dim=-1
+        )
+
+    def steering_target(
+        self, x: Tensor, desired_heading: Tensor, leg: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the point and heading [B, 3] to steer for, and the leg [B] after a change.
+
+        `desired_heading` [B] is the desired heading in rad, x [B, nx] the state.
+        """
+        last_leg = len(self.points) - 2
+        current_position = position(x)
+        is_near_end = (self.points[leg + 1] - current_position).norm(dim=-1) < self.config.circle
+        has_arrived = is_near_end & (leg == last_leg)
+        leg = torch.where(is_near_end & (leg < last_leg), leg + 1, leg)
+        start, end = self.points[leg], self.points[leg + 1]
+        leg_direction = (end - start) / (end - start).norm(dim=-1, keepdim=True)
+        offset = current_position - start
+        distance_along_leg = (offset * leg_direction).sum(-1)
+        cross_track_error = offset[:, 0] * leg_direction[:, 1] - offset[:, 1] * leg_direction[:, 0]
+        forward_reach = (self.config.circle**2 - cross_track_error.square()).clamp(min=0.0).sqrt()
+        target_point = torch.where(
+            has_arrived[:, None],
+            end,
+            start + (distance_along_leg + forward_reach)[:, None] * leg_direction,
+        )
+        aim_vector = torch.where(
+            has_arrived[:, None], leg_direction, target_point - current_position
+        )
+        direction = torch.atan2(aim_vector[:, 1], aim_vector[:, 0])
+        return torch.cat(
+            (target_point, (desired_heading + wrap_angle(direction - desired_heading))[:, None]),
+            dim=-1,
+        ), leg
+
+    def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
+        previous_leg = s[:, 9].long()
+        target, leg = self.steering_target(x, heading(s), previous_leg)
+        # where the point jumps (first step, change of leg, the stop) it has no rate
+        rate = (target - s[:, 10:]) / self.dt
+        is_continuous = (position(rate).norm(dim=-1) < self.config.circle) & (leg == previous_leg)
+        rate = torch.where(is_continuous[:, None], rate, torch.zeros_like(rate))
+        desired_motion = filter_derivatives(self.filter_config, s[:, :9], target, rate)
+        forces = [
+            required_force(
+                model, PoseDerivatives(*(part[i : i + 1] for part in desired_motion)), lag, self.dt
+            )
+            for i, (model, lag) in enumerate(self.models)
+        ]
+        error = torch.stack((pose(s) - target, dynamic_states(s), motion_accelerations(s)), dim=-1)
+        next_error = torch.einsum("aij,baj->bia", self.step_matrix, error)
+        memory = torch.cat(
+            (
+                next_error[:, 0] + target,
+                next_error[:, 1],
+                next_error[:, 2],
+                leg[:, None].to(s.dtype),
+                target,
+            ),
+            dim=-1,
+        )
+        return stack_reference(desired_motion, torch.cat(forces)), memory

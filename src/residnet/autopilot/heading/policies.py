@@ -1,0 +1,680 @@
+"""Learned policies: an observer and a law with a recurrent network, or a network alone.
+
+They steer the heading, or the dive angle under a depth policy.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple, final
+
+import torch
+from torch import Tensor, nn
+
+from residnet.autopilot.base import Policy
+from residnet.autopilot.heading.classical import HeadingLaw
+from residnet.autopilot.heading.turning import NomotoModel
+from residnet.core.frames import wrap_angle
+from residnet.dynamics.steering_variation import DEPTH, HEADING, Axis
+
+
+class AnglePolicy(Policy, ABC):
+    """A policy that turns a heading, or the dive angle of a depth policy.
+
+    Attributes:
+        dt: step in s.
+    """
+
+    dt: float
+
+    def set_state_columns(self, state: Sequence[str]) -> None:
+        """Take heading and yaw rate, and the speed, from a state with these names."""
+        self.psi, self.u, self.r = state.index("psi"), state.index("u"), state.index("r")
+
+    def set_step(self, dt: float) -> None:
+        """Take steps of dt seconds from now on."""
+        self.dt = dt
+
+
+class HeadingPolicy(AnglePolicy, ABC):
+    """A heading policy with K, T and speed of its vessel, a rudder, and a memory with ranges.
+
+    Attributes:
+        axis: that it steers.
+        measured: what it is given, with units; what it steers by stands first.
+        gain: K of its vessel in 1/s.
+        time: T of its vessel in s.
+        speed: at which K and T hold, in m/s.
+        limit: of the rudder in rad.
+        rate: of the rudder in rad/s; infinite where it stands at its command at once.
+        max_rudder_step: most that the rudder moves in a step, in rad.
+    """
+
+    axis: ClassVar[Axis] = HEADING
+    measured: ClassVar[Mapping[str, str]] = {"psi": "rad", "u": "m/s", "r": "rad/s"}
+
+    def __init__(
+        self, state: Sequence[str], nomoto: NomotoModel, limit: float, rate: float | None
+    ) -> None:
+        super().__init__()
+        self.set_state_columns(state)
+        self.gain, self.time, self.speed = nomoto.gain, nomoto.time, nomoto.speed
+        self.limit = limit
+        self.rate = math.inf if rate is None else rate
+
+    def set_step(self, dt: float) -> None:
+        super().set_step(dt)
+        # a large number where the rudder has no rate: infinity would spoil gradients
+        self.max_rudder_step = min(self.rate * dt, 2.0 * self.limit)
+
+    @abstractmethod
+    def memory_ranges(
+        self, max_yaw_rate: float, max_rudder: float
+    ) -> dict[str, tuple[float, float]]:
+        """Return what the entries of the memory can be, [low, high] by name, with some room.
+
+        Args:
+            max_yaw_rate: fastest yaw rate in rad/s that is measured.
+            max_rudder: largest rudder angle in rad, relative to that of a course where one is followed.
+        """
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """Return what the card of an exported policy says of its structure."""
+
+
+@final
+class OddGRUCell(nn.Module):
+    """A gated recurrent unit whose memory changes sign with its features.
+
+    Gates see the sizes of features and memory, so that they are even; the candidate has no bias, so
+    that it is odd (K. Cho and others, 2014, for the gates). A step of another length than that of
+    training moves the memory by as much per second.
+
+    Args:
+        dt: step of training in s.
+        hidden: units of an odd layer between memory and output; 0 for none.
+    """
+
+    def __init__(self, features: int, units: int, dt: float, hidden: int = 0) -> None:
+        super().__init__()
+        n_joint = features + units
+        self.gates = nn.Linear(n_joint, 2 * units)
+        self.candidate = nn.Linear(n_joint, units, bias=False)
+        self.hidden = nn.Linear(n_joint, hidden, bias=False) if hidden > 0 else None
+        self.out = nn.Linear(n_joint + hidden, 1, bias=False)
+        nn.init.normal_(self.gates.weight, std=1.0 / math.sqrt(n_joint))
+        nn.init.zeros_(self.gates.bias)
+        nn.init.normal_(self.candidate.weight, std=1.0 / math.sqrt(n_joint))
+        nn.init.zeros_(self.out.weight)
+        self.units, self.trained_at = units, dt
+
+    def forward(self, features: Tensor, memory: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+        """Return the output [B, 1] and the memory [B, units] after a step of dt seconds."""
+        magnitudes = torch.cat((features, memory), dim=1).abs()
+        update, reset = torch.sigmoid(self.gates(magnitudes)).chunk(2, dim=1)
+        retention = (1.0 - update).clamp(min=1e-6)
+        if dt != self.trained_at:
+            retention = retention.pow(dt / self.trained_at)
+        candidate = torch.tanh(self.candidate(torch.cat((features, reset * memory), dim=1)))
+        memory = candidate + retention * (memory - candidate)
+        output_features = torch.cat((features, memory), dim=1)
+        if self.hidden is not None:
+            output_features = torch.cat(
+                (output_features, torch.tanh(self.hidden(output_features))), dim=1
+            )
+        output: Tensor = self.out(output_features)
+        return output, memory
+
+
+OBSERVER_CONSTANTS = ("heading_rate", "yaw_rate_rate", "push_rate", "cross_rate")
+"""Of the observer: how fast heading, yaw rate and push follow what is measured in 1/s, and how
+fast the yaw rate follows the heading's innovation in 1/s^2."""
+
+_MAX_INNOVATION = 0.35
+"""Difference in rad between measured and expected heading beyond which the estimate is lost."""
+
+
+class ObserverEstimate(NamedTuple):
+    """What is known of the vessel at a step, each [B, 1], SI.
+
+    Attributes:
+        heading, r: now.
+        disturbance_rudder: rudder angle that what pushes the bow stands for.
+        heading_ahead, r_ahead: once the pending commands have arrived.
+        surprise_heading, surprise_r: measured less expected.
+    """
+
+    heading: Tensor
+    r: Tensor
+    disturbance_rudder: Tensor
+    predicted_heading: Tensor
+    predicted_r: Tensor
+    heading_innovation: Tensor
+    r_innovation: Tensor
+
+
+@final
+class HeadingObserver(nn.Module):
+    """A Luenberger observer of T r_dot + r = K (delta + push - c psi), with a predictor.
+
+    The rudder is taken to act `lag` seconds after its command; the predictor adds what the commands
+    of these seconds will do, in closed form. K grows and T falls with the speed; c, which is zero
+    but for a dive angle, falls with its square. Where heading or yaw rate are far from what was
+    expected, the estimate begins anew at what is measured.
+
+    Args:
+        nomoto: K, T and speed of the vessel about straight ahead.
+        limit: largest push in rad.
+        lag: time in s between a command and its rudder; 0 for no predictor.
+        dt: step in s.
+    """
+
+    def __init__(self, nomoto: NomotoModel, limit: float, lag: float, dt: float) -> None:
+        super().__init__()
+        self.gain, self.time, self.restoring = nomoto.gain, nomoto.time, nomoto.restoring
+        self.limit, self.lag, self.max_innovation = limit, lag, _MAX_INNOVATION
+        self.dt, self.n_pending = dt, round(lag / dt)
+        self.register_buffer("remaining_lag", torch.zeros(0), persistent=False)
+        self.remaining_lag: Tensor
+        self.set_step(dt)
+
+    def set_step(self, dt: float) -> None:
+        """Take steps of dt seconds from now on."""
+        self.dt, self.n_pending = dt, round(self.lag / dt)
+        # time in s that is left of the lag when each pending command has acted, the oldest first
+        remaining = dt * torch.arange(self.n_pending - 1, -1, -1, dtype=torch.float64)
+        self.remaining_lag = remaining.to(self.remaining_lag.dtype)
+
+    def forward(
+        self,
+        psi: Tensor,
+        r: Tensor,
+        heading: Tensor,
+        yaw_rate: Tensor,
+        disturbance: Tensor,
+        pending: Tensor,
+        ratio: Tensor,
+        constants: list[Tensor],
+    ) -> ObserverEstimate:
+        """Return the estimate with a measurement taken in.
+
+        Args:
+            psi, r: measured heading and yaw rate [B, 1].
+            heading, yaw_rate, push: expected before the measurement, [B, 1].
+            pending: rudder angles [B, pending] that have still to act, the oldest first.
+            ratio: speed [B, 1] over that of K and T.
+            constants: `OBSERVER_CONSTANTS`, [1] or [B, 1] each.
+        """
+        heading_innovation, r_innovation = wrap_angle(psi - heading), r - yaw_rate
+        # no vessel does this within a step: measurements were missing, and the estimate is taken
+        # up anew where they come back, with the push as it was
+        max_yaw_rate = 3.0 * self.gain * ratio * self.limit
+        is_lost = (heading_innovation.abs() > self.max_innovation) | (
+            r_innovation.abs() > max_yaw_rate
+        )
+        heading, yaw_rate = torch.where(is_lost, psi, heading), torch.where(is_lost, r, yaw_rate)
+        zero_innovation = torch.zeros_like(r_innovation)
+        heading_innovation = torch.where(is_lost, zero_innovation, heading_innovation)
+        r_innovation = torch.where(is_lost, zero_innovation, r_innovation)
+        filter_gains = [1.0 - torch.exp(-self.dt * rate) for rate in constants[:2]]
+        rate_correction = (
+            filter_gains[1] * r_innovation + self.dt * constants[3] * heading_innovation
+        )
+        heading, yaw_rate = (
+            heading + filter_gains[0] * heading_innovation,
+            yaw_rate + rate_correction,
+        )
+        rudder_per_rate = self.time / (self.gain * ratio.square())
+        disturbance = (disturbance + constants[2] * rudder_per_rate * rate_correction).clamp(
+            -self.limit, self.limit
+        )
+        predicted_heading, predicted_r = heading, yaw_rate
+        if self.n_pending > 0:
+            effective_disturbance = self.with_restoring(disturbance, heading, ratio)
+            predicted_heading, predicted_r = self._predict_pending(
+                heading, yaw_rate, effective_disturbance, pending, ratio
+            )
+        return ObserverEstimate(
+            heading,
+            yaw_rate,
+            disturbance,
+            predicted_heading,
+            predicted_r,
+            heading_innovation,
+            r_innovation,
+        )
+
+    def with_restoring(self, disturbance: Tensor, heading: Tensor, ratio: Tensor) -> Tensor:
+        """Return the push [B, 1] in rad of rudder with what rights the vessel at an angle."""
+        return (
+            disturbance
+            if self.restoring == 0.0
+            else disturbance - self.restoring / ratio.square() * heading
+        )
+
+    def _predict_pending(
+        self, heading: Tensor, r: Tensor, disturbance: Tensor, pending: Tensor, ratio: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return heading and yaw rate [B, 1] when the pending rudder angles have acted."""
+        time_constant = self.time / ratio
+        step_response = 1.0 - torch.exp(-self.dt / time_constant)
+        remaining_decay = torch.exp(-self.remaining_lag / time_constant)
+        steady_rates = self.gain * ratio * (pending + disturbance)
+        lag = self.dt * self.n_pending
+        lag_decay = torch.exp(-lag / time_constant)
+        predicted_r = lag_decay * r + (steady_rates * step_response * remaining_decay).sum(
+            1, keepdim=True
+        )
+        heading_change = (
+            steady_rates * (self.dt - time_constant * step_response * remaining_decay)
+        ).sum(1, keepdim=True)
+        return heading + time_constant * (1.0 - lag_decay) * r + heading_change, predicted_r
+
+    def predict_step(
+        self, heading: Tensor, r: Tensor, disturbance: Tensor, rudder: Tensor, ratio: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return heading [-pi, pi) and yaw rate [B, 1] a step later under a rudder angle."""
+        time_constant = self.time / ratio
+        steady_rate = self.gain * ratio * (rudder + disturbance)
+        rate_change = (1.0 - torch.exp(-self.dt / time_constant)) * (steady_rate - r)
+        return wrap_angle(
+            heading + self.dt * steady_rate - time_constant * rate_change
+        ), r + rate_change
+
+
+OBSERVER_MEMORY = ("heading", "yaw_rate", "push", "rudder", "last_command")
+"""Memory of every observed policy; pending rudder angles and the network's units stand behind."""
+_N_FEATURES = 11
+"""Columns that the network sees; `ObservedPolicy.forward` lists them."""
+_DEGREE = math.pi / 180.0
+
+
+@final
+class ObservedPolicy(HeadingPolicy):
+    """The command clamp(limit (law + network) - push), with the law on estimates.
+
+    An observer estimates heading, yaw rate and push, a predictor where they will be once the
+    pending commands have arrived; the law sees these, and the push is taken away, with what rights
+    a dive angle. The network is a
+    recurrent residual, odd, so that port and starboard are alike; its output starts at zero. With
+    no units there is no network.
+
+    Memory s [B, 5 + pending + units]: `OBSERVER_MEMORY` in rad and rad/s, rudder angles that have still to
+    act, the oldest first, and the network's units.
+
+    Args:
+        nomoto: K, T and speed of the vessel about straight ahead.
+        constants: of the law, then `observer.CONSTANTS`, all positive.
+        limit: of the rudder in rad.
+        dt: step of the controller in s; `set_step` changes it.
+        rate: of the rudder in rad/s; None where it stands at its command at once.
+        lag: time in s between a command and its rudder; 0 for no predictor.
+        units: of the network; 0 for none.
+        trained_at: step in s that the network is trained at.
+    """
+
+    def __init__(
+        self,
+        state: Sequence[str],
+        *,
+        nomoto: NomotoModel,
+        law: HeadingLaw,
+        constants: Mapping[str, float | Tensor],
+        limit: float,
+        dt: float,
+        rate: float | None = None,
+        lag: float = 0.0,
+        units: int = 0,
+        trained_at: float = 0.04,
+    ) -> None:
+        super().__init__(state, nomoto, limit, rate)
+        self.units, self.radians_per_degree = units, _DEGREE
+        self.law = law
+        self.observer = HeadingObserver(nomoto, limit, lag, dt)
+        self.constant_names = (*law.constants, *OBSERVER_CONSTANTS)
+        self.n_law_constants = len(law.constants)
+        values = [
+            torch.as_tensor(constants[name], dtype=torch.float32) for name in self.constant_names
+        ]
+        self.constants = torch.nn.Parameter(torch.stack(values, dim=-1).log())
+        self.network = OddGRUCell(_N_FEATURES, max(units, 1), trained_at).requires_grad_(units > 0)
+        self.trained_at = trained_at
+        self.set_step(dt)
+
+    def set_step(self, dt: float) -> None:
+        super().set_step(dt)
+        self.observer.set_step(dt)
+        self.n_state = len(OBSERVER_MEMORY) + self.observer.n_pending + self.units
+
+    def without_network(self) -> ObservedPolicy:
+        """Return a copy whose network gives nothing: the law with its constants as they are."""
+        policy = copy.deepcopy(self)
+        torch.nn.init.zeros_(policy.network.out.weight)
+        return policy
+
+    def constant_values(self) -> dict[str, float]:
+        """Return the constants by name."""
+        constants = torch.exp(self.constants.detach()).tolist()
+        return dict(zip(self.constant_names, constants, strict=True))
+
+    def with_applied_rudder(self, s: Tensor, rudder: Tensor) -> Tensor:
+        pending_end = 5 + self.observer.n_pending
+        parts = (s[:, :3], rudder, s[:, 4:pending_end])
+        if self.observer.n_pending > 0:
+            parts = (s[:, :3], rudder, torch.cat((s[:, 4 : pending_end - 1], rudder), dim=1))
+        return torch.cat((parts[0], parts[1], parts[2], s[:, pending_end:]), dim=1)
+
+    def memory_ranges(
+        self, max_yaw_rate: float, max_rudder: float
+    ) -> dict[str, tuple[float, float]]:
+        disturbance, max_pending, half_turn = (
+            1.001 * self.limit,
+            1.001 * max_rudder,
+            1.001 * math.pi,
+        )
+        upper_limits = dict(
+            zip(
+                OBSERVER_MEMORY,
+                (half_turn, 3.0 * max_yaw_rate, disturbance, max_pending, max_pending),
+                strict=True,
+            )
+        )
+        upper_limits |= {f"pending_{k}": max_pending for k in range(self.observer.n_pending)}
+        upper_limits |= {f"unit_{k}": 1.001 for k in range(self.units)}
+        return {name: (-upper, upper) for name, upper in upper_limits.items()}
+
+    def describe(self) -> dict[str, Any]:
+        """Return the constants of law and observer, the predictor's lag and the network's units."""
+        return {
+            "kind": "observed",
+            "constants": self.constant_values(),
+            "lag": self.observer.lag,
+            "units": self.units,
+            "trained_at": self.trained_at,
+        }
+
+    def initial_state(self, x: Tensor) -> Tensor:
+        """Return the memory at the start: heading and yaw rate as seen, rudder amidships."""
+        heading = wrap_angle(x[:, self.psi : self.psi + 1])
+        zero_memory = torch.zeros(x.shape[0], self.n_state - 2, dtype=x.dtype)
+        return torch.cat((heading, x[:, self.r : self.r + 1], zero_memory), dim=-1)
+
+    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        n_fixed, n_pending = 5, self.observer.n_pending
+        rudder, last_command = s[:, 3:4], s[:, 4:5]
+        pending = s[:, n_fixed : n_fixed + n_pending]
+        constants = list(torch.exp(self.constants).split(1, dim=-1))
+        ratio = (x[:, self.u : self.u + 1] / self.speed).clamp(0.3, 3.0)
+        psi = x[:, self.psi : self.psi + 1]
+        estimate = self.observer(
+            psi,
+            x[:, self.r : self.r + 1],
+            s[:, 0:1],
+            s[:, 1:2],
+            s[:, 2:3],
+            pending,
+            ratio,
+            constants[self.n_law_constants :],
+        )
+        error = wrap_angle(reference - estimate.predicted_heading)
+        decay = ratio / self.time
+        force = decay * self.gain * ratio * self.limit
+        effective_disturbance = self.observer.with_restoring(
+            estimate.push, estimate.predicted_heading, ratio
+        )
+        rudder_share = (rudder + effective_disturbance) / self.limit
+        law_share = self.law(
+            error,
+            estimate.predicted_r,
+            rudder_share,
+            force,
+            decay,
+            constants[: self.n_law_constants],
+        )
+        law_share = law_share - effective_disturbance / self.limit
+        memory = s[:, n_fixed + n_pending :]
+        unlimited_share = law_share
+        if self.units > 0:
+            max_yaw_rate = self.gain * ratio * self.limit
+            noise_scale = math.sqrt(self.dt / self.trained_at)
+            features = torch.cat(
+                (
+                    torch.tanh(wrap_angle(reference - psi) / self.radians_per_degree),
+                    torch.tanh(error / self.radians_per_degree),
+                    torch.tanh(error / (5.0 * self.radians_per_degree)),
+                    error / (30.0 * self.radians_per_degree),
+                    1.7 * estimate.predicted_r / max_yaw_rate,
+                    torch.tanh(17.0 * estimate.predicted_r / max_yaw_rate),
+                    5.0 * estimate.push / self.limit,
+                    (3.0 * noise_scale / self.radians_per_degree) * estimate.heading_innovation,
+                    (52.0 * noise_scale) * estimate.r_innovation / max_yaw_rate,
+                    last_command / self.limit,
+                    torch.tanh(law_share),
+                ),
+                dim=1,
+            )
+            correction, memory = self.network(features, memory, self.dt)
+            unlimited_share = law_share + correction
+        command = self.limit * unlimited_share.clamp(-1.0, 1.0)
+        next_rudder = rudder + (command - rudder).clamp(-self.max_rudder_step, self.max_rudder_step)
+        queue = torch.cat((pending, next_rudder), dim=1)
+        effective_disturbance = self.observer.with_restoring(estimate.push, estimate.heading, ratio)
+        heading, yaw_rate = self.observer.predict_step(
+            estimate.heading, estimate.r, effective_disturbance, queue[:, 0:1], ratio
+        )
+        s = torch.cat(
+            (heading, yaw_rate, estimate.push, next_rudder, command, queue[:, 1:], memory), dim=1
+        )
+        return command, s
+
+
+@final
+class NetworkPolicy(HeadingPolicy):
+    """The command clamp(limit network): what it knows of its vessel it has learned in flight.
+
+    The network is a gated recurrent unit with an odd layer behind it, so that port and starboard
+    are alike. It sees heading error, yaw rate, the rudder's angle and the last command. Its output
+    starts at zero: untrained, it holds the rudder amidships. K and speed of the vessel are scales
+    of what it sees.
+
+    Memory s [B, 2 + units]: rudder and last command in rad, then the network's units.
+
+    Args:
+        nomoto: K, T and speed of the vessel about straight ahead.
+        limit: of the rudder in rad.
+        dt: step of the controller in s; `set_step` changes it.
+        rate: of the rudder in rad/s; None where it stands at its command at once.
+        units: of the network, at least one.
+        trained_at: step in s that the network is trained at.
+    """
+
+    def __init__(
+        self,
+        state: Sequence[str],
+        *,
+        nomoto: NomotoModel,
+        limit: float,
+        dt: float,
+        rate: float | None = None,
+        units: int,
+        trained_at: float = 0.04,
+    ) -> None:
+        super().__init__(state, nomoto, limit, rate)
+        self.units, self.radians_per_degree, self.trained_at = units, _DEGREE, trained_at
+        self.network = OddGRUCell(8, units, trained_at, hidden=units)
+        self.n_state = 2 + units
+        self.set_step(dt)
+
+    def constant_values(self) -> dict[str, float]:
+        """Return no constants: there is no law that has any."""
+        return {}
+
+    def with_applied_rudder(self, s: Tensor, rudder: Tensor) -> Tensor:
+        return torch.cat((rudder, s[:, 1:]), dim=1)
+
+    def memory_ranges(
+        self, max_yaw_rate: float, max_rudder: float
+    ) -> dict[str, tuple[float, float]]:
+        upper_limits = dict.fromkeys(("rudder", "last_command"), 1.001 * max_rudder)
+        upper_limits |= {f"unit_{k}": 1.001 for k in range(self.units)}
+        return {name: (-upper, upper) for name, upper in upper_limits.items()}
+
+    def describe(self) -> dict[str, Any]:
+        """Return the network's units and the step of its training."""
+        return {"kind": "network", "units": self.units, "trained_at": self.trained_at}
+
+    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        rudder, last_command, memory = s[:, 0:1], s[:, 1:2], s[:, 2:]
+        ratio = (x[:, self.u : self.u + 1] / self.speed).clamp(0.3, 3.0)
+        error = wrap_angle(reference - x[:, self.psi : self.psi + 1]) / self.radians_per_degree
+        relative_yaw_rate = x[:, self.r : self.r + 1] / (self.gain * ratio * self.limit)
+        features = torch.cat(
+            (
+                torch.tanh(error),
+                torch.tanh(error / 5.0),
+                torch.tanh(error / 20.0),
+                error / 30.0,
+                1.7 * relative_yaw_rate,
+                torch.tanh(17.0 * relative_yaw_rate),
+                rudder / self.limit,
+                last_command / self.limit,
+            ),
+            dim=1,
+        )
+        unlimited_share, memory = self.network(features, memory, self.dt)
+        command = self.limit * unlimited_share.clamp(-1.0, 1.0)
+        next_rudder = rudder + (command - rudder).clamp(-self.max_rudder_step, self.max_rudder_step)
+        return command, torch.cat((next_rudder, command, memory), dim=1)
+
+
+SIGHT_CONSTANTS = ("lookahead", "depth_rate", "drift_rate")
+"""Of a depth policy: look-ahead distance in m, and how fast depth and drift follow what is
+measured, in 1/s."""
+MAX_DEPTH = 1.2e4
+"""Largest depth in m, beyond the deepest sea."""
+_MAX_DRIFT_SHARE = 0.5
+"""Largest drift of the depth as a share of the speed."""
+
+
+@final
+class DepthPolicy(HeadingPolicy):
+    """Depth by the stern planes: a line of sight down to it, and a law on the dive angle.
+
+    The dive angle wanted is atan((z_d - z) / lookahead) - d / u, within `steepest`, with depth z
+    and drift d of z_dot = u sin(dive) + d estimated: what buoyancy and the angle of attack do to
+    the depth stands in d (T. I. Fossen, Handbook of Marine Craft, 2nd ed. 2021, section 12.4, for
+    the line of sight). The law sees the dive angle -theta as heading and -q as yaw rate.
+
+    Memory s [B, 2 + k]: z expected [m], d [m/s], then that of the law.
+
+    Args:
+        nomoto: K, T, c and speed of the dive angle.
+        constants: `SIGHT_CONSTANTS`, all positive.
+        steepest: largest dive angle wanted in rad.
+        limit, rate, dt: as of a heading policy, of the planes.
+    """
+
+    axis = DEPTH
+    measured: ClassVar[Mapping[str, str]] = {"z": "m", "u": "m/s", "theta": "rad", "q": "rad/s"}
+
+    def __init__(
+        self,
+        state: Sequence[str],
+        *,
+        nomoto: NomotoModel,
+        law: AnglePolicy,
+        constants: Mapping[str, float | Tensor],
+        steepest: float,
+        limit: float,
+        dt: float,
+        rate: float | None = None,
+    ) -> None:
+        super().__init__(state, nomoto, limit, rate)
+        self.law, self.steepest, self.max_drift_share = law, steepest, _MAX_DRIFT_SHARE
+        law.set_state_columns(tuple(HeadingPolicy.measured))
+        values = [torch.as_tensor(constants[name], dtype=torch.float32) for name in SIGHT_CONSTANTS]
+        self.constants = torch.nn.Parameter(torch.stack(values, dim=-1).log())
+        self.set_step(dt)
+
+    def set_state_columns(self, state: Sequence[str]) -> None:
+        """Take depth, speed, pitch and pitch rate from a state with these names."""
+        self.state_columns = [state.index(name) for name in self.measured]
+
+    def set_step(self, dt: float) -> None:
+        super().set_step(dt)
+        self.law.set_step(dt)
+        self.n_state = 2 + self.law.n_state
+
+    def without_network(self) -> DepthPolicy:
+        """Return a copy whose law has no network."""
+        policy, law = copy.deepcopy(self), self.law
+        assert isinstance(law, ObservedPolicy)
+        policy.law = law.without_network()
+        return policy
+
+    def constant_values(self) -> dict[str, float]:
+        """Return the constants by name, those of an observed law too."""
+        constants = dict(
+            zip(SIGHT_CONSTANTS, torch.exp(self.constants.detach()).tolist(), strict=True)
+        )
+        return constants | (
+            self.law.constant_values() if isinstance(self.law, ObservedPolicy) else {}
+        )
+
+    def memory_ranges(
+        self, max_yaw_rate: float, max_rudder: float
+    ) -> dict[str, tuple[float, float]]:
+        assert isinstance(self.law, HeadingPolicy)
+        max_drift = 3.1 * self.max_drift_share * self.speed
+        depth_ranges = {
+            "depth": (-1.01 * MAX_DEPTH, 1.01 * MAX_DEPTH),
+            "drift": (-max_drift, max_drift),
+        }
+        return depth_ranges | self.law.memory_ranges(max_yaw_rate, max_rudder)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the constants, the steepest dive, and what the law says of itself."""
+        assert isinstance(self.law, HeadingPolicy)
+        return {
+            "kind": "depth",
+            "constants": dict(
+                zip(SIGHT_CONSTANTS, torch.exp(self.constants.detach()).tolist(), strict=True)
+            ),
+            "steepest": self.steepest,
+            "law": self.law.describe(),
+        }
+
+    def with_applied_rudder(self, s: Tensor, rudder: Tensor) -> Tensor:
+        return torch.cat((s[:, :2], self.law.with_applied_rudder(s[:, 2:], rudder)), dim=1)
+
+    def _to_angle_state(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the depth [B, 1], and dive angle, speed and rate [B, 3] as the law sees them."""
+        z, u, theta, q = x[:, self.state_columns].split(1, dim=1)
+        return z, torch.cat((-theta, u, -q), dim=1)
+
+    def initial_state(self, x: Tensor) -> Tensor:
+        """Return the memory at the start: the depth as seen, no drift."""
+        z, angle_state = self._to_angle_state(x)
+        return torch.cat((z, torch.zeros_like(z), self.law.initial_state(angle_state)), dim=-1)
+
+    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        z, angle_state = self._to_angle_state(x)
+        lookahead, depth_rate, drift_rate = torch.exp(self.constants).split(1, dim=-1)
+        u = angle_state[:, 1:2].clamp(0.3 * self.speed, 3.0 * self.speed)
+        innovation = z - s[:, 0:1]
+        # no vessel does this within a step: the estimate begins anew, with the drift as it was
+        innovation = torch.where(innovation.abs() > u, torch.zeros_like(z), innovation)
+        predicted_depth = z - innovation
+        depth = predicted_depth + (1.0 - torch.exp(-self.dt * depth_rate)) * innovation
+        max_drift = self.max_drift_share * u
+        drift = s[:, 1:2] + (self.dt * depth_rate * drift_rate) * innovation
+        drift = torch.minimum(torch.maximum(drift, -max_drift), max_drift)
+        target_angle = torch.atan((reference - depth) / lookahead) - drift / u
+        target_angle = target_angle.clamp(-self.steepest, self.steepest)
+        command, memory = self.law(angle_state, target_angle, s[:, 2:])
+        next_depth = depth + self.dt * (u * torch.sin(angle_state[:, 0:1]) + drift)
+        return command, torch.cat((next_depth, drift, memory), dim=1)

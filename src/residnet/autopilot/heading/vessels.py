@@ -1,0 +1,411 @@
+"""Vessels as heading controllers see them: simulated, or a learned model of one."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import replace
+from typing import final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from residnet.autopilot.heading.turning import (
+    Array,
+    ManoeuvreRecord,
+    NomotoModel,
+    fit_response,
+    limit_rudder_rate,
+)
+from residnet.core.errors import ConfigError, FitError
+from residnet.core.names import suggest_name
+from residnet.dynamics.base import Dynamics
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.steering_variation import HEADING, Axis, VariedModel, VariedPlant
+from residnet.manoeuvres.actuated import commanded
+from residnet.physics.plant import HullPlant, Plant
+from residnet.physics.symmetry import get_dof
+
+_MAX_RESPONSE_STEP = 0.4
+"""Longest step in s by which a vessel's answer to its rudder is measured."""
+_STEPS_PER_LENGTH = 400
+"""Steps of one length before the next are twice as long."""
+_STEADY_TOLERANCE = 0.1
+"""Share of the yaw rate by which it may still change over the last half of the time."""
+_MAX_OVERSHOOT = 0.02
+"""Share of the steady yaw rate that a vessel of the first order may overshoot by."""
+_MAX_DURATION_FACTOR = 8
+"""Times the duration given that a turn is waited for."""
+_N_ZIGZAG_SWITCHES = 6
+"""Changes of rudder that a zigzag ends after."""
+_STEPS_TO_FIRST_SWITCH = 25
+"""Steps until a zigzag's first change of rudder."""
+_MAX_ZIGZAG_STEPS = 12000
+"""Steps after which a zigzag is given up."""
+_ZERO_STATES = ("x", "y", "z", "theta", "psi", "v", "w", "p", "q", "r")
+"""States that a straight course begins with at zero."""
+_RUN_UP_STEPS = (0.1, 6000)
+"""Step in s and steps of the run from rest to the speed of a straight course."""
+
+
+class SteeredVessel(ABC):
+    """A vessel whose first command is the angle that steers: the rudder's, or another axis' own.
+
+    Attributes:
+        axis: that is steered.
+        state: names of the columns of x.
+        inputs: names of the columns of w.
+        rate: of the rudder in rad/s; None where it stands at its command at once.
+        has_free_step: whether `model` can be built with steps of any length.
+    """
+
+    axis: Axis = HEADING
+    state: tuple[str, ...]
+    inputs: tuple[str, ...]
+    rate: float | None
+    has_free_step: bool = True
+
+    @abstractmethod
+    def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
+        """Return the steps of dt seconds.
+
+        The first columns of its memory are the variation of each row
+        (`dynamics.steering_variation.VARIATION`).
+        """
+
+    def memory(self, variation: Tensor) -> Tensor:
+        """Return the memory of `model` for variations [B, 3]."""
+        return variation
+
+    @abstractmethod
+    def straight_course(self, speed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the states [B, nx] and inputs [B, m] of straight courses.
+
+        `speed` [B] are multiples of the service speed.
+        """
+
+    @final
+    def state_column(self, name: str) -> int:
+        """Return the column of a state."""
+        return self.state.index(name)
+
+    @final
+    def estimate_nomoto(self, angle: float, duration: float, dt: float = 0.02) -> NomotoModel:
+        """Return K and T at the service speed, from answers to a rudder angle.
+
+        The angle is held first: T is the area above the yaw rate's answer over its end, less that
+        above the rudder's own way to the angle. The yaw rate of a vessel that hardly holds its
+        course overshoots in hard turns, or is not steady for long. Then K and T are those that
+        simulate its yaw rate best in a zigzag, with a delay beside them. An angle that comes to
+        rest under the held rudder tells c, and the zigzag K and T.
+
+        Args:
+            angle: of the rudder in rad.
+            duration: until the turn is steady, in s.
+            dt: step in s; later steps are longer.
+
+        Raises:
+            FitError: where the vessel does not answer its rudder so that it can be steered.
+        """
+        speed = float(self._straight_state()[0][0, self.state_column("u")])
+        times, rates, headings = self._simulate_step_response(angle, duration, dt)
+        if self.axis.value != self.axis.angle:
+            last_half = np.array_split(headings, 2)[1]
+            # an angle that is righted nears its end; one that is not goes round and round
+            if not np.ptp(last_half) <= abs(last_half.mean()):
+                raise FitError(
+                    f"at {angle:.3g} rad of planes the vessel is at {headings[-1]:.3g} rad after"
+                    f" {times[-1]:.3g} s and does not come to rest: nothing rights it. The planes"
+                    " hold an angle against what rights the vessel: check that its weight lies"
+                    " below its buoyancy (rigid_body.z_G, buoyancy.z_B) and its speed, or give"
+                    " turning_time more"
+                )
+            return self._estimate_restoring(angle, float(headings[-1]), speed, dt)
+        while times[-1] < _MAX_DURATION_FACTOR * duration and not _is_steady(times, rates):
+            times, rates, headings = self._simulate_step_response(angle, 2.0 * float(times[-1]), dt)
+        if not np.isfinite(rates).all():
+            raise FitError(f"the vessel's motion does not stay finite at {angle:.3g} rad of rudder")
+        steady = float(rates[-1])
+        is_first_order = steady * angle > 0 and _is_steady(times, rates)
+        if is_first_order and (rates / steady).max() <= 1.0 + _MAX_OVERSHOOT:
+            time = float(np.trapezoid(steady - rates, times)) / steady
+            time -= 0.0 if self.rate is None else 0.5 * abs(angle) / self.rate
+            if time > 0:
+                return NomotoModel(gain=steady / angle, time=time, speed=speed)
+        reached_indices = np.flatnonzero(headings * np.sign(angle) >= abs(angle))
+        if len(reached_indices) == 0:
+            raise FitError(
+                f"at {angle:.3g} rad of rudder the vessel does not turn by as much to that side"
+                f" within {times[-1]:.3g} s; it cannot be steered (check the sign of its rudder and"
+                " the limit)"
+            )
+        first_switch_time = float(times[reached_indices[0]])
+        response = fit_response(
+            [self._simulate_zigzag(angle, angle, first_switch_time, dt)[0]], 0.5 * first_switch_time
+        )
+        return NomotoModel(gain=response.gain, time=response.time, speed=speed)
+
+    def _estimate_restoring(
+        self, angle: float, final_angle: float, speed: float, dt: float
+    ) -> NomotoModel:
+        """Return K, T and c of a vessel that has come to rest at an angle `final_angle` under a held one.
+
+        `speed` is that of K and T in m/s.
+        """
+        if not (math.isfinite(final_angle) and final_angle * angle > 0):
+            raise FitError(
+                f"at {angle:.3g} rad of rudder the vessel comes to rest at an angle of {final_angle:.3g}"
+                " rad; it cannot be steered (check the sign of the command that steers)"
+            )
+        restoring, first_switch_time = angle / final_angle, 2.0 * self._longest_step(dt)
+        record, headings = self._simulate_zigzag(
+            angle, min(abs(angle), 0.5 * abs(final_angle)), first_switch_time, dt
+        )
+        corrected_record = replace(record, rudder=record.rudder - restoring * headings)
+        response = fit_response([corrected_record], _STEPS_TO_FIRST_SWITCH * first_switch_time)
+        return NomotoModel(float(response.gain), response.time, speed, restoring)
+
+    def _longest_step(self, dt: float) -> float:
+        """Return the longest step in s of answers that begin with steps of dt seconds."""
+        return max(dt, _MAX_RESPONSE_STEP) if self.has_free_step else dt
+
+    def _straight_state(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return state, inputs and memory of a straight course at the service speed, [1, ...]."""
+        x, w = self.straight_course(torch.ones(1, dtype=torch.float64))
+        return x, w, self.memory(torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64))
+
+    def _simulate_step_response(
+        self, angle: float, duration: float, dt: float
+    ) -> tuple[Array, Array, Array]:
+        """Return times, yaw rates and headings [N] under a held rudder, in steps that grow."""
+        r, psi, rate_sign = (
+            self.state_column(self.axis.rate),
+            self.state_column(self.axis.angle),
+            self.axis.side,
+        )
+        x, w, s = self._straight_state()
+        initial_heading = float(x[0, psi])
+        w[:, 0] = angle
+        times, rates, headings = [0.0], [0.0], [0.0]
+        longest_step = self._longest_step(dt)
+        with torch.no_grad():
+            while times[-1] < duration - 0.5 * dt:
+                model = self.model(dt)
+                for _ in range(min(_STEPS_PER_LENGTH, round((duration - times[-1]) / dt))):
+                    x, s = model.step(x, w, s)
+                    times.append(times[-1] + dt)
+                    rates.append(rate_sign * float(x[0, r]))
+                    headings.append(rate_sign * (float(x[0, psi]) - initial_heading))
+                dt = min(2.0 * dt, longest_step)
+        return np.array(times), np.array(rates), np.array(headings)
+
+    def _simulate_zigzag(
+        self, angle: float, switch_angle: float, first_switch_time: float, dt: float
+    ) -> tuple[ManoeuvreRecord, Array]:
+        """Return a zigzag with its headings, which go to an angle `turned` on each side.
+
+        `first_switch_time` is the time in s until its first change of rudder.
+        """
+        r, psi = self.state_column(self.axis.rate), self.state_column(self.axis.angle)
+        longest_step = self._longest_step(dt)
+        dt = (
+            dt
+            if longest_step <= dt
+            else min(max(first_switch_time / _STEPS_TO_FIRST_SWITCH, dt), longest_step)
+        )
+        model, (x, w, s) = self.model(dt), self._straight_state()
+        initial_heading, rudder_sign, switches = float(x[0, psi]), float(np.sign(angle)), 0
+        rates: list[float] = []
+        rudder: list[float] = []
+        headings: list[float] = []
+        with torch.no_grad():
+            while switches < _N_ZIGZAG_SWITCHES:
+                if len(rates) > _MAX_ZIGZAG_STEPS:
+                    raise FitError(
+                        f"a zigzag with {abs(angle):.3g} rad of rudder does not turn the vessel"
+                        f" back within {dt * _MAX_ZIGZAG_STEPS:.3g} s; it cannot be steered with so little"
+                        " rudder"
+                    )
+                headings.append(self.axis.side * (float(x[0, psi]) - initial_heading))
+                if rudder_sign * headings[-1] > abs(switch_angle):
+                    rudder_sign, switches = -rudder_sign, switches + 1
+                w[:, 0] = rudder_sign * abs(angle)
+                rates.append(self.axis.side * float(x[0, r]))
+                rudder.append(rudder_sign * abs(angle))
+                x, s = model.step(x, w, s)
+        rate = np.array(rates)
+        rudder_rate = math.inf if self.rate is None else self.rate
+        rudder_angles = limit_rudder_rate(np.array([0.0, *rudder]), rudder_rate, dt)[1:]
+        return ManoeuvreRecord(dt, rudder_angles, rate, np.isfinite(rate)), np.array(headings)
+
+
+def _is_steady(times: Array, rates: Array) -> bool:
+    """Return whether a yaw rate is steady over the last half of the time."""
+    last_half, steady = rates[np.searchsorted(times, 0.5 * times[-1]) :], rates[-1]
+    overshoots = np.abs(rates).max() > (1.0 + _STEADY_TOLERANCE) * abs(steady)
+    return bool(overshoots or np.abs(last_half - steady).max() <= _STEADY_TOLERANCE * abs(steady))
+
+
+@final
+class SteeredPlant(SteeredVessel):
+    """A simulated vessel; in calm water, or in the weather [inputs by name] given.
+
+    Raises:
+        ConfigError: where nothing steers it on the axis, or it makes no way ahead.
+    """
+
+    def __init__(self, plant: Plant, *, in_calm_water: bool = True, axis: Axis = HEADING) -> None:
+        if in_calm_water and isinstance(plant, HullPlant):
+            plant = plant.without_environment()
+        self.plant, self.axis = plant, axis
+        other_inputs = [name for name in plant.input_names if name != axis.command]
+        self.state, self.inputs = plant.state_names, (axis.command, *other_inputs)
+        self._straight_course_state = plant.make_initial_state(1)
+        # a propeller heels what turns about all axes
+        if (
+            plant.attitude_columns
+            or float(self._straight_course_state[0, self.state_column("u")]) == 0.0
+        ):
+            self._straight_course_state = self._simulate_run_up()
+        self.rate, self.lag = _identify_rudder_gear(plant, axis)
+
+    def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
+        return VariedPlant(self.plant, dt, integrator, self.axis)
+
+    def straight_course(self, speed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return states and inputs of straight courses; thrust grows with the speed squared."""
+        x = self._straight_course_state.to(speed.dtype).repeat(len(speed), 1)
+        x[:, self.state_column("u")] *= speed
+        command = self.plant.commands_for_demand(speed.square(), torch.zeros_like(speed))
+        command_inputs = dict(zip(self.plant.input_names, command.unbind(1), strict=False))
+        zero_input = torch.zeros_like(speed)
+        return x, torch.stack([command_inputs.get(name, zero_input) for name in self.inputs], dim=1)
+
+    def _simulate_run_up(self) -> Tensor:
+        """Return the state [1, nx] of a straight course at the speed of full drive, from rest."""
+        unit_speed, column = torch.ones(1, dtype=torch.float64), self.state_column("u")
+        (x, w), model = self.straight_course(unit_speed), self.model(_RUN_UP_STEPS[0])
+        with torch.no_grad():
+            for k in range(_RUN_UP_STEPS[1]):
+                previous_speed = float(x[0, column])
+                x, _ = model.step(x, w, torch.tensor([[1.0, 1.0, 0.0]]).double())
+                if k > 100 and abs(float(x[0, column]) - previous_speed) < 1e-7 * max(
+                    abs(previous_speed), 1e-3
+                ):
+                    break
+        if not float(x[0, column]) > 0.0:
+            raise ConfigError(
+                f"{self.axis.name} control needs a vessel that makes way ahead at full drive; this"
+                f" one reaches {float(x[0, column]):.3g} m/s"
+            )
+        course_state = self.plant.make_initial_state(1)
+        levelled_states = () if self.plant.attitude_columns else ("phi",)
+        retained = [
+            i for i, name in enumerate(self.state) if name not in (*_ZERO_STATES, *levelled_states)
+        ]
+        course_state[:, retained] = x[:, retained]
+        return course_state
+
+
+def _identify_rudder_gear(plant: Plant, axis: Axis) -> tuple[float | None, float | None]:
+    """Return the rate of the steering gear in rad/s and its time constant in s; None without one.
+
+    They are seen from what two angles lead to: where large ones move the rudder alike, its rate
+    holds, and where small ones move it in their proportion, it follows with a time constant.
+    """
+    if axis.gear not in plant.state_names:
+        return None, None
+    column, dt = plant.state_names.index(axis.gear), 1e-3
+    command = plant.input_names.index(axis.command)
+    x, w = plant.make_initial_state(1), torch.zeros(1, len(plant.input_names), dtype=torch.float64)
+
+    def rudder_rate_at(angle: float) -> float:
+        w[:, command] = angle
+        step = float(plant.finish_step(x, w, dt)[0, column] - x[0, column]) / dt
+        return step + float(plant.derivative(x, w)[0, column])
+
+    rate_at_large, rate_at_small, rate_at_half_small = (
+        rudder_rate_at(1.0),
+        rudder_rate_at(0.02),
+        rudder_rate_at(0.01),
+    )
+    if abs(rate_at_large - rudder_rate_at(0.5)) <= 1e-6 * abs(rate_at_large):
+        return rate_at_large, None
+    # what is at its command within a step has no lag
+    has_lag = (
+        abs(rate_at_small - 2.0 * rate_at_half_small) <= 1e-6 * abs(rate_at_small)
+        and rate_at_small * dt < 0.5 * 0.02
+    )
+    return None, 0.02 / rate_at_small if has_lag else None
+
+
+@final
+class SteeredModel(SteeredVessel):
+    """A learned model with the steering gear and straight courses of the vessel that it models.
+
+    Args:
+        input_names: names of its inputs; of what steers the angle or its command, the others are
+            commands of the vessel.
+        input_hold: whether its inputs are those at a step's start or means over the step.
+        vessel: in calm water.
+
+    Raises:
+        ConfigError: where nothing steers the model, or an input that the vessel does not command.
+    """
+
+    def __init__(
+        self,
+        model: HybridDynamics,
+        input_names: tuple[str, ...],
+        input_hold: str,
+        vessel: SteeredPlant,
+    ) -> None:
+        states = get_dof(model.signals.names).state_names
+        self.hull, self.vessel, self.uses_step_mean = model, vessel, input_hold == "mean"
+        self.axis = axis = vessel.axis
+        has_gear = vessel.rate is not None or vessel.lag is not None
+        self.state = (*states, axis.gear) if has_gear else states
+        self.inputs, self.rate = vessel.inputs, vessel.rate
+        if not {axis.gear, axis.command} & set(input_names) or axis.value not in states:
+            raise ConfigError(
+                f"{axis.name} control needs a model that tells {axis.value} and is driven by"
+                f" '{axis.gear}' or '{axis.command}'; it tells {', '.join(states)}, and its inputs"
+                f" are {', '.join(input_names)}"
+            )
+        self.has_free_step = model.n_state == 0
+        self.input_indices: list[int] = []
+        for name in input_names:
+            command = commanded(name)
+            if command not in vessel.inputs:
+                raise ConfigError(
+                    f"the model is driven by '{name}', which the vessel does not"
+                    f" command{suggest_name(command, vessel.inputs)}"
+                )
+            self.input_indices.append(vessel.inputs.index(command))
+
+    def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
+        """Return the model, varied, with its own integrator.
+
+        One without memory takes steps of any length.
+        """
+        return VariedModel(
+            self.hull,
+            dt,
+            self.input_indices,
+            self.uses_step_mean,
+            self.rate,
+            self.vessel.lag,
+            self.axis,
+        )
+
+    def memory(self, variation: Tensor) -> Tensor:
+        """Return the variation, then the head's memory without a past."""
+        return torch.cat((variation, variation.new_zeros(len(variation), self.hull.n_state)), dim=1)
+
+    def straight_course(self, speed: Tensor) -> tuple[Tensor, Tensor]:
+        x, w = self.vessel.straight_course(speed)
+        vessel_states = dict(zip(self.vessel.state, x.unbind(1), strict=True))
+        # what the vessel does not have, such as roll, is at rest
+        zero_state = torch.zeros_like(speed)
+        return torch.stack([vessel_states.get(name, zero_state) for name in self.state], dim=1), w

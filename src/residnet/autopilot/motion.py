@@ -1,0 +1,509 @@
+"""Motion control in three degrees of freedom: reference filter, PID, and feed-forward.
+
+Source: document 002 sections 2.2 and 2.2.1, eq. (2.15), corrections J7, J9, J13.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Annotated, Literal, NamedTuple, final
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from residnet.autopilot.base import Policy, Reference
+from residnet.core import columns
+from residnet.core.columns import dynamic_states, motion_accelerations, pose
+from residnet.core.config import Config, Metres, Radians, RadiansPerSecond, Seconds
+from residnet.core.errors import ConfigError
+from residnet.core.frames import to_body, wrap_angle
+from residnet.physics.force_model import ForceModel
+from residnet.physics.plant import Hull
+
+Waypoint = tuple[Metres, Metres, Radians]
+"""North, east and heading; headings are followed as they are written: from 0 to 180 deg clockwise,
+from 135 to -45 deg the other way.
+"""
+Frequency = Annotated[RadiansPerSecond, Field(gt=0)]
+Damping = Annotated[float, Field(gt=0)]
+
+
+class ReferenceFilterConfig(Config):
+    """A trajectory through way-points that are given one after the other, smoothed by a filter.
+
+    Attributes:
+        waypoints: (north, east, heading), the first from the start on.
+        interval: between waypoints; the last one stays.
+        frequency: Omega of x, y and psi.
+        damping: Delta of x, y and psi.
+    """
+
+    kind: Literal["reference_filter"] = "reference_filter"
+    waypoints: Annotated[tuple[Waypoint, ...], Field(min_length=1)]
+    interval: Seconds = Field(default=60.0, gt=0)
+    frequency: tuple[Frequency, Frequency, Frequency] = (0.5, 0.5, 0.5)
+    damping: tuple[Damping, Damping, Damping] = (0.7, 0.7, 0.7)
+
+    @property
+    def duration(self) -> float:
+        """Until the last waypoint's interval is over, in s."""
+        return self.interval * len(self.waypoints)
+
+    def build(self, dt: float) -> ReferenceFilter:
+        """Return the guidance for a loop with steps of dt seconds.
+
+        Raises:
+            ConfigError: where the interval is no whole number of steps.
+        """
+        return ReferenceFilter([self], dt)
+
+
+@final
+class ReferenceFilter(Reference):
+    """The filter (s + W)(s^2 + 2 D W s + W^2) on each of north, east and heading.
+
+    It is stepped by RK4 with the way-point held over a step.
+
+    The reference [B, 9] of a step is where the filter stands at its start: eta_d (north, east [m],
+    heading [rad], not wrapped), then nu_d and nu_d_dot in body axes along the desired heading. The
+    memory [B, 9] holds eta_d and its first and second derivative. The filter starts at rest where
+    the vessel is. It has one config for all rows, or one for each row of the batch, with the same
+    interval.
+    """
+
+    def __init__(self, configs: Sequence[ReferenceFilterConfig], dt: float) -> None:
+        super().__init__()
+        self.n_state = 9
+        intervals = {config.interval for config in configs}
+        steps = max(intervals) / dt
+        if len(intervals) > 1 or abs(steps - round(steps)) > 1e-6 * steps or round(steps) < 1:
+            interval_text = ", ".join(f"{interval:g} s" for interval in sorted(intervals))
+            raise ConfigError(
+                f"reference filter: interval ({interval_text}) must be the same for all and a whole number"
+                f" of steps of {dt:g} s"
+            )
+        self.steps_per_waypoint = round(steps)
+        self.n_waypoints = max(len(config.waypoints) for config in configs)
+        points = [
+            (
+                *config.waypoints,
+                *[config.waypoints[-1]] * (self.n_waypoints - len(config.waypoints)),
+            )
+            for config in configs
+        ]
+        self.register_buffer(
+            "waypoints", torch.tensor(points, dtype=torch.float64), persistent=False
+        )
+        self.waypoints: Tensor
+        self.register_buffer(
+            "advance",
+            torch.stack([self._step_matrix(config, dt) for config in configs]),
+            persistent=False,
+        )
+        self.advance: Tensor
+
+    @staticmethod
+    def _step_matrix(config: ReferenceFilterConfig, dt: float) -> Tensor:
+        """Return the matrix [3, 3, 3] of an RK4 step for (error, rate, acceleration) of each axis.
+
+        It is exact for a linear filter.
+        """
+        matrices = []
+        for w, d in zip(config.frequency, config.damping, strict=True):
+            a = (
+                torch.tensor(
+                    [[0, 1, 0], [0, 0, 1], [-(w**3), -(2 * d + 1) * w**2, -(2 * d + 1) * w]],
+                    dtype=torch.float64,
+                )
+                * dt
+            )
+            eye = torch.eye(3, dtype=torch.float64)
+            matrices.append(eye + a @ (eye + a @ (eye + a @ (eye + a / 4.0) / 3.0) / 2.0))
+        return torch.stack(matrices)
+
+    def initial_state(self, x: Tensor) -> Tensor:
+        """Return the memory [B, 9]: at rest at the vessel's pose."""
+        return torch.cat((pose(x), torch.zeros_like(x[:, :1]).expand(-1, 6)), dim=-1)
+
+    def waypoint_at(self, k: int) -> Tensor:
+        """Return the waypoint [B or 1, 3] that is given at step k."""
+        return self.waypoints[:, min(k // self.steps_per_waypoint, self.n_waypoints - 1)]
+
+    def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
+        desired_pose, pose_rate, pose_acceleration = (
+            pose(s),
+            dynamic_states(s),
+            motion_accelerations(s),
+        )
+        nu, nu_dot = to_body_derivatives(desired_pose[:, 2], pose_rate, pose_acceleration)
+        target = self.waypoint_at(k).to(s.dtype)
+        error = torch.stack(
+            (desired_pose - target, pose_rate, pose_acceleration), dim=-1
+        ).unsqueeze(-1)
+        next_error = (self.advance.to(s.dtype) @ error).squeeze(-1)
+        memory = torch.cat(
+            (next_error[:, :, 0] + target, next_error[:, :, 1], next_error[:, :, 2]), dim=-1
+        )
+        return torch.cat((desired_pose, nu, nu_dot), dim=-1), memory
+
+
+def to_body_derivatives(
+    psi: Tensor, pose_rate: Tensor, pose_acceleration: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return nu and nu_dot [..., 3] of a pose's first and second derivative [..., 3] in the earth.
+
+    A vector fixed in the earth turns by -r in the body (correction J7).
+    """
+    u, v = to_body(pose_rate[..., 0], pose_rate[..., 1], psi)
+    surge_acceleration, sway_acceleration = to_body(
+        pose_acceleration[..., 0], pose_acceleration[..., 1], psi
+    )
+    r = pose_rate[..., 2]
+    return (
+        torch.stack((u, v, r), dim=-1),
+        torch.stack(
+            (surge_acceleration + r * v, sway_acceleration - r * u, pose_acceleration[..., 2]),
+            dim=-1,
+        ),
+    )
+
+
+Gain = Annotated[float, Field(ge=0)]
+Gains = tuple[Gain, Gain, Gain]
+
+
+class FeedForward(nn.Module, ABC):
+    """The forces that a model of the vessel needs for the desired motion."""
+
+    @abstractmethod
+    def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
+        """Return tau [B, 3] for the desired nu_dot [B, 3] and nu [B, 3] in body axes."""
+
+
+@final
+class NoFeedForward(FeedForward):
+    """No feed-forward: feedback alone."""
+
+    def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
+        return torch.zeros_like(nu)
+
+
+@final
+class HullFeedForward(FeedForward):
+    """F0(nu_dot_d, nu_d) = M nu_dot_d + C(nu_d) nu_d + D(nu_d) nu_d of the believed hull (2.10)."""
+
+    def __init__(self, hull: Hull) -> None:
+        super().__init__()
+        self.hull = hull
+
+    def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
+        return self.hull.required_force(nu_dot, nu)
+
+
+class MotionPIDConfig(Config):
+    """Gains on surge, sway and yaw; all zero leaves the feed-forward alone.
+
+    Attributes:
+        proportional: in N/m, N/m, N m/rad.
+        integral: in N/(m s), N/(m s), N m/(rad s).
+        derivative: in N s/m, N s/m, N m s/rad.
+    """
+
+    kind: Literal["motion_pid"] = "motion_pid"
+    proportional: Gains
+    integral: Gains = (0.0, 0.0, 0.0)
+    derivative: Gains = (0.0, 0.0, 0.0)
+
+    def build(self, dt: float, feed_forward: FeedForward | None = None) -> MotionPID:
+        """Return the controller for a loop with steps of dt seconds."""
+        return MotionPID([self], dt, NoFeedForward() if feed_forward is None else feed_forward)
+
+
+@final
+class MotionPID(Policy):
+    """The law tau = F(nu_dot_d, nu_d) + Kp e + Ki I + Kd (nu_d - nu).
+
+    e = R^T(psi) (eta_d - eta) with its heading wrapped (2.9)-(2.14).
+
+    Reference [B, 9]: eta_d, nu_d, nu_dot_d, as `ReferenceFilter` gives it. The memory [B, 3] is I,
+    the sum of e dt of the steps before. There is one config for all rows, or one for each row of
+    the batch.
+    """
+
+    def __init__(
+        self, configs: Sequence[MotionPIDConfig], dt: float, feed_forward: FeedForward
+    ) -> None:
+        super().__init__()
+        self.n_state = 3
+        self.dt = dt
+        self.feed_forward = feed_forward
+        gains = [
+            [config.proportional for config in configs],
+            [config.integral for config in configs],
+            [config.derivative for config in configs],
+        ]
+        self.register_buffer("gains", torch.tensor(gains, dtype=torch.float64), persistent=False)
+        self.gains: Tensor
+
+    def body_error(self, x: Tensor, reference: Tensor) -> Tensor:
+        """Return e [B, 3] in body axes: m, m, rad."""
+        difference = pose(reference) - pose(x)
+        forward_error, lateral_error = to_body(difference[:, 0], difference[:, 1], x[:, 2])
+        return torch.stack((forward_error, lateral_error, wrap_angle(difference[:, 2])), dim=-1)
+
+    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the command tau [B, 3] in N, N, N m, and the integral with this step's error."""
+        error = self.body_error(x, reference)
+        nu_d = dynamic_states(reference)
+        gains = self.gains.to(x.dtype)
+        feedback = gains[0] * error + gains[1] * s + gains[2] * (nu_d - dynamic_states(x))
+        return self.feed_forward(reference[:, 6:9], nu_d) + feedback, s + self.dt * error
+
+
+@final
+class AllocatedPolicy(Policy):
+    """A controller whose demands are turned into the commands of a vessel.
+
+    Its forces, for example, are allocated to revolutions and angles of azimuth thrusters.
+
+    Args:
+        allocate: returns commands [B, c] for what the controller demands, [B, d].
+    """
+
+    def __init__(self, policy: Policy, allocate: Callable[[Tensor], Tensor]) -> None:
+        super().__init__()
+        self.policy, self.allocate = policy, allocate
+        self.n_state = policy.n_state
+
+    def initial_state(self, x: Tensor) -> Tensor:
+        return self.policy.initial_state(x)
+
+    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        demand, s = self.policy(x, reference, s)
+        return self.allocate(demand), s
+
+
+_DIFFERENCE_STEP = 0.05
+"""Seconds between the points that the force's derivatives are taken from; the reference itself is
+known analytically there.
+"""
+_RECOVERY_RATIO = 0.7
+"""How fast a miss of the needed force is made up for, in units of the lag's own frequency: the
+command's peaks grow with it.
+"""
+
+
+class ActuatorLag(Config):
+    """The lag of forces behind commands: tau'' + 2 zeta omega tau' + omega^2 tau = omega^2 tau_c.
+
+    tau_c is taken at t - delay (document 002 eq. (4.3)).
+
+    Attributes:
+        frequency: omega in rad/s.
+        damping: zeta, dimensionless.
+        delay: in s.
+    """
+
+    frequency: RadiansPerSecond = Field(gt=0)
+    damping: float = Field(gt=0)
+    delay: Seconds = Field(default=0.0, ge=0)
+
+
+class PoseDerivatives(NamedTuple):
+    """A desired pose in earth axes (north, east [m], heading [rad]) with derivatives, [..., 3]."""
+
+    pose: Tensor
+    rate: Tensor
+    acceleration: Tensor
+    jerk: Tensor
+    snap: Tensor
+
+    def extrapolate(self, h: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Return heading [...], nu_d and nu_dot_d [..., 3] in body axes h seconds later.
+
+        They follow the Taylor series.
+        """
+        pose = self.pose + h * (
+            self.rate + h / 2 * (self.acceleration + h / 3 * (self.jerk + h / 4 * self.snap))
+        )
+        rate = self.rate + h * (self.acceleration + h / 2 * (self.jerk + h / 3 * self.snap))
+        acceleration = self.acceleration + h * (self.jerk + h / 2 * self.snap)
+        psi = pose[..., 2]
+        return psi, *to_body_derivatives(psi, rate, acceleration)
+
+
+def filter_derivatives(
+    config: ReferenceFilterConfig, memory: Tensor, target: Tensor, target_rate: Tensor
+) -> PoseDerivatives:
+    """Return the desired pose and its derivatives up to the snap, from the filter's memory.
+
+    The third-order filter (2.15) has memory [..., 9] and a target [..., 3] that moves by
+    `target_rate`.
+    """
+    w = torch.tensor(config.frequency, dtype=memory.dtype)
+    d = 2.0 * torch.tensor(config.damping, dtype=memory.dtype) + 1.0
+    pose, rate, acceleration = (
+        columns.pose(memory),
+        columns.dynamic_states(memory),
+        columns.motion_accelerations(memory),
+    )
+    jerk = w**3 * (target - pose) - d * w**2 * rate - d * w * acceleration
+    snap = w**3 * (target_rate - rate) - d * w**2 * acceleration - d * w * jerk
+    return PoseDerivatives(pose, rate, acceleration, jerk, snap)
+
+
+def required_force(
+    model: ForceModel, motion: PoseDerivatives, lag: ActuatorLag | None, hold_time: float
+) -> Tensor:
+    """Return the force that a model needs when a command given now takes effect, [..., 9].
+
+    Its first and second derivative stand behind it.
+
+    Args:
+        lag: of the actuators; None commands the force itself, now and without derivatives.
+        hold_time: seconds that a command is held; on average it comes late by half of them.
+    """
+
+    def force_at(h: float) -> Tensor:
+        psi, nu, nu_dot = motion.extrapolate(h)
+        return model.thruster_force(nu_dot, nu, psi)
+
+    if lag is None:
+        force_now = force_at(0.0)
+        return torch.cat(
+            (force_now, torch.zeros_like(force_now), torch.zeros_like(force_now)), dim=-1
+        )
+    lead_time = lag.delay + 0.5 * hold_time
+    force_before, force_now, force_after = (
+        force_at(lead_time - _DIFFERENCE_STEP),
+        force_at(lead_time),
+        force_at(lead_time + _DIFFERENCE_STEP),
+    )
+    return torch.cat(
+        (
+            force_now,
+            (force_after - force_before) / (2 * _DIFFERENCE_STEP),
+            (force_after - 2 * force_now + force_before) / _DIFFERENCE_STEP**2,
+        ),
+        dim=-1,
+    )
+
+
+@final
+class LagCompensatedPID(Policy):
+    """PID on a reference that brings along what a model needs, led by the lag of the actuators.
+
+    Reference [B, 18]: eta_d, nu_d, nu_dot_d, then `required_force`. Memory [B, 15]: the integral of
+    the PID, then of each axis the predicted force of the actuators, its rate, and the integral and
+    double integral of what it misses of the needed force.
+
+    The command is tau_p + 2 zeta / omega tau_p' + (tau'' + k1 e' + k2 e + k3 I + k4 II) / omega^2,
+    e the miss: where the desired jerk jumps, the needed force has a corner that no command follows,
+    and the vessel would be left with a wrong velocity that the PID takes a minute to mend; the
+    integrals make up for it within seconds.
+
+    Args:
+        feedback: the PID, without feed-forward.
+        lags: of each row's actuators as its model has it; None commands the needed force itself.
+        dt: step in s.
+    """
+
+    def __init__(self, feedback: MotionPID, lags: Sequence[ActuatorLag | None], dt: float) -> None:
+        super().__init__()
+        self.feedback = feedback
+        self.n_state = feedback.n_state + 12
+        self.dt = dt
+        self.has_lag = any(lag is not None for lag in lags)
+        effective_lags = [lag or ActuatorLag(frequency=2.0, damping=1.0) for lag in lags]
+        lag_table = [
+            [float(lag is not None), effective_lag.frequency, effective_lag.damping]
+            for lag, effective_lag in zip(lags, effective_lags, strict=True)
+        ]
+        lag_matrices = [
+            [[0.0, 1.0, 0.0], [-(w**2), -2 * z * w, w**2], [0.0, 0.0, 0.0]]
+            for w, z in ((lag.frequency, lag.damping) for lag in effective_lags)
+        ]
+        step_matrix = torch.linalg.matrix_exp(torch.tensor(lag_matrices, dtype=torch.float64) * dt)
+        self.register_buffer("lag", torch.tensor(lag_table, dtype=torch.float64), persistent=False)
+        self.register_buffer("step", step_matrix, persistent=False)
+        self.lag: Tensor
+        self.step: Tensor
+
+    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        n = self.feedback.n_state
+        correction, integral = self.feedback(x, reference[:, :9], s[:, :n])
+        target_force = reference[:, 9:12]
+        if not self.has_lag:
+            return target_force + correction, torch.cat((integral, s[:, n:]), dim=-1)
+        force, rate, integral_error, double_integral = s[:, n:].unflatten(-1, (4, 3)).unbind(1)
+        error = target_force - force
+        is_lagged, frequency, damping = self.lag.split(1, dim=1)
+        k1, k2, k3, k4 = (
+            factor * (_RECOVERY_RATIO * frequency) ** power
+            for factor, power in ((4.0, 1), (6.0, 2), (4.0, 3), (1.0, 4))
+        )
+        required_acceleration = (
+            reference[:, 15:18]
+            + k1 * (reference[:, 12:15] - rate)
+            + k2 * error
+            + k3 * integral_error
+            + k4 * double_integral
+        )
+        lead_command = (
+            force + (2 * damping / frequency) * rate + required_acceleration / frequency**2
+        )
+        state = self.step @ torch.stack((force, rate, lead_command), dim=1)
+        memory = torch.cat(
+            (
+                integral,
+                state[:, 0],
+                state[:, 1],
+                integral_error + self.dt * error,
+                double_integral + self.dt * integral_error,
+            ),
+            dim=-1,
+        )
+        return torch.where(is_lagged > 0.0, lead_command, target_force) + correction, memory
+
+
+def stack_reference(motion: PoseDerivatives, force: Tensor) -> Tensor:
+    """Return [..., 18] for `LagCompensatedPID` from the desired motion and `required_force` [..., 9]."""
+    _, nu, nu_dot = motion.extrapolate(0.0)
+    return torch.cat((motion.pose, nu, nu_dot, force), dim=-1)
+
+
+def sample_filtered_course(config: ReferenceFilterConfig, dt: float) -> PoseDerivatives:
+    """Return the desired motion [T, 3] of a whole course from rest at the origin.
+
+    It is what the filter of `config` gives step by step.
+
+    The filter is linear and its target constant over an interval, so that powers of its step matrix
+    give each interval at once.
+    """
+    reference_filter = config.build(dt)
+    matrix, steps_per_waypoint = reference_filter.advance[0], reference_filter.steps_per_waypoint
+    powers = torch.eye(3, dtype=torch.float64).expand(1, 3, 3, 3)
+    step_power = matrix
+    while len(powers) <= steps_per_waypoint:
+        powers = torch.cat((powers, powers @ step_power))
+        step_power = step_power @ step_power
+    memory, memory_parts, targets = torch.zeros(9, dtype=torch.float64), [], []
+    for target in reference_filter.waypoints[0]:
+        error = torch.stack(
+            (
+                columns.pose(memory) - target,
+                columns.dynamic_states(memory),
+                columns.motion_accelerations(memory),
+            ),
+            dim=-1,
+        )
+        error_path = torch.einsum("taij,aj->tia", powers[: steps_per_waypoint + 1], error)
+        error_path[:, 0] += target
+        states = error_path.reshape(steps_per_waypoint + 1, 9)
+        memory_parts.append(states[:steps_per_waypoint])
+        targets.append(target.expand(steps_per_waypoint, 3))
+        memory = states[steps_per_waypoint]
+    target = torch.cat(targets)
+    return filter_derivatives(config, torch.cat(memory_parts), target, torch.zeros_like(target))

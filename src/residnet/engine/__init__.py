@@ -1,0 +1,1 @@
+"""What follows from one trace of the step: compiled rollouts, adjoints and Jacobians."""

@@ -1,0 +1,557 @@
+"""Measures of heading controllers: steps over many vessels, flights under conditions, courses.
+
+Times of courses are compared with a reference of arcs and straight lines.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from residnet.autopilot.base import Policy
+from residnet.autopilot.courses.config import PlannedCourse
+from residnet.autopilot.courses.course_check import find_passages
+from residnet.autopilot.heading.conditions import (
+    ClosedLoopSimulation,
+    ClosedLoopTrajectories,
+    ConditionsConfig,
+    HeadingStepBatch,
+    SteadinessLimits,
+    simulate_heading_steps,
+)
+from residnet.autopilot.heading.vessels import SteeredPlant, SteeredVessel
+from residnet.core.columns import all_but_pose
+from residnet.core.frames import wrap_angle
+from residnet.core.layout import HEADING, POSITION, RANGE_VELOCITIES
+from residnet.manoeuvres.trials import DisturbanceConfig
+from residnet.physics.environment import WavesConfig
+from residnet.physics.plant import Plant
+
+METRIC_UNITS = {
+    "settling": "s",
+    "overshoot": "rad",
+    "iae": "rad s",
+    "travel": "rad",
+    "energy": "rad^2 s",
+}
+"""Of a row, with units: last entry into the band, overshoot, integral of the absolute error, travel
+of the rudder command, integral of its square.
+"""
+
+
+def compute_run_metrics(
+    trajectories: ClosedLoopTrajectories, tolerance: float
+) -> dict[str, Tensor]:
+    """Return each of `METRIC_UNITS` by flight, [B]."""
+    values = (
+        trajectories.settling_time(tolerance),
+        trajectories.overshoot(),
+        trajectories.integrated_absolute_error(),
+        trajectories.rudder_travel(),
+        trajectories.control_effort(),
+    )
+    return dict(zip(METRIC_UNITS, values, strict=True))
+
+
+def summarize_distribution(values: Tensor) -> dict[str, float]:
+    """Return mean, median, 95th percentile and largest of values [B]."""
+    array = values.double().numpy()
+    return {
+        "mean": float(array.mean()),
+        "median": float(np.median(array)),
+        "p95": float(np.quantile(array, 0.95)),
+        "max": float(array.max()),
+    }
+
+
+def list_policy_objections(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return what rows of metrics.json say against using a policy rather than a tuned law."""
+    return _describe_cheaper_law(model, rows, "conditions", "under its conditions")
+
+
+def list_unsuitable_conditions(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return under which conditions beyond its own a tuned law costs less than a policy."""
+    protocols = dict.fromkeys(
+        row["protocol"] for row in rows if row["protocol"].startswith("beyond_")
+    )
+    return [
+        objection
+        for protocol in protocols
+        for objection in _describe_cheaper_law(model, rows, protocol, f"under '{protocol[7:]}'")
+    ]
+
+
+def describe_limit_cycles(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return in a sentence in how many flights without noise a policy keeps swinging, if any."""
+    rows_by_model = {row["model"]: row for row in rows if row["protocol"] == "quiet"}
+    if not (policy_row := rows_by_model.get(model)) or not policy_row.get("cycling"):
+        return []
+    steady_laws = [
+        name
+        for name, row in rows_by_model.items()
+        if row["kind"] == "classical" and not row["cycling"]
+    ]
+    return [
+        f"'{model}' keeps swinging in {policy_row['cycling']} of {policy_row['n']} flights without noise, its"
+        f" command by up to {math.degrees(policy_row['rudder_swing']['max']):.3g} deg; "
+        + (f"not so {', '.join(steady_laws)}." if steady_laws else "each tuned law does so too.")
+    ]
+
+
+def _describe_cheaper_law(
+    model: str, rows: Sequence[Mapping[str, Any]], protocol: str, condition_text: str
+) -> list[str]:
+    """Return in a sentence what the cheapest tuned law costs, where a policy costs more."""
+    costs = {
+        row["model"]: (row["kind"], row["cost"]["mean"])
+        for row in rows
+        if row["protocol"] == protocol and "cost" in row
+    }
+    laws = {name: cost for name, (model_kind, cost) in costs.items() if model_kind == "classical"}
+    if model not in costs or not laws:
+        return []
+    policy_cost, cheapest_law = costs[model][1], min(laws, key=laws.__getitem__)
+    # a policy that learned nothing flies as the law that it began with, but for rounding
+    if policy_cost <= laws[cheapest_law] or math.isclose(policy_cost, laws[cheapest_law]):
+        return []
+    return [
+        f"{condition_text} a flight costs {policy_cost:.4g} s, with {cheapest_law} {laws[cheapest_law]:.4g} s"
+    ]
+
+
+def _build_row(
+    controller: str, model_kind: str, protocol: str, metrics: Mapping[str, Tensor]
+) -> dict[str, Any]:
+    """Return a row of metrics.json with the distributions of what was found, [B] by name."""
+    row = {"model": controller, "kind": model_kind, "split": "simulated", "protocol": protocol}
+    return row | {name: summarize_distribution(values) for name, values in metrics.items()}
+
+
+def build_step_row(
+    controller: str,
+    model_kind: str,
+    protocol: str,
+    trajectories: ClosedLoopTrajectories,
+    tolerance: float,
+) -> dict[str, Any]:
+    """Return a row of metrics.json: distributions, flights not settled at the end, flights."""
+    is_finite = torch.isfinite(trajectories.states).all(dim=2).all(dim=1)
+    is_unsettled = (trajectories.error[:, -1].abs() > tolerance) | ~is_finite
+    return _build_row(
+        controller, model_kind, protocol, compute_run_metrics(trajectories, tolerance)
+    ) | {
+        "unsettled": int(is_unsettled.sum()),
+        "n": len(is_finite),
+        "diverged": int((~is_finite).sum()),
+    }
+
+
+def build_variation_grid(
+    effect_range: tuple[float, float], time_range: tuple[float, float]
+) -> Tensor:
+    """Return effect, time and zero bias [9, 3]: nominal first, then ends and middles."""
+    return torch.tensor(
+        [
+            (effect_factor, time_factor, 0.0)
+            for effect_factor in (1.0, *effect_range)
+            for time_factor in (1.0, *time_range)
+        ]
+    ).double()
+
+
+def draw_variations(
+    effect_range: tuple[float, float], time_range: tuple[float, float], n_variations: int, seed: int
+) -> Tensor:
+    """Return effect and time drawn evenly from their ranges, no bias: [count, 3]."""
+    uniform = torch.rand(
+        n_variations, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
+    lower, upper = torch.tensor([effect_range, time_range], dtype=torch.float64).T
+    return torch.cat(
+        (lower + (upper - lower) * uniform, torch.zeros(n_variations, 1).double()), dim=1
+    )
+
+
+def simulate_steps(
+    vessel: SteeredVessel,
+    policy: Policy,
+    heading_step: float,
+    dt: float,
+    duration: float,
+    variations: Tensor,
+) -> ClosedLoopTrajectories:
+    """Run steps of the reference, to starboard and to port in turn."""
+    turn_sign = torch.where(torch.arange(len(variations)) % 2 == 0, 1.0, -1.0)
+    return simulate_heading_steps(
+        vessel, policy, heading_step * turn_sign, variations, dt=dt, duration=duration
+    )
+
+
+def simulate_steps_in_wind(
+    plant: Plant, policy: Policy, speed: float, heading_step: float, dt: float, duration: float
+) -> ClosedLoopTrajectories:
+    """Run steps of the reference with the nominal vessel in wind from eight directions."""
+    wind_channels: dict[str, float | Tensor] = {
+        "wind_speed": speed,
+        "wind_dir": torch.arange(8) * (torch.pi / 4.0),
+    }
+    vessel, heading_steps = SteeredPlant(plant, in_calm_water=False), torch.full((8,), heading_step)
+    return simulate_heading_steps(
+        vessel,
+        policy,
+        heading_steps,
+        _nominal_variations(8),
+        dt=dt,
+        duration=duration,
+        weather=wind_channels,
+    )
+
+
+def simulate_steps_in_waves(
+    plant: Plant,
+    policy: Policy,
+    waves: WavesConfig,
+    heading_step: float,
+    dt: float,
+    duration: float,
+    seed: int,
+) -> ClosedLoopTrajectories:
+    """Run steps of the reference with the nominal vessel in eight seaways."""
+    disturbance, n_seaways = DisturbanceConfig(waves=waves), 8
+    return simulate_heading_steps(
+        SteeredPlant(plant, in_calm_water=False),
+        policy,
+        torch.full((n_seaways,), heading_step),
+        _nominal_variations(n_seaways),
+        dt=dt,
+        duration=duration,
+        wrap_source=lambda source: disturbance.add_waves(source, plant, n_seaways, dt, seed),
+    )
+
+
+def build_sea_row(
+    controller: str, model_kind: str, trajectories: ClosedLoopTrajectories, start_time: float
+) -> dict[str, Any]:
+    """Return a row of metrics.json: roots of mean squares from a time [s] on.
+
+    They are of heading error, rudder and, where the vessel rolls, heel.
+    """
+    signals = {"heading": trajectories.error, "rudder": trajectories.command}
+    if "phi" in trajectories.names:
+        signals["heel"] = trajectories.state("phi")
+    first_sample = round(start_time / trajectories.dt)
+    rms_values = {
+        f"{key}_rms": signal[:, first_sample:].square().mean(1).sqrt()
+        for key, signal in signals.items()
+    }
+    return _build_row(controller, model_kind, "sea", rms_values) | {"n": len(trajectories.target)}
+
+
+def _nominal_variations(count: int) -> Tensor:
+    return torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(count, -1)
+
+
+def build_time_series(
+    name: str, trajectories: ClosedLoopTrajectories, variations: Tensor
+) -> pd.DataFrame:
+    """Return heading, or depth, its rate and rudder every 0.05 s, all turned to starboard."""
+    stride = max(round(0.05 / trajectories.dt), 1)
+    tables = []
+    for i, variation in enumerate(variations):
+        turn_sign = 1.0 if i % 2 == 0 else -1.0
+        tables.append(
+            pd.DataFrame(
+                {
+                    "controller": name,
+                    "effect": float(variation[0]),
+                    "time": float(variation[1]),
+                    "t": torch.arange(0, trajectories.command.shape[1], stride).numpy()
+                    * trajectories.dt,
+                    **{
+                        state: turn_sign * trajectories.state(state)[i, :-1:stride].numpy()
+                        for state in (trajectories.axis.value, trajectories.axis.rate)
+                    },
+                    "rudder": turn_sign * trajectories.command[i, ::stride].numpy(),
+                }
+            )
+        )
+    return pd.concat(tables, ignore_index=True)
+
+
+_SWING_TOLERANCE = 1.25
+"""Of the limits that choose an epoch of training, which are a fifth below what a policy may do."""
+N_QUIET_RUNS = 100
+"""Flights without noise, waves and push; chosen by hand: fewer tell, and each takes longer."""
+
+
+def draw_heading_changes(conditions: ConditionsConfig, n_runs: int, seed: int) -> HeadingStepBatch:
+    """Return flights that no tuning or training has seen, the same for all controllers."""
+    generator = torch.Generator().manual_seed(seed + 2_000_003)
+    return conditions.sample_steps(n_runs, conditions.dt, generator)
+
+
+def evaluate_under_conditions(
+    controller: str,
+    model_kind: str,
+    protocol: str,
+    run: ClosedLoopSimulation,
+    conditions: ConditionsConfig,
+    changes: HeadingStepBatch,
+) -> tuple[dict[str, Any], pd.DataFrame]:
+    """Return a row of metrics.json, and a table with a line for each flight, in SI units.
+
+    A flight whose heading is no number counts as diverged, and with a heading error of 180 deg all
+    the time in the means.
+    """
+    trajectories = run.simulate(changes)
+    controlled_angle = trajectories.state(trajectories.axis.value)[:, :-1]
+    is_finite = torch.isfinite(controlled_angle).all(1) & torch.isfinite(trajectories.command).all(
+        1
+    )
+    worst_cost = conditions.duration + 0.5 * 180.0
+    metrics = {
+        name: torch.where(is_finite, values, worst_cost if name == "cost" else torch.nan)
+        for name, values in trajectories.step_metrics(conditions).items()
+    }
+    finite_metrics = {
+        name: values if name == "cost" else values[is_finite] for name, values in metrics.items()
+    }
+    available_metrics = {name: values for name, values in finite_metrics.items() if len(values)}
+    table = pd.DataFrame(
+        {
+            "controller": controller,
+            "protocol": protocol,
+            "flight": range(len(is_finite)),
+            **{name: values.numpy() for name, values in metrics.items()},
+        }
+    )
+    row = _build_row(controller, model_kind, protocol, available_metrics)
+    return row | {"n": len(is_finite), "diverged": int((~is_finite).sum())}, table
+
+
+def evaluate_limit_cycles(
+    controller: str,
+    model_kind: str,
+    run: ClosedLoopSimulation,
+    changes: HeadingStepBatch,
+    settling_time: float,
+) -> dict[str, Any]:
+    """Return the row of metrics.json of flights without noise: what still swings at their end.
+
+    `settling_time` is the time in s from the change on from which they are looked at.
+    """
+    trajectories = run.simulate(changes)
+    heading_swing, rudder_swing = trajectories.peak_to_peak(settling_time)
+    steadiness_limits = SteadinessLimits()
+    tolerances = (
+        _SWING_TOLERANCE * steadiness_limits.limits_for(trajectories.axis)[0],
+        _SWING_TOLERANCE * steadiness_limits.rudder_swing,
+    )
+    # what is no number is not within its limit
+    is_steady = (heading_swing <= tolerances[0]) & (rudder_swing <= tolerances[1])
+    swings = {"heading_swing": heading_swing, "rudder_swing": rudder_swing}
+    row = _build_row(controller, model_kind, "quiet", swings)
+    return row | {"cycling": int((~is_steady).sum()), "n": len(heading_swing)}
+
+
+@dataclass(frozen=True)
+class TrackingMetrics:
+    """The metrics of one run in closed loop; SI, angles in rad.
+
+    Attributes:
+        position_mae, position_mse: of the distance to the desired position in m, m^2 (4.6).
+        heading_mae, heading_mse: of the wrapped heading error in rad, rad^2 (4.7).
+        tau: mean |tau| commanded in surge, sway, yaw.
+        feedback: mean |tau_FB| in surge, sway, yaw.
+        motion_mse: of the velocities and accelerations against the desired ones in (m/s)^2,
+            (m/s)^2, (rad/s)^2 and per second squared (Table 4.8).
+        energy: integral of |tau' nu| in J, surge and sway, then yaw.
+        power: the same per second in W (Table 4.13).
+        iaew: integral of |e| times integral of power (3.18), position [m s J] and heading [rad s
+            J].
+    """
+
+    position_mae: float
+    position_mse: float
+    heading_mae: float
+    heading_mse: float
+    tau: tuple[float, float, float]
+    feedback: tuple[float, float, float]
+    motion_mse: tuple[float, ...]
+    energy: tuple[float, float]
+    power: tuple[float, float]
+    iaew: tuple[float, float]
+
+    def to_json(self) -> dict[str, float | list[float]]:
+        """Return the metrics for JSON."""
+        return {
+            key: list(value) if isinstance(value, tuple) else value
+            for key, value in asdict(self).items()
+        }
+
+
+def compute_tracking_metrics(
+    pose: Tensor,
+    motion: Tensor,
+    desired_motion: Tensor,
+    command: Tensor,
+    feedback: Tensor,
+    dt: float,
+) -> TrackingMetrics:
+    """Return the metrics of a run in closed loop.
+
+    Args:
+        pose: x, y, psi [T, 3].
+        motion: nu, nu_dot [T, 6].
+        desired_motion: eta_d, nu_d, nu_dot_d [T, 9].
+        command: tau_c [T, 3].
+        feedback: its part tau_FB [T, 3].
+        dt: step in s.
+    """
+    position_error = (desired_motion[:, POSITION] - pose[:, POSITION]).norm(dim=-1)
+    heading_error = wrap_angle(desired_motion[:, HEADING] - pose[:, HEADING]).abs()
+    power = command * motion[:, RANGE_VELOCITIES]
+    # the power of keeping the position and of keeping the heading are told apart (Table 4.13)
+    energy = [float(power[:, :2].sum(-1).abs().sum() * dt), float(power[:, 2].abs().sum() * dt)]
+    integrated_errors = [float(position_error.sum() * dt), float(heading_error.sum() * dt)]
+    duration, motion_mse = (
+        dt * len(pose),
+        (all_but_pose(desired_motion) - motion).square().mean(0).tolist(),
+    )
+    mean_command, mean_feedback = command.abs().mean(0).tolist(), feedback.abs().mean(0).tolist()
+    return TrackingMetrics(
+        float(position_error.mean()),
+        float(position_error.square().mean()),
+        float(heading_error.mean()),
+        float(heading_error.square().mean()),
+        (mean_command[0], mean_command[1], mean_command[2]),
+        (mean_feedback[0], mean_feedback[1], mean_feedback[2]),
+        tuple(motion_mse),
+        (energy[0], energy[1]),
+        (energy[0] / duration, energy[1] / duration),
+        (integrated_errors[0] * energy[0], integrated_errors[1] * energy[1]),
+    )
+
+
+def mean_squares_by_axis(residuals: Tensor) -> list[float]:
+    """Return the mean square of a residual [N, 3] by axis."""
+    return [float(value) for value in torch.mean(residuals.square(), dim=0)]
+
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CourseRun:
+    """A flight of one vessel along one course, until it ended.
+
+    Attributes:
+        track: north, east [N, 2] in m.
+        heading: [N] in rad.
+        rudder: command [N] in rad.
+        speed: [N] in m/s.
+        cross_track: [N] in m, positive to starboard of the plan.
+        dt: step in s.
+        finished: whether the end was reached in the time given.
+    """
+
+    track: Array
+    heading: Array
+    rudder: Array
+    speed: Array
+    cross_track: Array
+    dt: float
+    finished: bool
+
+
+def build_course_row(
+    model: str,
+    model_kind: str,
+    guidance: str,
+    planned: PlannedCourse,
+    run: CourseRun,
+    acceptance_radius: float,
+    service_speed: float,
+) -> dict[str, Any]:
+    """Return a row of metrics.json.
+
+    `ratios` is course time over the reference's length at the service speed; `ratio_turning` takes
+    the speed that the vessel keeps in its smallest turn, for vessels that slow down. `margins` is
+    how far inside the circle that was entered least, or outside the one that was passed most
+    closely.
+    """
+    must_enter = planned.protocol == "enter"
+    buoys = [
+        buoy.model_copy(update={"radius": acceptance_radius}) if must_enter else buoy
+        for buoy in planned.buoys
+    ]
+    closest_passages = find_passages(run.track, buoys)
+    course_time = (len(run.track) - 1) * run.dt
+    yaw_rate = np.abs(np.diff(run.heading)) / run.dt
+    metrics: dict[str, Any] = {
+        "model": model,
+        "kind": model_kind,
+        "guidance": guidance,
+        "split": "simulated",
+        "protocol": planned.protocol,
+        "finished": run.finished,
+        "course_time": course_time,
+        "reference_time": planned.reference_length / service_speed,
+        "ratio": course_time * service_speed / planned.reference_length,
+        "ratio_turning": course_time * planned.steady.speed / planned.reference_length,
+        "cross_track_rms": float(np.sqrt(np.mean(run.cross_track**2))),
+        "cross_track_max": float(np.abs(run.cross_track).max()),
+        "travel": float(abs(run.rudder[0]) + np.abs(np.diff(run.rudder)).sum()),
+        "tightest_turn": float((run.speed[:-1] / np.maximum(yaw_rate, 1e-9)).min()),
+        "distances": [passage.min_distance for passage in closest_passages],
+    }
+    boundary_distances = [
+        passage.min_distance - buoy.radius
+        for passage, buoy in zip(closest_passages, buoys, strict=True)
+    ]
+    margins = [-distance for distance in boundary_distances] if must_enter else boundary_distances
+    n_cleared, n_on_correct_side = sum(margin >= 0 for margin in margins), len(closest_passages)
+    if must_enter:
+        metrics |= {"entered": n_cleared}
+    else:
+        n_on_correct_side = sum(
+            closest_passage.passing_side == buoy.leave_to
+            for closest_passage, buoy in zip(closest_passages, buoys, strict=True)
+        )
+        metrics |= {"right_side": n_on_correct_side, "clear": n_cleared, "clearance": min(margins)}
+    return metrics | {
+        "passed": n_on_correct_side == n_cleared == len(closest_passages),
+        "margin": min(margins),
+        "n": len(closest_passages),
+    }
+
+
+def build_ensemble_row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return a row of metrics.json for many flights of one controller, from their own rows.
+
+    `passed` and `finished` are shares of the flights; flights that were given up count with the
+    time until then.
+    """
+    ratios, margins = (np.array([row[name] for row in rows]) for name in ("ratio", "margin"))
+    summary = {
+        name: rows[0][name] for name in ("model", "kind", "guidance", "protocol", "reference_time")
+    }
+    return summary | {
+        "split": "spread",
+        "n": len(rows),
+        "passed": float(np.mean([row["passed"] for row in rows])),
+        "finished": float(np.mean([row["finished"] for row in rows])),
+        "ratio": float(np.median(ratios)),
+        "ratio_worst": float(ratios.max()),
+        "margin": float(np.median(margins)),
+        "margin_worst": float(margins.min()),
+        "cross_track_rms": float(np.median([row["cross_track_rms"] for row in rows])),
+    }

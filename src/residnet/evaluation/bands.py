@@ -1,0 +1,480 @@
+"""Bands from errors of free runs over logs that the model was not fitted on, and how they fared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from residnet.core.layout import (
+    EXTRA_STATES,
+    HEADING,
+    PLANAR_LAYOUT,
+    POSITION,
+    SURGE_SWAY_YAW,
+    VELOCITIES,
+    DegreesOfFreedom,
+)
+from residnet.evaluation.band import (
+    Band,
+    MotionIntensity,
+    band_channels,
+    compute_run_weights,
+    conformal_level,
+    effective_sample_size,
+    excess_disagreement,
+    interval_score,
+    is_covered,
+    largest_error_ratios,
+    running_mean_squares,
+    weighted_quantile,
+    width_factors,
+)
+from residnet.evaluation.freerun import FreeRunErrors, Prediction
+from residnet.evaluation.protocol import Window
+from residnet.preprocessing.prepare import PreparedLog
+
+_MASKED_CHANNELS = tuple(PLANAR_LAYOUT.band_channels.index(name) for name in ("u", "v", "position"))
+"""Channels that are scored over usable samples alone."""
+
+
+@dataclass(frozen=True)
+class RunErrors:
+    """What a free run of L samples after the first got wrong, and how it moved.
+
+    Attributes:
+        log: name of the log.
+        manoeuvre: its kind.
+        error: absolute errors [L, c] by channel, NaN where they are not scored.
+        states: predicted [L + 1, 3 + n], from the initial state on.
+        spread: standard deviation between unlike models [L, c]; None where there are none.
+        dof: what moves, by which channels are.
+    """
+
+    log: str
+    manoeuvre: str
+    error: np.ndarray
+    states: np.ndarray
+    spread: np.ndarray | None = None
+    dof: DegreesOfFreedom = SURGE_SWAY_YAW
+
+    def half_widths(self, band: Band) -> np.ndarray:
+        """Return the half widths [L, c] that a band gives the run."""
+        return band.half_widths(self.states, self.spread)
+
+    def __len__(self) -> int:
+        return len(self.error)
+
+
+def compute_run_errors(
+    windows: Sequence[Window],
+    predictions: Sequence[Prediction],
+    logs: Sequence[PreparedLog],
+    errors: FreeRunErrors | None = None,
+) -> list[RunErrors]:
+    """Return the errors of one model's free runs over W windows, their first samples left out."""
+    errors = (
+        FreeRunErrors.from_predictions(windows, predictions, logs) if errors is None else errors
+    )
+    channel_errors = band_channels(np.abs(errors.error), np.hypot(*errors.error[:, POSITION].T))
+    channel_errors[np.ix_(~errors.is_usable, np.array(_MASKED_CHANNELS))] = np.nan
+    dof = errors.dof
+    scored_channels = {
+        *dof.active_states,
+        *["heading"] * dof.has_heading,
+        *["position"] * dof.has_position,
+    }
+    channel_errors[:, [name not in scored_channels for name in dof.layout.band_channels]] = np.nan
+    errors_by_window = np.split(channel_errors, errors.window_starts[1:])
+    return [
+        RunErrors(
+            log.log.name, log.log.manoeuvre, error[1:], prediction.states, prediction.spread, dof
+        )
+        for log, error, prediction in zip(
+            (logs[window.log_index] for window in windows),
+            errors_by_window,
+            predictions,
+            strict=True,
+        )
+    ]
+
+
+@dataclass(frozen=True)
+class BandCounts:
+    """Sums over the scored samples of each of W windows, by channel [W, c].
+
+    Attributes:
+        channels: names.
+        n_scored: number of samples.
+        n_inside: how many of them the band holds.
+        is_run_inside: 1 where the band of whole runs holds the window, NaN where nothing is scored.
+        interval_score_sum: sum of the interval scores, in the units of the band.
+        constant_score_sum: the same of a band of one width.
+    """
+
+    channels: tuple[str, ...]
+    n_scored: np.ndarray
+    n_inside: np.ndarray
+    is_run_inside: np.ndarray
+    interval_score_sum: np.ndarray
+    constant_score_sum: np.ndarray
+
+    def to_row(self, window_mask: np.ndarray) -> dict[str, Any]:
+        """Return what a row of metrics.json says of chosen windows [W] bool."""
+        n_scored = self.n_scored[window_mask].sum(axis=0)
+        is_scored = n_scored > 0
+
+        def compute_mean(window_sums: np.ndarray) -> np.ndarray:
+            return np.asarray(window_sums[window_mask].sum(axis=0)[is_scored] / n_scored[is_scored])
+
+        coverage = compute_mean(self.n_inside)
+        names = [name for name, scored in zip(self.channels, is_scored, strict=True) if scored]
+        return {
+            "band_coverage": {
+                **dict(zip(names, map(float, coverage), strict=True)),
+                "mean": float(coverage.mean()),
+                "whole": float(np.nanmean(self.is_run_inside[window_mask])),
+            },
+            "band_score": float(compute_mean(self.interval_score_sum).mean()),
+            "band_score_constant": float(compute_mean(self.constant_score_sum).mean()),
+        }
+
+
+def count_coverage(runs: Sequence[RunErrors], band: Band) -> BandCounts:
+    """Return how a band fared over free runs of its model."""
+    errors = [run.error for run in runs]
+    widths = [run.half_widths(band) for run in runs]
+    largest_ratios = largest_error_ratios(errors, widths)
+
+    def scores(half_widths: Sequence[np.ndarray]) -> np.ndarray:
+        return np.stack(
+            [
+                np.nansum(interval_score(error, width, band.level), axis=0) / band.score_unit
+                for error, width in zip(errors, half_widths, strict=True)
+            ]
+        )
+
+    return BandCounts(
+        band.channels,
+        np.stack([np.isfinite(error).sum(axis=0) for error in errors]),
+        np.stack(
+            [(error <= width).sum(axis=0) for error, width in zip(errors, widths, strict=True)]
+        ),
+        np.where(np.isnan(largest_ratios), np.nan, largest_ratios <= band.simultaneous_factor),
+        scores(widths),
+        scores([np.broadcast_to(band.constant_width, error.shape) for error in errors]),
+    )
+
+
+def band_limits(states: np.ndarray, half_width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and upper limits [L + 1, 3 + n] of predicted states.
+
+    The initial state is given, and has no width. Limits of x and y are those of the box about the
+    circle that holds the position.
+
+    Args:
+        states: predicted [L + 1, 3 + n], from the initial state on.
+        half_width: half widths [L, c] after it.
+    """
+    half_widths_of_states = np.zeros_like(states)
+    half_widths_of_states[1:, VELOCITIES] = half_width[:, :3]
+    half_widths_of_states[1:, HEADING] = half_width[:, 3]
+    half_widths_of_states[1:, POSITION] = half_width[:, 4:5]
+    half_widths_of_states[1:, EXTRA_STATES] = half_width[:, 5:]
+    return states - half_widths_of_states, states + half_widths_of_states
+
+
+MIN_LOGS = 9
+"""Logs below which no band can promise 90 % whatever errors are distributed like."""
+_MAX_HORIZONS = 100
+"""Horizons that half widths are kept at."""
+_SMOOTHING_SHARE = 0.11
+"""Share of the horizon over which widths are smoothed."""
+_SLOPE_RIDGE = 0.02
+"""Pull of the slopes to zero, against measures of unit variance."""
+_ALTERNATIONS = 2
+"""Turns of shape and slopes, each given the other; chosen by hand."""
+_SCALE_FOLDS = 5
+"""Groups of logs whose errors are scaled by what the others say."""
+_HORIZON_STRIDE = 3
+"""Of so many horizons one says how liveliness acts."""
+_NEWTON_STEPS = 8
+"""Of Newton's method; chosen by hand: near the end each doubles the digits."""
+
+
+@dataclass(frozen=True)
+class _CalibrationRuns:
+    """Errors [W, G, c] of W runs at G horizons, and measures [W, G, 2 n] of how lively they are."""
+
+    names: Sequence[str]
+    weights: np.ndarray
+    steps: np.ndarray
+    errors: np.ndarray
+    intensities: np.ndarray
+    intensity: MotionIntensity
+
+    def select(self, run_mask: np.ndarray) -> _CalibrationRuns:
+        """Return those runs that are chosen [W] bool."""
+        return replace(
+            self,
+            names=[name for name, selected in zip(self.names, run_mask, strict=True) if selected],
+            weights=self.weights[run_mask] / self.weights[run_mask].sum(),
+            errors=self.errors[run_mask],
+            intensities=self.intensities[run_mask],
+        )
+
+
+def calibrate_band(
+    runs: Sequence[RunErrors], coverage_level: float, step: float, score_unit: np.ndarray
+) -> Band:
+    """Return the band that holds a share `coverage_level` of the errors of runs to come.
+
+    Args:
+        runs: over logs that the model was not fitted on, under one protocol; at least one.
+        coverage_level: wanted.
+        step: of the runs in s.
+        score_unit: that scores are given in, [c].
+    """
+    all_errors = _to_calibration_runs(runs, step)
+    names, weights, channels = (
+        all_errors.names,
+        all_errors.weights,
+        runs[0].dof.layout.band_channels,
+    )
+    unexplained_errors = all_errors
+    typical_spread: np.ndarray | None = None
+    run_spreads = [run.spread for run in runs if run.spread is not None]
+    if len(run_spreads) == len(runs):
+        spreads = _sample_at_horizons(run_spreads, unexplained_errors.steps)
+        typical_spread = _smoothed_rms(spreads, unexplained_errors)
+        # what the disagreement of models explains is no error that the rest of the band must hold
+        disagreement_variance = np.nan_to_num(
+            excess_disagreement(spreads, typical_spread, coverage_level, channels)
+        )
+        unexplained_errors = replace(
+            unexplained_errors,
+            errors=np.sqrt(np.maximum(unexplained_errors.errors**2 - disagreement_variance, 0.0)),
+        )
+    rms_shape, slopes = _fit_scale(unexplained_errors)
+    cross_fitted_scale = _cross_fitted_scales(unexplained_errors)
+    coverage = np.nanmean(
+        is_covered(
+            unexplained_errors.errors,
+            _normalized_quantiles(unexplained_errors, cross_fitted_scale, coverage_level)
+            * cross_fitted_scale,
+        ),
+        axis=(1, 2),
+    )
+    n_scores = effective_sample_size(coverage, weights, names, coverage_level)
+    corrected_level = conformal_level(coverage_level, n_scores)
+    quantiles = _normalized_quantiles(unexplained_errors, cross_fitted_scale, corrected_level)
+    # a channel that no velocity moves is not scored, and its band has no width
+    half_width = np.nan_to_num(rms_shape * quantiles)
+    unconditional_shape = _rms_shape(all_errors, np.zeros_like(slopes))
+    unconditional_width = unconditional_shape * _normalized_quantiles(
+        all_errors,
+        np.broadcast_to(unconditional_shape, unexplained_errors.errors.shape),
+        corrected_level,
+    )
+    unconditional_width = np.nan_to_num(unconditional_width)
+    flat_errors = all_errors.errors.reshape(-1, len(channels))
+    band = Band(
+        coverage_level,
+        step,
+        unexplained_errors.steps,
+        half_width,
+        unconditional_width,
+        np.ones(len(channels)),
+        np.nan_to_num(
+            weighted_quantile(
+                flat_errors, np.repeat(weights, unexplained_errors.errors.shape[1]), corrected_level
+            )
+        ),
+        score_unit,
+        unexplained_errors.intensity,
+        slopes,
+        len(set(names)),
+        n_scores,
+        typical_spread=typical_spread,
+        channels=channels,
+    )
+    largest_ratios = largest_error_ratios(
+        [run.error for run in runs], [run.half_widths(band) for run in runs]
+    )
+    # as far as the runs of other logs know the scale
+    in_sample_scale = rms_shape * width_factors(unexplained_errors.intensities, slopes)
+    largest_ratios *= _largest_error_ratios(
+        unexplained_errors.errors, cross_fitted_scale * quantiles
+    ) / _largest_error_ratios(unexplained_errors.errors, in_sample_scale * quantiles)
+    simultaneous_factor = np.nan_to_num(
+        weighted_quantile(largest_ratios, weights, corrected_level), nan=1.0
+    )
+    return replace(
+        band, simultaneous_factor=simultaneous_factor, cautions=describe_few_logs(band.n_logs)
+    )
+
+
+def _sample_at_horizons(series: Sequence[np.ndarray], steps: np.ndarray) -> np.ndarray:
+    """Return rows [L, c] of each run at some steps [W, G, c]; NaN beyond its end."""
+    values = np.full((len(series), len(steps), series[0].shape[1]), np.nan)
+    for values_of_run, run_series in zip(values, series, strict=True):
+        reached_samples = steps[steps <= len(run_series)] - 1
+        values_of_run[: len(reached_samples)] = run_series[reached_samples]
+    return values
+
+
+def _smoothed_rms(values: np.ndarray, runs: _CalibrationRuns) -> np.ndarray:
+    """Return the root mean square [G, c] of values [W, G, c] over runs, smoothed over horizons."""
+    sample_weights = np.where(np.isfinite(values), runs.weights[:, None, None], 0.0)
+    total_weights = sample_weights.sum(axis=0)
+    mean_squares = np.where(
+        total_weights > 0, (sample_weights * np.nan_to_num(values) ** 2).sum(axis=0), np.nan
+    )
+    return np.asarray(
+        np.sqrt(
+            _smooth_over_horizons(
+                mean_squares / np.where(total_weights > 0, total_weights, 1.0), runs.steps
+            )
+        )
+    )
+
+
+def _largest_error_ratios(error: np.ndarray, half_width: np.ndarray) -> np.ndarray:
+    """Return the largest error in half widths of each run [W, c], over horizons."""
+    ratios = np.where(
+        np.isfinite(error) & (half_width > 0.0), error / np.maximum(half_width, 1e-300), 0.0
+    )
+    return np.asarray(np.maximum(ratios.max(axis=1), 1e-12))
+
+
+def _fit_scale(runs: _CalibrationRuns) -> tuple[np.ndarray, np.ndarray]:
+    """Return shape [G, c] and slopes [2 n, c] of the errors of runs."""
+    slopes = np.zeros((runs.intensities.shape[2], runs.errors.shape[2]))
+    for _ in range(_ALTERNATIONS):
+        slopes = _fit_slopes(runs, _rms_shape(runs, slopes), slopes)
+    return _rms_shape(runs, slopes), slopes
+
+
+def _cross_fitted_scales(runs: _CalibrationRuns) -> np.ndarray:
+    """Return the scale [W, G, c] of every run's errors as the runs of other logs have it.
+
+    A scale that has seen a run would take its errors for smaller than those of runs to come.
+    """
+    _, log_indices = np.unique(runs.names, return_inverse=True)
+    fold_indices = log_indices % _SCALE_FOLDS
+    scales = np.empty_like(runs.errors)
+    for k in np.unique(fold_indices):
+        in_fold = fold_indices == k
+        other_runs = runs.select(~in_fold) if (~in_fold).any() else runs
+        rms_shape, slopes = _fit_scale(other_runs)
+        scales[in_fold] = rms_shape * width_factors(runs.intensities[in_fold], slopes)
+    return scales
+
+
+def describe_few_logs(n_logs: int) -> tuple[str, ...]:
+    """Return what to say where logs are too few for a promise."""
+    if n_logs >= MIN_LOGS:
+        return ()
+    subject = f"{n_logs} logs calibrate" if n_logs > 1 else "One log calibrates"
+    return (
+        f"{subject} this band; below {MIN_LOGS} no method can promise 90 % for every"
+        " distribution of errors.",
+    )
+
+
+def _to_calibration_runs(runs: Sequence[RunErrors], step: float) -> _CalibrationRuns:
+    """Return the errors and measures of runs at the horizons that a band is kept at."""
+    longest_run = max(map(len, runs))
+    steps = np.unique(
+        np.linspace(1, longest_run, min(_MAX_HORIZONS, longest_run)).round().astype(int)
+    )
+    names = [run.log for run in runs]
+    weights = compute_run_weights(names)
+    mean_squares_of_runs = [running_mean_squares(run.states, step) for run in runs]
+    intensity = MotionIntensity.from_runs(mean_squares_of_runs, weights)
+    errors, intensities = (
+        _sample_at_horizons([run.error for run in runs], steps),
+        _sample_at_horizons(mean_squares_of_runs, steps),
+    )
+    intensities = np.nan_to_num(intensity.standardize(intensities))
+    return _CalibrationRuns(names, weights, steps, errors, intensities, intensity)
+
+
+def _rms_shape(runs: _CalibrationRuns, slopes: np.ndarray) -> np.ndarray:
+    """Return the root mean square [G, c] of errors over what liveliness explains, smoothed."""
+    rms = _smoothed_rms(runs.errors / width_factors(runs.intensities, slopes), runs)
+    return np.asarray(np.maximum(rms, 1e-12 + 1e-6 * np.nan_to_num(rms).max(axis=0)))
+
+
+def _normalized_quantiles(runs: _CalibrationRuns, scale: np.ndarray, level: float) -> np.ndarray:
+    """Return the quantile [G, c] of errors over a scale [W, G, c], smoothed over horizons."""
+    return _smooth_over_horizons(
+        weighted_quantile(runs.errors / scale, runs.weights, level), runs.steps
+    )
+
+
+def _smooth_over_horizons(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return moving means [G, c] over neighbouring horizons; gaps are filled from beside them."""
+    half_window = 0.5 * _SMOOTHING_SHARE * steps[-1]
+    # the first steps, where errors begin, are smoothed over what lies as near as the start itself
+    half_windows = np.minimum(half_window, steps - 1 + 0.5)
+    is_neighbour = np.abs(steps[:, None] - steps[None, :]) <= half_windows[:, None]
+    is_finite = np.isfinite(values)
+    n_neighbours = is_neighbour @ is_finite.astype(float)
+    smoothed = (is_neighbour @ np.where(is_finite, values, 0.0)) / np.maximum(n_neighbours, 1.0)
+    for column, has_neighbours in zip(smoothed.T, (n_neighbours > 0).T, strict=True):
+        column[:] = (
+            np.interp(steps, steps[has_neighbours], column[has_neighbours])
+            if has_neighbours.any()
+            else np.nan
+        )
+    return np.asarray(smoothed)
+
+
+def _fit_slopes(
+    runs: _CalibrationRuns, rms_shape: np.ndarray, initial_slopes: np.ndarray
+) -> np.ndarray:
+    """Return by how much liveliness raises the logarithm of the errors [2 n, c].
+
+    Errors over the shape are taken for gamma distributed with a logarithmic link; Newton's method.
+    """
+    slopes = initial_slopes.copy()
+    horizon_stride = slice(None, None, _HORIZON_STRIDE)
+    errors, intensities, rms_shape = (
+        runs.errors[:, horizon_stride],
+        runs.intensities[:, horizon_stride],
+        rms_shape[horizon_stride],
+    )
+    run_weights = runs.weights[:, None] / errors.shape[1]
+    ridge, flat_intensities = (
+        _SLOPE_RIDGE * np.eye(intensities.shape[2]),
+        intensities.reshape(-1, intensities.shape[2]),
+    )
+    for channel in range(errors.shape[2]):
+        normalized_errors = errors[:, :, channel] / rms_shape[:, channel]
+        is_scored = np.isfinite(normalized_errors)
+        y, sample_weights = (
+            np.where(is_scored, normalized_errors, 0.0),
+            np.where(is_scored, run_weights, 0.0),
+        )
+        if not is_scored.any():
+            continue
+        coefficients = slopes[:, channel].copy()
+        for _ in range(_NEWTON_STEPS):
+            predicted = np.exp(np.clip(intensities @ coefficients, -20.0, 20.0))
+            predicted *= (sample_weights * y).sum() / max(
+                (sample_weights * predicted).sum(), 1e-300
+            )
+            weighted_ratio = sample_weights * y / np.maximum(predicted, 1e-300)
+            gradient = (
+                flat_intensities.T @ (weighted_ratio - sample_weights).ravel()
+                - ridge @ coefficients
+            )
+            hessian = (
+                flat_intensities.T @ (weighted_ratio.reshape(-1, 1) * flat_intensities) + ridge
+            )
+            coefficients = coefficients + np.clip(np.linalg.solve(hessian, gradient), -1.0, 1.0)
+        slopes[:, channel] = coefficients
+    return slopes

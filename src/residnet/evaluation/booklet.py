@@ -1,0 +1,241 @@
+"""The manoeuvring booklet and the table of indices, with intervals and limits of IMO."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from residnet.core.config import Config, Metres, Quantity, Seconds
+from residnet.core.errors import ConfigError
+from residnet.core.log import Log
+from residnet.core.names import CHANNEL_UNITS
+from residnet.manoeuvres import ManoeuvreConfig
+from residnet.manoeuvres.actuated import InputShare
+from residnet.manoeuvres.base import Manoeuvre
+from residnet.manoeuvres.indices import INDEX_UNITS, LENGTH_INDICES
+from residnet.manoeuvres.trials import ManoeuvreRun, SimulatedVessel
+
+SCHEMA = "residnet.booklet/1"
+# power of the scale by which Froude's law brings a unit from the model to the ship
+_FROUDE_EXPONENTS = {"m": 1.0, "s": 0.5, "m/s": 0.5, "rad/s": -0.5, "rad": 0.0, "-": 0.0}
+
+
+class BookletConfig(Config):
+    """A manoeuvring booklet by one of the fit's refitted baselines.
+
+    Parameters are drawn from what the refit leaves open; every draw flies every manoeuvre, and the
+    intervals are those of the indices. They know the model's form to be right and speak of nothing
+    else, so that they are short where the form is wrong.
+
+    Attributes:
+        model: name of the baseline.
+        length: of the hull, in the scale of the logs.
+        scale: of the ship to what was measured (Froude's law); 1 for the ship itself.
+        inputs: of the model, by their share in drive and steer, with limits and rates.
+        initial: states (by name) that manoeuvres start from.
+        manoeuvres: standard manoeuvres.
+        duration: of manoeuvres that give none, or the time after which one has failed.
+        repeat: splits whose measured zigzags the model repeats in closed loop, with the rudder
+            angles and reversals of each.
+        draws: of the parameters.
+        level: of the intervals.
+        seed: of the draws.
+    """
+
+    model: str
+    length: Metres = Field(gt=0)
+    scale: float = Field(default=1.0, gt=0)
+    inputs: dict[str, InputShare]
+    initial: dict[str, float | str] = Field(default_factory=dict)
+    manoeuvres: tuple[ManoeuvreConfig, ...] = Field(min_length=1)
+    duration: Seconds = Field(default=600.0, gt=0, le=86_400)
+    repeat: tuple[str, ...] = ("validation", "test")
+    draws: int = Field(default=100, ge=20, le=100_000)
+    level: float = Field(default=0.95, gt=0, lt=1)
+    seed: int = Field(default=0, ge=0)
+
+    @field_validator("initial")
+    @classmethod
+    def convert_initial_units(cls, initial: dict[str, float | str]) -> dict[str, float | str]:
+        return {
+            name: Quantity(CHANNEL_UNITS.get(name, "-")).convert(value)
+            for name, value in initial.items()
+        }
+
+    def steering_input(self) -> str:
+        """Return the input that steers.
+
+        Raises:
+            ConfigError: where none or several do.
+        """
+        steering_inputs = [
+            name for name, share in self.inputs.items() if share.steer not in (0, 0.0)
+        ]
+        if len(steering_inputs) != 1:
+            raise ConfigError(
+                f"booklet.inputs: one input must have a share in steer, given {steering_inputs or 'none'}"
+            )
+        return steering_inputs[0]
+
+
+@dataclass(frozen=True)
+class BookletPage:
+    """A page of the booklet, for one manoeuvre.
+
+    Attributes:
+        name: of it.
+        manoeuvre: what was flown.
+        runs: with the fitted parameters, then with drawn ones.
+        indices: of each flight; empty where it had a fault or diverged.
+        limits: of IMO, for the ship.
+        measured_log: the log that was repeated; None for a standard manoeuvre.
+        split: of that log.
+        measured_indices: its indices.
+    """
+
+    name: str
+    manoeuvre: Manoeuvre
+    runs: Sequence[ManoeuvreRun]
+    indices: Sequence[Mapping[str, Any]]
+    limits: Mapping[str, float]
+    measured_log: Log | None
+    split: str
+    measured_indices: Mapping[str, Any]
+
+
+def build_booklet(
+    model: str, length: float, scale: float, draws: int, level: float, pages: Sequence[BookletPage]
+) -> dict[str, Any]:
+    """Return the contents of booklet.json, SI and rad, in the scale of the logs.
+
+    `ship` beside an index is its value for the ship.
+
+    Args:
+        length: of the hull in the scale of the logs, m.
+    """
+    rows = [_page_row(page, length, scale, level) for page in pages]
+    index_names = sorted({name for row in rows for name in row["indices"]})
+    metadata = {
+        "schema": SCHEMA,
+        "model": model,
+        "length": length,
+        "scale": scale,
+        "draws": draws,
+        "level": level,
+    }
+    return metadata | {"units": {name: INDEX_UNITS[name] for name in index_names}, "pages": rows}
+
+
+def _page_row(page: BookletPage, length: float, scale: float, level: float) -> dict[str, Any]:
+    names = [
+        name
+        for name, value in page.indices[0].items()
+        if name in INDEX_UNITS and not isinstance(value, list)
+    ]
+    indices = {name: _index_summary(page, name, length, scale, level) for name in names}
+    return {
+        "name": page.name,
+        "manoeuvre": page.manoeuvre.kind,
+        "demand": page.manoeuvre.model_dump(mode="json"),
+        "split": page.split,
+        "faults": sum(not run_indices for run_indices in page.indices[1:]),
+        "indices": indices,
+    }
+
+
+def _index_summary(
+    page: BookletPage, name: str, length: float, scale: float, level: float
+) -> dict[str, Any]:
+    """`value` of the fitted parameters, `interval` over draws, and what there is of `lengths`,
+    `measured_log`, `difference`, `limit`, `kept`.
+    """
+    value = float(page.indices[0][name])
+    draws = np.array(
+        [float(run_indices[name]) for run_indices in page.indices[1:] if name in run_indices]
+    )
+    froude_factor = scale ** _FROUDE_EXPONENTS[INDEX_UNITS[name]]
+    summary: dict[str, Any] = {
+        "value": value,
+        "ship": froude_factor * value,
+        "draws": int(draws.size),
+    }
+    if draws.size:
+        summary["interval"] = np.quantile(draws, (0.5 - level / 2, 0.5 + level / 2)).tolist()
+    if name in LENGTH_INDICES:
+        summary["lengths"] = value / length
+    if name in page.measured_indices:
+        summary |= {
+            "measured": float(page.measured_indices[name]),
+            "difference": value - float(page.measured_indices[name]),
+        }
+    if name in page.limits:
+        limit = page.limits[name]
+        summary |= {
+            "limit": limit,
+            "kept": froude_factor * value <= limit,
+            "kept_share": float(np.mean(froude_factor * draws <= limit)) if draws.size else None,
+        }
+    return summary
+
+
+INDICES_SCHEMA = "residnet.indices/1"
+
+
+def build_index_rows(
+    vessel: SimulatedVessel, runs: Sequence[ManoeuvreRun], length: float | None
+) -> list[dict[str, Any]]:
+    """Return log, manoeuvre, craft, faults, indices and limits of each flight.
+
+    Indices in SI and rad; each limit with whether it is kept.
+
+    Args:
+        length: of the hull in m; None where unknown, then there are neither lengths nor limits.
+    """
+    rows = []
+    for run in runs:
+        indices = (
+            {}
+            if run.measured_log.meta.get("diverged")
+            else run.manoeuvre.compute_indices(run.true_log, length)
+        )
+        speed = indices.get("approach_speed", 0.0)
+        limits = (
+            run.manoeuvre.imo_limits(vessel.helm, length, speed)
+            if length is not None and speed > 0
+            else {}
+        )
+        rows.append(
+            {
+                "log": run.true_log.name,
+                "manoeuvre": run.manoeuvre.kind,
+                "craft": vessel.name,
+                "fault": run.fault_text,
+                "timed_out": bool(run.measured_log.meta.get("timed_out", False)),
+                "indices": indices,
+                "limits": {
+                    name: {"limit": limit, "kept": indices[name] <= limit}
+                    for name, limit in limits.items()
+                    if name in indices
+                },
+            }
+        )
+    return rows
+
+
+def build_index_table(
+    run: str, length: float | None, rows: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return the contents of indices.json."""
+    index_names = {name for row in rows for name in row["indices"]}
+    units = {name: INDEX_UNITS.get(name, "-") for name in sorted(index_names)}
+    return {
+        "schema": INDICES_SCHEMA,
+        "run": run,
+        "length": length,
+        "units": units,
+        "rows": list(rows),
+    }

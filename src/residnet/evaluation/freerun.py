@@ -1,0 +1,530 @@
+"""The free-run evaluator: every model over every window of a protocol, in one batch."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+
+from residnet.core.columns import level_velocities
+from residnet.core.frames import compose_rotation, rotation_angle_between, wrap_angle_array
+from residnet.core.layout import (
+    ATTITUDE,
+    HEADING,
+    POSE,
+    POSITION,
+    SURGE_SWAY_YAW,
+    DegreesOfFreedom,
+    to_horizontal_plane,
+)
+from residnet.dynamics.base import Dynamics
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.engine.free_runs import compiled
+from residnet.engine.rollout import Rollout
+from residnet.evaluation.band import Band, band_channels
+from residnet.evaluation.protocol import Window
+from residnet.preprocessing.prepare import PreparedLog
+
+_MAX_LENGTH_RATIO = 4
+"""Times its own length that a window may be kept going beside longer ones."""
+_MAX_BATCH_NUMBERS = 30_000_000
+"""Numbers that the windows of a batch may hold."""
+_MEASURED_SPEED_MARGIN = 2.0
+"""Times what the vessel itself did in a window that a prediction may reach."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model to evaluate.
+
+    Attributes:
+        name: unique in a run.
+        model_kind: zero, baseline, head, truth or ensemble.
+        model: the dynamics; float64 parameters are run in float64.
+        state_names: names of the columns of the model's state; those of the prepared logs where empty.
+            What is not among these (actuators) starts from the log's channel.
+        input_names: channels of the log that make w; None for the prepared inputs.
+        n_zero_inputs: inputs after those that are held at zero (disturbances that the model is not told
+            about).
+        reference: name of the model that this one is compared with, window by window; None for
+            none.
+        training_ranges: smallest and largest training value of each velocity and input; empty where they
+            are not known.
+        bands: of its free runs by protocol; empty where there are none.
+        members: models beside it whose free runs it is the mean of; empty for none.
+        spread_members: models beside it that lie apart where the logs of the fit do not tell the motion;
+            empty for none.
+    """
+
+    name: str
+    model_kind: str
+    model: Dynamics
+    state_names: tuple[str, ...] = ()
+    input_names: tuple[str, ...] | None = None
+    n_zero_inputs: int = 0
+    reference: str | None = None
+    training_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    bands: Mapping[str, Band] = field(default_factory=dict)
+    members: tuple[str, ...] = ()
+    spread_members: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A prediction of one model for one window.
+
+    States [L, 3 + n] hold what moves in the model and the pose integrated from it; `has_diverged`
+    says whether the free run ran away. `spread` [L - 1, c] is the standard deviation between unlike
+    models by channel of a band, from the first step on; None where there are none.
+    """
+
+    states: np.ndarray
+    has_diverged: bool
+    spread: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class FreeRun:
+    """The free runs of all models over all windows of one protocol and split.
+
+    predictions[model][i] belongs to windows[i].
+    """
+
+    protocol: str
+    split: str
+    windows: list[Window]
+    predictions: dict[str, list[Prediction]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FreeRunErrors:
+    """Errors of one model's free runs, the samples of all W windows one after the other.
+
+    u, v and the position are scored over usable samples; r, the heading and the roll, which no
+    position sensor disturbs, over all.
+
+    Attributes:
+        error: predicted minus measured states [N, 3 + n]; psi within half a turn.
+        is_usable: which samples are [N].
+        window_lengths: samples of each window [W].
+        dof: velocities that the logs tell; others are zero, and no error counts.
+        attitude_error: angle of the rotation between the attitudes [N]; None on the surface.
+    """
+
+    error: np.ndarray
+    is_usable: np.ndarray
+    window_lengths: np.ndarray
+    dof: DegreesOfFreedom = SURGE_SWAY_YAW
+    attitude_error: np.ndarray | None = None
+
+    @classmethod
+    def from_predictions(
+        cls,
+        windows: Sequence[Window],
+        predictions: Sequence[Prediction],
+        logs: Sequence[PreparedLog],
+    ) -> FreeRunErrors:
+        """Return the errors of predictions over windows of logs."""
+        log_slices = [
+            (logs[window.log_index], slice(window.start, window.stop)) for window in windows
+        ]
+        predicted = np.concatenate([prediction.states for prediction in predictions])
+        measured = np.concatenate([log.y[window_slice] for log, window_slice in log_slices])
+        error = predicted - measured
+        # a turn too many is no error of where the vessel points
+        error[:, HEADING] = wrap_angle_array(error[:, HEADING])
+        dof, attitude_error = logs[windows[0].log_index].dof, None
+        if dof.is_six_dof:
+            roll_column = dof.state_names.index("phi")
+            error[:, roll_column] = wrap_angle_array(error[:, roll_column])
+            attitude_error = rotation_angle_between(predicted[:, ATTITUDE], measured[:, ATTITUDE])
+        return cls(
+            error,
+            np.concatenate([log.usable[window_slice] for log, window_slice in log_slices]),
+            np.array([window.stop - window.start for window in windows]),
+            dof,
+            attitude_error,
+        )
+
+    def nrmse(self, scales: np.ndarray) -> np.ndarray:
+        """Return the mean over the live velocities of rmse / scale of each window [W]."""
+        return np.asarray((self.rmse / scales).take(self.dof.active_indices, axis=1).mean(1))
+
+    @property
+    def window_starts(self) -> np.ndarray:
+        """First sample of each window [W]."""
+        return np.asarray(np.cumsum(self.window_lengths) - self.window_lengths)
+
+    @property
+    def is_scored(self) -> np.ndarray:
+        """Whether each of what moves counts at each sample [N, n]."""
+        always_scored = [np.ones_like(self.is_usable)] * (self.dof.n_dynamic - 2)
+        return np.stack((self.is_usable, self.is_usable, *always_scored), axis=1)
+
+    @property
+    def velocity_errors(self) -> np.ndarray:
+        """Errors of what moves [N, n], zero where they do not count."""
+        return np.asarray(np.where(self.is_scored, self.error[:, self.dof.dynamic_columns], 0.0))
+
+    def mean_by_window(self, values: np.ndarray) -> np.ndarray:
+        """Return the mean of values [N, n] over each window's samples that count [W, n]."""
+        with np.errstate(invalid="ignore"):
+            window_sums = np.add.reduceat(values, self.window_starts)
+            return np.asarray(
+                window_sums / np.add.reduceat(self.is_scored.astype(float), self.window_starts)
+            )
+
+    @property
+    def rmse(self) -> np.ndarray:
+        """Root mean square errors of what moves of each window [W, n]."""
+        return np.asarray(np.sqrt(self.mean_by_window(self.velocity_errors**2)))
+
+    @property
+    def mae(self) -> np.ndarray:
+        """Mean absolute errors of what moves of each window [W, n]."""
+        return self.mean_by_window(np.abs(self.velocity_errors))
+
+    def final_pose_errors(self, sample_indices: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """Return the sizes [W] of the errors of the pose by name, see `Live.ends`.
+
+        Args:
+            sample_indices: samples [W]; None for the last of each window.
+        """
+        last_samples = (
+            self.window_starts + self.window_lengths - 1
+            if sample_indices is None
+            else sample_indices
+        )
+        state_errors, attitude_errors = (
+            self.error[last_samples],
+            None if self.attitude_error is None else self.attitude_error[last_samples],
+        )
+        return pose_error_sizes(state_errors, self.dof, attitude_errors)
+
+    @property
+    def n_usable(self) -> np.ndarray:
+        """Usable samples of each window [W]."""
+        return np.asarray(np.add.reduceat(self.is_usable.astype(int), self.window_starts))
+
+
+def run_free_runs(
+    candidates: Sequence[Candidate],
+    windows: Sequence[Window],
+    logs: Sequence[PreparedLog],
+    dt: float,
+    velocity_limits: np.ndarray,
+    dtype: torch.dtype = torch.float64,
+) -> dict[str, list[Prediction]]:
+    """Free-run every candidate over every window.
+
+    A window whose prediction is not finite, or whose velocities exceed both `velocity_limits` [n] and twice
+    what the vessel itself did in it, has diverged and holds the prediction of `zero`, velocities
+    held, instead. Beyond a negative limit everything has diverged.
+    """
+    names = {candidate.name for candidate in candidates}
+    ensembles = [entry for entry in candidates if entry.members and set(entry.members) <= names]
+    predictions = {
+        candidate.name: _run_candidate(candidate, windows, logs, dt, velocity_limits, dtype)
+        for candidate in candidates
+        if candidate not in ensembles
+    }
+    for ensemble in ensembles:
+        member_predictions = [*zip(*(predictions[name] for name in ensemble.members), strict=True)]
+        # where a member was replaced, what it really did is in nobody's prediction
+        windows_with_divergence = [
+            i
+            for i, predictions_of_window in enumerate(member_predictions)
+            if any(entry.diverged for entry in predictions_of_window)
+        ]
+        rerun_predictions = iter(
+            _run_candidate(
+                ensemble,
+                [windows[i] for i in windows_with_divergence],
+                logs,
+                dt,
+                velocity_limits,
+                dtype,
+            )
+        )
+        predictions[ensemble.name] = []
+        for i, predictions_of_window in enumerate(member_predictions):
+            states = [entry.states for entry in predictions_of_window]
+            nu = np.mean(states, axis=0)
+            nu = nu if logs[0].dof.is_six_dof else nu[:, logs[0].dof.dynamic_columns]
+            prediction = (
+                next(rerun_predictions)
+                if i in windows_with_divergence
+                else _to_prediction(windows[i], nu, logs, dt, velocity_limits)
+            )
+            predictions[ensemble.name].append(prediction)
+    spreads_by_members: dict[tuple[str, ...], list[np.ndarray]] = {}
+    for entry in candidates:
+        if len(entry.spread_members) > 1 and set(entry.spread_members) <= names:
+            if entry.spread_members not in spreads_by_members:
+                member_predictions = [
+                    *zip(*(predictions[name] for name in entry.spread_members), strict=True)
+                ]
+                spreads_by_members[entry.spread_members] = [
+                    standard_deviation_between_models(
+                        [
+                            predictions_of_window.states
+                            for predictions_of_window in window_predictions
+                        ]
+                    )
+                    for window_predictions in member_predictions
+                ]
+            predictions_and_spreads = zip(
+                predictions[entry.name], spreads_by_members[entry.spread_members], strict=True
+            )
+            predictions[entry.name] = [
+                replace(prediction, spread=spread) for prediction, spread in predictions_and_spreads
+            ]
+    return {candidate.name: predictions[candidate.name] for candidate in candidates}
+
+
+def standard_deviation_between_models(states: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the standard deviation [L, c] between models' states [L + 1, 3 + n] after the first.
+
+    Its columns are the channels of a band; that of the position is per axis, mean over both.
+    """
+    spread = np.stack([model_states[1:] for model_states in states]).std(axis=0, ddof=1)
+    return band_channels(spread, np.sqrt(0.5 * (spread[:, POSITION] ** 2).sum(axis=1)))
+
+
+def _run_candidate(
+    candidate: Candidate,
+    windows: Sequence[Window],
+    logs: Sequence[PreparedLog],
+    dt: float,
+    velocity_limits: np.ndarray,
+    dtype: torch.dtype,
+) -> list[Prediction]:
+    input_tables = {
+        log_index: _input_table(candidate, logs[log_index])
+        for log_index in {window.log_index for window in windows}
+    }
+    # a copy: a validation in float32 must not round the model that it validates
+    model = copy.deepcopy(candidate.model).to("cpu", dtype).eval()
+    # the pose is integrated from the velocities below, or composed of rotations by the model
+    model.positions = model.spatial
+    dof = logs[0].dof
+    state_names = candidate.state_names or dof.state_names
+    simulated_states = dof.state_names if model.spatial else dof.dynamic_states
+    columns = [state_names.index(name) for name in simulated_states]
+    predictions: dict[int, Prediction] = {}
+    numbers_per_step = len(state_names) + sum(
+        table.shape[1] for table in list(input_tables.values())[:1]
+    )
+    for batch in _batch_windows(windows, numbers_per_step):
+        batch_windows = [windows[window_index] for window_index in batch]
+        x0 = np.stack(
+            [_initial_state(candidate, window, logs[window.log_index]) for window in batch_windows]
+        )
+        simulated = (
+            _simulate_batch(model, batch_windows, x0, logs, input_tables, dtype)[:, :, columns]
+            .double()
+            .numpy()
+        )
+        for window_index, window, window_states in zip(
+            batch, batch_windows, simulated, strict=True
+        ):
+            predictions[window_index] = _to_prediction(
+                window, window_states[: _window_length(window)], logs, dt, velocity_limits
+            )
+    return [predictions[window_index] for window_index in range(len(windows))]
+
+
+def _window_length(window: Window) -> int:
+    return window.stop - window.start
+
+
+def _batch_windows(windows: Sequence[Window], numbers_per_step: int) -> Iterator[list[int]]:
+    """Yield the windows that are run together, by their numbers.
+
+    Steps cost much the same for one row or many, so that long and short windows run side by side,
+    as long as none is kept going for far more than its own length and memory suffices.
+
+    Args:
+        numbers_per_step: numbers that each row keeps for each step.
+    """
+    indices_by_length = sorted(range(len(windows)), key=lambda row: -_window_length(windows[row]))
+    batch: list[int] = []
+    for window_index in indices_by_length:
+        longest_window = _window_length(windows[batch[0]]) if batch else 0
+        if batch and (
+            _MAX_LENGTH_RATIO * _window_length(windows[window_index]) < longest_window
+            or (len(batch) + 1) * longest_window * numbers_per_step > _MAX_BATCH_NUMBERS
+        ):
+            yield batch
+            batch = []
+        batch.append(window_index)
+    if batch:
+        yield batch
+
+
+def _simulate_batch(
+    model: Dynamics,
+    windows: Sequence[Window],
+    x0: np.ndarray,
+    logs: Sequence[PreparedLog],
+    input_tables: Mapping[int, np.ndarray],
+    dtype: torch.dtype,
+) -> torch.Tensor:
+    """Return the states [W, L, nx] of windows that run together, each from its row of x0."""
+    longest_window = max(map(_window_length, windows))
+    future_inputs = np.stack(
+        [
+            input_tables[w_history.log_index][
+                np.minimum(
+                    np.arange(w_history.start, w_history.start + longest_window - 1),
+                    w_history.stop - 1,
+                )
+            ]
+            for w_history in windows
+        ]
+    )
+    with torch.no_grad():
+        memory = model.initial_state(len(windows)).to(dtype)
+        if isinstance(model, HybridDynamics):
+            history_lengths = np.array([window.start - window.history_start for window in windows])
+            for history_length in np.unique(history_lengths):
+                same_history = np.flatnonzero(history_lengths == history_length)
+                history_windows = [windows[i] for i in same_history.tolist()]
+                y_history = np.stack(
+                    [
+                        logs[window.log_index].y[window.history_start : window.start]
+                        for window in history_windows
+                    ]
+                )
+                w_history = np.stack(
+                    [
+                        input_tables[window.log_index][window.history_start : window.start]
+                        for window in history_windows
+                    ]
+                )
+                memory[torch.from_numpy(same_history)] = model.warmup(
+                    torch.from_numpy(y_history).to(dtype), torch.from_numpy(w_history).to(dtype)
+                )
+        states, _, _ = compiled(Rollout(model), longest_window)(
+            torch.from_numpy(x0).to(dtype), torch.from_numpy(future_inputs).to(dtype), memory
+        )
+    result: torch.Tensor = states
+    return result
+
+
+def _to_prediction(
+    window: Window,
+    simulated: np.ndarray,
+    logs: Sequence[PreparedLog],
+    dt: float,
+    velocity_limits: np.ndarray,
+) -> Prediction:
+    """Return states [L, 3 + n] or what moves [L, n] with its pose; of `zero` if it ran away."""
+    log, window_slice = logs[window.log_index], slice(window.start, window.stop)
+    velocities = simulated[:, -log.dof.n_dynamic :]
+    measured_speeds = np.abs(log.y[window_slice, log.dof.dynamic_columns][log.usable[window_slice]])
+    # short training logs may hold far less than the window, and then it is the vessel that exceeds
+    measured_limits = _MEASURED_SPEED_MARGIN * measured_speeds.max(0, initial=0.0)
+    velocity_limits = np.where(
+        velocity_limits < 0.0, velocity_limits, np.maximum(velocity_limits, measured_limits)
+    )
+    has_diverged = not np.isfinite(velocities).all() or bool(
+        (np.abs(velocities) > velocity_limits).any()
+    )
+    if has_diverged:
+        velocities = np.tile(window.initial_velocities, (len(velocities), 1))
+    if not has_diverged and velocities.shape != simulated.shape:
+        return Prediction(simulated, has_diverged)
+    pose = integrate_pose(logs[window.log_index].y[window.start, POSE], velocities, dt)
+    return Prediction(np.concatenate((pose, velocities), axis=1), has_diverged)
+
+
+def _input_table(candidate: Candidate, log: PreparedLog) -> np.ndarray:
+    if candidate.input_names is None:
+        return log.w
+    input_values = log.log.stack(candidate.input_names)
+    return np.concatenate((input_values, np.zeros((len(log), candidate.n_zero_inputs))), axis=1)
+
+
+def _initial_state(candidate: Candidate, window: Window, log: PreparedLog) -> np.ndarray:
+    state_names = log.dof.state_names
+    initial_values = dict(
+        zip(state_names, (*log.y[window.start, POSE], *window.initial_velocities), strict=True)
+    )
+    required_names = candidate.state_names or state_names
+    return np.array(
+        [
+            initial_values[name] if name in initial_values else log.log[name][window.start]
+            for name in required_names
+        ]
+    )
+
+
+def pose_error_sizes(
+    error: np.ndarray, dof: DegreesOfFreedom, attitude_errors: np.ndarray | None
+) -> dict[str, np.ndarray]:
+    """Return the sizes [W] of errors of the pose by name, see `Live.ends`.
+
+    Args:
+        error: of states [W, 3 + n], psi within half a turn.
+        attitude_errors: angles between attitudes [W]; None on the surface.
+    """
+    sizes = {"position": np.hypot(*error[:, POSITION].T), "heading": np.abs(error[:, HEADING])}
+    if attitude_errors is not None:
+        sizes |= {
+            "depth": np.abs(error[:, dof.state_names.index("z")]),
+            "attitude": attitude_errors,
+        }
+    return {name: sizes[name] for name in dof.pose_error_names}
+
+
+def compute_integration_errors(
+    y: np.ndarray, dof: DegreesOfFreedom, dt: float
+) -> dict[str, np.ndarray]:
+    """Return how far integrated measured velocities end from the measured pose, by name [W].
+
+    See `Live.ends`.
+
+    Args:
+        y: measured states [W, L, 3 + n].
+        dt: between samples in s.
+    """
+    error = np.zeros_like(y[:, -1])
+    for error_of_run, measured in zip(error, y, strict=True):
+        error_of_run[POSE] = (
+            integrate_pose(measured[0, POSE], measured[:, dof.dynamic_columns], dt)[-1]
+            - measured[-1, POSE]
+        )
+    error[:, HEADING] = wrap_angle_array(error[:, HEADING])
+    if not dof.is_six_dof:
+        return pose_error_sizes(error, dof, None)
+    depth_rate = level_velocities(torch.from_numpy(y[:, :, dof.dynamic_columns]))[2].numpy()
+    depth_change = np.trapezoid(depth_rate, dx=dt, axis=1)
+    depth_column = dof.state_names.index("z")
+    error[:, depth_column] = depth_change - (y[:, -1, depth_column] - y[:, 0, depth_column])
+    angular_velocity = torch.from_numpy(y[:, :, [dof.state_names.index(name) for name in "pqr"]])
+    attitude = torch.from_numpy(y[:, 0, ATTITUDE])
+    for rotation in (0.5 * dt * (angular_velocity[:, 1:] + angular_velocity[:, :-1])).unbind(1):
+        attitude = compose_rotation(attitude, rotation)
+    return pose_error_sizes(
+        error, dof, rotation_angle_between(attitude.numpy(), y[:, -1, ATTITUDE])
+    )
+
+
+def integrate_pose(pose: np.ndarray, nu: np.ndarray, dt: float) -> np.ndarray:
+    """Return the pose [L, 3] from its first value [3] and what moves [L, n].
+
+    By the trapezoidal rule, heading first, then position.
+    """
+
+    def trapezoid(initial_value: float, rate: np.ndarray) -> np.ndarray:
+        return initial_value + np.concatenate(([0.0], np.cumsum(0.5 * dt * (rate[1:] + rate[:-1]))))
+
+    nu = to_horizontal_plane(nu)
+    psi = trapezoid(pose[2], nu[:, 2])
+    north = nu[:, 0] * np.cos(psi) - nu[:, 1] * np.sin(psi)
+    east = nu[:, 0] * np.sin(psi) + nu[:, 1] * np.cos(psi)
+    return np.stack((trapezoid(pose[0], north), trapezoid(pose[1], east), psi), axis=1)

@@ -1,0 +1,817 @@
+"""Errors of free runs: rows of metrics.json, their intervals, and the limits of a model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy
+
+from residnet.core.files import atomic_write, make_file_stem
+from residnet.core.layout import PLANAR_LAYOUT, VELOCITIES, DegreesOfFreedom
+from residnet.core.names import POSE_ERROR_UNITS
+from residnet.evaluation.band import BandsByModel
+from residnet.evaluation.bands import band_limits, compute_run_errors, count_coverage
+from residnet.evaluation.freerun import (
+    Candidate,
+    FreeRun,
+    FreeRunErrors,
+    compute_integration_errors,
+)
+from residnet.evaluation.verdict import MIN_LOGS_FOR_INTERVAL, describe_divergence
+from residnet.preprocessing.prepare import PreparedLog
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+CONFIDENCE_LEVEL = 0.95
+"""Of all intervals."""
+_N_RESAMPLES = 10_000
+"""Of the blocks: their 2.5 % tail then holds 250."""
+MIN_LOGS_AS_BLOCKS, TARGET_BLOCKS, _MIN_BLOCKS = 5, 8, 5
+"""Logs from which on each is a block; blocks that fewer are cut into, and need at least.
+
+Chosen by hand: to resample fewer blocks tells little, and smaller ones are alike.
+"""
+
+
+@dataclass(frozen=True)
+class ResamplingBlocks:
+    """What is drawn together.
+
+    Attributes:
+        block_indices: number of each window's block, [W], from 0 on.
+        block_kind: `log_indices` where a block is all windows of a log, else `windows`: consecutive windows of one
+            log.
+        n_blocks: number of blocks.
+    """
+
+    block_indices: np.ndarray
+    block_kind: str
+    n_blocks: int
+
+    def to_row(self) -> dict[str, Any]:
+        """Return the blocks as they stand in metrics.json."""
+        return {"of": self.block_kind, "count": self.n_blocks}
+
+
+def make_resampling_blocks(log_indices: Sequence[int] | np.ndarray) -> ResamplingBlocks | None:
+    """Return blocks of windows from the number of the log that each comes from.
+
+    Windows of a log are in time order.
+
+    From five logs on a block is a log: the interval then speaks for other logs, whatever the
+    windows of one have in common. Of three or four logs the mean cannot be resampled so; each is
+    cut into as few equal runs of consecutive windows as make at least eight blocks, and the
+    interval holds only as far as what lies between logs is small against what lies between such
+    runs. None, and so no interval, where there are fewer than three logs or five blocks.
+    """
+    log_numbers = np.asarray(log_indices, dtype=int)
+    unique_logs, windows_per_log = np.unique(log_numbers, return_counts=True)
+    if len(unique_logs) >= MIN_LOGS_AS_BLOCKS:
+        return ResamplingBlocks(np.searchsorted(unique_logs, log_numbers), "logs", len(unique_logs))
+    if len(unique_logs) < MIN_LOGS_FOR_INTERVAL:
+        return None
+    block_length = int(windows_per_log.max())
+    while (
+        block_length > 1
+        and sum(math.ceil(n_windows / block_length) for n_windows in windows_per_log)
+        < TARGET_BLOCKS
+    ):
+        block_length -= 1
+    block_indices, n_blocks = np.zeros(len(log_numbers), dtype=int), 0
+    for log_number, n_windows in zip(unique_logs, windows_per_log, strict=True):
+        for consecutive_windows in np.array_split(
+            np.flatnonzero(log_numbers == log_number), math.ceil(n_windows / block_length)
+        ):
+            block_indices[consecutive_windows] = n_blocks
+            n_blocks += 1
+    return ResamplingBlocks(block_indices, "windows", n_blocks) if n_blocks >= _MIN_BLOCKS else None
+
+
+def bootstrap_intervals(
+    values: np.ndarray, resampling_blocks: ResamplingBlocks | None
+) -> list[list[float] | None]:
+    """Return 95 % intervals of the means of columns [W, C] over windows, [low, high] of each.
+
+    None where there are no blocks.
+
+    Percentile bootstrap over blocks drawn with replacement, with a fixed seed, at levels widened
+    for few blocks as Student's t is against the normal distribution (Hesterberg 2015, The American
+    Statistician 69, 371-386, section 5.3): plain percentiles cover some 83 % with five blocks.
+    """
+    if resampling_blocks is None:
+        return [None] * values.shape[1]
+    block_sums = np.stack(
+        [
+            np.bincount(resampling_blocks.block_indices, column, resampling_blocks.n_blocks)
+            for column in values.T
+        ],
+        axis=1,
+    )
+    block_counts = _draw_block_counts(resampling_blocks.n_blocks)
+    resampled_means = (block_counts @ block_sums) / (
+        block_counts
+        @ np.bincount(resampling_blocks.block_indices, minlength=resampling_blocks.n_blocks)
+    )[:, None]
+    tail_probability = bootstrap_tail_probability(resampling_blocks.n_blocks)
+    return [
+        [float(lower), float(upper)]
+        for lower, upper in np.quantile(
+            resampled_means, [tail_probability, 1 - tail_probability], axis=0
+        ).T
+    ]
+
+
+def prediction_intervals(
+    window_errors: np.ndarray, log_indices: np.ndarray
+) -> list[list[float] | None]:
+    """Return 95 % intervals of the means of columns [W, C] over as many new logs, [low, high].
+
+    The windows of a log have its manoeuvre, weather and speed in common, so that the means of logs
+    are what scatters. Errors are positive and their size is drawn: Student's t holds for the
+    logarithm of the mean over logs, twice over, for the logs seen and the new ones. It scatters as
+    the logs do beside their mean, so that a log in which next to nothing goes wrong widens nothing.
+    By how much logs differ is estimated from all columns, since the few logs of one alone tell too
+    little by chance, and what looks best has too narrow an interval then. Columns hang together:
+    they count as two.
+
+    Args:
+        window_errors: errors of windows, none negative; a column is a model's error of one kind.
+        log_indices: number [W] of the log that each window is of.
+
+    Returns:
+        An interval for each column; None where there are fewer than three logs.
+    """
+    unique_logs, log_positions = np.unique(log_indices, return_inverse=True)
+    n_logs = len(unique_logs)
+    if n_logs < MIN_LOGS_FOR_INTERVAL:
+        return [None] * window_errors.shape[1]
+    log_sums = np.stack(
+        [np.bincount(log_positions, column, n_logs) for column in window_errors.T], axis=1
+    )
+    log_means = (log_sums / np.bincount(log_positions)[:, None])[
+        :, log_sums.any(axis=0) & np.isfinite(log_sums).all(0)
+    ]
+    relative_variances = (log_means / log_means.mean(axis=0)).var(axis=0, ddof=1)
+    relative_std = math.sqrt(relative_variances.mean()) if relative_variances.size else 0.0
+    degrees_of_freedom = min(window_errors.shape[1], 2) * (n_logs - 1)
+    half_width_factor = scipy.stats.t.ppf(
+        0.5 + CONFIDENCE_LEVEL / 2, degrees_of_freedom
+    ) * math.sqrt(2 / n_logs)
+    interval_factor = math.exp(half_width_factor * relative_std)
+    return [
+        [float(mean / interval_factor), float(mean * interval_factor)]
+        for mean in window_errors.mean(0)
+    ]
+
+
+def bootstrap_tail_probability(n_blocks: int) -> float:
+    """Return the share of resampled means left out at either end, for at least 2 blocks.
+
+    It is 0.025 for many blocks and less for few.
+    """
+    widened_t_quantile = math.sqrt(n_blocks / (n_blocks - 1)) * scipy.stats.t.ppf(
+        0.5 + CONFIDENCE_LEVEL / 2, n_blocks - 1
+    )
+    return float(scipy.stats.norm.cdf(-widened_t_quantile))
+
+
+@lru_cache(maxsize=16)
+def _draw_block_counts(n_blocks: int) -> np.ndarray:
+    """How often each block is drawn, [resamples, count]."""
+    return (
+        np.random.default_rng(0)
+        .multinomial(n_blocks, np.full(n_blocks, 1 / n_blocks), size=_N_RESAMPLES)
+        .astype(float)
+    )
+
+
+def paired_difference(
+    model_errors: np.ndarray,
+    reference_errors: np.ndarray,
+    reference_name: str,
+    resampling_blocks: ResamplingBlocks | None,
+) -> dict[str, Any]:
+    """Return the paired difference of two models' mean errors, as in metrics.json.
+
+    Both are over the same windows.
+
+    Args:
+        model_errors: error of each window, [W].
+        reference_errors: error of the reference model over the same windows, [W].
+
+    Returns:
+        to; nrmse_mean, the mean of model minus reference (negative where the model is better), with
+        its interval ci95 (None where there is none) and excludes_zero; ratio of the means (None
+        where the reference has no error) and worse, a ratio above 1.05.
+    """
+    differences = model_errors - reference_errors
+    (confidence_interval,) = bootstrap_intervals(differences[:, None], resampling_blocks)
+    reference_mean = float(reference_errors.mean())
+    ratio = float(model_errors.mean()) / reference_mean if reference_mean > 0 else None
+    return {
+        "to": reference_name,
+        "nrmse_mean": float(differences.mean()),
+        "ci95": confidence_interval,
+        "excludes_zero": confidence_interval is not None
+        and (confidence_interval[0] > 0 or confidence_interval[1] < 0),
+        "ratio": ratio,
+        "worse": ratio is not None and ratio > 1.05,
+    }
+
+
+SCHEMA = "residnet.metrics/1"
+LIMITS_SCHEMA = "residnet.limits/1"
+CONSTANT_VELOCITY = "zero"
+_N_WORST_WINDOWS, _N_SPEED_CLASSES, _MIN_CLASS_WINDOWS = 3, 3, 3
+"""Worst windows that are told, bands of speed, and windows that a band needs; chosen by hand."""
+_WIND_CHANNEL = "wind_speed"
+_HORIZONS = (10.0, 30.0, 100.0)
+"""Times in s after which errors of the pose are told."""
+
+
+class ProtocolEvaluation:
+    """The errors of all models over the W windows of one protocol, and what is read off them.
+
+    Args:
+        free_run: free runs of all models.
+        scales: of what moves, which nrmse divides by.
+    """
+
+    def __init__(
+        self,
+        free_run: FreeRun,
+        candidates: Sequence[Candidate],
+        logs: Sequence[PreparedLog],
+        scales: Mapping[str, float],
+    ) -> None:
+        self.free_run, self.candidates, self.logs = free_run, candidates, logs
+        self.dof = logs[0].dof
+        self.state_scales = np.array([scales.get(name, 1.0) for name in self.dof.dynamic_states])
+        self.log_slices = [(logs[w.log_index], slice(w.start, w.stop)) for w in free_run.windows]
+        self.log_indices = np.array([window.log_index for window in free_run.windows])
+        self.errors = {
+            candidate.name: FreeRunErrors.from_predictions(
+                free_run.windows, free_run.predictions[candidate.name], logs
+            )
+            for candidate in candidates
+        }
+        self.nrmse_by_window = {
+            name: errors.nrmse(self.state_scales) for name, errors in self.errors.items()
+        }
+
+    def paired_difference(
+        self,
+        model_name: str,
+        reference_name: str | None,
+        window_mask: np.ndarray,
+        errors_by_model: Mapping[str, np.ndarray] | None = None,
+    ) -> dict[str, Any] | None:
+        """Return the paired difference of two models over chosen windows [W] bool.
+
+        None where the other is not among the models. `values` [W] by model stand for the nrmse.
+        """
+        errors_by_model = self.nrmse_by_window if errors_by_model is None else errors_by_model
+        if reference_name is None or reference_name not in errors_by_model:
+            return None
+        resampling_blocks = make_resampling_blocks(self.log_indices[window_mask])
+        return paired_difference(
+            errors_by_model[model_name][window_mask],
+            errors_by_model[reference_name][window_mask],
+            reference_name,
+            resampling_blocks,
+        )
+
+    def build_rows(self, groups: Mapping[str, Sequence[str]]) -> list[dict[str, Any]]:
+        """Return the rows of metrics.json.
+
+        Every model, over all windows, every kind of manoeuvre and every named group of kinds.
+        `paired_difference` compares a model with its reference (`Candidate.reference`); None where it has
+        none. Models with a band have its coverage and interval score, too.
+        """
+        manoeuvre_kinds = [log.log.manoeuvre for log, _ in self.log_slices]
+        kinds_by_group: dict[str, Sequence[str]] = {"all": manoeuvre_kinds}
+        kinds_by_group |= {
+            manoeuvre_kind: [manoeuvre_kind] for manoeuvre_kind in sorted(set(manoeuvre_kinds))
+        } | dict(groups)
+        coverage_by_model = {
+            candidate.name: count_coverage(
+                compute_run_errors(
+                    self.free_run.windows,
+                    self.free_run.predictions[candidate.name],
+                    self.logs,
+                    self.errors[candidate.name],
+                ),
+                candidate.bands[self.free_run.protocol],
+            )
+            for candidate in self.candidates
+            if self.free_run.protocol in candidate.bands
+        }
+        metric_rows = []
+        for candidate in self.candidates:
+            for group_name, group_kinds in kinds_by_group.items():
+                window_mask = np.isin(manoeuvre_kinds, list(group_kinds))
+                if not window_mask.any():
+                    continue
+                labels = {
+                    "model": candidate.name,
+                    "kind": candidate.model_kind,
+                    "split": self.free_run.split,
+                    "protocol": self.free_run.protocol,
+                    "manoeuvre": group_name,
+                }
+                row = labels | self._summarize_windows(candidate.name, window_mask)
+                row["difference"] = self.paired_difference(
+                    candidate.name, candidate.reference, window_mask
+                )
+                metric_rows.append(
+                    row
+                    | (
+                        coverage_by_model[candidate.name].to_row(window_mask)
+                        if candidate.name in coverage_by_model
+                        else {}
+                    )
+                )
+        return metric_rows
+
+    def _summarize_windows(self, model_name: str, window_mask: np.ndarray) -> dict[str, Any]:
+        errors, resampling_blocks = (
+            self.errors[model_name],
+            make_resampling_blocks(self.log_indices[window_mask]),
+        )
+        dof, pose_errors = self.dof, errors.final_pose_errors()
+        errors_by_window = np.column_stack(
+            (errors.rmse, self.nrmse_by_window[model_name], *pose_errors.values())
+        )[window_mask]
+        rmse, mae = errors_by_window[:, : dof.n_dynamic].mean(0), errors.mae[window_mask].mean(0)
+        nrmse = rmse / self.state_scales
+        confidence_intervals = bootstrap_intervals(errors_by_window, resampling_blocks)
+        n_usable = errors.n_usable[window_mask]
+
+        def map_by_state(by_state: np.ndarray) -> dict[str, float]:
+            return {dof.dynamic_states[axis]: float(by_state[axis]) for axis in dof.active_indices}
+
+        summary = {
+            "windows": len(n_usable),
+            "n": int(n_usable.sum()),
+            "diverged": sum(
+                prediction.has_diverged
+                for prediction, is_selected in zip(
+                    self.free_run.predictions[model_name], window_mask, strict=True
+                )
+                if is_selected
+            ),
+            "rmse": map_by_state(rmse),
+            "mae": map_by_state(mae),
+            "nrmse": map_by_state(nrmse) | {"mean": float(nrmse[dof.active_indices].mean())},
+            "rmse_ci95": {
+                dof.dynamic_states[axis]: confidence_intervals[axis] for axis in dof.active_indices
+            },
+            "nrmse_mean_ci95": confidence_intervals[dof.n_dynamic],
+            "ci95_blocks": resampling_blocks.to_row() if resampling_blocks is not None else None,
+        }
+        # they stand behind the errors of what moves and their mean
+        for column, model_name in enumerate(pose_errors, dof.n_dynamic + 1):
+            summary[f"{model_name}_error_end"] = float(errors_by_window[:, column].mean())
+            summary[f"{model_name}_error_end_ci95"] = confidence_intervals[column]
+        return summary
+
+    def build_limits(self, dt: float) -> dict[str, Any]:
+        """Return the part of limits.json for one protocol and split; `dt` of the grid in s."""
+        return {
+            "kinematics": self.evaluate_kinematics(dt),
+            "bands": self.evaluate_by_class(),
+            "worst": {name: self.list_worst_windows(name) for name in self.errors},
+            "compared": self.compare_with_references(),
+            "outside": self.share_outside_training_range(),
+            "horizons": self.evaluate_horizons(dt),
+        }
+
+    def evaluate_horizons(self, dt: float) -> list[dict[str, Any]]:
+        """Return how far models are off after some times that matter, in metres and radians.
+
+        Returns:
+            One entry for 10, 30 and 100 s, as far as the windows go, and for the end of the longest
+            window: `seconds`; `windows` and `log_indices` that last so long, `slowest` and `fastest` of
+            them (mean speeds, m/s) and the mean way `distances` in m; `integration_errors`: what integrated
+            measured velocities are off in each of `Live.ends`; and by model the mean of each over
+            the windows, with `intervals` for as many new logs, see `prediction_intervals`.
+        """
+        any_errors, mean_speeds = next(iter(self.errors.values())), self._mean_speeds()
+        max_steps = int(any_errors.window_lengths.max()) - 1
+        horizon_steps = [round(seconds / dt) for seconds in _HORIZONS]
+        entries = []
+        for n_steps in [
+            *(n_steps for n_steps in horizon_steps if 0 < n_steps < max_steps),
+            max_steps,
+        ]:
+            reaches_horizon = any_errors.window_lengths > n_steps
+            reaches_horizon[reaches_horizon] = any_errors.is_usable[
+                (any_errors.window_starts + n_steps)[reaches_horizon]
+            ]
+            if not reaches_horizon.any():
+                continue
+            log_indices = self.log_indices[reaches_horizon]
+            long_slices = (self.log_slices[i] for i in np.flatnonzero(reaches_horizon).tolist())
+            measured_states = [
+                log.y[window_slice][: n_steps + 1] for log, window_slice in long_slices
+            ]
+            distances = [
+                float(np.hypot(*states[:, VELOCITIES][:, :2].T).sum()) * dt
+                for states in measured_states
+            ]
+            pose_errors_by_model = {
+                name: errors.final_pose_errors((errors.window_starts + n_steps)[reaches_horizon])
+                for name, errors in self.errors.items()
+            }
+            integration_errors = {
+                "floor": compute_integration_errors(np.stack(measured_states), self.dof, dt)
+            }
+            entries.append(
+                {
+                    "seconds": n_steps * dt,
+                    "windows": len(measured_states),
+                    "logs": len(set(log_indices.tolist())),
+                    "slowest": float(mean_speeds[reaches_horizon].min()),
+                    "fastest": float(mean_speeds[reaches_horizon].max()),
+                    "sailed": float(np.mean(distances)),
+                    "floor": _summarize_pose_errors(integration_errors, log_indices)["floor"],
+                    "models": _summarize_pose_errors(pose_errors_by_model, log_indices),
+                }
+            )
+        return entries
+
+    def evaluate_kinematics(self, dt: float) -> dict[str, float]:
+        """Return how far integrated measured velocities end from the measured pose.
+
+        They are integrated over each window from its measured pose, as predictions are.
+
+        Returns:
+            windows; mean and root mean square of each of `Live.ends` at the ends of windows, as
+            position_mean and position_rms. A model that predicted the measured velocities exactly
+            would have these errors. Empty where only some velocities were recorded.
+        """
+        if self.dof.fixed_states:
+            return {}
+        states_by_length: dict[int, list[np.ndarray]] = {}
+        for log, window_slice in self.log_slices:
+            states_by_length.setdefault(window_slice.stop - window_slice.start, []).append(
+                log.y[window_slice]
+            )
+        integration_errors = [
+            compute_integration_errors(np.stack(states_of_length), self.dof, dt)
+            for states_of_length in states_by_length.values()
+        ]
+        summary: dict[str, float] = {"windows": len(self.log_slices)}
+        for name in self.dof.pose_error_names:
+            values = np.concatenate(
+                [errors_of_length[name] for errors_of_length in integration_errors]
+            )
+            summary[f"{name}_mean"] = float(values.mean())
+            summary[f"{name}_rms"] = float(np.sqrt(np.mean(values**2)))
+        return summary
+
+    def _mean_speeds(self) -> np.ndarray:
+        return np.array(
+            [
+                np.hypot(*log.y[window_slice, VELOCITIES][:, :2].T).mean()
+                for log, window_slice in self.log_slices
+            ]
+        )
+
+    def evaluate_by_class(self) -> list[dict[str, Any]]:
+        """Return errors by thirds of the windows in mean speed and in mean true wind speed.
+
+        The wind only where every log has it. A band of fewer than three windows is left out, and
+        so is a quantity of which one band remains. Each entry: `by` (speed or wind), `low` and
+        `upper` in m/s (extremes of the windows' means), `windows`, and by model `nrmse_mean` and
+        `paired_difference` as in metrics.json.
+        """
+        values_by_quantity = {"speed": self._mean_speeds()}
+        if all(_WIND_CHANNEL in log.log.channels for log, _ in self.log_slices):
+            mean_wind_speeds = [
+                log.log[_WIND_CHANNEL][window_slice].mean() for log, window_slice in self.log_slices
+            ]
+            values_by_quantity["wind"] = np.array(mean_wind_speeds)
+        entries = []
+        for quantity, values in values_by_quantity.items():
+            if not np.isfinite(values).all():
+                continue
+            # equal values stay together
+            class_limits = np.quantile(values, np.arange(1, _N_SPEED_CLASSES) / _N_SPEED_CLASSES)
+            class_indices = np.searchsorted(class_limits, values, side="left")
+            class_masks = [
+                class_indices == k
+                for k in range(_N_SPEED_CLASSES)
+                if (class_indices == k).sum() >= _MIN_CLASS_WINDOWS
+            ]
+            entries += [
+                {
+                    "by": quantity,
+                    "low": float(values[class_mask].min()),
+                    "high": float(values[class_mask].max()),
+                    "windows": int(class_mask.sum()),
+                    "models": {
+                        candidate.name: {
+                            "nrmse_mean": float(
+                                self.nrmse_by_window[candidate.name][class_mask].mean()
+                            ),
+                            "difference": self.paired_difference(
+                                candidate.name, candidate.reference, class_mask
+                            ),
+                        }
+                        for candidate in self.candidates
+                    },
+                }
+                for class_mask in (class_masks if len(class_masks) > 1 else ())
+            ]
+        return entries
+
+    def list_worst_windows(self, model_name: str) -> list[dict[str, Any]]:
+        """Return the three windows with the largest nrmse of a model.
+
+        Each with log, manoeuvre, t (start, the log's clock, s), nrmse, rmse, position_error_end
+        (heading_error_end where no velocity moves the position).
+        """
+        errors, nrmse, pose_error_name = (
+            self.errors[model_name],
+            self.nrmse_by_window[model_name],
+            self.dof.pose_error_names[0],
+        )
+        pose_errors = errors.final_pose_errors()[pose_error_name]
+        return [
+            {
+                "log": self.log_slices[i][0].log.name,
+                "manoeuvre": self.log_slices[i][0].log.manoeuvre,
+                "t": float(self.log_slices[i][0].log.t[self.free_run.windows[i].start]),
+                "nrmse": float(nrmse[i]),
+                "rmse": {
+                    self.dof.dynamic_states[axis]: float(errors.rmse[i, axis])
+                    for axis in self.dof.active_indices
+                },
+                f"{pose_error_name}_error_end": float(pose_errors[i]),
+            }
+            for i in np.argsort(-nrmse, kind="stable")[:_N_WORST_WINDOWS].tolist()
+        ]
+
+    def compare_with_references(self) -> dict[str, dict[str, Any]]:
+        """Return by model its paired differences to `zero` and to the first baseline."""
+        all_windows = np.ones(len(self.log_indices), dtype=bool)
+        reference_names = [CONSTANT_VELOCITY] if CONSTANT_VELOCITY in self.errors else []
+        reference_names += [
+            candidate.name for candidate in self.candidates if candidate.model_kind == "baseline"
+        ][:1]
+        return {
+            model_name: {
+                reference_name: self.paired_difference(model_name, reference_name, all_windows)
+                for reference_name in reference_names
+                if reference_name != model_name
+            }
+            for model_name in self.errors
+        }
+
+    def share_outside_training_range(self) -> dict[str, Any]:
+        """Return how much of the windows lies outside the range of the training data.
+
+        Returns:
+            `share` of the usable samples with a velocity or an input outside its range, and
+            `channels`: the share of each channel that is; empty where no model says its ranges. A
+            depth, which drives nothing, does not count.
+        """
+        ranges = next(
+            (
+                candidate.training_ranges
+                for candidate in self.candidates
+                if candidate.training_ranges
+            ),
+            {},
+        )
+        if not ranges:
+            return {}
+        values = np.concatenate(
+            [
+                np.concatenate(
+                    (log.y[window_slice, log.dof.dynamic_columns], log.w[window_slice]), axis=1
+                )[log.usable[window_slice]]
+                for log, window_slice in self.log_slices
+            ]
+        )
+        lower, upper = np.array(list(ranges.values())).T
+        unused_channels = self.log_slices[0][0].dof.unmodelled_states
+        is_outside = (values < lower) | (values > upper)
+        is_outside &= np.array([name not in unused_channels for name in ranges])
+        shares = dict(zip(ranges, is_outside.mean(0).tolist(), strict=True))
+        return {
+            "share": float(is_outside.any(1).mean()),
+            "channels": {name: share for name, share in shares.items() if share > 0},
+        }
+
+
+def _summarize_pose_errors(
+    pose_errors: Mapping[str, Mapping[str, np.ndarray]], log_indices: np.ndarray
+) -> dict[str, dict[str, Any]]:
+    """Return means and intervals of sizes [W] of errors of the pose, by model and name."""
+    values = np.column_stack(
+        [sizes for sizes_by_name in pose_errors.values() for sizes in sizes_by_name.values()]
+    )
+    means_and_intervals = zip(
+        values.mean(0).tolist(), prediction_intervals(values, log_indices), strict=True
+    )
+    summary: dict[str, dict[str, Any]] = {}
+    for model, sizes_by_name in pose_errors.items():
+        mean_and_interval = {name: next(means_and_intervals) for name in sizes_by_name}
+        # an angle is off by half a turn at most
+        upper_bounds = {
+            name: math.pi if POSE_ERROR_UNITS[name] == "rad" else math.inf for name in sizes_by_name
+        }
+        intervals_by_name = {
+            name: interval and [interval[0], min(interval[1], upper_bounds[name])]
+            for name, (_, interval) in mean_and_interval.items()
+        }
+        summary[model] = {name: mean for name, (mean, _) in mean_and_interval.items()} | {
+            "intervals": intervals_by_name
+        }
+    return summary
+
+
+def find_row(rows: Sequence[Mapping[str, Any]], **labels: str) -> Mapping[str, Any]:
+    """Return the one row of a model, split, protocol and manoeuvre (`all` where not given)."""
+    keys = {"manoeuvre": "all"} | labels
+    matching_rows = [row for row in rows if all(row[key] == value for key, value in keys.items())]
+    if len(matching_rows) != 1:
+        raise KeyError(f"{len(matching_rows)} rows with {keys}")
+    return matching_rows[0]
+
+
+_LABEL_COLUMNS = ("model", "kind", "split", "protocol", "manoeuvre", "selected")
+_COUNT_COLUMNS = ("windows", "diverged", "n")
+_CHANNEL_COLUMNS = ("rmse", "mae", "nrmse")
+_POSE_ERROR_COLUMNS = tuple(f"{end}_error_end" for end in POSE_ERROR_UNITS)
+
+
+def build_metrics_content(
+    run: str,
+    units: Mapping[str, str],
+    scales: Mapping[str, float],
+    selected: str,
+    selected_ensemble: str | None,
+    predictor: str,
+    rows: Sequence[Mapping[str, Any]],
+) -> dict[str, Any]:
+    """Return the contents of metrics.json.
+
+    Args:
+        selected: name of the single model that the validation data chose.
+        selected_ensemble: name of the best ensemble; None where there is none.
+        predictor: name of the model that is reported first and exported where none is named.
+        rows: of all splits, without `selected`.
+    """
+    marked_rows = [{**row, "selected": row["model"] == selected} for row in rows]
+    return {
+        "schema": SCHEMA,
+        "run": run,
+        "channels": dict(units),
+        "scales": dict(scales),
+        "selected": selected,
+        "selected_ensemble": selected_ensemble,
+        "predictor": predictor,
+        "rows": marked_rows,
+    }
+
+
+def build_metrics_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Return rows of metrics.json as a table with one column per number.
+
+    Args:
+        rows: of metrics.json, as `evaluate` or the file gives them.
+
+    Returns:
+        Columns model, kind, split, protocol, manoeuvre (and selected where the rows have it),
+        windows, diverged, n, then rmse_u, rmse_v, rmse_r (m/s, m/s, rad/s), the same for mae and
+        nrmse with nrmse_mean, note (such as "2/12 diverged", where such windows count with the
+        error of `zero`), and position_error_end (m), heading_error_end (rad), or depth_error_end
+        (m) and attitude_error_end (rad) where the vessel dives.
+    """
+    import pandas as pd
+
+    return pd.DataFrame([_flatten_row(row) for row in rows])
+
+
+def _flatten_row(row: Mapping[str, Any]) -> dict[str, Any]:
+    flat_row = {name: row[name] for name in (*_LABEL_COLUMNS, *_COUNT_COLUMNS) if name in row}
+    for name in _CHANNEL_COLUMNS:
+        flat_row |= {f"{name}_{channel}": value for channel, value in row[name].items()}
+    # beside the score, since the diverged windows in it are no errors of the model
+    flat_row["note"] = describe_divergence(row)
+    return flat_row | {name: row[name] for name in _POSE_ERROR_COLUMNS if name in row}
+
+
+INPUT_PREFIX = "input_"
+"""Stands before the name of an input among the columns."""
+
+
+def state_column_names(dof: DegreesOfFreedom) -> tuple[str, ...]:
+    """Return the names of the columns of states: u, v, r, heading and position, then the rest."""
+    planar, non_planar_states = (
+        dof.dynamic_states[: PLANAR_LAYOUT.n_dof],
+        dof.dynamic_states[PLANAR_LAYOUT.n_dof :],
+    )
+    return (*planar, "psi", "x", "y", *non_planar_states)
+
+
+def iterate_rollout_columns(
+    runs: Sequence[FreeRun],
+    logs: Sequence[PreparedLog],
+    inputs: Sequence[str] = (),
+    bands: BandsByModel | None = None,
+) -> Iterator[tuple[PreparedLog, dict[str, np.ndarray]]]:
+    """Yield each log that has a window, with a row for each step of each model's free runs.
+
+    Columns: protocol, model, window, t (s, the log's clock), usable, diverged, then u, v, r, psi,
+    x, y (and p and phi of a roll) as measured and with `_hat` as predicted (SI, rad), and the
+    inputs that are held over the step after each sample with `input_` before their names. Where
+    there are bands, `_low` and `_high` are their pointwise limits; those of x and y are the box
+    about the circle that holds the position, and a model without a band has NaN.
+
+    Args:
+        inputs: names of the inputs, in the order of their columns.
+        bands: by model and protocol; None for none.
+    """
+    bands_by_model = bands or {}
+    for log_index, log in enumerate(logs):
+        tables: list[dict[str, np.ndarray]] = []
+        state_columns = {
+            name: log.dof.state_names.index(name) for name in state_column_names(log.dof)
+        }
+        for run in runs:
+            window_indices = [
+                window_index
+                for window_index, window in enumerate(run.windows)
+                if window.log_index == log_index
+            ]
+            for model, predictions in run.predictions.items():
+                band = bands_by_model.get(model, {}).get(run.protocol)
+                for window_number, window_index in enumerate(window_indices):
+                    window_slice, prediction = (
+                        slice(run.windows[window_index].start, run.windows[window_index].stop),
+                        predictions[window_index],
+                    )
+                    label_columns = {
+                        "protocol": run.protocol,
+                        "model": model,
+                        "window": window_number,
+                    }
+                    states_by_suffix = {"": log.y[window_slice], "_hat": prediction.states}
+                    if any(bands_by_model.values()):
+                        lower = upper = np.full_like(prediction.states, np.nan)
+                        if band is not None:
+                            half_widths = band.half_widths(prediction.states, prediction.spread)
+                            lower, upper = band_limits(prediction.states, half_widths)
+                        states_by_suffix |= {"_low": lower, "_high": upper}
+                    tables.append(
+                        {
+                            name: np.full(len(prediction.states), label)
+                            for name, label in label_columns.items()
+                        }
+                        | {"t": log.log.t[window_slice], "usable": log.usable[window_slice]}
+                        | {"diverged": np.full(len(prediction.states), prediction.has_diverged)}
+                        | {
+                            f"{name}{suffix}": values[:, column]
+                            for suffix, values in states_by_suffix.items()
+                            for name, column in state_columns.items()
+                        }
+                        | {
+                            f"{INPUT_PREFIX}{input_name}": log.w[window_slice, k]
+                            for k, input_name in enumerate(inputs)
+                        }
+                    )
+        if tables:
+            yield (
+                log,
+                {name: np.concatenate([table[name] for table in tables]) for name in tables[0]},
+            )
+
+
+def write_rollouts(
+    folder: Path,
+    runs: Sequence[FreeRun],
+    logs: Sequence[PreparedLog],
+    inputs: Sequence[str],
+    bands: BandsByModel | None = None,
+) -> None:
+    """Write one file per log of a split, as `iterate_rollout_columns` gives it."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    for log, columns in iterate_rollout_columns(runs, logs, inputs, bands):
+        table = pa.table({name: pa.array(values) for name, values in columns.items()})
+        with atomic_write(folder / f"{make_file_stem(log.log.name)}.parquet") as file:
+            # dictionaries of numbers that do not repeat take time and room
+            pq.write_table(table, file, compression="zstd", use_dictionary=["protocol", "model"])

@@ -1,0 +1,354 @@
+"""The choice of one model among fitted ones: the simplest that is as good as the best.
+
+Models are compared by the ratio of their errors, block by block: the logarithms of errors are
+averaged. In a mean of the errors themselves one bad stretch outweighs all others, and its standard
+error grows with it, so that few logs would tell nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from residnet.core.format import format_number
+from residnet.evaluation.freerun import FreeRun, FreeRunErrors
+from residnet.evaluation.metrics import MIN_LOGS_AS_BLOCKS, TARGET_BLOCKS
+from residnet.preprocessing.prepare import PreparedLog
+
+SCHEMA = "residnet.selection/2"
+MODEL_FAMILIES = (
+    "zero",
+    "baseline",
+    "refitted baseline",
+    "closed-form head",
+    "network",
+    "ensemble",
+)
+"""What a model is, the simplest first."""
+
+_EQUIVALENCE_STANDARD_ERRORS = {"logs": 1.0, "stretches": 0.5}
+"""Standard errors within which models are alike. Stretches of a few logs resemble each other."""
+_ERROR_OFFSET_SHARE = 0.1
+"""Share of the least mean error below which the error of a block hardly counts."""
+
+
+@dataclass(frozen=True)
+class SelectionCandidate:
+    """A model with what decides whether it is chosen.
+
+    Attributes:
+        name: of the model.
+        family: one of `MODEL_FAMILIES`.
+        n_parameters: number of its fitted parameters.
+        mean_nrmse: its mean NRMSE over the validation windows.
+        block_scores: what each block of the validation data contributes to the mean logarithm of its
+            error, [B]; see `block_log_errors`.
+        n_diverged: number of its validation windows that diverged, over all protocols.
+        faults: sentences on what makes it unsound, divergences among them; empty for a sound model.
+    """
+
+    name: str
+    family: str
+    n_parameters: int
+    mean_nrmse: float
+    block_scores: np.ndarray
+    n_diverged: int = 0
+    faults: tuple[str, ...] = ()
+
+    @property
+    def mean_log_error(self) -> float:
+        """The mean logarithm of its error over the blocks."""
+        return float(self.block_scores.sum())
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether nothing speaks against its use."""
+        return not self.faults
+
+    @property
+    def complexity_rank(self) -> tuple[int, int]:
+        """The place in the order of models: family, then the number of parameters."""
+        return MODEL_FAMILIES.index(self.family), self.n_parameters
+
+
+@dataclass(frozen=True)
+class SelectionBlocks:
+    """The blocks of the validation data over which errors are paired.
+
+    Attributes:
+        weights: share of each block in the mean over windows, [B]; their sum is 1.
+        block_kind: `logs` where a block is all windows of a log, else `stretches` of logs.
+    """
+
+    weights: np.ndarray
+    block_kind: str
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks."""
+        return len(self.weights)
+
+    @property
+    def equivalence_standard_errors(self) -> float:
+        """Number of standard errors within which two models are alike."""
+        return _EQUIVALENCE_STANDARD_ERRORS[self.block_kind]
+
+    def standard_error(self, contributions: np.ndarray, other_contributions: np.ndarray) -> float:
+        """Return the standard error of the difference of two means.
+
+        A single block adds nothing, since it does not tell of the spread.
+
+        Args:
+            contributions: what each block contributes to the first mean, [B].
+            other_contributions: the same of the second, [B].
+        """
+        if self.n_blocks < 2:
+            return 0.0
+        differences = contributions - other_contributions
+        residuals = differences - self.weights * differences.sum()
+        return math.sqrt(self.n_blocks / (self.n_blocks - 1) * float(residuals @ residuals))
+
+
+def log_error_ratio(
+    candidate: SelectionCandidate, reference: SelectionCandidate, blocks: SelectionBlocks
+) -> tuple[float, float]:
+    """Return the mean logarithm of the ratio of two models' errors, and its standard error.
+
+    Both are shares: 0.1 is about 10 %.
+    """
+    mean_log_ratio = float((candidate.block_scores - reference.block_scores).sum())
+    return mean_log_ratio, blocks.standard_error(candidate.block_scores, reference.block_scores)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The chosen models, and why.
+
+    Attributes:
+        selected: name of the chosen single model.
+        selected_ensemble: name of the best ensemble; None where there is none.
+        reason: one sentence on why the single model was chosen.
+        candidates: all models, in the order that they were given.
+        blocks: over which errors were paired.
+        default_ensemble: name of a mean that is reported first whatever was chosen; None for none.
+    """
+
+    selected: str
+    selected_ensemble: str | None
+    reason: str
+    candidates: tuple[SelectionCandidate, ...]
+    blocks: SelectionBlocks
+    default_ensemble: str | None = None
+
+    @property
+    def default_model(self) -> str:
+        """Name of the model that is reported first and exported where none is named."""
+        return self.selected if self.default_ensemble is None else self.default_ensemble
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the contents of selection.json."""
+        selected_candidate = next(
+            candidate for candidate in self.candidates if candidate.name == self.selected
+        )
+        return {
+            "schema": SCHEMA,
+            "selected": self.selected,
+            "selected_ensemble": self.selected_ensemble,
+            "predictor": self.default_model,
+            "reason": self.reason,
+            "blocks": {"of": self.blocks.block_kind, "count": self.blocks.n_blocks},
+            "models": [
+                {
+                    "model": candidate.name,
+                    "family": candidate.family,
+                    "parameters": candidate.n_parameters,
+                    "nrmse_mean": candidate.mean_nrmse,
+                    "ratio": math.exp(
+                        log_error_ratio(candidate, selected_candidate, self.blocks)[0]
+                    ),
+                    "standard_error": log_error_ratio(candidate, selected_candidate, self.blocks)[
+                        1
+                    ],
+                    "diverged": candidate.n_diverged,
+                    "sound": candidate.is_sound,
+                    "faults": list(candidate.faults),
+                }
+                for candidate in self.candidates
+            ],
+        }
+
+
+def select_models(candidates: Iterable[SelectionCandidate], blocks: SelectionBlocks) -> Selection:
+    """Choose a single model and an ensemble.
+
+    Among the models that never diverged, those are alike whose error is within one standard error
+    of the least (Breiman and others 1984, Classification and Regression Trees, section 3.4.3;
+    paired here, since all models run over the same windows). Of fewer than five logs half a
+    standard error is taken: their stretches resemble each other, and a whole one took lines for
+    hulls. Of those that are alike a sound one comes before an unsound one, and then the simplest
+    is chosen: what speaks against a model costs it as much error as the logs can tell, no more.
+
+    Args:
+        candidates: `zero` and at least one other.
+    """
+    all_candidates = tuple(candidates)
+    selected_model, reason = _simplest_equivalent(
+        [candidate for candidate in all_candidates if candidate.family != "ensemble"], blocks
+    )
+    ensembles = [candidate for candidate in all_candidates if candidate.family == "ensemble"]
+    best_ensemble = min(
+        ensembles, key=lambda one: (one.n_diverged, one.mean_log_error), default=None
+    )
+    return Selection(
+        selected_model.name,
+        None if best_ensemble is None else best_ensemble.name,
+        reason,
+        all_candidates,
+        blocks,
+    )
+
+
+def _simplest_equivalent(
+    single_models: Sequence[SelectionCandidate], blocks: SelectionBlocks
+) -> tuple[SelectionCandidate, str]:
+    """Return the simplest of the models that are as good as the best, the sound first, and why."""
+    bounded_models = [model for model in single_models if not model.n_diverged]
+    most_accurate = min(bounded_models, key=lambda one: one.mean_log_error)
+    tolerance_text = (
+        "one standard error"
+        if blocks.equivalence_standard_errors == 1.0
+        else "half a standard error"
+    )
+    for candidate in sorted(
+        bounded_models, key=lambda one: (not one.is_sound, *one.complexity_rank, one.mean_log_error)
+    ):
+        mean_log_ratio, standard_error = log_error_ratio(candidate, most_accurate, blocks)
+        if mean_log_ratio <= (tolerance := blocks.equivalence_standard_errors * standard_error):
+            break
+    error_text = f"mean validation error {format_number(candidate.mean_nrmse)}"
+    if candidate.family == "zero":
+        reason = f"No model beats zero, which predicts nothing, by more than {tolerance_text}"
+    elif candidate is most_accurate:
+        reason = f"{candidate.name} errs least ({error_text})"
+        if any(model.complexity_rank < most_accurate.complexity_rank for model in bounded_models):
+            reason += f", and no {'simpler' if most_accurate.is_sound else 'sound'} one comes within {tolerance_text}"
+    else:
+        superlative = "simplest sound" if candidate.is_sound else "simplest"
+        reason = (
+            f"{candidate.name} is the {superlative} model within {tolerance_text} ({format_number(100.0 * tolerance, 2)} %) of"
+            f" the best one, {most_accurate.name} ({error_text} and {format_number(most_accurate.mean_nrmse)})"
+        )
+    diverged_models = [
+        model
+        for model in single_models
+        if model.mean_log_error < candidate.mean_log_error and model.n_diverged
+    ]
+    if diverged_models:
+        diverged_text = ", ".join(f"{model.name} ({model.faults[0]})" for model in diverged_models)
+        reason += f"; passed over: {diverged_text}"
+    if not candidate.is_sound:
+        reason += f"; against it speaks: {'; '.join(candidate.faults)}"
+    return candidate, reason + "."
+
+
+def make_selection_blocks(free_run: FreeRun) -> tuple[SelectionBlocks, list[np.ndarray]]:
+    """Return the blocks of validation windows, and the number of the block of each sample.
+
+    From five logs on a block is a log, so that what is chosen holds for other logs. Fewer logs are
+    cut into contiguous stretches of equal length, about eight in all.
+
+    Returns:
+        The blocks, and for each window [L] of block numbers.
+    """
+    log_indices = np.array([window.log_index for window in free_run.windows])
+    window_lengths = np.array([window.stop - window.start for window in free_run.windows])
+    logs = np.unique(log_indices)
+    block_numbers: list[np.ndarray] = [np.zeros(length, dtype=int) for length in window_lengths]
+    segments_per_log = (
+        1 if len(logs) >= MIN_LOGS_AS_BLOCKS else math.ceil(TARGET_BLOCKS / len(logs))
+    )
+    for log_position, log_index in enumerate(logs.tolist()):
+        window_indices = np.flatnonzero(log_indices == log_index)
+        n_segments = min(segments_per_log, int(window_lengths[window_indices].sum()))
+        sample_groups = np.array_split(np.arange(window_lengths[window_indices].sum()), n_segments)
+        log_block_numbers = np.concatenate(
+            [
+                np.full(len(window_block_numbers), i)
+                for i, window_block_numbers in enumerate(sample_groups)
+            ]
+        )
+        for window_index, window_block_numbers in zip(
+            window_indices,
+            np.split(log_block_numbers, np.cumsum(window_lengths[window_indices])[:-1]),
+            strict=True,
+        ):
+            block_numbers[window_index] = log_position * segments_per_log + window_block_numbers
+    # a log of fewer samples than pieces leaves numbers out
+    unique_blocks, log_block_numbers = np.unique(np.concatenate(block_numbers), return_inverse=True)
+    block_numbers = np.split(log_block_numbers, np.cumsum(window_lengths)[:-1])
+    weights = np.zeros(len(unique_blocks))
+    for window_blocks in block_numbers:
+        weights += np.bincount(window_blocks, minlength=len(unique_blocks)) / (
+            len(window_blocks) * len(block_numbers)
+        )
+    return SelectionBlocks(weights, "logs" if segments_per_log == 1 else "stretches"), block_numbers
+
+
+def block_error_shares(
+    free_run: FreeRun,
+    model_name: str,
+    logs: Sequence[PreparedLog],
+    scales: Mapping[str, float],
+    block_numbers: Sequence[np.ndarray],
+    n_blocks: int,
+) -> np.ndarray:
+    """Return what each block contributes to a model's mean NRMSE, [count].
+
+    A window's root mean square error is shared out in proportion to the squares, so that the sum
+    is the mean NRMSE of the rows of metrics.json.
+
+    Args:
+        free_run: free runs over the windows.
+        block_numbers: number of the block of each sample of each window.
+    """
+    errors = FreeRunErrors.from_predictions(
+        free_run.windows, free_run.predictions[model_name], logs
+    )
+    weighted_rmse = errors.rmse * np.add.reduceat(
+        errors.is_scored, errors.window_starts, dtype=float
+    )
+    scaled_columns = [logs[0].dof.dynamic_states.index(name) for name in scales]
+    weighted_rmse = np.where(weighted_rmse > 0, weighted_rmse, 1.0).take(scaled_columns, axis=1)
+    weighted_rmse = weighted_rmse * np.array(list(scales.values()))
+    velocity_errors = errors.velocity_errors.take(scaled_columns, axis=1)
+    sample_contributions = (
+        velocity_errors**2 / np.repeat(weighted_rmse, errors.window_lengths, axis=0)
+    ).sum(1)
+    sample_shares = sample_contributions / (weighted_rmse.shape[1] * len(free_run.windows))
+    return np.bincount(np.concatenate(block_numbers), sample_shares, n_blocks)
+
+
+def block_log_errors(
+    error_shares: Mapping[str, np.ndarray], block_weights: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return what each block contributes to the mean logarithm of a model's error, [B] by model.
+
+    A tenth of the least mean error is added to each error, so that no block counts much where all
+    models are nearly right.
+
+    Args:
+        error_shares: what each block contributes to the mean NRMSE, [B] by model.
+        block_weights: of the blocks, [B].
+    """
+    least_mean_error = min(
+        (float(share_of_model.sum()) for share_of_model in error_shares.values()), default=0.0
+    )
+    offset = max(_ERROR_OFFSET_SHARE * least_mean_error, float(np.finfo(float).tiny))
+    return {
+        name: block_weights * np.log(share_of_model / block_weights + offset)
+        for name, share_of_model in error_shares.items()
+    }

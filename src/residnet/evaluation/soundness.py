@@ -1,0 +1,739 @@
+"""Whether a model behaves like a vessel: damping, stability, symmetry, and motion within bounds.
+
+What a model does where its logs have been, at recorded states and inputs, can make it unsound, so
+that a sound one that is as good is selected. What it does elsewhere is reported, and speaks against
+no choice.
+
+A full hull may be unstable on a course in truth, so that instability is a fault only where the
+vessel, its inputs held, settled from a disturbance such as the entry of a turn, and stayed so for
+several times as long as the model's disturbances take to grow. A straight run that nothing disturbs
+proves nothing. Disturbances have the size that they had in the log: a model of logs whose wind
+nobody measured may swing a little in a steady turn, as the vessel did.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from residnet.core.columns import all_but_pose
+from residnet.core.errors import DataError
+from residnet.core.files import read_json
+from residnet.core.format import display_unit, format_interval, format_number
+from residnet.core.layout import LATERAL, POSE, SURGE, SWAY
+from residnet.core.names import WIND_INPUTS
+from residnet.core.stretches import find_runs
+from residnet.dynamics.ensemble import MeanOfTrajectories
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec
+from residnet.engine.free_runs import compiled
+from residnet.engine.rollout import Rollout
+from residnet.physics.symmetry import (
+    find_heeling_propellers,
+    get_axis_parities,
+    get_channel_parity,
+    get_pair_parity,
+    get_partners,
+)
+from residnet.preprocessing.prepare import PreparedLog
+
+SCHEMA = "residnet.sanity/1"
+DAMPING, STABILITY, SYMMETRY, BOUNDEDNESS = CHECKS = ("damping", "stability", "symmetry", "bounded")
+
+_N_CHECK_POINTS = 90
+"""Recorded states that are looked at, besides those of extreme inputs; chosen by hand."""
+_NEGLIGIBLE_SLOPE_SHARE = 0.05
+"""Share of a slope's size elsewhere below which a positive one is no wrong sign."""
+_MAX_DOUBLING_TIME = 300.0
+"""Time in s within which a growing disturbance counts."""
+_MAX_ASYMMETRY = 0.1
+"""Uneven part of the acceleration, share of its spread, beyond which sides differ; by choice."""
+_LONG_RUN_DURATION = 300.0
+"""Time in s that inputs are held at least: within it a disturbance doubles that counts."""
+_MEMORY_SETTLING_TIME, _STEADY_TOLERANCE = 10.0, 1e-4
+_SPEED_FRACTIONS, _CRUISE_FRACTION = (0.0, 0.25, 0.5, 0.67, 1.0, 1.5), 0.67
+"""Speeds of straight running, in the largest of the training data."""
+_MAX_CORNERS = 64
+"""Corners of the inputs' ranges: all of up to six inputs."""
+_CONSTANT_INPUT_TOLERANCE, _MIN_CONSTANT_DURATION = 0.02, 5.0
+"""Share of an input's range within which it is held, and for how long in s at least."""
+_MIN_MODEL_GROWTH, _MAX_MEASURED_GROWTH, _MIN_MEASURED_DECAY = 20.0, 3.0, 3.0
+_MAX_STEADY_RUNS, _SETTLING_SHARE = 20, 0.25
+"""Steady runs that are looked at, and the share of each that settles; chosen by hand."""
+_DISTURBANCE_SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
+
+
+@dataclass(frozen=True)
+class SanityFinding:
+    """A finding of one check of one model.
+
+    `ok` is None where the check does not apply or could not be made. `fault` says in a few words
+    what makes the model unsound, so that one that is as good comes first; it is empty where the
+    finding is only reported.
+    """
+
+    model: str
+    check: str
+    ok: bool | None
+    text: str
+    fault: str = ""
+
+
+@dataclass(frozen=True)
+class SteadyRun:
+    """A stretch of a log with held inputs.
+
+    Attributes:
+        log: name of the log.
+        duration: that it lasts, its settling left out.
+        mean_state: mean state [3 + n] with the pose at zero.
+        mean_inputs: mean inputs [m].
+        decay: how many times farther the lateral velocities lie from their last mean when the
+            stretch begins than in the end.
+        growth: how many times farther the lateral velocities lie from their first third's mean in
+            the last third than in the first.
+        scatter: standard deviations of the lateral velocities [2].
+    """
+
+    log: str
+    duration: float
+    mean_state: np.ndarray
+    mean_inputs: np.ndarray
+    decay: float
+    growth: float
+    scatter: np.ndarray
+
+
+@dataclass(frozen=True)
+class TrainingPoints:
+    """What training logs hold for the checks.
+
+    Attributes:
+        x: recorded states [K, 3 + n] with the pose at zero.
+        w: inputs [K, m].
+        longest_duration: how long the longest log lasts in s.
+        steady_runs: stretches with held inputs.
+    """
+
+    x: Tensor
+    w: Tensor
+    longest_duration: float
+    steady_runs: Sequence[SteadyRun]
+
+    @classmethod
+    def from_logs(cls, logs: Sequence[PreparedLog], dt: float) -> TrainingPoints:
+        """Return points spread evenly over the speeds, those of extreme inputs, and steady runs."""
+        # all states of large data would fill the memory: only those of the points are put together
+        usable_indices = [np.flatnonzero(log.usable) for log in logs]
+        logs_and_indices = list(zip(logs, usable_indices, strict=True))
+        speed = np.concatenate(
+            [
+                np.hypot(*log.smoothed[sample_indices, SURGE : SURGE + 2].T)
+                for log, sample_indices in logs_and_indices
+            ]
+        )
+        speed_order = np.argsort(speed, kind="stable")
+        evenly_spread = speed_order[
+            np.linspace(0, len(speed_order) - 1, min(_N_CHECK_POINTS, len(speed_order)))
+            .round()
+            .astype(int)
+        ]
+        extreme_indices = []
+        for column in range(logs[0].w.shape[1]):
+            w = np.concatenate(
+                [log.w[sample_indices, column] for log, sample_indices in logs_and_indices]
+            )
+            extreme_indices += [w.argmin(), w.argmax()]
+        selected_samples = np.union1d(
+            evenly_spread, np.array(extreme_indices, dtype=evenly_spread.dtype)
+        )
+        cumulative_counts = np.cumsum([len(sample_indices) for sample_indices in usable_indices])
+        selected_by_log = [
+            (
+                log,
+                sample_indices[
+                    selected_samples[
+                        (selected_samples >= cumulative_count - len(sample_indices))
+                        & (selected_samples < cumulative_count)
+                    ]
+                    - (cumulative_count - len(sample_indices))
+                ],
+            )
+            for (log, sample_indices), cumulative_count in zip(
+                logs_and_indices, cumulative_counts, strict=True
+            )
+        ]
+        x = np.concatenate(
+            [log.smoothed[sample_indices] for log, sample_indices in selected_by_log]
+        )
+        w = np.concatenate([log.w[sample_indices] for log, sample_indices in selected_by_log])
+        x[:, POSE] = 0.0
+        longest_duration = max(float(log.log.t[-1] - log.log.t[0]) for log in logs)
+        return cls(
+            torch.from_numpy(x), torch.from_numpy(w), longest_duration, find_steady_runs(logs, dt)
+        )
+
+
+def find_steady_runs(logs: Sequence[PreparedLog], dt: float) -> list[SteadyRun]:
+    """Return the stretches of logs whose inputs hold within 2 % of their ranges.
+
+    The first quarter of each is left out, in which the motion settles, and so are stretches of
+    fewer than five seconds.
+    """
+    usable_inputs = [log.w[log.usable] for log in logs if log.usable.any()]
+    input_ranges = np.max([inputs.max(0) for inputs in usable_inputs], 0) - np.min(
+        [inputs.min(0) for inputs in usable_inputs], 0
+    )
+    tolerance = _CONSTANT_INPUT_TOLERANCE * np.maximum(input_ranges, 1e-12)
+    runs = []
+    for log in logs:
+        for run_start, run_end in _constant_input_runs(
+            log, tolerance, round(_MIN_CONSTANT_DURATION / dt)
+        ):
+            settled_slice = slice(run_start + int(_SETTLING_SHARE * (run_end - run_start)), run_end)
+            settled_states, lateral_velocities = (
+                log.smoothed[settled_slice],
+                log.smoothed[settled_slice, LATERAL],
+            )
+            mean_state = settled_states.mean(0)
+            mean_state[POSE] = 0.0
+            third_length = max(len(lateral_velocities) // 3, 1)
+            first_mean, last_mean = (
+                lateral_velocities[:third_length].mean(0),
+                lateral_velocities[-third_length:].mean(0),
+            )
+            entry_velocities = log.smoothed[
+                run_start : run_start + max(third_length // 10, 1), LATERAL
+            ]
+            initial_deviation, final_deviation, early_deviation, late_deviation = (
+                np.abs(velocities - reference_mean).mean(0)
+                for velocities, reference_mean in (
+                    (entry_velocities, last_mean),
+                    (lateral_velocities[-third_length:], last_mean),
+                    (lateral_velocities[:third_length], first_mean),
+                    (lateral_velocities[-third_length:], first_mean),
+                )
+            )
+            decay = float((initial_deviation / np.maximum(final_deviation, 1e-9)).max())
+            growth = float((late_deviation / np.maximum(early_deviation, 1e-9)).max())
+            inputs, lateral_std = log.w[settled_slice].mean(0), lateral_velocities.std(0)
+            runs.append(
+                SteadyRun(
+                    log.log.name,
+                    len(settled_states) * dt,
+                    mean_state,
+                    inputs,
+                    decay,
+                    growth,
+                    lateral_std,
+                )
+            )
+    return runs
+
+
+def _constant_input_runs(
+    log: PreparedLog, tolerance: np.ndarray, min_length: int
+) -> Iterator[tuple[int, int]]:
+    """First sample and end of each stretch whose inputs stay within a tolerance [m] of its first.
+
+    Stretches follow each other and do not overlap.
+    """
+    for segment_start, segment_end in zip(*find_runs(log.segment), strict=True):
+        start = int(segment_start)
+        while segment_end - start >= min_length:
+            exceeds_tolerance = (np.abs(log.w[start:segment_end] - log.w[start]) > tolerance).any(1)
+            run_stop = start + (
+                int(exceeds_tolerance.argmax()) if exceeds_tolerance.any() else segment_end - start
+            )
+            if run_stop - start >= min_length:
+                yield start, run_stop
+            start = max(run_stop, start + 1)
+
+
+def check_model(
+    spec: ModelSpec,
+    model: HybridDynamics,
+    training_points: TrainingPoints,
+    divergence_factor: float = 3.0,
+) -> list[SanityFinding]:
+    """Return all checks of one model, in the order of `CHECKS`.
+
+    Args:
+        spec: its description; the training ranges are taken from it.
+        model: with its numbers filled in; it stays as it is.
+        training_points: states, inputs and steady runs of the logs that fitted it.
+        divergence_factor: a velocity beyond this many times its largest training value has run away.
+    """
+    # a copy: the checks run in float64, and must not round what others hold
+    model = copy.deepcopy(model).to(torch.float64).eval()
+    n_threads = torch.get_num_threads()
+    # products this small only lose time to a second thread
+    torch.set_num_threads(1)
+    # the memory of a mean is too large for a Jacobian at each point; free runs show what it does
+    ensemble_text = "not looked at: the mean of several models, whose free runs are bounded or not"
+    straight_text = "not looked at: the model neither sways nor turns"
+    straight_text = straight_text if spec.signals.velocities == ("u",) else ""
+    skip_reason = straight_text or (ensemble_text if isinstance(model, MeanOfTrajectories) else "")
+    try:
+        return [
+            check_damping(spec, model, training_points),
+            SanityFinding(spec.name, STABILITY, None, skip_reason)
+            if skip_reason
+            else check_stability(spec, model, training_points),
+            SanityFinding(spec.name, SYMMETRY, None, straight_text)
+            if straight_text
+            else check_symmetry(spec, model, training_points),
+            check_boundedness(spec, model, training_points, divergence_factor),
+        ]
+    finally:
+        torch.set_num_threads(n_threads)
+
+
+def _to_sanity_finding(
+    spec: ModelSpec, check: str, passed: bool, text: str, fault: str
+) -> SanityFinding:
+    full_text = f"unsound: {fault}. {text}" if fault else text
+    return SanityFinding(spec.name, check, passed and not fault, full_text, fault)
+
+
+def settle_memory(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
+    """Return the memory [B, n_state] after ten seconds in states x [B, 3 + n], inputs w [B, m]."""
+    n_steps = max(round(_MEMORY_SETTLING_TIME / model.dt), 1) if model.n_state else 0
+    return model.warmup(x[:, None].expand(-1, n_steps, -1), w[:, None].expand(-1, n_steps, -1))
+
+
+def settled_acceleration(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
+    """Return nu_dot [B, n] of baseline and head together, the head's memory settled.
+
+    To a model that looks for what was predicted wrong, states that are held would tell of a force
+    that holds them: it has no past.
+    """
+    memory = model.initial_state(len(x)).to(x) if model.observes else settle_memory(model, x, w)
+    return model.acceleration(x, w, memory)
+
+
+def check_damping(
+    spec: ModelSpec, model: HybridDynamics, training_points: TrainingPoints
+) -> SanityFinding:
+    """Check that each velocity decays by itself: d u_dot/du, d v_dot/dv and so on, by autograd.
+
+    None may be positive at more than half of the recorded points, unless it is negligible beside
+    what it is elsewhere.
+    """
+    x, dof = training_points.x.clone().requires_grad_(), spec.signals.dof
+    # a model may depend on no velocity at all
+    nu_dot = settled_acceleration(model, x, training_points.w) + 0.0 * all_but_pose(x)
+    damping_slopes = np.stack(
+        [
+            torch.autograd.grad(nu_dot[:, i].sum(), x, retain_graph=True)[0][:, SURGE + i].numpy()
+            for i in dof.regressed_indices
+        ],
+        axis=1,
+    )
+    median_slopes, typical_sizes = (
+        np.median(damping_slopes, axis=0),
+        np.quantile(np.abs(damping_slopes), 0.9, axis=0),
+    )
+    wrong_signs = [
+        f"d{name}′/d{name} {median_slopes[i]:+.2g} 1/s, positive at {(damping_slopes[:, i] > 0).mean():.0%} of it"
+        for i, name in enumerate(dof.velocities)
+        if median_slopes[i] > _NEGLIGIBLE_SLOPE_SHARE * typical_sizes[i]
+    ]
+    fault = f"its damping has the wrong sign in most of the data ({'; '.join(wrong_signs)})"
+    medians_text = ", ".join(
+        f"d{name}′/d{name} {median_slopes[i]:+.3g}" for i, name in enumerate(dof.velocities)
+    )
+    text = f"medians over the training data: {medians_text} 1/s"
+    return _to_sanity_finding(spec, DAMPING, True, text, fault if wrong_signs else "")
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """Straight running at a speed: state x [3 + n], inputs w [m], and whether the data reach it."""
+
+    label: str
+    speed: float
+    x: Tensor
+    w: Tensor
+    is_inside_training_range: bool
+
+    def __str__(self) -> str:
+        label_text = f"{self.label}, " if self.label else ""
+        outside_text = "" if self.is_inside_training_range else " (outside the training data)"
+        return f"{label_text}u = {format_number(self.speed)} m/s{outside_text}"
+
+
+def find_operating_points(spec: ModelSpec, model: HybridDynamics) -> list[OperatingPoint]:
+    """Return points of straight running from rest to half as fast again as the training data.
+
+    Each is under the drive that nearly holds the speed. Drives are all inputs that do not steer,
+    moved together from the low to the high end of their ranges; rudders are amidships and the air
+    is calm, as far as the ranges allow.
+    """
+    input_names = spec.signals.input_columns
+    dof = spec.signals.dof
+    lower, upper = (
+        _range_tensor(range_limits)[dof.n_dynamic :].clone()
+        for range_limits in (spec.low, spec.high)
+    )
+    mirror_partners = get_partners(input_names)
+    for name, partner_name in mirror_partners.items():
+        # both sides alike, over the range that they share
+        pair_columns = [input_names.index(name), input_names.index(partner_name)]
+        lower[pair_columns], upper[pair_columns] = (
+            lower[pair_columns].max(),
+            upper[pair_columns].min(),
+        )
+    neutral_columns = [
+        i
+        for i, name in enumerate(input_names)
+        if name in WIND_INPUTS or (name not in mirror_partners and get_channel_parity(name) == -1)
+    ]
+    input_candidates = lower + torch.linspace(0.0, 1.0, 41, dtype=torch.float64)[:, None] * (
+        upper - lower
+    )
+    input_candidates[:, neutral_columns] = torch.zeros(
+        len(neutral_columns), dtype=torch.float64
+    ).clamp(lower[neutral_columns], upper[neutral_columns])
+    points = []
+    for speed_fraction in (
+        _SPEED_FRACTIONS if "u" in spec.signals.velocities else _SPEED_FRACTIONS[:1]
+    ):
+        speed = speed_fraction * max(spec.high[0], 1e-6)
+        x = torch.zeros(len(input_candidates), len(dof.state_names), dtype=torch.float64)
+        x[:, SURGE] = speed
+        with torch.no_grad():
+            best_index = int(settled_acceleration(model, x, input_candidates)[:, 0].abs().argmin())
+        label = {0.0: "rest", _CRUISE_FRACTION: "cruise"}.get(speed_fraction, "")
+        is_inside = spec.low[0] <= speed <= spec.high[0]
+        points.append(
+            OperatingPoint(label, speed, x[best_index], input_candidates[best_index], is_inside)
+        )
+    return points
+
+
+def _range_tensor(limits: Sequence[float]) -> Tensor:
+    return torch.tensor(limits, dtype=torch.float64)
+
+
+def check_stability(
+    spec: ModelSpec, model: HybridDynamics, training_points: TrainingPoints
+) -> SanityFinding:
+    """Check how small disturbances of sway, yaw, roll and memory grow in straight running."""
+    motion_names = {"v": "sway", "r": "yaw", "p": "roll"}
+    motion_text = " and ".join(
+        motion_names[name] for name in motion_names if name in spec.signals.velocities
+    )
+    verb = "are" if " " in motion_text else "is"
+    rates_and_points = [
+        (compute_growth_rate(model, point.x, point.w), point)
+        for point in find_operating_points(spec, model)
+    ]
+    summary = "; ".join(
+        f"{point}: slowest mode "
+        + (
+            f"halves in {format_number(-math.log(2) / mode_rate, 2)} s"
+            if mode_rate < 0
+            else f"has rate {mode_rate:+.2g} 1/s"
+        )
+        for mode_rate, point in rates_and_points
+        if point.label
+    )
+    fault = find_contradicting_steady_run(model, training_points.steady_runs)
+    unstable_points = [
+        rate_and_point
+        for rate_and_point in rates_and_points
+        if rate_and_point[0] > math.log(2.0) / _MAX_DOUBLING_TIME
+    ]
+    if not unstable_points:
+        speeds = format_interval(
+            [rates_and_points[0][1].speed, rates_and_points[-1][1].speed], digits=2
+        )
+        text = (
+            f"{motion_text} {verb} stable in straight running at {speeds} m/s (no mode doubles within"
+            f" {_MAX_DOUBLING_TIME:.0f} s). {summary}"
+        )
+        return _to_sanity_finding(spec, STABILITY, True, text, fault)
+    unstable_inside = [
+        rate_and_point
+        for rate_and_point in unstable_points
+        if rate_and_point[1].is_inside_training_range
+    ]
+    mode_rate, worst_point = max(unstable_inside or unstable_points, key=lambda one: one[0])
+    range_text = "inside the training data" if unstable_inside else "only outside the training data"
+    text = (
+        f"{motion_text} unstable in straight running, {range_text}: worst at {worst_point}, a disturbance"
+        f" doubles in {format_number(math.log(2) / mode_rate, 2)} s. Some full hulls are so in truth; otherwise"
+        f" do not trust long free runs there. {summary}"
+    )
+    return _to_sanity_finding(spec, STABILITY, False, text, fault)
+
+
+def compute_growth_rate(model: HybridDynamics, x: Tensor, w: Tensor) -> float:
+    """Return the largest growth rate [1/s] of a small disturbance of all but surge at a point.
+
+    It is the logarithm of the step map's spectral radius over dt.
+
+    Args:
+        model: in float64 and evaluation mode.
+        x: state [3 + n].
+        w: inputs [m].
+    """
+    memory = settle_memory(model, x[None], w[None])
+    perturbed_variables = torch.cat((x[SWAY:], memory[0])).detach()
+    n_variables, n_velocities = perturbed_variables.numel(), len(x) - SWAY
+    variables = perturbed_variables.expand(n_variables, n_variables).clone().requires_grad_()
+    states = torch.cat((x[:SWAY].expand(n_variables, SWAY), variables[:, :n_velocities]), dim=1)
+    next_states, next_memory = model.step(
+        states, w.expand(n_variables, -1), variables[:, n_velocities:]
+    )
+    # one row of the batch for each output: one backward pass gives the whole Jacobian
+    next_variables = torch.cat((next_states[:, SWAY:], next_memory), dim=1)
+    jacobian = torch.autograd.grad(next_variables.diagonal().sum(), variables)[0]
+    spectral_radius = float(torch.linalg.eigvals(jacobian).abs().max())
+    return math.log(max(spectral_radius, 1e-12)) / model.dt
+
+
+def find_contradicting_steady_run(model: HybridDynamics, steady_runs: Sequence[SteadyRun]) -> str:
+    """Return in a few words how logs contradict an unstable model; empty where they do not.
+
+    A disturbance of the model, linearised about the mean of a steady run, would have grown
+    twentyfold over it; the vessel had settled from three times its deviations at the end, and these
+    did not even grow threefold. The model itself, begun with the vessel's deviations, ends farther
+    than three of them from where the vessel stayed. The twenty longest of such runs are looked at.
+    """
+    informative_runs = [
+        run
+        for run in steady_runs
+        if run.decay > _MIN_MEASURED_DECAY and run.growth < _MAX_MEASURED_GROWTH
+    ]
+    for run in sorted(informative_runs, key=lambda run: -run.duration)[:_MAX_STEADY_RUNS]:
+        model_rate = compute_growth_rate(
+            model, torch.from_numpy(run.mean_state), torch.from_numpy(run.mean_inputs)
+        )
+        if (
+            model_rate * run.duration > math.log(_MIN_MODEL_GROWTH)
+            and _final_deviation(model, run) > _MAX_MEASURED_GROWTH
+        ):
+            return (
+                "it is unstable where the logs are not (a disturbance would double in"
+                f" {format_number(math.log(2.0) / model_rate, 2)} s; log {run.log} runs steadily for"
+                f" {run.duration:.0f} s)"
+            )
+    return ""
+
+
+def _final_deviation(model: HybridDynamics, run: SteadyRun) -> float:
+    """How far the model ends from a steady run, in deviations of the vessel; infinite out of range.
+
+    It begins with deviations of the vessel's size; the mean over the last third is looked at.
+    """
+    deviation_scale = torch.from_numpy(np.maximum(run.scatter, 1e-9))
+    initial_states = torch.from_numpy(run.mean_state).repeat(len(_DISTURBANCE_SIGNS), 1)
+    initial_states[:, LATERAL] += (
+        torch.tensor(_DISTURBANCE_SIGNS, dtype=torch.float64) * deviation_scale
+    )
+    inputs = torch.from_numpy(run.mean_inputs).expand(len(initial_states), -1)
+    model_without_pose = copy.deepcopy(model)
+    model_without_pose.positions = False
+    n_steps = max(round(run.duration / model.dt), 3)
+    with torch.no_grad():
+        states, _, _ = Rollout(model_without_pose)(
+            initial_states,
+            inputs[:, None].expand(-1, n_steps, -1),
+            settle_memory(model, initial_states, inputs),
+        )
+    deviations = states[:, -(n_steps // 3) :, LATERAL] - torch.from_numpy(run.mean_state)[LATERAL]
+    return float(torch.nan_to_num(deviations.abs() / deviation_scale, nan=math.inf).mean(1).max())
+
+
+def mirror_inputs(input_names: Sequence[str], w: Tensor) -> Tensor | None:
+    """Return inputs w [B, m] as a mirror shows them; None where it is not known how that is.
+
+    Rudders change sign, port and starboard change places, wind comes from the other side.
+    """
+    mirror_partners, parity_by_name = get_partners(input_names), {"wind_speed": 1, "wind_dir": -1}
+    mirrored_columns, has_steering = [], False
+    for column, name in enumerate(input_names):
+        parity = parity_by_name.get(name, get_channel_parity(name))
+        if name in mirror_partners:
+            parity, column = get_pair_parity(name), input_names.index(mirror_partners[name])
+        if parity is None:
+            return None
+        has_steering |= name in mirror_partners or (parity < 0 and name not in parity_by_name)
+        mirrored_columns.append(parity * w[:, column])
+    return torch.stack(mirrored_columns, dim=1) if has_steering else None
+
+
+def check_symmetry(
+    spec: ModelSpec, model: HybridDynamics, training_points: TrainingPoints
+) -> SanityFinding:
+    """Check that mirrored states and inputs give the mirrored acceleration, at recorded points."""
+    input_names, x, w = spec.signals.input_columns, training_points.x, training_points.w
+    mirror_image = mirror_inputs(input_names, w)
+    if mirror_image is None:
+        text = (
+            f"not checked: nobody said which input steers (inputs {', '.join(spec.signals.inputs)};"
+            " delta and *_port/*_stbd pairs are understood)"
+        )
+        return SanityFinding(spec.name, SYMMETRY, None, text)
+    dof = spec.signals.dof
+    parity = torch.tensor(get_axis_parities(model.signals.names), dtype=x.dtype)
+    mirrored_states = x * torch.cat((x.new_tensor([1.0, -1.0, -1.0]), parity))
+    mirrored_channels = torch.cat((all_but_pose(mirrored_states), mirror_image), dim=1)
+    is_inside = (
+        (mirrored_channels >= _range_tensor(spec.low))
+        & (mirrored_channels <= _range_tensor(spec.high))
+    ).all(1)
+    if not bool(is_inside.any()):
+        text = "not checked: no recorded state has its mirror image within the training ranges"
+        return SanityFinding(spec.name, SYMMETRY, None, text)
+    with torch.no_grad():
+        accelerations = settled_acceleration(model, x[is_inside], w[is_inside])
+        mirrored_accelerations = settled_acceleration(
+            model, mirrored_states[is_inside], mirror_image[is_inside]
+        )
+    mirrored_accelerations = mirrored_accelerations * parity
+    asymmetry = 0.5 * (accelerations - mirrored_accelerations).abs()
+    acceleration_std = torch.cat((accelerations, mirrored_accelerations)).std(0).clamp(min=1e-12)
+    rms_asymmetry, max_asymmetry = (
+        asymmetry.square().mean(0).sqrt() / acceleration_std,
+        asymmetry.amax(0) / acceleration_std,
+    )
+    # the torque of a lone propeller heels the vessel to one side
+    roll_excluded = {"p"} if find_heeling_propellers(model.signals.names) else set()
+    checked_velocities = [name for name in dof.velocities if name not in roll_excluded]
+    percentages = (100 * torch.stack((rms_asymmetry, max_asymmetry), dim=1)).tolist()
+    percentages_by_name = dict(zip(dof.dynamic_states, percentages, strict=True))
+    max_percentage = max(percentages_by_name[name][0] for name in checked_velocities)
+    is_symmetric = max_percentage <= 100 * _MAX_ASYMMETRY
+    details = ", ".join(
+        "{}′ {:.1f} % (largest {:.1f} %)".format(name, *percentages_by_name[name])
+        for name in dof.velocities
+    )
+    details += (
+        "; a propeller's torque heels, so that the roll is not judged" if roll_excluded else ""
+    )
+    reason = (
+        "A single screw, an offset of the steering or too few turns one way may be the reason. "
+    )
+    text = (
+        f"port and starboard {'alike' if is_symmetric else 'differ'}: the uneven part of the acceleration is"
+        f" up to {max_percentage:.0f} % of its spread. {'' if is_symmetric else reason}RMS over"
+        f" {int(is_inside.sum())} points of the training data: {details}"
+    )
+    return SanityFinding(spec.name, SYMMETRY, is_symmetric, text)
+
+
+def check_boundedness(
+    spec: ModelSpec,
+    model: HybridDynamics,
+    training_points: TrainingPoints,
+    divergence_factor: float,
+) -> SanityFinding:
+    """Check that the motion stays bounded with held inputs.
+
+    It starts from the recorded points with their inputs, and from rest with inputs at the edges of
+    their ranges; each is held for 300 s, or as long as the longest log where that is longer.
+    """
+    max_velocities = spec.signals.dof.range_limits(np.array(spec.low), np.array(spec.high))
+    velocity_limits = torch.from_numpy(max_velocities).clamp(min=1e-9)
+    lower, upper = (
+        _range_tensor(range_limits)[spec.signals.dof.n_dynamic :]
+        for range_limits in (spec.low, spec.high)
+    )
+    n_inputs = lower.numel()
+    if 2**n_inputs <= _MAX_CORNERS:
+        corner_bits = (torch.arange(2**n_inputs)[:, None] >> torch.arange(n_inputs)) & 1
+    else:
+        generator = torch.Generator().manual_seed(0)
+        corner_bits = torch.randint(0, 2, (_MAX_CORNERS, n_inputs), generator=generator)
+    corners = lower + corner_bits.double() * (upper - lower)
+    n_recorded = len(training_points.x)
+    x = torch.cat(
+        (training_points.x, training_points.x.new_zeros(len(corners), training_points.x.shape[1]))
+    )
+    w = torch.cat((training_points.w, corners))
+    memory, previous_velocities = model.initial_state(len(x)).double(), all_but_pose(x)
+    chunk_steps = max(round(_MEMORY_SETTLING_TIME / model.dt), 1)
+    # where the vessel is says nothing of how fast it is
+    model_without_pose = copy.deepcopy(model)
+    model_without_pose.positions = False
+    n_steps = round(max(_LONG_RUN_DURATION, training_points.longest_duration) / model.dt)
+    rollout, constant_inputs = (
+        compiled(Rollout(model_without_pose), n_steps),
+        w.unsqueeze(1).expand(-1, chunk_steps, -1),
+    )
+    divergence_time = torch.zeros(len(x))
+    with torch.no_grad():
+        for k in range(chunk_steps, n_steps + 1, chunk_steps):
+            states, _, memory = rollout(x, constant_inputs, memory)
+            x = states[:, -1]
+            velocity_ratio = torch.nan_to_num(
+                all_but_pose(x).abs() / velocity_limits, nan=math.inf
+            ).amax(1)
+            divergence_time = torch.where(
+                (divergence_time == 0.0) & (velocity_ratio > divergence_factor),
+                k * model.dt,
+                divergence_time,
+            )
+            velocity_change = (
+                (all_but_pose(x) - previous_velocities).abs() / velocity_limits
+            ).amax(1)
+            previous_velocities = all_but_pose(x)
+            if bool((divergence_time[:n_recorded] > 0.0).any()) or bool(
+                ((velocity_change < _STEADY_TOLERANCE) | (divergence_time > 0)).all()
+            ):
+                break
+    first_diverged = int((divergence_time > 0.0).double().argmax())
+    inputs = ", ".join(
+        f"{name} {format_number(factor * float(value))} {unit}".removesuffix(" -")
+        for name, value in zip(spec.signals.input_columns, w[first_diverged], strict=True)
+        for unit, factor in [display_unit(spec.signals.channel_units().get(name, "-"))]
+    )
+    limit_text = f"(more than {divergence_factor:g} times the largest training velocity)"
+    if not bool((divergence_time > 0.0).any()):
+        text = (
+            f"{n_recorded} runs of {_LONG_RUN_DURATION:.0f} s or longer from recorded states, and {len(corners)}"
+            " from rest with inputs held at their extremes, stay bounded"
+        )
+        return _to_sanity_finding(spec, BOUNDEDNESS, True, text, "")
+    if first_diverged < n_recorded:
+        fault = (
+            f"it runs away within {float(divergence_time[first_diverged]):.0f} s from a recorded state with recorded"
+            f" inputs ({inputs})"
+        )
+        return _to_sanity_finding(spec, BOUNDEDNESS, False, limit_text.strip("()"), fault)
+    text = f"runs away within {float(divergence_time[first_diverged]):.0f} s with {inputs} held from rest {limit_text}"
+    return _to_sanity_finding(spec, BOUNDEDNESS, False, text, "")
+
+
+def build_sanity_content(findings: Mapping[str, Sequence[SanityFinding]]) -> dict[str, Any]:
+    """Return the contents of sanity.json from the findings of each model."""
+    rows = [asdict(finding) for model_findings in findings.values() for finding in model_findings]
+    return {"schema": SCHEMA, "findings": rows}
+
+
+def read_sanity_findings(run_folder: Path) -> list[SanityFinding]:
+    """Return the findings in a run folder's sanity.json; none where there is no such file.
+
+    Raises:
+        DataError: where the file cannot be read.
+    """
+    path = run_folder / "sanity.json"
+    if not path.is_file():
+        return []
+    try:
+        return [SanityFinding(**row) for row in read_json(path)["findings"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f"{path}: not readable as the findings of a run ({error}); delete the file"
+        ) from None

@@ -1,0 +1,1 @@
+"""Files of measured logs: readers, the map of their channels, drafted configs and splits."""

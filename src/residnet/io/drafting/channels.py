@@ -1,0 +1,1075 @@
+"""The entries of a channel map: units, signs and frames by headers, values and physics.
+
+A vessel moves where it points, more or less, and turns as its heading changes. From that follow the
+factor and the sign between a column and the quantity that it stands for, whatever its header says.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, final
+
+import numpy as np
+
+from residnet.core.frames import rotate, unwrap_angle
+from residnet.core.layout import DegreesOfFreedom
+from residnet.core.names import BOW_WIND_CHANNELS, CHANNEL_UNITS, port_starboard_pairs
+from residnet.core.units import si_unit, to_si, unit_names
+from residnet.io.drafting.questions import DraftNotes
+from residnet.io.readers.quantities import (
+    COSINE_SUFFIX,
+    QUATERNION,
+    SINE_SUFFIX,
+    normalize_quaternion,
+    project_fixes,
+    quaternion_yaw,
+)
+from residnet.io.words import (
+    guess_scaling,
+    guess_unit_from_size,
+    infer_unit,
+    match_axis_velocity,
+    match_depth_channel,
+    parse_header_unit,
+    parse_name,
+)
+from residnet.preprocessing.channel_values import NEGLIGIBLE_MOTION_SHARE
+from residnet.preprocessing.derivatives import fit_local_polynomials
+from residnet.preprocessing.motion import remove_pauses
+
+_MIN_WINDOW_SECONDS = 1.0
+"""Shortest time in s over which positions are differentiated."""
+_MAX_UNIT_RATIO = 1.35
+"""Largest ratio between a measured factor and that of the unit that it stands for."""
+MIN_STANDARD_ERRORS = 4.0
+"""Standard errors from which a side is told."""
+_MIN_CORRELATION = 0.6
+"""Least correlation that says anything."""
+
+
+class PoseFrame(NamedTuple):
+    """How columns called x, y, psi become north, east and a heading clockwise from north.
+
+    Attributes:
+        is_swapped: x is the east and y the north.
+        is_from_east: psi counts counter-clockwise from east.
+    """
+
+    is_swapped: bool
+    is_from_east: bool
+
+
+POSE_FRAMES = (PoseFrame(False, False), PoseFrame(True, False), PoseFrame(False, True))
+"""Frames that can be told apart; both changes together are a mirror image that fits as well."""
+ROS_POSE_FRAMES = (PoseFrame(True, True), PoseFrame(True, False))
+"""Frames of a pose of ROS, by REP 103 first: x east, y north, headings from east."""
+
+
+@dataclass(frozen=True)
+class RawTable:
+    """Columns of one log as they stand in its file.
+
+    Attributes:
+        t: times [T] in s.
+        columns: channel -> values [T] in whatever unit.
+    """
+
+    t: np.ndarray
+    columns: Mapping[str, np.ndarray]
+
+
+class ScaleFit(NamedTuple):
+    """How a column follows the quantity that it may stand for.
+
+    Attributes:
+        factor: that brings the column to SI; negative where it points the other way.
+        correlation: between both, without sign.
+    """
+
+    factor: float
+    correlation: float
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether both follow each other."""
+        return (
+            self.correlation >= _MIN_CORRELATION and np.isfinite(self.factor) and self.factor != 0.0
+        )
+
+    def matching_unit(self, expected: str) -> str | None:
+        """Return the unit whose factor this is; None where no unit comes near."""
+        excluded_units = ("rad/min", "m/min", "cm/s")
+        candidate_units = [
+            n for n in unit_names() if si_unit(n) == expected and n not in excluded_units
+        ]
+        closest_unit = min(
+            candidate_units, key=lambda name: abs(np.log(abs(self.factor) / to_si(name)))
+        )
+        ratio = abs(self.factor) / to_si(closest_unit)
+        return closest_unit if 1.0 / _MAX_UNIT_RATIO < ratio < _MAX_UNIT_RATIO else None
+
+
+class Motion(NamedTuple):
+    """The motion of one log by its positions and headings, on a uniform grid.
+
+    Attributes:
+        t: times [T].
+        surge_velocity: speed along the heading [T].
+        sway_velocity: speed to starboard [T].
+        yaw_rate: rate of the heading [T].
+    """
+
+    t: np.ndarray
+    surge_velocity: np.ndarray
+    sway_velocity: np.ndarray
+    yaw_rate: np.ndarray
+
+
+def convert_heading(table: RawTable, unit: str, frame: PoseFrame) -> np.ndarray:
+    """Return the heading [T] in rad, unwrapped over its known samples."""
+    psi = table.columns["psi"] * to_si(unit, "rad")
+    return unwrap_angle(np.pi / 2 - psi if frame.is_from_east else psi)
+
+
+def estimate_motion(table: RawTable, unit: str, frame: PoseFrame) -> Motion | None:
+    """Return the motion by position and heading; None where there are too few of either.
+
+    Args:
+        table: with the columns x, y, psi.
+        frame: that is tried.
+    """
+    psi = convert_heading(table, unit, frame)
+    north, east = ("y", "x") if frame.is_swapped else ("x", "y")
+    has_position = (
+        np.isfinite(table.columns[north]) & np.isfinite(table.columns[east]) & np.isfinite(table.t)
+    )
+    has_heading = np.isfinite(psi) & np.isfinite(table.t)
+    if min(int(has_position.sum()), int(has_heading.sum())) < 30:
+        return None
+    position_times = table.t[has_position]
+    time_step = float(np.median(np.diff(position_times)))
+    if time_step <= 0.0 or (position_times[-1] - position_times[0]) / time_step > 1e6:
+        return None
+    grid_times = np.arange(position_times[0], position_times[-1], time_step)
+    window = max(5, 2 * round(0.5 * _MIN_WINDOW_SECONDS / time_step) + 1)
+    if grid_times.size < 3 * window:
+        return None
+
+    def differentiate(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+        return fit_local_polynomials(
+            np.interp(grid_times, t, values)[:, None], window, 2, time_step
+        )[1][:, 0]
+
+    speed_north = differentiate(position_times, table.columns[north][has_position])
+    speed_east = differentiate(position_times, table.columns[east][has_position])
+    heading = np.interp(grid_times, table.t[has_heading], psi[has_heading])
+    surge_velocity, sway_velocity = rotate(speed_north, speed_east, -heading)
+    return Motion(
+        grid_times,
+        surge_velocity,
+        sway_velocity,
+        differentiate(table.t[has_heading], psi[has_heading]),
+    )
+
+
+def forward_alignment(motions: Sequence[Motion | None]) -> float:
+    """Return how far vessels moved where they pointed, from -1 (astern) over 0 (anywhere) to 1."""
+    estimated_motions = [motion for motion in motions if motion is not None]
+    forward_sum = sum(
+        float((m.surge_velocity * np.hypot(m.surge_velocity, m.sway_velocity)).sum())
+        for m in estimated_motions
+    )
+    total_sum = sum(
+        float((m.surge_velocity**2 + m.sway_velocity**2).sum()) for m in estimated_motions
+    )
+    return forward_sum / total_sum if total_sum > 0.0 else 0.0
+
+
+def fit_to_motion(
+    logs: Sequence[RawTable], motions: Sequence[Motion | None], channel: str
+) -> ScaleFit:
+    """Return how a column follows the motion, over all logs that hold it.
+
+    Args:
+        logs: with the column.
+        motions: of the same logs.
+        channel: `u`, `rudder_angles` or `rate_values`.
+    """
+    component_index = {"u": 1, "v": 2, "r": 3}[channel]
+    covariance_sum = correlation_sum = column_sum = motion_sum = 0.0
+    for table, log_motion in zip(logs, motions, strict=True):
+        values = table.columns.get(channel)
+        if log_motion is None or values is None:
+            continue
+        is_finite = np.isfinite(values) & np.isfinite(table.t)
+        if is_finite.sum() < 30:
+            continue
+        column_values = np.interp(log_motion.t, table.t[is_finite], values[is_finite])
+        motion_values = log_motion[component_index]
+        # positions and headings jump at times, which is no motion
+        is_plausible = (
+            np.abs(motion_values) <= 5.0 * float(np.quantile(np.abs(motion_values), 0.95)) + 1e-12
+        )
+        # about their means: a bias is no factor, and a steady speed tells one all the same
+        column_mean = 0.0 if channel == "u" else float(column_values[is_plausible].mean())
+        motion_mean = 0.0 if channel == "u" else float(motion_values[is_plausible].mean())
+        column_centred, motion_centred = (
+            column_values[is_plausible] - column_mean,
+            motion_values[is_plausible] - motion_mean,
+        )
+        covariance_sum += float(column_centred @ motion_centred)
+        # a gyro that was turned over between logs follows in each of them; no frame is told by it
+        correlation_sum += (
+            abs(float(column_centred @ motion_centred))
+            if channel == "r"
+            else float(column_centred @ motion_centred)
+        )
+        column_sum += float(column_centred @ column_centred)
+        motion_sum += float(motion_centred @ motion_centred)
+    if min(column_sum, motion_sum) <= 0.0:
+        return ScaleFit(0.0, 0.0)
+    # of two noisy quantities neither explains the other: the factor lies between both regressions
+    correlation = correlation_sum / np.sqrt(column_sum * motion_sum)
+    return ScaleFit(
+        float(np.sign(covariance_sum) * np.sqrt(motion_sum / column_sum)), abs(float(correlation))
+    )
+
+
+def estimate_rudder_gain(
+    logs: Sequence[RawTable],
+    channel: str,
+    rates: Mapping[int, np.ndarray],
+    angle_column: str | None = None,
+) -> tuple[float, float]:
+    """Return how a rudder's angle turns the vessel, and the standard error of that.
+
+    The growth of the yaw rate over two seconds is explained by the rudder's mean angle over them
+    and by the yaw rate itself. Of planes it is the pitch rate, which weight and buoyancy change by
+    the pitch, too.
+
+    Args:
+        logs: with the column.
+        rates: yaw or pitch rate [T] of each log by its number, rad/s.
+        angle_column: column of the angle that the vessel is righted by; None for none.
+    """
+    rows, rate_changes = [], []
+    for log_index, table in enumerate(logs):
+        values, rate_values = table.columns.get(channel), rates.get(log_index)
+        if values is None or rate_values is None:
+            continue
+        restoring_angle = (
+            np.zeros(table.t.size) if angle_column is None else table.columns[angle_column]
+        )
+        is_finite = (
+            np.isfinite(values)
+            & np.isfinite(rate_values)
+            & np.isfinite(table.t)
+            & np.isfinite(restoring_angle)
+        )
+        if is_finite.sum() < 50:
+            continue
+        t, rudder_angles, rates_finite = (
+            remove_pauses(table.t[is_finite]),
+            values[is_finite],
+            rate_values[is_finite],
+        )
+        horizon = max(2.0, 3.0 * float(np.median(np.diff(t))))
+        start_times = np.arange(t[0], t[-1] - horizon, horizon / 4)
+        if start_times.size < 10:
+            continue
+        initial_rate, final_rate = (
+            np.interp(start_times, t, rates_finite),
+            np.interp(start_times + horizon, t, rates_finite),
+        )
+        mean_rudder_angle = np.mean(
+            [
+                np.interp(start_times + share * horizon, t, rudder_angles)
+                for share in (0.0, 0.25, 0.5, 0.75)
+            ],
+            0,
+        )
+        tilt_angle = np.interp(start_times, t, restoring_angle[is_finite])
+        rows.append(
+            np.stack(
+                (mean_rudder_angle, initial_rate, np.ones(start_times.size), tilt_angle), axis=1
+            )
+        )
+        rate_changes.append(final_rate - initial_rate)
+    if not rows:
+        return 0.0, 1.0
+    regressors, response = np.concatenate(rows), np.concatenate(rate_changes)
+    scale = np.maximum(np.abs(regressors).max(axis=0), 1e-12)
+    solution, *_ = np.linalg.lstsq(regressors / scale, response, rcond=1e-9)
+    residual = response - (regressors / scale) @ solution
+    # neighbouring rows overlap: a quarter of them counts
+    variance = 4.0 * float(residual @ residual) / max(response.size - 3, 1)
+    standard_error = float(
+        np.sqrt(variance * np.linalg.pinv((regressors / scale).T @ (regressors / scale))[0, 0])
+    )
+    return float(solution[0]), standard_error
+
+
+READER_KEY = ("data", "reader")
+CHANNELS_KEY = (*READER_KEY, "channels")
+_OVERRULING_CORRELATION = 0.9
+"""Correlation from which a measured factor overrules a header."""
+_MAX_WIND_SPREAD_RATIO = 0.8
+"""Spread of the true wind, in that of what its name says, from which it is told another way.
+
+Of 120 winds of boats that turn, drawn at random, all are told right, and none from north is
+misread; of boats that turn by less than a radian a third is taken as its name says.
+"""
+_MIN_WIND_SAMPLES = 50
+"""Samples of a wind that tell nothing yet."""
+_DEPTH_CHANNELS = ("w", "q", "z", "theta")
+"""What a vessel under water is told by, beside the channels of a roll."""
+STATE_NAMES = (
+    *("x", "y", "psi", "u", "v", "r", "phi", "p", *_DEPTH_CHANNELS, "wind_speed", "wind_dir"),
+    *BOW_WIND_CHANNELS,
+)
+_FIX_OF_AXIS = {"x": "latitude", "y": "longitude"}
+MAGNETIC_PATTERN = re.compile(
+    r"magn|compass|kompass|\bhdm\b|\(m\)|\bmag(?![a-z])|_mag(?![a-z])", re.I
+)
+_QUATERNION_PATTERN = re.compile(
+    r"(?P<stem>(?:.*[\W_])?(?:q|quat|quaternions?|orient|orientation|att|attitude|rot|rotation))"
+    r"[\W_]*(?P<part>[xyzwijk0-3])\W*",
+    re.IGNORECASE,
+)
+_QUATERNION_CHANNELS = {
+    **dict(zip("xyzw", QUATERNION, strict=True)),
+    "i": "qx",
+    "j": "qy",
+    "k": "qz",
+}
+_QUATERNION_ORDERS = (("qw", "qx", "qy", "qz"), QUATERNION)
+"""What counted parts may be: most write the scalar part first, some last."""
+_ROS_POSE_PATTERNS = {
+    **{"x": r"position\W*x", "y": r"position\W*y"},
+    **{"qw": r"orientation\W*w", "psi": r"orientation\W*yaw"},
+}
+"""How the columns of a message geometry_msgs/Pose end, and of its yaw in PlotJuggler."""
+_NED_PATTERN = re.compile(r"(?:^|[\W_])(?:ned|frd)(?:$|[\W_])", re.IGNORECASE)
+
+
+def find_quaternions(columns: Sequence[str]) -> list[dict[str, str]]:
+    """Return for each quaternion channel -> column, by what the columns are called.
+
+    Parts that are counted 0 to 3 stand twice, with the scalar part first and last.
+    """
+    parts_by_stem: dict[str, dict[str, str]] = {}
+    for column in columns:
+        # units in brackets do not belong to the name
+        match = _QUATERNION_PATTERN.fullmatch(
+            re.sub(r"\s*\[\D*\]$|\s*\(\D*\)$", "", column.strip())
+        )
+        if match is not None:
+            part = match["part"].lower()
+            channels = (
+                [_QUATERNION_CHANNELS[part]]
+                if part in _QUATERNION_CHANNELS
+                else [order[int(part)] for order in _QUATERNION_ORDERS]
+            )
+            for number, channel in enumerate(channels):
+                group_key = f"{match['stem']} {number if part.isdigit() else 'named'}"
+                parts_by_stem.setdefault(group_key, {}).setdefault(channel, column)
+    return [parts for parts in parts_by_stem.values() if set(parts) == set(QUATERNION)]
+
+
+def find_depth_channels(columns: Sequence[str], known_channels: Collection[str]) -> dict[str, str]:
+    """Return heave, pitch rate, depth and pitch -> column, of vessels that may dive alone.
+
+    They do with depth, pitch and roll, and where nothing turns them.
+
+    Args:
+        known_channels: channels that are known already.
+    """
+    depth_channels = {column: match_depth_channel(parse_name(column)) for column in columns}
+    column_by_channel = {name: column for column, name in reversed(depth_channels.items()) if name}
+    column_by_channel = {
+        name: column_by_channel[name] for name in _DEPTH_CHANNELS if name in column_by_channel
+    }
+    has_full_attitude = "phi" in known_channels and {"z", "theta"} <= column_by_channel.keys()
+    return (
+        column_by_channel
+        if has_full_attitude
+        or DegreesOfFreedom.vertical_plane_dof({*known_channels, *column_by_channel})
+        else {}
+    )
+
+
+def choose_quaternion_order(
+    attitudes: Sequence[dict[str, str]], tables: Sequence[Mapping[str, np.ndarray]]
+) -> dict[str, str]:
+    """Return the first of quaternions, in the order of its parts that leaves a vessel level.
+
+    Empty where its squares do not add up to one.
+
+    Args:
+        attitudes: channel -> column of each, as `find_quaternions` gave them.
+        tables: column -> values of each table.
+    """
+    if not attitudes:
+        return {}
+    columns = set(attitudes[0].values())
+    complete_tables = [table for table in tables if columns <= set(table)]
+    candidates = [parts for parts in attitudes if set(parts.values()) == columns]
+
+    def concatenate_columns(names: Iterable[str]) -> np.ndarray:
+        return np.array(
+            [np.concatenate([table[name] for table in complete_tables]) for name in names]
+        )
+
+    if not complete_tables:
+        return {}
+    norm = np.sqrt((concatenate_columns(columns) ** 2).sum(axis=0))
+    norm = norm[np.isfinite(norm) & (norm > 0)]
+    if not norm.size or abs(float(np.median(norm)) - 1.0) >= 0.02:
+        return {}
+    return min(
+        candidates,
+        key=lambda parts: np.nanmean(concatenate_columns((parts["qx"], parts["qy"])) ** 2),
+    )
+
+
+def _choose_candidate_frames(
+    names: Mapping[str, str], texts: Iterable[str]
+) -> tuple[PoseFrame, ...]:
+    """Return the frames that a position and a heading may have, by what they are called.
+
+    A pose of ROS counts from east, as REP 103 asks, unless something is called NED.
+    """
+    is_ros_pose = all(
+        re.search(rf"(?:^|[\W_]){pattern}$", names[name].strip(), re.IGNORECASE)
+        for name, pattern in _ROS_POSE_PATTERNS.items()
+        if name in names
+    )
+    has_heading = {"qw", "psi"} & set(names)
+    return (
+        POSE_FRAMES
+        if not has_heading or not is_ros_pose or any(map(_NED_PATTERN.search, texts))
+        else ROS_POSE_FRAMES
+    )
+
+
+_SIN_COS_PATTERN = re.compile(
+    r"(?P<stem>.*?)[\W_]*(?P<part>cosine|cos|sine|sin|(?<![^\W_])[csxy])"
+    r"|(?P<head>cos|sin)[\W_]*(?P<tail>.+?)\W*",
+    re.IGNORECASE,
+)
+
+
+def find_sin_cos_pairs(
+    columns: Sequence[str], tables: Sequence[Mapping[str, np.ndarray]]
+) -> dict[str, tuple[str, str]]:
+    """Return stem -> columns of an angle's cosine and sine: their squares add up to one.
+
+    Args:
+        columns: names, such as `psi_cos` and `psi_sin`, or `alpha_x` and `alpha_y`.
+        tables: column -> values of each table.
+    """
+    parts_by_stem: dict[str, dict[str, str]] = {}
+    for column in columns:
+        name = column.strip()
+        match = _SIN_COS_PATTERN.fullmatch(name) or _SIN_COS_PATTERN.fullmatch(
+            re.sub(r"\s*[\[(].*", "", name)
+        )
+        if match is not None:
+            part = (match["part"] or match["head"])[0].lower()
+            suffix = COSINE_SUFFIX if part in "cx" else SINE_SUFFIX
+            parts_by_stem.setdefault(match["stem"] or match["tail"] or "", {}).setdefault(
+                suffix, column
+            )
+    pairs = {}
+    for stem, parts in parts_by_stem.items():
+        pair = (parts.get(COSINE_SUFFIX, ""), parts.get(SINE_SUFFIX, ""))
+        pairs_in_tables = [
+            [table[name] for name in pair] for table in tables if {*pair} <= table.keys()
+        ]
+        radius = np.concatenate(
+            [np.hypot(*pair_values) for pair_values in pairs_in_tables] or [np.zeros(0)]
+        )
+        radius = radius[np.isfinite(radius)]
+        if stem and radius.size and np.quantile(np.abs(radius - 1.0), 0.9) < 0.02:
+            pairs[stem] = pair
+    return pairs
+
+
+def draft_channel_map(
+    names: Mapping[str, str],
+    logs: Sequence[RawTable],
+    draft_notes: DraftNotes,
+    texts: Iterable[str] = (),
+) -> dict[str, dict[str, Any]]:
+    """Return channel -> entry of a channel map.
+
+    Args:
+        names: channel -> column.
+        texts: names of columns and cells that may tell a frame.
+    """
+    quaternion_columns = {name: column for name, column in names.items() if name in QUATERNION}
+    candidate_frames = _choose_candidate_frames(names, texts)
+    channel_columns = {name: column for name, column in names.items() if name not in QUATERNION}
+    angle_columns, derived_angles = {}, dict[str, tuple[str, ...]]()
+    for name in [
+        item.removesuffix(COSINE_SUFFIX) for item in names if item.endswith(COSINE_SUFFIX)
+    ]:
+        derived_angles[name] = (name + COSINE_SUFFIX, name + SINE_SUFFIX)
+        pair = (channel_columns.pop(name + COSINE_SUFFIX), channel_columns.pop(name + SINE_SUFFIX))
+        channel_columns[name] = f"angle of {' and '.join(pair)} [rad]"
+        angle_columns[channel_columns[name]] = pair
+    if quaternion_columns:
+        derived_angles["psi"] = QUATERNION
+        channel_columns["psi"] = "heading of the quaternion [rad]"
+    logs = [_add_derived_angles(raw, derived_angles) for raw in logs]
+    channel_columns, logs, degrees_per_count = _project_fixes(channel_columns, logs, draft_notes)
+    entries = ChannelMapper(
+        channel_columns, logs, draft_notes, degrees_per_count, candidate_frames
+    ).draft_entries()
+    if degrees_per_count:
+        entries = {_FIX_OF_AXIS.get(name, name): entry for name, entry in entries.items()}
+    for name in [item for item, entry in entries.items() if entry["column"] in angle_columns]:
+        entry = entries.pop(name)
+        cosine, sine = angle_columns[entry["column"]]
+        if entry.pop("frame", ""):
+            cosine, sine = sine, cosine
+        sign_settings = {"sign": entry["sign"]} if "sign" in entry else {}
+        entries[name + COSINE_SUFFIX] = {"column": cosine, "unit": "-"}
+        entries[name + SINE_SUFFIX] = {"column": sine, "unit": "-", **sign_settings}
+        draft_notes.move_key((*CHANNELS_KEY, name), (*CHANNELS_KEY, name + COSINE_SUFFIX))
+    if not quaternion_columns:
+        return entries
+    psi = entries.pop("psi")
+    entries |= {name: {"column": quaternion_columns[name], "unit": "-"} for name in QUATERNION}
+    entries["qw"] |= {"frame": psi["frame"]} if "frame" in psi else {}
+    draft_notes.move_key((*CHANNELS_KEY, "psi"), (*CHANNELS_KEY, "qw"))
+    direction = "anticlockwise from east" if "frame" in psi else "clockwise from north"
+    text = f"no position tells the frame; the heading is taken to count {direction}"
+    if {"x", "y"} <= set(channel_columns):
+        text = f"position and heading fit together best where the heading counts {direction}"
+    draft_notes.add_guess((*CHANNELS_KEY, "qw"), text)
+    if re.search(r"\d\W*$", quaternion_columns["qw"]):
+        text = f"'{quaternion_columns['qw']}' is taken as the scalar part, which leaves the vessel level"
+        draft_notes.add_guess((*CHANNELS_KEY, "qw"), text)
+    return entries
+
+
+def _add_derived_angles(table: RawTable, derived_angles: Mapping[str, tuple[str, ...]]) -> RawTable:
+    """Return a log with angles in rad that cosine and sine, or the parts of a quaternion, tell."""
+    columns = dict(table.columns)
+    for name, parts in derived_angles.items():
+        if columns.keys() >= {*parts}:
+            part_values = [columns[part] for part in parts]
+            is_quaternion = len(part_values) == len(QUATERNION)
+            columns[name] = (
+                quaternion_yaw(*normalize_quaternion(*part_values))
+                if is_quaternion
+                else np.arctan2(*part_values[::-1])
+            )
+    return RawTable(table.t, columns)
+
+
+def _project_fixes(
+    names: Mapping[str, str], logs: Sequence[RawTable], draft_notes: DraftNotes
+) -> tuple[dict[str, str], list[RawTable], float]:
+    """Return channel -> column, the logs, and how many degrees one count of x and y is, or 0.
+
+    Where they are latitude and longitude, x, y of the logs are metres north and east of the first
+    fix of each.
+    """
+    fix_channels = set(_FIX_OF_AXIS.values())
+    other_names = {name: column for name, column in names.items() if name not in fix_channels}
+    if set(_FIX_OF_AXIS) <= set(names) and len(other_names) < len(names):
+        columns = ", ".join(names[name] for name in sorted(fix_channels & set(names)))
+        draft_notes.add_note(CHANNELS_KEY, f"x and y stand beside it; left out: {columns}")
+        return other_names, list(logs), 0.0
+    if not fix_channels <= set(names) or set(_FIX_OF_AXIS) & set(names):
+        return dict(names), list(logs), 0.0
+    fix_tables = [raw for raw in logs if fix_channels <= set(raw.columns)]
+    fix_values = {
+        fix_name: np.concatenate([raw.columns[fix_name] for raw in fix_tables] or [np.zeros(0)])
+        for fix_name in fix_channels
+    }
+    finite_values = {name: values[np.isfinite(values)] for name, values in fix_values.items()}
+    max_latitude = float(np.abs(finite_values["latitude"]).max(initial=0.0))
+    # autopilots count ten millionths of a degree in whole numbers
+    are_integers = all(
+        bool((values == np.round(values)).all()) for values in finite_values.values()
+    )
+    degrees_per_count = 1e-7 if 1e6 < max_latitude <= 90e7 and are_integers else 1.0
+    if not fix_tables or max_latitude * degrees_per_count > 90.0:
+        columns = ", ".join(names[name] for name in _FIX_OF_AXIS.values())
+        draft_notes.add_note(CHANNELS_KEY, f"{columns} are no degrees with decimals; left out")
+        return other_names, list(logs), 0.0
+    if degrees_per_count < 1.0:
+        for name in _FIX_OF_AXIS.values():
+            text = "whole numbers of this size are ten millionths of a degree"
+            draft_notes.add_guess((*CHANNELS_KEY, name), text)
+    projected = []
+    for raw in logs:
+        if fix_channels <= set(raw.columns):
+            phi, lam = (
+                np.radians(degrees_per_count * raw.columns[name]) for name in _FIX_OF_AXIS.values()
+            )
+            north, east, origin, _ = project_fixes(phi, lam)
+            if origin is not None:
+                raw = RawTable(raw.t, {**raw.columns, "x": north, "y": east})
+        projected.append(raw)
+    return (
+        {**{name: names[fix] for name, fix in _FIX_OF_AXIS.items()}, **other_names},
+        projected,
+        degrees_per_count,
+    )
+
+
+@final
+class ChannelMapper:
+    """The entries of a channel map, from names, headers, values and physics."""
+
+    def __init__(
+        self,
+        names: Mapping[str, str],
+        logs: Sequence[RawTable],
+        draft_notes: DraftNotes,
+        degrees_per_count: float,
+        candidate_frames: Sequence[PoseFrame] = POSE_FRAMES,
+    ) -> None:
+        """From channel -> column, logs, and degrees in one count of x and y, 0 for metres.
+
+        The frames are those that are tried, the likeliest first.
+        """
+        self._degrees_per_count, self._candidate_frames = (
+            float(degrees_per_count),
+            tuple(candidate_frames),
+        )
+        self._names, self._logs, self._draft_notes = dict(names), list(logs), draft_notes
+        self._pose_frame = self._candidate_frames[0]
+        self._motions: list[Motion | None] = [None] * len(logs)
+        self._psi_unit = "rad"
+        self._sign_flipped: set[str] = set()
+
+    def draft_entries(self) -> dict[str, dict[str, Any]]:
+        """Return channel -> entry."""
+        if {"x", "y", "psi"} <= set(self._names):
+            self._drop_earth_fixed_velocities()
+            self._choose_heading_frame()
+            for name in [
+                velocity_name for velocity_name in ("u", "v", "r") if velocity_name in self._names
+            ]:
+                self._drop_inconsistent_velocity(name)
+        elif "psi" in self._names:
+            self._psi_unit = self._infer_unit("psi")
+        self._choose_wind_reference()
+        return {name: self._make_entry(name) for name in self._names}
+
+    def _drop_inconsistent_velocity(self, name: str) -> None:
+        """Leave out what does not move, or is far larger than the motion and does not follow it."""
+        motions = [motion for motion in self._motions if motion is not None]
+        if not motions:
+            return
+        component_index = {"u": 1, "v": 2, "r": 3}[name]
+        motion_values = np.concatenate([motion[component_index] for motion in motions])
+        factor = to_si(self._infer_unit(name, should_note=False), CHANNEL_UNITS[name])
+        column_values = factor * self._concatenate_values(name)
+        # a vessel that only drifts has nearly no motion of one of its axes
+        reference_speed = (
+            motion_values
+            if name == "r"
+            else np.hypot(*np.concatenate([m[1:3] for m in motions], axis=1))
+        )
+        problem = ""
+        if float(np.nanstd(column_values)) < NEGLIGIBLE_MOTION_SHARE * float(np.std(motion_values)):
+            problem = "does not move, while position and heading do"
+        elif (
+            float(np.nanmedian(np.abs(column_values))) > float(reference_speed.max())
+            and not fit_to_motion(self._logs, self._motions, name).is_significant
+        ):
+            problem = "is larger than all motion by position and heading, and does not follow it"
+        if problem:
+            column = self._names.pop(name)
+            text = f"'{column}' {problem}; left out: {name} follows from them"
+            self._draft_notes.add_note(CHANNELS_KEY, text)
+
+    @property
+    def _is_ros_pose(self) -> bool:
+        """Whether position and heading are called as those of a pose of ROS."""
+        return self._candidate_frames == ROS_POSE_FRAMES
+
+    def _concatenate_values(self, name: str) -> np.ndarray:
+        parts = [raw.columns[name] for raw in self._logs if name in raw.columns]
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    def _choose_heading_frame(self) -> None:
+        """Find the unit and frame of the heading under which the vessel moves where it points."""
+        header_unit = parse_header_unit(self._names["psi"], "rad")
+        unit_from_size, _ = guess_unit_from_size("psi", self._concatenate_values("psi"))
+        # a heading that is not wrapped is large in radians too: its size decides only where the
+        # motion does not
+        alternative_unit = "rad" if unit_from_size == "deg" else "deg"
+        candidate_units = [header_unit] if header_unit else [unit_from_size, alternative_unit]
+        if (
+            not header_unit
+            and np.nanmax(np.abs(self._concatenate_values("psi")), initial=0.0) > 720.0
+        ):
+            candidate_units.append("cdeg")
+        best_candidate = (-np.inf, "rad", self._candidate_frames[0])
+        for unit in candidate_units:
+            for frame in (
+                f for f in self._candidate_frames if not (self._degrees_per_count and f.is_swapped)
+            ):
+                motions = [estimate_motion(table, unit, frame) for table in self._logs]
+                score = self._score_consistency(motions)
+                if score > best_candidate[0] + 0.02:
+                    best_candidate = (score, unit, frame)
+                    self._motions = motions
+        score, self._psi_unit, self._pose_frame = best_candidate
+        if header_unit is None:
+            reason = f"position and heading fit together best in {self._psi_unit}"
+            self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), f"the header has no unit; {reason}")
+        x, y = parse_name(self._names["x"]), parse_name(self._names["y"])
+        is_named_north_east = (
+            x.has_all("north") and y.has_all("east") and not (x.text == "x" or y.text == "y")
+        )
+        is_named_north_east = is_named_north_east or self._degrees_per_count > 0.0
+        if not is_named_north_east and not self._is_ros_pose and self._is_mirrored():
+            self._pose_frame = PoseFrame(
+                not self._pose_frame.is_swapped, not self._pose_frame.is_from_east
+            )
+            self._motions = [
+                estimate_motion(table, self._psi_unit, self._pose_frame) for table in self._logs
+            ]
+            text = "seen in a mirror the motion fits as well, but thrust to port turns it to port"
+            self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), text)
+        if self._pose_frame.is_swapped and not is_named_north_east:
+            self._names["x"], self._names["y"] = self._names["y"], self._names["x"]
+            text = "the vessel moves where it points only if the column called y is the north"
+            if self._is_ros_pose and self._pose_frame.is_from_east:
+                text = "x is taken as east and y as north, as in a pose of ROS (REP 103)"
+            self._draft_notes.add_guess((*CHANNELS_KEY, "x"), text)
+        elif self._pose_frame.is_swapped:
+            # named north and east, yet turned about: the heading counts from east
+            self._pose_frame = PoseFrame(False, True)
+            self._motions = [
+                estimate_motion(table, self._psi_unit, self._pose_frame) for table in self._logs
+            ]
+        elif not is_named_north_east and not self._pose_frame.is_from_east:
+            text = f"x is taken as north and y as east: with them the heading fits ({score:.2f})"
+            self._draft_notes.add_guess((*CHANNELS_KEY, "x"), text)
+        if self._pose_frame.is_from_east:
+            text = "the vessel moves where it points only if the heading counts from east"
+            if self._is_ros_pose:
+                text = "the heading is taken to count from east, as in a pose of ROS (REP 103)"
+            self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), text)
+        if score < 0.5:
+            text = f"position, heading and velocities fit together badly ({score:.2f} of 1)"
+            self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), f"{text}: check units and axes")
+        self._pose_frame = PoseFrame(False, self._pose_frame.is_from_east)
+
+    def _is_mirrored(self) -> bool:
+        """Return whether more of a thruster on the port side turns the vessel to port."""
+        for port, stbd in port_starboard_pairs(self._names).items():
+            if re.match(r"(cmd_)?(delta|azimuth)", port):
+                continue
+            thruster_differences = [
+                (RawTable(table.t, {"more": table.columns[port] - table.columns[stbd]}), motion)
+                for table, motion in zip(self._logs, self._motions, strict=True)
+                if motion is not None and {port, stbd} <= table.columns.keys()
+            ]
+            rates = {
+                k: np.interp(table.t, m.t, m.yaw_rate)
+                for k, (table, m) in enumerate(thruster_differences)
+            }
+            gain, standard_error = estimate_rudder_gain(
+                [table for table, _ in thruster_differences], "more", rates
+            )
+            return gain < -MIN_STANDARD_ERRORS * standard_error
+        return False
+
+    def _drop_earth_fixed_velocities(self) -> None:
+        """Leave out velocities along x and y that count along north and east, not along the hull.
+
+        Names such as vx and vy do not say which; position and heading do, without them.
+        """
+        axis_velocities = [
+            name
+            for name in ("u", "v")
+            if name in self._names
+            and match_axis_velocity(parse_name(self._names[name])) is not None
+        ]
+        if not axis_velocities:
+            return
+        other_names = {
+            name: column for name, column in self._names.items() if name not in axis_velocities
+        }
+        reference_mapper = ChannelMapper(
+            other_names, self._logs, DraftNotes(), self._degrees_per_count, self._candidate_frames
+        )
+        reference_mapper._choose_heading_frame()
+        unrotated_tables = [
+            RawTable(table.t, {**table.columns, "psi": np.zeros(table.t.size)})
+            for table in self._logs
+        ]
+        earth_fixed_motions = [
+            estimate_motion(table, "rad", POSE_FRAMES[0]) for table in unrotated_tables
+        ]
+
+        def mean_correlation(
+            motions: Sequence[Motion | None], component_of: Mapping[str, str]
+        ) -> float:
+            velocity_tables = [
+                RawTable(
+                    table.t,
+                    {
+                        component_of[n]: table.columns[n]
+                        for n in axis_velocities
+                        if n in table.columns
+                    },
+                )
+                for table in self._logs
+            ]
+            return float(
+                np.mean(
+                    [
+                        fit_to_motion(velocity_tables, motions, component_of[n]).correlation
+                        for n in axis_velocities
+                    ]
+                )
+            )
+
+        direct, exchanged = {"u": "u", "v": "v"}, {"u": "v", "v": "u"}
+        best_correlation = max(
+            mean_correlation(earth_fixed_motions, direct),
+            mean_correlation(earth_fixed_motions, exchanged),
+        )
+        if (
+            best_correlation > _OVERRULING_CORRELATION
+            and best_correlation > mean_correlation(reference_mapper._motions, direct) + 0.05
+        ):
+            columns = ", ".join(self._names.pop(name) for name in axis_velocities)
+            text = f"{columns} follow the motion along north and east, and not along the vessel's"
+            self._draft_notes.add_note(
+                CHANNELS_KEY, f"{text} axes; left out, for u and v follow from positions"
+            )
+            return
+        for name in axis_velocities:
+            text = "taken along the vessel's own axes, which position and heading do not contradict"
+            self._draft_notes.add_guess((*CHANNELS_KEY, name), text)
+
+    def _score_consistency(self, motions: Sequence[Motion | None]) -> float:
+        """Return how well position, heading and velocities fit together, at most 1."""
+        velocity_fits = [
+            fit_to_motion(self._logs, motions, name) for name in ("u", "v") if name in self._names
+        ]
+        if len(velocity_fits) == 2:
+            # only the forward component tells how the heading lies; both count
+            return (
+                sum(fit.correlation * (fit.factor > 0 or i) for i, fit in enumerate(velocity_fits))
+                / 2
+            )
+        return forward_alignment(motions)
+
+    def _choose_wind_reference(self) -> None:
+        """Find whether the wind is told from north or from the bow; one without its half goes."""
+        for name_pair in (BOW_WIND_CHANNELS[1:], ("wind_speed", "wind_dir")):
+            if len(present := {*name_pair} & {*self._names}) == 1:
+                column = self._names.pop(present.pop())
+                self._draft_notes.add_note(CHANNELS_KEY, f"'{column}' alone is no wind; left out")
+        if "wind_dir" in self._names and BOW_WIND_CHANNELS[2] in self._names:
+            columns = ", ".join(self._names.pop(name) for name in BOW_WIND_CHANNELS[1:])
+            self._draft_notes.add_note(
+                CHANNELS_KEY, f"the true wind stands beside it; left out: {columns}"
+            )
+        current_names = (
+            BOW_WIND_CHANNELS[1:]
+            if BOW_WIND_CHANNELS[2] in self._names
+            else ("wind_speed", "wind_dir")
+        )
+        if current_names[1] not in self._names:
+            return
+        hypotheses = ["felt", "felt to port", "bow", "bow to port"]
+        if current_names[1] == "wind_dir":
+            is_true_wind = parse_name(self._names["wind_dir"]).has_all("true")
+            hypotheses = ["north", *hypotheses[2 * is_true_wind :]]
+        spreads = self._wind_spreads(*current_names)
+        best_hypothesis = min(hypotheses, key=lambda hypothesis: spreads.get(hypothesis, np.inf))
+        if spreads.get(best_hypothesis, np.inf) > _MAX_WIND_SPREAD_RATIO * spreads.get(
+            hypotheses[0], 0.0
+        ):
+            best_hypothesis = hypotheses[0]
+        if best_hypothesis == "north":
+            text = "the direction is taken as that which the true wind comes from, clockwise from"
+            self._draft_notes.add_guess((*CHANNELS_KEY, "wind_dir"), f"{text} north")
+            return
+        is_apparent = best_hypothesis.startswith("felt")
+        side_text = " to port" if best_hypothesis.endswith("port") else ""
+        new_names = BOW_WIND_CHANNELS[1:] if is_apparent else ("wind_speed", BOW_WIND_CHANNELS[0])
+        names = dict(zip(current_names, new_names, strict=True))
+        self._names = {names.get(name, name): column for name, column in self._names.items()}
+        self._logs = [
+            RawTable(
+                table.t, {names.get(name, name): values for name, values in table.columns.items()}
+            )
+            for table in self._logs
+        ]
+        self._sign_flipped |= {new_names[1]} if side_text else set()
+        wind = "apparent" if is_apparent else "true"
+        text = f"taken from the bow{side_text}, where the {wind} wind comes from:"
+        ratio = spreads.get(best_hypothesis, 1.0) / max(spreads.get("north", 1.0), 1e-9)
+        text += f" so the true wind is steadiest ({ratio:.2f} of its spread if told from north)"
+        self._draft_notes.add_guess((*CHANNELS_KEY, new_names[1]), text)
+
+    def _wind_spreads(self, speed: str, angle: str) -> dict[str, float]:
+        """Return how a wind may be told -> spread in m/s of the true wind within a log.
+
+        It may be told from north, or from the bow, clockwise or to port, and that which the moving
+        vessel feels has its own velocity in it.
+        """
+        factors = [
+            to_si(self._infer_unit(n, should_note=False), CHANNEL_UNITS[n]) for n in (speed, angle)
+        ]
+        variances: dict[str, list[float]] = {}
+        for table, motion in zip(self._logs, self._motions, strict=True):
+            psi = self._log_heading(table)
+            if psi is None or not {speed, angle} <= table.columns.keys():
+                continue
+            wind_speed, wind_angle = (
+                table.columns[n] * f for n, f in zip((speed, angle), factors, strict=True)
+            )
+            vessel_velocity, bow_direction = self._vessel_velocity(table, motion), np.exp(1j * psi)
+            winds = {"north": wind_speed * np.exp(1j * wind_angle)}
+            for suffix, sign in (("", 1.0), (" to port", -1.0)):
+                winds[f"bow{suffix}"] = wind_speed * np.exp(1j * sign * wind_angle) * bow_direction
+                if vessel_velocity is not None:
+                    winds[f"felt{suffix}"] = winds[f"bow{suffix}"] - vessel_velocity * bow_direction
+            is_finite = np.isfinite(np.stack([*winds.values()])).all(axis=0)
+            if is_finite.sum() >= _MIN_WIND_SAMPLES:
+                for name, wind in winds.items():
+                    variances.setdefault(name, []).append(float(np.var(wind[is_finite])))
+        return {name: float(np.sqrt(np.mean(parts))) for name, parts in variances.items()}
+
+    def _vessel_velocity(self, table: RawTable, motion: Motion | None) -> np.ndarray | None:
+        """Return the velocity [T] ahead and to starboard as a complex number; None without."""
+        if {"u", "v"} <= self._names.keys() & table.columns.keys():
+            u, v = (
+                table.columns[n] * to_si(self._infer_unit(n, should_note=False), "m/s")
+                for n in ("u", "v")
+            )
+        elif motion is not None:
+            u, v = (np.interp(table.t, motion.t, part) for part in motion[1:3])
+        else:
+            return None
+        return np.asarray(u + 1j * v)
+
+    def _log_heading(self, table: RawTable) -> np.ndarray | None:
+        """Return the heading [T] in rad of a log, from any zero where only a rate tells it."""
+        if {"psi"} <= self._names.keys() & table.columns.keys():
+            return convert_heading(table, self._psi_unit, self._pose_frame)
+        if {"r"} <= self._names.keys() & table.columns.keys():
+            rate = table.columns["r"] * to_si(self._infer_unit("r", should_note=False), "rad/s")
+            time_steps = np.diff(table.t, prepend=table.t[:1])
+            return np.asarray(np.cumsum(np.nan_to_num(rate * time_steps)))
+        return None
+
+    def _infer_unit(self, name: str, *, should_note: bool = True) -> str:
+        """Return the unit of a channel from its header or its size."""
+        scaling = infer_unit(name, self._names[name], self._concatenate_values(name))
+        if should_note and scaling.reason:
+            self._draft_notes.add_guess((*CHANNELS_KEY, name), scaling.reason)
+        return str(scaling.settings["unit"])
+
+    def _make_entry(self, name: str) -> dict[str, Any]:
+        column = self._names[name]
+        entry: dict[str, Any] = {"column": column}
+        if self._degrees_per_count and name in ("x", "y"):
+            return (
+                entry
+                | {"unit": "deg"}
+                | ({"scale": self._degrees_per_count} if self._degrees_per_count < 1.0 else {})
+            )
+        if name == "psi":
+            if MAGNETIC_PATTERN.search(column):
+                text = f"'{column}' is magnetic by its name, and is taken as true: give `offset`,"
+                self._draft_notes.add_guess(
+                    (*CHANNELS_KEY, name), f"{text} minus the declination at that place"
+                )
+            entry["unit"] = self._psi_unit
+            return entry | ({"frame": "enu"} if self._pose_frame.is_from_east else {})
+        if name in ("u", "v", "r") and {"x", "y", "psi"} <= set(self._names):
+            fit = fit_to_motion(self._logs, self._motions, name)
+            return entry | self._settle_rate(name, fit, "position and heading")
+        if name == "r" and "psi" in self._names:
+            return entry | self._settle_rate(
+                name, self._fit_rate_to_angle("psi", self._psi_unit, name), "headings"
+            )
+        if name == "p" and "phi" in self._names:
+            unit = self._infer_unit("phi", should_note=False)
+            return entry | self._settle_rate(
+                name, self._fit_rate_to_angle("phi", unit, name), "roll angles"
+            )
+        if name not in STATE_NAMES and (
+            scaling := guess_scaling(name, column, self._concatenate_values(name))
+        ):
+            self._draft_notes.add_guess((*CHANNELS_KEY, name), scaling.reason)
+            return entry | scaling.settings
+        sign = -1 if name in self._sign_flipped else self._conventional_sign(name)
+        return entry | {"unit": self._infer_unit(name)} | ({"sign": sign} if sign < 0 else {})
+
+    def _conventional_sign(self, name: str) -> int:
+        """Return -1 for v and r beside a pose of ROS, which count to port by REP 103, else 1."""
+        if not self._is_ros_pose or name not in ("v", "r"):
+            return 1
+        text = "taken as positive to port, as beside a pose of ROS (REP 103)"
+        self._draft_notes.add_guess((*CHANNELS_KEY, name), text)
+        return -1
+
+    def _fit_rate_to_angle(self, angle: str, unit: str, name: str) -> ScaleFit:
+        """Return how a rate follows its angle, which is taken for a heading."""
+        tables_with_both = [table for table in self._logs if {angle, name} <= set(table.columns)]
+        angles = [
+            RawTable(table.t, dict.fromkeys(("x", "y", "psi"), table.columns[angle]))
+            for table in tables_with_both
+        ]
+        frame = self._pose_frame if angle == "psi" else POSE_FRAMES[0]
+        motions = [estimate_motion(table, unit, frame) for table in angles]
+        return fit_to_motion(
+            [RawTable(table.t, {"r": table.columns[name]}) for table in tables_with_both],
+            motions,
+            "r",
+        )
+
+    def _settle_rate(self, name: str, fit: ScaleFit, reference: str) -> dict[str, Any]:
+        """Return unit and sign of a velocity, checked against what it is the rate of.
+
+        Args:
+            reference: what that is, for a reader.
+        """
+        key, column, expected_unit = (*CHANNELS_KEY, name), self._names[name], CHANNEL_UNITS[name]
+        header_unit, measured_unit = (
+            parse_header_unit(column, expected_unit),
+            fit.matching_unit(expected_unit) if fit.is_significant else None,
+        )
+        unit = header_unit or measured_unit or self._infer_unit(name)
+        if header_unit is None and measured_unit is not None:
+            text = f"the header has no unit; {reference} say {measured_unit}"
+            self._draft_notes.add_guess(key, f"{text} (correlation {fit.correlation:.2f})")
+        elif header_unit and measured_unit and fit.correlation >= _OVERRULING_CORRELATION:
+            ratio = abs(fit.factor) / to_si(header_unit, expected_unit)
+            if to_si(measured_unit) != to_si(header_unit, expected_unit) and not 0.6 < ratio < 1.6:
+                text = f"the header says {header_unit}, {reference} say {measured_unit} (factor {ratio:.3g})"
+                question = f"unit of '{column}'"
+                unit = self._draft_notes.ask_question(
+                    key, question, measured_unit, text, (measured_unit, header_unit)
+                )
+        entry: dict[str, Any] = {"unit": unit}
+        if fit.is_significant and fit.factor < 0.0:
+            entry["sign"] = -1
+            direction = {"u": "astern", "v": "port", "r": "port", "p": "port"}[name]
+            text = f"{reference} say that it is positive to {direction} (correlation"
+            self._draft_notes.add_guess(key, f"{text} {fit.correlation:.2f})")
+        elif not fit.is_significant and self._conventional_sign(name) < 0:
+            entry["sign"] = -1
+        if not fit.is_significant and header_unit is None:
+            self._draft_notes.add_guess(key, f"{reference} do not tell whether {unit} is right")
+        return entry

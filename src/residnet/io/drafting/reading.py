@@ -1,0 +1,829 @@
+"""Logs of any format read without a config: their reader is drafted, and read them.
+
+`inspect`, `read_logs`, `fit`, `new` and `draft` come through here, so that each has the same map.
+What recordings say of themselves is taken, checked, and completed by names.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from residnet.core.config import validate_config
+from residnet.core.errors import DataError, ResidnetError, UsageError
+from residnet.core.layout import DegreesOfFreedom
+from residnet.core.log import Log
+from residnet.core.names import CHANNEL_UNITS, STATE_NAMES
+from residnet.core.progress import report_progress
+from residnet.io.drafting.channels import (
+    CHANNELS_KEY,
+    MIN_STANDARD_ERRORS,
+    POSE_FRAMES,
+    READER_KEY,
+    Motion,
+    RawTable,
+    ScaleFit,
+    draft_channel_map,
+    estimate_motion,
+    estimate_rudder_gain,
+    fit_to_motion,
+    forward_alignment,
+)
+from residnet.io.drafting.questions import DraftNotes, Key
+from residnet.io.drafting.tables import (
+    draft_manoeuvre_setting,
+    draft_tables,
+    match_channels,
+    preview_table,
+)
+from residnet.io.readers import ReaderConfig
+from residnet.io.readers.compose import extract_heading, extract_position
+from residnet.io.readers.detect import AutoConfig, detect_log_kind, suggest_conversion
+from residnet.io.readers.joined import group_trip_files
+from residnet.io.readers.messages import extend_with_standard_messages, is_ned_format
+from residnet.io.readers.quantities import (
+    QUATERNION,
+    AngleHeading,
+    ChannelPlan,
+    FieldMap,
+    GeodeticPosition,
+    HeadingConfig,
+    LocalPosition,
+    PositionConfig,
+    QuaternionHeading,
+)
+from residnet.io.readers.recording import ALL_FIELDS, Recording, Series
+from residnet.io.readers.tables import read_column_names
+from residnet.io.readers.topics import align_clocks
+from residnet.io.split import assign_log_names, find_logs
+from residnet.io.words import (
+    MOTION_CHANNELS,
+    PLANE_PATTERN,
+    guess_scaling,
+    infer_unit,
+    match_input_channel,
+    match_state_channel,
+    parse_name,
+)
+from residnet.preprocessing.motion import MotionConfig, complete_motion
+
+# how well position, heading and velocities of a recording that is taken as it is fit together, of 1
+_MIN_CONSISTENCY = 0.7
+# interval in s from which a pose is looked for that comes more often
+_MAX_POSE_INTERVAL = 0.6
+# rows of a topic of the motion, and of one of inputs
+_MIN_MOTION_ROWS, _MIN_INPUT_ROWS = 50, 20
+_MAX_POSE_CANDIDATES = 12
+"""Positions, and headings, that are tried with each other; chosen by hand: 144 poses take long."""
+_AXIS_PAIRS = (("x", "y"), ("north", "east"), ("east", "north"))
+
+
+@dataclass(frozen=True)
+class _MotionSources:
+    """Where the motion comes from.
+
+    Attributes:
+        settings: position, heading, channels and what else goes with them in a reader's settings.
+        used_fields: topics and fields that it takes.
+        step: the shorter of the usual steps of position and heading, s.
+    """
+
+    settings: dict[str, Any]
+    used_fields: set[tuple[str, str]]
+    step: float
+
+
+def draft_recordings(
+    paths: Sequence[Path], draft_notes: DraftNotes
+) -> tuple[dict[str, Any], dict[Path, Recording]]:
+    """Return the settings of a reader of recordings of one format, and those that were loaded.
+
+    Standard messages map themselves. Where position, heading and velocities do not fit together by
+    them, or the pose comes rarely, other topics and frames are tried, unless the format fixes its
+    frames. Inputs are found by names.
+
+    Raises:
+        UsageError: where the first one cannot be read.
+        DataError: where it holds nothing that can be used.
+    """
+    # what stands still in one recording may move in another: three are looked at
+    stride = max(1, (len(paths) - 1) // 2)
+    auto = AutoConfig()
+    recordings = {path: auto.load(path, ALL_FIELDS) for path in (paths[0], *paths[::stride])}
+    aligned = [align_clocks(recording, {}, None) for recording in recordings.values()]
+    settings: dict[str, Any] = {"kind": "auto", **draft_manoeuvre_setting(paths, draft_notes)}
+    try:
+        log = auto.build().to_log(recordings[paths[0]])
+    except ResidnetError:
+        log = None
+    plan = extend_with_standard_messages(aligned[0], ChannelPlan())
+    has_pose = log is not None and {"x", "y", "psi"} <= set(log.channels)
+    pose_sources = [source for source in (plan.position, plan.heading) if source is not None]
+    used_fields = {(entry.topic or "", entry.field) for entry in plan.channels.values()}
+    used_fields |= {
+        (source.topic or "", field) for source in pose_sources for field in source.fields
+    }
+    steps = [
+        _median_series_step(aligned[0].series[s.topic])
+        for s in pose_sources
+        if s.topic in aligned[0].series
+    ]
+    sample_step = max(min(steps), 0.02) if steps else 1.0
+    if not steps and log is not None:
+        sample_step = float(np.median(np.diff(log.t)))
+    sources = _MotionSources({}, used_fields, sample_step)
+    is_frame_fixed = any(is_ned_format(aligned[0][source.topic]) for source in pose_sources)
+    if named_sources := _find_named_table(aligned, draft_notes):
+        sources = named_sources
+    elif log is None or not has_pose or not _is_consistent(log, draft_notes):
+        pose_sources_found = None
+        if not (has_pose and is_frame_fixed):
+            pose_sources_found = _find_best_pose(
+                aligned[0], draft_notes, _MIN_CONSISTENCY if has_pose else 0.0
+            )
+        if pose_sources_found is None and has_pose:
+            text = "position, heading and velocities fit together badly: check the frames"
+            draft_notes.add_guess(READER_KEY, text)
+        sources = pose_sources_found or sources
+    elif sources.step > _MAX_POSE_INTERVAL and not is_frame_fixed:
+        candidate_notes = DraftNotes()
+        pose_sources_found = _find_best_pose(aligned[0], candidate_notes, _MIN_CONSISTENCY)
+        # the same pose again would lose the velocities that stand beside it
+        if pose_sources_found is not None and pose_sources_found.step < 0.9 * sources.step:
+            draft_notes.extend(candidate_notes)
+            sources = pose_sources_found
+    settings |= sources.settings
+    settings["clock"] = {"kind": "uniform", "step": f"{float(f'{sources.step:.2g}'):g} s"}
+    draft_notes.add_note((*READER_KEY, "clock"), "as often as the heading or the position comes")
+    uses_standard_messages = "standard_messages" not in settings
+    known_channels = set(log.channels) if log is not None and uses_standard_messages else set()
+    channels = dict(settings.pop("channels", {}))
+    renamed_fields = _name_bare_numbers(aligned[0], plan.channels) if uses_standard_messages else ()
+    for name, (topic, field) in (
+        *renamed_fields,
+        *_find_actuator_fields(aligned, sources.used_fields),
+    ):
+        if name in known_channels or name in channels:
+            continue
+        values = _concatenate_field(aligned, topic, field)
+        scaling = guess_scaling(name, field, values) or infer_unit(name, field, values)
+        reason = f"taken by its name; {scaling.reason}" if scaling.reason else "taken by its name"
+        draft_notes.add_guess((*CHANNELS_KEY, name), reason)
+        channels[name] = {"topic": topic, "field": field, **scaling.settings, "hold": True}
+    return settings | ({"channels": channels} if channels else {}), recordings
+
+
+def _median_series_step(series: Series) -> float:
+    return float(np.median(np.diff(series.clock))) if len(series) > 1 else float("inf")
+
+
+def _is_consistent(log: Log, draft_notes: DraftNotes) -> bool:
+    """Return whether position, heading and velocities fit together as they are."""
+    table = RawTable(log.t, log.channels)
+    motions = [estimate_motion(table, "rad", frame) for frame in POSE_FRAMES]
+    if None in motions:
+        return True
+    scores = []
+    for motion in motions:
+        velocity_fits = [
+            fit_to_motion([table], [motion], name) for name in ("u", "v") if name in log.channels
+        ]
+        velocity_score = sum(f.correlation * np.sign(f.factor) for f in velocity_fits) / 2
+        scores.append(velocity_score if len(velocity_fits) == 2 else forward_alignment([motion]))
+    if scores[0] < _MIN_CONSISTENCY and max(scores) > scores[0] + 0.1:
+        return False
+    if scores[0] < 0.3:
+        if forward_alignment(motions[:1]) > _MIN_CONSISTENCY:
+            # the pose is right, and the velocities are not those of the body
+            return False
+        text = f"position, heading and velocities fit together badly ({scores[0]:.2f} of 1)"
+        draft_notes.add_guess(READER_KEY, f"{text}: check the frames")
+    return True
+
+
+def _find_named_table(
+    recordings: Sequence[Recording], draft_notes: DraftNotes
+) -> _MotionSources | None:
+    """Return the motion and inputs of the only table whose fields are named as columns are.
+
+    MATLAB structs and HDF5 groups are such; units, signs and frames are settled as those of a
+    table. None where no series without a message type holds position and heading.
+    """
+    candidates = []
+    for series in recordings[0].series.values():
+        channels = {match_state_channel(parse_name(name)) for name in series.fields}
+        has_position = {"x", "y"} <= channels or {"latitude", "longitude"} <= channels
+        if (
+            not series.message_type
+            and len(series) >= _MIN_MOTION_ROWS
+            and "psi" in channels
+            and has_position
+        ):
+            candidates.append(series)
+    if len({frozenset(series.fields) for series in candidates}) < len(candidates):
+        table_names = ", ".join(series.name for series in candidates)
+        raise DataError(
+            f"{recordings[0].path}: holds {len(candidates)} tables of the same columns ({table_names[:120]}),"
+            " each a log of its own; write each to a file, in Python"
+            " pandas.DataFrame({name: column for name, column in table.items()}).to_csv(...)"
+        )
+    if len(candidates) != 1:
+        return None
+    series = candidates[0]
+    topic, same_series = (
+        series.name,
+        [r.series[series.name] for r in recordings if series.name in r.series],
+    )
+    fields = [
+        name
+        for name in series.fields
+        if all(
+            series_part.has_field(name) and np.isfinite(series_part[name]).any()
+            for series_part in same_series
+        )
+        and not (parse_name(name).has_all("time") and bool((np.diff(series[name]) > 0.0).all()))
+    ]
+    names = match_channels(fields, draft_notes)
+    logs = [
+        RawTable(series_part.clock, {name: series_part[field] for name, field in names.items()})
+        for series_part in same_series
+    ]
+    entries = draft_channel_map(names, logs, draft_notes)
+    unused_fields = [name for name in fields if name not in names.values()]
+    if unused_fields:
+        draft_notes.add_note(
+            CHANNELS_KEY, f"fields that no channel takes: {', '.join(unused_fields[:20])}"
+        )
+    settings: dict[str, Any] = {"standard_messages": False}
+    for position_kind, channel_pair, keys in (
+        ("local", ("x", "y"), ("north", "east")),
+        ("geodetic", ("latitude", "longitude"), ("latitude", "longitude")),
+    ):
+        if set(channel_pair) <= set(entries):
+            first_entry, second_entry = (entries.pop(name) for name in channel_pair)
+            position_settings = {
+                "kind": position_kind,
+                "topic": topic,
+                keys[0]: first_entry["column"],
+            }
+            settings["position"] = position_settings | {
+                keys[1]: second_entry["column"],
+                "unit": first_entry["unit"],
+            }
+    heading = entries.pop("psi")
+    settings["heading"] = {"kind": "angle", "topic": topic, "field": heading["column"]}
+    settings["heading"] |= {"unit": heading["unit"], "frame": heading.get("frame", "ned")}
+    for name, setting_name in (("x", "position"), ("y", "position"), ("psi", "heading")):
+        draft_notes.move_key((*CHANNELS_KEY, name), (*READER_KEY, setting_name))
+    settings["channels"] = {
+        name: {"topic": topic, "field": entry.pop("column"), **entry}
+        for name, entry in entries.items()
+    }
+    return _MotionSources(
+        settings, {(topic, name) for name in series.fields}, _median_series_step(series)
+    )
+
+
+def _find_best_pose(
+    recording: Recording, draft_notes: DraftNotes, min_score: float
+) -> _MotionSources | None:
+    """Return the position and heading that fit together best and come most often.
+
+    None where there is no pair of both that fits at least as well as asked, of 1.
+    """
+    positions, headings = (
+        list(_iter_position_sources(recording)),
+        list(_iter_heading_sources(recording)),
+    )
+    velocities = list(_iter_velocity_fields(recording))
+    best_candidate: tuple[float, Any] = (-np.inf, None)
+    for position in positions[:_MAX_POSE_CANDIDATES]:
+        for heading in headings[:_MAX_POSE_CANDIDATES]:
+            pose = _extract_pose(recording, position, heading)
+            if pose is None:
+                continue
+            score, velocity = _score_pose(pose, velocities)
+            source_steps = [
+                _median_series_step(recording[source.topic]) for source in (position, heading)
+            ]
+            # a pose that comes once a second is worth less than one that comes ten times
+            rated_score = score - 0.3 * float(np.log10(max(max(source_steps), 0.05) / 0.05))
+            if rated_score > best_candidate[0]:
+                best_candidate = (
+                    rated_score,
+                    (position, heading, score, velocity, min(source_steps)),
+                )
+    if best_candidate[1] is None or best_candidate[1][2] < min_score:
+        return None
+    position, heading, score, velocity, step = best_candidate[1]
+    text = f"of {len(positions)} positions and {len(headings)} headings these fit together and come"
+    draft_notes.add_guess((*READER_KEY, "position"), f"{text} most often (fit {score:.2f} of 1)")
+    draft_notes.add_guess(
+        (*READER_KEY, "heading"), f"frame {heading.frame}: with it the motion fits"
+    )
+    if velocity is not None:
+        draft_notes.add_note(
+            READER_KEY, f"velocities in {velocity} served to check the frames only"
+        )
+    settings: dict[str, Any] = {"standard_messages": False}
+    for name, source in (("position", position), ("heading", heading)):
+        source_settings = source.model_dump(mode="json", exclude_defaults=True)
+        settings[name] = {"kind": source.kind, **source_settings}
+    used_fields = {
+        (source.topic, field) for source in (position, heading) for field in source.fields
+    }
+    return _MotionSources(settings, used_fields, max(step, 0.02))
+
+
+def _iter_measured_series(recording: Recording) -> Iterator[Series]:
+    """Yield the topics with enough rows that are no references that somebody asks for."""
+    for series in recording.series.values():
+        parsed_name = parse_name(series.name)
+        if (
+            len(series) >= _MIN_MOTION_ROWS
+            and not parsed_name.has_all("command")
+            and "guidance" not in parsed_name.text
+        ):
+            yield series
+
+
+def _iter_position_sources(recording: Recording) -> Iterator[PositionConfig]:
+    """Yield the positions that a recording may hold, in both orders of their axes."""
+    for series in _iter_measured_series(recording):
+        if series.has_field("latitude") and series.has_field("longitude"):
+            yield GeodeticPosition(topic=series.name)
+            continue
+        field_by_channel = {
+            match_state_channel(parse_name(field)): field for field in reversed(series.fields)
+        }
+        if {"latitude", "longitude"} <= set(field_by_channel):
+            fix_fields = field_by_channel["latitude"], field_by_channel["longitude"]
+            largest = [float(np.nanmax(np.abs(series[name]), initial=0.0)) for name in fix_fields]
+            if min(largest) > 0.0 and max(largest) <= 180.0:
+                yield GeodeticPosition(
+                    topic=series.name, latitude=fix_fields[0], longitude=fix_fields[1]
+                )
+                continue
+        prefixes = ("pose.pose.position.", "pose.position.", "position.", "")
+        pairs = ((f"{p}{a}", f"{p}{b}") for p in prefixes for a, b in _AXIS_PAIRS)
+        axis_pair = next(
+            (axis_pair for axis_pair in pairs if all(map(series.has_field, axis_pair))), None
+        )
+        if axis_pair is None or ("." not in axis_pair[0] and "orientation" in series.name):
+            continue
+        if all(float(np.nanstd(series[name])) > 0.05 for name in axis_pair):
+            yield LocalPosition(topic=series.name, north=axis_pair[0], east=axis_pair[1])
+            if not is_ned_format(series):
+                yield LocalPosition(topic=series.name, north=axis_pair[1], east=axis_pair[0])
+
+
+def _iter_heading_sources(recording: Recording) -> Iterator[HeadingConfig]:
+    for series in _iter_measured_series(recording):
+        frames: tuple[Literal["ned", "enu"], ...] = (
+            ("ned",) if is_ned_format(series) else ("ned", "enu")
+        )
+        for quaternion_path in [
+            field[:-2] for field in series.fields if field.endswith((".w", "_w"))
+        ]:
+            if (
+                all(series.has_field(f"{quaternion_path}.{axis}") for axis in "xyz")
+                and series[f"{quaternion_path}.w"].any()
+            ):
+                for frame in frames:
+                    yield QuaternionHeading(topic=series.name, field=quaternion_path, frame=frame)
+        for field in series.fields:
+            if match_state_channel(parse_name(field)) == "psi" and np.isfinite(series[field]).any():
+                max_angle = float(np.nanmax(np.abs(series[field])))
+                unit = "deg" if max_angle > 7.0 else "rad"
+                if 0.0 < max_angle <= 400.0:
+                    for frame in frames:
+                        yield AngleHeading(topic=series.name, field=field, unit=unit, frame=frame)
+
+
+def _iter_velocity_fields(recording: Recording) -> Iterator[tuple[Series, str, str]]:
+    """Yield pairs of fields that may be the velocities forward and sideways."""
+    for series in _iter_measured_series(recording):
+        prefixes = ("twist.twist.linear.", "twist.linear.", "linear.")
+        prefix = next(
+            (p for p in prefixes if series.has_field(f"{p}x") and series.has_field(f"{p}y")), None
+        )
+        if prefix is not None:
+            yield series, f"{prefix}x", f"{prefix}y"
+
+
+def _extract_pose(
+    recording: Recording, position: PositionConfig, heading: HeadingConfig
+) -> RawTable | None:
+    """Return north, east and heading at the times of the positions; None where they cannot be."""
+    try:
+        position_log = extract_position(recording, position).log
+        heading_log = extract_heading(recording, heading).log
+    except ResidnetError:
+        return None
+    is_finite = np.isfinite(heading_log["psi"])
+    # a heading that stands still fits a velocity over ground as well as one through the water
+    if is_finite.sum() < _MIN_MOTION_ROWS or float(np.ptp(heading_log["psi"][is_finite])) < 0.3:
+        return None
+    if heading_log.t[-1] < position_log.t[0] or heading_log.t[0] > position_log.t[-1]:
+        return None
+    heading_at_positions = np.interp(
+        position_log.t,
+        heading_log.t[is_finite],
+        heading_log["psi"][is_finite],
+        left=np.nan,
+        right=np.nan,
+    )
+    return RawTable(
+        position_log.t,
+        {"x": position_log["x"], "y": position_log["y"], "psi": heading_at_positions},
+    )
+
+
+def _score_pose(
+    pose: RawTable, velocities: list[tuple[Series, str, str]]
+) -> tuple[float, str | None]:
+    """Return how well a pose fits the velocities, and the topic of these; itself without any."""
+    motion = estimate_motion(pose, "rad", POSE_FRAMES[0])
+    if motion is None:
+        return -1.0, None
+    unrotated_pose = RawTable(pose.t, {**pose.columns, "psi": np.zeros(pose.t.size)})
+    earth_fixed_motion = estimate_motion(unrotated_pose, "rad", POSE_FRAMES[0])
+    scored_topics = [(-1.0, "")]
+    for series, first_field, second_field in velocities:
+        field_orders = [(first_field, second_field), (second_field, first_field)]
+        earth_fixed_scores = (
+            [
+                _mean_velocity_correlation(unrotated_pose, earth_fixed_motion, series, *pair)
+                for pair in field_orders
+            ]
+            if earth_fixed_motion
+            else [0.0]
+        )
+        # along north and east it says nothing of the heading
+        if max(earth_fixed_scores) <= 0.85:
+            scored_topics.append(
+                (
+                    _mean_velocity_correlation(pose, motion, series, first_field, second_field),
+                    series.name,
+                )
+            )
+    best_fit = max(scored_topics)
+    return best_fit if best_fit[0] > 0.3 else (forward_alignment([motion]), None)
+
+
+def _mean_velocity_correlation(
+    pose: RawTable, motion: Motion, series: Series, forward_field: str, sideways_field: str
+) -> float:
+    """Return the mean correlation of forward and sideways velocity with a pair of fields."""
+    velocity_fits: list[ScaleFit] = []
+    for name, field in (("u", forward_field), ("v", sideways_field)):
+        is_finite = np.isfinite(series[field])
+        if is_finite.sum() < _MIN_MOTION_ROWS:
+            return -1.0
+        interpolated = np.interp(pose.t, series.clock[is_finite], series[field][is_finite])
+        velocity_fits.append(
+            fit_to_motion([RawTable(pose.t, {**pose.columns, name: interpolated})], [motion], name)
+        )
+    forward_fit, sideways_fit = velocity_fits
+    # the speed itself must agree: a heading that is turned by a right angle swaps the two
+    return float(
+        0.5 * (forward_fit.correlation * np.sign(forward_fit.factor) + sideways_fit.correlation)
+    )
+
+
+def _name_bare_numbers(
+    recording: Recording, standard: Mapping[str, FieldMap]
+) -> Iterator[tuple[str, tuple[str, str]]]:
+    """Yield channel, topic and field of plain numbers whose topic or joint names an actuator.
+
+    A message that holds a bare number says neither what it measures nor its unit.
+    """
+    for name, entry in standard.items():
+        topic, field = entry.topic or "", entry.field
+        if name in CHANNEL_UNITS or entry.unit not in ("-", "rad") or topic not in recording.series:
+            continue
+        # the last part of a topic says more than the folders that it lies in
+        names = (topic.rsplit("/", 1)[-1], name) if field == "data" else (name,)
+        channels = (
+            match_input_channel(parse_name(candidate.removesuffix("_position")))
+            for candidate in names
+        )
+        if channel := next(filter(None, channels), None):
+            yield channel, (topic, field)
+
+
+def _concatenate_field(recordings: Sequence[Recording], topic: str, field: str) -> np.ndarray:
+    """Return the values of a field in all recordings that hold it."""
+    series_with_topic = [r.series[topic] for r in recordings if topic in r.series]
+    return np.concatenate(
+        [series[field] for series in series_with_topic if series.has_field(field)]
+    )
+
+
+def _find_actuator_fields(
+    recordings: Sequence[Recording], used_fields: set[tuple[str, str]]
+) -> Iterator[tuple[str, tuple[str, str]]]:
+    """Yield channel, topic and field of those that are named as actuators are.
+
+    Several actuators of one topic are told apart by a number alone, `control[0]` and `control[1]`:
+    each is taken. Of other fields that stand for one channel the first one is.
+    """
+    fields_by_channel: dict[str, list[tuple[str, str]]] = {}
+    for topic, series in recordings[0].series.items():
+        for field in series.fields:
+            channel = match_input_channel(parse_name(f"{topic} {field}"))
+            if channel is None or channel in MOTION_CHANNELS or (topic, field) in used_fields:
+                continue
+            values = _concatenate_field(recordings, topic, field)
+            finite_values = values[np.isfinite(values)]
+            if finite_values.size >= _MIN_INPUT_ROWS and float(np.ptp(finite_values)) > 0.0:
+                fields_by_channel.setdefault(channel, []).append((topic, field))
+    for channel, candidate_fields in fields_by_channel.items():
+        field_patterns = [(topic, re.sub(r"\d+", "#", field)) for topic, field in candidate_fields]
+        numbered_fields = [
+            topic_field
+            for topic_field, field_pattern in zip(candidate_fields, field_patterns, strict=True)
+            if field_pattern == field_patterns[0]
+        ]
+        for number, topic_field in enumerate(numbered_fields, 1):
+            yield f"{channel}_{number}" if len(numbered_fields) > 1 else channel, topic_field
+
+
+INPUTS_KEY = ("signals", "inputs")
+"""Key of a config's inputs."""
+_TABLE_SUFFIXES = (".csv", ".parquet")
+
+
+def find_log_files(paths: Sequence[Path]) -> list[Path]:
+    """Return the files, and the logs below folders, in order; each once.
+
+    A folder may itself be a log, as a ROS 2 bag is, and where a folder holds neither such nor
+    tables, logs of any other format are taken.
+
+    Raises:
+        UsageError: where a path does not exist or a folder holds no log.
+    """
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            nested_logs = find_logs(path)
+            # notes and settings often lie beside tables
+            preferred_logs = [
+                p for p in nested_logs if p.is_dir() or p.suffix in _TABLE_SUFFIXES
+            ] or nested_logs
+            if not preferred_logs:
+                raise UsageError(
+                    f"{path}: holds no log of a format that is known{describe_other_files(path)}"
+                )
+            files += preferred_logs
+        elif path.is_file():
+            files.append(path)
+        else:
+            raise UsageError(f"{path}: no such file or folder")
+    unique_files: dict[Path, Path] = {}
+    for file in files:
+        unique_files.setdefault(file.resolve(), file)
+    return list(unique_files.values())
+
+
+def describe_other_files(folder: Path) -> str:
+    """Return what a folder without logs holds, and how it can become logs; empty for nothing."""
+    endings = Counter(path.suffix.lower() for path in folder.rglob("*") if path.is_file())
+    counts_text = ", ".join(
+        f"{n} file{'s' * (n > 1)} {suffix or 'without ending'}" for suffix, n in endings.items()
+    )
+    commonest = max(endings, key=lambda ending: endings[ending], default="")
+    return f", but {counts_text[:120]}; {suggest_conversion(commonest)}" if counts_text else ""
+
+
+@dataclass
+class DraftResult:
+    """Logs that one drafted reader reads.
+
+    Attributes:
+        reader: `data.reader` of a config.
+        logs: path -> log, in SI, as the reader gives it.
+        errors: path -> why it cannot be read.
+        draft_notes: what of the reader is not sure.
+    """
+
+    reader: dict[str, Any]
+    draft_notes: DraftNotes
+    logs: dict[Path, Log] = dataclasses.field(default_factory=dict)
+    errors: dict[Path, ResidnetError] = dataclasses.field(default_factory=dict)
+
+
+def read_drafted(
+    paths: Sequence[Path], draft_notes: DraftNotes, *, is_gridded: bool = True
+) -> DraftResult:
+    """Return the logs in files of one format, by a reader that is drafted from them.
+
+    Args:
+        is_gridded: recordings come on a uniform clock, and else on that of their positions.
+
+    Raises:
+        UsageError: where the files are of several formats.
+        DataError: where none can be used.
+    """
+    kind_by_path = {path: detect_log_kind(path) for path in paths}
+    if len(set(kind_by_path.values())) > 1:
+        kinds_text = "; ".join(
+            f"{log_kind}: {', '.join(path.name for path in paths if kind_by_path[path] == log_kind)[:120]}"
+            for log_kind in sorted(set(kind_by_path.values()))
+        )
+        raise UsageError(
+            f"the logs are of several formats, and a fit reads one ({kinds_text}); give those of one"
+        )
+    log_kind, result = kind_by_path[paths[0]], DraftResult({"kind": "canonical"}, draft_notes)
+    recordings: dict[Path, Recording] = {}
+    if log_kind == "table" and (trip_files := group_by_trip(paths)):
+        unpaired_paths = set(paths).difference(*trip_files.values())
+        part_settings: dict[str, dict[str, Any]] = {}
+        errors: dict[Path, ResidnetError] = {}
+        for part_name, files in trip_files.items():
+            part_notes = DraftNotes()
+            part_settings[part_name], part_errors = draft_tables(
+                files, part_notes, has_heading=True
+            )
+            errors |= part_errors
+            part_notes.move_key(READER_KEY, (*READER_KEY, "parts", part_name))
+            draft_notes.extend(part_notes)
+        part_order = sorted(
+            part_settings, key=lambda word: -len(_motion_channels(part_settings[word]["channels"]))
+        )
+        text = (
+            f"files whose names differ in {' and '.join(part_order)} alone are taken as one trip; where"
+            " both have no dates, their clocks are brought together by what the commands explain"
+        )
+        draft_notes.add_guess((*READER_KEY, "parts"), text)
+        reader = {
+            "kind": "joined",
+            "parts": {part_name: part_settings[part_name] for part_name in part_order},
+        }
+        result.reader, paths, result.errors = reader, [*trip_files[part_order[0]]], errors
+        result.errors |= {
+            path: DataError(f"{path}: no other file of its trip is beside it; leave it out")
+            for path in sorted(unpaired_paths)
+        }
+    elif log_kind == "table":
+        result.reader, result.errors = draft_tables(paths, draft_notes)
+    elif log_kind != "canonical":
+        result.reader, recordings = draft_recordings(paths, draft_notes)
+    settings = {key: value for key, value in result.reader.items() if is_gridded or key != "clock"}
+    reader, names = (
+        validate_config(settings, ReaderConfig, "draft").build(),
+        assign_log_names(paths),
+    )
+    for number, path in enumerate(paths):
+        report_progress("reading logs", number, len(paths))
+        try:
+            if path not in result.errors:
+                # a recording that was drafted from is not loaded again
+                recording = recordings.pop(path, None)
+                log = reader.read(path) if recording is None else reader.to_log(recording)
+                result.logs[path] = log.replace(name=names[path])
+        except ResidnetError as error:
+            result.errors[path] = error
+    report_progress("reading logs", len(paths), len(paths))
+    if not result.logs:
+        raise next(iter(result.errors.values()))
+    _correct_rudder_signs(result)
+    return result
+
+
+def group_by_trip(paths: Sequence[Path]) -> dict[str, list[Path]]:
+    """Return word -> tables, where those that differ in one word of their names are parts of trips.
+
+    Empty where they are not. Two files with a position or a speed each are of two vessels, or of
+    two recorders that each are a log; a compass may be in both.
+    """
+    columns = {path: read_column_names(path) for path in paths}
+    # lists of names and notes lie beside logs
+    paths_by_columns: dict[tuple[str, ...], list[Path]] = {}
+    for path, names in columns.items():
+        paths_by_columns.setdefault(names, []).append(path)
+    log_groups = {
+        n: files
+        for n, files in paths_by_columns.items()
+        if len(paths_by_columns) > 1 and _channels_from_headers(files)
+    }
+    trip_files = group_trip_files(
+        {path: names for path, names in columns.items() if names in log_groups}
+    )
+    motion_sets = [
+        _motion_channels(_channels_from_headers(files)) & {*"xyuv"} for files in trip_files.values()
+    ]
+    is_ambiguous = any(
+        first_set & second_set for first_set, second_set in itertools.combinations(motion_sets, 2)
+    )
+    return {} if is_ambiguous else trip_files
+
+
+def _channels_from_headers(files: Sequence[Path]) -> Iterable[str]:
+    """Return the channels that the names of columns tell, of the first table that can be read."""
+    for path in files:
+        with contextlib.suppress(ResidnetError):
+            if channels := match_channels([*preview_table(path, 50).numeric_columns], DraftNotes()):
+                return channels
+    return ()
+
+
+def _motion_channels(channels: Iterable[str]) -> set[str]:
+    """Return what channels tell of the motion: position, heading, velocities and roll by name."""
+    equivalent_channels = {"latitude": "x", "longitude": "y", **dict.fromkeys(QUATERNION, "psi")}
+    return {equivalent_channels.get(name, name) for name in channels} & {*STATE_NAMES, "phi", "p"}
+
+
+def read_mixed_formats(paths: Sequence[Path]) -> list[DraftResult]:
+    """Return logs of any formats, those with the same columns together.
+
+    Where none of those alike can be read, all of them are left out.
+    """
+    groups: dict[tuple[str, ...], list[Path]] = {}
+    columns_by_path = {
+        path: read_column_names(path) for path in paths if detect_log_kind(path) == "table"
+    }
+    has_trips = bool(group_by_trip([*columns_by_path]))
+    for path in paths:
+        log_kind = detect_log_kind(path)
+        names = columns_by_path[path] if log_kind == "table" and not has_trips else ()
+        groups.setdefault((log_kind, *names), []).append(path)
+    results = []
+    for group in groups.values():
+        marks = DraftNotes()
+        try:
+            results.append(read_drafted(group, marks, is_gridded=False))
+        except ResidnetError as error:
+            results.append(DraftResult({}, marks, errors=dict.fromkeys(group, error)))
+    return results
+
+
+def _correct_rudder_signs(result: DraftResult) -> None:
+    """Turn the sign of rudders whose positive angles turn the vessel to port, of planes those that
+    turn it up.
+    """
+    part_settings: dict[Key, Mapping[str, Any]] = {
+        (*READER_KEY, "parts", part_name): part
+        for part_name, part in result.reader.get("parts", {}).items()
+    }
+    part_settings = part_settings or {READER_KEY: result.reader}
+    channels: dict[str, dict[str, Any]] = {}
+    entry_keys: dict[str, Key] = {}
+    for part_key, part in part_settings.items():
+        for name, entry in part.get("channels", {}).items():
+            channels.setdefault(name, entry)
+            entry_keys.setdefault(name, (*part_key, "channels", name))
+    channel_names = dict.fromkeys(name for log in result.logs.values() for name in log.channels)
+    names = [name for name in channel_names if re.match(r"(cmd_)?delta(?!_rate)", name)]
+    logs_with_rates = [
+        completed_log
+        for log in result.logs.values()
+        if names and (completed_log := _complete_turn_rates(log))
+    ]
+    for name in names:
+        is_plane = PLANE_PATTERN.match(name) is not None
+        rate, rate_sign, opposite_direction = (
+            ("q", -1.0, "up") if is_plane else ("r", 1.0, "to port")
+        )
+        columns = [name, "theta"] if is_plane else [name]
+        usable_logs = [log for log in logs_with_rates if {rate, *columns} <= log.channels.keys()]
+        logs = [RawTable(log.t, {column: log[column] for column in columns}) for log in usable_logs]
+        rates = {number: rate_sign * log[rate] for number, log in enumerate(usable_logs)}
+        gain, standard_error = estimate_rudder_gain(
+            logs, name, rates, "theta" if is_plane else None
+        )
+        key = entry_keys.get(name, INPUTS_KEY)
+        if abs(gain) < MIN_STANDARD_ERRORS * standard_error:
+            result.draft_notes.add_guess(
+                key, f"the logs do not tell which way {name} turns the vessel"
+            )
+        elif gain < 0.0 and name in channels:
+            channels[name]["sign"] = -1 * int(channels[name].get("sign", 1))
+            text = f"positive values turned the vessel {opposite_direction} in the logs ({-gain / standard_error:.0f}"
+            result.draft_notes.add_guess(key, f"{text} standard errors): the sign is turned")
+            for path, log in result.logs.items():
+                if name in log.channels:
+                    negated_channels = {**log.channels, name: -log[name]}
+                    result.logs[path] = log.replace(channels=negated_channels)
+        elif gain < 0.0:
+            text = f"positive values of {name} turned the vessel {opposite_direction} in the logs"
+            result.draft_notes.add_guess(key, text)
+
+
+def _complete_turn_rates(log: Log) -> Log | None:
+    """Return a log with its yaw rate and, where it dives, its pitch rate; None without."""
+    try:
+        dof = DegreesOfFreedom.from_channels(log.channels)
+        rates = {"r", "q"} if dof.is_six_dof else {"r"}
+        return log if rates <= log.channels.keys() else complete_motion(log, MotionConfig(), dof)
+    except ResidnetError:
+        return None

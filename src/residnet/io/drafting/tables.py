@@ -1,0 +1,1033 @@
+"""The channel map of tables that nobody described, with what is not sure about it."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from residnet.core.errors import DataError, ResidnetError, UsageError
+from residnet.core.names import CHANNEL_UNITS, get_si_unit, truncate
+from residnet.core.units import is_unit, to_si
+from residnet.io.drafting.channels import (
+    CHANNELS_KEY,
+    MAGNETIC_PATTERN,
+    READER_KEY,
+    STATE_NAMES,
+    RawTable,
+    choose_quaternion_order,
+    draft_channel_map,
+    find_depth_channels,
+    find_quaternions,
+    find_sin_cos_pairs,
+)
+from residnet.io.drafting.questions import DraftNotes
+from residnet.io.readers.base import require_file
+from residnet.io.readers.quantities import COSINE_SUFFIX, QUATERNION, SINE_SUFFIX
+from residnet.io.readers.tables import (
+    TABLE_KINDS,
+    list_sheet_names,
+    read_excel_sheet,
+    read_json_head,
+    read_parquet_head,
+)
+from residnet.io.readers.texts import read_table_head
+from residnet.io.readers.written import (
+    AngleForm,
+    LetterO,
+    detect_date_order,
+    detect_unix_unit,
+    find_unique_rows,
+    hemisphere_signs,
+    infer_time_unit,
+    is_date_column,
+    parse_degrees,
+    parse_texts,
+    repair_clock,
+)
+from residnet.io.words import (
+    MOTION_CHANNELS,
+    find_mismatched_unit,
+    match_input_channel,
+    match_state_channel,
+    normalize_name,
+    parse_header_unit,
+    parse_name,
+)
+from residnet.preprocessing.channel_values import (
+    INTERVAL_TOLERANCE,
+    MIN_REGULAR_SHARE,
+    mask_fill_values,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_HEAD_READERS = {"parquet": read_parquet_head, "json_lines": read_json_head}
+_OPENING_BRACKET = re.compile(r"[\[(]")
+_NAME_OVER_UNIT = re.compile(r"(?P<name>.*\S)\s+/\s+(?P<unit>\S.*)")
+_REVOLUTION_PATTERN = re.compile(
+    r"rpm|rev|1/s|hz|turns|u/?min|umdr|drehz|toeren|tours|giri|varv", re.IGNORECASE
+)
+_DRIVE_PATTERN = re.compile(r"^(?:cmd_)?(?:n(?=_|$)|thrust)")
+_PULSE_RANGE = (900.0, 2100.0)
+"""Pulses in us that servos and speed controllers take."""
+_PARTS_OF_TIME = (
+    *("year", "yyyy", "jahr", "month", "mm", "monat", "day", "dd", "tag", "hour", "hours", "hh"),
+    *("stunde", "minute", "minutes", "min", "second", "seconds", "sekunde", "ss"),
+)
+_DATE_PATTERN = r"\d\s*[-./年]\s*\w{1,9}\s*[-./月]"
+_DOTTED_TIME_PATTERN = r"^\d\d?\.\d\d\.\d\d[.,]"
+"""How a time of day begins that has points between its parts."""
+_ANGLE_FORMS: tuple[AngleForm, ...] = ("number", "ddmm")
+_MAX_ANGLE = {"latitude": 90.0, "longitude": 180.0}
+_HEMISPHERES = {"latitude": {"N", "S"}, "longitude": {"E", "W", "O"}}
+_GERMANIC_PATTERN = re.compile(
+    r"breite|l(?:ae|a)nge|breedte|lengte|zeit|tijd|kurs|koers|ruder|roer"
+)
+ColumnSettings = Mapping[str, Mapping[str, Any]]
+"""Column -> what its entry in a channel map says beside column and unit."""
+_MAX_FULL_PREVIEWS = 24
+"""Tables whose values are looked at; of the others only the header is."""
+
+
+def draft_tables(
+    files: Sequence[Path], draft_notes: DraftNotes, *, has_heading: bool = False
+) -> tuple[dict[str, Any], dict[Path, ResidnetError]]:
+    """Return the settings of a reader of tables, and file -> why it is not read.
+
+    They come from names, units in the headers, values and physics.
+
+    Args:
+        files: at least one table.
+        has_heading: whether other files may tell the heading.
+
+    Raises:
+        UsageError: where the tables have nothing in common.
+        DataError: where none can be read, or none has a time.
+    """
+    previews, errors = _preview_tables(files)
+    main_preview, column_settings = convert_positions_to_degrees(previews[0], draft_notes)
+    previews = [
+        main_preview,
+        *(convert_positions_to_degrees(sheet, DraftNotes())[0] for sheet in previews[1:]),
+    ]
+    common_columns = [
+        name
+        for name in main_preview.column_names
+        if all(name in sheet.column_names for sheet in previews)
+    ]
+    missing_columns = sorted(
+        {name for sheet in previews for name in sheet.column_names} - set(common_columns)
+    )
+    if missing_columns:
+        draft_notes.add_note(
+            CHANNELS_KEY, f"not in every file, left out: {', '.join(missing_columns[:12])}"
+        )
+    clock = detect_clock(main_preview)
+    if not set(clock.columns) <= set(common_columns):
+        same_table_names = [
+            sheet.path.name for sheet in previews if sheet.column_names == main_preview.column_names
+        ]
+        raise UsageError(
+            f"{main_preview.path}: its time '{clock.columns[0]}' is not in every file, so that these are"
+            f" tables of several kinds; give those of one, here {', '.join(same_table_names)[:120]} (parts of"
+            " one trip are files whose names differ in one word, each with other quantities)"
+        )
+    if clock.guess:
+        draft_notes.add_guess((*READER_KEY, "time"), clock.guess)
+    numeric_columns = {name for sheet in previews for name in sheet.numeric_columns}
+    common_numeric = [
+        name for name in common_columns if name in numeric_columns and name not in clock.columns
+    ]
+    minute_columns = [
+        name
+        for name in common_numeric
+        if match_state_channel(parse_name(name)) in _MAX_ANGLE
+        and parse_header_unit(name, "s") == "min"
+    ]
+    if minute_columns:
+        raise DataError(
+            f"{main_preview.path}: '{minute_columns[0]}' holds minutes whose degrees stand in another column;"
+            " write degrees + minutes / 60 into one column each for latitude and longitude"
+        )
+    attitudes = find_quaternions(common_numeric)
+    compound_columns = {column for attitude in attitudes for column in attitude.values()}
+    sin_cos_pairs = find_sin_cos_pairs(
+        common_numeric, [preview.numeric_columns for preview in previews]
+    )
+    compound_columns |= {column for pair in sin_cos_pairs.values() for column in pair}
+    simple_columns = [name for name in common_numeric if name not in compound_columns]
+    has_sin_cos_heading = any(
+        match_state_channel(parse_name(stem)) == "psi" for stem in sin_cos_pairs
+    )
+    column_by_channel = _select_one_vessel(
+        simple_columns,
+        main_preview.numeric_columns,
+        draft_notes,
+        has_heading=has_heading or has_sin_cos_heading or bool(attitudes),
+    )
+    column_by_channel = _rename_pulsed_drives(column_by_channel, previews)
+    column_by_channel = _add_sin_cos_channels(column_by_channel, sin_cos_pairs)
+    # a vessel without roll is modelled too, so that no log is lost for it
+    roll_channels = [name for name in ("phi", "p") if name in column_by_channel]
+    for name in [
+        preview
+        for preview in roll_channels
+        if any(column_by_channel[preview] not in s.numeric_columns for s in previews)
+    ]:
+        draft_notes.add_note(
+            CHANNELS_KEY, f"empty in some files, left out: {column_by_channel.pop(name)}"
+        )
+    column_by_channel |= find_depth_channels(common_numeric, column_by_channel)
+    position_texts = [
+        name
+        for name in main_preview.text_columns
+        if match_state_channel(parse_name(name)) in _MAX_ANGLE
+    ]
+    if (
+        position_texts
+        and "x" not in column_by_channel
+        and not set(_MAX_ANGLE) <= set(column_by_channel)
+    ):
+        example = main_preview.text_columns[position_texts[0]].dropna().iloc[0]
+        raise DataError(
+            f"{main_preview.path}: column '{position_texts[0]}' holds '{truncate(str(example))}', which is no latitude or"
+            " longitude beside its other column; forms that are read are 59.90535, 59°54.321'N,"
+            " 59 54 19.3 N and 5954.321"
+        )
+    if "psi" not in column_by_channel:
+        column_by_channel |= choose_quaternion_order(
+            attitudes, [preview.numeric_columns for preview in previews]
+        )
+    if not column_by_channel:
+        raise DataError(
+            f"{main_preview.path}: none of its columns is called as a channel is"
+            f" ({', '.join(common_numeric[:12])}); {_suggest_table_fix(main_preview, clock, common_numeric)}"
+        )
+    logs = _build_raw_tables(previews, column_by_channel, errors)
+    cells = [
+        str(text) for texts in main_preview.text_columns.values() for text in texts.unique()[:20]
+    ]
+    channels = draft_channel_map(
+        column_by_channel, logs, draft_notes, [*main_preview.column_names, *cells]
+    )
+    for channel, entry in channels.items():
+        if _is_recorded_on_change(channel, logs):
+            entry["hold"] = True
+            text = "recorded when it changes: the last value holds until the next"
+            draft_notes.add_guess((*CHANNELS_KEY, channel), text)
+        settings = column_settings.get(entry["column"], {})
+        entry |= {"column": main_preview.original_name(entry["column"]), **settings}
+    reader_settings = {
+        key: value for key, value in main_preview.reader_settings.items() if key != "kind"
+    }
+    time = {**clock.settings, "column": main_preview.original_name(clock.settings["column"])}
+    reader_config = {"kind": main_preview.reader_settings["kind"], **reader_settings, "time": time}
+    reader_config |= draft_manoeuvre_setting(files, draft_notes)
+    _note_unused_columns(main_preview, column_by_channel, clock, draft_notes)
+    return {**reader_config, "channels": channels}, errors
+
+
+def _suggest_table_fix(
+    preview: TablePreview, clock: TableClock, numeric_columns: Sequence[str]
+) -> str:
+    """Return what to do with a table whose columns name no channel."""
+    if not numeric_columns:
+        return "the files have no column of numbers in common: give those of one kind"
+    category_columns = [
+        name
+        for name, cells in preview.text_columns.items()
+        if 1 < cells.nunique() <= len(cells) / 4
+    ]
+    category_columns = [name for name in category_columns if name not in clock.columns]
+    if len(numeric_columns) == 1 and category_columns:
+        return (
+            f"'{category_columns[0]}' says what each row holds: make columns of it, in Python"
+            f" pandas.read_csv(file).pivot_table({numeric_columns[0]!r}, {clock.columns[0]!r},"
+            f" {category_columns[0]!r}).to_csv('log.csv')"
+        )
+    if len(numeric_columns) == 1:
+        return (
+            "where each file holds one quantity, make one table of them, in Python"
+            " pandas.concat({file.stem: pandas.read_csv(file, index_col=0).iloc[:, 0] for file in"
+            " files}, axis=1).sort_index().to_csv('log.csv')"
+        )
+    if all(_parse_unit_cell(re.sub(r"\.\d+$", "", name)) for name in numeric_columns):
+        return "these are units: write each column's name in one cell above its unit, or before it"
+    return "name them in a channel map (--config)"
+
+
+def draft_manoeuvre_setting(files: Sequence[Path], draft_notes: DraftNotes) -> dict[str, str]:
+    """Return the setting of files in several folders, whose names tell the manoeuvres."""
+    if len({path.resolve().parent for path in files}) < 2:
+        return {}
+    draft_notes.add_guess(
+        (*READER_KEY, "manoeuvre"), "the kind of manoeuvre is taken from the folder's name"
+    )
+    return {"manoeuvre": "folder"}
+
+
+def _preview_tables(files: Sequence[Path]) -> tuple[list[TablePreview], dict[Path, ResidnetError]]:
+    """Return the first rows of the tables, those of some with all that is looked at."""
+    stride = max(1, len(files) // _MAX_FULL_PREVIEWS)
+    previews: list[TablePreview] = []
+    errors: dict[Path, ResidnetError] = {}
+    for number, path in enumerate(files):
+        try:
+            previews.append(
+                preview_table(path) if number % stride == 0 else preview_table(path, 50)
+            )
+        except DataError as error:
+            errors[path] = error
+    if not previews:
+        raise next(iter(errors.values()))
+    reader_settings = {
+        tuple(sorted(sheet.reader_settings.items()))
+        for sheet in previews
+        if len(sheet.numeric_columns) > 1
+    }
+    if not reader_settings:
+        path, names = previews[0].path, ", ".join(previews[0].column_names[:12])
+        raise DataError(
+            f"{path}: fewer than two of its columns hold numbers (columns: {names}); check how the"
+            " table was exported"
+        )
+    if len({dict(settings_items)["kind"] for settings_items in reader_settings}) > 1:
+        raise UsageError("the tables are of several formats; give those of one format at a time")
+    # the form that most of them have: a table of whole numbers shows no decimal sign
+    common_settings = max(
+        reader_settings,
+        key=lambda kind: (len(kind), sum(s.reader_settings == dict(kind) for s in previews)),
+    )
+    best_index = next(
+        i
+        for i, s in enumerate(previews)
+        if tuple(sorted(s.reader_settings.items())) == common_settings
+    )
+    return [previews[best_index], *previews[:best_index], *previews[best_index + 1 :]], errors
+
+
+def _select_one_vessel(
+    columns: Sequence[str],
+    numeric_columns: Mapping[str, np.ndarray],
+    draft_notes: DraftNotes,
+    *,
+    has_heading: bool,
+) -> dict[str, str]:
+    """Return channel -> column; of `boat1_x` and `boat2_x`, side by side, those of the first.
+
+    The same words stand behind the word of each vessel or sensor, a place and an input among them.
+    What rests or is commanded is not taken for a vessel.
+    """
+    columns_by_prefix: dict[str, dict[str, str]] = {}
+    for column in columns:
+        prefix, _, suffix = re.sub(r"[\W_]+", "\0", column, count=1).partition("\0")
+        columns_by_prefix.setdefault(prefix, {})[suffix] = column
+    for suffixes in columns_by_prefix.values():
+        same_suffix_groups = {
+            prefix: prefix_columns
+            for prefix, prefix_columns in columns_by_prefix.items()
+            if prefix_columns.keys() == suffixes.keys()
+        }
+        if len(same_suffix_groups) < 2 or any(
+            parse_name(prefix).has_all("command") for prefix in same_suffix_groups
+        ):
+            continue
+        channels = match_channels([*suffixes], DraftNotes())
+        position_pair = next(
+            (pair for pair in (("x", "y"), (*_MAX_ANGLE,)) if {*pair} <= channels.keys()), ()
+        )
+        if not position_pair or not channels.keys() - {*STATE_NAMES, *_MAX_ANGLE}:
+            continue
+        for prefix, prefix_columns in same_suffix_groups.items():
+            if any(
+                np.nanstd(numeric_columns[prefix_columns[channels[name]]]) > 0.0
+                for name in position_pair
+            ):
+                text = (
+                    f"the columns of {', '.join(same_suffix_groups)} hold a position each; of these vessels or"
+                    f" sensors {prefix} is read; write the others into tables of their own"
+                )
+                draft_notes.add_guess(CHANNELS_KEY, text)
+                return {
+                    channel: prefix_columns[suffix]
+                    for channel, suffix in match_channels([*prefix_columns], draft_notes).items()
+                }
+    return match_channels(columns, draft_notes, has_heading=has_heading)
+
+
+def match_channels(
+    columns: Sequence[str], draft_notes: DraftNotes, *, has_heading: bool = True
+) -> dict[str, str]:
+    """Return channel -> column, by what the columns are called.
+
+    A speed is that forward where no position and heading tell it.
+
+    Args:
+        has_heading: whether something else may tell the heading.
+    """
+    column_by_bare_name = {
+        re.sub(r"\W*[\[(].*|_m$", "", column).strip().lower(): column for column in columns
+    }
+    if {"n", "e"} <= set(column_by_bare_name):
+        north_east = {"x": column_by_bare_name["n"], "y": column_by_bare_name["e"]}
+        other_notes = DraftNotes()
+        other_channels = match_channels(
+            [name for name in columns if name not in north_east.values()],
+            other_notes,
+            has_heading=has_heading,
+        )
+        if not {"x", "y", "latitude", "longitude"} & set(other_channels):
+            # beside E, N counts no revolutions
+            draft_notes.extend(other_notes)
+            text = f"'{north_east['x']}' and '{north_east['y']}' side by side are taken as north and east"
+            draft_notes.add_guess((*CHANNELS_KEY, "x"), text)
+            return {**north_east, **other_channels}
+    names: dict[str, str] = {}
+    duplicates: dict[str, list[str]] = {}
+    speeds: list[str] = []
+    parsed_names = {column: parse_name(column) for column in columns}
+    copy_suffix = re.compile(r"\.\d+$")
+    # of one vessel only what drives it has a speed to either side
+    shaft_of_side = {"port": "n_port", "starboard": "n_stbd"}
+    side_velocities = {
+        column: shaft_channel
+        for column, parsed in parsed_names.items()
+        for sided_channel, shaft_channel in shaft_of_side.items()
+        if match_state_channel(parsed) == "v"
+        and parsed.has_all("speed", sided_channel)
+        and parsed.has_none("sway")
+    }
+    side_velocities = side_velocities if len({*side_velocities.values()}) == 2 else {}
+
+    def sort_key(column: str) -> tuple[bool, bool, int]:
+        is_magnetic = (
+            MAGNETIC_PATTERN.search(column) and match_state_channel(parsed_names[column]) == "psi"
+        )
+        return (
+            bool(is_magnetic),
+            parsed_names[column].text not in MOTION_CHANNELS,
+            len(parsed_names[column].concepts),
+        )
+
+    # true headings first, then a channel's own name, `u` before `vx`, then shorter names: `heading`
+    # before `heading of the second compass`
+    for column in sorted(columns, key=sort_key):
+        channel = (
+            side_velocities.get(column)
+            or match_state_channel(parsed_names[column])
+            or match_input_channel(parsed_names[column])
+        )
+        if (
+            channel is None
+            and parsed_names[column].has_all("pitch")
+            and parse_header_unit(column, "-") == "%"
+        ):
+            # no angle, but that of a propeller's blades
+            channel = match_input_channel(parse_name(f"propeller {column}"))
+        expected_unit = get_si_unit(channel) if channel else None
+        header_unit_mismatch = (
+            find_mismatched_unit(column, expected_unit) if expected_unit else None
+        )
+        if channel == "n" and header_unit_mismatch == "m":
+            channel = "x"
+        elif channel and "thrust" in channel and parse_header_unit(column, "1/s"):
+            # a thruster that turns, and no force
+            channel = channel.replace("thrust", "n")
+        elif (
+            channel
+            and _DRIVE_PATTERN.match(channel)
+            and (header_unit_mismatch in ("-", "us") or parse_header_unit(column, "-") == "%")
+        ):
+            # no revolutions and no force: the share of the throttle, or pulses to it
+            channel = _DRIVE_PATTERN.sub("throttle", channel)
+        elif channel in STATE_NAMES and header_unit_mismatch:
+            draft_notes.add_note(
+                CHANNELS_KEY,
+                f"'{column}' is called as {channel} is, but holds {header_unit_mismatch}",
+            )
+            continue
+        if channel == "speed":
+            speeds.append(column)
+        elif channel is not None and channel not in names:
+            names[channel] = column
+        elif channel is not None and copy_suffix.sub("", column) == copy_suffix.sub(
+            "", names[channel]
+        ):
+            text = f"the header names it more than once; '{names[channel]}' is the first of them"
+            draft_notes.add_guess((*CHANNELS_KEY, channel), text)
+        elif channel is not None:
+            duplicates.setdefault(channel, [names[channel]]).append(column)
+    for channel, duplicate_columns in duplicates.items():
+        numbered = {
+            f"{channel}_{k}": duplicate
+            for k, duplicate in enumerate(sorted(duplicate_columns, key=columns.index), 1)
+        }
+        if "thrust" not in channel or names.keys() & numbered.keys():
+            # of a rudder or a shaft that is told twice, one is an indicator
+            for column in duplicate_columns[1:]:
+                draft_notes.add_note(
+                    CHANNELS_KEY,
+                    f"'{column}' may be {channel} as well as '{duplicate_columns[0]}' is",
+                )
+            continue
+        # thrusters that no number tells apart
+        del names[channel]
+        names |= numbered
+        draft_notes.add_guess(
+            (*CHANNELS_KEY, f"{channel}_1"),
+            f"{', '.join(duplicate_columns)} are taken for one each",
+        )
+    has_position = bool({"x", "y", "latitude", "longitude"} & names.keys())
+    theta = next(
+        (column for column in columns if "theta" in parsed_names[column].text.split()), None
+    )
+    if has_position and theta is not None and not {"psi", "phi"} & names.keys():
+        names["psi"] = theta
+        draft_notes.add_guess(
+            (*CHANNELS_KEY, "psi"), f"'{theta}' is taken as the heading, for no other is there"
+        )
+    for port, stbd in (("delta_port", "delta_stbd"), ("cmd_delta_port", "cmd_delta_stbd")):
+        if (port in names) != (stbd in names):
+            # one rudder: the side says where positive angles turn it
+            sided_channel = port if port in names else stbd
+            rudder, column = sided_channel.rpartition("_")[0], names.pop(sided_channel)
+            if names.setdefault(rudder, column) != column:
+                draft_notes.add_note(
+                    CHANNELS_KEY, f"'{column}' may be {rudder} as well as '{names[rudder]}' is"
+                )
+    has_heading = (
+        has_heading
+        or "psi" in names
+        or any("course" in parsed.concepts for parsed in parsed_names.values())
+    )
+    if "u" not in names and speeds and ("v" in names or not (has_position and has_heading)):
+        names["u"] = speeds[0]
+        draft_notes.add_guess(
+            (*CHANNELS_KEY, "u"), f"'{speeds[0]}' is taken as the speed forward, not its size"
+        )
+    ordered_channels = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]
+    return {name: names[name] for name in ordered_channels if name in names}
+
+
+def _add_sin_cos_channels(
+    names: dict[str, str], sin_cos_pairs: Mapping[str, tuple[str, str]]
+) -> dict[str, str]:
+    """Return channel -> column with angles that are told by a cosine and a sine.
+
+    A direction of nothing known is that of the wind, where its speed stands alone.
+    """
+    known_channels = {*names}
+    for stem, cos_sin in sin_cos_pairs.items():
+        parsed_name = parse_name(stem)
+        channel = match_state_channel(parsed_name)
+        if channel is None and known_channels & {"wind_speed", "wind_dir"} == {"wind_speed"}:
+            channel = "wind_dir"
+        channel = channel or match_input_channel(parsed_name)
+        if channel and CHANNEL_UNITS.get(channel, "rad") == "rad" and channel not in known_channels:
+            known_channels.add(channel)
+            names = {
+                **names,
+                channel + COSINE_SUFFIX: cos_sin[0],
+                channel + SINE_SUFFIX: cos_sin[1],
+            }
+    return names
+
+
+def _rename_pulsed_drives(
+    names: Mapping[str, str], sheets: Sequence[TablePreview]
+) -> dict[str, str]:
+    """Return channel -> column, where pulses to a motor are its throttle, and no revolutions.
+
+    Pulses are whole microseconds between 900 and 2,100, and a share of a motor's or thruster's all
+    is one at most; revolutions say in their name what they are, or are zero at rest.
+    """
+    renamed = {}
+    for channel, column in names.items():
+        values = np.concatenate(
+            [preview.numeric_columns.get(column, np.zeros(0)) for preview in sheets]
+        )
+        values = values[np.isfinite(values)]
+        if _DRIVE_PATTERN.match(channel) and values.size and not _REVOLUTION_PATTERN.search(column):
+            are_integers = bool((values == np.round(values)).all())
+            are_pulses = (
+                are_integers and values.min() >= _PULSE_RANGE[0] and values.max() <= _PULSE_RANGE[1]
+            )
+            parsed_name = parse_name(column)
+            is_share = "thrust" in channel or parsed_name.has_all("engine")
+            is_share &= (
+                parsed_name.has_none("revolutions", "propeller", "speed") and not are_integers
+            )
+            throttle = _DRIVE_PATTERN.sub("throttle", channel)
+            if throttle not in names and (are_pulses or (is_share and np.abs(values).max() <= 1.0)):
+                channel = throttle
+        renamed[channel] = column
+    return renamed
+
+
+def _build_raw_tables(
+    sheets: Sequence[TablePreview], names: Mapping[str, str], errors: dict[Path, ResidnetError]
+) -> list[RawTable]:
+    logs = []
+    for preview in sheets:
+        try:
+            clock = detect_clock(preview)
+        except DataError as error:
+            errors[preview.path] = error
+            continue
+        columns = {
+            channel: preview.numeric_columns[column]
+            for channel, column in names.items()
+            if column in preview.numeric_columns
+        }
+        # the newest first
+        direction = -1 if (np.diff(clock.seconds[np.isfinite(clock.seconds)]) < 0.0).all() else 1
+        columns = {channel: values[::direction] for channel, values in columns.items()}
+        t = clock.seconds[::direction]
+        is_unique = find_unique_rows(t, columns.values()) if columns else t == t
+        logs.append(
+            RawTable(t[is_unique], {name: values[is_unique] for name, values in columns.items()})
+        )
+    return logs
+
+
+def _is_recorded_on_change(channel: str, logs: Sequence[RawTable]) -> bool:
+    """Return whether a channel that drives the vessel has values at fewer than half of the samples,
+    and no interval between them that is usual.
+    """
+    if channel in (*STATE_NAMES, *QUATERNION, *_MAX_ANGLE):
+        return False
+    filled_rows = [
+        np.flatnonzero(np.isfinite(table.columns[channel]))
+        for table in logs
+        if channel in table.columns
+    ]
+    samples = sum(table.t.size for table in logs if channel in table.columns)
+    intervals = (
+        np.concatenate([np.diff(rows) for rows in filled_rows]) if filled_rows else np.zeros(0)
+    )
+    if not intervals.size or 2 * sum(rows.size for rows in filled_rows) >= samples:
+        return False
+    is_regular = np.abs(intervals - np.median(intervals)) <= INTERVAL_TOLERANCE * np.median(
+        intervals
+    )
+    return bool(is_regular.mean() < MIN_REGULAR_SHARE)
+
+
+def _note_unused_columns(
+    preview: TablePreview, names: Mapping[str, str], clock: TableClock, draft_notes: DraftNotes
+) -> None:
+    used_columns = {*names.values(), *clock.columns}
+    unused_columns = [name for name in preview.numeric_columns if name not in used_columns]
+    if unused_columns:
+        draft_notes.add_note(
+            CHANNELS_KEY, f"columns that no channel takes: {', '.join(unused_columns[:20])}"
+        )
+    texts = [
+        f"{name} ('{truncate(str(cells.dropna().iloc[0]), 20)}')"
+        for name, cells in preview.text_columns.items()
+        if name not in used_columns
+    ]
+    if texts:
+        draft_notes.add_note(CHANNELS_KEY, f"columns of text: {', '.join(texts[:12])}")
+    if preview.empty_columns:
+        draft_notes.add_note(
+            CHANNELS_KEY, f"empty columns: {', '.join(preview.empty_columns[:12])}"
+        )
+    if preview.other_sheets:
+        text = f"sheets that are not read: {', '.join(preview.other_sheets)}; write what belongs together"
+        draft_notes.add_note(CHANNELS_KEY, f"{text} into one sheet, or each into a file of its own")
+
+
+@dataclass(frozen=True)
+class TablePreview:
+    """The first rows of one table.
+
+    Attributes:
+        path: of the file.
+        reader_settings: settings of its reader beside time and channels: kind, delimiter, decimal.
+        column_names: names of all columns.
+        numeric_columns: values [T] of the columns that hold numbers.
+        text_columns: columns that hold text, dates among them.
+        empty_columns: columns that hold nothing.
+        original_names: what the file calls a column, where its name here has a unit that stands below.
+        other_sheets: sheets beside it that hold numbers too.
+    """
+
+    path: Path
+    reader_settings: dict[str, Any]
+    column_names: tuple[str, ...]
+    numeric_columns: dict[str, np.ndarray]
+    text_columns: dict[str, pd.Series]
+    empty_columns: tuple[str, ...]
+    original_names: dict[str, str]
+    other_sheets: tuple[str, ...] = ()
+
+    def original_name(self, name: str) -> str:
+        """Return what the file calls a column."""
+        return self.original_names.get(name, name)
+
+
+def preview_table(path: Path, rows: int = 20_000) -> TablePreview:
+    """Return the first rows of a table, 20,000 where `unit_rows` does not say otherwise."""
+    import pandas as pd
+
+    require_file(path)
+    table_kind = TABLE_KINDS.get(path.suffix.lower(), "csv")
+    if table_kind in _HEAD_READERS:
+        table, reader_settings = _HEAD_READERS[table_kind](path, rows), {"kind": table_kind}
+    else:
+        table, reader_settings = (
+            _preview_excel(path, rows) if table_kind == "excel" else read_table_head(path, rows)
+        )
+    columns, other_sheets = _append_units(table), table.attrs.get("others", ())
+    # pandas copies all that is told of a table for each of its columns
+    table.columns, table.attrs = pd.Index(list(columns)), {}
+    if table.empty:
+        raise DataError(f"{path}: holds a header and no rows; leave it out")
+    numeric_columns: dict[str, np.ndarray] = {}
+    text_columns: dict[str, pd.Series] = {}
+    empty_columns = []
+    for name, (_, column) in zip(columns, table.items(), strict=True):
+        is_empty = column.isna().to_numpy()
+        if is_empty.all():
+            empty_columns.append(name)
+            continue
+        values = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
+        has_text = np.isnan(values).sum() > is_empty.sum()
+        values = mask_fill_values(values)
+        if has_text or column.dtype == bool or pd.api.types.is_datetime64_any_dtype(column):
+            text_columns[name] = column
+        else:
+            numeric_columns[name] = values
+    renamed = {name: column for name, column in columns.items() if name != column}
+    return TablePreview(
+        path,
+        reader_settings,
+        tuple(table.columns),
+        numeric_columns,
+        text_columns,
+        tuple(empty_columns),
+        renamed,
+        other_sheets,
+    )
+
+
+def _append_units(table: pd.DataFrame) -> dict[str, str]:
+    """Return the names of columns with the units beneath them or in cells -> their names alone."""
+    cell_units = table.attrs.get("units", ())
+    names = [str(name).strip() for name in table.columns]
+    unit_rows = [[_parse_unit_cell(cell) for cell in row] for row in table.attrs.get("between", [])]
+    units = max(unit_rows, key=lambda row: sum(map(bool, row)), default=[])
+    units = units if 2 * sum(map(bool, units)) >= len([name for name in names if name]) else []
+    units = cell_units if any(cell_units) else units
+    original_names = {}
+    for name, unit_below in zip(names, [*units, *[""] * len(names)], strict=False):
+        # physicists write a quantity by its unit, `u / m/s`
+        match = _NAME_OVER_UNIT.fullmatch(name)
+        bare_name, unit = (
+            (match["name"], _parse_unit_cell(match["unit"])) if match else (name, unit_below)
+        )
+        original_names[
+            f"{bare_name} [{unit}]" if unit and not _OPENING_BRACKET.search(name) else name
+        ] = name
+    return original_names
+
+
+def _parse_unit_cell(cell: str) -> str:
+    """Return the unit that a cell beneath a name holds; empty where it holds none."""
+    unit = cell.strip(" []()")
+    return unit if is_unit(unit) else ""
+
+
+def _preview_excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """Return the first sheet with two columns of numbers, else the first, and its settings."""
+    names = list_sheet_names(path)
+    tables = {name: read_excel_sheet(path, name, rows) for name in names}
+    numeric_sheets = [
+        n for n, table in tables.items() if len(table.select_dtypes("number").columns) > 1
+    ]
+    name = next(iter([*numeric_sheets, *names]))
+    table = tables[name]
+    table.attrs["others"] = tuple(numeric_sheets[1:])
+    return table, {"kind": "excel", **({"sheet": name} if name != names[0] else {})}
+
+
+@dataclass(frozen=True)
+class TableClock:
+    """The time of a table.
+
+    Attributes:
+        settings: `time` of a table's reader.
+        seconds: times [T] of the first rows.
+        guess: what is not sure about it; empty where all is.
+        columns: that it takes.
+    """
+
+    settings: dict[str, Any]
+    seconds: np.ndarray
+    guess: str
+    columns: tuple[str, ...]
+
+
+def detect_clock(preview: TablePreview) -> TableClock:
+    """Return the time of a table."""
+    time_columns = [name for name in preview.column_names if parse_name(name).has_all("time")]
+    part_columns = [
+        name for name in preview.numeric_columns if normalize_name(name) in _PARTS_OF_TIME
+    ]
+    has_time_text = any(
+        preview.text_columns[name].astype("string").str.contains(":").any()
+        for name in preview.text_columns
+    )
+    if len(part_columns) > 1 and not has_time_text:
+        raise DataError(
+            f"{preview.path}: its time stands in parts ({', '.join(part_columns)}); write it as one column,"
+            " such as 2025-06-17 08:30:00.25"
+        )
+    date_columns = {
+        name: cells for name, cells in preview.text_columns.items() if is_date_column(cells)
+    }
+    if date_columns:
+        return _detect_date_clock(preview, date_columns)
+
+    def is_increasing(name: str) -> bool:
+        values = preview.numeric_columns[name]
+        finite_values = values[np.isfinite(values)]
+        # pandas writes the number of each row under no name, or the time
+        return (
+            values.size > 1
+            and bool((np.diff(repair_clock(finite_values, [finite_values], 1.0)[0]) > 0.0).all())
+            and not (name.startswith("Unnamed: ") and bool((np.diff(values) == 1.0).all()))
+        )
+
+    numeric_time_columns = [name for name in time_columns if name in preview.numeric_columns]
+    # one that is called time and does not increase is refused where it is read; a counter is none
+    increasing_columns = [
+        name
+        for name in (preview.numeric_columns if not numeric_time_columns else ())
+        if parse_name(name).has_none("index")
+        and match_state_channel(parse_name(name)) is None
+        and is_increasing(name)
+    ]
+    increasing_columns.sort(key=lambda name: _relative_step_spread(preview.numeric_columns[name]))
+    clock_column = next(
+        filter(is_increasing, numeric_time_columns),
+        next(iter([*numeric_time_columns, *increasing_columns]), None),
+    )
+    if clock_column is None:
+        if not time_columns:
+            raise DataError(
+                f"{preview.path}: no column is called time or increases as time does; name it in a"
+                " channel map (--config)"
+            )
+        cells = [
+            str(cell) for cell in preview.text_columns.get(time_columns[0], ()) if cell == cell
+        ]
+        unparsed_cells = [cell for cell in cells if not re.fullmatch(r"[-\d.,]+", cell)]
+        advice = "write it as numbers, or such as 2025-06-17 08:30:00.25"
+        advice = (
+            advice
+            if 2 * len(unparsed_cells) >= len(cells)
+            else "delete such lines, which are no rows"
+        )
+        example = f", such as '{truncate(unparsed_cells[-1])}'" if unparsed_cells else ""
+        raise DataError(
+            f"{preview.path}: column '{time_columns[0]}' holds no times that can be read{example}; {advice}"
+        )
+    values = preview.numeric_columns[clock_column]
+    unit = parse_header_unit(clock_column, "s")
+    guess = ""
+    if unit is None:
+        unit, guess = _guess_time_unit(values)
+    if clock_column not in time_columns:
+        guess = f"no column is called time; this one increases as time does. {guess}".strip()
+    seconds = _repair_preview_clock(preview, values * to_si(unit), to_si(unit))
+    return TableClock({"column": clock_column, "unit": unit}, seconds, guess, (clock_column,))
+
+
+def _relative_step_spread(values: np.ndarray) -> float:
+    """Return the spread of steps, as a share of the usual one and without the last digit."""
+    time_steps = np.diff(values[np.isfinite(values)])
+    return round(float(np.std(time_steps) / np.median(time_steps)), 2)
+
+
+def _repair_preview_clock(
+    preview: TablePreview, t: np.ndarray, clock_resolution: float | None = None
+) -> np.ndarray:
+    """Return the times of a sheet as its reader will mend them."""
+    is_finite = np.isfinite(t)
+    if is_finite.sum() > 1 and preview.numeric_columns:
+        t = t.copy()
+        columns = (values[is_finite] for values in preview.numeric_columns.values())
+        t[is_finite] = repair_clock(t[is_finite], columns, clock_resolution)[0]
+    return t
+
+
+def _detect_date_clock(preview: TablePreview, date_columns: dict[str, pd.Series]) -> TableClock:
+    """Return the time from one column of dates with times, or from two."""
+
+    def all_match(name: str, pattern: str) -> bool:
+        return bool(date_columns[name].dropna().astype("string").str.contains(pattern).all())
+
+    time_columns = [
+        name
+        for name in date_columns
+        if all_match(name, rf":|時|\s\d\d?\.\d\d\.\d\d|{_DOTTED_TIME_PATTERN}")
+    ]
+    date_only_columns = [name for name in date_columns if name not in time_columns]
+    if not time_columns:
+        raise DataError(
+            f"{preview.path}: column '{date_only_columns[0]}' holds dates without a time of day"
+        )
+    complete_columns = [
+        name
+        for name in time_columns
+        if all_match(name, _DATE_PATTERN) and not all_match(name, _DOTTED_TIME_PATTERN)
+    ]
+    column = (complete_columns or time_columns)[0]
+    settings: dict[str, Any] = {"column": column, "unit": "date"}
+    texts, guess = date_columns[column], ""
+    if not complete_columns and date_only_columns:
+        settings["date"] = date_only_columns[0]
+        texts = date_columns[date_only_columns[0]].astype("string") + " " + texts.astype("string")
+    order = detect_date_order(texts)
+    if order is None and (complete_columns or date_only_columns):
+        order = "dmy"
+        guess = "day and month of the dates can be told apart nowhere in the first rows"
+    settings |= {"order": order} if order in ("dmy", "mdy") else {}
+    stamps = parse_texts(texts, has_only_dates=True)
+    seconds = _repair_preview_clock(preview, stamps.seconds_since(int(stamps.ns[0])))
+    return TableClock(
+        settings, seconds, guess, (column, *date_only_columns[: not complete_columns])
+    )
+
+
+def _guess_time_unit(values: np.ndarray) -> tuple[str, str]:
+    """Return the unit of times without one, and why it is a guess."""
+    finite_values = values[np.isfinite(values)]
+    step, median_size = (
+        float(np.median(np.diff(finite_values))),
+        float(np.median(np.abs(finite_values))),
+    )
+    if unix_unit_found := detect_unix_unit(finite_values):
+        return unix_unit_found, f"times of this size are Unix time in {unix_unit_found}"
+    if step < 1e-3 and (2e4 < median_size < 7e4 or 6.5e5 < median_size < 8e5):
+        return "day", "times of this size are days as Excel and MATLAB count them"
+    unit = infer_time_unit(step)
+    return unit, f"the header has no unit; steps of {step:g} would be {unit}"
+
+
+def convert_positions_to_degrees(
+    preview: TablePreview, draft_notes: DraftNotes
+) -> tuple[TablePreview, ColumnSettings]:
+    """Return a sheet with its positions as numbers of degrees, and how their columns are read.
+
+    Columns that hold nothing that can be read so stay what they are.
+    """
+    import pandas as pd
+
+    columns: dict[str, str] = {}
+    for column in preview.column_names:
+        channel = match_state_channel(parse_name(column))
+        if channel in _MAX_ANGLE and column not in preview.empty_columns:
+            columns.setdefault(channel, column)
+    if len(columns) < 2:
+        return preview, {}
+    cells = {
+        name: pd.Series(preview.numeric_columns[column])
+        if column in preview.numeric_columns
+        else preview.text_columns[column]
+        for name, column in columns.items()
+    }
+    hemisphere_columns = {name: _find_hemisphere_column(preview, name) for name in columns}
+    letter_o, reason = _guess_letter_o(
+        preview, hemisphere_columns["longitude"] or columns["longitude"]
+    )
+    for form in _ANGLE_FORMS:
+        try:
+            degrees = {name: parse_degrees(cells[name], name, form, letter_o) for name in columns}
+        except DataError:
+            continue
+        max_angles = {name: np.abs(v[np.isfinite(v)]).max(initial=0) for name, v in degrees.items()}
+        if all(max_angles[name] <= _MAX_ANGLE[name] for name in columns):
+            break
+    else:
+        return preview, {}
+    settings: dict[str, dict[str, Any]] = {column: {} for column in columns.values()}
+    if form == "ddmm":
+        for entry in settings.values():
+            entry["form"] = form
+        text = "numbers beyond 90 are taken as degrees and minutes in one, 5954.321 for 59° 54.321'"
+        draft_notes.add_guess((*CHANNELS_KEY, "latitude"), text)
+    for name, hemisphere_column in hemisphere_columns.items():
+        if hemisphere_column is not None:
+            settings[columns[name]]["hemisphere"] = preview.original_name(hemisphere_column)
+            degrees[name] = degrees[name] * hemisphere_signs(
+                preview.text_columns[hemisphere_column], name, letter_o
+            )
+    if letter_o is not None:
+        settings[columns["longitude"]]["letter_o"] = letter_o
+        draft_notes.add_guess((*CHANNELS_KEY, "longitude"), reason)
+    converted = {
+        **preview.numeric_columns,
+        **{columns[name]: values for name, values in degrees.items()},
+    }
+    used_columns = {*columns.values(), *hemisphere_columns.values()}
+    return (
+        dataclasses.replace(
+            preview,
+            numeric_columns={
+                name: converted[name] for name in preview.column_names if name in converted
+            },
+            text_columns={
+                name: cells
+                for name, cells in preview.text_columns.items()
+                if name not in used_columns
+            },
+        ),
+        settings,
+    )
+
+
+def _guess_letter_o(preview: TablePreview, column: str) -> tuple[LetterO | None, str]:
+    """Return what O means as a hemisphere, and why; None where no longitude has it.
+
+    Beside W it is the east, and beside E the west. Alone it is as the names of columns have it:
+    the east in German and Dutch, the west in Spanish, French, Italian and Portuguese.
+    """
+    cells = preview.text_columns.get(column)
+    if cells is None:
+        return None, ""
+    first_and_last_letters = (
+        cells.dropna().astype("string").str.upper().str.extract(r"^\s*([EOW])?.*?([EOW])?\s*$")
+    )
+    letters = {
+        str(letter)
+        for position in first_and_last_letters
+        for letter in first_and_last_letters[position].dropna().unique()
+    }
+    if "O" not in letters:
+        return None, ""
+    if len(letters) > 1:
+        return ("east" if "W" in letters else "west"), f"O stands beside {min(letters - {'O'})}"
+    is_germanic = any(
+        _GERMANIC_PATTERN.search(normalize_name(name)) for name in preview.column_names
+    )
+    meaning: LetterO = "east" if is_germanic else "west"
+    return meaning, f"the letter O is taken as {meaning}, by the language of the columns' names"
+
+
+def _find_hemisphere_column(preview: TablePreview, name: str) -> str | None:
+    """Return the column that holds the letters of a channel's hemispheres; None for none."""
+    for column, cells in preview.text_columns.items():
+        letters = set(cells.dropna().astype("string").str.strip().str.upper()) - {""}
+        if letters and letters <= _HEMISPHERES[name]:
+            return column
+    return None

@@ -1,0 +1,38 @@
+"""Readers of logs: one row per format."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+
+from residnet.core.registry import PluginUnion
+
+if TYPE_CHECKING:
+    from residnet.io.readers.base import CanonicalConfig, ReaderKind
+
+    ReaderConfig: TypeAlias = ReaderKind | CanonicalConfig
+else:
+    ReaderConfig = Annotated[
+        Any,
+        PluginUnion(
+            "residnet.readers",
+            "residnet.io.readers.base:ReaderKind",
+            {
+                "csv": "residnet.io.readers.tables:CsvConfig",
+                "parquet": "residnet.io.readers.tables:ParquetConfig",
+                "excel": "residnet.io.readers.tables:ExcelConfig",
+                "json_lines": "residnet.io.readers.tables:JsonLinesConfig",
+                "joined": "residnet.io.readers.joined:JoinedConfig",
+                "canonical": "residnet.io.readers.base:CanonicalConfig",
+                "csv_topics": "residnet.io.readers.formats.topic_folder:TopicFolderConfig",
+                "rosbag": "residnet.io.readers.formats.rosbag:RosbagConfig",
+                "mat": "residnet.io.readers.formats.trees:MatConfig",
+                "hdf5": "residnet.io.readers.formats.trees:Hdf5Config",
+                "nmea": "residnet.io.readers.formats.nmea:NmeaConfig",
+                "moos": "residnet.io.readers.formats.moos:MoosConfig",
+                "ulog": "residnet.io.readers.formats.ulog:UlogConfig",
+                "ardupilot": "residnet.io.readers.formats.ardupilot:ArduPilotConfig",
+                "auto": "residnet.io.readers.detect:AutoConfig",
+            },
+        ),
+    ]
+"""Config of any reader, those of other packages included; its `kind` says which."""

@@ -1,0 +1,81 @@
+"""Mission logs of MOOS-IvP (alog): time, variable, source and value on each line."""
+
+from __future__ import annotations
+
+import re
+from array import array
+from collections import defaultdict
+from pathlib import Path
+from typing import ClassVar, Literal, final
+
+import numpy as np
+
+from residnet.core.errors import DataError
+from residnet.io.readers.base import REPORT_INTERVAL, reading_progress, require_file
+from residnet.io.readers.compose import RecordingConfig
+from residnet.io.readers.recording import ALL_FIELDS, FieldFilter, Recording, Series
+
+_VALUE_LINE = re.compile(
+    rb"^\s*(?P<time>[-+\d.eE]+)\s+(?P<name>\S+)\s+(?P<source>\S+)\s+(?P<value>\S+)"
+)
+_START_LINE = re.compile(rb"^%%\s*LOGSTART\s+(?P<start>\d+(?:\.\d+)?)")
+
+
+@final
+class MoosConfig(RecordingConfig):
+    """An alog file, as pLogger of MOOS-IvP writes it.
+
+    A series is named by its source (`uNav`) and holds the variables that it publishes together;
+    one that comes at times of its own is a series by its own name. NAV_X is east, NAV_Y north, and
+    NAV_HEADING in deg clockwise from north. Variables of text are left out.
+    """
+
+    kind: Literal["moos"] = "moos"
+    endings: ClassVar = (".alog",)
+    formats: ClassVar = {
+        "MOOS alog": lambda path, head: path.suffix.lower() == ".alog" or b"%% LOGSTART" in head
+    }
+
+    def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
+        """Read the variables that hold numbers."""
+        require_file(path)
+        times: dict[tuple[str, str], array[float]] = defaultdict(lambda: array("d"))
+        values: dict[tuple[str, str], array[float]] = defaultdict(lambda: array("d"))
+        epoch, bytes_read, size = None, 0, path.stat().st_size
+        with path.open("rb") as stream, reading_progress(path.name, size, size) as advance:
+            for count, line in enumerate(stream):
+                bytes_read += len(line)
+                if count % REPORT_INTERVAL == 0:
+                    advance(min(bytes_read, size))
+                if start_match := _START_LINE.match(line):
+                    epoch = round(float(start_match["start"]) * 1e9)
+                match = None if line.startswith(b"%") else _VALUE_LINE.match(line)
+                if match is None:
+                    continue
+                try:
+                    time, value = float(match["time"]), float(match["value"])
+                except ValueError:
+                    continue
+                source_and_name = (
+                    match["source"].decode(errors="replace"),
+                    match["name"].decode("latin-1"),
+                )
+                times[source_and_name].append(time)
+                values[source_and_name].append(value)
+        if not times:
+            raise DataError(f"{path}: holds no line of time, variable, source and a number")
+        series: dict[str, Series] = {}
+        for (source, name), clock in times.items():
+            stamp, samples = np.array(clock), np.array(values[source, name])
+            same_source = series.get(source)
+            if same_source is None or np.array_equal(same_source.clock, stamp):
+                fields = {**(same_source.fields if same_source else {}), name: samples}
+                series[source] = Series(source, "moos/Variables", fields, stamp)
+            else:
+                series[name] = Series(name, "moos/Variables", {name: samples}, stamp)
+        selected = {
+            name: source_series for name, source_series in series.items() if field_filter(name)
+        }
+        return Recording(
+            path, selected, epoch, (path,), unread_series=tuple(set(series) - set(selected))
+        )

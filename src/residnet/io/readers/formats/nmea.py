@@ -1,0 +1,270 @@
+"""NMEA 0183 sentences in text files, through the package pynmea2."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from array import array
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, ClassVar, Literal, final
+
+import numpy as np
+
+from residnet.core.errors import DataError
+from residnet.core.log import Remark, make_remark
+from residnet.core.stretches import find_run_bounds
+from residnet.io.readers.base import (
+    REPORT_INTERVAL,
+    optional_import,
+    reading_progress,
+    require_file,
+)
+from residnet.io.readers.compose import RecordingConfig
+from residnet.io.readers.recording import (
+    ALL_FIELDS,
+    FieldFilter,
+    MessageBuffer,
+    RawSeries,
+    Recording,
+    TimeStamps,
+    build_recording,
+)
+from residnet.io.readers.texts import detect_encoding_of_head, open_as_utf8
+from residnet.io.readers.written import parse_texts
+
+_SENTENCE = re.compile(rb"^(?P<before>[^$!]*)(?P<sentence>[$!][A-Z]{2}[A-Z0-9]{2,4},[\x20-\x7e]*)")
+# a sentence, to its checksum where it has one, at the start of a line or behind a time
+_SENTENCE_LINE = re.compile(rb"(?m)^[^$!\n]{0,40}[$!][A-Z]{2}[A-Z]{3},[\x20-\x7e]*\s*$")
+# a date with a time, a time of day or Unix time, among what else a recorder writes
+_TIME_PREFIX = re.compile(
+    r"\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[T ,_]+\d{1,2}:\d\d[\d:.,]*(?:Z|[-+]\d\d:?\d\d)?"
+    r"|\d{1,2}:\d\d:\d\d[\d.,]*|\d{9,}(?:\.\d+)?"
+)
+_UNIT_FACTORS = {"rate_of_turn": 1.0 / 60.0}
+_DAY_NS = 86_400 * 10**9
+_HEAD_BYTES = 1024
+"""Bytes that tell the encoding: a dozen sentences."""
+
+
+def _contains_sentence(path: Path, head: bytes) -> bool:
+    text = head.decode(detect_encoding_of_head(head), errors="replace").encode("utf-8")
+    return _SENTENCE_LINE.search(text) is not None
+
+
+@final
+class NmeaConfig(RecordingConfig):
+    """NMEA 0183 text, one sentence per line, with or without a time in front of it.
+
+    A series is named by its sentence (`RMC`, `HDT`).
+
+    Fields bear the names of pynmea2; `latitude` and `longitude` are in signed degrees,
+    `rate_of_turn` is in deg/s (the sentence has deg/min).
+    """
+
+    kind: Literal["nmea"] = "nmea"
+    endings: ClassVar = (".nmea", ".log")
+    formats: ClassVar = {"NMEA 0183": _contains_sentence}
+
+    def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
+        """Read the wanted sentences of a text file.
+
+        Sentences with a time of day are dated by the last RMC or ZDA; those without a time lie
+        between the ones around them in the order of the lines, unless every line begins with a time
+        of its own.
+        """
+        require_file(path)
+        with optional_import("nmea", "pynmea2", "a file of NMEA 0183 sentences"):
+            import pynmea2
+        collector = _SentenceCollector()
+        size, bytes_read, n_invalid = path.stat().st_size, 0, 0
+        # a shell of Windows may have written them as UTF-16
+        with path.open("rb") as stream:
+            encoding = detect_encoding_of_head(stream.read(_HEAD_BYTES))
+        with (
+            open_as_utf8(path, encoding) as file,
+            file.open("rb") as stream,
+            reading_progress(path.name, size, size) as advance,
+        ):
+            for count, line in enumerate(stream):
+                bytes_read += len(line)
+                if count % REPORT_INTERVAL == 0:
+                    advance(min(bytes_read, size))
+                match = _SENTENCE.match(line)
+                if match is None:
+                    n_invalid += bool(line.strip())
+                    continue
+                prefix = match["before"].decode("ascii", errors="replace").strip(" ,;\t[]")
+                stamp = _TIME_PREFIX.search(prefix)
+                prefix = stamp[0].rstrip(".,:") if stamp else prefix
+                try:
+                    message = pynmea2.parse(match["sentence"].decode("ascii").strip())
+                    collector.add_sentence(message, prefix, field_filter)
+                except (pynmea2.ParseError, ValueError):
+                    n_invalid += 1
+        if not collector.buffers:
+            raise DataError(
+                f"{path}: holds no NMEA 0183 sentence ({n_invalid} lines are none, or fail their"
+                " checksum)"
+            )
+        return collector.to_recording(path, n_invalid)
+
+
+@final
+class _SentenceBuffer:
+    """The sentences of one kind: their numbers and times.
+
+    A time is the sentence's own or -1; beside it stands how many timed sentences went before.
+    """
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self.buffer, self.preceding_tick = MessageBuffer(names), array("q")
+        self.prefixes: list[str] = []
+
+
+@final
+class _SentenceCollector:
+    """All sentences of a file, and its clock: the times that sentences tell."""
+
+    def __init__(self) -> None:
+        self.buffers: dict[str, _SentenceBuffer] = {}
+        self._ticks = array("q")
+        self._day_ns: int | None = None
+        self._has_date = False
+
+    def add_sentence(self, message: Any, prefix: str, field_filter: FieldFilter) -> None:
+        """Take one more sentence with the text before it."""
+        time_ns = self._parse_time(message)
+        # positions in signed degrees, NaN where the receiver says that there is no fix
+        values: dict[str, float] = {}
+        names = [str(entry[1]) for entry in message.fields]
+        for name, cell in zip(names, message.data, strict=False):
+            if name in ("timestamp", "datestamp", "lat", "lon"):
+                continue
+            try:
+                values[name] = float(cell) * _UNIT_FACTORS.get(name, 1.0)
+            except ValueError:
+                if not cell:
+                    values[name] = float("nan")
+        if {"lat", "lon"} <= set(names):
+            has_fix = bool(message.lat and message.lon) and getattr(message, "status", "A") != "V"
+            has_fix = has_fix and str(getattr(message, "gps_qual", "1")) != "0"
+            position = (
+                (message.latitude, message.longitude) if has_fix else (float("nan"), float("nan"))
+            )
+            values["latitude"], values["longitude"] = position
+        name = str(message.sentence_type)
+        if not field_filter(name) or not values:
+            return
+        buffer = self.buffers.setdefault(name, _SentenceBuffer(values))
+        field_values = [values.get(field, np.nan) for field in buffer.buffer.names]
+        buffer.buffer.add(-1 if time_ns is None else time_ns, field_values)
+        buffer.preceding_tick.append(len(self._ticks) - 1)
+        buffer.prefixes.append(prefix)
+
+    def _parse_time(self, message: Any) -> int | None:
+        """Return the time of a sentence in ns (Unix time once a date is known), else None."""
+        try:
+            time_of_day, date = message.timestamp, _sentence_date(message)
+        except (AttributeError, ValueError, TypeError):
+            return None
+        if not isinstance(time_of_day, datetime.time):
+            return None
+        seconds = (time_of_day.hour * 60 + time_of_day.minute) * 60 + time_of_day.second
+        ns = seconds * 10**9 + time_of_day.microsecond * 1000
+        if date is not None:
+            self._day_ns, self._has_date = (date - datetime.date(1970, 1, 1)).days * _DAY_NS, True
+        day = self._day_ns or 0
+        if self._ticks and date is None and day + ns < self._ticks[-1] - _DAY_NS // 2:
+            # past midnight, and the date has not come yet
+            day = self._day_ns = day + _DAY_NS
+        if not self._ticks or day + ns != self._ticks[-1]:
+            self._ticks.append(day + ns)
+        return day + ns
+
+    def to_recording(self, path: Path, n_invalid: int) -> Recording:
+        """Return the recording of what was added."""
+        ticks = np.frombuffer(self._ticks, dtype=np.int64)
+        has_prefix_times = all(all(buffer.prefixes) for buffer in self.buffers.values())
+        if not ticks.size and not has_prefix_times:
+            raise DataError(
+                f"{path}: no sentence tells the time (RMC, GGA, ZDA, ...), and the lines do not"
+                " begin with one"
+            )
+        remarks: list[Remark] = []
+        if n_invalid:
+            text = f"{n_invalid} lines are no NMEA sentence or fail their checksum; left out"
+            remarks.append(make_remark("note", "bad_lines", text, lines=n_invalid))
+        arrivals = {
+            name: parse_texts(np.array(buffer.prefixes, dtype=object))
+            for name, buffer in self.buffers.items()
+            if has_prefix_times
+        }
+        prefix_starts, day_offset = (
+            [int(buffer.ns.min()) for buffer in arrivals.values() if buffer.is_absolute],
+            0,
+        )
+        if ticks.size and not self._has_date:
+            if prefix_starts:
+                # the times before the lines tell the day that the sentences do not
+                day_offset = round((min(prefix_starts) - int(ticks[0])) / _DAY_NS) * _DAY_NS
+            else:
+                text = "no sentence tells the date; time counts from midnight"
+                remarks.append(make_remark("note", "undated", text))
+        topics = {}
+        for name, buffer in sorted(self.buffers.items()):
+            times, time_remarks = buffer.buffer.times, tuple[Remark, ...]()
+            is_timed = bool((times >= 0).all())
+            if not is_timed and not has_prefix_times:
+                times = _interpolate_times(
+                    np.frombuffer(buffer.preceding_tick, dtype=np.int64), ticks
+                )
+                text = (
+                    f"topic {name}: its sentences tell no time; they are spread between the timed"
+                    " ones before and after"
+                )
+                time_remarks = (make_remark("note", "estimated_times", text, rows=times.size),)
+            stamp = (
+                TimeStamps(times + day_offset, self._has_date or bool(prefix_starts))
+                if is_timed or not has_prefix_times
+                else None
+            )
+            fields = buffer.buffer.fields
+            sender = _engine_numbers(fields)
+            topics[name] = RawSeries(
+                f"nmea/{name}", fields, stamp, arrivals.get(name), sender, time_remarks
+            )
+        return build_recording(path, topics, (path,), remarks)
+
+
+def _engine_numbers(fields: dict[str, np.ndarray]) -> np.ndarray | None:
+    """Return the number of the engine that each row [T] is about; None where there is none."""
+    number = fields.get("engine_no")
+    if number is None or not np.isfinite(number).all():
+        return None
+    return np.array([f"{value:g}" for value in number.tolist()], dtype=object)
+
+
+def _interpolate_times(tick_index: np.ndarray, ticks: np.ndarray) -> np.ndarray:
+    """Return the times [T] of sentences without a time, evenly between the timed ones.
+
+    `tick_index` says after which timed sentence each came.
+    """
+    tick_index = np.clip(tick_index, 0, ticks.size - 1)
+    order_in_group = np.arange(tick_index.size) - find_run_bounds(tick_index)[0]
+    _, group, count = np.unique(tick_index, return_inverse=True, return_counts=True)
+    median_tick = np.median(np.diff(ticks)) if ticks.size > 1 else 10**9
+    interval = np.append(np.diff(ticks), median_tick)[tick_index]
+    times: np.ndarray = ticks[tick_index] + np.rint(
+        interval * order_in_group / count[group]
+    ).astype(np.int64)
+    return times
+
+
+def _sentence_date(message: Any) -> datetime.date | None:
+    if message.sentence_type == "RMC":
+        day = message.datestamp
+        return day if isinstance(day, datetime.date) else None
+    if message.sentence_type == "ZDA":
+        return datetime.date(int(message.year), int(message.month), int(message.day))
+    return None

@@ -1,0 +1,110 @@
+"""PX4 flight logs (ULog), through the package pyulog."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from pathlib import Path
+from typing import ClassVar, Literal, final
+
+import numpy as np
+
+from residnet.core.errors import UsageError
+from residnet.core.log import Remark, make_remark
+from residnet.io.readers.base import optional_import, require_file, wrap_read_errors
+from residnet.io.readers.compose import RecordingConfig
+from residnet.io.readers.recording import (
+    ALL_FIELDS,
+    FieldFilter,
+    RawSeries,
+    Recording,
+    TimeStamps,
+    build_recording,
+)
+
+
+@final
+class UlogConfig(RecordingConfig):
+    """A PX4 ULog file.
+
+    A series is named by its message (`vehicle_local_position`, the second instance
+    `vehicle_gps_position_1`).
+
+    Fields bear PX4's names; the parts of a quaternion `q[0]` to `q[3]` are `q.w`, `q.x`, `q.y`,
+    `q.z` too, whole-number latitudes in 1e-7 deg become degrees.
+    """
+
+    kind: Literal["ulog"] = "ulog"
+    endings: ClassVar = (".ulg",)
+    formats: ClassVar = {"PX4 ULog": lambda path, head: head.startswith(b"ULog\x01\x12\x35")}
+
+    def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
+        """Read the wanted messages of a ULog, on the boot clock.
+
+        Dated by the receiver's UTC where it logged one.
+        """
+        require_file(path)
+        with optional_import("px4", "pyulog", "a PX4 flight log"):
+            from pyulog import ULog
+        # pyulog prints what it finds damaged, which the remarks say below
+        with wrap_read_errors(path, "a ULog file"), contextlib.redirect_stdout(io.StringIO()):
+            log = ULog(str(path), None, disable_str_exceptions=True)
+        data = {
+            dataset.name + (f"_{dataset.multi_id}" if dataset.multi_id else ""): dataset
+            for dataset in log.data_list
+        }
+        selected = {
+            name: dataset.data
+            for name, dataset in sorted(data.items())
+            if field_filter(name) and len(dataset.data.get("timestamp", ()))
+        }
+        if not selected:
+            raise UsageError(
+                f"{path}: none of its messages is wanted (it holds"
+                f" {', '.join(sorted(data)) or 'none'})"
+            )
+        boot_ns = _find_boot_time([dataset.data for dataset in log.data_list])
+        topics = {}
+        for name, raw_fields in selected.items():
+            ns = raw_fields["timestamp"].astype(np.int64) * 1000 + (boot_ns or 0)
+            fields = {
+                p: v
+                for p, v in _convert_fields(raw_fields).items()
+                if field_filter.accepts_field(name, p)
+            }
+            message_type = f"px4/{data[name].name}"
+            topics[name] = RawSeries(message_type, fields, TimeStamps(ns, boot_ns is not None))
+        remarks: list[Remark] = []
+        if log.file_corruption:
+            text = "the file is damaged in places; messages there are lost"
+            remarks.append(make_remark("will mislead", "damaged", text))
+        if log.dropouts:
+            lost_seconds, count = (
+                sum(dataset.duration for dataset in log.dropouts) * 1e-3,
+                len(log.dropouts),
+            )
+            text = f"the logger dropped data {count} times, {lost_seconds:.3g} s in all; gaps stay gaps"
+            remarks.append(
+                make_remark("note", "dropouts", text, dropouts=count, seconds=lost_seconds)
+            )
+        return build_recording(path, topics, (path,), remarks, sorted(data.keys() - topics))
+
+
+def _find_boot_time(messages: list[dict[str, np.ndarray]]) -> int | None:
+    """Return Unix time of the boot in ns, from the first fix that has UTC."""
+    for fields in messages:
+        utc = fields.get("time_utc_usec")
+        valid_rows = np.flatnonzero(utc) if utc is not None else np.zeros(0, dtype=int)
+        if utc is not None and valid_rows.size:
+            return (int(utc[valid_rows[0]]) - int(fields["timestamp"][valid_rows[0]])) * 1000
+    return None
+
+
+def _convert_fields(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    fields = {}
+    for name, values in data.items():
+        if name != "timestamp":
+            is_integer_degrees = values.dtype.kind in "iu" and name in ("lat", "lon")
+            fields[name] = values.astype(np.float64) * (1e-7 if is_integer_degrees else 1.0)
+    parts = {f"q.{letter}": f"q[{i}]" for i, letter in enumerate("wxyz")}
+    return fields | {part: fields[name] for part, name in parts.items() if name in fields}

@@ -1,0 +1,388 @@
+"""Several files of one trip, each from a recorder of its own, as one log."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple, final
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from residnet.core.config import Seconds
+from residnet.core.errors import DataError, ResidnetError
+from residnet.core.log import Level, Log, Remark, make_remark
+from residnet.core.names import STATE_NAMES
+from residnet.io.readers.base import ConfiguredReader, hash_files, require_file
+from residnet.io.readers.tables import (
+    TABLE_KINDS,
+    CsvConfig,
+    ExcelConfig,
+    JsonLinesConfig,
+    ParquetConfig,
+)
+from residnet.io.readers.written import detect_unix_unit
+from residnet.preprocessing.align import GridConfig, resample_at
+from residnet.preprocessing.motion import MotionConfig, complete_motion
+from residnet.preprocessing.statistics import OverlappingBlocks
+
+_MIN_OVERLAP = 0.5
+"""Share of the shorter log that two clocks must have in common while their shift is looked for."""
+_COARSE_STEP, _FINE_STEP = 0.5, 0.05
+"""Steps in s by which the shift is looked for, and then around the best."""
+_MIN_VARIANCE_RATIO = 1.5
+"""How much more of the accelerations any shift far from the best one must leave unexplained."""
+_MIN_ALTERNATIVE_OFFSET = 3.0
+"""Time in s from which on a shift is another one."""
+_BLOCK_SECONDS = 2.5
+"""Time in s over which the velocities that are gained are explained: derivatives would be noise."""
+_MAX_SAMPLES = 3000
+"""Samples of the motion from which a shift is found."""
+
+TableKind = CsvConfig | ParquetConfig | ExcelConfig | JsonLinesConfig
+
+
+class ClockOffset(NamedTuple):
+    """The time in s to add to a clock, and what it explains of what the motion alone leaves.
+
+    Attributes:
+        seconds: to add.
+        explained_share: share of the variance, from 0 to 1.
+        runner_up_share: the same with the best shift that is far from it.
+    """
+
+    seconds: float
+    explained_share: float
+    runner_up_share: float
+
+
+@final
+class JoinedConfig(ConfiguredReader):
+    """Files of one trip whose names differ in one word, such as gnss_1.csv beside motors_1.csv.
+
+    The first part is that of the motion: a log is named by its file and has its clock. What the
+    others hold is brought to this clock, averaged where it comes more often and held where it comes
+    more rarely.
+
+    Attributes:
+        parts: word in the file's name -> reader of such files, that of the motion first.
+        shift: word -> time in s that is added to the clock of that part; parts without one are
+            joined by their dates (Unix time among them), and where they have none by the shift with
+            which their channels explain most of the accelerations.
+    """
+
+    kind: Literal["joined"] = "joined"
+    parts: dict[str, TableKind] = Field(min_length=2)
+    shift: dict[str, Seconds] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _validate_shift_keys(self) -> JoinedConfig:
+        secondary_parts = list(self.parts)[1:]
+        if unknown_parts := set(self.shift) - set(secondary_parts):
+            raise ValueError(
+                f"shift: '{min(unknown_parts)}' is no part whose clock can be moved ({', '.join(secondary_parts)})"
+            )
+        return self
+
+    def select_logs(self, paths: Sequence[Path]) -> list[Path]:
+        """Return the files of the motion."""
+        main_word, *secondary_words = self.parts
+        reader_kind = self.parts[main_word].kind
+        return [
+            path
+            for path in paths
+            if main_word in path.name
+            and not any(part_name in path.name for part_name in secondary_words)
+            and TABLE_KINDS.get(path.suffix.lower(), "csv") == reader_kind
+        ]
+
+    def list_member_files(self, path: Path) -> list[Path]:
+        """Return the files of the trip that a file of the motion is of."""
+        return [*self.find_trip_files(path).values()]
+
+    def find_trip_files(self, path: Path) -> dict[str, Path]:
+        """Return word -> file of the trip that a file of the motion is of."""
+        require_file(path)
+        main_word, *secondary_words = self.parts
+        prefix, matched_word, suffix = path.name.rpartition(main_word)
+        if not matched_word:
+            raise DataError(
+                f"{path}: its name holds no '{main_word}'; give the files of the motion, to which"
+                f" those of {', '.join(secondary_words)} belong"
+            )
+        trip_files = {main_word: path}
+        for part_name in secondary_words:
+            candidate = path.with_name(f"{prefix}{part_name}{suffix}")
+            if not candidate.is_file():
+                raise DataError(f"{path}: {candidate.name} is not beside it; leave the trip out")
+            trip_files[part_name] = candidate
+        return trip_files
+
+    def read(self, path: Path) -> Log:
+        """Return the log of one trip; see `LogReader.read`."""
+        files = self.find_trip_files(path)
+        logs = {
+            part_name: self.parts[part_name].build().read(file) for part_name, file in files.items()
+        }
+        main_word, *secondary_words = logs
+        log = logs[main_word]
+        # what dates join may be what the shift of the others is found by
+        for part_name in sorted(
+            secondary_words, key=lambda word: _offset_from_dates(log, logs[word]) is None
+        ):
+            log = self._merge_channels(log, logs[part_name], part_name)
+        checksums = {part_name: hash_files([file]) for part_name, file in files.items()}
+        meta = {**log.meta, "sha256": hash_files(list(files.values())), "parts": checksums}
+        return log.replace(meta=meta)
+
+    def _merge_channels(self, log: Log, other_log: Log, part_name: str) -> Log:
+        """Return a log with the channels of another one, on its own clock."""
+        new_channels = {
+            n: values for n, values in other_log.channels.items() if n not in log.channels
+        }
+        if not new_channels:
+            raise DataError(
+                f"log {log.name}: {part_name} holds {', '.join(other_log.channels)}, which are there"
+                " already; leave this part out"
+            )
+        shift, offset_remark = self._choose_clock_offset(
+            log, other_log.replace(channels=new_channels), part_name
+        )
+        t = other_log.t + shift
+        step = float(np.median(np.diff(log.t)))
+        in_overlap = (log.t >= t[0]) & (log.t <= t[-1])
+        if in_overlap.sum() < 2:
+            raise DataError(
+                f"log {log.name}: its clock goes from {log.t[0]:.1f} to {log.t[-1]:.1f} s, that of"
+                f" {part_name} from {t[0]:.1f} to {t[-1]:.1f} s; give `shift: {{{part_name}: ...}}`"
+            )
+        hold_names = tuple(new_channels) if float(np.median(np.diff(t))) > step else ()
+        resampled = resample_at(
+            other_log.replace(t=t, channels=new_channels),
+            GridConfig(step=step, held=hold_names),
+            log.t,
+        )
+        findings = [
+            *log.meta.get("findings", ()),
+            *other_log.meta.get("findings", ()),
+            offset_remark,
+        ]
+        return log.replace(
+            channels={**log.channels, **{name: resampled[name] for name in new_channels}},
+            units={**log.units, **{name: other_log.units[name] for name in new_channels}},
+            meta={**log.meta, "findings": findings},
+        )
+
+    def _choose_clock_offset(
+        self, log: Log, other_log: Log, part_name: str
+    ) -> tuple[float, Remark]:
+        """Return what is added to the other clock, and how sure that is.
+
+        Dates of both join them, unless what the channels explain is sure to say otherwise.
+        """
+        configured_shift = self.shift.get(part_name)
+        if configured_shift is not None:
+            return configured_shift, make_remark(
+                "note", "joined", f"{part_name}: its clock is moved by {configured_shift:g} s"
+            )
+        date_offset, advice = (
+            _offset_from_dates(log, other_log),
+            f"give `shift: {{{part_name}: ...}}`",
+        )
+        try:
+            estimate = estimate_clock_offset(log, other_log)
+        except ResidnetError as error:
+            if date_offset is not None:
+                return date_offset, make_remark(
+                    "note", "joined", f"{part_name}: joined by the dates of both"
+                )
+            text = f"{part_name}: its clock cannot be brought to that of the motion ({error}); both are"
+            text += f" taken to begin together: {advice}"
+            return float(log.t[0] - other_log.t[0]), make_remark("will mislead", "joined", text)
+        offset_figures = estimate._asdict()
+        is_unambiguous = 1.0 - estimate.runner_up_share >= _MIN_VARIANCE_RATIO * (
+            1.0 - estimate.explained_share
+        )
+        explanation = f"with which its channels explain {100 * estimate.explained_share:.0f} % of what the motion"
+        explanation += " alone leaves of the accelerations"
+        if date_offset is not None and (
+            not is_unambiguous or abs(estimate.seconds - date_offset) < _COARSE_STEP
+        ):
+            text = f"{part_name}: joined by the dates of both"
+            return date_offset, make_remark("note", "joined", text, **offset_figures)
+        if date_offset is not None:
+            text = f"{part_name}: joined by the dates of both, which are {date_offset - estimate.seconds:+.2f} s"
+            text += f" from the shift {explanation}: one of the clocks is wrong, {advice}"
+            return date_offset, make_remark("will mislead", "joined", text, **offset_figures)
+        text = f"{part_name}: its clock is moved by {estimate.seconds:+.2f} s, {explanation}"
+        text += f" ({100 * estimate.runner_up_share:.0f} % with any shift {_MIN_ALTERNATIVE_OFFSET:g} s from it)"
+        text += "" if is_unambiguous else f"; that is not sure, {advice}"
+        level: Level = "note" if is_unambiguous else "will mislead"
+        return estimate.seconds, make_remark(level, "joined", text, **offset_figures)
+
+
+def _offset_from_dates(log: Log, other_log: Log) -> float | None:
+    """Return what brings another clock to that of a log by dates or Unix time that overlap."""
+    first_epoch, second_epoch = (
+        item.meta.get("epoch", item.t[0] if detect_unix_unit(item.t) == "s" else None)
+        for item in (log, other_log)
+    )
+    if first_epoch is None or second_epoch is None:
+        return None
+    epoch_difference = float(second_epoch) - float(first_epoch)
+    if not other_log.t[0] - other_log.t[-1] < epoch_difference < log.t[-1] - log.t[0]:
+        return None
+    return epoch_difference + float(log.t[0] - other_log.t[0])
+
+
+def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
+    """Return the shift of another log's clock with which its channels explain most accelerations.
+
+    For each shift that leaves half of the shorter log, what u and r gain over blocks of time is
+    fitted by integrals of the velocities, and of each channel, its square and its product with the
+    speed. What counts is the share of what the velocities alone leave of all blocks.
+
+    Args:
+        log: of the motion, measured or by position and heading.
+    """
+    motion_log = complete_motion(log, MotionConfig())
+    stride = max(1, len(motion_log) // _MAX_SAMPLES)
+    t = motion_log.t[::stride]
+    block_length = max(4, round(_BLOCK_SECONDS / float(np.median(np.diff(t)))))
+    blocks = OverlappingBlocks(
+        t, np.arange(0, len(t) - block_length, max(1, block_length // 4)), block_length
+    )
+    if not blocks.starts.size:
+        raise DataError(f"log {log.name}: {t[-1] - t[0]:.1f} s are too short to tell")
+
+    def integrate_columns(*columns: np.ndarray) -> np.ndarray:
+        """Return the integrals of columns [T] over the blocks [B, k]."""
+        return blocks.make_integrator(np.stack(columns, axis=1))(0)
+
+    is_finite = {name: np.isfinite(motion_log[name]) for name in ("u", "r")}
+    u, r = (np.interp(t, motion_log.t[k], motion_log[n][k]) for n, k in is_finite.items())
+    velocity_change = blocks.compute_changes(np.stack((u, r), axis=1))
+    velocity_change /= np.maximum(velocity_change.std(axis=0), 1e-12)
+    motion_regressors = integrate_columns(
+        np.ones_like(u), u, u * np.abs(u), r, r * np.abs(r), u * r
+    )
+    # what the motion explains by itself, which says nothing of the commands
+    motion_residual = (
+        velocity_change
+        - motion_regressors @ np.linalg.lstsq(motion_regressors, velocity_change, rcond=1e-9)[0]
+    )
+    squared_motion_residual = (motion_residual**2).sum(axis=1)
+    total_variance = float(squared_motion_residual.sum())
+    input_signals = [
+        values for name, values in other_log.channels.items() if name not in STATE_NAMES
+    ]
+    # a velocity that the other one measured too gains what this one gains
+    velocity_signals = [
+        values for name, values in other_log.channels.items() if name in ("u", "v", "r")
+    ]
+    min_overlap = _MIN_OVERLAP * min(t[-1] - t[0], other_log.t[-1] - other_log.t[0])
+
+    def explained_share(shift: float) -> float:
+        shifted_times = t - shift
+        block_start, block_end = (
+            shifted_times[blocks.starts],
+            shifted_times[blocks.starts + block_length],
+        )
+        in_range = (block_start >= other_log.t[0]) & (block_end <= other_log.t[-1])
+        if (
+            in_range.sum()
+            < 3 * (motion_regressors.shape[1] + 3 * len(input_signals) + len(velocity_signals))
+            or not total_variance
+        ):
+            return 0.0
+
+        def interpolate_signal(values: np.ndarray) -> np.ndarray:
+            is_finite = np.isfinite(values)
+            return np.asarray(np.interp(shifted_times, other_log.t[is_finite], values[is_finite]))
+
+        columns = [motion_regressors[in_range]]
+        columns += [
+            blocks.compute_changes(w)[in_range, None]
+            for w in map(interpolate_signal, velocity_signals)
+        ]
+        columns += [
+            integrate_columns(w, w * np.abs(w), w * u)[in_range]
+            for w in map(interpolate_signal, input_signals)
+        ]
+        regressors, response = np.concatenate(columns, axis=1), velocity_change[in_range]
+        regressors = regressors / np.maximum(np.abs(regressors).max(axis=0), 1e-12)
+        residual = response - regressors @ np.linalg.lstsq(regressors, response, rcond=1e-9)[0]
+        # blocks that the other log does not reach stay as the motion alone leaves them
+        return float(
+            (squared_motion_residual[in_range].sum() - (residual**2).sum()) / total_variance
+        )
+
+    lower_shift, upper_shift = (
+        t[0] - other_log.t[-1] + min_overlap,
+        t[-1] - other_log.t[0] - min_overlap,
+    )
+    coarse_shifts = np.arange(
+        lower_shift, max(upper_shift, lower_shift + _COARSE_STEP), _COARSE_STEP
+    )
+    scores = np.array([explained_share(shift) for shift in coarse_shifts.tolist()])
+    best_coarse_shift = float(coarse_shifts[scores.argmax()])
+    fine_shifts = best_coarse_shift + np.arange(
+        -_COARSE_STEP, _COARSE_STEP + _FINE_STEP, _FINE_STEP
+    )
+    fine_scores = np.array([explained_share(shift) for shift in fine_shifts.tolist()])
+    seconds = float(fine_shifts[fine_scores.argmax()])
+    is_alternative = scores[np.abs(coarse_shifts - seconds) > _MIN_ALTERNATIVE_OFFSET]
+    return ClockOffset(seconds, float(fine_scores.max()), float(is_alternative.max(initial=0.0)))
+
+
+def group_trip_files(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Path]]:
+    """Return word -> files, where files come in groups whose names differ in that word alone.
+
+    Empty where they do not: files of one group have the same columns, and some trips one of each.
+    Files of trips that lack a part are left out.
+
+    Args:
+        paths: file -> its columns.
+    """
+    groups: dict[tuple[str, ...], list[Path]] = {}
+    for path, columns in paths.items():
+        groups.setdefault(columns, []).append(path)
+    file_groups = list(groups.values())
+    if not 2 <= len(file_groups) <= 6:
+        return {}
+    file_words = [
+        [set(re.findall(r"[^\W\d_]+", path.stem)) for path in group] for group in file_groups
+    ]
+    # the longest words that the names of all files of a group hold go first
+    common_words = [
+        sorted(set.intersection(*word_sets), key=lambda w: (-len(w), w)) for word_sets in file_words
+    ]
+    word_counts = Counter(
+        shared_word for distinctive_words in common_words for shared_word in distinctive_words
+    )
+    distinctive_words = [
+        [shared_word for shared_word in group_words if word_counts[shared_word] == 1]
+        for group_words in common_words
+    ]
+    if not all(distinctive_words):
+        return {}
+    trips = {
+        group_words[0]: {
+            path.with_name(path.name.replace(group_words[0], "\0")): path for path in group
+        }
+        for group_words, group in zip(distinctive_words, file_groups, strict=True)
+    }
+    first_trips, *other_trips = trips.values()
+    complete_trips = [
+        trip for trip in first_trips if all(trip in other_trip for other_trip in other_trips)
+    ]
+    return (
+        {
+            shared_word: [trip_paths[trip] for trip in complete_trips]
+            for shared_word, trip_paths in trips.items()
+        }
+        if complete_trips
+        else {}
+    )

@@ -1,0 +1,461 @@
+"""Kinds of message that map themselves to channels: one row of `MESSAGE_KINDS` each.
+
+A row says by which types (or fields, where a source tells no types) a message is known, and which
+channels it holds. Of rows that hold the same channel the first wins, of topics alike the longest.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from residnet.core.log import make_remark
+from residnet.core.names import CHANNEL_UNITS
+from residnet.io.readers.quantities import (
+    AngleHeading,
+    ChannelPlan,
+    CourseSpeedVelocity,
+    DerivedVelocity,
+    EarthFixedVelocity,
+    FieldMap,
+    GeodeticPosition,
+    LocalPosition,
+    QuaternionHeading,
+    source_channels,
+)
+from residnet.io.readers.recording import Recording, Series, normalize_field_path
+
+_ROS_CONVERSION = "REP-103 (ENU, forward-left-up) to NED, forward-starboard-down"
+_NED_CONVERSION = "already in NED and forward-starboard-down"
+_BY_NAME_CONVERSION = "by its names, taken to be in SI, NED and body axes"
+_WORLD_FRAMES = ("map", "odom", "earth", "world", "enu", "ned")
+_INTEGERS = tuple(f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64))
+_NUMBER_TYPES = ("Float64", "Float32", *_INTEGERS, "Float64Stamped", "Float32Stamped")
+_FIX_FIELDS = ("latitude", "longitude")
+
+
+@dataclass(frozen=True)
+class MessageKind:
+    """A kind of message.
+
+    Attributes:
+        name: for the log's meta.
+        types: names of the message's type, without its package.
+        plan: series -> channels, position, heading and velocity that it gives.
+        conversion: how its frames become residnet's, for the log's meta.
+        fields: that tell it where the source has no types; none where only a type does.
+    """
+
+    name: str
+    types: tuple[str, ...]
+    plan: Callable[[Series], ChannelPlan]
+    conversion: str = _NED_CONVERSION
+    fields: tuple[str, ...] = ()
+
+    def matches(self, series: Series) -> bool:
+        """Return whether a series holds messages of this kind."""
+        if series.message_type:
+            return series.message_type.rsplit("/", 1)[-1] in self.types
+        if self.name == "Named":
+            return len(_canonical_fields(series)) >= 3
+        return bool(self.fields) and all(series.has_field(field) for field in self.fields)
+
+
+def _map_fields(
+    s: Series, unit: str, paths: dict[str, str], **settings: Any
+) -> dict[str, FieldMap]:
+    return {n: FieldMap(topic=s.name, field=f, unit=unit, **settings) for n, f in paths.items()}
+
+
+def _find_prefix(s: Series, prefixes: tuple[str, ...], field: str) -> str:
+    return next((prefix for prefix in prefixes if s.has_field(prefix + field)), "")
+
+
+def _map_body_velocities(s: Series, prefix: str) -> dict[str, FieldMap]:
+    """Velocities of a twist that are not zero throughout: a planar source leaves others empty."""
+    field_maps: dict[str, FieldMap] = {}
+    paths = {"u": "linear.x", "v": "linear.y", "r": "angular.z", "p": "angular.x"}
+    paths |= {"w": "linear.z", "q": "angular.y"}
+    for name, path in paths.items():
+        if s.has_field(prefix + path) and s[prefix + path].any():
+            field_maps |= _map_fields(
+                s, CHANNEL_UNITS[name], {name: prefix + path}, frame="body_fpu"
+            )
+    return field_maps
+
+
+def _map_depth(s: Series, field: str, **settings: Any) -> dict[str, FieldMap]:
+    """The depth, where it moves: a planar source leaves it at zero."""
+    is_varying = s.has_field(field) and float(np.nanstd(s[field])) > 0.0
+    return _map_fields(s, "m", {"z": field}, **settings) if is_varying else {}
+
+
+def _find_orientation(s: Series, path: str) -> QuaternionHeading | None:
+    if not all(s.has_field(f"{path}.{axis}") for axis in "xyzw"):
+        return None
+    has_tilt = bool(s[f"{path}.x"].any() or s[f"{path}.y"].any())
+    return QuaternionHeading(topic=s.name, field=path, frame="enu", roll=has_tilt)
+
+
+def _plan_navigation(s: Series) -> ChannelPlan:
+    """A pose, a twist, or both."""
+    pose_prefix = _find_prefix(s, ("pose.pose.", "pose.", ""), "position.x")
+    twist_prefix = _find_prefix(s, ("twist.twist.", "twist.", ""), "linear.x")
+    if s.has_field(f"{pose_prefix}position.x"):
+        position_source = LocalPosition(
+            topic=s.name, north=f"{pose_prefix}position.y", east=f"{pose_prefix}position.x"
+        )
+        channels = _map_body_velocities(s, twist_prefix) | _map_depth(
+            s, f"{pose_prefix}position.z", frame="enu"
+        )
+        return ChannelPlan(
+            channels, position_source, _find_orientation(s, f"{pose_prefix}orientation")
+        )
+    if (
+        s.sender is not None
+        and len(s.sender)
+        and str(s.sender[0]).strip("/").lower() in _WORLD_FRAMES
+    ):
+        # along the axes of the earth, which is left to the config
+        return ChannelPlan()
+    return ChannelPlan(_map_body_velocities(s, twist_prefix))
+
+
+def _plan_imu(s: Series) -> ChannelPlan:
+    rates = {"r": "angular_velocity.z", "p": "angular_velocity.x"}
+    rate_fields = {name: path for name, path in rates.items() if s.has_field(path)}
+    # a driver without orientation says so by -1 in the covariance, or leaves zeros
+    covariance = "orientation_covariance.0"
+    lacks_orientation = s.has_field(covariance) and bool((s[covariance] == -1.0).all())
+    lacks_orientation = (
+        lacks_orientation or not s.has_field("orientation.w") or not s["orientation.w"].any()
+    )
+    heading = None if lacks_orientation else _find_orientation(s, "orientation")
+    return ChannelPlan(_map_fields(s, "rad/s", rate_fields, frame="body_fpu"), None, heading)
+
+
+def _plan_wrench(s: Series) -> ChannelPlan:
+    prefix = _find_prefix(s, ("wrench.",), "force.x")
+    body_settings: dict[str, Any] = {"frame": "body_fpu", "hold": True}
+    forces = _map_fields(
+        s, "N", {"tau_x": f"{prefix}force.x", "tau_y": f"{prefix}force.y"}, **body_settings
+    )
+    return ChannelPlan(
+        forces | _map_fields(s, "N m", {"tau_n": f"{prefix}torque.z"}, **body_settings)
+    )
+
+
+def _plan_number(s: Series) -> ChannelPlan:
+    if not s.has_field("data"):
+        return ChannelPlan()
+    name_parts = [part for part in normalize_field_path(s.name).split("_") if part]
+    name_suffixes = ["_".join(name_parts[k:]) for k in range(len(name_parts))]
+    name = next(
+        (suffix for suffix in name_suffixes if suffix in CHANNEL_UNITS),
+        "_".join(name_parts) or "data",
+    )
+    return ChannelPlan(_map_fields(s, CHANNEL_UNITS.get(name, "-"), {name: "data"}, hold=True))
+
+
+def _plan_joints(s: Series) -> ChannelPlan:
+    channels: dict[str, FieldMap] = {}
+    for path in s.fields:
+        quantity, _, joint = path.partition(".")
+        unit = {"position": "rad", "velocity": "rad/s", "effort": "N m"}.get(quantity)
+        if unit is not None and joint:
+            name = joint if quantity == "position" else f"{joint}_{quantity}"
+            # a joint of a known name in another unit is another quantity
+            name = name if CHANNEL_UNITS.get(name, unit) == unit else f"{name}_{quantity}"
+            channels |= _map_fields(s, unit, {name: path})
+    return ChannelPlan(channels)
+
+
+def _plan_moos(s: Series) -> ChannelPlan:
+    position_source = None
+    if s.has_field("NAV_X") and s.has_field("NAV_Y"):
+        position_source = LocalPosition(topic=s.name, north="NAV_Y", east="NAV_X")
+    heading = (
+        AngleHeading(topic=s.name, field="NAV_HEADING", unit="deg")
+        if s.has_field("NAV_HEADING")
+        else None
+    )
+    return ChannelPlan({}, position_source, heading)
+
+
+def _canonical_fields(s: Series) -> list[str]:
+    canonical_names = (name for name in s.fields if name in CHANNEL_UNITS and name != "t")
+    return [name for name in canonical_names if s[name].size and not np.isnan(s[name]).all()]
+
+
+def _plan_canonical_fields(s: Series) -> ChannelPlan:
+    names = _canonical_fields(s)
+    heading = AngleHeading(topic=s.name, field="psi") if "psi" in names else None
+    position_source = (
+        LocalPosition(topic=s.name, north="x", east="y") if {"x", "y"} <= set(names) else None
+    )
+    channels: dict[str, FieldMap] = {}
+    for name in names:
+        if name != "psi" and not (position_source and name in ("x", "y")):
+            is_command = name.startswith("cmd_")
+            channels |= _map_fields(s, CHANNEL_UNITS[name], {name: name}, hold=is_command)
+    return ChannelPlan(channels, position_source, heading)
+
+
+def _plan_revolutions(s: Series) -> ChannelPlan:
+    if not s.has_field("speed"):
+        return ChannelPlan()
+    senders = [] if s.sender is None else sorted(set(s.sender.tolist()))
+    if len(senders) < 2:
+        return ChannelPlan(_map_fields(s, "rpm", {"n": "speed"}))
+    # odd numbers are to starboard, even ones to port
+    channel_of_engine = {"1": "n_stbd", "2": "n_port"}
+    channels: dict[str, FieldMap] = {}
+    for sender in senders:
+        channels |= _map_fields(
+            s, "rpm", {channel_of_engine.get(sender, f"n_{sender}"): "speed"}, sender=sender
+        )
+    return ChannelPlan(channels)
+
+
+def _earth_fixed_velocity(s: Series, north: str, east: str) -> EarthFixedVelocity | None:
+    return EarthFixedVelocity(topic=s.name, north=north, east=east) if s.has_field(north) else None
+
+
+def _plan_px4_gps(s: Series) -> ChannelPlan:
+    latitude, longitude = (
+        ("lat", "lon") if s.has_field("lat") else ("latitude_deg", "longitude_deg")
+    )
+    position_source = GeodeticPosition(topic=s.name, latitude=latitude, longitude=longitude)
+    return ChannelPlan(
+        {}, position_source, None, _earth_fixed_velocity(s, "vel_n_m_s", "vel_e_m_s")
+    )
+
+
+def _make_local_position_plan(
+    north: str, east: str, down: str, v_north: str, v_east: str
+) -> Callable[[Series], ChannelPlan]:
+    return lambda s: ChannelPlan(
+        _map_depth(s, down),
+        LocalPosition(topic=s.name, north=north, east=east),
+        None,
+        _earth_fixed_velocity(s, v_north, v_east),
+    )
+
+
+def _make_field_plan(
+    channel_fields: dict[str, str],
+    unit: str = "deg",
+    *,
+    fix_fields: tuple[str, str] | None = None,
+    heading: str = "",
+    course_speed_fields: tuple[str, str, str] | None = None,
+) -> Callable[[Series], ChannelPlan]:
+    """A message by its fields: channels -> fields, latitude and longitude, and a heading in deg,
+    and course in deg, speed and the unit of the speed over ground.
+    """
+
+    def make_plan(s: Series) -> ChannelPlan:
+        available_fields = {
+            name: field for name, field in channel_fields.items() if s.has_field(field)
+        }
+        position_source = (
+            GeodeticPosition(topic=s.name, latitude=fix_fields[0], longitude=fix_fields[1])
+            if fix_fields
+            else None
+        )
+        heading_source = AngleHeading(topic=s.name, field=heading, unit="deg") if heading else None
+        if course_speed_fields is None or not s.has_field(course_speed_fields[1]):
+            return ChannelPlan(
+                _map_fields(s, unit, available_fields), position_source, heading_source
+            )
+        course, speed, speed_unit = course_speed_fields
+        velocity_source = CourseSpeedVelocity(
+            topic=s.name, course=course, speed=speed, speed_unit=speed_unit
+        )
+        return ChannelPlan(
+            _map_fields(s, unit, available_fields), position_source, heading_source, velocity_source
+        )
+
+    return make_plan
+
+
+MESSAGE_KINDS = (
+    MessageKind(
+        "Odometry",
+        ("Odometry",),
+        _plan_navigation,
+        _ROS_CONVERSION,
+        ("pose.pose.position.x", "twist.twist.linear.x"),
+    ),
+    MessageKind(
+        "Pose",
+        ("PoseStamped", "Pose", "PoseWithCovarianceStamped"),
+        _plan_navigation,
+        _ROS_CONVERSION,
+        ("pose.position.x", "pose.orientation.w"),
+    ),
+    MessageKind(
+        "Twist",
+        ("TwistStamped", "Twist", "TwistWithCovarianceStamped"),
+        _plan_navigation,
+        _ROS_CONVERSION,
+        ("twist.linear.x", "twist.angular.z"),
+    ),
+    MessageKind(
+        "Pose2D",
+        ("Pose2D", "Pose2DStamped"),
+        lambda s: ChannelPlan(
+            {},
+            LocalPosition(topic=s.name, north="y", east="x"),
+            AngleHeading(topic=s.name, field="theta", frame="enu"),
+        ),
+        _ROS_CONVERSION,
+        ("x", "y", "theta"),
+    ),
+    MessageKind(
+        "Imu", ("Imu",), _plan_imu, _ROS_CONVERSION, ("angular_velocity.z", "linear_acceleration.x")
+    ),
+    MessageKind(
+        "Fix",
+        ("NavSatFix",),
+        _make_field_plan({}, fix_fields=_FIX_FIELDS),
+        _ROS_CONVERSION,
+        _FIX_FIELDS,
+    ),
+    MessageKind(
+        "Wrench",
+        ("WrenchStamped", "Wrench"),
+        _plan_wrench,
+        _ROS_CONVERSION,
+        ("wrench.force.x", "wrench.torque.z"),
+    ),
+    MessageKind(
+        "Px4LocalPosition",
+        ("vehicle_local_position",),
+        _make_local_position_plan("x", "y", "z", "vx", "vy"),
+    ),
+    MessageKind(
+        "Px4Attitude",
+        ("vehicle_attitude",),
+        lambda s: ChannelPlan(
+            {}, None, QuaternionHeading(topic=s.name, field="q", frame="ned", roll=True)
+        ),
+    ),
+    MessageKind(
+        "Px4AngularVelocity",
+        ("vehicle_angular_velocity",),
+        _make_field_plan({"r": "xyz[2]", "p": "xyz[0]"}, "rad/s"),
+    ),
+    MessageKind("Px4Gps", ("vehicle_gps_position", "sensor_gps"), _plan_px4_gps),
+    MessageKind(
+        "ArduPilotFilter", ("XKF1", "NKF1"), _make_local_position_plan("PN", "PE", "PD", "VN", "VE")
+    ),
+    MessageKind(
+        "ArduPilotAttitude",
+        ("ATT",),
+        _make_field_plan({"phi": "Roll", "theta": "Pitch"}, heading="Yaw"),
+    ),
+    MessageKind("ArduPilotImu", ("IMU",), _make_field_plan({"r": "GyrZ", "p": "GyrX"}, "rad/s")),
+    MessageKind(
+        "ArduPilotGps",
+        ("GPS",),
+        _make_field_plan({}, fix_fields=("Lat", "Lng"), course_speed_fields=("GCrs", "Spd", "m/s")),
+    ),
+    MessageKind(
+        "NmeaFix",
+        ("GGA", "GNS", "RMC", "GLL"),
+        _make_field_plan(
+            {}, fix_fields=_FIX_FIELDS, course_speed_fields=("true_course", "spd_over_grnd", "kn")
+        ),
+    ),
+    MessageKind(
+        "NmeaCourse",
+        ("VTG",),
+        _make_field_plan({}, course_speed_fields=("true_track", "spd_over_grnd_kts", "kn")),
+    ),
+    MessageKind("MoosNavigation", ("Variables",), _plan_moos),
+    MessageKind("NmeaHeading", ("HDT",), _make_field_plan({}, heading="heading")),
+    MessageKind("NmeaRateOfTurn", ("ROT",), _make_field_plan({"r": "rate_of_turn"}, "deg/s")),
+    MessageKind(
+        "NmeaRudder",
+        ("RSA",),
+        lambda s: ChannelPlan(_map_fields(s, "deg", {"delta": next(iter(s.fields))})),
+    ),
+    MessageKind("NmeaRevolutions", ("RPM",), _plan_revolutions),
+    MessageKind(
+        "Joints", ("JointState",), _plan_joints, _ROS_CONVERSION, ("position.0", "effort.0")
+    ),
+    MessageKind("Number", _NUMBER_TYPES, _plan_number, _ROS_CONVERSION, ("data",)),
+    MessageKind("Named", (), _plan_canonical_fields, _BY_NAME_CONVERSION),
+)
+"""In the order in which they are asked: the one that says most first."""
+
+
+def is_ned_format(series: Series) -> bool:
+    """Return whether a series holds messages whose format fixes their frames as NED."""
+    return any(m.conversion == _NED_CONVERSION and m.matches(series) for m in MESSAGE_KINDS)
+
+
+def extend_with_standard_messages(recording: Recording, declared: ChannelPlan) -> ChannelPlan:
+    """Return the declared plan with what standard messages add to it."""
+    plan, conversions, remarks = declared, [], []
+    for message in MESSAGE_KINDS:
+        matching_series = [
+            s for s in recording.series.values() if len(s) > 1 and message.matches(s)
+        ]
+        pose_tables = [s.name for s in matching_series if {"x", "y", "psi"} <= set(s.fields)]
+        if message.name == "Named" and len(pose_tables) > 1:
+            text = (
+                f"{len(pose_tables)} tables hold positions and headings ({', '.join(pose_tables[:6])}): several"
+                " experiments? name one with `table`, or map fields"
+            )
+            remarks.append(
+                make_remark("will mislead", "several_tables", text, tables=len(pose_tables))
+            )
+        for series in sorted(matching_series, key=lambda s: (-len(s), s.name)):
+            message_plan = message.plan(series)
+            planned_channels = {
+                *plan.channels,
+                *source_channels(plan.position, plan.heading, plan.velocity),
+            }
+            planned_channels |= {"r"} if isinstance(plan.velocity, DerivedVelocity) else set()
+            # a field that is taken under one name is not offered under another
+            used_fields = {
+                (entry.topic, entry.field, entry.sender) for entry in plan.channels.values()
+            }
+            new_channels = {
+                name: entry
+                for name, entry in message_plan.channels.items()
+                if name not in planned_channels
+                and (entry.topic, entry.field, entry.sender) not in used_fields
+            }
+            position = None if {"x", "y"} & planned_channels else message_plan.position
+            heading = None if "psi" in planned_channels else message_plan.heading
+            velocity = (
+                None
+                if {"u", "v"} & (planned_channels | set(new_channels))
+                else message_plan.velocity
+            )
+            plan = dataclasses.replace(
+                plan,
+                channels={**plan.channels, **new_channels},
+                position=plan.position or position,
+                heading=plan.heading or heading,
+                velocity=plan.velocity or velocity,
+            )
+            added_channels = [*source_channels(position, heading, velocity), *new_channels]
+            if added_channels:
+                source_text = f"{', '.join(added_channels)}: {message.name} of {series.name}"
+                conversions.append(f"{source_text}, {message.conversion}")
+    if plan.heading is None and "psi" not in plan.channels and declared.velocity is None:
+        # without a heading an earth-fixed velocity has no components in the body
+        plan = dataclasses.replace(plan, velocity=None)
+    return dataclasses.replace(
+        plan,
+        conversions=(*declared.conversions, *conversions),
+        remarks=(*declared.remarks, *remarks),
+    )

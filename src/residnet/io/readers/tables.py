@@ -1,0 +1,782 @@
+"""Readers of tables (csv, Parquet, Excel, JSON lines), each column by its entry in a channel map.
+
+Everything foreign is converted here, once: units to SI, signs and frames to NED and body axes
+forward-starboard-down, psi unwrapped.
+"""
+
+from __future__ import annotations
+
+import codecs
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from residnet.core.config import Config
+from residnet.core.errors import DataError, UsageError
+from residnet.core.frames import unwrap_angle
+from residnet.core.log import Log, Remark, make_remark
+from residnet.core.names import suggest_name, truncate
+from residnet.core.units import canonical_unit, to_si
+from residnet.io.readers.base import (
+    ConfiguredReader,
+    ProgressCallback,
+    describe_provenance,
+    optional_import,
+    reading_progress,
+    require_file,
+    require_increasing,
+    require_samples,
+    require_values,
+    wrap_read_errors,
+)
+from residnet.io.readers.quantities import (
+    COSINE_SUFFIX,
+    QUATERNION,
+    SINE_SUFFIX,
+    ChannelMap,
+    conversion_factor,
+    normalize_quaternion,
+    project_fixes,
+    quaternion_yaw,
+)
+from residnet.io.readers.texts import (
+    coerce_numeric,
+    find_column_positions,
+    find_header,
+    make_names_unique,
+    open_as_utf8,
+    read_csv,
+)
+from residnet.io.readers.written import (
+    DateOrder,
+    find_unique_rows,
+    hemisphere_signs,
+    parse_degrees,
+    parse_texts,
+    parse_zone,
+    repair_clock,
+)
+from residnet.preprocessing.channel_values import is_fill_value, is_implausible, max_magnitude
+from residnet.preprocessing.motion import add_true_wind
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+DATE_UNIT = "date"
+"""Stands for a unit where a column holds dates."""
+TABLE_KINDS = {
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat"), "csv"),
+    ".xlsx": "excel",
+    ".parquet": "parquet",
+    **dict.fromkeys((".jsonl", ".ndjson", ".json"), "json_lines"),
+}
+"""Ending of a table -> its kind of reader; a table does not say what its columns are."""
+FIX_CHANNELS = ("latitude", "longitude")
+_HEADER_SEARCH_ROWS = 60
+"""Rows of a sheet among which names are looked for."""
+_MAX_LIST_COLUMNS = 16
+"""Most entries of a list in JSON that become columns."""
+_MIN_TABLE_ROWS = 20
+"""Rows of a JSON document that are no note beside its log but a table; by choice."""
+
+
+class TimeColumn(Config):
+    """The column that holds time, and its unit.
+
+    Attributes:
+        column: name of the column.
+        unit: unit of its numbers, for example `ms`; `date` for dates and times of day, as
+            `2024-05-03T12:00:00.5+02:00`, `03.05.2024 12:00:00,5` or `12:00:00.5`.
+        date: column with the dates, where `column` holds times of day; null for none.
+        zone: time zone of dates that name none, for example `Europe/Berlin`; null leaves them
+            without one.
+        order: of day, month and year in dates: `dmy`, `mdy` or `ymd`; null takes it from the cells.
+    """
+
+    column: str
+    unit: str = "s"
+    date: str | None = None
+    zone: str | None = None
+    order: DateOrder | None = None
+
+    @field_validator("unit")
+    @classmethod
+    def _validate_time_unit(cls, unit: str) -> str:
+        if unit == DATE_UNIT:
+            return unit
+        conversion_factor(unit, "s")
+        return canonical_unit(unit, "s")
+
+    @field_validator("zone")
+    @classmethod
+    def _validate_zone(cls, zone: str | None) -> str | None:
+        return zone if zone is None else parse_zone(zone).key
+
+    @model_validator(mode="after")
+    def _validate_date_settings(self) -> TimeColumn:
+        date_settings = [
+            name for name in ("date", "zone", "order") if getattr(self, name) is not None
+        ]
+        if date_settings and self.unit != DATE_UNIT:
+            raise ValueError(f"{date_settings[0]} is for dates; set unit: {DATE_UNIT}")
+        return self
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns that hold time."""
+        return (self.column,) if self.date is None else (self.column, self.date)
+
+
+class TableConfig(ConfiguredReader, ABC):
+    """The part that all tables have in common.
+
+    Attributes:
+        time: column of the time.
+        channels: canonical names (or names of your own) and the columns that they are taken from,
+            all of which must exist; `latitude` and `longitude` become x, y where these are not
+            there, `qx`, `qy`, `qz`, `qw` become the heading psi where there is none, and of any
+            angle its cosine and sine do, as `psi_cos` and `psi_sin`.
+        manoeuvre: kind of manoeuvre of every file; `folder` takes the name of each file's folder,
+            null says that it is not known.
+    """
+
+    time: TimeColumn
+    channels: dict[str, ChannelMap] = Field(min_length=1)
+    manoeuvre: str | None = None
+    row_format: ClassVar[str] = "row {0}"
+    """How a user calls a row of the table, by its number from 1, and from 2 behind a header."""
+
+    @field_validator("channels")
+    @classmethod
+    def _validate_channels(cls, channels: dict[str, ChannelMap]) -> dict[str, ChannelMap]:
+        for name, entry in channels.items():
+            entry.require_valid_channel(name)
+        quaternion_names = [name for name in QUATERNION if name in channels]
+        if quaternion_names and len(quaternion_names) < len(QUATERNION):
+            missing_names = ", ".join(name for name in QUATERNION if name not in channels)
+            raise ValueError(
+                f"an attitude needs all of {', '.join(QUATERNION)}; add {missing_names}"
+            )
+        return channels
+
+    @abstractmethod
+    def load(self, path: Path, columns: Sequence[str], advance: ProgressCallback) -> pd.DataFrame:
+        """Return the columns side by side, in order; `advance` is told the share that is read.
+
+        Its `attrs` may hold `n_lines_above`, lines above the values beside one header, and `is_truncated`, whether
+        the file ends within a last row that is left out.
+
+        Raises:
+            UsageError: where a column is missing.
+            DataError: where the file cannot be read.
+        """
+
+    def read(self, path: Path) -> Log:
+        """Return the log in `path`.
+
+        See `LogReader.read`. Fill values far from all else (-999, 9.97e36) count as missing, and
+        are counted. Rows without a measurement at either end, and blank rows, are dropped and
+        counted; other rows keep NaN where a channel was not measured.
+        """
+        import pandas as pd
+
+        require_file(path)
+        time, channel_maps = self.time, self.channels
+        columns = [*time.columns, *(entry.column for entry in channel_maps.values())]
+        hemisphere_columns = [
+            entry.hemisphere for entry in channel_maps.values() if entry.hemisphere
+        ]
+        with reading_progress(path.name, path.stat().st_size, 1.0) as advance:
+            table = self.load(path, [*columns, *hemisphere_columns], advance)
+        # pandas copies all that is told of a table for each of its columns
+        attributes, table.attrs = table.attrs, {}
+        n_lines_above, is_truncated = attributes.get("above", 0), bool(attributes.get("cut"))
+        rows = len(table) + is_truncated
+        cells = dict(
+            zip([*columns, *hemisphere_columns], (cells for _, cells in table.items()), strict=True)
+        )
+        self._require_matching_units(path, attributes.get("units", ()))
+        t, start_ns, findings = self._parse_times(path, cells, n_lines_above)
+        raw = {name: self._parse_channel(path, name, cells, n_lines_above) for name in channel_maps}
+        # each column is let go where its channel is made
+        del table, cells
+        measured = np.zeros(t.size, dtype=bool)
+        for values in raw.values():
+            measured |= np.isfinite(values)
+        undated_rows = np.flatnonzero(measured & ~np.isfinite(t))
+        if undated_rows.size:
+            raise DataError(
+                f"{path}: {self._format_row(undated_rows[0] + n_lines_above)} has measurements but no time in column"
+                f" '{time.column}' ({undated_rows.size} such rows); delete them or restore their"
+                " time"
+            )
+        for name, values in raw.items():
+            raw[name], new_findings = self._mask_implausible(path, name, values, n_lines_above)
+            findings += new_findings
+        first_and_last = np.flatnonzero(measured)[[0, -1]] if measured.any() else np.array([0, -1])
+        sample_rows = first_and_last[0] + np.flatnonzero(
+            np.isfinite(t[first_and_last[0] : first_and_last[1] + 1])
+        )
+        require_samples(path, sample_rows)
+        if (np.diff(t[sample_rows]) < 0.0).all():
+            sample_rows = sample_rows[::-1]
+            text = "the rows stand with the newest first, and are read from the last one on"
+            findings.append(make_remark("note", "newest_first", text))
+        raw_columns = [*raw.values()]
+        is_not_duplicate = find_unique_rows(
+            t[sample_rows], (_take_rows(values, sample_rows) for values in raw_columns)
+        )
+        if not is_not_duplicate.all():
+            text = (
+                f"{int((~is_not_duplicate).sum())} rows repeat the one before them and are left out"
+            )
+            findings.append(
+                make_remark("note", "copied_rows", text, rows=float((~is_not_duplicate).sum()))
+            )
+            sample_rows = sample_rows[is_not_duplicate]
+        hold_names = [name for name in raw if channel_maps[name].hold]
+        for name in hold_names:
+            raw[name] = pd.Series(raw[name]).ffill().to_numpy()
+        if hold_names and len(hold_names) < len(raw):
+            # a row of commands alone belongs to the next sample of the motion
+            measured_channels = [
+                values[sample_rows] for name, values in raw.items() if name not in hold_names
+            ]
+            sample_rows = sample_rows[np.isfinite(np.stack(measured_channels)).any(axis=0)]
+        clock_resolution = None if time.unit == DATE_UNIT else to_si(time.unit)
+        clock, new_findings = repair_clock(
+            t[sample_rows],
+            (_take_rows(values, sample_rows) for values in raw_columns),
+            clock_resolution,
+        )
+        findings += new_findings
+        del raw_columns, values
+        require_increasing(
+            path, clock, lambda i: self._format_row(int(sample_rows[i]) + n_lines_above)
+        )
+        channels: dict[str, np.ndarray] = {}
+        for name in channel_maps:
+            raw_channel = _take_rows(raw.pop(name), sample_rows)
+            channels[name] = channel_maps[name].convert(name, raw_channel)
+            require_values(path, name, channel_maps[name].column, channels[name])
+            n_interpolated = int((np.isfinite(raw_channel) & ~np.isfinite(channels[name])).sum())
+            if name == "psi" and n_interpolated:
+                text = (
+                    f"{n_interpolated} headings were interpolated by the recorder from 359 to 1 deg by way"
+                    " of 180; they are left empty"
+                )
+                findings.append(make_remark("note", "heading_interpolated", text))
+        channels, new_findings = _to_local_plane(path, channels, channel_maps)
+        findings += new_findings
+        if channels.keys() >= {*QUATERNION} and "psi" not in channels:
+            # where qw has the frame `enu`, the heading counts anticlockwise from east
+            yaw = quaternion_yaw(
+                *normalize_quaternion(*(channels.pop(name) for name in QUATERNION))
+            )
+            if not np.isfinite(yaw).any():
+                columns = [channel_maps[name].column for name in QUATERNION]
+                raise DataError(f"{path}: {', '.join(columns)} hold no attitude, all are empty")
+            channels["psi"] = unwrap_angle(
+                np.pi / 2.0 - yaw if channel_maps["qw"].frame == "enu" else yaw
+            )
+        for name in [
+            cosine_name.removesuffix(COSINE_SUFFIX)
+            for cosine_name in channels
+            if cosine_name.endswith(COSINE_SUFFIX)
+        ]:
+            if name + SINE_SUFFIX in channels and name not in channels:
+                sine, cosine = channels.pop(name + SINE_SUFFIX), channels.pop(name + COSINE_SUFFIX)
+                channels[name] = unwrap_angle(np.arctan2(sine, cosine))
+        derived_units = {"x": "m", "y": "m"}
+        units = {
+            n: channel_maps[n].si_unit_of(n) if n in channel_maps else derived_units.get(n, "rad")
+            for n in channels
+        }
+        if is_truncated:
+            text = "the file ends within its last line, which is left out"
+            findings.append(make_remark("note", "cut_line", text))
+        meta = describe_provenance(path, rows, rows - sample_rows.size)
+        meta |= {"findings": findings} if findings else {}
+        if start_ns is not None:
+            first_epoch_ns = start_ns + int(np.rint(clock[0] * 1e9))
+            meta |= {"epoch": first_epoch_ns * 1e-9, "epoch_ns": first_epoch_ns}
+        manoeuvre = self.manoeuvre
+        manoeuvre = path.resolve().parent.name if manoeuvre == "folder" else manoeuvre
+        log = Log(path.stem, clock, channels, units, manoeuvre or "unknown", meta=meta)
+        return add_true_wind(log)
+
+    def _require_matching_units(self, path: Path, cell_units: Sequence[str]) -> None:
+        """Stop where cells name another unit than the channel map; `written` are those of cells."""
+        time, channel_maps = self.time, self.channels.values()
+        time_units = [(name, time.unit) for name in time.columns]
+        # with a scale, the map says what its numbers mean
+        channel_units = [
+            (item.column, "" if item.scale != 1.0 else item.unit) for item in channel_maps
+        ]
+        for (column, unit), cell_unit in zip(
+            [*time_units, *channel_units], cell_units, strict=False
+        ):
+            if cell_unit and unit and cell_unit != canonical_unit(unit):
+                raise DataError(
+                    f"{path}: the cells of column '{column}' are in {cell_unit}, not in {unit}; set"
+                    f" unit: {cell_unit}"
+                )
+
+    def _format_row(self, i: int) -> str:
+        return self.row_format.format(i + 1, i + 2)
+
+    def _parse_times(
+        self, path: Path, cells: Mapping[str, pd.Series], n_lines_above: int
+    ) -> tuple[np.ndarray, int | None, list[Remark]]:
+        """Return the times [T] in s, from Unix time in ns where there are dates, and remarks."""
+        time = self.time
+        texts = cells[time.column]
+        if time.unit != DATE_UNIT:
+            return (
+                self._parse_numbers(path, texts, time.column, n_lines_above) * to_si(time.unit),
+                None,
+                [],
+            )
+        if time.date is not None:
+            days = cells[time.date].astype("string").str.strip()
+            texts = days + " " + texts.astype("string").str.strip()
+        try:
+            stamps = parse_texts(texts, zone=time.zone, order=time.order, has_only_dates=True)
+        except DataError as error:
+            raise DataError(f"{path}: column '{time.column}': {error}") from None
+        is_valid = np.ones(len(texts), dtype=bool) if stamps.valid is None else stamps.valid
+        start_ns = int(stamps.ns[is_valid][0]) if is_valid.any() else 0
+        t = np.where(is_valid, (stamps.ns - start_ns) * 1e-9, np.nan)
+        return t, start_ns if stamps.is_absolute else None, list(stamps.remarks)
+
+    def _parse_channel(
+        self, path: Path, name: str, cells: Mapping[str, pd.Series], n_lines_above: int
+    ) -> np.ndarray:
+        """Return one channel [T] as it stands in the table, NaN where empty."""
+        import pandas as pd
+
+        entry = self.channels[name]
+        column = entry.column
+        is_text = name in FIX_CHANNELS and not pd.api.types.is_numeric_dtype(cells[column])
+        if not entry.is_angle and not is_text:
+            return self._parse_numbers(path, cells[column], column, n_lines_above)
+        if canonical_unit(entry.unit) != "deg":
+            raise DataError(f"{path}: column '{column}' is written in degrees; set unit: deg")
+        try:
+            angles = parse_degrees(cells[column], name, entry.form, entry.letter_o)
+            if entry.hemisphere is not None:
+                column = entry.hemisphere
+                angles = angles * hemisphere_signs(cells[column], name, entry.letter_o)
+        except DataError as error:
+            raise DataError(f"{path}: column '{column}': {error}") from None
+        return angles
+
+    def _parse_numbers(
+        self, path: Path, column: pd.Series, name: str, n_lines_above: int
+    ) -> np.ndarray:
+        """Return the cells of one column as float64 [T], NaN where empty."""
+        import pandas as pd
+
+        numeric = (
+            column
+            if pd.api.types.is_numeric_dtype(column)
+            else pd.to_numeric(column.astype("string"), errors="coerce")
+        )
+        values = numeric.to_numpy(dtype=np.float64, na_value=np.nan)
+        if np.isfinite(values).all():
+            return values
+        invalid_rows = np.flatnonzero(
+            (np.isnan(values) & column.notna().to_numpy()) | np.isinf(values)
+        )
+        if invalid_rows.size:
+            i = int(invalid_rows[0])
+            raise DataError(
+                f"{path}: {self._format_row(i + n_lines_above)}, column '{name}': '{truncate(column.iloc[i])}' is not"
+                f" a finite number ({invalid_rows.size} such cells in {len(column)} rows); leave cells"
+                " without a measurement empty, and check `delimiter` and `decimal`"
+            )
+        return values
+
+    def _mask_implausible(
+        self, path: Path, name: str, values: np.ndarray, n_lines_above: int
+    ) -> tuple[np.ndarray, list[Remark]]:
+        """Return a channel [T] without fill values; stop at one that no vessel can have."""
+        entry, findings = self.channels[name], []
+        is_fill = is_fill_value(values)
+        if is_fill.any():
+            count = int(is_fill.sum())
+            text = f"{count} cells of {name} hold a fill value and count as missing"
+            findings.append(make_remark("note", "fill_values", text, count=count))
+            values = np.where(is_fill, np.nan, values)
+        unit = entry.si_unit_of(name)
+        implausible_rows = np.flatnonzero(is_implausible(entry.magnitude_in_si(name, values), unit))
+        if implausible_rows.size:
+            i = int(implausible_rows[0])
+            raise DataError(
+                f"{path}: {self._format_row(i + n_lines_above)}, column '{entry.column}': {values[i]:g} makes"
+                f" {name} larger than {max_magnitude(unit):g} {unit}, which no vessel reaches"
+                f" ({implausible_rows.size} such cells); correct or empty them, or correct the unit"
+            )
+        return values, findings
+
+
+@final
+class CsvConfig(TableConfig):
+    """Text tables with a line of column names; lines above it, and units beneath it, are skipped.
+
+    The names' line is the first one that holds the time's and all channels' columns.
+
+    Attributes:
+        delimiter: between cells; a blank stands for any number of blanks and tabulators.
+        decimal: sign of the decimals, `.` or `,`.
+        encoding: of the text, for example `cp1252` for a file that an older Windows wrote; null
+            finds it by the bytes themselves, UTF-16, cp932 and gb18030 included.
+    """
+
+    kind: Literal["csv"] = "csv"
+    delimiter: str = Field(default=",", min_length=1, max_length=1)
+    decimal: Literal[".", ","] = "."
+    encoding: str | None = None
+    row_format: ClassVar[str] = "line {1}"
+
+    @field_validator("encoding")
+    @classmethod
+    def _validate_encoding(cls, encoding: str | None) -> str | None:
+        if encoding is None:
+            return None
+        try:
+            return codecs.lookup(encoding).name
+        except LookupError as error:
+            raise ValueError(
+                f"no encoding is called '{encoding}'; usual are utf-8, utf-16, cp1252 and cp932"
+            ) from error
+
+    def load(self, path: Path, columns: Sequence[str], advance: ProgressCallback) -> pd.DataFrame:
+        return read_csv(path, columns, self.delimiter, self.decimal, self.encoding, advance)
+
+
+@final
+class ExcelConfig(TableConfig):
+    """Sheets of Excel files (.xlsx); lines above the column names, and units beneath, are skipped.
+
+    Attributes:
+        sheet: name of the sheet; null takes the first.
+    """
+
+    kind: Literal["excel"] = "excel"
+    sheet: str | None = None
+    row_format: ClassVar[str] = "row {1}"
+
+    def load(self, path: Path, columns: Sequence[str], advance: ProgressCallback) -> pd.DataFrame:
+        table = read_excel_sheet(path, self.sheet)
+        selected = table.iloc[
+            :, find_column_positions(path, [str(name) for name in table.columns], columns)
+        ]
+        selected.attrs["above"] = table.attrs["above"] - 1
+        return coerce_numeric(selected)
+
+
+@final
+class ParquetConfig(TableConfig):
+    """Parquet tables that residnet did not write."""
+
+    kind: Literal["parquet"] = "parquet"
+
+    def load(self, path: Path, columns: Sequence[str], advance: ProgressCallback) -> pd.DataFrame:
+        import pyarrow.parquet as pq
+
+        find_column_positions(path, _read_parquet_names(path), columns)
+        with wrap_read_errors(path, "a Parquet file"):
+            with pq.ParquetFile(path, page_checksum_verification=True) as file:
+                table = file.read(columns=sorted(set(columns)))
+            selected: pd.DataFrame = table.to_pandas(ignore_metadata=True)[list(columns)]
+            return selected
+
+
+@final
+class JsonLinesConfig(TableConfig):
+    """Files with a JSON object a line (.jsonl, .ndjson), or a document (.json) that holds a table.
+
+    A column is a key, `nav.lat` one within; entries of lists are counted from zero: `imu.q[0]`. The
+    table of a document is its longest list of objects, or the lists of one length beside each
+    other.
+    """
+
+    kind: Literal["json_lines"] = "json_lines"
+    row_format: ClassVar[str] = "object {0}"
+
+    def load(self, path: Path, columns: Sequence[str], advance: ProgressCallback) -> pd.DataFrame:
+        """Return the columns of JSON lines; an object without a key has an empty cell there."""
+        import pandas as pd
+
+        lines = _JsonObjectReader(path)
+        rows = list(lines)
+        keys = {key for row in rows for key in row}
+        for name in columns:
+            if name not in keys and rows:
+                raise UsageError(f"{path}: no key '{name}'{suggest_name(name, list(keys))}")
+        table = pd.DataFrame({i: [row.get(n) for row in rows] for i, n in enumerate(columns)})
+        table = table.infer_objects()
+        table.columns = pd.Index(list(columns))
+        table.attrs["cut"] = lines.is_truncated
+        return coerce_numeric(table)
+
+
+def _take_rows(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return values [T] at rows [K]; themselves, and no copy, where these are all in order."""
+    is_identity = rows.size == values.size and rows[0] == 0
+    return values if is_identity else np.asarray(values[rows])
+
+
+def _to_local_plane(
+    path: Path, channels: dict[str, np.ndarray], channel_maps: Mapping[str, ChannelMap]
+) -> tuple[dict[str, np.ndarray], list[Remark]]:
+    """Return channels with x, y in place of latitude and longitude, and where they count from."""
+    if not channels.keys() >= {*FIX_CHANNELS} or {"x", "y"} & channels.keys():
+        return channels, []
+    latitude, longitude = (channels[name] for name in FIX_CHANNELS)
+    north, east, origin, n_null_fixes = project_fixes(latitude, longitude)
+    max_latitude = float(np.abs(latitude[np.isfinite(latitude)]).max(initial=0.0))
+    if channel_maps["latitude"].si_unit_of("latitude") != "rad" or max_latitude > np.pi / 2:
+        raise DataError(
+            f"{path}: latitude reaches {np.degrees(max_latitude):.4g} deg, which none does; give the unit"
+            " of its column (deg), and `form: ddmm` for degrees and minutes in one number"
+        )
+    if origin is None:
+        raise DataError(f"{path}: latitude and longitude hold no fix")
+    origin_deg = [float(np.degrees(angle)) for angle in origin]
+    text = (
+        f"x, y are north and east of the first fix, latitude {origin_deg[0]:.6f} deg, longitude"
+        f" {origin_deg[1]:.6f} deg"
+    )
+    remarks = [make_remark("note", "origin", text, latitude=origin[0], longitude=origin[1])]
+    if n_null_fixes:
+        text = f"{n_null_fixes} fixes at latitude 0, longitude 0 are no fixes; left empty"
+        remarks.append(make_remark("note", "no_fix", text, count=float(n_null_fixes)))
+    other_channels = {name: values for name, values in channels.items() if name not in FIX_CHANNELS}
+    return {"x": north, "y": east, **other_channels}, remarks
+
+
+def read_excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> pd.DataFrame:
+    """Return a sheet as its cells are, with the line above its values that holds names as names.
+
+    Its `attrs` hold `n_lines_above`, the number of lines above the values, and `between`, the cells of the
+    lines between names and values.
+
+    Args:
+        sheet: its name; None takes the first.
+        rows: how many are read; None for all.
+    """
+    import pandas as pd
+
+    names = list_sheet_names(path)
+    if sheet is not None and sheet not in names:
+        raise UsageError(f"{path}: no sheet '{sheet}'{suggest_name(sheet, names)}")
+    with wrap_read_errors(path, "an Excel file"):
+        cells = pd.read_excel(
+            path, sheet_name=sheet or 0, nrows=rows, engine="openpyxl", header=None
+        )
+    head_rows = [
+        ["" if pd.isna(cell) else str(cell).strip() for cell in row]
+        for row in cells.head(_HEADER_SEARCH_ROWS).itertuples(index=False)
+    ]
+    header_row, first_value_row = find_header(head_rows) or (0, 1)
+    # with the names among them, all columns were of objects
+    table = cells.iloc[first_value_row:].infer_objects()
+    table.columns = pd.Index(make_names_unique(head_rows[header_row] if head_rows else []))
+    table = table.dropna(how="all")
+    table.attrs |= {
+        "above": first_value_row,
+        "between": head_rows[header_row + 1 : first_value_row],
+    }
+    return table
+
+
+def list_sheet_names(path: Path) -> list[str]:
+    """Return the names of the sheets of an Excel file, in order.
+
+    Raises:
+        UsageError: where openpyxl is not installed.
+        DataError: where the file cannot be read.
+    """
+    with optional_import("excel", "openpyxl", "an Excel sheet"):
+        import openpyxl
+    with wrap_read_errors(path, "an Excel file"):
+        return [str(name) for name in openpyxl.load_workbook(path, read_only=True).sheetnames]
+
+
+def _read_parquet_names(path: Path) -> list[str]:
+    import pyarrow.parquet as pq
+
+    with wrap_read_errors(path, "a Parquet file"):
+        try:
+            return list(pq.read_schema(path).names)
+        except UnicodeDecodeError as error:
+            name = truncate(bytes(error.object).decode("latin-1"), 60)
+            raise DataError(
+                f"{path}: '{name}', the name of a column, is no UTF-8 text; rename it where it is"
+                " written"
+            ) from error
+
+
+def read_parquet_head(path: Path, rows: int) -> pd.DataFrame:
+    """Return the first rows of a Parquet file.
+
+    Raises:
+        DataError: where it cannot be read.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    with wrap_read_errors(path, "a Parquet file"):
+        # an index of pandas is a column as its reader sees it
+        batch = next(pq.ParquetFile(path).iter_batches(batch_size=rows))
+        table: pd.DataFrame = pa.Table.from_batches([batch]).to_pandas(ignore_metadata=True)
+        return table
+
+
+def read_json_head(path: Path, rows: int) -> pd.DataFrame:
+    """Return the first rows of a file of JSON lines, a column for each key."""
+    import pandas as pd
+
+    objects = list(islice(_JsonObjectReader(path), rows))
+    if not objects:
+        raise DataError(f"{path}: the file is empty; an object a line was expected")
+    return coerce_numeric(pd.DataFrame(objects).infer_objects())
+
+
+def read_column_names(path: Path) -> tuple[str, ...]:
+    """Return what tells tables of the same columns: their names, or the first line of a text."""
+    table_kind = TABLE_KINDS.get(path.suffix.lower(), "csv")
+    if table_kind == "parquet":
+        return tuple(_read_parquet_names(path))
+    if table_kind != "csv":
+        return ()
+    with path.open("rb") as stream:
+        return (stream.readline(1 << 16).decode(errors="replace").strip(),)
+
+
+@final
+class _JsonObjectReader:
+    """The objects of a file, flat: `nav.lat` is a key within, `imu.q[0]` an entry of a list."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self.is_truncated = path, False
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        n_objects = 0
+        with open_as_utf8(self._path) as file, file.open("rb") as stream:
+            if (table := _parse_json_table(self._path, file)) is not None:
+                yield from map(_flatten_json, table)
+                return
+            for line_number, line in enumerate(stream, start=1):
+                text = line.decode("utf-8-sig", errors="replace").strip()
+                try:
+                    if text:
+                        value = json.loads(text)
+                        if not isinstance(value, dict):
+                            raise ValueError("no object")
+                        yield from _expand_signal_k(value)
+                        n_objects += 1
+                except (ValueError, RecursionError) as error:
+                    # a recorder that was switched off ends within a line
+                    self.is_truncated = n_objects > 0 and not line.endswith(b"\n")
+                    if self.is_truncated:
+                        return
+                    raise DataError(
+                        f"{self._path}: line {line_number}, '{truncate(text, 60)}', is no JSON object;"
+                        " give files with one object a line"
+                    ) from error
+
+
+def _parse_json_table(path: Path, file: Path) -> Sequence[Mapping[str, Any]] | None:
+    """Return the objects of the table that one JSON document holds; None for an object a line."""
+    if path.suffix.lower() != ".json":
+        return None
+    try:
+        document = json.loads(file.read_text("utf-8-sig", errors="replace"))
+    except (ValueError, RecursionError):
+        return None
+    tables = dict(_find_json_tables(document))
+    if not tables:
+        raise DataError(
+            f"{path}: holds no table; a list of objects, or lists of one length by name, were"
+            " expected"
+        )
+    longest_name = max(tables, key=lambda name: len(tables[name]))
+    other_names = [
+        name
+        for name, rows in tables.items()
+        if len(rows) >= _MIN_TABLE_ROWS and name != longest_name
+    ]
+    if other_names:
+        table_sizes = ", ".join(
+            f"{name} ({len(tables[name])} rows)" for name in [longest_name, *other_names]
+        )
+        raise DataError(
+            f"{path}: holds several tables, {table_sizes}; write each into a file of its own, all with a"
+            " time: files whose names differ in that word alone are read as one log"
+        )
+    return tables[longest_name]
+
+
+def _find_json_tables(
+    value: Any, name: str = ""
+) -> Iterator[tuple[str, Sequence[Mapping[str, Any]]]]:
+    """Yield name and rows of the tables in a value: lists of objects, and lists side by side."""
+    if isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
+        yield name, value
+    if not isinstance(value, dict):
+        return
+    columns = {key: cells for key, cells in value.items() if isinstance(cells, list)}
+    plain_columns = {
+        n: c for n, c in columns.items() if not any(isinstance(cell, dict) for cell in c)
+    }
+    max_length = max(map(len, plain_columns.values()), default=0)
+    plain_columns = {key: cells for key, cells in plain_columns.items() if len(cells) == max_length}
+    if len(plain_columns) > 1:
+        yield (
+            name,
+            [
+                dict(zip(plain_columns, row, strict=True))
+                for row in zip(*plain_columns.values(), strict=True)
+            ],
+        )
+    for key, child in value.items():
+        yield from _find_json_tables(child, f"{name}.{key}" if name else str(key))
+
+
+def _expand_signal_k(value: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the rows that an object holds: one, or one for each update of Signal K."""
+    updates = value.get("updates")
+    if not isinstance(updates, list) or "context" not in value:
+        yield _flatten_json(value)
+        return
+    for update in updates:
+        values_by_path = {entry["path"]: entry["value"] for entry in update.get("values", [])}
+        yield _flatten_json({"timestamp": update.get("timestamp")} | values_by_path)
+
+
+def _flatten_json(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flattened: dict[str, Any] = {}
+    if value.get("type") == "Point" and isinstance(value.get("coordinates"), list):
+        # of GeoJSON (RFC 7946, section 3.1.1)
+        coordinates = zip(("longitude", "latitude"), value["coordinates"], strict=False)
+        value = dict(coordinates)
+    for key, entry in value.items():
+        name = f"{prefix}{key}"
+        if isinstance(entry, dict):
+            flattened |= _flatten_json(entry, f"{name}.")
+        elif isinstance(entry, list):
+            # scans and pictures are no channels
+            entry = entry if len(entry) <= _MAX_LIST_COLUMNS else []
+            flattened |= _flatten_json({f"{name}[{i}]": part for i, part in enumerate(entry)})
+        else:
+            flattened[name] = entry
+    return flattened

@@ -1,0 +1,615 @@
+"""Which logs, and which stretches of them, are for training, validation and test.
+
+Files are named by patterns; a log may be cut in time. Where nobody said which is which they are
+divided here, and no two splits may share measurements.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from residnet.core.arrays.paged import MAX_SAMPLES_IN_MEMORY, is_memory_mapped, release_pages
+from residnet.core.config import Config, ConfigPath, Seconds, load_mapping, validate_config
+from residnet.core.errors import ConfigError, DataError
+from residnet.core.log import Log
+from residnet.core.names import STATE_NAMES, suggest_name
+from residnet.io.readers.base import list_files
+from residnet.io.readers.detect import LOG_ENDINGS, detect_recording_format, is_text_table
+from residnet.preprocessing.motion import remove_pauses
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+SPLITS = ("train", "validation", "test")
+_MIN_LOGS_FOR_WHOLE_SPLITS = 5
+"""Logs from which whole ones are taken for each split."""
+_MIN_TEST_LOGS, _MIN_LOGS_FOR_TEST_LOGS = 3, 8
+"""Test logs without which no verdict is passed, and logs of which so many can be spared."""
+_SPLIT_SHARES = (
+    ("train", 0.0, 0.3),
+    ("validation", 0.3, 0.5),
+    ("train", 0.5, 0.8),
+    ("test", 0.8, 1.0),
+)
+"""Stretches of each log where there are fewer."""
+_SPLITS_BY_NAME = {
+    **dict.fromkeys(("train", "training"), "train"),
+    **dict.fromkeys(("validation", "valid", "val", "dev"), "validation"),
+    **dict.fromkeys(("test", "testing"), "test"),
+}
+"""What folders and files of a split are called."""
+_MAX_SHARED_ROWS = 100
+"""Rows that two logs may share before one is a copy of part of the other."""
+
+
+class LogPart(Config):
+    """Logs, or a stretch of one, that belong to a split.
+
+    Attributes:
+        log: path or pattern of files, folders and bags, relative to `root`.
+        from: time in s on the log's own clock at which the stretch begins; null for its start.
+        to: time in s at which it ends; null for the log's end.
+        manoeuvre: only logs of this kind of manoeuvre; null for all.
+    """
+
+    log: str
+    start: Seconds | None = Field(default=None, alias="from")
+    stop: Seconds | None = Field(default=None, alias="to")
+    manoeuvre: str | None = None
+
+    @model_validator(mode="after")
+    def check_order(self) -> LogPart:
+        if self.start is not None and self.stop is not None and self.stop <= self.start:
+            raise ValueError(
+                f"a stretch from {self.start:.10g} s to {self.stop:.10g} s holds nothing"
+            )
+        return self
+
+    @property
+    def path(self) -> Path:
+        """The file or folder, where it names one (`resolve_log_parts`)."""
+        return Path(self.log)
+
+    @property
+    def is_whole_log(self) -> bool:
+        """Whether it is the log from end to end."""
+        return self.start is None and self.stop is None
+
+    @property
+    def time_range(self) -> tuple[float, float]:
+        """Times at which it begins and ends, s; infinite for those of the log."""
+        start, stop = self.start, self.stop
+        return -np.inf if start is None else start, np.inf if stop is None else stop
+
+    def overlaps(self, other: LogPart) -> bool:
+        """Return whether two parts of one log share a stretch of time, whatever its kind."""
+        is_other_manoeuvre = self.manoeuvre != other.manoeuvre and None not in (
+            self.manoeuvre,
+            other.manoeuvre,
+        )
+        return not is_other_manoeuvre and max(self.time_range[0], other.time_range[0]) < min(
+            self.time_range[1], other.time_range[1]
+        )
+
+    def extract(self, log: Log) -> Log | None:
+        """Return this part of a log; None where the log is of another manoeuvre.
+
+        Raises:
+            DataError: where the stretch holds fewer than two samples.
+        """
+        if self.manoeuvre not in (None, log.manoeuvre):
+            return None
+        return log if self.is_whole_log else extract_segment(log, *self.time_range)
+
+
+def extract_segment(log: Log, start_time: float, stop_time: float) -> Log:
+    """Return the samples of a log with start <= t < stop, under a name of their own."""
+    is_inside = (log.t >= start_time - 1e-9) & (log.t < stop_time - 1e-9)
+    first_time, last_time = float(log.t[0]), float(log.t[-1])
+    time_range = [
+        start_time if np.isfinite(start_time) else first_time,
+        stop_time if np.isfinite(stop_time) else last_time,
+    ]
+    if is_inside.sum() < 2:
+        raise DataError(
+            f"log {log.name}: {int(is_inside.sum())} samples from {time_range[0]:.10g} s to"
+            f" {time_range[1]:.10g} s; the log runs from {first_time:.10g} s to {last_time:.10g} s"
+        )
+    name = "_".join(
+        [log.name, *(f"{time_limit:.13g}s".replace(".", "p") for time_limit in time_range)]
+    )
+    first_index = int(np.argmax(is_inside))
+    # a slice, and no copy
+    segment = log.select_rows(slice(first_index, first_index + int(is_inside.sum()))).replace(
+        name=name, meta={**log.meta, "stretch": time_range}
+    )
+    return segment.move_to_disk() if is_memory_mapped(log.t) else segment
+
+
+def resolve_log_parts(
+    root: Path, entries: Sequence[str | LogPart], error_prefix: str
+) -> list[LogPart]:
+    """Return the parts of single logs that a split's entries name, each once."""
+    log_parts: dict[LogPart, None] = {}
+    for entry in entries:
+        log_part = entry if isinstance(entry, LogPart) else LogPart(log=entry)
+        for path in match_patterns(root, [log_part.log], error_prefix):
+            log_parts[log_part.model_copy(update={"log": str(path)})] = None
+    return list(log_parts)
+
+
+class SplitFile(Config):
+    """Logs of the three splits in a YAML file of their own, as in `SplitConfig`."""
+
+    train: tuple[str | LogPart, ...] = Field(min_length=1)
+    validation: tuple[str | LogPart, ...] = Field(min_length=1)
+    test: tuple[str | LogPart, ...] = Field(min_length=1)
+
+
+class SplitConfig(Config):
+    """Logs of the three splits: from a YAML file, from patterns, or divided by residnet.
+
+    Attributes:
+        file: YAML file with the keys train, validation and test, each a list of paths or patterns
+            relative to `root`.
+        root: folder that paths and patterns start from; by default the folder of `file`, else the
+            current folder.
+        auto: patterns of logs that are divided by residnet: of each five logs, in the order of
+            their manoeuvres, the third is for validation and the fifth for the test; fewer are cut
+            in time. Copies are left out.
+        train: files, folders, bags or patterns such as `turning/*.csv` (`**` for any depth), where
+            there is no `file`; or stretches of time and logs of a manoeuvre, such as `{log:
+            trip.mcap, from: 120 s, to: 300 s}` and `{log: "*.csv", manoeuvre: zigzag}`.
+        validation: the same for the logs that models are chosen on.
+        test: the same for the logs that nothing is chosen on.
+    """
+
+    file: ConfigPath | None = None
+    root: ConfigPath | None = None
+    auto: tuple[str, ...] = ()
+    train: tuple[str | LogPart, ...] = Field(default=())
+    validation: tuple[str | LogPart, ...] = Field(default=())
+    test: tuple[str | LogPart, ...] = Field(default=())
+
+    @model_validator(mode="after")
+    def check_source(self) -> SplitConfig:
+        named_splits = [name for name in SPLITS if getattr(self, name)]
+        if self.auto and (named_splits or self.file is not None):
+            given_text = ", ".join([*named_splits, *(["file"] if self.file is not None else [])])
+            raise ValueError(
+                f"give either `auto`, `file` or patterns (given: auto and {given_text})"
+            )
+        if self.auto:
+            return self
+        if self.file is not None and named_splits:
+            raise ValueError(
+                f"give either `file` or patterns, not both (given: file and {', '.join(named_splits)})"
+            )
+        if self.file is None and len(named_splits) < len(SPLITS):
+            missing_splits = [name for name in SPLITS if name not in named_splits]
+            raise ValueError(
+                f"no files for {', '.join(missing_splits)}; give patterns for train, validation and test,"
+                " one `file` that names them, or `auto` with patterns of all logs"
+            )
+        return self
+
+    def resolve_parts(self) -> dict[str, list[LogPart]]:
+        """Return what each split consists of, in the order of its patterns; nothing of `auto`.
+
+        The matches of a pattern are sorted.
+
+        Raises:
+            ConfigError: where a split is empty, a pattern matches nothing, or a stretch stands in
+                two splits.
+        """
+        if self.auto:
+            return {}
+        root, error_prefix = self._find_root(), "split" if self.file is None else str(self.file)
+        split_settings = (
+            self
+            if self.file is None
+            else validate_config(load_mapping(self.file), SplitFile, error_prefix)
+        )
+        parts_by_split = {
+            name: resolve_log_parts(root, getattr(split_settings, name), f"{error_prefix}: {name}")
+            for name in SPLITS
+        }
+        listed_parts = [
+            (log_part.path.resolve(), split, log_part)
+            for split, parts_of_split in parts_by_split.items()
+            for log_part in parts_of_split
+        ]
+        for part_index, (resolved_path, split, log_part) in enumerate(listed_parts):
+            for other_path, other_split, other_part in listed_parts[:part_index]:
+                if (
+                    other_path == resolved_path
+                    and other_split != split
+                    and log_part.overlaps(other_part)
+                ):
+                    subject = "" if log_part.is_whole_log else "the same stretch of "
+                    raise ConfigError(
+                        f"{error_prefix}: {subject}{log_part.path} stands in {other_split} and in {split}; a"
+                        f" {'file' if log_part.is_whole_log else 'stretch'} belongs to one split"
+                    )
+        return parts_by_split
+
+    def list_files(self) -> list[Path]:
+        """Return all logs, each once.
+
+        Raises:
+            ConfigError: as `parts`.
+        """
+        if self.auto:
+            return match_patterns(self._find_root(), self.auto, "split: auto")
+        return list(
+            dict.fromkeys(part.path for parts in self.resolve_parts().values() for part in parts)
+        )
+
+    def resolve_paths(self) -> dict[str, list[Path]]:
+        """Return the logs of each split; nothing where `auto` divides them.
+
+        Raises:
+            ConfigError: as `parts`.
+        """
+        return {
+            split: list(dict.fromkeys(part.path for part in parts))
+            for split, parts in self.resolve_parts().items()
+        }
+
+    def _find_root(self) -> Path:
+        root = self.root or (self.file.parent if self.file is not None else Path.cwd())
+        if not root.is_dir():
+            raise ConfigError(f"split: root {root} is not a folder; correct `root`")
+        return root
+
+
+def split_logs(logs: Sequence[Log]) -> dict[str, list[Log]]:
+    """Return the logs by split (train, validation, test); copies are left out.
+
+    Of each five logs, in the order of their manoeuvres, the third is for validation and the fifth
+    for the test; of eight or more three at least, fewer cannot tell how good a model is. Where
+    there are fewer than five, each is cut in time: its first three tenths and those from the middle
+    on are for training, the rest for validation and test. Where folders or files are called train
+    and test (and validation), that is the split.
+
+    Raises:
+        DataError: where a log is too short to be cut.
+    """
+    distinct_logs = remove_copies(logs)
+    logs_by_split: dict[str, list[Log]] = {split: [] for split in SPLITS}
+    split_names, n_logs = splits_from_names(distinct_logs), len(distinct_logs)
+    if not split_names and n_logs >= _MIN_LOGS_FOR_WHOLE_SPLITS:
+        logs_per_test_log = (
+            n_logs / _MIN_TEST_LOGS
+            if _MIN_LOGS_FOR_TEST_LOGS <= n_logs < _MIN_TEST_LOGS * _MIN_LOGS_FOR_WHOLE_SPLITS
+            else _MIN_LOGS_FOR_WHOLE_SPLITS
+        )
+        test_indices = {int((k + 0.8) * logs_per_test_log) for k in range(n_logs)}
+        distinct_logs = sorted(distinct_logs, key=lambda log: log.manoeuvre)
+        split_names = [
+            "test" if log_index in test_indices else "train" for log_index in range(n_logs)
+        ]
+    if split_names:
+        for log, split_name in zip(distinct_logs, split_names, strict=True):
+            logs_by_split[split_name].append(log)
+        if not logs_by_split["validation"]:
+            training_logs = logs_by_split["train"]
+            validation_indices = range(2, len(training_logs), 4) or range(
+                len(training_logs) - 1, 0, -len(training_logs)
+            )
+            logs_by_split["validation"] = [
+                training_logs[log_index] for log_index in validation_indices
+            ]
+            logs_by_split["train"] = [
+                log
+                for log_index, log in enumerate(training_logs)
+                if log_index not in validation_indices
+            ]
+        return logs_by_split
+    for log in distinct_logs:
+        elapsed, duration = remove_pauses(log.t), float(log.t[-1] - log.t[0])
+        # whole numbers read better, where the log is long enough for them
+        n_digits = max(0, 2 - int(np.log10(max(duration, 1e-9))))
+        for split, *share_limits in _SPLIT_SHARES:
+            start_time, stop_time = (
+                round(float(np.interp(share * elapsed[-1], elapsed, log.t)), n_digits)
+                for share in share_limits
+            )
+            segment_start, segment_stop = (
+                start_time if share_limits[0] else -np.inf,
+                stop_time if share_limits[1] < 1.0 else np.inf,
+            )
+            logs_by_split[split].append(extract_segment(log, segment_start, segment_stop))
+    return logs_by_split
+
+
+def splits_from_names(logs: Sequence[Log]) -> list[str]:
+    """Return for each log the split that its folder or file is called after; empty for no split.
+
+    All must be called so, two of them for training and one for the test at least.
+    """
+    split_names = []
+    for log in logs:
+        path = Path(str(log.meta.get("source", "")).lower())
+        name_parts = [re.split(r"[\W_\d]+", path.stem)[0], *reversed(path.parent.parts)]
+        split_names.append(
+            next((_SPLITS_BY_NAME[word] for word in name_parts if word in _SPLITS_BY_NAME), "")
+        )
+    has_several_training_logs = split_names.count("train") + split_names.count("validation") > 1
+    return (
+        split_names
+        if has_several_training_logs
+        and "" not in split_names
+        and {"train", "test"} <= {*split_names}
+        else []
+    )
+
+
+def remove_copies(logs: Sequence[Log]) -> list[Log]:
+    """Return the logs without those whose rows another one holds; the longest stay."""
+    common_channels = sorted(set.intersection(*(set(log.channels) for log in logs))) if logs else []
+    if len(logs) < 2 or not common_channels:
+        return [*logs]
+    shared_rows = _count_shared_rows(
+        [np.unique(hash_measured_rows(log, common_channels)) for log in logs]
+    )
+    is_retained = np.zeros(len(logs), dtype=bool)
+    for i in sorted(range(len(logs)), key=lambda i: -len(logs[i])):
+        row_slice = slice(shared_rows.indptr[i], shared_rows.indptr[i + 1])
+        is_retained[i] = not (
+            is_retained[shared_rows.indices[row_slice]]
+            & (shared_rows.data[row_slice] > _MAX_SHARED_ROWS)
+        ).any()
+    return [log for log, is_retained_log in zip(logs, is_retained, strict=True) if is_retained_log]
+
+
+def _count_shared_rows(hashes: Sequence[np.ndarray]) -> csr_array:
+    """Return how many distinct rows logs have in common [L, L], by those that two of them hold."""
+    from scipy.sparse import coo_array, csr_array
+
+    log_indices = np.repeat(np.arange(len(hashes)), [log_hashes.size for log_hashes in hashes])
+    _, hash_indices, n_occurrences = np.unique(
+        np.concatenate(hashes), return_inverse=True, return_counts=True
+    )
+    is_shared = n_occurrences[hash_indices] > 1
+    row_and_column = log_indices[is_shared], hash_indices[is_shared]
+    incidence = coo_array(
+        (np.ones(is_shared.sum()), row_and_column), (len(hashes), n_occurrences.size)
+    ).tocsr()
+    shared_counts = csr_array(incidence @ incidence.T)
+    shared_counts.sort_indices()
+    return shared_counts
+
+
+def check_leaks(
+    logs_by_split: Mapping[str, Sequence[Log]], max_shared_rows: int = _MAX_SHARED_ROWS
+) -> None:
+    """Stop where two logs of different splits hold the same measurements.
+
+    Compared are rows of all channels that the logs have in common, without time and with angles
+    modulo a full circle, so that a copied stretch is found wherever its clock and heading start.
+    Equal rows within one log (a vessel at rest) count once.
+
+    Args:
+        logs_by_split: split -> its logs.
+        max_shared_rows: most distinct rows that two logs may share.
+
+    Raises:
+        DataError: naming the two logs that share most rows.
+    """
+    splits_and_logs = [
+        (split, log) for split, logs_of_split in logs_by_split.items() for log in logs_of_split
+    ]
+    common_channels = (
+        sorted(set.intersection(*(set(log.channels) for _, log in splits_and_logs)))
+        if splits_and_logs
+        else []
+    )
+    row_sampling_interval_ = row_sampling_interval([log for _, log in splits_and_logs])
+    hashes = [
+        hash_measured_rows(log, common_channels) for _, log in splits_and_logs if common_channels
+    ]
+    hashes = [
+        np.unique(log_hashes[log_hashes % np.uint64(row_sampling_interval_) == 0])
+        for log_hashes in hashes
+    ]
+    if len({split for split, _ in splits_and_logs}) < 2 or not any(
+        log_hashes_.size for log_hashes_ in hashes
+    ):
+        return
+    shared_counts = _count_shared_rows(hashes).tocoo()
+    split_indices = np.unique([split for split, _ in splits_and_logs], return_inverse=True)[1]
+    cross_split_counts = np.where(
+        split_indices[shared_counts.row] != split_indices[shared_counts.col],
+        shared_counts.data,
+        0.0,
+    )
+    if not cross_split_counts.any():
+        return
+    largest_index = int(np.argmax(cross_split_counts))
+    (first_split, first_log), (second_split, second_log) = (
+        splits_and_logs[shared_counts.row[largest_index]],
+        splits_and_logs[shared_counts.col[largest_index]],
+    )
+    n_identical = np.intersect1d(
+        hash_measured_rows(first_log, common_channels),
+        hash_measured_rows(second_log, common_channels),
+    ).size
+    if n_identical > max_shared_rows:
+        raise DataError(
+            f"logs {first_log.name} ({first_split}) and {second_log.name} ({second_split}) share {n_identical} identical rows, at"
+            f" most {max_shared_rows} are allowed; one is a copy of part of the other: leave one out, or put"
+            " both into one split"
+        )
+
+
+def row_sampling_interval(logs: Sequence[Log]) -> int:
+    """Return of how many rows one is compared between logs: more than one of very many."""
+    return -(-sum(len(log) for log in logs) // MAX_SAMPLES_IN_MEMORY)
+
+
+_MOTION_CHANNELS = (*STATE_NAMES, "phi", "p")
+
+
+def hash_measured_rows(log: Log, channels: Sequence[str]) -> np.ndarray:
+    """Return the hashes of the rows that hold half of the motion at least, uint64 [K].
+
+    Where channels come at several rates, a row between two fixes holds commands alone, and tells
+    nothing of the run that it is from.
+    """
+    motion_channels = [name for name in channels if name in _MOTION_CHANNELS] or channels
+    n_measured = np.isfinite(log.stack(tuple(motion_channels))).sum(axis=1)
+    return np.asarray(hash_rows(log, channels)[2 * n_measured >= n_measured.max(initial=0)])
+
+
+def hash_rows(log: Log, channels: Sequence[str]) -> np.ndarray:
+    """Return the hash of each row of some channels, uint64 [T]."""
+    import pandas as pd
+
+    columns = {}
+    for name in channels:
+        values = log[name]
+        # unwrapping a copied stretch from another start leaves rounding in the heading
+        columns[name] = (
+            np.round(np.remainder(values, 2.0 * np.pi), 9)
+            if log.units[name] == "rad"
+            else values + 0.0
+        )
+    hashes = pd.util.hash_pandas_object(pd.DataFrame(columns), index=False).to_numpy()
+    release_pages()
+    return np.asarray(hashes)
+
+
+def find_logs(folder: Path) -> list[Path]:
+    """Return the recordings and files of logs in a folder, in order; a recording is one log."""
+    # endings of one's own are looked into where there are no others
+    return _find_logs_recursively(
+        folder, lambda path: path.suffix.lower() in LOG_ENDINGS
+    ) or _find_logs_recursively(
+        folder, lambda path: detect_recording_format(path) is not None or is_text_table(path)
+    )
+
+
+def _find_logs_recursively(folder: Path, is_log: Callable[[Path], bool]) -> list[Path]:
+    if detect_recording_format(folder) is not None and not _contains_recordings(folder):
+        return [folder]
+    log_paths: list[Path] = []
+    for path in sorted(folder.iterdir()):
+        if path.name.startswith("."):
+            continue
+        if path.is_dir():
+            log_paths += _find_logs_recursively(path, is_log)
+        elif is_log(path):
+            log_paths.append(path)
+    return log_paths
+
+
+def _contains_recordings(folder: Path) -> bool:
+    """Return whether the folders in a folder hold files of the same names, as recordings do."""
+    subfolders = [path for path in folder.iterdir() if path.is_dir()]
+    file_name_sets = [
+        frozenset(f.relative_to(path) for f in list_files(path)) for path in subfolders
+    ]
+    return any(
+        file_name_sets.count(file_names) > 1 and len(file_names) > 1
+        for file_names in file_name_sets
+    )
+
+
+def assign_log_names(paths: Iterable[Path]) -> dict[Path, str]:
+    """Return the name of each log: that of its file without the ending, or of its folder.
+
+    Where several files or folders have one name, as with a folder for each trial, the folders above
+    come before it as far as they are needed to tell the logs apart; of files in one folder the
+    ending comes behind it.
+
+    Args:
+        paths: files and recordings; one that is given twice is one log.
+    """
+    distinct_paths = list(dict.fromkeys(paths))
+    resolved_paths = {path: path.resolve() for path in distinct_paths}
+    n_parent_names = dict.fromkeys(distinct_paths, 0)
+    n_by_stem = Counter(
+        (resolved_path.parent, path.stem)
+        for resolved_path, path in {
+            resolved_paths[distinct_path]: distinct_path for distinct_path in distinct_paths
+        }.items()
+    )
+    while True:
+        names_by_path = {
+            path: _make_log_name(path, resolved_paths[path], n_parent_names[path], n_by_stem)
+            for path in distinct_paths
+        }
+        paths_by_name: dict[str, set[Path]] = {}
+        for path, log_name in names_by_path.items():
+            paths_by_name.setdefault(log_name, set()).add(resolved_paths[path])
+        ambiguous_paths = [
+            path
+            for path, log_name in names_by_path.items()
+            if len(paths_by_name[log_name]) > 1
+            and n_parent_names[path] < len(resolved_paths[path].parents) - 1
+        ]
+        if not ambiguous_paths:
+            return names_by_path
+        for path in ambiguous_paths:
+            n_parent_names[path] += 1
+
+
+def _make_log_name(
+    path: Path, resolved_path: Path, n_parent_names: int, n_by_stem: Mapping[tuple[Path, str], int]
+) -> str:
+    is_unique = path.is_dir() or n_by_stem[resolved_path.parent, path.stem] == 1
+    own_name = (
+        (path.name if path.is_dir() else path.stem) if is_unique else path.name.replace(".", "_")
+    )
+    return "_".join(
+        [*(parent.name for parent in reversed(resolved_path.parents[:n_parent_names])), own_name]
+    )
+
+
+def match_patterns(root: Path, patterns: Sequence[str], error_prefix: str) -> list[Path]:
+    """Return logs of all patterns, each once: files, recordings, and what lies below folders."""
+    log_paths: dict[Path, None] = {}
+    for pattern in patterns:
+        # a plain path may hold characters that a pattern would read otherwise
+        path = root / pattern
+        matched_paths = [path] if path.exists() else _glob(root, pattern, error_prefix)
+        matched_logs = [
+            log
+            for matched_path in matched_paths
+            for log in (find_logs(matched_path) if matched_path.is_dir() else [matched_path])
+        ]
+        if not matched_logs:
+            parent = path.parent
+            hint = (
+                suggest_name(Path(pattern).name, (path.name for path in parent.iterdir()))
+                if parent.is_dir()
+                else f"; there is no folder {parent}"
+            )
+            raise ConfigError(f"{error_prefix}: '{pattern}' matches no file in {root}{hint}")
+        log_paths.update(dict.fromkeys(matched_logs))
+    return list(log_paths)
+
+
+def _glob(root: Path, pattern: str, error_prefix: str) -> list[Path]:
+    """Return files and recordings below `root` that a pattern matches, in order."""
+    reason_text = "it is an absolute path" if Path(pattern).is_absolute() else ""
+    try:
+        if not reason_text:
+            matched_paths = sorted(root.glob(pattern))
+            matched_files = [path for path in matched_paths if path.is_file()]
+            return matched_files or [
+                path for path in matched_paths if path.is_dir() and detect_recording_format(path)
+            ]
+    except ValueError as error:
+        reason_text = str(error)
+    raise ConfigError(
+        f"{error_prefix}: '{pattern}' is not a pattern relative to {root} ({reason_text}); set `root` instead"
+    )

@@ -1,0 +1,1 @@
+"""From a log to samples: grid, masks, derivatives, missing velocities and windows."""

@@ -1,0 +1,729 @@
+"""The motion of a log at every sample, where sensors measured less: no velocities, or rare fixes.
+
+Position and heading are brought into one motion by a smoother that knows where the antenna stands
+and how old its positions are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field
+
+from residnet.core.config import Config, Metres, Seconds
+from residnet.core.errors import DataError, UsageError
+from residnet.core.frames import rotate, unwrap_angle
+from residnet.core.layout import SIX_DOF_LAYOUT, SURGE_SWAY_YAW, DegreesOfFreedom
+from residnet.core.log import Log, make_remark
+from residnet.core.names import (
+    BOW_WIND_CHANNELS,
+    CHANNEL_UNITS,
+    POSE_NAMES,
+    STATE_NAMES,
+    WIND_INPUTS,
+)
+from residnet.preprocessing.channel_values import (
+    estimate_noise_std,
+    find_hampel_outliers,
+    mask_held_values,
+)
+
+_MIN_DENSE_QUANTILE = 0.9
+"""Share of the samples that hold a value in a channel that is measured at every sample."""
+MAX_BRIDGED_INTERVALS = 3.0
+"""Usual intervals between the values of a channel that are bridged."""
+_JERK_LEVELS = 10.0 ** (0.5 * np.arange(-8, 5))
+"""Jerk in units of the noise over the cube of the usual interval between positions."""
+_MAX_TUNING_SAMPLES = 4000
+"""Samples from which the intensity of the jerk is found."""
+
+
+class Antenna(Config):
+    """The place of an antenna from the vessel's centre, in body axes.
+
+    Attributes:
+        x: forward of the centre in m.
+        y: to starboard of the centre in m.
+    """
+
+    x: Metres = 0.0
+    y: Metres = 0.0
+
+
+class MotionConfig(Config):
+    """How position, heading and velocities become one motion at every sample.
+
+    A channel of the motion that is measured at every sample stays as it is measured. One that the
+    log lacks, or that has values at some samples only (a position at 1 Hz beside a heading at 10
+    Hz, the samples between empty or the last value repeated), is made by a smoother from all
+    others. Stretches without a position or heading for longer than three of their usual intervals
+    stay gaps.
+
+    Attributes:
+        antenna: where the antenna stands; null where x and y are those of the vessel's centre.
+        delay: age of the positions in s: x and y at t are where the antenna was at t - delay.
+    """
+
+    antenna: Antenna | None = None
+    delay: Seconds = Field(default=0.0, ge=0.0)
+
+    @property
+    def has_position_offset(self) -> bool:
+        """Whether positions are moved in place or time, so that all must be smoothed."""
+        return self.delay > 0.0 or self.antenna is not None
+
+
+def complete_motion(log: Log, config: MotionConfig, dof: DegreesOfFreedom = SURGE_SWAY_YAW) -> Log:
+    """Return the log with the states of a model at every sample, measured or smoothed.
+
+    What was smoothed stands in `meta["smoothed"]`, and as a note in `meta["findings"]`. A wind that
+    is told from the bow becomes the true wind.
+
+    Args:
+        log: in SI.
+        dof: velocities that the log tells; the others are zero, and so is what of the pose they
+            alone would move. With p the roll angle is told, and p by it where it is not measured.
+
+    Raises:
+        UsageError: where the log lacks position or heading, or the roll angle of a roll.
+        DataError: where these hold hardly a value.
+    """
+    return add_true_wind(_complete_states(log, config, dof))
+
+
+def _complete_states(log: Log, config: MotionConfig, dof: DegreesOfFreedom) -> Log:
+    log = _complete_vertical_plane(log, dof) if dof.is_vertical_plane else log
+    log = _complete_yaw_rate(log if dof.is_complete else _fill_zero_motion(log, dof))
+    log = _complete_roll(log) if dof.has_roll and not dof.is_six_dof else log
+    if dof.is_six_dof:
+        log = _complete_six_dof(log)
+        dense_states = [
+            name for name in dof.state_names if name in log.channels and _is_dense(log[name])
+        ]
+        if missing_states := [
+            name for name in dof.state_names if name not in (*STATE_NAMES, *dense_states)
+        ]:
+            raise UsageError(
+                f"log {log.name}: {', '.join(missing_states)} {'are' if len(missing_states) > 1 else 'is'} not measured"
+                f" at every sample, which a model of {', '.join(dof.velocities)} needs; name the"
+                " columns, or let it move on the surface alone (signals.velocities: [u, v, r])"
+            )
+    log_without_held = mask_held_values(log)
+    missing_channels = [name for name in STATE_NAMES if name not in log.channels]
+    made_names = {
+        name
+        for name in STATE_NAMES
+        if name in missing_channels or not _is_dense(log_without_held[name])
+    }
+    if not (made_names or config.has_position_offset):
+        return log
+    if missing_pose := [name for name in POSE_NAMES if name in missing_channels]:
+        # a heading from the rate alone would not be that of positions which were measured
+        if {"x", "y"} <= set(missing_channels) <= set(POSE_NAMES):
+            return _integrate_pose(log, missing_pose)
+        dof = DegreesOfFreedom.from_channels(log.channels)
+        velocities_text = ", ".join(dof.velocities)
+        velocities_text = f", or let the model be one of {velocities_text} alone (signals.velocities: [{velocities_text}])"
+        raise UsageError(
+            f"log {log.name}: no channel {', '.join(missing_channels)}; give position and heading, or u, v"
+            " and r without a position: either makes the other where it was not measured; name"
+            f" their columns{'' if dof.is_complete else velocities_text}"
+        )
+    made_names |= set(POSE_NAMES) if config.has_position_offset else set()
+    smoothed_names = [name for name in STATE_NAMES if name in made_names]
+    smoothed_motion = _smooth_planar_motion(log_without_held, config)
+    note = f"{', '.join(smoothed_names)} come from a smoother of the measured motion: "
+    note += ", ".join(
+        f"{name} {_describe_source(log_without_held, name)}" for name in smoothed_names
+    )
+    return _with_channels(
+        log, {name: smoothed_motion[name] for name in smoothed_names}, note, smoothed=smoothed_names
+    )
+
+
+def _with_channels(
+    log: Log,
+    new_channels: Mapping[str, np.ndarray],
+    finding_text: str = "",
+    code: str = "smoothed_motion",
+    **meta: Any,
+) -> Log:
+    """Return the log with channels that were made, and a note of it where there is a text."""
+    if finding_text:
+        finding = make_remark("note", code, finding_text, channels=len(new_channels))
+        meta["findings"] = [*log.meta.get("findings", ()), finding]
+    return log.replace(
+        channels={**log.channels, **new_channels},
+        units={**log.units, **{name: CHANNEL_UNITS[name] for name in new_channels}},
+        meta={**log.meta, **meta},
+    )
+
+
+def add_true_wind(log: Log) -> Log:
+    """Return the log with the true wind where it tells a wind from the bow.
+
+    `wind_angle` is where the true wind comes from, clockwise from the bow; `apparent_wind_angle`
+    and `apparent_wind_speed` are of the wind that the moving vessel feels. Without a heading it is
+    counted from where the integral of the yaw rate begins.
+    """
+    has_apparent_wind = {"apparent_wind_angle", "apparent_wind_speed"} <= log.channels.keys()
+    required_channels = ("u", "v") if has_apparent_wind else ("wind_angle", "wind_speed")
+    heading_channel = "psi" if "psi" in log.channels else "r"
+    if (
+        "wind_dir" in log.channels
+        or not {heading_channel, *required_channels} <= log.channels.keys()
+    ):
+        return log
+    if not _is_dense(log[heading_channel]) or (
+        has_apparent_wind and not all(_is_dense(log[name]) for name in required_channels)
+    ):
+        # the smoother will tell the motion at every sample
+        return log
+    if has_apparent_wind:
+        # what the vessel's own speed adds comes from ahead
+        complex_wind = log["apparent_wind_speed"] * np.exp(1j * log["apparent_wind_angle"])
+        complex_wind = complex_wind - (log["u"] + 1j * log["v"])
+        speed, angle = np.abs(complex_wind), np.angle(complex_wind)
+    else:
+        speed, angle = log["wind_speed"], log["wind_angle"]
+    heading = log["psi"] if heading_channel == "psi" else _integrate_rate(log.t, log["r"])
+    return _with_channels(log, {"wind_speed": speed, "wind_dir": unwrap_angle(heading + angle)})
+
+
+def original_input_names(log: Log, inputs: Sequence[str]) -> list[str]:
+    """Return inputs by the channels that tell them before the motion is complete.
+
+    Without u and v of its own a log holds the wind that the moving vessel feels, not the true one.
+    """
+    missing_wind = {*WIND_INPUTS} & {*inputs} - {*log.channels}
+    bow_wind_channels = [
+        name for name in (*BOW_WIND_CHANNELS, *WIND_INPUTS) if missing_wind and name in log.channels
+    ]
+    return [
+        *(name for name in inputs if not bow_wind_channels or name not in WIND_INPUTS),
+        *bow_wind_channels,
+    ]
+
+
+def _fill_zero_motion(log: Log, dof: DegreesOfFreedom) -> Log:
+    """Return the log with zeros where a velocity is dead, and no pose but that of the live ones.
+
+    A heading stays where the vessel turns, and a position where it moves as well.
+    """
+    retained_pose = {"psi"} if dof.has_heading else set[str]()
+    if dof.has_heading and dof.has_position and log.channels.keys() >= {*POSE_NAMES}:
+        retained_pose = {*POSE_NAMES}
+    channels = {
+        n: values for n, values in log.channels.items() if n not in {*POSE_NAMES} - retained_pose
+    }
+    channels |= dict.fromkeys(dof.fixed_states, np.zeros(len(log)))
+    return log.replace(
+        channels=channels,
+        units={name: log.units.get(name, CHANNEL_UNITS.get(name, "-")) for name in channels},
+    )
+
+
+def _complete_yaw_rate(log: Log) -> Log:
+    """Return a log without positions with the yaw rate that its heading tells."""
+    if "psi" not in log.channels or {"x", "y"} & log.channels.keys():
+        return log
+    if "r" in log.channels and _is_dense(log["r"]):
+        return log
+    heading = unwrap_angle(log["psi"])
+    is_finite = np.isfinite(heading)
+    if is_finite.sum() < 5:
+        return log
+    yaw_rate = np.where(
+        _is_within_bridged_interval(log.t, log.t[is_finite]),
+        _smooth_angle(log, heading, "r")[1],
+        np.nan,
+    )
+    log = log.replace(channels={**log.channels, "psi": heading})
+    return _with_channels(
+        log, {"r": yaw_rate}, "r comes from a smoother of the heading", smoothed=["r"]
+    )
+
+
+def _complete_roll(log: Log) -> Log:
+    """Return a log with roll angle and roll rate at every sample, from both or the first."""
+    roll_angle = log.channels.get("phi", np.full(len(log), np.nan))
+    is_finite = np.isfinite(roll_angle)
+    if is_finite.sum() < 5:
+        raise UsageError(
+            f"log {log.name}: no roll angle phi, which signals.velocities with p need; name its"
+            " column, or leave p out"
+        )
+    missing_channels = [n for n in ("phi", "p") if n not in log.channels or not _is_dense(log[n])]
+    if not missing_channels:
+        return log
+    is_bridged = _is_within_bridged_interval(log.t, log.t[is_finite])
+    smoothed_roll = dict(zip(("phi", "p"), _smooth_angle(log, roll_angle, "p"), strict=True))
+    note = f"{', '.join(missing_channels)} come from a smoother of the roll: "
+    note += ", ".join(f"{name} {_describe_source(log, name)}" for name in missing_channels)
+    return _with_channels(
+        log, {n: np.where(is_bridged, smoothed_roll[n], np.nan) for n in missing_channels}, note
+    )
+
+
+def _complete_six_dof(log: Log) -> Log:
+    """Return a log under water with velocities and rates of turn that were not measured.
+
+    They follow from attitude and depth, and from the position where u or v were not measured.
+    """
+    missing_channels = [
+        n for n in SIX_DOF_LAYOUT.velocities if n not in log.channels or not _is_dense(log[n])
+    ]
+    missing_linear = {"u", "v"} & {*missing_channels}
+    required_channels = ("z", "phi", "theta", "psi", *(("x", "y") if missing_linear else ()))
+    if not missing_channels or not all(
+        n in log.channels and _is_dense(log[n]) for n in required_channels
+    ):
+        return log
+    rates = {name: _smooth_angle(log, log[name], "")[1] for name in required_channels}
+    phi, theta = log["phi"], log["theta"]
+    # of the angles of Euler, roll within pitch within heading
+    pitch_rate, projected_yaw_rate = rates["theta"], rates["psi"] * np.cos(theta)
+    derived = {
+        "p": rates["phi"] - rates["psi"] * np.sin(theta),
+        "q": pitch_rate * np.cos(phi) + projected_yaw_rate * np.sin(phi),
+        "r": projected_yaw_rate * np.cos(phi) - pitch_rate * np.sin(phi),
+    }
+    if missing_linear:
+        forward_velocity, lateral_velocity = rotate(rates["x"], rates["y"], -log["psi"])
+        downward_velocity = forward_velocity * np.sin(theta) + rates["z"] * np.cos(theta)
+        derived["u"] = forward_velocity * np.cos(theta) - rates["z"] * np.sin(theta)
+        derived["v"] = lateral_velocity * np.cos(phi) + downward_velocity * np.sin(phi)
+        derived["w"] = downward_velocity * np.cos(phi) - lateral_velocity * np.sin(phi)
+    else:
+        heave_numerator = (
+            rates["z"] + log["u"] * np.sin(theta) - log["v"] * np.cos(theta) * np.sin(phi)
+        )
+        derived["w"] = heave_numerator / (np.cos(theta) * np.cos(phi))
+    note = f"{', '.join(missing_channels)} are not measured and follow from {', '.join(required_channels)}"
+    return _with_channels(log, {name: derived[name] for name in missing_channels}, note)
+
+
+def _complete_vertical_plane(log: Log, dof: DegreesOfFreedom) -> Log:
+    """Return a log of a motion in an upright plane with what of it follows from the rest.
+
+    Pitch and its rate tell each other, heave and depth do with the speed forward. A depth and a
+    pitch that come more slowly than the samples are smoothed over them.
+    """
+    dense_channels = {name: log[name] for name in log.channels if _is_dense(log[name])}
+    derived: dict[str, np.ndarray] = {}
+    zeros, smoothed_rates = np.zeros(len(log)), {}
+    for channel, rate_name in (("theta", "q"), ("z", "w")):
+        is_finite = np.isfinite(log.channels.get(channel, np.array(np.nan)))
+        if (
+            rate_name not in dof.velocities
+            or not is_finite.any()
+            or {channel, rate_name} <= dense_channels.keys()
+        ):
+            continue
+        smoothed, smoothed_rates[channel] = _smooth_angle(
+            log, log[channel], rate_name if channel == "theta" else ""
+        )
+        if channel not in dense_channels:
+            derived[channel] = np.where(
+                _is_within_bridged_interval(log.t, log.t[is_finite]), smoothed, np.nan
+            )
+    if "theta" in smoothed_rates and "q" not in dense_channels:
+        derived["q"] = smoothed_rates["theta"]
+    elif "q" in dense_channels and "theta" not in {*dense_channels, *derived}:
+        derived["theta"] = _integrate_rate(log.t, dense_channels["q"])
+    theta = {**dense_channels, **derived}.get("theta", zeros) if "q" in dof.velocities else zeros
+    forward_velocity = dense_channels.get("u", zeros) if "u" in dof.velocities else zeros
+    if "z" in smoothed_rates and "w" not in dense_channels:
+        derived["w"] = (smoothed_rates["z"] + forward_velocity * np.sin(theta)) / np.cos(theta)
+    if "z" not in {*dense_channels, *derived}:
+        heave_velocity = (
+            {**dense_channels, **derived}.get("w", zeros) if "w" in dof.velocities else zeros
+        )
+        derived["z"] = _integrate_rate(
+            log.t, heave_velocity * np.cos(theta) - forward_velocity * np.sin(theta)
+        )
+    if not derived:
+        return log
+    note = f"{', '.join(derived)} are not measured at every sample and follow from the motion"
+    return _with_channels(log, derived, note)
+
+
+def _smooth_angle(log: Log, angle: np.ndarray, rate_name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return a smoothed angle [T] in rad and its rate [T] in rad/s, from both or the first.
+
+    Args:
+        angle: as measured, [T].
+    """
+    angular_rate = log.channels.get(rate_name, np.full(angle.size, np.nan))
+    noise_ratio = max(estimate_noise_std(angular_rate), 1e-7) / max(estimate_noise_std(angle), 1e-7)
+    track = smooth_track(
+        log.t, np.stack((angle, angular_rate), axis=1)[:, :, None], (1.0, noise_ratio)
+    )
+    return track[:, 0, 0], track[:, 1, 0]
+
+
+def _integrate_rate(t: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Return the integral [T] of a rate [T] from the first sample on."""
+    dt, finite_rate = np.diff(t, prepend=t[:1]), np.nan_to_num(rate)
+    return np.asarray(
+        np.cumsum(0.5 * dt * (finite_rate + np.concatenate((finite_rate[:1], finite_rate[:-1]))))
+    )
+
+
+def _integrate_pose(log: Log, missing_names: Sequence[str]) -> Log:
+    """Return a log of velocities with the pose that they lead to, from the origin on.
+
+    A model of velocities needs no pose. Errors of position and heading are then those of the
+    integrated velocities, and not of a place.
+    """
+    integrated_pose = {
+        "psi": _integrate_rate(log.t, log["r"])
+        if "psi" in missing_names
+        else np.asarray(log["psi"])
+    }
+    heading = np.exp(1j * np.nan_to_num(integrated_pose["psi"]))
+    forward_velocity = np.nan_to_num(log["u"])
+    if {"w", "theta"} <= log.channels.keys():
+        theta = np.nan_to_num(log["theta"])
+        forward_velocity = forward_velocity * np.cos(theta) + np.nan_to_num(log["w"]) * np.sin(
+            theta
+        )
+    earth_velocity = heading * (forward_velocity + 1j * np.nan_to_num(log["v"]))
+    integrated_pose |= {
+        "x": _integrate_rate(log.t, earth_velocity.real),
+        "y": _integrate_rate(log.t, earth_velocity.imag),
+    }
+    new_channels = {name: integrated_pose[name] for name in missing_names}
+    note = (
+        f"{', '.join(missing_names)} were not measured and are integrated from the velocities: errors of"
+        " position and heading are those of integrated velocities, and not of a place"
+    )
+    return _with_channels(
+        log, new_channels, note, "integrated_pose", integrated=list(missing_names)
+    )
+
+
+def remove_pauses(t: np.ndarray) -> np.ndarray:
+    """Return times [T] in s from zero on, pauses of the recorder cut to what is bridged."""
+    time_steps = np.diff(t)
+    return np.append(
+        0.0, np.cumsum(np.minimum(time_steps, MAX_BRIDGED_INTERVALS * np.median(time_steps)))
+    )
+
+
+def fill_sparse(log: Log, channel_names: tuple[str, ...], held_channels: tuple[str, ...]) -> Log:
+    """Return the log with values at every sample of channels that lack some, or come more rarely.
+
+    Between two values a channel is interpolated, or held where `held` names it, unless they lie
+    further apart than three of their usual intervals: as a grid does it with rows that lack.
+    """
+    filled_channels = {}
+    for name in channel_names:
+        values = log[name]
+        is_finite = np.isfinite(values)
+        if is_finite.all() or is_finite.sum() < 2:
+            continue
+        measurement_times = log.t[is_finite]
+        if name in held_channels:
+            previous_index = np.clip(
+                np.searchsorted(measurement_times, log.t, side="right") - 1,
+                0,
+                measurement_times.size - 1,
+            )
+            filled_values = np.where(
+                log.t >= measurement_times[0], values[is_finite][previous_index], np.nan
+            )
+        else:
+            unwrapped_values = unwrap_angle(values) if log.units[name] == "rad" else values
+            filled_values = np.interp(
+                log.t, measurement_times, unwrapped_values[is_finite], left=np.nan, right=np.nan
+            )
+        filled_channels[name] = np.where(
+            _is_within_bridged_interval(log.t, measurement_times), filled_values, np.nan
+        )
+    return log.replace(channels={**log.channels, **filled_channels}) if filled_channels else log
+
+
+def _is_dense(values: np.ndarray) -> bool:
+    """Return whether a channel has a value at nearly every sample between its first and last.
+
+    One that fails in stretches, and is there at every sample otherwise, counts as such.
+    """
+    intervals = np.diff(np.flatnonzero(np.isfinite(values)))
+    return bool(
+        intervals.size
+        and np.median(intervals) == 1
+        and np.quantile(intervals, _MIN_DENSE_QUANTILE) == 1
+    )
+
+
+def _describe_source(log: Log, name: str) -> str:
+    """Return how a channel was measured, in words."""
+    if name not in log.channels:
+        return "was not measured"
+    measurement_times = log.t[np.isfinite(log[name])]
+    median_interval = (
+        float(np.median(np.diff(measurement_times))) if measurement_times.size > 1 else float("inf")
+    )
+    return f"every {median_interval:.3g} s"
+
+
+def _is_within_bridged_interval(t: np.ndarray, measurement_times: np.ndarray) -> np.ndarray:
+    """Return [T] bool: samples between values at `at` that are no further apart than usual."""
+    median_interval = float(np.median(np.diff(measurement_times)))
+    is_inside = (t >= measurement_times[0] - 1e-9) & (t <= measurement_times[-1] + 1e-9)
+    next_times = measurement_times[
+        np.clip(np.searchsorted(measurement_times, t, side="left"), 0, measurement_times.size - 1)
+    ]
+    previous_times = measurement_times[
+        np.clip(
+            np.searchsorted(measurement_times, t, side="right") - 1, 0, measurement_times.size - 1
+        )
+    ]
+    return np.asarray(
+        is_inside
+        & (next_times - previous_times <= MAX_BRIDGED_INTERVALS * median_interval * (1.0 + 1e-6))
+    )
+
+
+def _smooth_planar_motion(log: Log, config: MotionConfig) -> dict[str, np.ndarray]:
+    """Return the smoothed motion by channel [T], NaN in gaps of position or heading."""
+    t, psi = log.t, unwrap_angle(log["psi"])
+    positions = np.stack((log["x"], log["y"]), axis=1)
+    is_heading_outlier, *is_position_outlier = find_hampel_outliers([psi, log["x"], log["y"]])
+    psi[is_heading_outlier], positions[np.logical_or(*is_position_outlier)] = np.nan, np.nan
+    fix_indices = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    heading_indices = np.flatnonzero(np.isfinite(psi))
+    if min(fix_indices.size, heading_indices.size) < 5:
+        raise DataError(
+            f"log {log.name}: {fix_indices.size} positions and {heading_indices.size} headings, at least 5 of"
+            " each are needed to tell the motion; leave the log out"
+        )
+    u, v = (log.channels.get(name, np.full(t.size, np.nan)) for name in ("u", "v"))
+    heading, yaw_rate = _smooth_angle(log, psi, "r")
+    # positions belong to times between the samples where they are older than their row
+    fix_times = t[fix_indices] - config.delay
+    filter_times = np.union1d(t, fix_times) if config.delay else t
+    sample_indices, headings_at_clock = (
+        np.searchsorted(filter_times, t),
+        np.interp(filter_times, t, heading),
+    )
+    measurements = np.full((filter_times.size, 2, 2), np.nan)
+    measurements[np.searchsorted(filter_times, fix_times), 0] = positions[fix_indices]
+    antenna = config.antenna or Antenna()
+    measurements[:, 0] -= np.stack(rotate(antenna.x, antenna.y, headings_at_clock), axis=1)
+    noise_ratio = 1.0
+    if "u" in log.channels and "v" in log.channels:
+        measurements[sample_indices, 1] = np.stack(
+            rotate(u, v, headings_at_clock[sample_indices]), axis=1
+        )
+        fix_positions = measurements[np.isfinite(measurements[:, 0]).all(axis=1), 0]
+        position_noise = max(
+            estimate_noise_std(fix_positions[:, 0]), estimate_noise_std(fix_positions[:, 1])
+        )
+        noise_ratio = max(estimate_noise_std(u), estimate_noise_std(v), 1e-6) / max(
+            position_noise, 1e-6
+        )
+    track = smooth_track(filter_times, measurements, (1.0, noise_ratio))[sample_indices]
+    u, v = rotate(track[:, 1, 0], track[:, 1, 1], -heading)
+    is_observed = _is_within_bridged_interval(t, fix_times) & _is_within_bridged_interval(
+        t, t[heading_indices]
+    )
+    channels_and_values = zip(
+        STATE_NAMES, (track[:, 0, 0], track[:, 0, 1], heading, u, v, yaw_rate), strict=True
+    )
+    return {name: np.where(is_observed, values, np.nan) for name, values in channels_and_values}
+
+
+def smooth_measured_motion(
+    measurements: np.ndarray, noise: Sequence[float], dt: float
+) -> np.ndarray:
+    """Return the smoothed motion [N, 9] from x, y, psi, u, v, r, u_dot, v_dot, r_dot [N, 9], SI.
+
+    Heading and its rates are smoothed first, then north and east in the earth with the smoothed
+    heading.
+
+    Args:
+        measurements: measured, the heading unwrapped; a quantity without a measurement has an infinite
+            noise.
+        noise: standard deviations of the nine.
+        dt: sampling interval in s.
+    """
+    if not np.isfinite(measurements).all():
+        sample_index, column = (
+            int(index_array[0]) for index_array in np.nonzero(~np.isfinite(measurements))
+        )
+        raise DataError(
+            f"measured motion: column {column} is not finite at sample {sample_index}; mask or fill the gap"
+            " first"
+        )
+    t, noise_std = dt * np.arange(len(measurements)), np.asarray(noise)
+    x, y, psi, u, v, r, surge_acceleration, sway_acceleration, yaw_acceleration = measurements.T
+    yaw_measurements = np.stack((psi, r, yaw_acceleration), axis=1)[:, :, None]
+    psi, r, yaw_acceleration = smooth_track(t, yaw_measurements, noise_std[[2, 5, 8]])[:, :, 0].T
+    earth_rates = (
+        rotate(u, v, psi),
+        rotate(surge_acceleration - r * v, sway_acceleration + r * u, psi),
+    )
+    earth_measurements = np.moveaxis(np.array(((x, y), *earth_rates)), 2, 0)
+    tracks = [
+        smooth_track(
+            t,
+            earth_measurements[:, :, [axis_index]],
+            noise_std[[axis_index, 3 + axis_index, 6 + axis_index]],
+        )[:, :, 0]
+        for axis_index in (0, 1)
+    ]
+    (x, north, north_dot), (y, east, east_dot) = (track.T for track in tracks)
+    u, v = rotate(north, east, -psi)
+    surge_acceleration, sway_acceleration = rotate(north_dot, east_dot, -psi)
+    return np.stack(
+        (
+            x,
+            y,
+            psi,
+            u,
+            v,
+            r,
+            surge_acceleration + r * v,
+            sway_acceleration - r * u,
+            yaw_acceleration,
+        ),
+        axis=1,
+    )
+
+
+def smooth_track(t: np.ndarray, measurements: np.ndarray, noise_std: ArrayLike) -> np.ndarray:
+    """Return smoothed position, rate and acceleration [T, 3, A] along axes measured together.
+
+    A triple integrator driven by white jerk is filtered forwards and smoothed backwards (Rauch,
+    Tung and Striebel, 1965), so that past and future of a sample count alike and nothing lags. The
+    intensity of the jerk, and the size of the noise, are those under which the measurements are
+    likeliest.
+
+    Args:
+        t: times [T] in s, increasing.
+        measurements: measured positions, then rates, then accelerations as far as there are any, [T, k, A];
+            a row of NaN where there is no measurement.
+        noise_std: standard deviations [k], of which ratios count; infinite where nothing is measured.
+    """
+    noise_std = np.maximum(np.asarray(noise_std, dtype=np.float64), 1e-9)
+    measurements = np.where(np.isfinite(noise_std)[None, :, None], measurements, np.nan)
+    is_measured = np.isfinite(measurements).all(axis=2)
+    first_derivative_order = int(np.argmax(is_measured.any(axis=0)))
+    measurement_times = t[is_measured[:, first_derivative_order]]
+    median_interval = (
+        float(np.median(np.diff(measurement_times))) if measurement_times.size > 1 else 1.0
+    )
+    jerk_intensities = (
+        _JERK_LEVELS
+        * float(noise_std[first_derivative_order])
+        / median_interval ** (3 - first_derivative_order)
+    )
+    tuning_slice = slice(0, min(t.size, _MAX_TUNING_SAMPLES))
+    cost, _ = _filter_track(
+        t[tuning_slice], measurements[tuning_slice], noise_std, jerk_intensities
+    )
+    best_index = int(np.argmin(cost))
+    _, ((predicted_states, predicted_covariances), (smoothed_states, filtered_covariances)) = (
+        _filter_track(t, measurements, noise_std, jerk_intensities[best_index : best_index + 1])
+    )
+    transitions = _transition_matrices(np.diff(t, prepend=t[0]))
+    gains = (
+        filtered_covariances[:-1]
+        @ transitions[1:].transpose(0, 2, 1)
+        @ np.linalg.pinv(predicted_covariances[1:])
+    )
+    for k in range(len(t) - 2, -1, -1):
+        smoothed_states[k] += gains[k] @ (smoothed_states[k + 1] - predicted_states[k + 1])
+    return smoothed_states
+
+
+_StatesAndCovariances = tuple[np.ndarray, np.ndarray]
+
+
+def _filter_track(
+    t: np.ndarray, measurements: np.ndarray, noise: np.ndarray, jerk_intensities: np.ndarray
+) -> tuple[np.ndarray, tuple[_StatesAndCovariances, _StatesAndCovariances]]:
+    """Return the cost of each intensity of jerk [K], and states and covariances of the first.
+
+    Before each sample's measurements and after them: states [T, 3, A], covariances [T, 3, 3].
+    """
+    n_samples, n_axes, dt = t.size, measurements.shape[2], np.diff(t, prepend=t[0])
+    is_measured = np.isfinite(measurements).all(axis=2)
+    first_derivative_order = int(np.argmax(is_measured.any(axis=0)))
+    transitions, process_covariances = (
+        _transition_matrices(dt),
+        jerk_intensities[:, None, None] ** 2 * _jerk_covariances(dt)[:, None],
+    )
+    first_measurements = measurements[
+        is_measured[:, first_derivative_order], first_derivative_order
+    ]
+    state = np.zeros((jerk_intensities.size, 3, n_axes))
+    state[:, first_derivative_order] = first_measurements[0]
+    # nothing is known of what is not measured at the start
+    initial_std = float(np.ptp(first_measurements, axis=0).max(initial=0.0)) + 1.0
+    covariance = np.tile(initial_std**2 * np.eye(3), (jerk_intensities.size, 1, 1))
+    predicted = np.empty((n_samples, 3, n_axes)), np.empty((n_samples, 3, 3))
+    filtered = np.empty((n_samples, 3, n_axes)), np.empty((n_samples, 3, 3))
+    normalized_squares, log_determinant = (
+        np.zeros(jerk_intensities.size),
+        np.zeros(jerk_intensities.size),
+    )
+    variance = noise**2
+    for k in range(n_samples):
+        if k:
+            state, covariance = (
+                transitions[k] @ state,
+                transitions[k] @ covariance @ transitions[k].T + process_covariances[k],
+            )
+        predicted[0][k], predicted[1][k] = state[0], covariance[0]
+        for derivative_order in np.flatnonzero(is_measured[k]):
+            # rounding may leave less than nothing of a variance
+            innovation_variance = (
+                np.maximum(covariance[:, derivative_order, derivative_order], 0.0)
+                + variance[derivative_order]
+            )
+            gain = covariance[:, :, derivative_order] / innovation_variance[:, None]
+            innovation = measurements[k, derivative_order] - state[:, derivative_order]
+            state = state + gain[:, :, None] * innovation[:, None, :]
+            covariance = covariance - gain[:, :, None] * covariance[:, derivative_order, None, :]
+            normalized_squares += (innovation**2).sum(axis=1) / innovation_variance
+            log_determinant += n_axes * np.log(innovation_variance)
+        filtered[0][k], filtered[1][k] = state[0], covariance[0]
+    # the size of the noise is the one that suits each intensity best
+    n_measurements = n_axes * int(is_measured.sum())
+    cost = (
+        n_measurements * np.log(np.maximum(normalized_squares / max(n_measurements, 1), 1e-60))
+        + log_determinant
+    )
+    return cost, (predicted, filtered)
+
+
+def _transition_matrices(dt: np.ndarray) -> np.ndarray:
+    """Return the transition over each step, [T, 3, 3]."""
+    transitions = np.tile(np.eye(3), (dt.size, 1, 1))
+    transitions[:, 0, 1] = transitions[:, 1, 2] = dt
+    transitions[:, 0, 2] = dt**2 / 2
+    return transitions
+
+
+def _jerk_covariances(dt: np.ndarray) -> np.ndarray:
+    """Return the covariance that white jerk of unit intensity adds over each step, [T, 3, 3]."""
+    (
+        position_variance,
+        position_rate_covariance,
+        position_acceleration_covariance,
+        rate_variance,
+        rate_acceleration_covariance,
+    ) = dt**5 / 20, dt**4 / 8, dt**3 / 6, dt**3 / 3, dt**2 / 2
+    return np.array(
+        [
+            [position_variance, position_rate_covariance, position_acceleration_covariance],
+            [position_rate_covariance, rate_variance, rate_acceleration_covariance],
+            [position_acceleration_covariance, rate_acceleration_covariance, dt],
+        ]
+    ).transpose(2, 0, 1)

@@ -1,0 +1,785 @@
+"""What the motion says against propellers, rudders and the clock of the inputs."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from residnet.core.names import port_starboard_pairs
+from residnet.core.stretches import find_runs
+from residnet.preprocessing.channel_values import SIGMA_OF_MAD, nan_quantiles, nan_std
+from residnet.preprocessing.statistics import CHUNK_SAMPLES, MIN_SAMPLES, OverlappingBlocks
+from residnet.quality.findings import Check, Finding, check, make_correction
+from residnet.quality.statistics import (
+    N_SECTIONS,
+    SMOOTHING_SAMPLES,
+    STEERING_CHANNELS,
+    LeastSquaresFit,
+    LogStatistics,
+    abs_quantile,
+    fit_least_squares,
+    make_blocks,
+    make_input_terms,
+    make_velocity_terms,
+)
+
+_MIN_T_STATISTIC = 6.0
+"""Standard errors that call a sign wrong: many, since to turn a right one would ruin a fit."""
+_REVERSE_SIGN_FIX = "turn it in the channel map (sign: -1)"
+_REVERSE_SIGN_AND_CHECK_FIX = f"{_REVERSE_SIGN_FIX}, and check the sign of r and psi"
+
+
+def find_propellers(log: LogStatistics) -> list[str]:
+    """Return the inputs that are revolutions."""
+    revolution_inputs = [
+        name
+        for name in log.inputs
+        if log.units[name] == "1/s" and abs_quantile(log[name], 1.0) > 0.0
+    ]
+    # what a shaft does tells more than what it was told to do
+    return [name for name in revolution_inputs if not name.startswith("cmd_")] or revolution_inputs
+
+
+# rad of turning per revolution, at full rudder; vessels lie between .003 and .03
+_MIN_TURN_RATIO, _MAX_TURN_RATIO = 8e-4, 0.3
+# no propeller of a vessel turns faster, 1/s
+_MAX_REVOLUTIONS = 250.0
+_FULL_RUDDER = 0.35
+"""Angle of full rudder in rad."""
+_MIN_STEERING_SHARE = 0.2
+"""Share of full rudder from which on the turning of a vessel tells how fast its propellers are."""
+
+
+@check(
+    "actuators",
+    "unit",
+    fix="correct its unit in the channel map",
+    is_record_fault=True,
+    on_subsample=True,
+)
+def check_propeller_unit(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report revolutions that cannot be revolutions per second."""
+    names = log.cached(find_propellers)
+    # one of several may hardly turn while the others drive the vessel
+    max_revolutions = max((abs_quantile(log[name]) for name in names), default=0.0)
+    for name in names:
+        revolutions, factor = abs_quantile(log[name]), 0.0
+        text = f"{name} reaches {revolutions:.3g} 1/s, out of proportion to how the vessel turns"
+        steering_share = _steering_share(log, names) if "r" in log else 0.0
+        if revolutions > _MAX_REVOLUTIONS:
+            text, factor = f"{name} reaches {revolutions:.4g} 1/s, more than any propeller", 60.0
+        elif steering_share > _MIN_STEERING_SHARE:
+            turn_ratio = (
+                abs_quantile(log["r"]) / min(steering_share, 1.0) / max(max_revolutions, 1e-12)
+            )
+            if revolutions > 20.0 and turn_ratio < _MIN_TURN_RATIO:
+                factor = 60.0
+            elif max_revolutions < 1.0 and turn_ratio > _MAX_TURN_RATIO:
+                factor = 1.0 / 60.0
+        if factor:
+            text += ": rpm taken as 1/s?" if factor > 1.0 else ": 1/s taken as rpm?"
+            yield make_finding(
+                text, {"largest": revolutions}, repair=make_correction((name,), factor=factor)
+            )
+
+
+def _steering_share(log: LogStatistics, names: Sequence[str]) -> float:
+    """Return how far the vessel was steered, as a share of full rudder; 0 where nothing tells.
+
+    Without a rudder it is steered by propellers that differ. A vessel that was not steered does
+    not turn, however fast its propellers are.
+    """
+    rudder_shares = [
+        abs_quantile(log[name]) / _FULL_RUDDER for name in ("delta", "cmd_delta") if name in log
+    ]
+    if rudder_shares:
+        return max(rudder_shares)
+    revolutions = np.stack([log[name] for name in names])
+    return abs_quantile(np.ptp(revolutions, axis=0)) / max(
+        abs_quantile(np.abs(revolutions).max(axis=0)), 1e-12
+    )
+
+
+@check(
+    "actuators",
+    "propeller_sign",
+    fix=_REVERSE_SIGN_FIX,
+    required_channels=("u",),
+    is_record_fault=True,
+    on_subsample=True,
+)
+def check_propeller_sign(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report propellers that turn against the way that the vessel goes, or slow it down."""
+    names = log.cached(find_propellers)
+    is_moving = np.abs(log["u"]) > 0.3 * abs_quantile(log["u"], 0.9)
+    if not names or not is_moving.any():
+        return
+    opposing_propellers = [
+        name
+        for name in names
+        if float(np.mean((log[name] != 0.0)[is_moving])) > 0.5
+        and float(np.mean((log[name] * log["u"])[is_moving & (log[name] != 0.0)] < 0.0)) > 0.9
+    ]
+    yaw_rate = log["r"][is_moving & np.isfinite(log["r"])] if "r" in log else np.zeros(0)
+    is_one_sided = not yaw_rate.size or abs(float(yaw_rate.mean())) > 0.8 * float(
+        np.abs(yaw_rate).mean()
+    )
+    if len(opposing_propellers) < len(names) and is_one_sided:
+        # a propeller that runs astern beside one that runs ahead is how such a vessel turns
+        opposing_propellers = []
+    for name in opposing_propellers:
+        text = f"{name} turns against the way that the vessel goes"
+        yield make_finding(text, repair=make_correction((name,), factor=-1.0))
+    for name, t_statistic in (
+        () if opposing_propellers else _find_reversed_propellers(log, names).items()
+    ):
+        text = f"more {name} makes the vessel slower ({t_statistic:.0f} standard errors)"
+        yield make_finding(text, {"t": t_statistic}, repair=make_correction((name,), factor=-1.0))
+
+
+def _find_reversed_propellers(log: LogStatistics, names: Sequence[str]) -> dict[str, float]:
+    """Return reversed propellers, and by how many standard errors their thrust is the wrong way.
+
+    All choices of signs are compared by how well the sum of thrusts explains the surge: effects of
+    single propellers cannot be told apart where one runs ahead while the other runs astern.
+    """
+    blocks, u = log.cached(make_blocks, "u"), log["u"]
+    drift_terms = [log["v"] * log["r"], log["r"] ** 2] if "v" in log and "r" in log else []
+    thrusts = np.stack([log[name] * np.abs(log[name]) for name in names], axis=-1)
+    regressors = np.column_stack((np.ones(len(log)), u, u * np.abs(u), *drift_terms, thrusts))
+    integrated_regressors, velocity_changes = (
+        blocks.make_integrator(regressors)(0),
+        blocks.compute_changes(u),
+    )
+    if (np.isfinite(integrated_regressors).all(axis=1) & np.isfinite(velocity_changes)).sum() < 40:
+        return {}
+    common_terms, thrust_integrals = (
+        integrated_regressors[:, : -len(names)],
+        integrated_regressors[:, -len(names) :],
+    )
+
+    sign_choices = [
+        np.array((1.0, *other_signs))
+        for other_signs in itertools.product((1.0, -1.0), repeat=len(names) - 1)
+    ]
+    fits = [
+        fit_least_squares(
+            np.column_stack((common_terms, thrust_integrals @ signs)), velocity_changes
+        )
+        for signs in sign_choices
+    ]
+    best_index = min(range(len(fits)), key=lambda i: fits[i].sum_of_squares)
+    # other signs must leave clearly less than those that were logged
+    best_index = best_index if fits[best_index].sum_of_squares < 0.6 * fits[0].sum_of_squares else 0
+    signs, t_statistic = sign_choices[best_index], fits[best_index].t_statistic
+    total_thrust = thrusts @ signs
+    # of a thrust that hardly varies the effect cannot be told
+    relative_variation = nan_std(total_thrust) / max(abs_quantile(total_thrust, 1.0), 1e-12)
+    if abs(t_statistic) < _MIN_T_STATISTIC or relative_variation < 0.2:
+        return {}
+    return {
+        n: abs(t_statistic)
+        for n, sign in zip(names, signs * np.sign(t_statistic), strict=True)
+        if sign < 0.0
+    }
+
+
+@dataclass(frozen=True)
+class NeutralRudderAngle:
+    """The rudder angle at which the vessel goes straight, rad, and its standard error."""
+
+    angle: float
+    standard_error: float
+    rudder_effect: float
+    rudder_effect_error: float
+
+
+def estimate_neutral_angle(log: LogStatistics) -> NeutralRudderAngle | None:
+    """Return the neutral angle of delta, from the yaw moment that is there without any rudder."""
+    yaw_fit = _fit_yaw_model(log)
+    if yaw_fit is None or not abs(yaw_fit.coefficients[1]) > 4.0 * yaw_fit.standard_errors[1]:
+        return None
+    moment, rudder_effect = (float(value) for value in yaw_fit.coefficients[:2])
+    gradient = np.array([-1.0 / rudder_effect, moment / rudder_effect**2])
+    standard_error = float(np.sqrt(max(gradient @ yaw_fit.covariance[:2, :2] @ gradient, 0.0)))
+    return NeutralRudderAngle(
+        -moment / rudder_effect, standard_error, rudder_effect, float(yaw_fit.standard_errors[1])
+    )
+
+
+def _yaw_regression_data(
+    log: LogStatistics, *additional_angles: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of a yaw model linear in the rudder angle, x [K, k] and y [K].
+
+    The first two columns are the moment without rudder and the effect of the rudder, those of
+    `additional_angles` ones [T], which act as the rudder does, come next.
+    """
+    blocks, u, r = log.cached(make_blocks, "r"), log["u"], log["r"]
+    v = log["v"] if "v" in log else np.zeros(len(log))
+    flow_squared = u * np.abs(u)
+    if "n" in log:
+        propeller_race = log["n"] * np.abs(log["n"])
+        flow_squared, propeller_race = (
+            flow / max(float(np.nanmean(np.abs(flow))), 1e-9)
+            for flow in (flow_squared, propeller_race)
+        )
+        flow_squared = flow_squared + propeller_race
+    regressors = [
+        flow_squared,
+        flow_squared * log["delta"],
+        *(flow_squared * angle for angle in additional_angles),
+    ]
+    regressors += [np.abs(u) * r, r * np.abs(r), np.abs(u) * v, v * np.abs(v)]
+    if "wind_speed" in log and "wind_dir" in log:
+        relative_wind_angle = log["wind_dir"] - (log["psi"] if "psi" in log else np.zeros(len(log)))
+        regressors += [log["wind_speed"] ** 2 * np.sin(k * relative_wind_angle) for k in (1.0, 2.0)]
+    return blocks.make_integrator(np.stack(regressors, axis=-1))(0), blocks.compute_changes(r)
+
+
+def _fit_yaw_model(log: LogStatistics, *additional_angles: np.ndarray) -> LeastSquaresFit | None:
+    """Return the fit of the yaw model; None where the log does not tell."""
+    if any(name not in log for name in ("delta", "u", "r")):
+        return None
+    yaw_fit = fit_least_squares(*_yaw_regression_data(log, *additional_angles))
+    is_rudder_excited = log.std("delta") >= math.radians(1.0)
+    return yaw_fit if yaw_fit.residuals.size >= 60 and is_rudder_excited else None
+
+
+@check(
+    "actuators",
+    "rudder_bias",
+    required_channels=("delta",),
+    is_record_fault=True,
+    on_subsample=True,
+)
+def check_rudder_bias(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report a rudder whose zero is not where the vessel goes straight, or that is reversed."""
+    neutral = log.cached(estimate_neutral_angle) if "delta" in log.inputs else None
+    if neutral is None:
+        return
+    if neutral.rudder_effect < -_MIN_T_STATISTIC * neutral.rudder_effect_error:
+        text = "positive delta turns the vessel to port"
+        yield make_finding(
+            text,
+            {"effect": neutral.rudder_effect},
+            code="rudder_sign",
+            fix=_REVERSE_SIGN_AND_CHECK_FIX,
+        )
+    # hulls and single propellers have a neutral angle of a degree or so; beyond 2.6 even a wind is
+    # no excuse
+    elif abs(neutral.angle) > max(math.radians(2.6), _MIN_T_STATISTIC * neutral.standard_error):
+        text = (
+            f"the vessel goes straight at delta = {math.degrees(neutral.angle):+.1f} +-"
+            f" {math.degrees(2.0 * neutral.standard_error):.1f} deg"
+        )
+        yield make_finding(
+            text,
+            {"angle": neutral.angle, "error": neutral.standard_error},
+            fix="take the offset off, or give a steady wind or current as an input",
+            repair=make_correction(("delta",), offset=-neutral.angle),
+        )
+
+
+_WIDER_RANGE_FIX = "log with a wider range, or leave these parts out"
+
+
+# share of the time at one end, and how much harder the vessel then turns
+_MIN_SHARE_AT_LIMIT, _MIN_EFFECT_RATIO, _MIN_T_STATISTIC_AT_LIMIT = 0.03, 1.3, 4.5
+
+
+@check(
+    "actuators",
+    "rudder_clipped",
+    fix=_WIDER_RANGE_FIX,
+    required_channels=("delta", "u", "r"),
+    is_record_fault=True,
+    on_subsample=True,
+)
+def check_rudder_clipping(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report a rudder at whose recorded limit the vessel turns harder than the angle explains."""
+    rudder_limit = abs_quantile(log["delta"], 1.0)
+    is_at_limit = np.abs(log["delta"]) > 0.999 * rudder_limit
+    share_at_limit, n_visits = float(is_at_limit.mean()), find_runs(is_at_limit)[0].size
+    # a turning circle goes there once, and all of it lies there
+    if (
+        "delta" not in log.inputs
+        or not _MIN_SHARE_AT_LIMIT < share_at_limit < 1.0 - _MIN_SHARE_AT_LIMIT
+        or n_visits < 3
+    ):
+        return
+    # the ramps of a zigzag tell the effect of smaller angles
+    yaw_fit, excess_statistic = _fit_yaw_model(log, np.sign(log["delta"]) * is_at_limit), 0.0
+    if yaw_fit is not None:
+        t_statistic = float(abs(yaw_fit.coefficients[2]) / yaw_fit.standard_errors[2])
+        relative_effect = float(yaw_fit.coefficients[2] / (yaw_fit.coefficients[1] * rudder_limit))
+        excess_statistic = (
+            t_statistic
+            if relative_effect > _MIN_EFFECT_RATIO - 1.0 and t_statistic > _MIN_T_STATISTIC_AT_LIMIT
+            else 0.0
+        )
+    excess_statistic = max(
+        excess_statistic, _excess_turning_at_limit(log, is_at_limit) if n_visits >= 8 else 0.0
+    )
+    if excess_statistic > 0.0:
+        text = (
+            f"at {math.degrees(rudder_limit):.1f} deg of delta the vessel turns harder than smaller angles"
+            f" explain ({excess_statistic:.1f} times what they leave open): its record is cut off there"
+        )
+        yield make_finding(text, {"limit": rudder_limit, "harder": excess_statistic})
+
+
+def _excess_turning_at_limit(log: LogStatistics, is_at_limit: np.ndarray) -> float:
+    """Return how much harder the vessel turns at the limit, over what a fit elsewhere leaves.
+
+    The fit is one to all that lies off the limit, so it must hold rests at smaller angles; 0 where
+    it does not, or explains what happens at the limit.
+    """
+    blocks, values, (x, y) = log.cached(make_blocks, "r"), log["delta"], _yaw_regression_data(log)
+    is_finite = np.isfinite(x).all(axis=1) & np.isfinite(y)
+    is_inside_limit, is_outside_limit = (
+        is_finite & blocks.are_clear_of(~is_at_limit),
+        is_finite & blocks.are_clear_of(is_at_limit),
+    )
+    initial_angles, half_blocks = values[blocks.starts], replace(blocks, length=blocks.length // 2)
+    rudder_travel, max_angle = (
+        np.abs(blocks.compute_changes(values)) + np.abs(half_blocks.compute_changes(values)),
+        abs_quantile(values, 1.0),
+    )
+    is_rudder_constant = (
+        is_outside_limit
+        & (rudder_travel < 0.05 * max_angle)
+        & (np.abs(initial_angles) > 0.15 * max_angle)
+    )
+    if is_inside_limit.sum() < 10 or is_rudder_constant.sum() < 20:
+        return 0.0
+    yaw_fit = fit_least_squares(x[is_outside_limit], y[is_outside_limit])
+    rms_residual = max(float(np.sqrt(np.mean(yaw_fit.residuals**2))), 1e-300)
+    limit_residuals = (y - x @ yaw_fit.coefficients)[is_inside_limit] * np.sign(
+        initial_angles[is_inside_limit] * yaw_fit.coefficients[1]
+    )
+    excess = float(np.mean(limit_residuals)) / rms_residual
+    return excess if excess > _MIN_T_STATISTIC_AT_LIMIT else 0.0
+
+
+# so many times less must be left with the inputs shifted in time, and more without the steering
+_MIN_SHIFT_IMPROVEMENT, _MIN_STEERING_IMPROVEMENT = 1.3, 1.2
+
+
+@check("inputs", "rudder_sign", required_channels=("r",), is_record_fault=True, on_subsample=True)
+def check_rudder_sign(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report the side to which what steers turns the vessel."""
+    name, steering = _find_steering(log)
+    if not name or np.isfinite(log["r"]).sum() < 2 * MIN_SAMPLES:
+        return
+    is_finite = np.isfinite(log["r"]) & np.isfinite(steering)
+    r, steering_values = log.smoothed("r")[is_finite], steering[is_finite]
+    if is_finite.sum() >= 2 * MIN_SAMPLES and float(np.abs(r).mean()) >= 6.0 * log.noise_std("r"):
+        is_one_sided = all(
+            abs(signal.sum()) > 0.95 * np.abs(signal).sum() for signal in (r, steering_values)
+        )
+        # of a turning circle the loss of speed slows the turn, which no rudder does
+        if is_one_sided and float(r.sum()) * float(steering_values.sum()) < 0.0:
+            text = f"{name} stays on one side and the vessel turns to the other"
+            yield make_finding(text, fix=_REVERSE_SIGN_AND_CHECK_FIX)
+        elif is_one_sided:
+            text = f"{name} stays on one side and the vessel turns to it"
+            yield make_finding(text, level="note", fix="")
+        if is_one_sided:
+            return
+    # a rudder turns by the square of the speed past it
+    flow_speed = np.ones(len(log))
+    if "delta" in name and "u" in log:
+        flow_speed, is_finite = np.abs(log.smoothed("u")), is_finite & np.isfinite(log["u"])
+    sum_of_squares_without_steering, fits_by_shift = _fit_steering_responses(
+        log, steering, flow_speed, is_finite
+    )
+    if not fits_by_shift:
+        return
+    unshifted_fit, best_shift = (
+        fits_by_shift[0],
+        min(fits_by_shift, key=lambda shift: fits_by_shift[shift].sum_of_squares),
+    )
+    unshifted_t_statistic, shifted_t_statistic = (
+        unshifted_fit.t_statistic,
+        fits_by_shift[best_shift].t_statistic,
+    )
+    # with the shift where that is surer and of the same sign
+    is_consistent = (
+        unshifted_t_statistic * shifted_t_statistic > 0.0
+        and abs(unshifted_t_statistic) > 0.5 * _MIN_T_STATISTIC
+    )
+    t_statistic = (
+        shifted_t_statistic
+        if is_consistent and abs(shifted_t_statistic) > abs(unshifted_t_statistic)
+        else unshifted_t_statistic
+    )
+    improvement = unshifted_fit.sum_of_squares / max(
+        fits_by_shift[best_shift].sum_of_squares, 1e-300
+    )
+    is_identifiable = sum_of_squares_without_steering / max(
+        unshifted_fit.sum_of_squares, 1e-300
+    ) > _MIN_STEERING_IMPROVEMENT and (
+        improvement < _MIN_SHIFT_IMPROVEMENT or shifted_t_statistic < 0.0
+    )
+    effect = float(unshifted_fit.coefficients[-1] * np.nanmean(flow_speed**2))
+    figures = {
+        "effect": effect,
+        "t": unshifted_t_statistic,
+        "lag": best_shift * log.sampling_interval,
+        "better": improvement,
+    }
+    if t_statistic < -_MIN_T_STATISTIC and is_identifiable:
+        text = (
+            f"positive {name} turns the vessel to port (yaw acceleration {effect:.3g} per unit,"
+            f" {-t_statistic:.0f} standard errors)"
+        )
+        exchange_fix = "exchange the columns of both sides, or check the sign of r and psi"
+        yield make_finding(
+            text, figures, fix=_REVERSE_SIGN_AND_CHECK_FIX if name in log else exchange_fix
+        )
+    elif t_statistic > _MIN_T_STATISTIC:
+        text = f"positive {name} turns the vessel to starboard ({t_statistic:.0f} standard errors)"
+        yield make_finding(text, figures, level="note", fix="")
+
+
+def _find_steering(log: LogStatistics) -> tuple[str, np.ndarray]:
+    """Return what steers and its values [T], positive to starboard; no name where none is known."""
+    for name in STEERING_CHANNELS[:4]:
+        if name in log and log.std(name) > 1e-9:
+            return name, log[name]
+    for port_name, starboard_name in port_starboard_pairs(log).items():
+        if log.units[port_name] != "rad":
+            steering = log[port_name] * np.abs(log[port_name]) - log[starboard_name] * np.abs(
+                log[starboard_name]
+            )
+            if nan_std(steering) > 1e-9:
+                return f"{port_name} less {starboard_name}", steering
+    return "", np.zeros(0)
+
+
+_MIN_STEERING_VARIATION = 0.02
+"""Share of its size within which a rudder is held; of 24 helices of a torpedo all lie within 1.6 %,
+of its zigzags and random steps all beyond 46 %."""
+_MAX_BLOCKS = 10_000
+"""Blocks that a rudder's side is told by: more only overlap."""
+
+
+def _fit_steering_responses(
+    log: LogStatistics, steering: np.ndarray, flow: np.ndarray, is_known: np.ndarray
+) -> tuple[float, dict[int, LeastSquaresFit]]:
+    """Return what a yaw model leaves without steering, and fits with it by shift in samples: that
+    without a shift, and the one that leaves least.
+
+    Over blocks of a second or so: the change of r on the integrals of U^2, U r, r|r|, U v, v|v| and
+    U^2 times the steering, with the latter shifted in time; nothing where that says nothing.
+
+    Args:
+        log: with r.
+        steering: what steers [T].
+        flow: the speed U that it acts by [T]; 1 where it acts without any.
+        is_known: samples that are known [T].
+    """
+    r, block_length = log.smoothed("r"), max(round(1.0 / log.sampling_interval), SMOOTHING_SAMPLES)
+    lower, upper = nan_quantiles(log["r"], 0.05, 0.95)
+    v = np.zeros(len(log))
+    if "v" in log and np.isfinite(log["v"]).sum() > 2 * MIN_SAMPLES:
+        v = log.smoothed("v")
+    # a shift can be recognised as far as the yaw rate is correlated with itself
+    power_spectrum = np.abs(np.fft.rfft(r - r.mean(), 2 * r.size)) ** 2
+    autocorrelation = np.append(np.fft.irfft(power_spectrum)[: r.size], -1.0)
+    max_shift = max(
+        min(
+            int(np.argmax(autocorrelation < 0.0)), r.size // 8, round(30.0 / log.sampling_interval)
+        ),
+        3,
+    )
+    is_gap = (
+        ~is_known
+        | (np.append(np.diff(log.t), log.sampling_interval) > 3.0 * log.sampling_interval)
+        | log.near_seam(max_shift + block_length)
+    )
+    n_margin_samples = max_shift + SMOOTHING_SAMPLES
+    stride = max(round(0.2 / log.sampling_interval), len(log) // _MAX_BLOCKS, 1)
+    block_starts = np.arange(n_margin_samples, len(log) - n_margin_samples - block_length, stride)
+    blocks = OverlappingBlocks(log.t, block_starts, block_length)
+    blocks = replace(blocks, starts=block_starts[blocks.are_clear_of(is_gap)])
+    if blocks.starts.size < MIN_SAMPLES or upper - lower < 4.0 * log.noise_std("r"):
+        return 0.0, {}
+    regressors = np.stack((flow**2, flow * r, r * np.abs(r), flow * v, v * np.abs(v)), axis=-1)
+    integrated_terms, y = blocks.make_integrator(regressors)(0), blocks.compute_changes(r)
+    steering_integrals = blocks.make_integrator((flow**2 * np.nan_to_num(steering))[:, None])
+    candidate_shifts = sorted(
+        {round(float(shift)) for shift in np.linspace(-max_shift, max_shift, 61)}
+    )
+    is_finite = np.isfinite(integrated_terms).all(axis=1) & np.isfinite(y)
+    # of a rudder that is held through a steady turn only its shifted entry would seem to answer
+    mean_steering = steering_integrals(0)[is_finite, 0] / np.maximum(
+        integrated_terms[is_finite, 0], 1e-300
+    )
+    if (
+        is_finite.sum() < MIN_SAMPLES
+        or mean_steering.std() < _MIN_STEERING_VARIATION * np.abs(mean_steering).mean()
+    ):
+        return 0.0, {}
+    column_norms = np.maximum(np.linalg.norm(integrated_terms[is_finite], axis=0), 1e-300)
+    left_singular_vectors, singular_values, _ = np.linalg.svd(
+        integrated_terms[is_finite] / column_norms, full_matrices=False
+    )
+    left_singular_vectors = left_singular_vectors[:, singular_values > 1e-5 * singular_values[0]]
+    # what steers explains by the part of it that the other terms do not
+    shifted_steering = steering_integrals(candidate_shifts)[is_finite][..., 0]
+    residual_response, residual_steering = (
+        signal - left_singular_vectors @ (left_singular_vectors.T @ signal)
+        for signal in (y[is_finite], shifted_steering)
+    )
+    explained_squares = (residual_response @ residual_steering) ** 2 / np.maximum(
+        (residual_steering**2).sum(axis=0), 1e-300
+    )
+    best_shift = candidate_shifts[int(np.argmax(explained_squares))]
+    fits_by_shift = {
+        s: fit_least_squares(np.column_stack((integrated_terms, steering_integrals(s))), y)
+        for s in sorted({0, best_shift})
+    }
+    return fit_least_squares(integrated_terms, y).sum_of_squares, fits_by_shift
+
+
+# an answer so early, s, is no inaccuracy
+MIN_LEAD_TIME = 0.45
+# minima that are looked at closely, and how many times the least counts as good a fit
+_N_MINIMA, _MAX_EQUIVALENT_RATIO = 4, 1.15
+_N_SHIFTS_PER_SIDE = 12
+"""To either side, coarse ones first; chosen by hand: each costs a fit."""
+
+
+@dataclass(frozen=True)
+class ResponseDelay:
+    """When the motion answers an input.
+
+    Attributes:
+        delay: how late the answer comes; negative where it comes before the input.
+        standard_error: standard error of that, s.
+        improvement: what a fit leaves without the shift, over what it leaves with it (sums of squares).
+        late_answer_ratio: what the best shift leaves that is no early answer, over the least that any leaves.
+    """
+
+    delay: float
+    standard_error: float
+    improvement: float
+    late_answer_ratio: float
+
+
+def estimate_delays(
+    log: LogStatistics,
+) -> dict[tuple[str, str], tuple[tuple[str, ...], ResponseDelay]]:
+    """Return (channels, the velocity that answers) -> the channels one by one, and the delay.
+
+    Channels that may be shifted together are the first that steers, and all propellers.
+    """
+    input_groups: list[tuple[tuple[str, ...], str]] = []
+    rudder_name = next((name for name in STEERING_CHANNELS if name in log.inputs), "")
+    propeller_names = tuple(
+        name for name in log.cached(find_propellers) if not name.startswith("cmd_")
+    )
+    input_groups += [((rudder_name,), "r")] if rudder_name else []
+    input_groups += (
+        [(propeller_names, "u" if len(propeller_names) == 1 else "r")] if propeller_names else []
+    )
+    delays_by_input = {}
+    for names, answer in input_groups:
+        is_excited = all(log.std(n) > 0.02 * np.nanmax(np.abs(log[n])) for n in names)
+        delay = estimate_delay(log, names, answer) if answer in log and is_excited else None
+        if delay is not None:
+            delays_by_input[", ".join(names), answer] = names, delay
+    return delays_by_input
+
+
+def estimate_delay(log: LogStatistics, names: Sequence[str], answer: str) -> ResponseDelay | None:
+    """Return how late a velocity answers inputs; None where the log does not tell."""
+    step, blocks = log.sampling_interval, log.cached(make_blocks, answer)
+    max_shift = max(2 * blocks.length, round(3.0 / step))
+    if len(log) < max(20 * blocks.length, 6 * max_shift):
+        return None
+    block_starts = blocks.starts
+    is_inside = (block_starts >= max_shift) & (block_starts + blocks.length + max_shift < len(log))
+    blocks = replace(
+        blocks, starts=block_starts[is_inside & blocks.are_clear_of(log.near_seam(max_shift))]
+    )
+    other_inputs = [
+        name for name in log if name in ("n", "delta", "wind_speed") and name not in names
+    ]
+    velocity_changes = blocks.compute_changes(log[answer])
+    # shift -> the squares [K] that a fit leaves with the inputs shifted, NaN where unknown, and sum
+    squared_residuals_by_shift, sum_of_squares_by_shift = (
+        dict[int, np.ndarray](),
+        dict[int, float](),
+    )
+    # the flow over a rudder falls as the vessel turns: without their product in the fit the answer
+    # seems to come early
+    velocity_columns = {name: log[name][:, None] for name in log.velocities}
+    driving_inputs = [name for name in (*other_inputs, *names) if log.std(name) > 0.0]
+    is_linear = len(driving_inputs) > 4
+
+    def make_shifted_terms(
+        input_names: Sequence[str], shifts: Sequence[int] | np.ndarray
+    ) -> list[np.ndarray]:
+        """Return terms [T, S] of inputs that are shifted by so many samples each."""
+        shifted_indices = np.arange(len(log))[:, None] - np.array(shifts)
+        inputs = [
+            np.take(log[name], shifted_indices, mode="wrap")
+            for name in driving_inputs
+            if name in input_names
+        ]
+        return make_input_terms(inputs, velocity_columns.get("u"), is_linear=is_linear)
+
+    def integrate_columns(columns: Sequence[np.ndarray]) -> np.ndarray:
+        return np.stack([blocks.make_integrator(column)(0) for column in columns], axis=-1)
+
+    fixed_terms = integrate_columns(
+        [
+            np.ones((len(log), 1)),
+            *make_velocity_terms(velocity_columns),
+            *make_shifted_terms(other_inputs, [0]),
+        ]
+    )
+
+    def evaluate_shifts(candidate_shifts: Iterable[int]) -> None:
+        new_shifts = [
+            k
+            for k in dict.fromkeys(candidate_shifts)
+            if k not in squared_residuals_by_shift and abs(k) <= max_shift
+        ]
+        shift_batches = (
+            np.array_split(new_shifts, -(-len(new_shifts) * len(log) // CHUNK_SAMPLES))
+            if new_shifts
+            else ()
+        )
+        for shift_batch in shift_batches:
+            shifted_terms = integrate_columns(make_shifted_terms(names, shift_batch))
+            x = np.concatenate(
+                (fixed_terms.repeat(shift_batch.size, axis=1), shifted_terms), axis=2
+            ).transpose(1, 0, 2)
+            is_finite = np.isfinite(x).all(axis=2) & np.isfinite(velocity_changes)
+            regressors, target = (
+                np.where(is_finite[..., None], x, 0.0),
+                np.where(is_finite, velocity_changes, 0.0)[..., None],
+            )
+            regressors /= np.maximum(np.linalg.norm(regressors, axis=1, keepdims=True), 1e-300)
+            transposed = regressors.transpose(0, 2, 1)
+            gram = transposed @ regressors + 1e-9 * np.eye(regressors.shape[2])
+            residuals = (target - regressors @ np.linalg.solve(gram, transposed @ target))[..., 0]
+            squared_residuals_by_shift.update(
+                zip(shift_batch.tolist(), np.where(is_finite, residuals**2, np.nan), strict=True)
+            )
+            sum_of_squares_by_shift.update(
+                zip(shift_batch.tolist(), (residuals**2).sum(axis=1).tolist(), strict=True)
+            )
+
+    def find_minima() -> list[int]:
+        """Return the shifts of the minima so far, the lowest first."""
+        shifts = sorted(sum_of_squares_by_shift)
+        sums_of_squares = np.array([sum_of_squares_by_shift[shift] for shift in shifts])
+        padded = np.concatenate(([np.inf], sums_of_squares, [np.inf]))
+        minimum_indices = np.flatnonzero(
+            (sums_of_squares <= padded[:-2]) & (sums_of_squares <= padded[2:])
+        )
+        return [shifts[i] for i in minimum_indices[np.argsort(sums_of_squares[minimum_indices])]]
+
+    evaluate_shifts(
+        round(k * max_shift / _N_SHIFTS_PER_SIDE)
+        for k in range(-_N_SHIFTS_PER_SIDE, _N_SHIFTS_PER_SIDE + 1)
+    )
+    coarse_spacing = max(round(max_shift / _N_SHIFTS_PER_SIDE), 1)
+    evaluate_shifts(
+        min_shift + round(k * coarse_spacing / 6)
+        for min_shift in find_minima()[:_N_MINIMA]
+        for k in range(-6, 7)
+    )
+    # of several that fit alike the least that is no early answer: an input that repeats itself, as
+    # that of a zigzag, fits as well half a period away
+    min_sum_of_squares = max(min(sum_of_squares_by_shift.values()), 1e-300)
+    equivalent_shifts = [
+        shift
+        for shift in find_minima()
+        if sum_of_squares_by_shift[shift] <= _MAX_EQUIVALENT_RATIO * min_sum_of_squares
+    ]
+    best_shift = min(
+        equivalent_shifts, key=lambda shift: (-shift * step > MIN_LEAD_TIME, abs(shift))
+    )
+    is_finite = np.isfinite(squared_residuals_by_shift[best_shift]) & np.isfinite(
+        squared_residuals_by_shift[0]
+    )
+    if abs(best_shift) >= max_shift - coarse_spacing or is_finite.sum() < 5 * (
+        fixed_terms.shape[2] + len(make_shifted_terms(names, [0]))
+    ):
+        return None
+    # how well the least is determined: its scatter over sections of the log
+    tried_delays, squared_residuals = (
+        np.array([*squared_residuals_by_shift]) * step,
+        np.array([*squared_residuals_by_shift.values()]),
+    )
+    section_indices = np.array_split(np.flatnonzero(is_finite), N_SECTIONS // 2)
+    best_delay_by_section = [
+        tried_delays[
+            np.argmin(np.nan_to_num(squared_residuals[:, section].sum(axis=1), nan=np.inf))
+        ]
+        for section in section_indices
+    ]
+    scatter = SIGMA_OF_MAD * float(
+        np.median(np.abs(np.array(best_delay_by_section) - np.median(best_delay_by_section)))
+    )
+    standard_error = max(1.5 * scatter / np.sqrt(len(section_indices)), 0.25 * step)
+    best_sum_of_squares = max(
+        float(squared_residuals_by_shift[best_shift][is_finite].sum()), 1e-300
+    )
+    late_ratio = (
+        min(
+            value
+            for shift, value in sum_of_squares_by_shift.items()
+            if -shift * step <= MIN_LEAD_TIME
+        )
+        / min_sum_of_squares
+    )
+    return ResponseDelay(
+        best_shift * step,
+        standard_error,
+        float(squared_residuals_by_shift[0][is_finite].sum()) / best_sum_of_squares,
+        late_ratio,
+    )
+
+
+@check(
+    "actuators",
+    "acausal",
+    fix="the clocks of inputs and motion differ: shift one of them",
+    is_record_fault=True,
+    on_subsample=True,
+)
+def check_acausal_response(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report inputs that the motion answers before they are given.
+
+    A vessel cannot answer before it is told. That it answers late may be its actuators; among logs
+    of one vessel, though, the delay is the same (`between`).
+    """
+    for (channels, answer), (names, delay) in log.cached(estimate_delays).items():
+        lead_time = -delay.delay
+        is_significant = (
+            delay.improvement > 1.35 and delay.late_answer_ratio > _MAX_EQUIVALENT_RATIO
+        )
+        if is_significant and lead_time > max(
+            MIN_LEAD_TIME, 1.5 * log.sampling_interval, 3.0 * delay.standard_error
+        ):
+            text = (
+                f"{answer} answers {channels} {lead_time:.2f} +- {2.0 * delay.standard_error:.2f} s before it is"
+                f" given (a fit leaves {delay.improvement:.1f} times less with it shifted)"
+            )
+            figures = {
+                "lag": delay.delay,
+                "error": delay.standard_error,
+                "better": delay.improvement,
+            }
+            yield make_finding(text, figures, repair=make_correction(names, delay=lead_time))

@@ -1,0 +1,344 @@
+"""What a finding does to a fit, measured: findings that change next to nothing become notes.
+
+The fit is a cheap one of one step: the change of the velocities over a few seconds, by least
+squares. Dead reckoning tells how far the velocities of a log lead from its positions and headings.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from residnet.core.log import Log
+from residnet.preprocessing.statistics import OverlappingBlocks
+from residnet.quality.findings import Finding
+from residnet.quality.statistics import (
+    LogStatistics,
+    interpolate_gaps,
+    make_blocks,
+    make_input_terms,
+    make_velocity_terms,
+)
+
+MIN_EFFECT = 0.04
+"""Change of a fit's predictions, as a share of what they predict, below which none is misled."""
+_RIDGE = 1e-6
+"""Of columns of size 1: solves those that move together, and changes others by a millionth."""
+# the predictions must change by so many times what no fit explains
+_MIN_CHANGE_TO_RESIDUAL = 1.3
+# dead reckoning must change by this share of the way sailed
+_MIN_RECKONING_CHANGE = 0.06
+# a stretch is compared with so many others of its length, because every fit depends on its data
+_N_COMPARISON_SEGMENTS = 6
+_MIN_ROWS_PER_COLUMN = 4
+"""Rows for each coefficient; a fit to fewer follows their noise. Chosen by hand."""
+_CERTAIN_T_STATISTIC = 20.0
+"""Standard errors from which on a size is certain."""
+_MIN_VELOCITY_CHANGE = 0.1
+"""Share of its spread by which a velocity has to be wrong to count by itself."""
+_RECKONING_DURATION = 60.0
+"""Length of a free run by dead reckoning in s; a short log has at least three of them."""
+
+
+class OneStepRegression:
+    """The rows of a one-step fit to one log.
+
+    Args:
+        log: with the inputs that drive the vessel.
+        reference: rows whose block length is taken; None takes what the noise asks for.
+
+    Attributes:
+        blocks: over which the equations are integrated, K of them.
+        regressors: regressors [K, k], integrated over the blocks.
+        responses: of the velocities over the blocks [K, n].
+        response_std: standard deviation of the changes [n].
+    """
+
+    def __init__(self, log: LogStatistics, reference: OneStepRegression | None = None) -> None:
+        blocks: OverlappingBlocks = make_blocks(log, *log.velocities)
+        if reference is not None:
+            block_length = reference.blocks.length
+            block_starts = np.arange(0, len(log) - block_length, max(block_length // 4, 1))
+            blocks = dataclasses.replace(blocks, starts=block_starts, length=block_length)
+        velocities = {name: log[name] for name in log.velocities}
+        input_values = [log[name] for name in log.inputs if log.std(name) > 0.0]
+        # a polynomial that knows no vessel; beyond four inputs each enters linearly only
+        regressor_columns = [np.ones(len(log)), *make_velocity_terms(velocities)]
+        regressor_columns += make_input_terms(
+            input_values, velocities.get("u"), is_linear=len(input_values) > 4
+        )
+        regressors = blocks.make_integrator(np.stack(regressor_columns, axis=-1))(0)
+        responses = blocks.compute_changes(
+            np.stack([*velocities.values()] or [np.zeros(len(log))], axis=-1)
+        )
+        is_finite = np.isfinite(regressors).all(axis=1) & np.isfinite(responses).all(axis=1)
+        is_finite &= blocks.compute_changes(log.t) <= (blocks.length + 3.0) * log.sampling_interval
+        self.blocks: OverlappingBlocks = dataclasses.replace(
+            blocks, starts=blocks.starts[is_finite]
+        )
+        self.regressors, self.responses = regressors[is_finite], responses[is_finite]
+        self.response_std = (
+            np.maximum(self.responses.std(axis=0), 1e-12) if is_finite.any() else np.ones(1)
+        )
+
+    def __len__(self) -> int:
+        return int(self.blocks.starts.size)
+
+    def fit_ridge(self, row_mask: np.ndarray | None = None) -> np.ndarray:
+        """Return the coefficients [k, n] of a ridge fit, to rows [K] bool or to all."""
+        x, y = (
+            (self.regressors, self.responses)
+            if row_mask is None
+            else (self.regressors[row_mask], self.responses[row_mask])
+        )
+        column_scales = np.maximum(np.sqrt(np.mean(x**2, axis=0)), 1e-300)
+        x = x / column_scales
+        gram, cross_moments = x.T @ x / len(x), x.T @ y / len(x)
+        coefficients = np.linalg.solve(gram + _RIDGE * np.eye(x.shape[1]), cross_moments)
+        return np.asarray(coefficients / column_scales[:, None])
+
+    def residual_rms(
+        self, coefficients: np.ndarray, row_mask: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return what a fit leaves of each velocity's changes [n], root mean square."""
+        residuals = self.responses - self.regressors @ coefficients
+        return _root_mean_square(residuals if row_mask is None else residuals[row_mask])
+
+    def prediction_change(
+        self, change_of_predictions: np.ndarray, coefficients: np.ndarray
+    ) -> float:
+        """Return the largest change of the predictions [n] over what there is to predict.
+
+        Changes that drown in what no fit explains do not count.
+        """
+        counted_changes = np.where(
+            change_of_predictions > _MIN_CHANGE_TO_RESIDUAL * self.residual_rms(coefficients),
+            change_of_predictions / self.response_std,
+            0.0,
+        )
+        return float(counted_changes.max(initial=0.0))
+
+
+def _root_mean_square(values: np.ndarray) -> np.ndarray:
+    return np.asarray(np.sqrt(np.mean(values**2, axis=0)))
+
+
+def _excess_rms(rms_value: np.ndarray, typical_rms: np.ndarray) -> np.ndarray:
+    return np.asarray(np.sqrt(np.maximum(rms_value**2 - typical_rms**2, 0.0)))
+
+
+def _threshold_reckoning_change(reckoning_changes: np.ndarray) -> float:
+    """Return the larger change of dead reckoning [2], 0 where it is within what receivers do."""
+    return (
+        float(reckoning_changes.max()) if reckoning_changes.max() >= _MIN_RECKONING_CHANGE else 0.0
+    )
+
+
+class FindingEffects:
+    """What single findings change in a one-step fit to a log, and in its dead reckoning.
+
+    Args:
+        log: of which a long one is told by a part.
+        sample_mask: [T] bool, samples that this part has to hold; None for evenly spread ones.
+    """
+
+    def __init__(self, log: LogStatistics, sample_mask: np.ndarray | None = None) -> None:
+        self._full_log = log
+        self._sample_indices, log = (
+            (log.subsample_rows, log.subsample)
+            if sample_mask is None
+            else log.excerpt_around(sample_mask)
+        )
+        self._log, self._regression = log, OneStepRegression(log)
+        has_enough_rows = (
+            len(self._regression) >= _MIN_ROWS_PER_COLUMN * self._regression.regressors.shape[1]
+        )
+        self._coefficients = self._regression.fit_ridge() if has_enough_rows else None
+        self._reckoning_errors = compute_reckoning_errors(log)
+
+    def measure(self, finding: Finding) -> Finding:
+        """Return the finding with its effect, as a note where that is small.
+
+        Only what concerns single samples, or says how it would be corrected, can be measured.
+        """
+        if finding.level != "will mislead" or finding.is_record_fault:
+            return finding
+        if finding.repair is not None:
+            effect = self.measure_repair(finding.repair(self._log.log), finding)
+        elif finding.sample_mask is not None and finding.sample_mask.any():
+            if not finding.sample_mask[self._sample_indices].any():
+                return FindingEffects(self._full_log, finding.sample_mask).measure(finding)
+            fitted_channels = {*self._log.velocities, *self._log.inputs}
+            effect = self.measure_omission(
+                finding.sample_mask[self._sample_indices],
+                not finding.channels or not fitted_channels.isdisjoint(finding.channels),
+            )
+        else:
+            return finding
+        if effect is None:
+            return finding
+        level = finding.level if effect >= MIN_EFFECT else "note"
+        return dataclasses.replace(finding, level=level, effect=effect)
+
+    def measure_omission(self, sample_mask: np.ndarray, affects_fit: bool = True) -> float | None:
+        """Return what changes where the samples at [T] bool are left out; None if unknown.
+
+        `affects_fit` says whether a fit sees the channels concerned, and not dead reckoning alone.
+        """
+        comparison_masks = [
+            np.roll(sample_mask, round(sample_mask.size * (k + 0.5) / _N_COMPARISON_SEGMENTS))
+            for k in range(_N_COMPARISON_SEGMENTS)
+        ]
+        comparison_errors = [
+            _excess_rms(
+                self._reckoning_errors, compute_reckoning_errors(self._log, comparison_mask)
+            )
+            for comparison_mask in comparison_masks
+        ]
+        reckoning_change = _excess_rms(
+            self._reckoning_errors, compute_reckoning_errors(self._log, sample_mask)
+        )
+        counted_reckoning_change = _threshold_reckoning_change(
+            _excess_rms(reckoning_change, _root_mean_square(np.array(comparison_errors)))
+        )
+        if not affects_fit:
+            return counted_reckoning_change
+        regression, coefficients = self._regression, self._coefficients
+        if coefficients is None or regression.blocks.are_clear_of(sample_mask).sum() < max(
+            0.3 * len(regression), 1
+        ):
+            return None if counted_reckoning_change < MIN_EFFECT else counted_reckoning_change
+        full_residual_rms = regression.residual_rms(coefficients)
+
+        def refit_without(omitted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            """Return how far predictions [n] move, and what is left [n], without samples [T]."""
+            retained = regression.blocks.are_clear_of(omitted)
+            new_coefficients = regression.fit_ridge(retained)
+            return _root_mean_square(
+                regression.regressors[retained] @ (coefficients - new_coefficients)
+            ), regression.residual_rms(new_coefficients, retained)
+
+        prediction_changes, remaining_rms = refit_without(sample_mask)
+        comparison_changes, comparison_rms = zip(
+            *(refit_without(comparison_mask) for comparison_mask in comparison_masks), strict=True
+        )
+        # how much of the fit's error the samples had made, where no others had made as much
+        is_significant = (remaining_rms < 0.95 * full_residual_rms) & (
+            remaining_rms < 0.98 * np.min(comparison_rms, axis=0)
+        )
+        error_caused = np.where(
+            is_significant,
+            _excess_rms(full_residual_rms, remaining_rms) / regression.response_std,
+            0.0,
+        )
+        largest_change = regression.prediction_change(
+            _excess_rms(prediction_changes, _root_mean_square(np.array(comparison_changes))),
+            coefficients,
+        )
+        return max(largest_change, float(error_caused.max(initial=0.0)), counted_reckoning_change)
+
+    def measure_repair(self, repaired_log: Log, finding: Finding) -> float | None:
+        """Return what changes where the log is corrected; None if unknown."""
+        repaired_statistics = self._log.on_grid(repaired_log)
+        counted_reckoning_change = _threshold_reckoning_change(
+            _excess_rms(self._reckoning_errors, compute_reckoning_errors(repaired_statistics))
+        )
+        regression = OneStepRegression(repaired_statistics, self._regression)
+        coefficients, velocity_change = self._coefficients, 0.0
+        if abs(finding.figures.get("size", 0.0)) > _CERTAIN_T_STATISTIC * finding.figures.get(
+            "error", np.inf
+        ):
+            # one-step predictions may stay as good while the coefficients they give are wrong
+            for name in self._log.velocities:
+                rms_difference = float(
+                    np.sqrt(np.nanmean((repaired_statistics[name] - self._log[name]) ** 2))
+                )
+                velocity_change = max(
+                    velocity_change, rms_difference / max(self._log.std(name), 1e-12)
+                )
+            velocity_change = velocity_change if velocity_change >= _MIN_VELOCITY_CHANGE else 0.0
+        if (
+            coefficients is None
+            or regression.regressors.shape[1] != coefficients.shape[0]
+            or not len(regression)
+        ):
+            return (
+                None
+                if counted_reckoning_change < MIN_EFFECT
+                else max(counted_reckoning_change, velocity_change)
+            )
+        new_coefficients = regression.fit_ridge()
+        # a correction that leaves the fit worse off is not what is wrong with the velocities
+        initial_rms = _root_mean_square(
+            self._regression.residual_rms(coefficients) / self._regression.response_std
+        )
+        if (
+            _root_mean_square(regression.residual_rms(new_coefficients) / regression.response_std)
+            > 1.02 * initial_rms
+        ):
+            return max(counted_reckoning_change, velocity_change)
+        return max(
+            regression.prediction_change(
+                _root_mean_square(regression.regressors @ (coefficients - new_coefficients)),
+                new_coefficients,
+            ),
+            counted_reckoning_change,
+            velocity_change,
+        )
+
+
+def compute_reckoning_errors(log: LogStatistics, omitted: np.ndarray | None = None) -> np.ndarray:
+    """Return the errors [2] of dead reckoning over a minute in place and heading.
+
+    They are shares of the way sailed; an error of the heading counts with the share by which it
+    displaces the end of a straight way.
+
+    Args:
+        log: with an increasing clock.
+        omitted: [T] bool, samples that no window may touch; where that leaves too few windows, in
+            which none may begin or end.
+    """
+    window_length, errors = (
+        min(round(_RECKONING_DURATION / log.sampling_interval), len(log) // 3),
+        np.zeros(2),
+    )
+    is_omitted = log.near_seam(0) if omitted is None else omitted | log.near_seam(0)
+    cumulative_omitted = np.append(0, np.cumsum(is_omitted))
+    window_starts = np.flatnonzero(
+        cumulative_omitted[window_length + 1 :] == cumulative_omitted[: -window_length - 1]
+    )
+    if window_starts.size < 0.2 * (len(log) - window_length):
+        window_starts = np.flatnonzero(~is_omitted[:-window_length] & ~is_omitted[window_length:])
+    if window_length < 2 or not window_starts.size:
+        return errors
+
+    def compute_change(values: np.ndarray) -> np.ndarray:
+        return np.asarray(values[window_starts + window_length] - values[window_starts])
+
+    def integrate_rate(rate: np.ndarray) -> np.ndarray:
+        cumulative_integral = np.cumsum(0.5 * np.diff(log.t) * (rate[1:] + rate[:-1]))
+        return compute_change(np.append(0.0, cumulative_integral))
+
+    def root_mean_square(values: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(np.abs(values[is_finite]) ** 2)))
+
+    if all(name in log for name in ("x", "y", "psi", "u", "v")):
+        earth_velocity = interpolate_gaps(
+            log.t, (log["u"] + 1j * log["v"]) * np.exp(1j * log["psi"])
+        )
+        displacement_error = compute_change(log["x"] + 1j * log["y"]) - integrate_rate(
+            earth_velocity
+        )
+        is_finite = np.isfinite(displacement_error)
+        if is_finite.any():
+            errors[0] = root_mean_square(displacement_error) / max(
+                root_mean_square(integrate_rate(np.abs(earth_velocity))), 1e-9
+            )
+    if "psi" in log and "r" in log:
+        displacement_error = compute_change(log["psi"]) - integrate_rate(
+            interpolate_gaps(log.t, log["r"])
+        )
+        is_finite = np.isfinite(displacement_error)
+        errors[1] = 0.5 * root_mean_square(displacement_error) if is_finite.any() else 0.0
+    return errors

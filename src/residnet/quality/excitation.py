@@ -1,0 +1,163 @@
+"""How much of the vessel's envelope logs cover, and whether effects can be separated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from residnet.core.stretches import find_runs
+from residnet.preprocessing.channel_values import nan_quantiles
+from residnet.quality.findings import (
+    Check,
+    Finding,
+    Level,
+    check,
+    format_quantity,
+    format_share,
+)
+from residnet.quality.statistics import LogStatistics, interpolate_gaps, moving_average
+
+_MAX_CONDITION_NUMBER = 30.0
+"""Condition number of harmful collinearity: Belsley, Kuh and Welsch, 1980."""
+
+
+@check("excitation", "range", "note")
+def report_ranges(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report range and spectrum of velocities and inputs."""
+    for name in (*log.velocities, *log.inputs):
+        values, unit = log[name][np.isfinite(log[name])], log.units[name]
+        lower, upper, std = float(values.min()), float(values.max()), float(values.std())
+        figures = {"min": lower, "max": upper, "std": std}
+        if std <= 1e-6 * max(abs(lower), abs(upper)):
+            text = (
+                f"{name} stays at {format_quantity(lower, unit)}: its effect cannot be identified from this log"
+                " alone"
+            )
+            yield make_finding(text, figures, code="constant")
+            continue
+        text = f"{name} from {format_quantity(lower, unit)} to {format_quantity(upper, unit)}, standard deviation"
+        text += f" {format_quantity(std, unit)}"
+        if name in log.inputs and values.size >= 20:
+            subsample = log.subsample
+            power_spectrum = (
+                np.abs(
+                    np.fft.rfft(interpolate_gaps(subsample.t, subsample[name]) - values.mean())[1:]
+                )
+                ** 2
+            )
+            cumulative_power = np.cumsum(power_spectrum)
+            band_index = 1 + np.searchsorted(cumulative_power, 0.95 * cumulative_power[-1])
+            figures["band"] = float(band_index / (len(subsample) * log.sampling_interval))
+            text += f", 95 % of its power below {figures['band']:.3g} Hz"
+        yield make_finding(text, figures)
+
+
+def find_rest(log: LogStatistics) -> np.ndarray:
+    """Return [T] bool: no motion beyond the noise over two seconds."""
+    n_samples = max(round(2.0 / log.sampling_interval), 5)
+    is_at_rest = np.ones(len(log), dtype=bool)
+    speeds = np.hypot(moving_average(log["u"], n_samples), moving_average(log["v"], n_samples))
+    yaw_rates = np.abs(moving_average(log["r"], n_samples))
+    noise_levels = np.hypot(log.noise_std("u"), log.noise_std("v")), log.noise_std("r")
+    for values, noise_level in zip((speeds, yaw_rates), noise_levels, strict=True):
+        # what is left of the noise after averaging, but never a motion that is one for this vessel
+        high_level, averaged_noise = (
+            nan_quantiles(values, 0.95)[0],
+            4.0 * noise_level / np.sqrt(n_samples),
+        )
+        is_at_rest &= values < min(
+            max(0.03 * high_level, averaged_noise), max(0.2 * high_level, averaged_noise)
+        )
+    return is_at_rest
+
+
+@check(
+    "excitation",
+    "standing",
+    fix="leave these parts out: they hold noise only",
+    required_channels=("u", "v", "r"),
+)
+def check_rest(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report a vessel at rest; for a tenth of a log that makes it one about noise."""
+    is_at_rest = find_rest(log)
+    starts, stops = find_runs(is_at_rest)
+    rest_share = float(is_at_rest.mean())
+    durations = log.t[stops - 1] - log.t[starts]
+    longest_segment = int(np.argmax(stops - starts)) if starts.size else 0
+    if rest_share > 0.02 and durations[longest_segment] > 3.0:
+        start_time, longest_duration = (
+            float(log.t[starts[longest_segment]]),
+            float(durations[longest_segment]),
+        )
+        text = (
+            f"the vessel rests for {format_share(rest_share)} of the time, at most {longest_duration:.1f} s on end from"
+            f" t = {start_time:.2f} s"
+        )
+        level: Level = "will mislead" if rest_share > 0.1 else "note"
+        yield make_finding(
+            text,
+            {"share": rest_share, "longest": longest_duration, "t": start_time},
+            level=level,
+            sample_mask=is_at_rest,
+        )
+
+
+@check("excitation", "slow", "note", "there is little to learn there", required_channels=("u", "v"))
+def check_slow_motion(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report a vessel that hardly moves."""
+    speed = np.hypot(log["u"], log["v"])
+    slow_speed = 0.1 * nan_quantiles(speed, 0.95)[0]
+    slow_share = float(np.mean(speed[np.isfinite(speed)] <= slow_speed))
+    if slow_share > 0.05:
+        text = (
+            f"the vessel stands almost still (slower than {format_quantity(slow_speed, 'm/s')}, a tenth of its"
+            f" speed) for {format_share(slow_share)} of the time"
+        )
+        yield make_finding(text, {"share": slow_share})
+
+
+@check("excitation", "condition", "note", on_subsample=True)
+def report_condition_number(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report velocities and inputs that move together in a log."""
+    names = [
+        name
+        for name in (*log.velocities, *log.inputs)
+        if log.std(name) > 1e-6 * np.nanmax(np.abs(log[name]))
+    ]
+    columns = log.log.stack(names)
+    columns = columns[np.isfinite(columns).all(axis=1)]
+    if len(names) < 2 or columns.shape[0] < 10 * len(names):
+        return
+    condition_number, collinear_names = compute_condition_number(columns, names)
+    text = f"condition number of {format_names(names)} (centred, scaled): {condition_number:.3g}"
+    if condition_number > _MAX_CONDITION_NUMBER:
+        text += (
+            f"; {', '.join(collinear_names)} move together in this log: their effects are separated by other"
+            " manoeuvres only"
+        )
+    yield make_finding(text, {"condition": condition_number})
+
+
+def format_names(names: Sequence[str]) -> str:
+    """Return names in brackets, or how many they are where they are many."""
+    return f"[{', '.join(names)}]" if len(names) <= 12 else f"{len(names)} channels"
+
+
+def compute_condition_number(columns: np.ndarray, names: Sequence[str]) -> tuple[float, list[str]]:
+    """Return the condition number of columns [N, k], and the names that move together most.
+
+    Columns are centred and scaled; there are up to three names.
+    """
+    column_std = np.maximum(columns.std(axis=0), np.finfo(float).tiny)
+    _, singular_values, singular_vectors = np.linalg.svd(
+        (columns - columns.mean(axis=0)) / column_std, False
+    )
+    condition_number = float(
+        singular_values[0]
+        / max(singular_values[-1], 1e-16 * singular_values[0], np.finfo(float).tiny)
+    )
+    largest_indices = np.argsort(-np.abs(singular_vectors[-1]))[:3]
+    return condition_number, [
+        names[i] for i in largest_indices if abs(singular_vectors[-1][i]) > 0.2
+    ]

@@ -1,0 +1,393 @@
+"""Findings about the channels that drive the vessel, and about what stands beside the motion.
+
+Jumps, limits, offset, astern, unit, stuck actuators; wind that contains the motion; positions
+against latitude and longitude.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+
+import numpy as np
+
+from residnet.core.names import BOW_WIND_CHANNELS
+from residnet.core.stretches import find_runs
+from residnet.preprocessing.statistics import MIN_SAMPLES
+from residnet.quality.findings import (
+    Check,
+    Finding,
+    Level,
+    check,
+    describe_unit_confusion,
+    format_quantity,
+    format_share,
+)
+from residnet.quality.statistics import (
+    STEERING_CHANNELS,
+    LogStatistics,
+    abs_quantile,
+    count_reversals,
+    fit_least_squares,
+    interpolate_gaps,
+)
+
+_LATITUDE_NAMES = ("latitude", "lat", "gps_lat", "gnss_lat", "latitude_deg", "lat_deg")
+_LONGITUDE_NAMES = (
+    "longitude",
+    "lon",
+    "lng",
+    "long",
+    "gps_lon",
+    "gnss_lon",
+    "longitude_deg",
+    "lon_deg",
+)
+# mean radii of curvature are within .4 % of this
+_EARTH_RADIUS = 6_371_000.0
+
+
+@check(
+    "inputs",
+    "positions_scaled",
+    fix="compute x, y from latitude and longitude, or correct their unit",
+    required_channels=("x", "y"),
+)
+def check_positions_against_coordinates(
+    log: LogStatistics, make_finding: Check
+) -> Iterator[Finding]:
+    """Report a scale or turn of x, y against latitude and longitude."""
+    names_by_lowercase = {name.lower(): name for name in log}
+    latitude_name = next(
+        (names_by_lowercase[name] for name in _LATITUDE_NAMES if name in names_by_lowercase), ""
+    )
+    longitude_name = next(
+        (names_by_lowercase[name] for name in _LONGITUDE_NAMES if name in names_by_lowercase), ""
+    )
+    if not latitude_name or not longitude_name:
+        return
+    latitude_rad, longitude_rad = (
+        log[name] if log.units[name] == "rad" else np.radians(log[name])
+        for name in (latitude_name, longitude_name)
+    )
+    coordinate_positions = _EARTH_RADIUS * (
+        latitude_rad
+        - np.nanmean(latitude_rad)
+        + 1j * np.cos(latitude_rad) * (longitude_rad - np.nanmean(longitude_rad))
+    )
+    logged_positions = log["x"] + 1j * log["y"]
+    is_finite = np.isfinite(coordinate_positions) & np.isfinite(logged_positions)
+    if is_finite.sum() < MIN_SAMPLES:
+        return
+    coordinate_positions, logged_positions = (
+        coordinate_positions[is_finite] - coordinate_positions[is_finite].mean(),
+        logged_positions[is_finite] - logged_positions[is_finite].mean(),
+    )
+    if float(np.abs(coordinate_positions).max()) < 1.0:
+        return
+    complex_gain = complex(np.vdot(coordinate_positions, logged_positions)) / float(
+        np.vdot(coordinate_positions, coordinate_positions).real
+    )
+    position_norm, residual_norm = (
+        float(np.linalg.norm(logged_positions)),
+        float(np.linalg.norm(logged_positions - complex_gain * coordinate_positions)),
+    )
+    residual_share = residual_norm / max(position_norm, 1e-12)
+    scale, rotation = abs(complex_gain), float(np.angle(complex_gain))
+    if residual_share >= 0.2:
+        text = f"x, y do not follow {latitude_name}, {longitude_name}: {100.0 * residual_share:.0f} % is left"
+    elif abs(scale - 1.0) >= 0.02 or abs(rotation) >= math.radians(3.0):
+        text = (
+            f"x, y are {scale:.3f} times as far as {latitude_name}, {longitude_name} say, turned by"
+            f" {math.degrees(rotation):+.1f} deg{describe_unit_confusion(scale, 'm')}"
+        )
+    else:
+        return
+    yield make_finding(text, {"scale": scale, "turn": rotation, "rest": residual_share})
+
+
+def _finite_inputs(log: LogStatistics) -> list[str]:
+    return [name for name in log.inputs if np.isfinite(log[name]).sum() > 1]
+
+
+@check(
+    "inputs",
+    "input_jump",
+    "note",
+    "derivatives are biased around it, mask them (kind: input_jump)",
+)
+def check_input_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report inputs that change by a quarter of their range within one sample."""
+    for name in _finite_inputs(log):
+        changes = np.abs(np.nan_to_num(np.diff(log[name])))
+        input_range = float(np.nanmax(log[name]) - np.nanmin(log[name]))
+        largest_index = int(np.argmax(changes))
+        largest, time = float(changes[largest_index]), float(log.t[largest_index + 1])
+        # a direction may wrap
+        if 0.0 < 0.25 * input_range < largest and (
+            log.units[name] != "rad" or name in STEERING_CHANNELS
+        ):
+            text = (
+                f"{name} changes by {format_quantity(largest, log.units[name])} within one sample"
+                f" ({format_share(largest / input_range)} of its range) at t = {time:.2f} s"
+            )
+            yield make_finding(
+                text, {"largest": largest, "t": time, "share_of_range": largest / input_range}
+            )
+
+
+@check("inputs", "at_limits", "note", "what lies beyond is not learned")
+def check_input_limits(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report rests at the largest and smallest value, and where their middle lies."""
+    for name in _finite_inputs(log):
+        finite_values, unit = log[name][np.isfinite(log[name])], log.units[name]
+        lower, upper = float(finite_values.min()), float(finite_values.max())
+        margin = 1e-3 * (upper - lower)
+        limit_shares = (
+            float((finite_values <= lower + margin).mean()),
+            float((finite_values >= upper - margin).mean()),
+        )
+        if max(limit_shares) <= 0.01 or np.unique(finite_values).size <= 2:
+            continue
+        text = (
+            f"{name} rests at its limits {format_quantity(lower, unit)} ({format_share(limit_shares[0])}) and"
+            f" {format_quantity(upper, unit)} ({format_share(limit_shares[1])})"
+        )
+        yield make_finding(text, {"low": lower, "high": upper, "share": sum(limit_shares)})
+        midpoint = 0.5 * (lower + upper)
+        # only limits that are nearly the same on both sides are two ends of one actuator
+        is_nearly_symmetric = lower < 0.0 < upper and 1e-3 * upper < abs(midpoint) < 0.02 * (
+            upper - lower
+        )
+        if is_nearly_symmetric and name in STEERING_CHANNELS and unit == "rad":
+            text = (
+                f"{name} goes from {format_quantity(lower, unit)} to {format_quantity(upper, unit)}, not the same to both"
+                f" sides: an offset of {format_quantity(midpoint, unit)}"
+            )
+            fix = "take it off, or keep a constant among the regressors"
+            yield make_finding(
+                text,
+                {"offset": midpoint, "low": lower, "high": upper},
+                code="input_offset",
+                fix=fix,
+            )
+
+
+@check(
+    "inputs",
+    "reversed",
+    "note",
+    "a propeller astern obeys another law: give it terms of its own, or leave these parts out",
+)
+def check_astern_propellers(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report propellers that run astern."""
+    for name in _finite_inputs(log):
+        astern_share = float((log[name] < 0.0).mean())
+        is_propeller = log.units[name] == "1/s" or name.split("_")[0] in ("n", "rpm", "rev")
+        if is_propeller and 0.0 < astern_share < 1.0:
+            lowest_text = format_quantity(float(np.nanmin(log[name])), log.units[name])
+            text = f"{name} is negative (astern) in {format_share(astern_share)} of the samples, down to {lowest_text}"
+            yield make_finding(text, {"share": astern_share})
+
+
+@check("inputs", "unit", fix="correct the unit in the channel map", is_record_fault=True)
+def check_rudder_unit(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report a rudder angle that no rudder has."""
+    for name in _finite_inputs(log):
+        largest = abs_quantile(log[name], 0.99)
+        if name in ("delta", "cmd_delta") and largest > math.radians(100.0):
+            largest_text = format_quantity(largest, "rad")
+            text = f"{name} reaches {largest_text}, more than any rudder: deg taken as rad?"
+            yield make_finding(text, {"largest": largest})
+
+
+# words that tell a demand from what the actuator does
+_DEMAND_PATTERN = re.compile(
+    r"^(cmd|ref|command|commanded|set|desired)_|_(cmd|ref|command|commanded|set|desired)(?=_|$)"
+)
+_MIN_STUCK_DURATION, _MIN_STUCK_ERROR = 5.0, 0.2
+"""An actuator that rests so long, s, so far from its demand, share of the demand's range, is stuck.
+
+Chosen by hand: longer than actuators lag, and farther than they are inaccurate.
+"""
+
+
+@check("inputs", "stuck", fix="leave this part out", is_record_fault=True)
+def check_stuck_actuators(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report actuators that rest although their demand goes elsewhere."""
+    import pandas as pd
+
+    for demand_name in log:
+        base_name = _DEMAND_PATTERN.sub("", demand_name)
+        candidate_names = [
+            base_name,
+            f"n_{base_name}",
+            f"actual_{base_name}",
+            f"{base_name}_actual",
+            f"acting_{base_name}",
+        ]
+        candidate_names = candidate_names if base_name != demand_name else [f"acting_{demand_name}"]
+        actual_name = next((name for name in candidate_names if name in log), "")
+        demand_range = float(np.nanmax(log[demand_name]) - np.nanmin(log[demand_name]))
+        if (
+            not actual_name
+            or log.units[actual_name] != log.units[demand_name]
+            or demand_range <= 0.0
+        ):
+            continue
+        demanded_values, measured_values = log[demand_name], log[actual_name]
+        rest_tolerance = max(6.0 * log.noise_std(actual_name), 1e-4 * demand_range)
+        # a slow gear moves less in a step than its sensor is noisy: ranges over many steps tell
+        n_window_samples = max(2, round(_MIN_STUCK_DURATION / log.sampling_interval))
+        rolling = pd.Series(measured_values).rolling(n_window_samples, min_periods=1)
+        is_at_rest = ~(
+            (rolling.max() - rolling.min()).to_numpy()[n_window_samples - 1 :] > rest_tolerance
+        )
+        longest_run = slice(0, 0)
+        longest_duration = 0.0
+        for start, stop in zip(*find_runs(is_at_rest), strict=True):
+            segment = slice(start, stop + n_window_samples - 1)
+            duration = float(log.t[segment.stop - 1] - log.t[start])
+            is_far_from_demand = (
+                np.abs(demanded_values[segment] - measured_values[segment])
+                > _MIN_STUCK_ERROR * demand_range
+            )
+            has_demand_moved = (
+                float(np.ptp(demanded_values[segment])) > _MIN_STUCK_ERROR * demand_range
+            )
+            if (
+                duration > longest_duration
+                and has_demand_moved
+                and float(is_far_from_demand.sum()) * log.sampling_interval >= _MIN_STUCK_DURATION
+            ):
+                longest_run, longest_duration = segment, duration
+        if longest_duration:
+            is_stuck, start_time = np.zeros(len(log), dtype=bool), float(log.t[longest_run.start])
+            is_stuck[longest_run] = True
+            text = (
+                f"{actual_name} rests for {longest_duration:.1f} s from t = {start_time:.2f} s while {demand_name} moves"
+                " on: stuck, or not recorded"
+            )
+            yield make_finding(
+                text, {"seconds": longest_duration, "t": start_time}, sample_mask=is_stuck
+            )
+
+
+# a heading that goes so far one way and the other was steered
+_MIN_HEADING_SWING = math.radians(10.0)
+
+
+@check(
+    "inputs",
+    "stuck",
+    fix="the recorded input is stuck, or another one is missing from the log",
+    required_channels=("psi",),
+    is_record_fault=True,
+)
+def check_constant_inputs_while_turning(
+    log: LogStatistics, make_finding: Check
+) -> Iterator[Finding]:
+    """Report a vessel that weaves although nothing that drives it moves."""
+    driving_inputs = [name for name in log.inputs if not name.startswith(("wind", "current"))]
+    if not driving_inputs or np.isfinite(log["psi"]).sum() < MIN_SAMPLES:
+        return
+    psi, is_constant = interpolate_gaps(log.t, log["psi"]), np.ones(len(log) - 1, dtype=bool)
+    for name in driving_inputs:
+        is_constant &= np.abs(np.nan_to_num(np.diff(log[name]))) <= 1e-9 * abs_quantile(
+            log[name], 1.0
+        )
+    starts, stops = find_runs(is_constant)
+    # a heading that turns round goes farther than it gets
+    heading_travel = np.append(0.0, np.cumsum(np.abs(np.diff(psi))))
+    has_swing = (
+        heading_travel[stops] - heading_travel[starts] - np.abs(psi[stops] - psi[starts])
+        >= _MIN_HEADING_SWING
+    )
+    for start, stop in zip(starts[has_swing], stops[has_swing], strict=True):
+        heading_segment = psi[start : stop + 1]
+        n_reversals = count_reversals(heading_segment, _MIN_HEADING_SWING)
+        if n_reversals >= 2:
+            is_idle = np.zeros(len(log), dtype=bool)
+            is_idle[start : stop + 1] = True
+            duration, start_time = float(log.t[stop] - log.t[start]), float(log.t[start])
+            text = (
+                f"no input moves for {duration:.1f} s from t = {start_time:.2f} s, yet the heading turns"
+                f" round {n_reversals} times"
+            )
+            yield make_finding(
+                text,
+                {"seconds": duration, "turns": n_reversals, "t": start_time},
+                sample_mask=is_idle,
+            )
+
+
+@check("inputs", "relative_wind", required_channels=("psi",), on_subsample=True)
+def check_relative_wind(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report wind directions that turn against the heading: relative wind, not true wind."""
+    direction_names = [
+        n for n in log if "wind" in n and log.units[n] == "rad" and n not in BOW_WIND_CHANNELS
+    ]
+    for name in direction_names:
+        slope, error = _estimate_slope_against_heading(log, name)
+        matching_names = (
+            other_name
+            for other_name in direction_names
+            if other_name != name and _is_same_direction(log, name, other_name)
+        )
+        matching_name = next(matching_names, None)
+        has_heading_slope = (
+            error > 0.0 and slope < -5.0 * error and abs(slope + 1.0) < max(3.0 * error, 0.2)
+        )
+        if not (
+            has_heading_slope or matching_name or "relative" in name or name.startswith("rel_")
+        ):
+            continue
+        text = f"{name} turns by {slope:+.2f} +- {2.0 * error:.2f} of every change of heading"
+        text += f", and plus psi it is {matching_name}" if matching_name else ""
+        is_input = name in log.inputs
+        level: Level = "will mislead" if is_input else "note"
+        fix = "a free run must not be given it" if is_input else "do not make it an input"
+        text += ": a relative wind contains psi, u and v"
+        yield make_finding(
+            text, {"slope": slope, "error": error}, level=level, fix=f"{fix}: use the true wind"
+        )
+
+
+def _is_same_direction(log: LogStatistics, relative_name: str, true_name: str) -> bool:
+    """Return whether one direction plus the heading is the other, where the heading tells."""
+    coherence_with_heading, coherence_without_heading = (
+        abs(np.nanmean(np.exp(1j * (log[relative_name] + heading - log[true_name]))))
+        for heading in (log["psi"], 0.0)
+    )
+    return bool(
+        coherence_with_heading > 0.9 and coherence_without_heading < coherence_with_heading - 0.02
+    )
+
+
+def _estimate_slope_against_heading(log: LogStatistics, name: str) -> tuple[float, float]:
+    """Return the change of a direction over ten seconds per rad of heading, and its error.
+
+    The error is a standard error; both are 0 where nothing can be said.
+    """
+    n_hop_samples = max(round(10.0 / log.sampling_interval), 1)
+    if len(log) < 5 * n_hop_samples:
+        return 0.0, 0.0
+    direction_changes = np.angle(
+        np.exp(1j * (log[name][n_hop_samples:] - log[name][:-n_hop_samples]))
+    )
+    heading_changes = log["psi"][n_hop_samples:] - log["psi"][:-n_hop_samples]
+    # beyond half a circle a change of direction is ambiguous
+    is_valid = (
+        np.isfinite(direction_changes)
+        & np.isfinite(heading_changes)
+        & (np.abs(heading_changes) < 1.5)
+    )
+    if is_valid.sum() < 100 or float(np.std(heading_changes[is_valid])) < math.radians(1.0):
+        return 0.0, 0.0
+    centred_turn, centred_change = (
+        heading_changes[is_valid] - heading_changes[is_valid].mean(),
+        direction_changes[is_valid] - direction_changes[is_valid].mean(),
+    )
+    slope_fit = fit_least_squares(centred_turn[:, None], centred_change)
+    return float(slope_fit.coefficients[0]), float(slope_fit.standard_errors[0])

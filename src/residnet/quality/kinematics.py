@@ -1,0 +1,539 @@
+"""Whether position, heading and velocities describe one motion, to the accuracy of their noise.
+
+Gains, lags, biases, lever arm and drift are estimated.
+
+Increments of the pose between neighbouring samples are compared with the integral of the velocities
+over them. White noise on pose and velocities gives the increments a tridiagonal covariance, by
+which they are whitened; what remains is explained by as few causes as it takes, one after the
+other, each by what it would add to the increments (orthogonal matching pursuit over groups of
+columns). Intervals are those of a sandwich estimate over twenty sections of the log, because
+filters leave errors that are not white.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from residnet.core.log import Log
+from residnet.preprocessing.channel_values import SIGMA_OF_MAD, nan_median, nan_std
+from residnet.preprocessing.derivatives import fit_local_polynomials
+from residnet.preprocessing.statistics import MIN_SAMPLES
+from residnet.quality.findings import Check, Finding, Level, make_correction, with_channels
+from residnet.quality.statistics import (
+    N_SECTIONS,
+    SMOOTHING_SAMPLES,
+    LogStatistics,
+    fit_least_squares,
+    interpolate_gaps,
+)
+
+MIN_LAG = 0.2
+"""A lag below this matters to no rollout of a vessel, s."""
+_MAX_CAUSES = 4
+"""Causes of one difference; chosen by hand: further ones would explain one another."""
+# a cause must lower the sum of squares by this many variances of the noise, and be this many
+# standard errors from nothing
+_MIN_IMPROVEMENT, _MIN_T_STATISTIC = 60.0, 3.5
+_HALF_WINDOW = SMOOTHING_SAMPLES // 2
+_IS_DISTANT = np.abs(np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)) > 1
+_LEAVE_OUT_WEIGHTS = np.zeros(SMOOTHING_SAMPLES)
+"""Weights of the samples about one in the parabola that leaves it and its neighbours out."""
+_LEAVE_OUT_WEIGHTS[_IS_DISTANT] = np.linalg.pinv(
+    np.vander(np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)[_IS_DISTANT], 3)
+)[-1]
+_COLLINEARITY_TOLERANCE = 1e-9
+"""Square of what others leave of columns of length 1, below which they are sums of theirs."""
+
+
+@dataclass(frozen=True)
+class KinematicCause:
+    """What explains a difference between two measurements.
+
+    Attributes:
+        estimates: its size, one number for each column.
+        standard_errors: their standard errors.
+    """
+
+    estimates: np.ndarray
+    standard_errors: np.ndarray
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether any of its numbers differs from zero."""
+        return bool((np.abs(self.estimates) > _MIN_T_STATISTIC * self.standard_errors).any())
+
+
+# standard deviations of a heading's noise by which it has to move before the scale of r is told:
+# smoothing leaves .4 of them
+_MIN_HEADING_SIGNAL_TO_NOISE = 3.0
+
+
+def estimate_yaw_causes(log: LogStatistics) -> dict[str, KinematicCause]:
+    """Return what makes the increments of psi differ from the integral of r.
+
+    Causes: `gain` (r is too large by 1 + value), `lag` (r trails psi, s), `bias` (of r, rad/s, the
+    negative of what psi gains over it) and `ramp` (its growth over the log, rad/s from start to
+    end).
+    """
+    psi, r, t = log["psi"], log["r"], log.t
+    dt = np.diff(t)
+    smoothed_rate = log.cached(_smooth_leaving_out_centre, "r")
+    normalized_time = (0.5 * (t[1:] + t[:-1]) - t.mean()) / max(float(t[-1] - t[0]), 1e-12)
+    columns = {"bias": [-dt], "ramp": [-dt, -dt * normalized_time]}
+    # where the heading does not move, a bias of r would be all gain
+    heading_std = nan_std(log.cached(_smooth_leaving_out_centre, "psi"))
+    if _is_significant(log, "r") and heading_std > _MIN_HEADING_SIGNAL_TO_NOISE * log.noise_std(
+        "psi"
+    ):
+        columns = {
+            "gain": [-_integrate_steps(dt, smoothed_rate)],
+            "lag": [np.diff(smoothed_rate)],
+            **columns,
+        }
+    rate_noise = np.full(dt.size, log.noise_std("r"))
+    return _explain_increments(
+        psi, _integrate_steps(dt, r), dt, log.noise_std("psi"), rate_noise, columns
+    )
+
+
+def estimate_position_causes(log: LogStatistics) -> dict[str, KinematicCause]:
+    """Return what makes the increments of x, y differ from the integral of R(psi) [u, v].
+
+    Causes: `gain_u`, `gain_v`, `gain` (u, v, or both too large by 1 + value), `heading` (to be
+    added to psi, rad), `lag_u`, `lag_v`, `lag` (they trail the position, s), `lag_psi` (psi trails,
+    s), `lag_xy` (x, y trail all else, s), `lever_arm` (the receiver stands so far forward and to
+    starboard, m), `current` (u, v are through water that moves north, east, m/s), `bias` (of u, v,
+    m/s).
+    """
+    dt, psi = np.diff(log.t), log["psi"]
+    heading_rotation, mid_rotation = np.exp(1j * psi), np.exp(0.5j * (psi[1:] + psi[:-1]))
+    u, v = log.cached(_smooth_leaving_out_centre, "u"), log.cached(_smooth_leaving_out_centre, "v")
+    surge_increments, sway_increments = (
+        _integrate_steps(dt, heading_rotation * u),
+        _integrate_steps(dt, 1j * heading_rotation * v),
+    )
+    lag_u, lag_v = mid_rotation * np.diff(u), 1j * mid_rotation * np.diff(v)
+    earth_velocity = heading_rotation * (u + 1j * v)
+    lag_psi = (
+        0.5j
+        * np.diff(log.cached(_smooth_leaving_out_centre, "psi"))
+        * (earth_velocity[1:] + earth_velocity[:-1])
+    )
+    columns = {
+        "gain_u": [-surge_increments],
+        "gain_v": [-sway_increments],
+        "gain": [-(surge_increments + sway_increments)],
+        "heading": [-1j * (surge_increments + sway_increments)],
+        "lag_u": [lag_u],
+        "lag_v": [lag_v],
+        "lag": [lag_u + lag_v],
+        "lag_psi": [lag_psi],
+        "lag_xy": [-(lag_u + lag_v + lag_psi)],
+        "lever_arm": [np.diff(heading_rotation), 1j * np.diff(heading_rotation)],
+        "current": [dt + 0j, 1j * dt],
+        "bias": [
+            -_integrate_steps(dt, heading_rotation),
+            -1j * _integrate_steps(dt, heading_rotation),
+        ],
+    }
+    noise_only_channels = {name for name in ("u", "v") if not _is_significant(log, name)}
+    noise_only_channels |= {"psi"} if "r" in log and not _is_significant(log, "r") else set()
+    columns = {
+        name: cause_columns
+        for name, cause_columns in columns.items()
+        if not any(name in _UNIDENTIFIABLE_CAUSES[channel] for channel in noise_only_channels)
+    }
+    speed = np.hypot(np.nan_to_num(log["u"]), np.nan_to_num(log["v"]))
+    heading_noise_velocity = log.noise_std("psi") * 0.5 * (speed[1:] + speed[:-1])
+    rate_noise = np.hypot(max(log.noise_std("u"), log.noise_std("v")), heading_noise_velocity)
+    integrated_increments = _integrate_steps(dt, heading_rotation * (log["u"] + 1j * log["v"]))
+    position = log["x"] + 1j * log["y"]
+    return _explain_increments(
+        position,
+        integrated_increments,
+        dt,
+        max(log.noise_std("x"), log.noise_std("y")),
+        rate_noise,
+        columns,
+    )
+
+
+# channel -> causes that cannot be found where it holds noise only: the noise would explain itself
+_UNIDENTIFIABLE_CAUSES = {
+    "u": ("gain_u", "lag_u", "gain", "lag", "lag_xy", "heading"),
+    "v": ("gain_v", "lag_v"),
+    "psi": ("lag_psi", "lever_arm", "lag_v"),
+}
+
+
+def _integrate_steps(dt: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """Return the integrals [T - 1] of a rate [T] over each step."""
+    return np.asarray(0.5 * dt * (rates[1:] + rates[:-1]))
+
+
+def _is_significant(log: LogStatistics, name: str) -> bool:
+    """Return whether a channel does more than its noise."""
+    return float(
+        np.sqrt(np.nanmean(log.cached(_smooth_leaving_out_centre, name) ** 2))
+    ) > 1.2 * log.noise_std(name)
+
+
+def _smooth_leaving_out_centre(log: LogStatistics, name: str) -> np.ndarray:
+    """Return a channel [T] smoothed by a parabola over 15 samples; NaN stay where they are.
+
+    The parabola is that of the samples around each one, without it and its neighbours: columns then
+    share no noise with what they explain, which holds the noise of these samples. Near the ends of
+    a log they do.
+    """
+    values = log[name]
+    is_finite = np.isfinite(values)
+    if is_finite.sum() < SMOOTHING_SAMPLES:
+        return values
+    gap_free = interpolate_gaps(np.arange(values.size), values)
+    smoothed_values = fit_local_polynomials(gap_free[:, None], SMOOTHING_SAMPLES, 2, 1.0)[0][:, 0]
+    smoothed_values[_HALF_WINDOW:-_HALF_WINDOW] = np.convolve(gap_free, _LEAVE_OUT_WEIGHTS, "valid")
+    return np.where(is_finite & ~log.near_seam(_HALF_WINDOW), smoothed_values, np.nan)
+
+
+def _explain_increments(
+    measured_pose: np.ndarray,
+    integrated_increments: np.ndarray,
+    dt: np.ndarray,
+    pose_noise: float,
+    rate_noise: np.ndarray,
+    columns: Mapping[str, list[np.ndarray]],
+) -> dict[str, KinematicCause]:
+    """Return the causes that it takes to explain a pose, in the order of their weight.
+
+    Args:
+        measured_pose: [T] real or complex, NaN where it was not measured.
+        integrated_increments: its increments [T - 1] by the velocities, NaN where these are missing.
+        dt: time steps [T - 1], s.
+        pose_noise: of the pose at each sample.
+        rate_noise: noise [T - 1] of the velocity.
+        columns: what each cause adds to the increments, [T - 1] each.
+    """
+    measured_indices = np.flatnonzero(np.isfinite(measured_pose))
+
+    def sum_between_poses(steps: np.ndarray) -> np.ndarray:
+        """Return the sums [K, ...] of steps [T - 1, ...] from one pose to the next, NaN as well."""
+        if measured_indices.size == measured_pose.size:
+            return steps
+        is_missing, initial_zeros = ~np.isfinite(steps), np.zeros((1, *steps.shape[1:]))
+        cumulative_sums = np.concatenate(
+            (initial_zeros, np.cumsum(np.where(is_missing, 0.0, steps), axis=0))
+        )[measured_indices]
+        n_missing = np.concatenate((initial_zeros, np.cumsum(is_missing, axis=0)))[measured_indices]
+        return np.where(np.diff(n_missing, axis=0) > 0, np.nan, np.diff(cumulative_sums, axis=0))
+
+    if measured_indices.size < MIN_SAMPLES:
+        return {}
+    unexplained_increments, durations, variance = (
+        np.diff(measured_pose[measured_indices]) - sum_between_poses(integrated_increments),
+        sum_between_poses(dt),
+        (dt * rate_noise) ** 2,
+    )
+    cause_columns = sum_between_poses(
+        np.stack(
+            [column for columns_of_cause in columns.values() for column in columns_of_cause],
+            axis=-1,
+        )
+    )
+    is_usable = (
+        np.isfinite(unexplained_increments)
+        & np.isfinite(cause_columns).all(axis=1)
+        & np.isfinite(sum_between_poses(rate_noise))
+    )
+    retained_indices = np.flatnonzero(is_usable & (durations <= 3.0 * nan_median(durations)))
+    if retained_indices.size < MIN_SAMPLES:
+        return {}
+    total_variance = sum_between_poses(variance)[retained_indices]
+    shared_variance = variance[np.minimum(measured_indices[retained_indices], variance.size - 1)]
+    shared_variance = np.where(
+        np.isfinite(shared_variance), np.minimum(shared_variance, total_variance), total_variance
+    )
+    min_deviation = 1e-3 * nan_median(np.abs(unexplained_increments[retained_indices])) + 1e-12
+    # the trapezoid shares half a sample with its neighbour, which noise of the pose hides at least
+    # in part: increments are never taken as more alike than independent ones, or the whitening
+    # would look at the highest frequencies alone
+    end_variance = np.maximum(pose_noise**2 - 0.25 * shared_variance, 0.0)
+    is_adjacent = np.append(retained_indices[1:] == retained_indices[:-1] + 1, False)
+    # noise of the pose alone is singular in the limit: a little of the diagonal keeps the factor
+    covariance_band = np.stack(
+        (
+            1.0001 * (total_variance + 2.0 * end_variance + min_deviation**2),
+            np.where(is_adjacent, -end_variance, 0.0),
+        )
+    )
+    cholesky_factor = scipy.linalg.cholesky_banded(covariance_band, lower=True)
+    # real and imaginary parts of a sample side by side, so that sections hold both
+    whitened_rows = np.column_stack(
+        (unexplained_increments[retained_indices], cause_columns[retained_indices])
+    )
+    whitened_rows = scipy.linalg.solve_banded(
+        (1, 0), cholesky_factor, whitened_rows, overwrite_b=True
+    )
+    if np.iscomplexobj(whitened_rows):
+        whitened_rows = np.stack((whitened_rows.real, whitened_rows.imag), axis=1).reshape(
+            -1, whitened_rows.shape[1]
+        )
+    y, cause_columns = whitened_rows[:, 0], whitened_rows[:, 1:]
+    # rows that stand far out and that no cause explains are jumps
+    column_scales = np.maximum(np.abs(cause_columns).max(axis=0), 1e-300)
+    scaled_columns = cause_columns / column_scales
+    abs_residuals = np.abs(
+        y
+        - scaled_columns
+        @ np.linalg.lstsq(scaled_columns.T @ scaled_columns, scaled_columns.T @ y, rcond=1e-12)[0]
+    )
+    is_inlier = abs_residuals <= 8.0 * SIGMA_OF_MAD * max(nan_median(abs_residuals), 1e-300)
+    names = np.array([name for name, columns_of_cause in columns.items() for _ in columns_of_cause])
+    return _orthogonal_matching_pursuit(
+        np.where(is_inlier, y, 0.0), np.where(is_inlier[:, None], cause_columns, 0.0), names
+    )
+
+
+def _orthogonal_matching_pursuit(
+    response: np.ndarray, regressors: np.ndarray, names: np.ndarray
+) -> dict[str, KinematicCause]:
+    """Select groups of columns one at a time, then drop those that others made superfluous."""
+    column_norms = np.linalg.norm(regressors, axis=0)
+    regressors, names = (
+        regressors[:, column_norms > 0.0] / column_norms[column_norms > 0.0],
+        names[column_norms > 0.0],
+    )
+    column_norms = column_norms[column_norms > 0.0]
+    gram, product, energy = (
+        regressors.T @ regressors,
+        regressors.T @ response,
+        float(response @ response),
+    )
+    columns_by_cause = {
+        name: np.flatnonzero(names == name) for name in dict.fromkeys(names.tolist())
+    }
+
+    def compute_residual_energy(causes: Iterable[str]) -> float:
+        """Return the sum of squares that some causes leave."""
+        column_indices = np.concatenate([columns_by_cause[name] for name in causes])
+        coefficients = np.linalg.lstsq(
+            gram[column_indices][:, column_indices],
+            product[column_indices],
+            rcond=_COLLINEARITY_TOLERANCE,
+        )[0]
+        return energy - float(product[column_indices] @ coefficients)
+
+    if not columns_by_cause:
+        return {}
+    variance = max(
+        compute_residual_energy(columns_by_cause) / response.size, 1e-12 * energy / response.size
+    )
+    min_gain_by_cause = {
+        cause_name: _MIN_IMPROVEMENT * variance * (1.0 + 0.2 * is_selected.size)
+        for cause_name, is_selected in columns_by_cause.items()
+    }
+    selected_causes, residual_energy = list[str](), energy
+    while len(selected_causes) < _MAX_CAUSES:
+        residual_energy_by_cause = {
+            name: compute_residual_energy([*selected_causes, name])
+            for name in columns_by_cause
+            if name not in selected_causes
+        }
+        # of causes that explain the same, as lags of all channels but one and of that one do, the
+        # first counts
+        net_gain_by_cause = {
+            cause_name: round(
+                (residual_energy - energy_of_cause - min_gain_by_cause[cause_name])
+                / max(energy, 1e-300),
+                9,
+            )
+            for cause_name, energy_of_cause in residual_energy_by_cause.items()
+        }
+        best_cause = max(net_gain_by_cause, key=lambda name: net_gain_by_cause[name], default="")
+        if not best_cause or net_gain_by_cause[best_cause] <= 0.0:
+            break
+        selected_causes, residual_energy = (
+            [*selected_causes, best_cause],
+            residual_energy_by_cause[best_cause],
+        )
+    for name in list(selected_causes[:-1]):
+        reduced_causes = [cause for cause in selected_causes if cause != name]
+        selected_causes = (
+            reduced_causes
+            if compute_residual_energy(reduced_causes) - compute_residual_energy(selected_causes)
+            < min_gain_by_cause[name]
+            else selected_causes
+        )
+    if not selected_causes:
+        return {}
+    is_selected = np.isin(names, selected_causes)
+    columns, names, column_norms = (
+        regressors[:, is_selected],
+        names[is_selected],
+        column_norms[is_selected],
+    )
+    least_squares_fit = fit_least_squares(columns, response)
+    white_noise_covariance = (
+        np.linalg.pinv(columns.T @ columns)
+        * least_squares_fit.sum_of_squares
+        / max(response.size - columns.shape[1], 1)
+    )
+    sandwich_variance = np.diag(least_squares_fit.covariance) * N_SECTIONS / (N_SECTIONS - 1)
+    standard_errors = (
+        np.sqrt(np.maximum(sandwich_variance, np.diag(white_noise_covariance))) / column_norms
+    )
+    estimates = least_squares_fit.coefficients / column_norms
+    return {
+        name: KinematicCause(estimates[names == name], standard_errors[names == name])
+        for name in selected_causes
+    }
+
+
+@dataclass(frozen=True)
+class CauseLimit:
+    """What a cause of disagreement is called, and the size from which on it misleads.
+
+    Attributes:
+        text: before its size.
+        unit: of the size as shown.
+        min_size: size from which on it misleads, SI.
+        fix: what to do about it.
+        min_time_steps: least size in time steps.
+        min_speed_share: least size as a share of the speed.
+    """
+
+    text: str
+    unit: str
+    min_size: float
+    fix: str
+    min_time_steps: float = 0.0
+    min_speed_share: float = 0.0
+
+
+def _lag_limit(text: str, min_size: float = MIN_LAG) -> CauseLimit:
+    fix = "shift it in time, or estimate the lag where the reader can"
+    return CauseLimit(text, "s", min_size, fix, min_time_steps=1.0)
+
+
+def _gain_limit(text: str, min_size: float, fix: str = "correct its unit or scale") -> CauseLimit:
+    return CauseLimit(f"{text} by a share of", "", min_size, fix)
+
+
+YAW_LIMITS = {
+    "gain": _gain_limit("r is too large against psi", 0.06),
+    "lag": _lag_limit("r trails psi by"),
+}
+POSITION_LIMITS = {
+    "gain_u": _gain_limit("u is too large against the position", 0.04),
+    "gain_v": _gain_limit("v is too large against the position", 0.25),
+    "gain": _gain_limit(
+        "u, v are too large against the position", 0.04, "correct their unit or scale"
+    ),
+    "heading": CauseLimit(
+        "psi is off against course and drift by",
+        "deg",
+        math.radians(3.0),
+        "take the offset off psi",
+    ),
+    "lag_u": _lag_limit("u trails the position by"),
+    "lag_v": _lag_limit("v trails the position by"),
+    "lag": _lag_limit("u, v trail the position by"),
+    "lag_psi": _lag_limit("psi trails position and velocities by", 2.0 * MIN_LAG),
+    "lag_xy": _lag_limit("x, y trail heading and velocities by"),
+    "lever_arm": CauseLimit(
+        "x, y belong to a point forward and to starboard of where u, v hold by",
+        "m",
+        0.3,
+        "move it to the vessel's centre (lever arm)",
+        min_speed_share=0.05,
+    ),
+    "current": CauseLimit(
+        "u, v are through water that moves north and east by",
+        "m/s",
+        0.02,
+        "give the current as an input",
+        min_speed_share=0.1,
+    ),
+    "bias": CauseLimit(
+        "u, v are too large against the position by",
+        "m/s",
+        0.02,
+        "take the bias off",
+        min_speed_share=0.1,
+    ),
+}
+
+
+def make_cause_findings(
+    causes: Mapping[str, KinematicCause],
+    limits: Mapping[str, CauseLimit],
+    log: LogStatistics,
+    make_finding: Check,
+) -> Iterator[Finding]:
+    """Return the findings for the causes that are certain and large enough to matter."""
+    for name, cause in causes.items():
+        limit = limits.get(name)
+        if limit is None or not cause.is_significant:
+            continue
+        magnitude = float(np.hypot.reduce(cause.estimates))
+        min_size = max(
+            limit.min_size,
+            limit.min_time_steps * log.sampling_interval,
+            limit.min_speed_share * log.rms_speed,
+        )
+        if magnitude < 0.3 * min_size:
+            continue
+        is_leading = "trail" in limit.text and cause.estimates[0] < 0.0
+        text = limit.text.replace("trail", "lead") if is_leading else limit.text
+        display_factor = (math.degrees(1.0) if limit.unit == "deg" else 1.0) * (
+            -1.0 if is_leading else 1.0
+        )
+        values_and_errors = zip(
+            display_factor * cause.estimates,
+            np.abs(2.0 * display_factor * cause.standard_errors),
+            strict=True,
+        )
+        sizes_text = ", ".join(
+            f"{estimate:+.3g} +- {interval_half_width:.2g}"
+            for estimate, interval_half_width in values_and_errors
+        )
+        level: Level = "will mislead" if magnitude > min_size else "note"
+        figures = {f"value_{i + 1}": float(estimate) for i, estimate in enumerate(cause.estimates)}
+        yield make_finding(
+            f"{text}: {sizes_text} {limit.unit}".rstrip(),
+            {"size": magnitude, **figures, "error": cause.standard_errors.max()},
+            code=name,
+            level=level,
+            fix=limit.fix if level != "note" else "",
+            repair=_make_repair(
+                name, cause.estimates, ("r",) if limits is YAW_LIMITS else ("u", "v")
+            ),
+        )
+
+
+def _make_repair(
+    name: str, estimates: np.ndarray, velocity_names: tuple[str, ...]
+) -> Callable[[Log], Log] | None:
+    """Return what corrects a cause; `velocity_names` are the channels that are compared with the pose."""
+    cause_kind, _, channel_suffix = name.partition("_")
+    channel_names = {"": velocity_names, "xy": ("x", "y")}.get(channel_suffix, (channel_suffix,))
+    if cause_kind == "gain":
+        return make_correction(channel_names, factor=1.0 + estimates[0])
+    if cause_kind == "lag":
+        return make_correction(channel_names, delay=estimates[0])
+    if name == "heading":
+        return make_correction(("psi",), offset=estimates[0])
+    if name == "bias":
+        return lambda log: with_channels(log, u=log["u"] - estimates[0], v=log["v"] - estimates[1])
+    if name == "lever_arm":
+
+        def move_to_centre(log: Log) -> Log:
+            lever_arm = (estimates[0] + 1j * estimates[1]) * np.exp(1j * log["psi"])
+            return with_channels(log, x=log["x"] - lever_arm.real, y=log["y"] - lever_arm.imag)
+
+        return move_to_centre
+    return None

@@ -1,0 +1,684 @@
+"""Findings about single channels: absent, frozen, outlying, clipped, coarse, filled values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from residnet.core.errors import ResidnetError
+from residnet.core.frames import unwrap_angle
+from residnet.core.layout import DegreesOfFreedom, to_horizontal_plane
+from residnet.core.log import Log
+from residnet.core.names import POSE_NAMES, STATE_NAMES
+from residnet.core.stretches import find_runs
+from residnet.preprocessing.channel_values import (
+    estimate_noise_std,
+    find_spikes,
+    is_fill_value,
+    is_implausible,
+    mask_from_ranges,
+    median_update_interval,
+    nan_median,
+    nan_quantiles,
+    nan_std,
+)
+from residnet.preprocessing.motion import MAX_BRIDGED_INTERVALS, MotionConfig, complete_motion
+from residnet.quality.findings import (
+    Check,
+    Finding,
+    Level,
+    check,
+    format_quantity,
+    format_share,
+)
+from residnet.quality.statistics import (
+    MOTION_CHANNELS,
+    STEERING_CHANNELS,
+    LogStatistics,
+    estimate_resolution,
+)
+
+
+@check("header", "channels", "note")
+def report_channels(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report names and units."""
+    channels_text = ", ".join(f"{name} [{unit}]" for name, unit in log.units.items())
+    summary_text = f"{len(log.units)} channels, {len(log)} samples, manoeuvre {log.log.manoeuvre}"
+    yield make_finding(f"{summary_text}: {channels_text}")
+
+
+@check("values", "absent", "note")
+def report_missing_motion(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report what of the motion is not measured, and what is and no model takes."""
+    dof = DegreesOfFreedom.from_channels(log.log.channels)
+    missing_names = [name for name in STATE_NAMES if name not in log]
+    if missing_names:
+        try:
+            completed = complete_motion(log.log, MotionConfig(), dof)
+        except ResidnetError as error:
+            yield make_finding(f"it cannot be fitted: {error}", level="will mislead")
+        else:
+            derivation_text = "follow from position and heading by a smoother"
+            derivation_text = (
+                "are integrated from the velocities"
+                if "integrated" in completed.meta
+                else derivation_text
+            )
+            if not dof.fixed_states:
+                yield make_finding(f"no {', '.join(missing_names)}: they {derivation_text}")
+            else:
+                yield make_finding(f"no {', '.join(missing_names)}: {dof.description}")
+    if "p" in log and not dof.has_roll:
+        text = "p of the roll is measured and not modelled: a model that rolls needs an angle phi"
+        yield make_finding(f"{text} that moves", code="roll")
+    if {"z", "theta"} & {*log} and not dof.is_six_dof and {"x", "u"} & {*log}:
+        text = "depth or pitch is measured and not modelled: six degrees of freedom need both, phi,"
+        yield make_finding(f"{text} psi, and u and v or a position, that move", code="depth")
+
+
+# one full circle in rad, and in degrees that were taken for rad
+_FULL_CIRCLES = ((2.0 * math.pi, ""), (360.0, " of 360: degrees taken as rad"))
+_ANGLE_CHANNELS = ("psi", "phi")
+
+
+@check("clock", "heading_wrap", fix="unwrap it before it is filtered or differentiated")
+def check_heading_wraps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report headings that were not made continuous: steps by about a full circle."""
+    for name in _ANGLE_CHANNELS:
+        for full_circle, suffix in _FULL_CIRCLES if name in log else ():
+            is_finite = np.isfinite(log[name])
+            changes = np.abs(np.diff(log[name][is_finite]))
+            wrap_indices = np.flatnonzero(is_finite)[1:][
+                np.abs(changes - full_circle) < 0.25 * full_circle
+            ]
+            if wrap_indices.size:
+                text = (
+                    f"{name} wraps {wrap_indices.size} times{suffix}, first at t = {log.t[wrap_indices[0]]:.2f} s: logs"
+                    " hold it continuous"
+                )
+                yield make_finding(text, {"count": wrap_indices.size, "t": log.t[wrap_indices[0]]})
+
+
+def horizontal_motion(log: Log) -> Log:
+    """Return a log with roll or pitch with its velocities as rates of place and angles.
+
+    So do checks of the motion see a vessel under water as one on it, and one that heels as one that
+    does not. A gyro's yaw rate falls with the cosine of the roll and a compass's does not; whether
+    v and r are those of the hull is told by what they leave of the pose. Any other log stays.
+    """
+    dof = DegreesOfFreedom.from_channels(log.channels)
+    if not dof.is_six_dof:
+        return _select_yaw_rate_convention(log) if dof.has_roll else log
+    if not log.channels.keys() >= {*dof.dynamic_states}:
+        log = complete_motion(log, MotionConfig(), dof)
+    velocities = log.stack(dof.dynamic_states)
+    u, v, r = to_horizontal_plane(velocities).T
+    p = log["p"] + r * np.sin(log["theta"])
+    return log.replace(channels={**log.channels, "u": u, "v": v, "r": r, "p": p})
+
+
+def _select_yaw_rate_convention(log: Log) -> Log:
+    """Return a log whose v and r move the pose, from one in which they may be the hull's."""
+    pose_increments = {"r": np.diff(log["psi"])} if log.channels.keys() >= {"psi", "r"} else {}
+    if log.channels.keys() >= {"psi", "x", "y", "v"}:
+        pose_increments["v"] = (
+            np.diff(log["x"] + 1j * log["y"]) * np.exp(-1j * log["psi"][1:])
+        ).imag
+    channels = dict(log.channels)
+    for name, increment in pose_increments.items():
+        candidates = (log[name], log[name] * np.cos(log["phi"]))
+        mean_square_errors = [
+            np.nanmean(np.square(increment - np.diff(log.t) * candidate_rate[1:]))
+            for candidate_rate in candidates
+        ]
+        channels[name] = candidates[int(np.argmin(mean_square_errors))]
+    return log.replace(channels=channels)
+
+
+def unwrap_headings(log: Log) -> Log:
+    """Return the log with its headings continuous."""
+    unwrapped_headings = {
+        name: unwrap_angle(log[name]) for name in _ANGLE_CHANNELS if name in log.channels
+    }
+    return log.replace(channels={**log.channels, **unwrapped_headings})
+
+
+@check("values", "nan", fix="split the log there (mask kind: nan)")
+def check_missing_values(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report samples that are missing, and channels that are slower than the log."""
+    for name in log:
+        is_missing = ~np.isfinite(log[name])
+        missing_share, valid_indices = float(is_missing.mean()), np.flatnonzero(~is_missing)
+        if not missing_share:
+            continue
+        intervals = np.diff(valid_indices)
+        median_interval = float(np.median(intervals)) if intervals.size else 1.0
+        # longest of the intervals and of the ends
+        longest_gap = max(
+            intervals.max(initial=0), valid_indices[0], len(log) - 1 - valid_indices[-1]
+        )
+        if median_interval > 1.0 and longest_gap <= 2.0 * median_interval:
+            text = (
+                f"{name} holds a value once in {median_interval:.0f} samples: its sensor is slower"
+                " than the log"
+            )
+            fix = "give it a log of its own, or interpolate it"
+            figures = {"share": missing_share, "every": median_interval}
+            yield make_finding(text, figures, code="slow_channel", level="note", fix=fix)
+            continue
+        starts, stops = find_runs(is_missing)
+        longest_segment = int(np.argmax(stops - starts))
+        start_time = float(log.t[starts[longest_segment]])
+        duration = float(log.t[min(stops[longest_segment], len(log) - 1)]) - start_time
+        text = (
+            f"{name} is missing in {format_share(missing_share)} of the samples, {starts.size} stretches, the"
+            f" longest {duration:.2f} s from t = {start_time:.2f} s"
+        )
+        level: Level = "fatal" if missing_share > 0.5 else "will mislead"
+        figures = {
+            "share": missing_share,
+            "stretches": starts.size,
+            "longest": duration,
+            "t": start_time,
+        }
+        if longest_gap <= MAX_BRIDGED_INTERVALS:
+            level, text = "note", f"{text}; so short ones are interpolated"
+        yield make_finding(
+            text, figures, level=level, sample_mask=is_missing, fix="" if level == "note" else None
+        )
+
+
+@check(
+    "values", "repeated_rows", fix="delete them, or log at the sensors' rate", is_record_fault=True
+)
+def check_repeated_rows(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report rows that repeat the row before in every channel, more than by chance.
+
+    Digits are few, so that now and then each channel repeats itself.
+    """
+    is_repeated, has_noisy_channel, n_expected = (
+        np.ones(len(log) - 1, dtype=bool),
+        False,
+        float(len(log)),
+    )
+    for name in log:
+        is_equal_to_previous = log[name][1:] == log[name][:-1]
+        is_repeated &= is_equal_to_previous
+        n_expected *= float(is_equal_to_previous.mean())
+        has_noisy_channel |= name in MOTION_CHANNELS and float(is_equal_to_previous.mean()) < 0.5
+    is_repeated = np.append(False, is_repeated)
+    repeated_share = float(is_repeated.mean())
+    # commands alone rest for as long as nobody moves them
+    has_motion_channel = any(name in MOTION_CHANNELS for name in log)
+    is_beyond_chance = int(is_repeated.sum()) > n_expected + 3.0 * np.sqrt(n_expected)
+    if has_motion_channel and ((has_noisy_channel and is_beyond_chance) or repeated_share > 0.5):
+        text = (
+            f"{int(is_repeated.sum())} rows ({format_share(repeated_share)}) repeat the row before in every channel:"
+            " logged twice, or faster than measured"
+        )
+        level: Level = "fatal" if repeated_share > 0.9 else "will mislead"
+        yield make_finding(
+            text,
+            {"count": is_repeated.sum(), "share": repeated_share},
+            level=level,
+            sample_mask=is_repeated,
+        )
+
+
+@check("values", "fill_values", fix="leave these cells empty", is_record_fault=True)
+def check_fill_values(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report values that stand for a missing measurement."""
+    for name in log:
+        fill_indices = np.flatnonzero(is_fill_value(log[name]))
+        if fill_indices.size:
+            fill_value = float(log[name][fill_indices[0]])
+            text = (
+                f"{fill_indices.size} samples of {name} hold the fill value {fill_value:g}, first at t ="
+                f" {log.t[fill_indices[0]]:.2f} s: nothing was measured there"
+            )
+            yield make_finding(
+                text, {"count": fill_indices.size, "value": fill_value}, channels=(name,)
+            )
+
+
+@check("values", "absurd", "fatal", "correct or empty them")
+def check_implausible_values(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report values that no vessel can have."""
+    for name in log:
+        values = log[name]
+        implausible_indices = np.flatnonzero(is_implausible(values, log.units[name]))
+        implausible_indices = (
+            implausible_indices[~is_fill_value(values)[implausible_indices]]
+            if implausible_indices.size
+            else implausible_indices
+        )
+        if implausible_indices.size:
+            text = (
+                f"{name} is {format_quantity(float(values[implausible_indices[0]]), log.units[name])} at t ="
+                f" {log.t[implausible_indices[0]]:.2f} s, which no vessel reaches ({implausible_indices.size} such samples)"
+            )
+            yield make_finding(text, {"count": implausible_indices.size})
+
+
+# shortest run of equal values that counts as frozen, in steps
+_MIN_FROZEN_STEPS = 5
+# after a receiver's freeze its filter needs so long to recover, s
+_RECOVERY_DURATION = 2.0
+# a compass may rest for so long, s, while a heading is steady
+_MAX_STEADY_HEADING_DURATION = 3.0
+
+
+@check("values", "frozen", is_record_fault=True, invalidates_samples=True)
+def check_frozen_sensors(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report sensors that hold their last value although the vessel moves on."""
+    position_frozen = np.zeros(len(log), dtype=bool)
+    has_position = {"x", "y"} <= set(log.measured_motion)
+    for names in (
+        *((("x", "y"),) if has_position else ()),
+        *((name,) for name in log.measured_motion),
+    ):
+        is_frozen = _find_frozen_samples(log, names)
+        if len(names) == 2:
+            position_frozen = is_frozen
+        elif has_position and names[0] in ("x", "y"):
+            # the stretches of the position have a finding already, its ends included
+            is_frozen &= ~(np.convolve(position_frozen, np.ones(3))[1:-1] > 0.5)
+        starts, stops = find_runs(is_frozen)
+        if not starts.size:
+            continue
+        durations, affected = log.t[stops - 1] - log.t[starts], is_frozen
+        if names[0] in ("x", "y"):
+            recovery_ends = np.searchsorted(log.t, log.t[stops - 1] + _RECOVERY_DURATION - 1e-9)
+            affected = is_frozen | mask_from_ranges(
+                len(log), stops, np.maximum(recovery_ends, stops)
+            )
+        affected_share, longest_run = float(affected.mean()), int(np.argmax(durations))
+        text = (
+            f"{'position' if len(names) == 2 else names[0]} is bit-identical in {starts.size}"
+            f" stretches of {_MIN_FROZEN_STEPS} steps or more while the vessel moves,"
+            f" {durations.sum():.2f} s in all, the longest {durations[longest_run]:.2f} s from t ="
+            f" {log.t[starts[longest_run]]:.2f} s"
+        )
+        level: Level = "fatal" if affected_share > 0.5 else "will mislead"
+        if names[0] in _ANGLE_CHANNELS and durations[longest_run] < _MAX_STEADY_HEADING_DURATION:
+            level = "note"
+        yield make_finding(
+            text,
+            {
+                "count": starts.size,
+                "seconds": durations.sum(),
+                "longest": durations[longest_run],
+                "share": affected_share,
+                "t": log.t[starts[longest_run]],
+            },
+            level=level,
+            fix=f"mask them and what follows (kind: frozen, channels: [{', '.join(names)}])",
+            sample_mask=affected,
+            channels=names,
+        )
+
+
+def _find_frozen_samples(log: LogStatistics, names: tuple[str, ...]) -> np.ndarray:
+    """Return [T] bool: runs of equal values that neither chance nor rest explains."""
+    is_frozen_sample = np.zeros(len(log), dtype=bool)
+    is_multi_channel = len(names) > 1
+    is_repeated = np.logical_and.reduce([log[name][1:] == log[name][:-1] for name in names])
+    if not is_repeated.any():
+        return is_frozen_sample
+    starts, stops = find_runs(is_repeated)
+    # a slow sensor that repeats each value has steps of its own
+    min_run = _MIN_FROZEN_STEPS * median_update_interval(log.subsample.log.stack(names))
+    is_long = stops - starts >= min_run
+    n_outside = is_repeated.size - int((stops - starts)[is_long].sum())
+    if n_outside < 0.02 * is_repeated.size:
+        return is_frozen_sample
+    # share of equal neighbours where the channel moves: a coarse one repeats values anyhow
+    repeat_probability = min(float((stops - starts)[~is_long].sum()) / n_outside, 0.99)
+    # two channels that hold together are never chance
+    if repeat_probability > 0.0 and not is_multi_channel:
+        min_run = max(
+            min_run, int(np.ceil(np.log(1e-4 / is_repeated.size) / np.log(repeat_probability)))
+        )
+    # the last digits of a noisy channel never rest, whatever the vessel does
+    is_rare = repeat_probability < (0.15 if is_multi_channel else 1e-3)
+    is_long = stops - starts >= min_run
+    if not is_long.any():
+        return is_frozen_sample
+    starts, stops = starts[is_long], stops[is_long]
+    # noise is a good part of what it does from sample to sample
+    is_noisy = log.noise_std(names[0]) > 0.05 * nan_std(np.diff(log[names[0]]))
+    is_noisy &= is_rare or names[0] not in POSE_NAMES
+    vessel_moves = np.full(starts.size, is_noisy)
+    for name in () if is_noisy else names:
+        vessel_moves |= _moves_after_run(log[name], stops)
+    return mask_from_ranges(is_frozen_sample.size, starts[vessel_moves], stops[vessel_moves] + 1)
+
+
+def _moves_after_run(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
+    """Return [R] bool: a channel [T] moves over runs that end at `stops` [R].
+
+    It goes on far from where it stood.
+    """
+    changes = np.abs(np.diff(values))
+    min_change = nan_quantiles(changes[changes > 0.0], 0.1)[0] if (changes > 0.0).any() else 0.0
+    # the steps from the run's end on, no longer than the log
+    following_changes = sliding_window_view(np.append(changes, np.full(5, np.nan)), 6)[
+        np.minimum(stops, changes.size - 1)
+    ]
+    typical_change = np.nanmax(following_changes[:, 1:], axis=1)
+    is_large_step = following_changes[:, 0] > np.maximum(3.0 * typical_change, 3.0 * min_change)
+    return np.asarray((stops < changes.size - 3) & is_large_step)
+
+
+# share of the rows from which on repeats are no accident, and their longest run
+_MIN_REPEATED_SHARE, _MAX_REPEAT = 0.1, 5
+
+
+@check(
+    "values",
+    "repeated_fix",
+    fix="leave these cells empty, or log at the receiver's rate",
+    required_channels=("x", "y"),
+    is_record_fault=True,
+)
+def check_repeated_positions(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report single rows in which position stands still while the vessel moves."""
+    increments = np.diff(log.log.stack(("x", "y")), axis=0)
+    is_repeated = (increments == 0.0).all(axis=1)
+    starts, stops = find_runs(is_repeated)
+    is_short = stops - starts < _MAX_REPEAT
+    short_repeats = mask_from_ranges(is_repeated.size, starts[is_short], stops[is_short])
+    repeated_share = float(short_repeats.mean())
+    # a position moves by far more than its resolution where it moves
+    step_lengths = np.hypot(*increments[~is_repeated].T)
+    step_lengths = step_lengths[np.isfinite(step_lengths)]
+    north_changes = np.abs(increments[:, 0])
+    min_change = float(north_changes[north_changes > 0.0].min(initial=np.inf))
+    if (
+        repeated_share < _MIN_REPEATED_SHARE
+        or step_lengths.size < 20
+        or float(np.median(step_lengths)) <= 4.0 * min_change
+    ):
+        return
+    if median_update_interval(log.log.stack(("x", "y"))) > 1.0:
+        # a slow receiver: `held` says so, and a fit takes the repeats out
+        return
+    names = ["x", "y"]
+    for name in ("psi", "u", "v", "r"):
+        if name in log and float((np.diff(log[name])[short_repeats] == 0.0).mean()) > 0.8:
+            names.append(name)
+    text = (
+        f"{int(short_repeats.sum())} rows ({format_share(repeated_share)}) repeat the last {', '.join(names)}: the fix"
+        " is older than the row"
+    )
+    affected = np.append(False, short_repeats)
+    yield make_finding(
+        text,
+        {"count": short_repeats.sum(), "share": repeated_share},
+        sample_mask=affected,
+        channels=tuple(names),
+    )
+
+
+# shortest straight stretch, in samples and s
+_MIN_STRAIGHT_SAMPLES, _MIN_STRAIGHT_DURATION = 8, 1.0
+# share of a channel that may be straight before this is what the channel always does
+_MAX_STRAIGHT_SHARE = 0.4
+
+
+@check(
+    "values",
+    "interpolated",
+    fix="leave the cells between two measurements empty",
+    is_record_fault=True,
+    invalidates_samples=True,
+)
+def check_interpolated_values(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report stretches that were filled by straight lines between the samples at their ends."""
+    straight_by_channel = {
+        name: _find_straight_samples(log, name)
+        for name in log.measured_motion
+        if name in STATE_NAMES
+    }
+    names = tuple(name for name, is_straight in straight_by_channel.items() if is_straight.any())
+    if not names:
+        return
+    is_straight = np.logical_or.reduce([straight_by_channel[name] for name in names])
+    starts, stops = find_runs(is_straight)
+    durations, straight_share = log.t[stops - 1] - log.t[starts], float(is_straight.mean())
+    longest_segment = int(np.argmax(durations))
+    start_time = float(log.t[starts[longest_segment]])
+    text = (
+        f"{', '.join(names)} run along exactly straight lines for {durations.sum():.1f} s"
+        f" ({format_share(straight_share)}), the longest {durations[longest_segment]:.1f} s from t = {start_time:.2f} s: they"
+        " were interpolated"
+    )
+    figures = {"seconds": durations.sum(), "longest": durations[longest_segment]}
+    yield make_finding(
+        text,
+        {**figures, "t": start_time, "share": straight_share},
+        sample_mask=is_straight,
+        channels=names,
+    )
+
+
+def _find_straight_samples(log: LogStatistics, name: str) -> np.ndarray:
+    """Return [T] bool: samples within runs without curvature, in a channel that has some."""
+    is_straight_sample, values = np.zeros(len(log), dtype=bool), log.subsample[name]
+    second_differences = np.abs(np.diff(np.diff(values) / np.diff(log.subsample.t)))
+    second_differences = second_differences[np.isfinite(second_differences)]
+    if second_differences.size < 100:
+        return is_straight_sample
+    typical_bend = nan_median(second_differences)
+    rounding_error = 1e-9 * float(np.nanmax(np.abs(values))) / log.sampling_interval
+    resolution = estimate_resolution(values) / log.sampling_interval
+    # between few steps of its resolution a channel runs straight by itself, a smooth channel bends
+    # little anyhow: only noise bends at every sample
+    is_coarse = resolution > 0.0 and 8.0 * resolution >= typical_bend
+    slope_noise = log.noise_std(name) * np.sqrt(6.0)
+    is_noisy = slope_noise > 0.5 * nan_median(np.abs(np.diff(values, 2)))
+    if is_coarse or typical_bend <= 10.0 * rounding_error or not is_noisy:
+        return is_straight_sample
+    slope = np.diff(log[name]) / np.diff(log.t)
+    bends = np.abs(np.diff(slope))
+    is_flat = bends <= max(1e-5 * typical_bend, rounding_error, 2.1 * resolution)
+    if float(is_flat.mean()) > _MAX_STRAIGHT_SHARE:
+        return is_straight_sample
+    is_moving = np.abs(slope[:-1]) > 10.0 * rounding_error
+    starts, stops = find_runs(is_flat & is_moving)
+    is_long = log.t[stops] - log.t[starts] >= _MIN_STRAIGHT_DURATION
+    is_long &= stops - starts >= _MIN_STRAIGHT_SAMPLES
+    return mask_from_ranges(is_straight_sample.size, starts[is_long], stops[is_long] + 2)
+
+
+@check(
+    "values",
+    "spikes",
+    fix="correct or empty these cells; a fit bridges them and leaves them out",
+    is_record_fault=True,
+    invalidates_samples=True,
+)
+def check_spikes(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report single samples that leave all others and return at once."""
+    for name, is_spike in find_spikes(log.log).items():
+        values = log[name]
+        worst_index = int(
+            np.argmax(np.where(is_spike, np.abs(values - np.nanmedian(values)), -1.0))
+        )
+        text = (
+            f"{int(is_spike.sum())} single samples of {name} stand far out, the worst"
+            f" {format_quantity(float(values[worst_index]), log.units[name])} at t = {log.t[worst_index]:.2f} s"
+        )
+        yield make_finding(
+            text,
+            {"count": is_spike.sum(), "t": log.t[worst_index]},
+            sample_mask=is_spike,
+            channels=(name,),
+        )
+
+
+@check("values", "outliers", invalidates_samples=True)
+def check_outliers(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report samples far out of their neighbours, by the rule of the mask `hampel`.
+
+    An input may jump: its outliers leave the range of all others too.
+    """
+    for name in (*log.measured_motion, *log.inputs):
+        values, is_out_of_range = log[name], np.ones(1, dtype=bool)
+        if name not in log.measured_motion:
+            lower, upper = nan_quantiles(values, 0.01, 0.99)
+            is_out_of_range = np.maximum(lower - values, values - upper) > 0.25 * max(
+                upper - lower, 1e-12
+            )
+            # a direction may go anywhere at once, as that of a light wind does
+            if not is_out_of_range.any() or (
+                log.units[name] == "rad" and name not in STEERING_CHANNELS
+            ):
+                continue
+        is_outlier = log.is_spike(name) & is_out_of_range
+        n_outliers = int(is_outlier.sum())
+        if not n_outliers:
+            continue
+        is_inlier, sample_indices = np.isfinite(values) & ~is_outlier, np.arange(len(log))
+        interpolated_values = np.interp(
+            sample_indices, sample_indices[is_inlier], values[is_inlier]
+        )
+        worst_index = int(
+            np.argmax(np.where(is_outlier, np.abs(values - interpolated_values), 0.0))
+        )
+        outlier_share, time = n_outliers / len(log), float(log.t[worst_index])
+        text = (
+            f"{n_outliers} samples of {name} ({format_share(outlier_share)}) stand far out of their neighbours, the"
+            f" worst at t = {time:.2f} s"
+        )
+        level: Level = "will mislead" if n_outliers > 2 else "note"
+        fix = f"mask them (kind: hampel, channels: [{name}])"
+        figures = {"count": n_outliers, "share": outlier_share, "t": time}
+        yield make_finding(
+            text, figures, level=level, fix=fix, sample_mask=is_outlier, channels=(name,)
+        )
+
+
+@check("values", "clipping", fix="mask them, or log with a wider range", invalidates_samples=True)
+def check_clipping(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report samples exactly at an extreme, many compared with the levels beside it."""
+    for name in log.measured_motion:
+        finite_values = log[name][np.isfinite(log[name])]
+        if name in ("x", "y", "psi"):
+            continue
+        for limit in (float(finite_values.min()), float(finite_values.max())):
+            n_clipped = int((finite_values == limit).sum())
+            clipped_share = n_clipped / finite_values.size
+            if n_clipped < max(5, 0.003 * finite_values.size):
+                continue
+            levels, counts = np.unique(finite_values, return_counts=True)
+            neighbour_counts = counts[1:4] if limit == levels[0] else counts[-4:-1]
+            if levels.size < 10 or n_clipped < 4 * int(neighbour_counts.max()):
+                continue
+            text = (
+                f"{name} is exactly at its limit {format_quantity(limit, log.units[name])} in {n_clipped} samples"
+                f" ({format_share(clipped_share)}): the sensor clips or holds"
+            )
+            figures = {"count": n_clipped, "share": clipped_share, "limit": limit}
+            yield make_finding(text, figures, sample_mask=log[name] == limit, channels=(name,))
+
+
+# levels between the 5th and the 95th percentile below which a resolution is too coarse
+_MIN_LEVELS = 50
+# of a channel that moves less nothing is learned: .05 deg/s either way, over a minute in an angle
+_NEGLIGIBLE_RANGES = {"rad": math.radians(3.0), "rad/s": math.radians(0.1)}
+
+
+@check(
+    "values",
+    "resolution",
+    fix="decimals were dropped on the way: log more digits",
+    on_subsample=True,
+)
+def check_resolution(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report the step of a channel's values, too coarse where few lie between its ends."""
+    for name in log.measured_motion:
+        finite_values = log[name][np.isfinite(log[name])]
+        lower, upper = nan_quantiles(finite_values, 0.05, 0.95)
+        levels = np.unique(finite_values)
+        if levels.size < 2 or levels.size > 0.5 * finite_values.size:
+            continue
+        level_step = float(np.median(np.diff(levels)))
+        n_levels = (upper - lower) / level_step
+        # most samples differ from the one before by whole steps of the resolution, or it is none
+        increments_in_steps = np.diff(finite_values) / level_step
+        if float((np.abs(increments_in_steps - np.round(increments_in_steps)) < 1e-3).mean()) < 0.9:
+            continue
+        text = (
+            f"{name} has a resolution of {format_quantity(level_step, log.units[name])}, {n_levels:.0f} levels between"
+            " its 5th and 95th percentile"
+        )
+        is_fine = n_levels >= _MIN_LEVELS or upper - lower < _NEGLIGIBLE_RANGES.get(
+            log.units[name], 0.0
+        )
+        level: Level = "note" if is_fine else "will mislead"
+        fix = "" if is_fine else None
+        yield make_finding(
+            text, {"resolution": level_step, "levels": n_levels}, level=level, fix=fix
+        )
+
+
+@check(
+    "values",
+    "held",
+    fix="leave the cells between two measurements empty: held values are late by half an interval"
+    " and their derivative is spikes; a fit takes them out of the motion and smooths it",
+    on_subsample=True,
+)
+def check_sample_and_hold(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report slow sensors whose last value is repeated until the next."""
+    for name in log.measured_motion:
+        update_interval = median_update_interval(log[name])
+        if update_interval >= 2.0:
+            text = f"{name} changes once in {update_interval:.0f} samples, its last value is held in between"
+            yield make_finding(
+                text, {"every": update_interval}, level="note" if name in STATE_NAMES else None
+            )
+
+
+@check("values", "jump")
+def check_velocity_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report changes of a velocity's level within one sample, which a mass does not make."""
+    for name in (name for name in log.velocities if name in log.measured_motion):
+        values = np.where(log.is_spike(name), np.nan, log[name])
+        changes = np.abs(np.diff(values))
+        if np.isfinite(changes).sum() < 50:
+            continue
+        changes = np.nan_to_num(changes)
+        lower, upper = nan_quantiles(values, 0.01, 0.99)
+        # beyond noise, beyond what goes on beside it, and a good part of the whole range
+        min_jump = 0.3 * (upper - lower)
+        min_jump = (
+            max(8.0 * estimate_noise_std(values), min_jump) if changes.max() > min_jump else np.inf
+        )
+        is_jump = changes > min_jump
+        if is_jump.any():
+            neighbouring_changes = sliding_window_view(np.pad(changes, 4, mode="edge"), 9)
+            is_jump[is_jump] = (
+                changes[is_jump] > 4.0 * np.sort(neighbouring_changes[is_jump], axis=1)[:, -2]
+            )
+        if is_jump.any():
+            largest_index = int(np.argmax(np.where(is_jump, changes, 0.0)))
+            text = (
+                f"{name} changes level {int(is_jump.sum())} times within one sample, at most by"
+                f" {format_quantity(changes[largest_index], log.units[name])} at t = {log.t[largest_index + 1]:.2f} s"
+            )
+            yield make_finding(
+                text,
+                {
+                    "count": is_jump.sum(),
+                    "largest": changes[largest_index],
+                    "t": log.t[largest_index + 1],
+                },
+                fix=f"mask it (kind: jump, channel: {name}), or split the log there",
+                sample_mask=np.append(False, is_jump) | np.append(is_jump, False),
+                channels=(name,),
+            )

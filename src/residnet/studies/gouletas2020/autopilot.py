@@ -1,0 +1,234 @@
+"""Training of document 004's autopilot in a run: a perceptron learns what each rudder angle brings.
+
+Sections 6.1.1, 6.1.2, 6.2.1, 6.2.2.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any, NamedTuple, final
+
+import torch
+from torch import Tensor, nn
+
+from residnet.autopilot.base import Policy
+from residnet.autopilot.heading.controllers import ControlTask
+from residnet.autopilot.heading.vessels import SteeredVessel
+from residnet.core.errors import UsageError
+from residnet.core.format import DEGREES_PER_RADIAN
+from residnet.core.progress import begin_stage, log_message
+from residnet.engine.rollout import Rollout
+from residnet.preprocessing.data_module import RowsDataModule
+from residnet.runs.folder import RunFolder
+from residnet.runs.model_store import RunModelStore
+from residnet.studies.gouletas2020.law import (
+    NetworkPredictor,
+    PredictiveConfig,
+    PredictorTraining,
+    SimulatedPredictor,
+)
+from residnet.training.trainer import EpochTraining, run_epochs
+
+
+class RudderResponses(NamedTuple):
+    """The simulated changes [S, 2, C] that each of C rudder angles brings to states [S, nx].
+
+    Changes are of heading [rad] and yaw rate [rad/s].
+    """
+
+    x: Tensor
+    change: Tensor
+
+
+def simulate_rudder_responses(
+    vessel: SteeredVessel,
+    exact_predictor: SimulatedPredictor,
+    rudder: Tensor,
+    settings: PredictorTraining,
+    states: int,
+    seed: int,
+) -> RudderResponses:
+    """Return the data of section 6.1.1: random states, simulated under all rudder angles.
+
+    The states are those that the vessel comes through under random angles, since few combinations
+    of its velocities can occur, scattered a little beyond.
+
+    Args:
+        vessel: in calm water.
+        rudder: angles [C] in rad.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    dt = min(settings.hold / 10.0, 0.25)
+    steps = math.ceil(settings.wander / dt)
+    x, w = vessel.straight_course(torch.ones(states, dtype=torch.float64))
+    # each angle is held for a random time: an angle that was drawn at a step stays until the next
+    # drawing
+    is_switch = torch.rand(states, steps, generator=generator) < dt / settings.hold
+    is_switch[:, 0] = True
+    last_switch = torch.where(is_switch, torch.arange(steps), 0).cummax(1).values
+    angles = rudder[torch.randint(len(rudder), (states, steps), generator=generator)].gather(
+        1, last_switch
+    )
+    inputs = torch.cat((angles.unsqueeze(-1), w[:, None, 1:].expand(-1, steps, -1)), dim=-1)
+    nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(states, -1)
+    with torch.no_grad():
+        trajectories = Rollout(vessel.model(dt))(x, inputs, vessel.memory(nominal))[0]
+        sample_steps = torch.randint(steps + 1, (states,), generator=generator)
+        x = trajectories[torch.arange(states), sample_steps]
+        x = x + settings.scatter * x.std(0) * torch.randn(
+            x.shape, generator=generator, dtype=torch.float64
+        )
+        error, rate = exact_predictor(x, x[:, vessel.state_column("psi")], rudder)
+    return RudderResponses(
+        x, torch.stack((-error, rate - x[:, vessel.state_column("r"), None]), dim=1)
+    )
+
+
+@final
+class PredictorFit(EpochTraining):
+    """A training by least squares on the changes of heading and yaw rate, each over its spread.
+
+    Args:
+        predictor: what is trained, float64.
+    """
+
+    def __init__(
+        self,
+        predictor: NetworkPredictor,
+        validation_set: RudderResponses,
+        settings: PredictorTraining,
+        seed: int,
+    ) -> None:
+        super().__init__(settings, seed)
+        self.predictor = predictor
+        self.validation_set = validation_set
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Return Adam, as in the source."""
+        return torch.optim.Adam(self.predictor.parameters(), lr=self.settings.learning_rate)
+
+    def on_train_epoch_start(self) -> None:
+        """Set the learning rate."""
+        for group in self.trainer.optimizers[0].param_groups:
+            group["lr"] = self.settings.rate(self.epoch)
+
+    def training_step(self, rows: tuple[Tensor, Tensor], batch_index: int) -> Tensor:
+        """Return the mean squared error of one batch of states and their changes."""
+        loss = self._scaled_errors(RudderResponses(*rows)).square().mean()
+        self._losses.append(float(loss.detach()))
+        return loss
+
+    def _scaled_errors(self, answers: RudderResponses) -> Tensor:
+        return (self.predictor.predict_changes(answers.x) - answers.change) / self.predictor.scale
+
+    def validated(self) -> tuple[nn.Module, float]:
+        """Return the predictor and its error on fresh states, as a share of the spread.
+
+        The error is the root of the mean square.
+        """
+        with torch.no_grad():
+            return self.predictor, float(
+                self._scaled_errors(self.validation_set).square().mean().sqrt()
+            )
+
+
+def train_predictor(
+    name: str,
+    predictor: NetworkPredictor,
+    config: PredictiveConfig,
+    task: ControlTask,
+    seed: int,
+    folder: Path,
+) -> dict[str, Any]:
+    """Train the predictor and leave the weights that validated best in it.
+
+    `checkpoints/<name>/last.ckpt` is resumed where it exists.
+
+    Args:
+        config: of the controller and of the training.
+        task: the vessel in calm water and the limit of its rudder.
+
+    Returns:
+        The curve by epoch, the best score, the number of parameters, and on states kept back the
+        roots of the mean squared errors of heading [rad] and yaw rate [rad/s] at the horizon's end.
+
+    Raises:
+        FitError: where no epoch gave a finite error.
+    """
+    settings, exact_predictor = config.training, config.build_exact_predictor(task)
+    rudder = config.build_law(predictor, task).rudder
+    train, validation_set = (
+        simulate_rudder_responses(
+            task.vessel, exact_predictor, rudder, settings, states, state_seed
+        )
+        for states, state_seed in (
+            (settings.states, 2 * seed),
+            (settings.states // 5, 2 * seed + 1),
+        )
+    )
+    predictor = predictor.double()
+    predictor.calibrate(*train)
+    fit = PredictorFit(predictor, validation_set, settings, seed)
+    data = RowsDataModule((train.x, train.change), settings.batch, seed, lambda: fit.epoch)
+    notes = run_epochs(name, fit, data, predictor, predictor, folder)
+    with torch.no_grad():
+        rms_errors = (
+            (predictor.predict_changes(validation_set.x) - validation_set.change)
+            .square()
+            .mean((0, 2))
+            .sqrt()
+            .tolist()
+        )
+    return notes | dict(zip(("rms_heading", "rms_yaw_rate"), rms_errors, strict=True))
+
+
+def train_or_resume_controller(
+    name: str, config: PredictiveConfig, task: ControlTask, seed: int, folder: RunFolder
+) -> tuple[Policy, dict[str, Any]]:
+    """Train a controller, or take up the one that an interrupted run has trained.
+
+    Args:
+        config: how it predicts and how it is trained.
+        task: the vessel in calm water and the limit of its rudder.
+        seed: seed of the weights, the states and the batches.
+
+    Returns:
+        The controller, and notes on its config and on the errors of its predictions.
+
+    Raises:
+        FitError: where training fails.
+    """
+    torch.manual_seed(seed)
+    spec, store = config.predictor_spec(task), RunModelStore(folder)
+    network = spec.build()
+    notes = store.restore_module(name, network)
+    if notes is None:
+        start_time = time.time()
+        begin_stage(f"training {name}")
+        notes = train_predictor(name, network, config, task, seed, folder.path)
+        notes["seconds"] = round(time.time() - start_time, 1)
+        store.save_module(name, spec, network, notes)
+    degrees = [DEGREES_PER_RADIAN * notes[key] for key in ("rms_heading", "rms_yaw_rate")]
+    log_message(
+        f"  {name}: predicts {config.horizon:g} s ahead within {degrees[0]:.2g} deg and"
+        f" {degrees[1]:.2g} deg/s (rms), {notes['seconds']:.0f} s"
+    )
+    return config.build_law(network, task), {"config": config.model_dump(mode="json")} | {
+        key: value for key, value in notes.items() if key != "curve"
+    }
+
+
+def load_predictive_controller(
+    name: str, config: PredictiveConfig, task: ControlTask, folder: RunFolder
+) -> Policy:
+    """Return the controller that a finished run has trained.
+
+    Raises:
+        UsageError: where the run lacks it.
+    """
+    network = config.predictor_spec(task).build()
+    if RunModelStore(folder).restore_module(name, network) is None:
+        raise UsageError(f"{folder.path}: no trained '{name}' (models/{name}/model.json)")
+    return config.build_law(network, task)

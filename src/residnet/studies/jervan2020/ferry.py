@@ -1,0 +1,888 @@
+"""Task `ferry_study`: residual models of a ferry in closed loop (document 002, chapter 4).
+
+A plant that stands for the true ferry flies a course under a controller that believes in a model;
+residual models are identified from the course, and the course is flown again with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Literal, final
+
+import numpy as np
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from residnet.autopilot.guidance import CrossingConfig
+from residnet.autopilot.motion import ReferenceFilterConfig
+from residnet.baselines.given import BelievedConfig, HullEquations
+from residnet.core.config import Config
+from residnet.core.errors import ConfigError, FitError, UsageError
+from residnet.core.files import read_json
+from residnet.core.format import DEGREES_PER_RADIAN, format_number
+from residnet.core.frames import wrap_angle
+from residnet.core.layout import ACCELERATIONS, HEADING, POSE, POSITION, VELOCITIES
+from residnet.core.names import STATE_NAMES, suggest_name
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.engine.rollout import Rollout
+from residnet.evaluation.autopilots import mean_squares_by_axis
+from residnet.export.feed_forward import ExportedForce, RequiredForce
+from residnet.heads.base import ZeroHead
+from residnet.manoeuvres.closed_loop import ZigzagFamily
+from residnet.manoeuvres.trials import SimulatedTrials, simulate_trials
+from residnet.physics.force_model import ForceCorrection, ForceModel
+from residnet.physics.signals import FORCE_CHANNELS, SignalsConfig
+from residnet.report.blocks import Block, Cell, Section, Table, build_table
+from residnet.report.figure import DASHED_STYLE, SOLID_STYLE, Case, Figure, Panel, style_family
+from residnet.runs.folder import RunFolder
+from residnet.runs.task import ComputingTask, ExportRequest, ExportWriters, PartName, SummaryMetric
+from residnet.studies.jervan2020.ferry_loop import (
+    Disturbance,
+    FeedForwardModel,
+    FerryRun,
+    FerrySimulation,
+    LoopConfig,
+    MotionNoise,
+    load_force_vessel,
+)
+from residnet.studies.jervan2020.residual import (
+    AXES,
+    ForceRecord,
+    ResidualForceModel,
+    ResidualModelConfig,
+    derive_forward_equations,
+    fit_model,
+    fit_to_json,
+    missing_coefficients,
+    model_figures,
+    model_sections,
+    refit_with_settings,
+    to_baseline_yaml,
+)
+from residnet.studies.study import (
+    StudyResults,
+    StudyTask,
+    comparison_columns,
+    find_figures,
+    format_notes,
+    join_numbers,
+)
+
+_MAX_RESIDUAL_GROWTH, _MIN_VARIANCE_SHARE, _MIN_SEGMENT_SHARE = 4.0, 0.02, 0.5
+"""A model no longer fits an axis where the mean square residual of a share of the segments, so that
+one gust or one wake is no reason, and of the whole log is so many times what it was, and more than
+a trifle of the force's variance. Chosen by hand.
+"""
+
+
+def compare_residuals(
+    accepted_residual: Tensor, new_residual: Tensor, force: Tensor, fold: Tensor
+) -> dict[str, Any]:
+    """Return whether a model still fits, by comparing residuals.
+
+    Args:
+        accepted_residual: residual on data that the model was accepted on [N, 3].
+        new_residual: residual on new data [M, 3].
+        force: of the new data [M, 3].
+        fold: segment of each new sample [M].
+
+    Returns:
+        Whether the model `fits`; by axis `growth` (mean square residual now over then), `worse_share` of
+        the force's variance, and `segments`, the share of those that show a worse fit.
+    """
+    variance, accepted_mse = force.var(0), accepted_residual.square().mean(0)
+    segments = [new_residual[fold == segment].square().mean(0) for segment in torch.unique(fold)]
+    # the segments, and the whole log as the last row
+    squares = torch.stack([*segments, new_residual.square().mean(0)])
+    is_worse = (
+        (squares > _MAX_RESIDUAL_GROWTH * accepted_mse) & (squares > _MIN_VARIANCE_SHARE * variance)
+    ).to(torch.float64)
+    worse_share = is_worse[:-1].mean(0)
+    return {
+        "fits": not bool((is_worse[-1].bool() & (worse_share >= _MIN_SEGMENT_SHARE)).any()),
+        "growth": (squares[-1] / accepted_mse.clamp(min=1e-300)).tolist(),
+        "share": (squares[-1] / variance).tolist(),
+        "segments": worse_share.tolist(),
+    }
+
+
+def _verdict_text(comparison: StudyResults) -> str:
+    growth, share = (
+        "/".join(f"{value:.3g}" for value in values)
+        for values in (comparison["growth"], [100 * value for value in comparison["share"]])
+    )
+    sentence = (
+        "still fits" if comparison["fits"] else "no longer fits: identify it again from this log"
+    )
+    return (
+        f"{sentence} (residual {growth} times what it was, {share} % of the force's variance;"
+        " surge/sway/yaw)"
+    )
+
+
+_BELIEVED_NAME = "believed"
+_DIVERGENCE_FACTOR = 3.0
+"""Velocities of a free run in largest velocities of the true ferry from which it has diverged."""
+
+
+class PublishedFigures(Config):
+    """Figures that document 002 prints for one model, to stand beside the figures of a run.
+
+    The numbers stand as printed, except where a correction of the document says otherwise. A figure
+    that the document does not print is left out (null).
+
+    Attributes:
+        mse: mean square of the residual on the unseen half in N^2, N^2, (N m)^2 (Tables 4.2, 4.5,
+            4.7, 4.15); surge, sway and yaw.
+        position_mae: mean position error on the course in m (Tables 4.4, 4.10).
+        position_mse: mean square position error on the course in m^2 (Tables 4.4, 4.10).
+        heading_mae: mean heading error on the course in deg (Tables 4.4, 4.10).
+        tau: mean absolute commanded force in N, N, N m (Tables 4.3, 4.9).
+        feedback: mean absolute force of the feedback alone in N, N, N m (Tables 4.3, 4.9).
+        crossing_position_mae: mean position error in the operational crossing in m (Table 4.12).
+        crossing_position_mse: mean square position error in the crossing in m^2 (Table 4.12).
+        crossing_heading_mae: mean heading error in the crossing in deg (Table 4.12).
+        alone: mean square error of u, v, r and of their derivatives against the desired motion
+            without feedback, in (m/s)^2, (m/s)^2, (rad/s)^2 and the same per second squared
+            (Table 4.8, correction J21).
+        crossing_power: mean power in W that position and heading take in the crossing (Table 4.13).
+        coefficients: coefficients of the basis functions in surge, sway and yaw in SI units
+            (Table 4.11), by basis function.
+    """
+
+    mse: tuple[float, float, float] | None = None
+    position_mae: float | None = None
+    position_mse: float | None = None
+    heading_mae: float | None = None
+    tau: tuple[float, float, float] | None = None
+    feedback: tuple[float, float, float] | None = None
+    crossing_position_mae: float | None = None
+    crossing_position_mse: float | None = None
+    crossing_heading_mae: float | None = None
+    alone: tuple[float, float, float, float, float, float] | None = None
+    crossing_power: tuple[float, float] | None = None
+    coefficients: dict[str, tuple[float, float, float]] = Field(default_factory=dict)
+
+
+_FREE_RUN_TRIALS: Mapping[str, Any] = {
+    "trials": (
+        ZigzagFamily(count=6, drive=(0.03, 0.07), steer=(0.01, 0.03), heading=(0.17, 0.35)),
+    ),
+    "duration": 60.0,
+    "step": 0.1,
+    "seed": 0,
+    "identification": {},
+    "validation": {},
+}
+"""Manoeuvres of the true ferry beside which the models run forward in time."""
+
+
+class FerryModelConfig(ResidualModelConfig):
+    """One model of the ferry's residual force; with `lag`, its feed-forward is led by the lag.
+
+    Attributes:
+        smooth: estimate the motion from all noisy measurements together before the fit
+            (`residnet.preprocessing.motion`). Null does so where the noise is known and the model searches
+            its settings.
+        on: name of the model whose remaining residual this one explains (3.26); empty for the
+            believed hull.
+        fly: fly the course, and the crossing where there is one, with this model as feed-forward.
+        published: figures that the document prints for this model.
+    """
+
+    smooth: bool | None = None
+    on: str = ""
+    fly: bool = False
+    published: PublishedFigures = PublishedFigures()
+
+
+@final
+class FerryStudyConfig(StudyTask, ComputingTask):
+    """A course with the believed model, residual models identified from it, and the course again.
+
+    Attributes:
+        task: `ferry_study`.
+        believed: vessel whose hull the controller believes in, by name or file.
+        true: vessel that is simulated, by name or file.
+        course: waypoints and reference filter; its first half identifies, the second tests.
+        loop: controller and sampling.
+        crossing: an operational crossing that is flown too; null for none.
+        noise: noise on what is measured; null for none.
+        disturbance: force that is constant in earth axes.
+        feed_forward_alone: fly the course without feedback too (Table 4.8).
+        models: residual models by name; a model stands after the one that it builds on.
+        published: figures that the document prints for the believed model.
+        later: vessel that the true one has become later, by name or file; the models that fly are
+            judged on its log and identified again where they no longer fit. Null for none.
+        seed: seed of the noise.
+    """
+
+    results_file: ClassVar[str] = "ferry.json"
+
+    task: Literal["ferry_study"]
+    believed: str = "milliampere"
+    true: str = "milliampere_half"
+    course: ReferenceFilterConfig
+    loop: LoopConfig
+    crossing: CrossingConfig | None = None
+    noise: MotionNoise | None = None
+    disturbance: Disturbance = Disturbance()
+    feed_forward_alone: bool = False
+    models: dict[PartName, FerryModelConfig] = Field(min_length=1)
+    published: PublishedFigures = PublishedFigures()
+    later: str | None = None
+    seed: int = Field(default=0, ge=0)
+
+    supported_commands: ClassVar[tuple[str, ...]] = ("report", "export")
+
+    @model_validator(mode="after")
+    def _check_combination(self) -> FerryStudyConfig:
+        previous_names: list[str] = []
+        for name, model in self.models.items():
+            if name == _BELIEVED_NAME:
+                raise ValueError("'believed' cannot name a model: it is the controller's own")
+            if model.on and model.on not in previous_names:
+                raise ValueError(
+                    f"models.{name}.on: no model before it is named"
+                    f" '{model.on}'{suggest_name(model.on, previous_names)}"
+                )
+            base_model = self.models.get(model.on)
+            if base_model and (
+                base_model.searches_settings or bool(base_model.lag) != bool(model.lag)
+            ):
+                raise ValueError(
+                    f"models.{name}.on: '{model.on}' and it must both be with lag or without; say"
+                    " which of both by 'lag'"
+                )
+            previous_names.append(name)
+        if len(self.course.waypoints) < 4:
+            raise ValueError(
+                "course: at least four waypoints; half of them identify, segment by segment, and"
+                " half test"
+            )
+        try:
+            for plant_name in (self.true, self.later or self.true):
+                self.build_loop(plant_name)
+            self.course.build(self.loop.step)
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    def provenance_seed(self) -> int:
+        return self.seed
+
+    def build_loop(self, true: str) -> FerrySimulation:
+        """Return the loop with one vessel as the true one."""
+        return FerrySimulation(
+            true, self.believed, self.loop, self.noise, self.disturbance, self.seed
+        )
+
+    def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
+        return write_results(self, run_ferry_study(self), folder)
+
+    def exports(self, folder: RunFolder) -> ExportWriters:
+        return {
+            name: partial(self.export_model, ExportRequest(folder, name)) for name in self.models
+        }
+
+    def export_model(self, request: ExportRequest) -> Path:
+        """Write the feed-forward of a model; `selected` leaves the least of the residual force."""
+        run, results = request.run, read_json(request.run.path / self.results_file)
+        name = find_best_model(results) if request.model == "selected" else request.model
+        if name not in self.models:
+            raise UsageError(f"{run.path}: no model '{name}'{suggest_name(name, self.models)}")
+        chain = [name]
+        while base_name := self.models[chain[0]].on:
+            chain.insert(0, base_name)
+        chain_rows = [results["models"][name_in_chain]["exported"] for name_in_chain in chain]
+        force = ForceModel(load_force_vessel(self.believed)[0].hull)
+        for row in chain_rows:
+            tensors = (torch.tensor(row[key]).double() for key in ("coefficients", "intercept"))
+            force = force.with_correction(ForceCorrection(row["terms"], *tensors))
+        ranges = [(lower, upper) for lower, upper in chain_rows[-1]["range"]]
+        required_force = RequiredForce(*force.split_corrections(), is_mirrored=True)
+        exported = ExportedForce(name, required_force, ranges, chain_rows[-1]["notes"].get("lag"))
+        return request.write(
+            exported, list_feed_forward_objections(name, results), f"{name}_feed_forward"
+        )
+
+    def summarize(self, results: StudyResults) -> list[str]:
+        models, best_name = results["models"], find_best_model(results)
+        remaining_text = join_numbers([100 * share for share in models[best_name]["share_left"]])
+        sentences = [
+            f"Of {len(models)} residual models, {best_name} leaves the least of the residual force on"
+            f" the unseen half of the course: {remaining_text} % of its mean square in surge, sway and yaw."
+        ]
+        for run_kind in ("course", "crossing"):
+            position_errors = {name: run["position_mae"] for name, run in results[run_kind].items()}
+            believed_error = position_errors.pop(_BELIEVED_NAME, None)
+            if position_errors:
+                closest_model = min(position_errors, key=position_errors.__getitem__)
+                change_text = (
+                    "falls"
+                    if position_errors[closest_model] < believed_error
+                    else "does NOT fall: it goes"
+                )
+                sentences.append(
+                    f"With {closest_model} as feed-forward, the mean position error in the {run_kind} {change_text}"
+                    f" from {format_number(believed_error)} m to {format_number(position_errors[closest_model])} m."
+                )
+        return sentences + [
+            f"On the vessel as it is later, {name} {update['text']}."
+            for name, update in results["later"].items()
+        ]
+
+    def main_figures(self, results: StudyResults) -> dict[str, SummaryMetric]:
+        best_name = find_best_model(results)
+        shares = zip(AXES, results["models"][best_name]["share_left"], strict=True)
+        return {
+            f"residual left by {best_name}, {axis}": SummaryMetric(share) for axis, share in shares
+        } | {
+            f"mean position error on the course with {name}": SummaryMetric(
+                run["position_mae"], "m"
+            )
+            for name, run in results["course"].items()
+        }
+
+    def build_sections(self, results: StudyResults, run: Path) -> list[Section]:
+        residual_table = _residual_table(self, results)
+        run_pictures = [
+            picture.preview() for picture in find_figures(run, "errors_course", "errors_crossing")
+        ]
+        sections_written = [
+            Section("", [*run_pictures[:1], residual_table.select_columns(3, 6)]),
+            Section("Residual force on the unseen half", [residual_table]),
+        ]
+        for run_kind, title in (
+            ("course", "Course in closed loop"),
+            ("crossing", "Operational crossing"),
+            ("feed_forward_alone", "Feed-forward without feedback"),
+        ):
+            if results[run_kind]:
+                run_pictures = find_figures(run, f"errors_{run_kind}", f"forces_{run_kind}")
+                sections_written.append(
+                    Section(
+                        title, [*_tracking_tables(self, results[run_kind], run_kind), *run_pictures]
+                    )
+                )
+        if results["later"]:
+            sections_written.append(
+                Section("The vessel as it is later", [_update_table(results["later"])])
+            )
+        sections_written.append(Section("Forward in time", [_free_run_table(results["forward"])]))
+        # Table 4.11
+        comparisons = {
+            name: {
+                "true": {} if model.on else results["true_coefficients"],
+                "published": model.published.coefficients,
+            }
+            for name, model in self.models.items()
+        }
+        return sections_written + model_sections(
+            "Coefficients", results["models"], run, "notes", comparisons
+        )
+
+
+def identify_model(
+    config: FerryModelConfig, record: ForceRecord, base: ForceModel
+) -> ResidualForceModel:
+    """Fit one model on the training samples.
+
+    Raises:
+        FitError: where the data do not determine the model.
+    """
+    return fit_model(config, smooth_for_fit(config, record), base)
+
+
+def smooth_for_fit(config: FerryModelConfig, record: ForceRecord) -> ForceRecord:
+    """Return the record as a model is identified from it."""
+    should_smooth = config.searches_settings if config.smooth is None else config.smooth
+    return record.smooth() if should_smooth and any(record.noise) else record
+
+
+@dataclass(frozen=True)
+class FerryStudy:
+    """Everything that was flown and fitted.
+
+    Attributes:
+        believed_run: the course with the believed model, from which the models are identified.
+        record: its log, of which one half identifies the models and the other tests them.
+        unmodelled_mse: mean square of the believed model's residual on the test half, by axis in N^2,
+            N^2, (N m)^2.
+        models: fitted models by name, each from one half of the course.
+        whole_course_models: those that search their settings, fitted to the whole course as they are exported.
+        runs: by model, `believed` first, of the `course`, the `crossing`, and the course without
+            feedback (`feed_forward_alone`); empty where they were not flown.
+        updates: each model that flies, on the vessel as it is later: whether it still fits, and how
+            the course is followed before and after it was identified again where it does not.
+    """
+
+    believed_run: FerryRun
+    record: ForceRecord
+    unmodelled_mse: list[float]
+    models: dict[str, ResidualForceModel]
+    whole_course_models: dict[str, ResidualForceModel]
+    runs: dict[str, dict[str, FerryRun]]
+    updates: dict[str, dict[str, Any]]
+
+
+def build_record(run: FerryRun, interval: float, noise: MotionNoise | None) -> ForceRecord:
+    """Return the log of a course with a fold for each segment; its first half identifies.
+
+    Args:
+        run: the course as it was flown.
+        interval: time from one waypoint to the next in s.
+        noise: what is known of the sensors; None for none.
+    """
+    return ForceRecord(
+        run.t,
+        run.measured[:, POSE],
+        run.measured[:, VELOCITIES],
+        run.measured[:, ACCELERATIONS],
+        run.command,
+        run.averaged_command,
+        torch.div(run.t + 1e-9, interval, rounding_mode="floor").long(),
+        torch.arange(len(run.t)) < len(run.t) // 2,
+        (noise or MotionNoise()).standard_deviations(),
+    )
+
+
+def run_ferry_study(config: FerryStudyConfig) -> FerryStudy:
+    """Fly with the believed model, identify residual models, and fly with these.
+
+    Raises:
+        ResidnetError: where a model cannot be identified or flown.
+    """
+    ferry = config.build_loop(config.true)
+    believed = ForceModel(ferry.believed_hull)
+    believed_run = ferry.simulate(config.course, [(believed, None)])[0]
+    record = build_record(believed_run, config.course.interval, config.noise)
+    residual = believed.force_residual(
+        record.command, record.nu_dot, record.nu, record.pose[:, HEADING]
+    )
+    models: dict[str, ResidualForceModel] = {}
+    for name, model in config.models.items():
+        models[name] = identify_model(
+            model, record, models[model.on].force if model.on else believed
+        )
+    whole_record = replace(record, is_training=torch.ones_like(record.is_training))
+    # what a half chose and the other judged leaves with the coefficients of both
+    whole_course_models = {
+        name: refit_with_settings(
+            model, models[name], smooth_for_fit(model, whole_record), believed
+        )
+        for name, model in config.models.items()
+        if model.searches_settings and not model.on and models[name].fit.notes["order"] > 0
+    }
+    feed_forward_models = {name: models[name] for name, model in config.models.items() if model.fly}
+    feeds_by_name: dict[str, FeedForwardModel] = {_BELIEVED_NAME: (believed, None)}
+    feeds_by_name |= {name: (model.force, model.lag) for name, model in feed_forward_models.items()}
+
+    def simulate_runs(
+        loop: FerrySimulation,
+        path: ReferenceFilterConfig | CrossingConfig,
+        names: Iterable[str],
+        **options: bool,
+    ) -> dict[str, FerryRun]:
+        feeds = {name: feeds_by_name[name] for name in names}
+        if not feeds:
+            return {}
+        return dict(zip(feeds, loop.simulate(path, list(feeds.values()), **options), strict=True))
+
+    updates: dict[str, dict[str, Any]] = {}
+    if config.later is not None:
+        changed_loop = config.build_loop(config.later)
+        for name, run in simulate_runs(changed_loop, config.course, feed_forward_models).items():
+            log = build_record(run, config.course.interval, config.noise)
+            previous_residual, new_residual = (
+                feed_forward_models[name].residual_along(compared_record)
+                for compared_record in (record, log)
+            )
+            verdict = compare_residuals(
+                previous_residual[~record.is_training], new_residual, log.command, log.fold
+            )
+            updated_run = run
+            if not verdict["fits"]:
+                updated_model = identify_model(config.models[name], log, believed)
+                updated_run = changed_loop.simulate(
+                    config.course, [(updated_model.force, updated_model.lag)]
+                )[0]
+            updates[name] = {
+                "verdict": verdict,
+                "text": _verdict_text(verdict),
+                "before": run.tracking_metrics.to_json(),
+                "after": updated_run.tracking_metrics.to_json(),
+            }
+    return FerryStudy(
+        believed_run,
+        record,
+        mean_squares_by_axis(residual[~record.is_training]),
+        models,
+        whole_course_models,
+        {
+            "course": {
+                _BELIEVED_NAME: believed_run,
+                **simulate_runs(ferry, config.course, feed_forward_models),
+            },
+            "crossing": simulate_runs(ferry, config.crossing, feeds_by_name)
+            if config.crossing
+            else {},
+            "feed_forward_alone": simulate_runs(
+                ferry,
+                config.course,
+                feeds_by_name if config.feed_forward_alone else (),
+                feedback=False,
+            ),
+        },
+        updates,
+    )
+
+
+def forward_runs(
+    config: FerryStudyConfig, models: Mapping[str, HullEquations]
+) -> dict[str, dict[str, Any]]:
+    """Run models forward in time from the commanded forces of the true ferry's manoeuvres.
+
+    Args:
+        config: the study, with its manoeuvres.
+        models: equations of motion by name, beside which stand those of the known hull.
+
+    Returns:
+        By model, `believed` first: `rmse` of u, v, r in m/s, m/s, rad/s over the runs that did not
+        diverge (None without any), `runs`, and `diverged`, how many of them did.
+    """
+    trials = SimulatedTrials(vessel=config.true, **_FREE_RUN_TRIALS)
+    logs = [flight.true_log for flight in simulate_trials(trials.draw_manoeuvres(), trials)]
+    # one that ended early shows no free run
+    logs = [log for log in logs if len(log) == max(map(len, logs))]
+    thrusters = load_force_vessel(config.true)[1]
+    x, commands = (
+        torch.from_numpy(
+            np.stack([np.stack([log.channels[name] for name in names], 1) for log in logs])
+        )
+        for names in (STATE_NAMES, thrusters.command_names)
+    )
+    w = thrusters.requested_force(commands)[:, :-1]
+    velocity_limit = _DIVERGENCE_FACTOR * x[..., VELOCITIES].abs().amax(dim=(0, 1))
+    believed_equations = BelievedConfig(vessel=config.believed).hull_equations()
+    signals, rows = SignalsConfig(inputs=FORCE_CHANNELS).build(), {}
+    for name, equations in {_BELIEVED_NAME: believed_equations, **models}.items():
+        baseline = BelievedConfig(vessel=equations).build(signals.names)
+        model = HybridDynamics(signals, baseline, ZeroHead(), trials.step).double()
+        with torch.no_grad():
+            trajectories = Rollout(model)(x[:, 0], w, x[:, 0, :0])[0]
+        is_outside = (trajectories[..., VELOCITIES].abs() > velocity_limit).any(dim=-1)
+        has_diverged = (~torch.isfinite(trajectories).all(dim=-1) | is_outside).any(dim=-1)
+        errors = (trajectories - x)[~has_diverged][..., VELOCITIES]
+        rows[name] = {
+            "rmse": errors.square().mean(dim=(0, 1)).sqrt().tolist() if len(errors) else None,
+            "runs": len(x),
+            "diverged": int(has_diverged.sum()),
+        }
+    return rows
+
+
+def write_results(
+    config: FerryStudyConfig, study_result: FerryStudy, folder: RunFolder
+) -> tuple[dict[str, Any], list[Figure]]:
+    """Return the contents of ferry.json and the figures of a study.
+
+    The models' equations are written into the folder.
+    """
+    figures: list[Figure] = []
+    equations: dict[str, HullEquations] = {}
+    refusals = dict.fromkeys(study_result.models, "")
+    for name, model in study_result.models.items():
+        figures += model_figures(name, config.models[name], model.fit, study_result.unmodelled_mse)
+        try:
+            equations[name] = derive_forward_equations(
+                config.believed, model.force, f"model {name}"
+            )
+        except (ConfigError, FitError) as error:
+            refusals[name] = str(error)
+    forward = forward_runs(config, equations)
+    for name, model_equations in equations.items():
+        if forward[name]["diverged"]:
+            refusals[name] = (
+                f"model {name}: it diverges in {forward[name]['diverged']} of"
+                f" {forward[name]['runs']} free runs beside the true ferry, so its equations are"
+                " not written; take a model with fewer terms or with lag"
+            )
+        else:
+            text = to_baseline_yaml(model_equations, f"run {config.name}, model {name}")
+            folder.write(folder.path / "models" / f"{name}_forward.yaml", text)
+    models = {}
+    for name, model in study_result.models.items():
+        test_mse = model.test_mse(study_result.record)
+        models[name] = {
+            "test_mse": test_mse,
+            "share_left": [
+                a / b for a, b in zip(test_mse, study_result.unmodelled_mse, strict=True)
+            ],
+            "notes": model.fit.notes,
+            "not_forward": refusals[name],
+            **fit_to_json(config.models[name].terms, model.fit),
+            "exported": _exported_model(config.models[name].terms, study_result, name),
+        }
+    for run_kind, runs in study_result.runs.items():
+        figures += _run_figures(runs, run_kind) if runs else []
+    content = {
+        "schema": "residnet.ferry/1",
+        "run": config.name,
+        "unmodelled_test_mse": study_result.unmodelled_mse,
+        "true_coefficients": missing_coefficients(config.true, config.believed),
+        "models": models,
+        **{
+            run_kind: {name: run.tracking_metrics.to_json() for name, run in runs.items()}
+            for run_kind, runs in study_result.runs.items()
+        },
+        "later": study_result.updates,
+        "forward": forward,
+    }
+    return content, figures
+
+
+def _exported_model(terms: Sequence[str], study_result: FerryStudy, name: str) -> dict[str, Any]:
+    """Return a model as it is exported, with the range of what it was fitted to."""
+    record, model = study_result.record, study_result.models[name]
+    if name in study_result.whole_course_models:
+        record, model = (
+            replace(record, is_training=torch.ones_like(record.is_training)),
+            study_result.whole_course_models[name],
+        )
+    ranges = record.motion_ranges(mirror=bool(model.fit.notes.get("mirror")))
+    return {**fit_to_json(terms, model.fit), "notes": model.fit.notes, "range": ranges}
+
+
+def _run_figures(runs: Mapping[str, FerryRun], run_kind: str) -> list[Figure]:
+    t = next(iter(runs.values())).t.numpy()
+    pose_errors = {name: run.desired_pose - run.pose for name, run in runs.items()}
+    # the scales are logarithmic, since models differ by orders of magnitude
+    position = {
+        name: (t, pose_error[:, POSITION].norm(dim=-1).clamp(min=1e-5).numpy())
+        for name, pose_error in pose_errors.items()
+    }
+    heading = {
+        name: (
+            t,
+            (DEGREES_PER_RADIAN * wrap_angle(pose_error[:, HEADING]).abs()).clamp(min=1e-4).numpy(),
+        )
+        for name, pose_error in pose_errors.items()
+    }
+    panel_settings: Any = {"x_label": "time [s]", "height": 210, "group": "t", "y_log": True}
+    errors = Figure(
+        f"errors_{run_kind}",
+        "Errors in closed loop",
+        "Distance to the desired position and magnitude of the heading error over time, by"
+        " model of the feed-forward.",
+        style_family(runs, width=1.1),
+        [
+            Panel("position error [m]", **panel_settings),
+            Panel("heading error [deg]", **panel_settings),
+        ],
+        [Case("", [position, heading])],
+    )
+    if not any(bool(run.feedback.any()) for run in runs.values()):
+        return [errors]
+    shown_runs = dict(list(runs.items())[:3])
+    units = ("surge [N]", "sway [N]", "yaw [N m]")
+    forces = Figure(
+        f"forces_{run_kind}",
+        "Forces in closed loop",
+        "Commanded force and the part of it that is feedback, by model of the feed-forward.",
+        {
+            "command": replace(SOLID_STYLE, label="commanded force", width=1.0),
+            "feedback": replace(DASHED_STYLE, label="feedback part", width=1.0),
+        },
+        [
+            Panel(unit, "time [s]", name if not axis else "", height=165, group=name)
+            for axis, unit in enumerate(units)
+            for name in shown_runs
+        ],
+        [
+            Case(
+                "",
+                [
+                    {
+                        part: (t, getattr(run, part)[:, axis].numpy())
+                        for part in ("command", "feedback")
+                    }
+                    for axis in range(3)
+                    for run in shown_runs.values()
+                ],
+            )
+        ],
+        columns=len(shown_runs),
+    )
+    return [errors, forces]
+
+
+def list_feed_forward_objections(name: str, results: StudyResults) -> list[str]:
+    """Return what speaks against a feed-forward rather than the believed one.
+
+    That is what it leaves of the residual force on the unseen half, mean over the axes, and the
+    position error of every flight with it.
+    """
+    shares = results["models"][name]["share_left"]
+    reasons = []
+    if sum(shares) > len(shares):
+        remaining_text = join_numbers([100 * share for share in shares])
+        reasons.append(
+            f"on the unseen half it leaves {remaining_text} % of the residual force in surge, sway and yaw"
+        )
+    for run_kind in ("course", "crossing", "feed_forward_alone"):
+        if name in (runs := results[run_kind]):
+            model_error, believed_error = (
+                runs[model_name]["position_mae"] for model_name in (name, _BELIEVED_NAME)
+            )
+            if model_error > believed_error:
+                reasons.append(
+                    f"its mean position error in the {run_kind.replace('_', ' ')} is {format_number(model_error)} m,"
+                    f" the believed model's {format_number(believed_error)} m"
+                )
+    return reasons
+
+
+def find_best_model(results: StudyResults) -> str:
+    """Return the model that leaves the least of the residual."""
+    models: StudyResults = results["models"]
+    return min(models, key=lambda name: float(sum(models[name]["share_left"])))
+
+
+def _residual_table(config: FerryStudyConfig, results: StudyResults) -> Table:
+    """Return the table of the remaining residual (Tables 4.2, 4.5, 4.7 and 4.15)."""
+    unmodelled, published_base = results["unmodelled_test_mse"], config.published.mse
+    rows = []
+    believed_row = {"test_mse": unmodelled, "notes": {}}
+    for name, model in {_BELIEVED_NAME: believed_row, **results["models"]}.items():
+        published_figures = (
+            config.published if name == _BELIEVED_NAME else config.models[name].published
+        )
+        compared_values = {
+            "ours": (model["test_mse"], unmodelled),
+            "published": (published_figures.mse, published_base),
+        }
+        remaining_percent = {
+            origin: [100 * a / b for a, b in zip(model_mse, base_mse, strict=True)]
+            if model_mse and base_mse
+            else None
+            for origin, (model_mse, base_mse) in compared_values.items()
+        }
+        rows.append(
+            {
+                "name": name,
+                "mse": model["test_mse"],
+                "left": remaining_percent["ours"],
+                "published": {"mse": published_figures.mse, "left": remaining_percent["published"]},
+                "notes": format_notes(model["notes"]),
+            }
+        )
+    return build_table(
+        rows,
+        [
+            ("model", "name"),
+            *comparison_columns("mse", ("surge N^2", "sway N^2", "yaw (N m)^2")),
+            *comparison_columns("left", AXES, 3),
+            ("chosen by the estimator", "notes"),
+        ],
+        caption="Mean square of the residual, and what is left of the believed model's.",
+        groups=[("mean square", 3), ("% left of the residual force", 3)],
+        is_selected=lambda row: row["name"] == find_best_model(results),
+    )
+
+
+def _tracking_tables(
+    config: FerryStudyConfig, runs: Mapping[str, StudyResults], run_kind: str
+) -> list[Block]:
+    """Return how well a course is followed and with which forces.
+
+    Tables 4.4, 4.8, 4.10, 4.12 and 4.13 of the document; Tables 4.3 and 4.9.
+    """
+    rows = []
+    for name, metrics in runs.items():
+        published_figures = (
+            config.published if name == _BELIEVED_NAME else config.models[name].published
+        )
+        published_values = published_figures.model_dump()
+        if run_kind == "crossing":
+            crossing = {
+                key.partition("crossing_")[2]: value for key, value in published_values.items()
+            }
+            published_values = {key: value for key, value in crossing.items() if key}
+        elif run_kind == "feed_forward_alone":
+            published_values = {"motion_mse": published_figures.alone}
+        rows.append({"name": name, **metrics, "published": published_values})
+    name_column = ("feed-forward", "name")
+    open_loop_table = build_table(
+        rows,
+        [
+            name_column,
+            *comparison_columns("motion_mse", ("u", "v", "r", "u_dot", "v_dot", "r_dot")),
+        ],
+        caption="Mean square error against the desired motion without feedback, in (m/s)^2,"
+        " (m/s)^2, (rad/s)^2, and the same per second squared.",
+    )
+    errors = build_table(
+        rows,
+        [
+            name_column,
+            *comparison_columns("position_mae", "mean position error m"),
+            *comparison_columns("position_mse", "mean square m^2"),
+            *comparison_columns("heading_mae", "mean heading error deg", factor=DEGREES_PER_RADIAN),
+            *comparison_columns("power", ("power, position W", "power, heading W")),
+            *comparison_columns("iaew", ("IAEW, position m s J", "IAEW, heading rad s J")),
+        ],
+        caption="IAEW is the integral of the error times the work (3.18).",
+    )
+    units = ("surge N", "sway N", "yaw N m")
+    forces = build_table(
+        rows,
+        [name_column, *comparison_columns("tau", units), *comparison_columns("feedback", units)],
+        groups=[("mean absolute force", 3), ("mean absolute feedback", 3)],
+    )
+    return [*([open_loop_table] if run_kind == "feed_forward_alone" else []), errors, forces]
+
+
+def _free_run_table(rows: Mapping[str, StudyResults]) -> Table:
+    """Return the table of free runs beside manoeuvres of the true ferry (3.22)."""
+    free_run_rows = [
+        {
+            "name": name,
+            **row,
+            "rmse": row["rmse"] and [*row["rmse"][:2], DEGREES_PER_RADIAN * row["rmse"][2]],
+            "published": {},
+        }
+        for name, row in rows.items()
+    ]
+    return build_table(
+        free_run_rows,
+        [
+            ("model", "name"),
+            *comparison_columns("rmse", ("u m/s", "v m/s", "r deg/s"), 3),
+            ("diverged", lambda row: Cell(f"{row['diverged']} of {row['runs']}")),
+        ],
+        caption="Root mean square errors of free runs from the commanded forces, over the runs that"
+        " did not diverge. A model that explains the force may still be no model of motion.",
+    )
+
+
+def _update_table(updates: Mapping[str, StudyResults]) -> Table:
+    """Return the table of models on the changed vessel (section 3.7)."""
+
+    def format_short(value: float) -> str:
+        return format_number(value, 4)
+
+    return build_table(
+        [{"name": name, **row} for name, row in updates.items()],
+        [
+            ("model", "name"),
+            ("mean position error m", "before.position_mae", format_short),
+            ("after the update m", "after.position_mae", format_short),
+            ("on the new log", "text"),
+        ],
+        caption="A model that no longer fits is identified again from the log of one course.",
+    )

@@ -1,0 +1,344 @@
+"""Measured logs of force and motion, their folds, and what they say of thrusters and sensors.
+
+Source: document 002, chapter 5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from residnet.core.config import Config, ConfigPath, Seconds
+from residnet.core.errors import ConfigError, DataError, FitError
+from residnet.core.layout import ACCELERATIONS, PLANAR_LAYOUT, POSE, VELOCITIES
+from residnet.evaluation.metrics import (
+    ResamplingBlocks,
+    bootstrap_intervals,
+    make_resampling_blocks,
+)
+from residnet.io.readers import ReaderConfig
+from residnet.io.split import assign_log_names, check_leaks, match_patterns
+from residnet.preprocessing.prepare import PrepareConfig, prepare_log
+from residnet.studies.jervan2020.residual import AXES, ForceRecord
+from residnet.training.lag import fit_lag, followed
+
+_ChannelTriple = tuple[str, str, str]
+_MIN_LOGS_FOR_FOLDS = 3
+"""Number of logs from which on whole logs are left out instead of stretches of time."""
+_MIN_LOGS_FOR_INTERVALS = 5
+"""Number of logs from which on intervals resample logs instead of segments."""
+_MIN_SEGMENTS = 5
+"""Least number of segments for intervals."""
+
+
+class ForceLogsConfig(Config):
+    """Measured logs; `validation` says which part of them tests.
+
+    Attributes:
+        reader: format of the logs and their channel map.
+        root: folder that the patterns start from.
+        logs: file names or patterns such as `nlp*.csv`.
+    """
+
+    reader: ReaderConfig
+    root: ConfigPath
+    logs: tuple[str, ...] = Field(min_length=1)
+
+    def find_paths(self) -> list[Path]:
+        """Return the paths of all logs, each once.
+
+        Raises:
+            ConfigError: where the folder is not there or a pattern matches nothing.
+        """
+        if not self.root.is_dir():
+            raise ConfigError(f"data: root {self.root} is not a folder; correct `root`")
+        return match_patterns(self.root, self.logs, "data: logs")
+
+
+class ForceChannelsConfig(Config):
+    """Names of the channels of force and acceleration, beside x, y, psi, u, v and r.
+
+    Attributes:
+        actual: forces that acted, in N, N, N m, from measured revolutions and angles of the
+            thrusters.
+        commanded: forces that the controller commanded, in N, N, N m.
+        acceleration: measured accelerations of u, v, r in m/s^2, m/s^2, rad/s^2; null where there
+            are none.
+    """
+
+    actual: _ChannelTriple
+    commanded: _ChannelTriple
+    acceleration: _ChannelTriple | None = None
+
+
+class FoldsConfig(Config):
+    """Cross-validation in which no model is fitted to data near what it predicts.
+
+    Attributes:
+        folds: number of parts that are left out in turn: whole logs where there are at least three,
+            else equal stretches of time of each log.
+        gap: time in s before and after a left-out stretch that is left out of the fit too.
+        segment: length in s of the segments that the inner cross-validation leaves out to choose
+            orders and penalties, and that the intervals resample.
+    """
+
+    folds: int = Field(default=5, ge=2, le=1_000)
+    gap: Seconds = Field(default=5.0, ge=0)
+    segment: Seconds = Field(default=30.0, gt=0)
+
+
+@dataclass(frozen=True)
+class MeasuredForceLogs:
+    """All logs one after another, N samples; forces in N, N, N m.
+
+    Attributes:
+        names: names of the logs.
+        record: motion and commanded force, smoothed as `prepare` says; NaN where masked. Its folds
+            are the segments.
+        forces: `commanded` and `actual` forces [N, 3].
+        usable: samples that models may be fitted to and judged on [N] bool.
+        fold_index: number of the fold of the outer cross-validation [N].
+        fold_unit: what a fold consists of: `logs` or `stretches`.
+        masked_shares: share of the samples that each mask excludes, by log and mask.
+        accelerations: as measured and as derived from the velocities [N, 3], by what they are;
+            empty where none were measured.
+        acceleration_comparison: comparison of the two by axis; empty where no acceleration was measured.
+    """
+
+    names: tuple[str, ...]
+    record: ForceRecord
+    forces: dict[str, Tensor]
+    usable: Tensor
+    fold_index: Tensor
+    fold_unit: str
+    masked_shares: dict[str, dict[str, float]]
+    accelerations: dict[str, Tensor]
+    acceleration_comparison: dict[str, Any]
+
+    def split_fold(self, fold_index: int, gap: float) -> tuple[ForceRecord, Tensor]:
+        """Return the record without a fold for training, and the samples [N] of the fold.
+
+        Args:
+            gap: time in s around the fold that is left out of training too.
+
+        Raises:
+            DataError: where either has no samples.
+        """
+        inside_fold = self.fold_index == fold_index
+        gap_samples = round(gap / self.record.dt)
+        fold_flags = inside_fold.to(torch.float64)[None, None].split(
+            list(self.record.run_lengths), dim=-1
+        )
+        is_near_fold = torch.cat(
+            [
+                torch.nn.functional.max_pool1d(log_flags, 2 * gap_samples + 1, 1, gap_samples)[0, 0]
+                > 0
+                for log_flags in fold_flags
+            ]
+        )
+        train, test = self.usable & ~is_near_fold, self.usable & inside_fold
+        for problem, samples in (
+            ("nothing left to fit to beside", train),
+            ("no sample to judge on in", test),
+        ):
+            if not bool(samples.any()):
+                raise DataError(
+                    f"validation: {problem} fold {fold_index + 1}; check the masks, or lower"
+                    " validation.folds or validation.gap"
+                )
+        return replace(self.record, is_training=train), test
+
+    def usable_segments(self) -> list[Tensor]:
+        """Return the indices of the good samples of each segment.
+
+        A segment with less than half of the largest number of good samples is left out.
+        """
+        segments = [
+            ((self.record.fold == number) & self.usable).nonzero()[:, 0]
+            for number in torch.unique(self.record.fold)
+        ]
+        min_length = max(len(segment) for segment in segments) / 2
+        return [segment for segment in segments if len(segment) >= min_length]
+
+    def resampling_blocks(self) -> ResamplingBlocks | None:
+        """Return what the intervals resample: logs from five on, segments for fewer.
+
+        None where there are fewer than five segments.
+        """
+        log = torch.repeat_interleave(
+            torch.arange(len(self.names)), torch.tensor(self.record.run_lengths)
+        )
+        log_of_segment = [int(log[segment[0]]) for segment in self.usable_segments()]
+        if len(self.names) >= _MIN_LOGS_FOR_INTERVALS:
+            return make_resampling_blocks(log_of_segment)
+        return _segment_blocks(len(log_of_segment))
+
+
+def _segment_blocks(count: int) -> ResamplingBlocks | None:
+    """Return segments as blocks of a bootstrap; None where there are too few."""
+    return ResamplingBlocks(np.arange(count), "segments", count) if count >= _MIN_SEGMENTS else None
+
+
+def read_force_logs(
+    data: ForceLogsConfig,
+    channels: ForceChannelsConfig,
+    preparation: PrepareConfig,
+    validation: FoldsConfig,
+) -> MeasuredForceLogs:
+    """Read, mask, smooth and differentiate all logs.
+
+    Raises:
+        ResidnetError: where a log cannot be read or holds no usable samples.
+    """
+    import pandas as pd
+
+    reader, paths = data.reader.build(), assign_log_names(data.find_paths())
+    raw_logs = [reader.read(path).replace(name=name) for path, name in paths.items()]
+    # a model would be fitted to the very samples that judge it
+    check_leaks({log.name: [log] for log in raw_logs})
+    columns = (*channels.commanded, *channels.actual, *(channels.acceleration or ()))
+    logs = [prepare_log(log, "all", columns, preparation) for log in raw_logs]
+    names, lengths = [log.log.name for log in logs], [len(log) for log in logs]
+    step = preparation.grid.step
+    # whole logs are folds where there are enough; no segment reaches across logs
+    uses_log_folds = len(logs) >= _MIN_LOGS_FOR_FOLDS
+    fold_parts, segments, commands, masked, n_segments_total = [], [], [], {}, 0
+    for log_index, (log, name, length) in enumerate(zip(logs, names, lengths, strict=True)):
+        if not log.trainable.any():
+            raise DataError(
+                f"log {name}: no stretch is as long as the derivative's window; leave it out or"
+                " shorten prepare.derivative"
+            )
+        sample_index = torch.arange(length)
+        n_folds = min(validation.folds, len(logs)) if uses_log_folds else validation.folds
+        fold_parts.append(
+            0 * sample_index + log_index * n_folds // len(logs)
+            if uses_log_folds
+            else sample_index * n_folds // length
+        )
+        n_segments = max(round(length * step / validation.segment), 1)
+        segments.append(n_segments_total + sample_index * n_segments // length)
+        n_segments_total += n_segments
+        # commands hold their last value over gaps, and are zero before the first
+        filled_commands = (
+            pd.DataFrame(log.rate_inputs[:, : PLANAR_LAYOUT.n_dof]).ffill().fillna(0.0)
+        )
+        commands.append(torch.from_numpy(np.array(filled_commands)))
+        shares = {reason: float(mask.mean()) for reason, mask in log.log.masks.items()}
+        masked[name] = {reason: share for reason, share in shares.items() if share}
+    smooth, nu_dot, measured, usable = (
+        torch.from_numpy(np.concatenate([getattr(log, attribute) for log in logs]))
+        for attribute in ("smooth", "nu_dot", "recorded", "good")
+    )
+    fold = torch.cat(segments)
+    accelerations: dict[str, Tensor] = {}
+    acceleration: dict[str, Any] = {}
+    if channels.acceleration is not None:
+        sensed = measured[:, ACCELERATIONS]
+        accelerations = {"measured acceleration": sensed, "derivative of velocity": nu_dot}
+        acceleration = compare_accelerations(nu_dot[usable], sensed[usable], fold[usable])
+    command = torch.cat(commands)
+    record = ForceRecord(
+        step * torch.arange(len(fold), dtype=torch.float64),
+        smooth[:, POSE],
+        smooth[:, VELOCITIES],
+        nu_dot,
+        command,
+        command,
+        fold,
+        usable,
+        (0.0,) * 9,
+        tuple(lengths),
+    )
+    return MeasuredForceLogs(
+        tuple(names),
+        record,
+        {"commanded": command, "actual": measured[:, VELOCITIES]},
+        usable,
+        torch.cat(fold_parts),
+        "logs" if uses_log_folds else "stretches",
+        masked,
+        accelerations,
+        acceleration,
+    )
+
+
+def compare_accelerations(derived: Tensor, measured: Tensor, segment: Tensor) -> dict[str, Any]:
+    """Compare measured accelerations with derivatives of velocity, axis by axis.
+
+    Args:
+        derived: derivatives of velocity [N, 3].
+        measured: measured accelerations [N, 3].
+        segment: number of each sample's segment [N].
+
+    Returns:
+        By axis the offset, its 95 % interval, and the spread and correlation without it.
+    """
+    difference = measured - derived
+    means = np.stack(
+        [difference[segment == number].mean(0).numpy() for number in torch.unique(segment)]
+    )
+    confidence_intervals = bootstrap_intervals(means, _segment_blocks(len(means)))
+    comparison: dict[str, Any] = {}
+    for axis, name in enumerate(AXES):
+        correlation_matrix = torch.corrcoef(torch.stack((derived[:, axis], measured[:, axis])))
+        comparison[name] = {
+            "offset": float(difference[:, axis].mean()),
+            "offset_ci95": confidence_intervals[axis],
+            "rms_without_offset": float(difference[:, axis].std()),
+            "rms": float(derived[:, axis].std()),
+            "correlation": float(torch.nan_to_num(correlation_matrix[0, 1])),
+        }
+    return comparison
+
+
+def compare_forces(measured: MeasuredForceLogs) -> dict[str, Any]:
+    """Compare commanded and actual force: the thrusters' lag, and what the command explains.
+
+    Returns:
+        `lag` (its parameters, or why it is not determined), and by axis the share of the actual
+        force's variance that the command explains, without and with the lag.
+    """
+    record, usable = measured.record, measured.usable
+    comparison: dict[str, Any] = {}
+    try:
+        lag = fit_lag(
+            record.command,
+            torch.nan_to_num(measured.forces["actual"]),
+            torch.zeros_like(record.command),
+            record.dt,
+            usable,
+            record.run_lengths,
+        )
+        comparison["lag"] = lag.model_dump()
+        lagged_command = followed(record.command, lag, record.dt, record.run_lengths)
+    except FitError as error:
+        comparison["lag"], lagged_command = str(error), record.command
+    actual, commanded, lagged_force = (
+        measured.forces["actual"][usable],
+        record.command[usable],
+        lagged_command[usable],
+    )
+    force_variance = (actual - actual.mean(0)).square().mean(0)
+    unexplained, unexplained_late = (
+        (actual - force).square().mean(0) / force_variance for force in (commanded, lagged_force)
+    )
+    gain = (lagged_force * actual).sum(0) / lagged_force.square().sum(0).clamp(min=1e-300)
+    statistics = {
+        "rms_commanded": commanded.square().mean(0).sqrt(),
+        "rms_actual": actual.square().mean(0).sqrt(),
+        "explained": 1 - unexplained,
+        "explained_with_lag": 1 - unexplained_late,
+        "gain_with_lag": gain,
+    }
+    for axis, name in enumerate(AXES):
+        comparison[name] = {
+            quantity: float(values[axis]) for quantity, values in statistics.items()
+        }
+    return comparison

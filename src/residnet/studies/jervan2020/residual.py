@@ -1,0 +1,881 @@
+"""Residual forces of a known hull: how both studies of document 002 (Jervan 2020) identify them.
+
+The residual is the force that the hull does not explain: tau - F(nu_dot, nu) (3.19), (3.20). It is
+regressed on basis functions of the motion (chapters 3 and 4); a model runs forward in time by
+(3.22).
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, final
+
+import numpy as np
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from residnet.autopilot.motion import ActuatorLag
+from residnet.baselines.given import BelievedConfig, HullEquations
+from residnet.core.config import Config
+from residnet.core.errors import FitError
+from residnet.core.format import format_number
+from residnet.core.frames import to_body
+from residnet.core.layout import ACCELERATIONS, HEADING, POSE, VELOCITIES
+from residnet.core.names import ACCELERATION_NAMES, VELOCITY_NAMES
+from residnet.evaluation.autopilots import mean_squares_by_axis
+from residnet.physics.force_model import (
+    FERRY_TERMS,
+    MOTION_CHANNELS,
+    ForceCorrection,
+    ForceModel,
+    augment_mass,
+    weighted_column_std,
+)
+from residnet.physics.signals import FORCE_CHANNELS
+from residnet.physics.symmetry import compute_term_parity
+from residnet.physics.terms import TermLibrary, parse_term
+from residnet.regression.estimator import Estimator, validate_data
+from residnet.regression.least_squares import CentredLeastSquares, ElasticNet
+from residnet.regression.shrinkage import PLSR, Ridge, pls_path
+from residnet.regression.surface import ErrorSurface, SurfacePLSR
+from residnet.report.blocks import Bullets, Section, Table, Text
+from residnet.report.figure import (
+    BLUE,
+    GREY,
+    ORANGE,
+    PURPLE,
+    VERMILLION,
+    Case,
+    Figure,
+    GlyphStyle,
+    Panel,
+    bar_outlines,
+    join_with_gaps,
+    tick_labels,
+)
+from residnet.studies.study import StudyResults, find_figures, format_notes
+from residnet.training.lag import fit_lag, followed
+
+AXES = ("surge", "sway", "yaw")
+_FORCE_NAMES = ("surge force", "sway force", "yaw moment")
+_PENALTIES = tuple(10.0**k for k in range(-10, 1))
+"""Ridge penalties tried where none is given, in units of a standardised column's energy."""
+_RANK_TOLERANCE = 1e-7
+"""Regressors with singular values below this share of the largest count as dependent."""
+_MIN_EARTH_FORCE_RMS = 0.02
+"""Least root mean square that turning must leave of a unit force fixed in earth axes."""
+_MIRROR_SIGNS = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+"""Signs of surge, sway and yaw in the mirror."""
+_SURFACE_LIMITS = (6.3, 316.0)
+"""Shares in % that the axis of a surface analysis shows; single models lie orders above."""
+
+
+@dataclass(frozen=True)
+class ForceRegressionData:
+    """The data of a regression.
+
+    Attributes:
+        terms: names of the basis functions.
+        x: basis functions [N, J], float64.
+        y: residual forces [N, 3] in N, N, N m.
+        scale: what the columns are divided by [J].
+        fold: of each sample [N], from 0; samples that belong together (a segment, a run) share a
+            fold.
+        test: samples of the document's own choice of a model, which judges on them; None where a
+            model must not see them.
+    """
+
+    terms: tuple[str, ...]
+    x: Tensor
+    y: Tensor
+    scale: Tensor
+    fold: Tensor
+    test: tuple[Tensor, Tensor] | None = None
+
+    def __post_init__(self) -> None:
+        validate_data(self.x, self.y, self.terms, _FORCE_NAMES)
+        if len(self.x) <= len(self.terms):
+            raise FitError(
+                f"{len(self.x)} samples do not determine {len(self.terms)} basis functions; give"
+                " more data or fewer terms"
+            )
+
+    @property
+    def standardised(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """E [N, J], F [N, 3], mean of x, mean of y, std of y (3.3), (3.4), (4.8)."""
+        mean_x, mean_y, std_y = self.x.mean(0), self.y.mean(0), self.y.std(0)
+        return (self.x - mean_x) / self.scale, (self.y - mean_y) / std_y, mean_x, mean_y, std_y
+
+
+@dataclass(frozen=True)
+class RegressionFit:
+    """Coefficients of y = intercept + x coefficients.
+
+    Attributes:
+        coefficients: Theta_post [J, 3], zero for basis functions that were removed.
+        intercept: of each axis [3].
+        scaled_coefficients: Theta_pre [J, 3], coefficients of the scaled variables (3.11).
+        notes: what was chosen.
+        surface: errors of all models that the choice was made from, where a surface analysis made
+            it.
+        errors_by_order: mean square errors [A, 3] over the order of a PLSR in N^2, N^2, (N m)^2, by the
+            samples that they are of; NaN where there are none.
+    """
+
+    coefficients: Tensor
+    intercept: Tensor
+    scaled_coefficients: Tensor
+    notes: dict[str, Any] = field(default_factory=dict)
+    surface: ErrorSurface | None = None
+    errors_by_order: dict[str, Tensor] = field(default_factory=dict)
+
+    def predict(self, x: Tensor) -> Tensor:
+        """Return the outputs [N, 3] at basis functions [N, J]."""
+        return x @ self.coefficients + self.intercept
+
+
+_ESTIMATORS: Mapping[str, Estimator] = {
+    "ols": CentredLeastSquares(),
+    "ridge": Ridge(_PENALTIES, folds=None, is_scaled=False, is_shared=True),
+    "lasso": ElasticNet(),
+    "elastic_net": ElasticNet(0.5),
+}
+"""Estimators without settings, by kind; what they choose they choose over left-out folds."""
+
+
+@final
+class RegressionConfig(Config):
+    """A way to find the coefficients of a residual force.
+
+    Attributes:
+        kind: `plsr`, of the three axes together; `surface`, PLSR of each axis by itself, chosen by
+            surface analysis (document 002 section 4.5.1); `ols`, ordinary least squares; `ridge`,
+            `lasso` or `elastic_net`, with the penalty of the least error over left-out folds.
+        order: number of latent variables of `plsr`; null takes the least error over left-out folds.
+        choose: how `surface` chooses. `test_errors`, the document's own: the least error on the test half,
+            which then also judges it; `simplest`: cross-validation over the folds of the first half
+            and the one-standard-error rule; `lowest_error`: cross-validation and its bare minimum.
+    """
+
+    kind: Literal["plsr", "surface", "ols", "ridge", "lasso", "elastic_net"]
+    order: int | None = Field(default=None, ge=1)
+    choose: Literal["test", "simplest", "least"] = "simplest"
+
+    @model_validator(mode="after")
+    def _check_options(self) -> RegressionConfig:
+        for key, required_kind in (("order", "plsr"), ("choose", "surface")):
+            if (
+                self.kind != required_kind
+                and getattr(self, key) != type(self).model_fields[key].default
+            ):
+                raise ValueError(
+                    f"{key}: belongs to kind {required_kind}; leave it out of {self.kind}"
+                )
+        return self
+
+    @property
+    def searches_order(self) -> bool:
+        """Whether it searches its order."""
+        return self.kind == "plsr" and self.order is None
+
+    def fit(self, data: ForceRegressionData) -> RegressionFit:
+        """Return the coefficients that fit the regression's samples.
+
+        A PLSR tells its errors over all orders, too (Figures 4.4, 4.22, 4.42, 5.7).
+
+        Raises:
+            FitError: where the data do not determine them.
+        """
+        if self.kind == "surface":
+            return _fit_by_surface_analysis(data, self.choose)
+        needs_folds = self.kind != "ols" and self.order is None
+        estimator = _ESTIMATORS.get(self.kind) or PLSR(
+            self.order, max_order=None, folds=None, is_scaled=False
+        )
+        e, f, mean_x, mean_y, std_y = data.standardised
+        groups = data.fold if needs_folds else None
+        first_fit = estimator.fit(e, f, groups, names=data.terms, outputs=_FORCE_NAMES)[0]
+        # Theta_post = diag(scale)^-1 Theta_pre diag(std y) (3.12), correction J15
+        coefficients = first_fit.coefficients / data.scale[:, None] * std_y
+        notes = first_fit.hyperparameters or first_fit.notes
+        if self.kind == "ridge":
+            notes = {"penalty": notes["penalty"][0]}
+        if notes.get("order") == 0:
+            raise FitError("PLSR: nothing in the residual varies with the basis functions")
+        orders = _errors_by_order(data) if self.kind == "plsr" else {}
+        return RegressionFit(
+            coefficients,
+            mean_y - mean_x @ coefficients,
+            first_fit.coefficients,
+            notes,
+            errors_by_order=orders,
+        )
+
+
+def _errors_by_order(data: ForceRegressionData) -> dict[str, Tensor]:
+    """Return the mean square errors [A, 3] of a PLSR over its order, on folds left out and test."""
+    e, f, mean_x, mean_y, std_y = data.standardised
+    folds, nan_errors = data.fold.unique(), torch.full_like(f, torch.nan).repeat(e.shape[1], 1, 1)
+    left_out_errors, test_errors = nan_errors.clone(), nan_errors[:, :1]
+    for fold in folds if len(folds) > 1 else ():
+        is_left_out = data.fold == fold
+        left_out_errors[:, is_left_out] = _error_by_order(
+            e[~is_left_out], f[~is_left_out], e[is_left_out], f[is_left_out]
+        )
+    if data.test is not None and len(data.test[0]):
+        x, y = data.test
+        test_errors = _error_by_order(e, f, (x - mean_x) / data.scale, (y - mean_y) / std_y)
+    errors = {"left-out segments": left_out_errors, "test half": test_errors}
+    return {
+        sample_kind: error.square().mean(1) * std_y.square()
+        for sample_kind, error in errors.items()
+    }
+
+
+def _error_by_order(e: Tensor, f: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Return the errors [J, N, 3] at x of a PLSR of f on e, for each order."""
+    mean_e, mean_f = e.mean(0), f.mean(0)
+    centred, orders = e - mean_e, e.shape[1]
+    path = pls_path(centred.T @ centred, centred.T @ (f - mean_f), orders)
+    if len(path) < orders:
+        # what is left explains nothing: higher orders change no more
+        last = path[-1:] if len(path) else torch.zeros(1, orders, f.shape[1], dtype=e.dtype)
+        path = torch.cat((path, last.expand(orders - len(path), -1, -1)))
+    return y - mean_f - (x - mean_e) @ path
+
+
+def _fit_by_surface_analysis(data: ForceRegressionData, rule: str) -> RegressionFit:
+    x, y, groups = data.x, data.y, data.fold
+    estimator = SurfacePLSR("simplest" if rule == "simplest" else "least")
+    if rule == "test":
+        if data.test is None:
+            raise FitError("surface: choose 'test' needs the test half")
+        x, y = torch.cat((x, data.test[0])), torch.cat((y, data.test[1]))
+        groups = (torch.arange(len(x)) >= len(data.x)).long()
+        estimator = SurfacePLSR("least", test_groups=[1])
+    surface = estimator.error_surface(x, y, groups)
+    best_fit = estimator.solution_at_selection(surface, x, y, groups)
+    scaled_coefficients = best_fit.coefficients * data.x.std(0)[:, None] / data.y.std(0)
+    return RegressionFit(
+        best_fit.coefficients,
+        best_fit.intercept,
+        scaled_coefficients,
+        best_fit.hyperparameters,
+        surface,
+    )
+
+
+class ResidualModelConfig(Config):
+    """A regression of a force residual on basis functions of nu_dot and nu.
+
+    Attributes:
+        fit: estimator of the coefficients, with its settings.
+        terms: basis functions, written as products of u_dot, v_dot, r_dot, u, v, r and their
+            absolute values; the 30 of (4.12) unless given.
+        lag: identify the thrusters' lag together with the coefficients, and explain the force that
+            follows the command through it. Null where an estimator searches its order: with lag,
+            without, and no residual at all are then tried too, over the same left-out folds; for
+            other estimators null is without.
+        mirror: what a motion to port shows is taken to hold to starboard too, as for a hull that is
+            alike on both sides. Null tries both ways where `lag` does.
+        earth: also identify a force that is constant in earth axes, such as that of wind.
+    """
+
+    fit: RegressionConfig
+    terms: tuple[str, ...] = FERRY_TERMS
+    lag: bool | None = None
+    mirror: bool | None = None
+    earth: bool = False
+
+    @property
+    def searches_settings(self) -> bool:
+        """Whether lag, mirror and no residual at all are candidates beside the orders."""
+        return self.lag is None and self.fit.searches_order
+
+    def model_post_init(self, context: Any) -> None:
+        """Parse the terms, so that a wrong one is found when the config is read."""
+        for term in self.terms:
+            parse_term(term, MOTION_CHANNELS)
+
+
+@dataclass(frozen=True)
+class ForceRecord:
+    """Motion and commanded force of one or several runs, on a uniform time grid of N samples.
+
+    Attributes:
+        t: time [N] in s.
+        pose: measured x, y, psi [N, 3] in m, m, rad.
+        nu: measured u, v, r [N, 3] in m/s, m/s, rad/s.
+        nu_dot: measured accelerations [N, 3] in m/s^2, m/s^2, rad/s^2.
+        command: commanded force at the samples [N, 3] in N, N, N m.
+        averaged_command: commanded force averaged over the controller's steps around a sample [N, 3].
+        fold: number of the segment that a sample belongs to [N].
+        is_training: samples to identify from [N] bool; the others test the model.
+        noise: standard deviations of the measured pose, nu and nu_dot, nine numbers.
+        run_lengths: numbers of samples of the runs that stand one after another; empty for one run.
+    """
+
+    t: Tensor
+    pose: Tensor
+    nu: Tensor
+    nu_dot: Tensor
+    command: Tensor
+    averaged_command: Tensor
+    fold: Tensor
+    is_training: Tensor
+    noise: tuple[float, ...]
+    run_lengths: tuple[int, ...] = ()
+
+    @property
+    def dt(self) -> float:
+        """Sampling interval in s."""
+        return float(self.t[1] - self.t[0])
+
+    def motion_ranges(self, *, mirror: bool) -> list[tuple[float, float]]:
+        """Return the least and most of nu_dot and nu of the training samples, six.
+
+        With `mirror` the mirror images of the samples count too.
+        """
+        motion = torch.cat((self.nu_dot, self.nu), dim=-1)[self.is_training]
+        if mirror:
+            motion = torch.cat((motion, motion * torch.cat((_MIRROR_SIGNS, _MIRROR_SIGNS))))
+        return list(zip(motion.amin(0).tolist(), motion.amax(0).tolist(), strict=True))
+
+    def smooth(self) -> ForceRecord:
+        """Return the record with the most likely motion under the known noise of the sensors."""
+        from residnet.preprocessing.motion import smooth_measured_motion
+
+        measured = torch.cat((self.pose, self.nu, self.nu_dot), dim=-1)
+        motion = torch.from_numpy(smooth_measured_motion(measured.numpy(), self.noise, self.dt))
+        pose, nu, nu_dot = (motion[:, columns] for columns in (POSE, VELOCITIES, ACCELERATIONS))
+        return replace(self, pose=pose, nu=nu, nu_dot=nu_dot)
+
+
+class ResidualForceModel(NamedTuple):
+    """A fitted model of a residual force.
+
+    Attributes:
+        force: F = F_base + correction.
+        lag: of the thrusters; None where it was not fitted.
+        fit: coefficients, and in its notes what was chosen.
+    """
+
+    force: ForceModel
+    lag: ActuatorLag | None
+    fit: RegressionFit
+
+    def residual_along(self, record: ForceRecord) -> Tensor:
+        """Return the residual [N, 3] that the model leaves along a record, in N, N, N m.
+
+        The model is compared with the command, or through its lag with the force that follows it.
+        """
+        force = record.command
+        if self.lag is not None:
+            force = followed(record.averaged_command, self.lag, record.dt, record.run_lengths)
+        return self.force.force_residual(force, record.nu_dot, record.nu, record.pose[:, HEADING])
+
+    def test_mse(self, record: ForceRecord) -> list[float]:
+        """Return the mean square of what remains of the measurements as logged, by axis.
+
+        It is over the test samples, in N^2, N^2, (N m)^2.
+        """
+        return mean_squares_by_axis(self.residual_along(record)[~record.is_training])
+
+
+def fit_model(
+    config: ResidualModelConfig,
+    record: ForceRecord,
+    base: ForceModel,
+    lag: ActuatorLag | None = None,
+) -> ResidualForceModel:
+    """Fit one model of the residual force of `base` on the training samples of a record.
+
+    Args:
+        base: the known model, F_base(nu_dot, nu).
+        lag: where the config asks for one and it is known; None to find it.
+
+    Raises:
+        FitError: where the data do not determine the model.
+    """
+    if config.searches_settings:
+        return _search_settings(config, record, base)
+    train, psi = record.is_training, record.pose[:, HEADING]
+    x = TermLibrary(config.terms, MOTION_CHANNELS)(torch.cat((record.nu_dot, record.nu), dim=-1))
+    base_force = base.thruster_force(record.nu_dot, record.nu, psi)
+    # unit forces to north and to east in body axes, without a moment
+    unit_vectors = torch.eye(2, dtype=psi.dtype)
+    earth_axes = torch.stack(
+        [
+            torch.stack((*to_body(north, east, psi), torch.zeros_like(psi)), dim=-1)
+            for north, east in unit_vectors
+        ],
+        dim=-1,
+    )
+    force = record.command
+    notes: dict[str, Any] = {}
+    if config.lag:
+        regressors = torch.cat((x, earth_axes[:, 0]), dim=-1) if config.earth else x
+        if lag is None:
+            lag = fit_lag(
+                record.averaged_command,
+                base_force,
+                regressors,
+                record.dt,
+                train,
+                record.run_lengths,
+            )
+        force = followed(record.averaged_command, lag, record.dt, record.run_lengths)
+        notes["lag"] = lag.model_dump()
+    y, earth_force = force - base_force, None
+    if config.earth:
+        earth_force = estimate_earth_force(x[train], y[train], -earth_axes[train])
+        y = y + torch.einsum("nad,d->na", earth_axes, earth_force)
+        notes["earth"] = dict(zip(("north", "east"), earth_force.tolist(), strict=True))
+    train_terms, train_target, fold = x[train], y[train], record.fold[train]
+    if config.mirror:
+        signs = mirror_signs(config.terms)
+        if signs is None:
+            raise FitError("mirror: not all basis functions are known to mirror; leave it out")
+        train_terms, train_target = (
+            torch.cat((values, values * signs_applied))
+            for values, signs_applied in ((train_terms, signs), (train_target, _MIRROR_SIGNS))
+        )
+        fold, notes["mirror"] = fold.repeat(2), True
+    data = ForceRegressionData(
+        config.terms,
+        train_terms,
+        train_target,
+        weighted_column_std(config.terms, torch.nan_to_num(train_terms)),
+        torch.unique(fold, return_inverse=True)[1],
+        (x[~train], y[~train]),
+    )
+    fit = config.fit.fit(data)
+    correction = ForceCorrection(config.terms, fit.coefficients, fit.intercept)
+    model = base.with_correction(correction, earth_force)
+    return ResidualForceModel(model, lag, replace(fit, notes=fit.notes | notes))
+
+
+def _search_settings(
+    config: ResidualModelConfig, record: ForceRecord, base: ForceModel
+) -> ResidualForceModel:
+    """Return the model of least error over left-out folds.
+
+    Tried are lag and mirror, each with and without, and no residual. Errors are in units of what
+    the base leaves, so that no residual has an error of one.
+    """
+    no_residual_model = ResidualForceModel(
+        base, None, RegressionFit(torch.zeros(0), torch.zeros(0), torch.zeros(0))
+    )
+    base_mse = torch.tensor(
+        mean_squares_by_axis(no_residual_model.residual_along(record)[record.is_training])
+    )
+    candidates, errors = [], []
+    known_lag: ActuatorLag | None = None
+    mirrors = [False, True] if config.mirror is None else [config.mirror]
+    if mirror_signs(config.terms) is None and config.mirror is None:
+        mirrors = [False]
+    for lag, mirror in itertools.product((False, True), mirrors):
+        try:
+            candidate_config = config.model_copy(update={"lag": lag, "mirror": mirror})
+            candidate = fit_model(candidate_config, record, base, known_lag if lag else None)
+        except FitError as error:
+            errors.append(error)
+            continue
+        known_lag = candidate.lag
+        left_out_error = (
+            candidate.fit.errors_by_order["left-out segments"][candidate.fit.notes["order"] - 1]
+            / base_mse
+        )
+        candidates.append((float(left_out_error.nan_to_num(torch.inf).mean()), candidate))
+    if not candidates:
+        raise errors[0]
+    lowest_error, best_model = min(candidates, key=lambda pair: pair[0])
+    if lowest_error < 1.0:
+        notes = {**best_model.fit.notes, "left_out": lowest_error}
+        return best_model._replace(fit=replace(best_model.fit, notes=notes))
+    zero = torch.zeros_like(best_model.fit.coefficients)
+    fit = RegressionFit(zero, zero[0], zero, {"order": 0, "left_out": 1.0})
+    return ResidualForceModel(
+        base.with_correction(ForceCorrection(config.terms, zero, zero[0])), None, fit
+    )
+
+
+def refit_with_settings(
+    config: ResidualModelConfig, model: ResidualForceModel, record: ForceRecord, base: ForceModel
+) -> ResidualForceModel:
+    """Return a searched model fitted to other samples, with the settings and the lag that it has.
+
+    Raises:
+        FitError: where the samples do not determine it.
+    """
+    notes = model.fit.notes
+    settings = {
+        "fit": config.fit.model_copy(update={"order": notes["order"]}),
+        "lag": model.lag is not None,
+        "mirror": bool(notes.get("mirror")),
+    }
+    return fit_model(config.model_copy(update=settings), record, base, model.lag)
+
+
+def mirror_signs(terms: Sequence[str]) -> Tensor | None:
+    """Return the sign [J] that each basis function changes by in the mirror; None if unknown."""
+    signs = [
+        parity
+        for term in terms
+        if (parity := compute_term_parity(term, MOTION_CHANNELS)) is not None
+    ]
+    return torch.tensor(signs, dtype=torch.float64) if len(signs) == len(terms) else None
+
+
+def estimate_earth_force(x: Tensor, y: Tensor, unit_forces: Tensor) -> Tensor:
+    """Return the force (north, east) [2] in N that is constant in earth axes.
+
+    The basis functions, whose coefficients differ from axis to axis, are projected out first.
+
+    Args:
+        x: basis functions [N, J].
+        y: residual [N, 3] in N, N, N m.
+        unit_forces: what a unit force to north and to east adds to the residual [N, 3, 2].
+
+    Raises:
+        FitError: where the vessel hardly turned, so that a constant in body axes explains as much.
+    """
+    scaled = (x - x.mean(0)) / x.std(0).clamp(min=1e-300)
+    centred = torch.cat((torch.ones_like(x[:, :1]), scaled), dim=-1)
+    left_vectors, singular, _ = torch.linalg.svd(centred, full_matrices=False)
+    left_vectors = left_vectors[:, singular > _RANK_TOLERANCE * singular[0]]
+
+    def project_out(values: Tensor) -> Tensor:
+        projected: Tensor = values - left_vectors @ (left_vectors.T @ values)
+        return projected
+
+    weight = project_out(y).std(0).clamp(min=1e-9)
+    # a moment is none of its doing
+    design = torch.cat([project_out(unit_forces[:, a]) / weight[a] for a in range(2)])
+    target = torch.cat([project_out(y[:, a]) / weight[a] for a in range(2)])
+    sensitivity = float(torch.linalg.svdvals(design * weight[:2].mean())[-1]) / len(y) ** 0.5
+    if sensitivity < _MIN_EARTH_FORCE_RMS:
+        raise FitError(
+            "a force constant in earth axes does not show: the vessel kept its heading; give a run"
+            " that turns, or leave earth out"
+        )
+    solution: Tensor = torch.linalg.lstsq(design, target[:, None]).solution
+    return solution[:, 0]
+
+
+def _coefficients_by_term(rows: Sequence[Mapping[str, float]]) -> dict[str, Tensor]:
+    """Return the coefficients [3] of each term of three rows."""
+    return {
+        term: torch.tensor([row.get(term, 0.0) for row in rows], dtype=torch.float64)
+        for term in dict.fromkeys(term for row in rows for term in row)
+    }
+
+
+def derive_forward_equations(believed: str, model: ForceModel, label: str) -> HullEquations:
+    """Return the accelerations of a force-space model as sums of terms.
+
+    They are nu_dot = (M + A)^-1 (tau - C nu - D nu - b), in the form that the baseline `believed`
+    takes.
+
+    Args:
+        believed: vessel of the known hull, by name or file.
+        model: the known hull and its residual eps = A nu_dot + b(nu).
+        label: name of the model in error messages.
+
+    Raises:
+        ConfigError: where a basis function is not affine in nu_dot.
+        FitError: where the augmented mass cannot be inverted safely.
+    """
+    augmented_mass = model.hull.mass
+    zero_force = torch.zeros(3, dtype=torch.float64)
+    residual_terms = {"1": zero_force}
+    for correction in model.corrections:
+        assert isinstance(correction, ForceCorrection)
+        terms, coefficients = correction.library.terms, correction.coefficients
+        augmented_mass, remaining_terms = augment_mass(augmented_mass, terms, coefficients, label)
+        correction_terms = {"1": correction.intercept} | {
+            terms[j]: coefficients[j] for j in remaining_terms
+        }
+        for term, force in correction_terms.items():
+            residual_terms[term] = residual_terms.get(term, zero_force) + force
+    inverse = torch.linalg.inv(augmented_mass)
+    believed_terms = _coefficients_by_term(
+        BelievedConfig(vessel=believed).hull_equations().axis_coefficients()
+    )
+    acceleration_terms = {
+        term: inverse @ model.hull.mass @ column for term, column in believed_terms.items()
+    }
+    for term, force in residual_terms.items():
+        acceleration_terms[term] = acceleration_terms.get(term, zero_force) - inverse @ force
+    u, v, r = (
+        {
+            term: float(value[axis])
+            for term, value in acceleration_terms.items()
+            if float(value[axis]) != 0.0
+        }
+        for axis in range(3)
+    )
+    return HullEquations(u=u, v=v, r=r)
+
+
+def missing_coefficients(plant_name: str, believed: str) -> dict[str, list[float]]:
+    """Return the true coefficients of a residual by basis function: surge, sway, yaw.
+
+    They are those of the true hull less those of the believed one, where document 002 misprints the
+    cross terms (correction J19).
+    """
+
+    def factors(term: str) -> tuple[Any, ...]:
+        return tuple(sorted(parse_term(term, MOTION_CHANNELS)))
+
+    names = {factors(term): term for term in FERRY_TERMS}
+
+    def force_coefficients(vessel: str) -> dict[str, Tensor]:
+        """Return the coefficients [3] of F(nu_dot, nu) by basis function of document 002."""
+        columns = _coefficients_by_term(
+            BelievedConfig(vessel=vessel).hull_equations().axis_coefficients()
+        )
+        mass = torch.linalg.inv(torch.stack([columns.pop(name) for name in FORCE_CHANNELS], dim=1))
+        coefficients = {name: mass[:, axis] for axis, name in enumerate(ACCELERATION_NAMES)}
+        return coefficients | {
+            names.get(factors(term), term): -mass @ column for term, column in columns.items()
+        }
+
+    plant_coefficients, believed_coefficients = (
+        force_coefficients(plant_name),
+        force_coefficients(believed),
+    )
+    zero, missing = torch.zeros(3, dtype=torch.float64), {}
+    for key in dict.fromkeys((*believed_coefficients, *plant_coefficients)):
+        plant_value = plant_coefficients.get(key, zero)
+        difference = plant_value - believed_coefficients.get(key, zero)
+        # equal coefficients differ by rounding alone
+        is_different = difference.abs() > 1e-9 * (1 + plant_value.abs())
+        if bool(is_different.any()):
+            missing[key] = torch.where(is_different, difference, zero).tolist()
+    return missing
+
+
+def to_baseline_yaml(equations: HullEquations, label: str) -> str:
+    """Return the model as YAML lines for the `baseline` or `baselines` of a fit."""
+    lines = [
+        f"# {label}: accelerations from velocities and forces; needs the channels"
+        f" {', '.join((*VELOCITY_NAMES, *FORCE_CHANNELS))}"
+    ]
+    lines += ["kind: believed", "vessel:"]
+    for axis, row in zip(VELOCITY_NAMES, equations.axis_coefficients(), strict=True):
+        lines.append(f"  {axis}: {json.dumps(row)}")
+    return "\n".join(lines) + "\n"
+
+
+def fit_to_json(terms: Sequence[str], fit: RegressionFit) -> dict[str, Any]:
+    """Return a fitted model as it stands in the results: terms, coefficients and weights."""
+    return {
+        "terms": list(terms),
+        "coefficients": fit.coefficients.tolist(),
+        "intercept": fit.intercept.tolist(),
+        "weights": fit.scaled_coefficients.abs().tolist(),
+    }
+
+
+def model_sections(
+    title: str,
+    models: Mapping[str, StudyResults],
+    run: Path,
+    notes_key: str,
+    comparisons: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]],
+) -> list[Section]:
+    """Return what both studies tell of fitted models: refusals, coefficients, and their figures.
+
+    Args:
+        models: entries of the results (`fit_to_json`) by name.
+        run: folder that holds `model_figures`.
+        comparisons: coefficients [3] by basis function to stand beside those of a model, by its name and
+            by what they are, such as `plant_name` and `published`.
+    """
+    refusal_reasons = [model["not_forward"] for model in models.values() if model["not_forward"]]
+    refusal_section = Section("Models that cannot run forward in time", [Bullets(refusal_reasons)])
+    explanation = Text(
+        "The force of a model is that of the believed hull plus the sum of coefficient times basis"
+        " function, in SI units. A weight is the magnitude of the coefficient of scaled variables:"
+        " it says how much a basis function matters."
+    )
+    model_blocks = []
+    for name, model in models.items():
+        terms = model["terms"]
+        nonzero_coefficients = {
+            t: row for t, row in zip(terms, model["coefficients"], strict=True) if any(row)
+        }
+        comparison_values = {
+            comparison: values for comparison, values in comparisons.get(name, {}).items() if values
+        }
+        forces = {
+            "coefficient": {"1": model["intercept"], **nonzero_coefficients},
+            **comparison_values,
+        }
+        weights = dict(zip(terms, model["weights"], strict=True))
+        groups = [(comparison, 3) for comparison in ("coefficient", "weight", *comparison_values)]
+        table = Table(["basis function", *AXES * len(groups)], groups=groups)
+        for term in dict.fromkeys(
+            term for values_by_term in forces.values() for term in values_by_term
+        ):
+            model_cells, *comparison_cells = (
+                [format_number(value, 4) for value in values_by_term.get(term, (0.0, 0.0, 0.0))]
+                for values_by_term in forces.values()
+            )
+            weight = (
+                [format_number(value, 3) for value in weights[term]]
+                if term in weights
+                else [""] * 3
+            )
+            table.add_row(
+                term,
+                [*model_cells, *weight, *(text for texts in comparison_cells for text in texts)],
+            )
+        choice_text = format_notes(model[notes_key])
+        choice_block = Text(f"Chosen by the estimator: {choice_text}." if choice_text else "")
+        model_blocks.append(Section(name, [choice_block, table], is_folded=True))
+    figures = find_figures(run, "orders_", "surface_", "weights_")
+    return [
+        *([refusal_section] if refusal_reasons else []),
+        Section(title, [explanation, *model_blocks]),
+        Section("Orders, weights and surfaces", figures, True),
+    ]
+
+
+def model_figures(
+    name: str, config: ResidualModelConfig, fit: RegressionFit, unmodelled: Sequence[float]
+) -> list[Figure]:
+    """Return the weights of a model, and the errors that its order or surface was chosen from.
+
+    Figures 4.6, 4.20, 4.22 and 4.25 of the document.
+
+    Args:
+        unmodelled: mean square of the believed model's residual by axis.
+    """
+    positions, weights, names = (
+        np.arange(len(config.terms)),
+        fit.scaled_coefficients.abs().numpy(),
+        tick_labels(config.terms),
+    )
+    figures = [
+        Figure(
+            f"weights_{name}",
+            f"Weights of the basis functions in {name}",
+            "Magnitude of the coefficients of scaled basis functions. It shows how much each one"
+            " weighs in the model.",
+            {"weights": GlyphStyle("", BLUE, kind="fill")},
+            [Panel(f"{axis}, scaled [-]", height=165, group="w", x_names=names) for axis in AXES],
+            [
+                Case(
+                    "",
+                    [{"weights": bar_outlines(positions, weights[:, axis])} for axis in range(3)],
+                )
+            ],
+        )
+    ]
+    if fit.errors_by_order:
+        figures.append(
+            _order_figure(name, fit.errors_by_order, unmodelled, int(fit.notes["order"]))
+        )
+    if fit.surface is not None:
+        rule_choices = {
+            "chosen": list(zip(fit.notes["order"], fit.notes["terms"], strict=True)),
+            "least": [fit.surface.minimum_error_model(axis) for axis in range(3)],
+        }
+        figures.append(_surface_figure(name, fit.surface.error, unmodelled, rule_choices))
+    return figures
+
+
+def _order_figure(
+    name: str,
+    errors_by_samples: Mapping[str, Tensor],
+    unmodelled: Sequence[float],
+    chosen_order: int,
+) -> Figure:
+    """Return the error that is left over the order of a PLSR.
+
+    Args:
+        errors_by_samples: mean square error by order and axis [A, 3], by the samples that it is of.
+        unmodelled: mean square of the residual of each axis.
+        chosen_order: order of the model.
+    """
+    colors = dict(zip(errors_by_samples, (BLUE, VERMILLION), strict=True))
+    styles = {label: GlyphStyle(label, color) for label, color in colors.items()}
+    styles["chosen"] = GlyphStyle("this model", GREY, "dashed", 1.0, kind="upright")
+    panels_shown = []
+    for axis in range(3):
+        panel = {"chosen": (np.array([float(chosen_order)]), np.zeros(1))}
+        for label, error in errors_by_samples.items():
+            relative_error = error[:, axis].numpy() / unmodelled[axis]
+            if np.isfinite(relative_error).any():
+                panel[label] = (np.arange(len(relative_error)) + 1.0, relative_error)
+        panels_shown.append(panel)
+    return Figure(
+        f"orders_{name}",
+        "Error over the order of the PLSR",
+        "Share of the unmodelled residual's mean square that is left, by model order: on"
+        " segments that were left out of the fit one by one, and on the test half.",
+        styles,
+        [
+            Panel(f"{axis}, share of the MSE left", "model order", height=285, y_log=True)
+            for axis in AXES
+        ],
+        [Case("", panels_shown)],
+        columns=3,
+    )
+
+
+def _surface_figure(
+    name: str,
+    error: Tensor,
+    unmodelled: Sequence[float],
+    choices: Mapping[str, Sequence[tuple[int, int]]],
+) -> Figure:
+    marks = (("x", VERMILLION), ("o", PURPLE), ("s", ORANGE))
+    styles = {
+        "orders": GlyphStyle("each model order", GREY, width=0.8),
+        "order": GlyphStyle("order of this model", BLUE, width=1.6),
+    }
+    for label, (marker, color) in zip(choices, marks, strict=False):
+        styles[label] = GlyphStyle(
+            label, color, kind="points", marker=marker, size=7, is_hollow=True, z_order=5
+        )
+    panel_traces = []
+    for axis in range(3):
+        # [A, J] by model order, from 1 on, and number of basis functions
+        relative_error = 100.0 * error[axis].numpy() / unmodelled[axis]
+        counts = np.arange(relative_error.shape[1], dtype=float)
+        best_order, _ = choices["chosen"][axis]
+        panel = {
+            "orders": join_with_gaps((counts, row) for row in relative_error),
+            "order": (counts, relative_error[best_order - 1]),
+        }
+        for label, picks_by_axis in choices.items():
+            order, count = picks_by_axis[axis]
+            panel[label] = (np.array([float(count)]), relative_error[order - 1, [count]])
+        panel_traces.append(panel)
+    return Figure(
+        f"surface_{name}",
+        "Surface analysis",
+        "Share of the unmodelled residual's mean square that is left, by number of basis functions,"
+        " a line for each model order. Marks show what each rule chose.",
+        styles,
+        [
+            Panel(
+                f"{axis}, share of the MSE left [%]",
+                "basis functions",
+                height=285,
+                y_log=True,
+                y_limits=_SURFACE_LIMITS,
+            )
+            for axis in AXES
+        ],
+        [Case("", panel_traces)],
+        columns=3,
+    )

@@ -1,0 +1,234 @@
+"""The verdict in words, from made contents of a run's files."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from residnet.evaluation.verdict import (
+    VerdictEvidence,
+    describe_divergence,
+    list_model_objections,
+    order_protocols,
+    rate_model,
+    write_verdict,
+)
+
+
+def row(error: float, diverged: int = 0) -> dict[str, Any]:
+    return {"nrmse": {"mean": error}, "diverged": diverged, "windows": 12}
+
+
+def difference(value: float, half: float | None) -> dict[str, Any]:
+    interval = None if half is None else [value - half, value + half]
+    excludes = interval is not None and (interval[0] > 0 or interval[1] < 0)
+    return {"nrmse_mean": value, "ci95": interval, "excludes_zero": excludes}
+
+
+def errors(position: float, degrees: float, half: float | None = 0.1) -> dict[str, Any]:
+    """Errors of one model; `half` is the half width of the intervals as a share."""
+    heading = math.radians(degrees)
+    ends = {"position": position, "heading": heading}
+    return ends | {
+        "intervals": {
+            of: None if half is None else [value * (1.0 - half), value * (1.0 + half)]
+            for of, value in ends.items()
+        }
+    }
+
+
+def horizon(
+    seconds: float, mlp: dict[str, Any], windows: int = 12, best: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """One entry of limits.json: 2 m/s are sailed, zero is far off."""
+    models = {"mlp": mlp, "zero": errors(seconds, 40.0), "baseline": best or errors(seconds, 30.0)}
+    about = {"seconds": seconds, "windows": windows, "logs": 4, "slowest": 1.5, "fastest": 2.5}
+    return {**about, "sailed": 2.0 * seconds, "floor": errors(0.1, 0.2), "models": models}
+
+
+def under(content: dict[str, Any]) -> dict[str, Any]:
+    """Contents of limits.json for the protocol that decides."""
+    return {"T30": content}
+
+
+def evidence(error: float = 0.2, **change: Any) -> VerdictEvidence:
+    given: dict[str, Any] = {
+        "selected": "mlp",
+        "split": "test",
+        "rows": {"zero": row(0.5), "baseline": row(0.25), "mlp": row(error)},
+        "baseline": "baseline",
+        "selection": {
+            "reason": "mlp has the least validation error.",
+            "models": [{"model": "mlp", "faults": []}],
+        },
+        "limits": under(
+            {
+                "compared": {
+                    "mlp": {"zero": difference(-0.3, 0.1), "baseline": difference(-0.05, 0.1)}
+                }
+            }
+        ),
+        "protocol": "T30",
+    }
+    return VerdictEvidence(**{**given, **change})
+
+
+def test_the_first_sentence_compares_with_zero_and_the_baseline() -> None:
+    first = write_verdict(evidence())[0]
+    assert first.startswith("On test data model mlp is 60 % better than zero (paired 95 % interval")
+    for part in ("-0.4 to -0.2)", "20 % better than the baseline", "zero: the data cannot tell"):
+        assert part in first
+    worse = write_verdict(evidence(error=0.608, rows={"zero": row(0.506), "mlp": row(0.608)}))[0]
+    assert worse.startswith("WORSE THAN ZERO: on test data the selected model mlp has an NRMSE of")
+    for part in ("0.608", "0.506"):
+        assert part in worse
+    assert write_verdict(evidence(selected="zero"))[0].startswith("NOTHING BEATS ZERO")
+
+
+def test_what_is_worse_than_zero_or_the_baseline_is_objected_to() -> None:
+    assert list_model_objections(evidence(0.2)) == []
+    assert list_model_objections(evidence(0.3)) == [
+        "on test data its NRMSE is 0.300, that of baseline 0.250"
+    ]
+    assert len(list_model_objections(evidence(0.6))) == 2
+    assert list_model_objections(evidence(selected="baseline")) == []
+    assert list_model_objections(evidence(selected="unknown")) == []
+
+
+def test_unsound_models_and_divergences_are_named() -> None:
+    fault = {"models": [{"model": "mlp", "faults": ["its damping has the wrong sign"]}]}
+    rows = {"zero": row(0.5), "mlp": row(0.2, diverged=7)}
+    said = write_verdict(evidence(selection=fault, rows=rows))
+    assert "7/12 diverged, which count with the error of zero" in said[0]
+    assert said[1] == (
+        "It is UNSOUND: its damping has the wrong sign; 7 of its 12 test windows diverged."
+    )
+    assert write_verdict(evidence())[1].startswith("No window diverged")
+    assert (describe_divergence(row(0.2)), describe_divergence(row(0.2, 3))) == (
+        "",
+        "3/12 diverged",
+    )
+
+
+@pytest.mark.parametrize(
+    ("entries", "expected", "said"),
+    [
+        (
+            [horizon(10, errors(0.5, 2.0)), horizon(30, errors(3.0, 5.0))],
+            "good",
+            "Up to 30 s ahead, where",
+        ),
+        (
+            [horizon(10, errors(0.5, 2.0)), horizon(30, errors(9.0, 5.0))],
+            "good",
+            "Up to 10 s ahead",
+        ),
+        # a tenth of the way is no use where the bow points elsewhere
+        ([horizon(30, errors(3.0, 67.0))], "limited", "30 s ahead mlp is off by 3.0 m"),
+        # the upper end of the interval counts, and where there is none nobody can say
+        ([horizon(30, errors(5.0, 5.0, half=0.5))], "limited", "Good would be"),
+        ([horizon(30, errors(3.0, 5.0, half=None))], "too few windows", "5 of 3 logs are needed"),
+        # nor is a model that errs far more than another one of the run
+        ([horizon(30, errors(3.0, 5.0), best=errors(1.0, 4.0))], "limited", "Good would be"),
+        (
+            [horizon(60, errors(35.0, 160.0), windows=1)],
+            "too few windows",
+            "1 window of 4 logs on test data cannot say",
+        ),
+        # as near as the sensors tell is good, however short the way
+        ([horizon(0.5, errors(0.15, 0.3))], "good", "Up to 0.50 s ahead"),
+    ],
+)
+def test_a_model_is_good_in_metres_and_degrees(
+    entries: list[dict[str, Any]], expected: str, said: str
+) -> None:
+    given = evidence(limits=under({"horizons": entries}))
+    assert rate_model(given) == expected
+    assert any(said in sentence for sentence in write_verdict(given)[:3])
+
+
+def test_the_verdict_names_what_stands_beside_and_for_what_it_holds() -> None:
+    entries = [horizon(10, errors(0.5, 2.0)), horizon(30, errors(3.0, 5.0))]
+    said = write_verdict(evidence(limits=under({"horizons": entries})))
+    assert said[0].endswith(
+        "is off by 3.0 m (2.7 to 3.3, 5.0 % of the 60 m sailed) and 5.0 deg (4.5 to 5.5)."
+    )
+    assert said[1].startswith("Beside it: zero 30 m (27 to 33) and 40 deg (36 to 44); the baseline")
+    assert said[1].endswith("floor (measured velocities, integrated) 0.10 m and 0.20 deg.")
+    assert said[2] == "At other times of these free runs: 0.50 m and 2.0 deg after 10 s."
+    assert said[3] == "It holds for 12 free runs (T30) of 4 logs at mean speeds of 1.5 to 2.5 m/s."
+    # no number has an exponent that a reader must work out
+    limits = under({"horizons": [horizon(100, errors(1234.0, 113.0))]})
+    lost = " ".join(write_verdict(evidence(limits=limits)))
+    assert "off by 1234 m (1111 to 1357, 617 % of the 200 m sailed) and 113 deg" in lost
+
+
+def test_a_model_as_near_as_the_plant_itself_is_good() -> None:
+    """Another model is nearer, but within twice what the plant leaves all are alike."""
+    entry = horizon(10, errors(0.5, 1.0), best=errors(0.2, 1.0))
+    assert rate_model(evidence(limits=under({"horizons": [entry]}))) == "limited"
+    entry["models"]["truth"] = errors(0.4, 0.9)
+    rows = {"zero": row(0.5), "mlp": row(0.2), "truth": row(0.1) | {"kind": "truth"}}
+    assert rate_model(evidence(limits=under({"horizons": [entry]}), rows=rows)) == "good"
+
+
+def test_what_diverges_or_is_no_better_than_zero_is_never_good() -> None:
+    limits = under({"horizons": [horizon(30, errors(1.0, 1.0))]})
+    rows = {"zero": row(0.5), "baseline": row(0.25), "mlp": row(0.2, diverged=1)}
+    assert rate_model(evidence(limits=limits, rows=rows)) == "limited"
+    assert rate_model(evidence(error=0.6, limits=limits)) == "do not use"
+    assert rate_model(evidence(selected="zero", limits=limits)) == "do not use"
+    assert rate_model(evidence(selected="unknown")) == ""
+
+
+def test_a_horizon_is_judged_by_the_protocol_of_most_windows() -> None:
+    few = {"horizons": [horizon(10, errors(0.5, 2.0), windows=4)]}
+    many = {"horizons": [horizon(10, errors(0.6, 2.0), windows=20), horizon(20, errors(1, 3))]}
+    given = evidence(limits={"T10": many, "T30": few})
+    assert rate_model(given) == "good"
+    said = write_verdict(given)
+    assert said[0].startswith("Up to 10 s ahead, where mlp is off by 0.60 m")
+    assert any("12 free runs" not in text and "20 free runs (T10)" in text for text in said)
+    # a horizon that only another protocol has is not asked for
+    assert "20 s" not in " ".join(said)
+
+
+def test_a_model_that_the_data_cannot_tell_from_zero_is_not_to_be_used() -> None:
+    compared = {"mlp": {"zero": difference(-0.01, 0.1)}}
+    given = evidence(limits=under({"compared": compared, "horizons": [horizon(30, errors(1, 1))]}))
+    assert rate_model(given) == "do not use"
+    assert write_verdict(given)[0].startswith("NO BETTER THAN ZERO")
+    # too few logs for an interval tell neither
+    unknown = under({"compared": {"mlp": {"zero": difference(-0.01, None)}}})
+    assert rate_model(evidence(limits=unknown)) == "limited"
+
+
+def test_data_outside_the_training_range_and_the_doctor_are_told() -> None:
+    limits = under({"outside": {"share": 0.123, "channels": {"u": 0.1, "delta": 0.03}}})
+    said = write_verdict(
+        evidence(limits=limits, doctor="Data doctor: nothing would mislead a fit.")
+    )
+    assert any(text.startswith("Of the test data, 12 % lies outside") for text in said)
+    assert any("(u 10 %, delta 3.0 %)" in text for text in said)
+    assert said[1] == "Data doctor: nothing would mislead a fit."
+
+
+def test_an_old_run_without_these_files_still_has_a_verdict() -> None:
+    said = write_verdict(evidence(selection={}, limits={}))
+    assert said == [
+        "On test data model mlp is 60 % better than zero and 20 % better than the baseline; its"
+        " NRMSE is 0.200."
+    ]
+
+
+def test_a_split_that_is_too_short_is_judged_by_a_shorter_protocol() -> None:
+    rows = [{"split": "validation", "protocol": name} for name in ("T30", "T100", "T10")]
+    short = [*rows, {"split": "test", "protocol": "T30"}, {"split": "test", "protocol": "T10"}]
+    assert order_protocols(short, "test", "T100") == ["T30", "T10", "T100"]
+    assert (
+        order_protocols([*short, {"split": "test", "protocol": "T100"}], "test", "T100")[0]
+        == "T100"
+    )
+    assert order_protocols(short, "validation", "T100")[0] == "T100"

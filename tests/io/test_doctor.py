@@ -1,0 +1,536 @@
+"""The doctor on logs whose truth is known in closed form, and what it says of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from known_logs import wavy
+from planted import FAULTS
+
+from residnet.core.errors import DataError, UsageError
+from residnet.core.log import Log
+from residnet.preprocessing.channel_values import (
+    bridge_spikes,
+    find_spikes,
+    is_fill_value,
+    is_implausible,
+)
+from residnet.preprocessing.masks import FrozenMask
+from residnet.quality import (
+    CHECKS,
+    STAGE_DESCRIPTIONS,
+    Finding,
+    InspectionReport,
+    build_inspection,
+    find_clock_rate_errors,
+    inspect_log,
+    inspect_log_set,
+    summarize_inspection,
+)
+from residnet.quality.actuators import estimate_delay
+from residnet.quality.findings import run_checks
+from residnet.quality.kinematics import estimate_position_causes
+from residnet.quality.statistics import LogStatistics
+
+LOG = wavy()
+PSI, T = LOG["psi"], LOG.t
+RANDOM = np.random.default_rng(0)
+
+
+def changed(log: Log = LOG, /, **channels: np.ndarray) -> Log:
+    return log.replace(channels={**log.channels, **channels})
+
+
+def rows(log: Log, part: slice | np.ndarray, name: str = "part", start: float = 0.0) -> Log:
+    channels = {key: values[part] for key, values in log.channels.items()}
+    return Log(name, log.t[part] + start, channels)
+
+
+def one(report: InspectionReport, code: str) -> Finding:
+    (finding,) = report.find_by_code(code)
+    return finding
+
+
+def stepped(values: np.ndarray, at: int, by: float) -> np.ndarray:
+    return values + by * (np.arange(values.size) >= at)
+
+
+def held(*names: str) -> dict[str, np.ndarray]:
+    at = np.arange(len(LOG))
+    return {n: np.where((at > 500) & (at < 520), LOG[n][500], LOG[n]) for n in names}
+
+
+def test_a_healthy_log_has_nothing_but_information() -> None:
+    report = inspect_log(LOG)
+    assert [finding.text for finding in report.findings if finding.level != "note"] == []
+    assert one(report, "clock").figures["rate"] == pytest.approx(10.0)
+    assert one(report, "frames").figures["coherence"] == pytest.approx(1.0, abs=1e-3)
+    for name in "uvr":
+        figures = one(report, f"follows_{name}").figures
+        assert figures["correlation"] > 0.999
+        assert figures["gain"] == pytest.approx(1.0, abs=0.01)
+        assert figures["lag"] == pytest.approx(0.0, abs=0.02)
+    assert abs(one(report, "yaw_drift").figures["end"]) < 1e-3
+    assert all("\n" not in line and line.startswith("wavy: ") for line in report.to_lines())
+
+
+ARM = -0.99 * np.exp(1j * PSI) - 0.4j * np.exp(1j * PSI)
+KNOTS = changed(u=LOG["u"] / 0.5144, v=LOG["v"] / 0.5144)
+SHAKEN = LOG.replace(t=T + RANDOM.uniform(-0.03, 0.03, len(LOG)))
+SLOW = rows(LOG, slice(None, None, 10))
+SHAKEN_SLOW = SLOW.replace(t=SLOW.t + RANDOM.uniform(-0.45, 0.45, len(SLOW)))
+GAP = rows(LOG, np.r_[0:500, 560:2000])
+TWIN = changed(n=np.full(len(LOG), 10.0), delta_stbd=LOG["delta"].copy())
+STOPPED = {name: np.where(T < 60.0, 0.0, LOG[name]) for name in "uvr"}
+NO_POSE = Log("short", T, {name: LOG[name] for name in ("u", "v", "r", "delta")})
+BAD = np.arange(75, 2000, 150)
+TURN = 2.0 * np.pi
+WRAPS = float((np.abs(np.diff(PSI % TURN)) > 3.0).sum())
+# a level is what the fault does to a fit: what changes nothing is a note
+TOLD: list[tuple[Log, str, str, str, dict[str, float]]] = [
+    # frames, signs, units
+    (changed(psi=np.pi / 2 - PSI), "frames", "will mislead", "frame: enu", {"best_coherence": 1}),
+    (changed(psi=-PSI), "frames", "will mislead", "psi counted counter-clockwise (sign: -1)", {}),
+    (changed(x=LOG["y"], y=LOG["x"]), "frames", "will mislead", "x and y exchanged", {}),
+    (changed(y=-LOG["y"]), "frames", "will mislead", "y positive to the west", {}),
+    (changed(u=-LOG["u"]), "frames", "will mislead", "u positive astern", {}),
+    (changed(u=-LOG["u"], v=-LOG["v"]), "frames", "will mislead", "sign turned", {}),
+    (changed(v=-LOG["v"]), "frames", "will mislead", "v positive to port", {}),
+    (changed(psi=PSI - 1.2), "frames", "will mislead", "+68.8 deg added", {"best_offset": 1.2}),
+    (KNOTS, "frames", "will mislead", "kn taken as m/s", {"speed_ratio": 1.944}),
+    (changed(psi=PSI + 0.14), "frames", "will mislead", "compass offset", {"offset": -0.14}),
+    (changed(r=-LOG["r"]), "follows_r", "will mislead", "opposite sign", {"correlation": -1}),
+    (changed(r=np.degrees(LOG["r"])), "follows_r", "will mislead", "deg/s taken as rad/s", {}),
+    (changed(r=RANDOM.normal(size=50).repeat(40) / 20), "follows_r", "fatal", "one motion", {}),
+    (
+        changed(phi=0.1 * np.sin(0.5 * T), p=-0.05 * np.cos(0.5 * T)),
+        "roll_rate",
+        "will mislead",
+        "phi moves by -1 times",
+        {},
+    ),
+    # biases, arms, currents
+    (changed(r=LOG["r"] - 0.002), "yaw_drift", "will mislead", "", {"bias": 0.002, "end": 0.4}),
+    (
+        changed(x=LOG["x"] + ARM.real, y=LOG["y"] + ARM.imag),
+        "lever_arm",
+        "note",
+        "forward and to starboard",
+        {"value_1": -0.99, "value_2": -0.4},
+    ),
+    (
+        changed(x=LOG["x"] + 0.4 * T, y=LOG["y"] - 0.1 * T),
+        "current",
+        "will mislead",
+        "moves north and east",
+        {"value_1": 0.4, "value_2": -0.1},
+    ),
+    # values
+    (changed(**held("x", "y")), "frozen", "will mislead", "position", {"share": 39 / 2000}),
+    (changed(u=stepped(LOG["u"], 1500, 0.5)), "jump", "will mislead", "u changes", {"t": 150}),
+    (changed(x=stepped(LOG["x"], 1200, 1.0)), "position_jump", "note", "", {"largest": 1}),
+    (changed(psi=stepped(PSI, 900, 0.3)), "heading_jump", "will mislead", "17.", {"t": 90}),
+    (changed(psi=PSI % TURN), "heading_wrap", "will mislead", "continuous", {"count": WRAPS}),
+    (
+        Log("slow", T, {name: np.repeat(v[::4], 4) for name, v in LOG.channels.items()}),
+        "repeated_rows",
+        "will mislead",
+        "logged twice",
+        {"share": 0.75},
+    ),
+    (changed(u=np.where(T < 30, np.nan, LOG["u"])), "nan", "note", "", {"share": 0.15}),
+    (changed(u=np.where(T < 120, np.nan, LOG["u"])), "nan", "fatal", "60 %", {"longest": 120}),
+    (changed(v=np.minimum(LOG["v"], 0.3)), "clipping", "note", "exactly", {"limit": 0.3}),
+    (
+        changed(r=LOG["r"] + 1.0 * np.isin(np.arange(2000), BAD)),
+        "outliers",
+        "will mislead",
+        "13 samples of r",
+        {"share": 13 / 2000},
+    ),
+    (changed(u=np.round(LOG["u"], 1)), "resolution", "will mislead", "0.1 m/s", {"levels": 10}),
+    # clock
+    (GAP, "gaps", "note", "1 gaps", {"count": 1, "longest": 6.1, "lost": 6.0}),
+    (changed(u=np.repeat(LOG["u"][::2], 2)), "held", "note", "once in 2 samples", {"every": 2}),
+    (SHAKEN, "clock", "note", "steps vary", {"rate": 10.0}),
+    (SHAKEN_SLOW, "clock", "will mislead", "steps vary", {"rate": 1.0}),
+    (LOG.replace(t=stepped(T, 1000, 1.7e9)), "clock_span", "fatal", "unit of time", {}),
+    (LOG.replace(t=np.where(T == 50.0, 49.9, T)), "duplicate_rows", "fatal", "repeat", {}),
+    (LOG.replace(t=np.where(T > 99.95, T - 9, T)), "time_backwards", "fatal", "backwards", {}),
+    (LOG.replace(t=np.where(T > 199, np.nan, T)), "time_missing", "fatal", "no time", {"count": 9}),
+    # channels that are not there
+    (NO_POSE, "frames_unchecked", "note", "no x, y, psi", {}),
+    (NO_POSE, "absent", "note", "", {}),
+    # inputs and excitation
+    (TWIN, "constant", "note", "n stays at 10", {}),
+    (TWIN, "condition", "note", "delta_stbd", {}),
+    (changed(delta=np.sign(LOG["delta"])), "input_jump", "note", "", {"share_of_range": 1.0}),
+    (changed(**STOPPED), "standing", "will mislead", "rests for 30 %", {"share": 0.3}),
+    (changed(**STOPPED), "slow", "note", "almost still", {"share": 0.3}),
+    (changed(wind_dir=1.0 - PSI), "relative_wind", "will mislead", "contains psi", {"slope": -1}),
+    (changed(delta=np.degrees(LOG["delta"])), "unit", "will mislead", "more than any rudder", {}),
+]
+
+
+@pytest.mark.parametrize(("log", "code", "level", "words", "figures"), TOLD)
+def test_what_is_wrong_is_named_and_measured(
+    log: Log, code: str, level: str, words: str, figures: dict[str, float]
+) -> None:
+    found = [f for f in inspect_log(log).findings if f.code == code and words in f.text]
+    assert found, inspect_log(log).to_lines()
+    assert found[0].level == level
+    assert {name: found[0].figures[name] for name in figures} == pytest.approx(figures, rel=0.03)
+    assert found[0].action or level != "will mislead"
+    if found[0].sample_mask is not None:
+        assert found[0].sample_mask.shape == log.t.shape
+
+
+def test_every_check_above_a_note_has_a_fault() -> None:
+    # groups of causes are named one by one
+    named = {"follows", "position_causes", "yaw_causes", "contradicts", "extrapolation"}
+    named |= {code for fault in FAULTS for code in fault.codes} | {row[1] for row in TOLD}
+    assert {check.code for check in CHECKS if check.level != "note"} <= named
+    assert {check.stage for check in CHECKS} == STAGE_DESCRIPTIONS.keys()
+
+
+@pytest.mark.parametrize("lag", [-0.5, 0.63])
+def test_lags_are_measured_in_seconds(lag: float) -> None:
+    report = inspect_log(wavy(lag=lag))
+    for name in "uvr":
+        finding = one(report, f"follows_{name}")
+        assert ("trails" if lag > 0 else "leads") in finding.text
+        assert finding.figures["lag"] == pytest.approx(lag, abs=0.05)
+
+
+def test_a_wind_that_does_not_turn_is_true() -> None:
+    gusts = 0.3 * np.sin(0.17 * T) + 0.2 * np.sin(0.71 * T)
+    assert not inspect_log(changed(wind_dir=1.0 + gusts)).find_by_code("relative_wind")
+
+
+def test_a_jump_behind_a_gap_is_told_at_its_samples() -> None:
+    log = rows(changed(x=stepped(LOG["x"], 1200, 1.0)), np.r_[0:500, 560:2000])
+    at = one(inspect_log(log), "position_jump").sample_mask
+    assert at is not None
+    assert set(np.round(log.t[at], 1)) == {119.9, 120.0}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("way", ["zero", "constant", "half unknown", "rare", "moored"])
+def test_channels_without_content_are_told_and_stop_nothing(way: str) -> None:
+    ways = {
+        "zero": lambda v: 0.0 * v,
+        "constant": lambda v: np.full_like(v, v[20]),
+        "half unknown": lambda v: np.where(T > 100.0, np.nan, v),
+        "rare": lambda v: np.where(np.arange(v.size) % 10, np.nan, v),
+    }
+    sick = [{n: ways[way](v)} for n, v in LOG.channels.items()] if way in ways else []
+    still = {name: np.full(len(LOG), 0.1 * (name in ("x", "y", "psi"))) for name in LOG.channels}
+    for channels in [
+        *sick,
+        still | {"delta": LOG["delta"]},
+        *([sick[0] | sick[1]] if sick else []),
+    ]:
+        # reports may say what they like: to end with one is what counts
+        assert inspect_log(changed(**channels), inputs=["delta"]).to_lines(), channels.keys()
+
+
+@pytest.mark.parametrize("size", [2, 3, 20, 60])
+def test_short_logs_are_examined_as_far_as_they_go(size: int) -> None:
+    report = inspect_log(rows(LOG, slice(size)))
+    assert f"7 channels, {size} samples" in one(report, "channels").text
+    assert one(report, "clock").figures["span"] == pytest.approx(0.1 * (size - 1))
+    extremes = {f.text.split()[0]: f.figures["max"] for f in report.find_by_code("range")}
+    assert extremes == {name: LOG[name][:size].max() for name in ("u", "v", "r", "delta")}
+    # frames need 50 samples, and each extreme that is reached once is no clipping
+    assert bool(report.find_by_code("frames")) == (size >= 50)
+    assert bool(report.find_by_code("frames_unchecked")) == (size < 50)
+    assert not report.find_by_code("clipping")
+    assert not report.has_problems
+
+
+@pytest.mark.parametrize(
+    ("log", "inputs", "error", "words"),
+    [
+        (rows(LOG, slice(1)), None, DataError, "at least 2"),
+        (changed(u=np.full(2000, np.nan)), None, DataError, "channel u holds no number"),
+        (LOG, ["rudder"], UsageError, "no channel 'rudder'"),
+    ],
+)
+def test_what_cannot_be_examined(log: Log, inputs: Any, error: type, words: str) -> None:
+    with pytest.raises(error, match=words):
+        inspect_log(log, inputs)
+
+
+def test_what_a_reader_noticed_is_told_and_masked_samples_excuse() -> None:
+    noted = {"level": "will mislead", "code": "latency", "text": "late", "figures": {"s": 0.9}}
+    sick = changed(**held("x", "y")).replace(meta={"findings": [noted]})
+    plain, masked = inspect_log(sick), inspect_log(sick, masks=[FrozenMask()])
+    assert one(plain, "latency").figures == {"s": 0.9}
+    assert [one(report, "frozen").level for report in (plain, masked)] == ["will mislead", "note"]
+    assert one(masked, "latency").level == "will mislead"
+    assert inspect_log(LOG, masks=[FrozenMask()]).findings == inspect_log(LOG).findings
+
+
+@pytest.mark.parametrize("hull", [True, False])
+def test_rates_of_a_vessel_that_heels_may_be_the_hulls_or_the_headings(*, hull: bool) -> None:
+    phi = 0.4 - 1.2 * LOG["r"]
+    level = np.cos(phi) if hull else 1.0
+    log = changed(phi=phi, p=np.gradient(phi, T), r=LOG["r"] / level, v=LOG["v"] / level)
+    found = inspect_log(log).findings
+    assert [finding.text for finding in found if finding.level != "note"] == []
+
+
+def test_a_slow_gear_with_a_noisy_sensor_is_not_stuck() -> None:
+    demand = np.radians(20.0) * np.sign(np.sin(0.4 * T))
+    angle = [0.0]
+    for wanted in demand[1:]:
+        angle.append(angle[-1] + np.clip(wanted - angle[-1], -0.004, 0.004))
+    gear = np.array(angle) + RANDOM.normal(scale=0.0015, size=T.size)
+    assert not inspect_log(changed(cmd_delta=demand, delta=gear)).find_by_code("stuck")
+    rests = np.where((T > 60.0) & (T < 80.0), gear[600], gear)
+    assert inspect_log(changed(cmd_delta=demand, delta=rests)).find_by_code("stuck")
+
+
+def test_an_effect_on_a_fit_is_measured() -> None:
+    jump = one(inspect_log(changed(u=stepped(LOG["u"], 1500, 0.5))), "jump")
+    assert jump.effect is not None
+    assert 0.04 < jump.effect < 1.0
+    lags = inspect_log(wavy(lag=0.25)).find_by_code("lag")
+    assert [(finding.level, finding.effect) for finding in lags] == [("note", 0.0)] * 2
+
+
+def answering(delta: np.ndarray, late: float, gain: float = 0.3, time: float = 1.2) -> Log:
+    """A first-order answer in yaw to a rudder [T] that was given `late` s before."""
+    t = 0.1 * np.arange(delta.size)
+    acting, r = np.interp(t - late, t, delta), np.zeros(delta.size)
+    for k in range(delta.size - 1):
+        r[k + 1] = r[k] + 0.1 / time * (gain * acting[k] - r[k])
+    noise = np.random.default_rng(5).normal(0.0, 2e-4, (2, delta.size))
+    return Log("one", t, {"u": 1.0 + noise[0], "r": r + noise[1], "delta": delta})
+
+
+STEPS = np.repeat(np.random.default_rng(3).uniform(-0.4, 0.4, 40), 20)
+
+
+def test_the_side_and_the_time_of_an_answer() -> None:
+    fine = one(inspect_log(answering(STEPS, 0.0)), "rudder_sign")
+    assert fine.level == "note"
+    # yaw acceleration per rad of rudder is gain over time
+    assert fine.figures["effect"] == pytest.approx(0.25, rel=0.05)
+    turned = inspect_log(answering(STEPS, 0.0, gain=-0.3)).find_by_code("rudder_sign")
+    assert {finding.level for finding in turned} == {"will mislead"}
+    # commands to two sides steer by their difference
+    log = answering(STEPS, 0.0)
+    pair = {"cmd_thrust_port": np.ones(len(log)), "cmd_thrust_stbd": np.sqrt(1.0 + log["delta"])}
+    (crossed,) = inspect_log(
+        Log("two", log.t, {**pair, "u": log["u"], "r": log["r"]})
+    ).find_by_code("rudder_sign")
+    assert (crossed.level, crossed.action[:8]) == ("will mislead", "exchange")
+    for early in (0.8, 1.6):
+        late = one(inspect_log(answering(STEPS, -early)), "acausal")
+        assert late.level == "will mislead"
+        assert late.figures["lag"] == pytest.approx(-early, abs=0.25)
+
+
+def test_a_row_that_repeats_by_chance_is_logged_once() -> None:
+    u = RANDOM.standard_normal(2000).round(4)
+    u[501] = u[500]
+    assert not inspect_log(Log("one", T, {"u": u, "delta": np.ones(2000)})).find_by_code(
+        "repeated_rows"
+    )
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_turning_circle_that_loses_its_speed_is_no_reversed_rudder(side: float) -> None:
+    t, r = np.arange(0.0, 900.0), np.zeros(900)
+    delta = side * np.clip((t - 60.0) / 14.0, 0.0, 1.0) * np.radians(35.0)
+    speed = np.where(t < 60.0, 14.0, 6.0 + 8.0 * np.exp(-(t - 60.0) / 150.0))
+    for k in range(t.size - 1):
+        r[k + 1] = r[k] + 0.15 * (0.009 * speed[k] * delta[k] - r[k])
+    r += np.random.default_rng(5).normal(0.0, 2e-4, r.size)
+    good = one(inspect_log(Log("circle", t, {"r": r, "delta": delta})), "rudder_sign")
+    assert good.level == "note"
+    wrong = one(inspect_log(Log("circle", t, {"r": r, "delta": -delta})), "rudder_sign")
+    assert wrong.level == "will mislead"
+
+
+@pytest.mark.parametrize(("period", "late"), [(5.8, 0.1), (8.4, 0.4), (11.0, 0.4), (11.0, 0.1)])
+def test_a_repeated_manoeuvre_is_not_answered_half_a_period_early(
+    period: float, late: float
+) -> None:
+    zigzag = 0.35 * np.clip(8.0 * np.sin(0.2 * np.pi * np.arange(800) / period), -1.0, 1.0)
+    log = answering(zigzag, late)
+    delay = estimate_delay(LogStatistics(log, ["delta"]), ("delta",), "r")
+    assert delay is not None
+    assert delay.delay == pytest.approx(late, abs=0.25)
+    assert not inspect_log(log).find_by_code("acausal")
+
+
+def twin(port: float, stbd: float, yaw: float, speed: float) -> Log:
+    """A vessel with two propellers and no rudder at steady revolutions."""
+    noise, size = np.random.default_rng(0), 600
+    u, r = speed + 0.01 * noise.normal(size=size), yaw + 0.002 * noise.normal(size=size)
+    turns = {"n_port": np.full(size, port), "n_stbd": np.full(size, stbd)}
+    return Log("twin", 0.1 * np.arange(size), {"u": u, "r": r, **turns})
+
+
+@pytest.mark.parametrize(
+    ("log", "said"),
+    [
+        (twin(-10.0, 30.0, -0.3, 0.8), []),  # it turns to port because one runs astern
+        (twin(-20.0, 20.0, 0.0, 1.2), ["propeller_sign"]),  # it would turn, and does not
+        (twin(-20.0, -20.0, 0.0, 1.2), ["propeller_sign"] * 2),
+        (twin(34.0, 34.0, 0.0, 1.9), []),  # who does not steer does not turn
+        (twin(1200.0, 600.0, -0.3, 1.2), ["unit", "unit"]),
+        (twin(0.8, 30.0, -0.3, 0.9), []),  # one hardly turns, the other drives
+    ],
+)
+def test_two_propellers_steer_by_their_difference(log: Log, said: list[str]) -> None:
+    found = run_checks("actuators", LogStatistics(log, ["n_port", "n_stbd"]))
+    assert [finding.code for finding in found] == said
+
+
+def test_noise_of_velocities_is_no_scale_of_theirs() -> None:
+    # on the spot a lever arm can stand for the steady part, and then noise decides on the scale
+    t = 0.05 * np.arange(1200)
+    u, v, r = np.outer((0.03, 0.033, -0.19), 1.0 - np.exp(-t / 0.8))
+    psi, x, y = (
+        np.append(0.0, np.cumsum(0.025 * (rate[1:] + rate[:-1]))) for rate in (r, 0 * r, 0 * r)
+    )
+    ground = np.exp(1j * psi) * (u + 1j * v)
+    place = np.append(0.0, np.cumsum(0.025 * (ground[1:] + ground[:-1])))
+    for seed in range(10):
+        noise = np.random.default_rng(seed).standard_normal((3, t.size)) * [[0.03], [0.03], [0.003]]
+        seen = dict(zip("uvr", np.stack((u, v, r)) + noise, strict=True))
+        log = Log("spot", t, {"x": x + place.real, "y": y + place.imag, "psi": psi, **seen})
+        causes = estimate_position_causes(LogStatistics(log))
+        gains = [causes[name].estimates for name in causes if name.startswith("gain")]
+        assert np.abs(np.concatenate([[0.0], *gains])).max() < 0.3, seed
+
+
+def test_noise_of_v_on_a_slow_straight_course_is_no_drift() -> None:
+    random, t = np.random.default_rng(1), 0.1 * np.arange(400)
+    noise = {"u": 0.005, "v": 0.005, "r": 0.002, "psi": 0.003}
+    moving = {"x": 0.05 * t, "y": 0.0 * t, "u": 0.05 + 0.0 * t, "delta": np.sin(t)}
+    told = {name: moving.get(name, 0.0 * t) for name in ("x", "y", "psi", "u", "v", "r", "delta")}
+    log = Log(
+        "slow", t, {n: c + noise.get(n, 0.0) * random.normal(size=400) for n, c in told.items()}
+    )
+    assert not inspect_log(log, ["delta"]).find_by_code("course_as_heading")
+
+
+def test_spikes_are_bridged_and_fill_values_told_from_measurements() -> None:
+    assert find_spikes(LOG) == {}
+    assert bridge_spikes(LOG) is LOG
+    shown = np.full(len(LOG), 132.0)
+    shown[[300, 701]] = 131.0, 133.0
+    assert "delta" not in find_spikes(changed(delta=shown))
+    u = LOG["u"].copy()
+    u[700] = -999.0
+    clean = bridge_spikes(changed(u=u))
+    assert clean.meta["spikes"] == {"u": 1}
+    assert np.flatnonzero(clean.masks["spike"]).tolist() == [700]
+    assert clean["u"][700] == pytest.approx(0.5 * (u[699] + u[701]))
+    values = np.linspace(900.0, 1100.0, 201)
+    assert not is_fill_value(values).any()
+    values[3], values[7] = -9999.0, np.float32(9.96921e36)
+    assert np.flatnonzero(is_fill_value(values)).tolist() == [3, 7]
+    assert is_implausible(np.array([3.0, 1e4, np.nan]), "m/s").tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("epoch", [True, False])
+def test_a_nominal_clock_is_held_against_the_dates(tmp_path: Path, *, epoch: bool) -> None:
+    for rate in (1.095, 1.0):
+        seconds = pd.Series(1.6e9 + rate * T)
+        texts = pd.to_datetime(seconds, unit="s").dt.strftime("%Y-%m-%d %H:%M:%S.%f")
+        table = pd.DataFrame({"t": T, "date": seconds if epoch else texts, "u": LOG["u"]})
+        table.to_csv(tmp_path / "log.csv", index=False)
+        found = find_clock_rate_errors(LOG, tmp_path / "log.csv")
+        assert [finding.code for finding in found] == ["clock_rate"] * (rate != 1.0)
+        assert all(f.figures["rate"] == pytest.approx(1.095, abs=1e-4) for f in found)
+        # rows of other topics between them are none of the log's
+        assert (
+            find_clock_rate_errors(LOG.replace(meta={"rows_dropped": 900}), tmp_path / "log.csv")
+            == []
+        )
+    (tmp_path / "log.csv").write_bytes(np.random.default_rng(0).bytes(2000))
+    assert find_clock_rate_errors(LOG, tmp_path / "log.csv") == []
+
+
+NOISY = changed(**{n: v + 1e-3 * RANDOM.standard_normal(2000) for n, v in LOG.channels.items()})
+WHOLE, PART = rows(NOISY, slice(None), "whole"), rows(NOISY, slice(700, 1200))
+FIRST, SECOND = (
+    rows(NOISY, part, name, 50.0)
+    for name, part in (("first", slice(900)), ("second", slice(900, 2000)))
+)
+OTHER = changed(**{n: v + 1e-3 * RANDOM.standard_normal(2000) for n, v in LOG.channels.items()})
+SAME = changed(OTHER, delta=NOISY["delta"])
+FAST = changed(SAME, u=SAME["u"] + 0.6).replace(name="fast")
+STRAIGHT = {name: np.zeros(2000) for name in ("y", "psi", "v", "r")}
+DULL = Log("dull", T, {**STRAIGHT, "x": 2.0 * T, "u": np.full(2000, 2.0), "delta": LOG["delta"]})
+ROUND, OTHER_ROUND = (changed(one, r=np.abs(one["r"])) for one in (LOG, OTHER))
+AHEAD, OTHER_AHEAD = (changed(one, r=1e-3 * RANDOM.standard_normal(2000)) for one in (LOG, OTHER))
+TRAIN_TEST = {"whole": "train", "part": "test", "fast": "test", "first": "train", "second": "test"}
+
+
+@pytest.mark.parametrize(
+    ("logs", "splits", "code", "level", "words"),
+    [
+        ([WHOLE, PART], {}, "copied_part", "will mislead", "100 % a copy of rows 700 to 1199 of w"),
+        ([WHOLE, PART], TRAIN_TEST, "copied_part", "fatal", "(train and test)"),
+        ([WHOLE, PART], {"whole": "train"}, "copied_part", "note", "part is in"),
+        ([WHOLE, WHOLE.replace(name="b")], {}, "duplicate_log", "will mislead", "are the same"),
+        ([SECOND, FIRST], {}, "continued", "note", "second goes on where first ends, 0.10 s later"),
+        ([FIRST, SECOND], TRAIN_TEST, "continued", "note", "they stand in train and test"),
+        ([WHOLE, SAME], {}, "same_commands", "note", "(delta) over 2000 samples"),
+        ([WHOLE, FAST], TRAIN_TEST, "extrapolation", "will mislead", "u of fast (test) lies out"),
+        ([DULL], {}, "no_excitation", "fatal", "no velocity varies beyond its noise"),
+        ([ROUND, OTHER_ROUND], {}, "one_side", "will mislead", "all of 2 logs turn to starboard"),
+        ([ROUND], {}, "one_side", "note", "how it turns to the other"),
+        ([AHEAD, OTHER_AHEAD], {}, "one_side", "will mislead", "nothing is learned of steering"),
+    ],
+)
+def test_logs_beside_each_other(
+    logs: list[Log], splits: dict[str, str], code: str, level: str, words: str
+) -> None:
+    found = inspect_log_set(logs, splits=splits).find_by_code(code)
+    assert [finding.level for finding in found][:1] == [level]
+    assert words in found[0].text
+
+
+def test_the_report_has_every_finding_and_names_what_to_fix_first() -> None:
+    sick = changed(psi=-PSI).replace(name="sick")
+    reports = [inspect_log(LOG), inspect_log(sick)]
+    content = json.loads(json.dumps(build_inspection(reports, inspect_log_set([LOG]))))
+    assert content["schema"] == "residnet.inspection/1"
+    assert [entry["misled"] for entry in content["logs"]] == [False, True]
+    for entry, report in zip(content["logs"], reports, strict=True):
+        texts = [(finding["text"], finding["level"]) for finding in entry["findings"]]
+        assert texts == [(finding.text, finding.level) for finding in report.findings]
+    clean = summarize_inspection(build_inspection(reports[:1], InspectionReport("together", ())))
+    assert clean.sentences == ["Data doctor: nothing in the log would mislead a fit."]
+    counted = summarize_inspection(content)
+    assert (counted.n_logs, counted.n_logs_with_problems) == (2, 1)
+    assert counted.tally.startswith("Data doctor: 1 of 2 logs hold something")
+    assert counted.first_action.startswith("First fix this: sick: ")
+    assert [content["tally"], content["first"]] == counted.sentences
+
+
+@pytest.mark.parametrize("slow", [0.5, 3.0])
+def test_a_rudder_is_told_by_samples_whose_speed_is_known(*, slow: float) -> None:
+    """Where a speed fails the last one known is none: the rudder may seem to be reversed."""
+    t = np.arange(0.0, 180.0, 0.2)
+    u, delta, r = np.where(t < 90.0, slow, 2.0), 0.2 * np.sign(np.sin(0.3 * t)), np.zeros(t.size)
+    for k in range(t.size - 1):
+        turn = 0.18 * u[k] ** 2 * delta[k] - 0.8 * u[k] * r[k] - 0.9 * r[k] * abs(r[k])
+        r[k + 1] = r[k] + 0.2 * turn
+    noise = 0.003 * np.random.default_rng(0).standard_normal(t.size)
+    channels = {"u": np.where(t < 90.0, u, np.nan), "r": r + noise, "delta": delta}
+    (said,) = inspect_log(Log("log", t, channels)).find_by_code("rudder_sign")
+    assert said.level == "note"
+    assert said.figures["effect"] == pytest.approx(0.18 * slow**2, rel=0.2)
