@@ -42,12 +42,12 @@ _HOME = {
     "core.errors": "ResidnetError",
     "core.log": "Log",
     "core.progress": "Progress",
-    "api.data": "Data draft inspect prepare read_logs",
+    "api.data": "Dataset draft_config inspect prepare read_logs",
     "api.models": "Model Monitor export_model load save trust",
-    "api.fitting": "FreeRuns Models fit free_run metrics select",
+    "api.fitting": "FreeRuns Models fit free_run metrics select_model",
     "api.tasks": (
-        "Result Trials autopilot available baseline head manoeuvre own_autopilot run simulate"
-        " vessel"
+        "RunResult SimulationResult autopilot baseline design_autopilot head list_available"
+        " manoeuvre run simulate vessel"
     ),
 }
 

@@ -234,7 +234,7 @@ def draft_config(
         DataError: where no log can be used.
 
     Example:
-        draft = residnet.draft("trials/"); draft.save("my_boat.yaml"); residnet.run("my_boat.yaml")
+        draft = residnet.draft_config("trials/"); draft.save("my_boat.yaml"); residnet.run("my_boat.yaml")
     """
     sources = list(logs) if isinstance(logs, list | tuple) else [logs]
     if not sources:

@@ -459,7 +459,7 @@ def select_model(models: Models) -> Model:
     Free runs over the validation logs decide; `models.selection.reason` says why.
 
     Example:
-        residnet.select(models).name
+        residnet.select_model(models).name
     """
     require_instance(models, Models, "select: expected models from residnet.fit")
     return models[models.selected_name]

@@ -320,7 +320,7 @@ def export_model(
     Args:
         model: to export.
         file: to write.
-        format: one of `available("formats")`.
+        format: one of `list_available("formats")`.
         metrics: rows of metrics.json. Those of this model stand in the card; those of `zero` and
             of a baseline under the same protocol show whether it is worse than they are.
         allows_objections: whether a model is wanted that is worse, too; its card says so.

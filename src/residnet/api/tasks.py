@@ -62,7 +62,7 @@ def list_available(part_kind: PartKind) -> pd.DataFrame:
         UsageError: where it is none of these.
 
     Example:
-        residnet.available("heads")
+        residnet.list_available("heads")
     """
     import pandas as pd
 
@@ -77,7 +77,7 @@ def head(kind: PartLike, *, trust: bool = False, **settings: Any) -> FeatureConf
     """Return the config of a residual head, for `fit`.
 
     Args:
-        kind: one of `available("heads")`.
+        kind: one of `list_available("heads")`.
         trust: allow classes of scikit-learn whose fitted state is not stored as data; they can run
             code, so only for sources that you trust.
         settings: of the head, as YAML has them.
@@ -99,7 +99,7 @@ def baseline(kind: PartLike, **settings: Any) -> IdentifiedConfig:
     """Return the config of a baseline, for `fit`.
 
     Args:
-        kind: one of `available("baselines")`.
+        kind: one of `list_available("baselines")`.
         settings: of the baseline, as YAML has them.
 
     Raises:
@@ -117,7 +117,7 @@ def manoeuvre(kind: PartLike, **settings: Any) -> Manoeuvre:
     """Return a manoeuvre by its kind and settings, for `simulate`.
 
     Args:
-        kind: one of `available("manoeuvres")`.
+        kind: one of `list_available("manoeuvres")`.
         settings: of the manoeuvre; SI numbers, or texts with a unit such as "20 deg".
 
     Raises:
@@ -136,7 +136,7 @@ def vessel(name: str) -> VesselFile:
     """Return a vessel by its name or file: particulars in SI, each with its source.
 
     Args:
-        name: one of `available("vessels")`, or the path of a YAML file.
+        name: one of `list_available("vessels")`, or the path of a YAML file.
 
     Raises:
         ConfigError: where there is no such vessel or its file is wrong.
@@ -418,7 +418,7 @@ def design_autopilot(
         FitError: where the logs show no answer to the rudder.
 
     Example:
-        residnet.own_autopilot("0.31,7.4", rate="6 deg/s", folder="runs/own")
+        residnet.design_autopilot("0.31,7.4", rate="6 deg/s", folder="runs/own")
     """
     sources = [source] if isinstance(source, str | PathLike) else source
     steering_options = {"rudder": rudder, "rate": rate, "speed": speed}

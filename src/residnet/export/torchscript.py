@@ -22,7 +22,6 @@ from torch.jit._trace import TracerWarning
 
 from residnet.core.errors import ExportError
 from residnet.core.files import atomic_write
-from residnet.engine.trace import recorded
 from residnet.export.base import (
     Exportable,
     Exporter,
@@ -97,6 +96,9 @@ def trace_function(function: Callable[..., Any], examples: tuple[Tensor, ...], w
         tuple(part[:1] for part in examples),
         tuple(torch.cat((part, part[:1])) for part in examples),
     ]
+    # CasADi, which the recorder needs, is not imported where nothing is exported
+    from residnet.engine.trace import recorded
+
     # a trace would take the branch of the examples always
     recorded(function, examples, what)
     with torch.no_grad(), warnings.catch_warnings():

@@ -25,7 +25,6 @@ from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.engine.free_runs import compiled
-from residnet.engine.jacobian import StepJacobian
 from residnet.engine.rollout import Rollout
 from residnet.preprocessing.channel_values import estimate_noise_std
 from residnet.preprocessing.windows import WindowStore
@@ -280,6 +279,9 @@ def sensitivities(
         w: inputs of the steps [B, T, m].
     """
     batch, total = w.shape[:2]
+    # CasADi, which it needs, is not imported where nothing is refitted
+    from residnet.engine.jacobian import StepJacobian
+
     jacobian = StepJacobian.of(model)
     s = torch.zeros(batch, 1 + model.dof, len(jacobian.free), dtype=x.dtype)
     if to_start:
