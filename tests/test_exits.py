@@ -132,6 +132,6 @@ def test_secrets_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("closed", ["1>&-", "2>&-"])
 def test_closed_streams_do_not_end_a_command(closed: str, tmp_path: Path) -> None:
-    told = "import sys; from residnet.exits import enter; enter(lambda: sys.stderr.write('x'))"
+    told = "import sys; from residnet.exits import run_cli; run_cli(lambda: sys.stderr.write('x'))"
     command = f'{sys.executable} -c "{told}" {closed}'
     assert subprocess.run(command, shell=True, check=False, cwd=tmp_path).returncode == 0

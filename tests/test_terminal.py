@@ -56,7 +56,7 @@ def test_bars_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_long_work_is_never_silent(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli, "SILENCE", 0.05)
+    monkeypatch.setattr(cli, "SILENCE_SECONDS", 0.05)
     with show_progress():
         begin_stage("calibrating bands")
         log_message("  First fix this: a clock")

@@ -139,7 +139,7 @@ def test_json_holds_no_nan_and_a_write_that_fails_leaves_the_old_file(
 def test_two_processes_do_not_write_into_one_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(folders, "_PATIENCE", 1)
+    monkeypatch.setattr(folders, "_LOCK_RETRIES", 1)
     run = tmp_path / "run"
     with RunFolder(run).lock():
         for overwrite in (False, True):

@@ -202,9 +202,9 @@ def no_execution(monkeypatch: pytest.MonkeyPatch) -> None:
         (pickle, "load"), (pickle, "loads"), (pickle, "Unpickler"),
     ):  # fmt: skip
         monkeypatch.setattr(owner, name, forbidden)
-    monkeypatch.setattr(page, "draw_sections", lambda sections: {})
-    monkeypatch.setattr(figure_files, "still", lambda figure, case: None)
-    monkeypatch.setattr(figure_files, "save", lambda still, path, *_: path.write_bytes(PIXEL))
+    monkeypatch.setattr(page, "render_figures", lambda sections: {})
+    monkeypatch.setattr(figure_files, "render_matplotlib", lambda figure, case: None)
+    monkeypatch.setattr(figure_files, "save_png", lambda still, path, *_: path.write_bytes(PIXEL))
 
 
 PIXEL = bytes.fromhex(

@@ -233,7 +233,7 @@ def test_evaluate_locks_its_folder(
     command: Command,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(folders, "_PATIENCE", 1)
+    monkeypatch.setattr(folders, "_LOCK_RETRIES", 1)
     out = tmp_path / "out"
     with RunFolder(out).lock():
         said = command("evaluate", tiny_run, flown / "logs", "--out", out, "--quiet")

@@ -62,7 +62,7 @@ def test_a_grid_is_searched_whole_and_resumed(
             raise KeyboardInterrupt
         return real(*words)
 
-    monkeypatch.setattr(running, "carry_out_trial", killed)
+    monkeypatch.setattr(running, "run_sweep_trial", killed)
     space = {**SWEEP["space"], WINDOW: {"choices": [0.9]}}
     words = ["run", sweep, "--out", out, "-s", f"space={json.dumps(space)}"]
     assert command(*words).code == 130
@@ -179,7 +179,7 @@ def test_a_lost_process_costs_its_own_trial_alone(
             raise BrokenProcessPool("a process ended")
         return running.TrialResult(float(words[3]), False, "", 0.0)
 
-    monkeypatch.setattr(running, "carry_out_trial", lost)
+    monkeypatch.setattr(running, "run_sweep_trial", lost)
     space = {**SWEEP["space"], WINDOW: {"choices": [0.9, 1.1, 1.3]}}
     words = ["run", sweep, "--out", tmp_path / "out", "-s", f"space={json.dumps(space)}"]
     assert command(*words, "-s", "runner.workers=1").code == 0

@@ -5,14 +5,19 @@ Angles are unwrapped in logs and states; only differences of angles are wrapped.
 
 from __future__ import annotations
 
+import math
+from typing import TYPE_CHECKING
+
 import numpy as np
-import torch
-from torch import Tensor
+
+if TYPE_CHECKING:
+    # tensors are computed by their methods, so that readers of logs do not wait for PyTorch
+    from torch import Tensor
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
     """Bring angles [rad] of any shape to [-pi, pi)."""
-    return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi
+    return (angle + math.pi).remainder(2.0 * math.pi) - math.pi
 
 
 def wrap_angle_array(angle: np.ndarray) -> np.ndarray:
@@ -30,7 +35,7 @@ def to_body(north: Tensor, east: Tensor, psi: Tensor) -> tuple[Tensor, Tensor]:
 
     Source: document 003 eq. (4), transposed.
     """
-    cos_psi, sin_psi = torch.cos(psi), torch.sin(psi)
+    cos_psi, sin_psi = psi.cos(), psi.sin()
     return cos_psi * north + sin_psi * east, cos_psi * east - sin_psi * north
 
 
@@ -44,7 +49,7 @@ def to_earth(forward: Tensor, starboard: Tensor, psi: Tensor) -> tuple[Tensor, T
 
     Source: document 003 eq. (4).
     """
-    cos_psi, sin_psi = torch.cos(psi), torch.sin(psi)
+    cos_psi, sin_psi = psi.cos(), psi.sin()
     return cos_psi * forward - sin_psi * starboard, sin_psi * forward + cos_psi * starboard
 
 
@@ -75,8 +80,8 @@ def horizontal_to_body(north: Tensor, east: Tensor, angles: Tensor) -> list[Tens
     """
     phi, theta, psi = angles.unbind(-1)
     forward, starboard = to_body(north, east, psi)
-    body_y, body_z = to_body(starboard, forward * torch.sin(theta), phi)
-    return [forward * torch.cos(theta), body_y, body_z]
+    body_y, body_z = to_body(starboard, forward * theta.sin(), phi)
+    return [forward * theta.cos(), body_y, body_z]
 
 
 def compose_rotation(angles: Tensor, rotation_vector: Tensor) -> Tensor:
@@ -92,9 +97,11 @@ def compose_rotation(angles: Tensor, rotation_vector: Tensor) -> Tensor:
 
     Source: Fossen 2021, section 2.2.2.
     """
+    import torch
+
     half_angles = 0.5 * angles
-    cf, ct, cp = torch.cos(half_angles).unbind(-1)
-    sf, st, sp = torch.sin(half_angles).unbind(-1)
+    cf, ct, cp = half_angles.cos().unbind(-1)
+    sf, st, sp = half_angles.sin().unbind(-1)
     w, x = cf * ct * cp + sf * st * sp, sf * ct * cp - cf * st * sp
     y, z = cf * st * cp + sf * ct * sp, cf * ct * sp - sf * st * cp
     # the offset keeps the gradient finite where nothing turns
