@@ -568,11 +568,11 @@ def monitor(
         log_paths = _collect_log_paths(folder, log_arguments, log_options)
         with name_damaged_key(folder):
             monitored_logs, refit_result = task.monitor(run, log_paths, model, settings, refit)
-    content: list[dict[str, Any]] = [log.content() for log in monitored_logs]
-    lines = [line for log in monitored_logs for line in log.text()]
+    content: list[dict[str, Any]] = [log.to_json() for log in monitored_logs]
+    lines = [line for log in monitored_logs for line in log.to_lines()]
     if refit_result is not None:
-        lines += refit_result.text()
-        content.append({"refit": refit_result.content()})
+        lines += refit_result.to_lines()
+        content.append({"refit": refit_result.to_json()})
     document = json.dumps(content, indent=1)
     if output_folder is not None:
         from residnet.tasks.fit_service import write_monitoring_page
@@ -582,7 +582,7 @@ def monitor(
             with atomic_write(output_folder / "monitor.json") as temporary_file:
                 temporary_file.write_text(document + "\n")
     print(document if as_json else "\n".join(lines))
-    if any(log.since is not None for log in monitored_logs):
+    if any(log.alarm_time is not None for log in monitored_logs):
         raise typer.Exit(1)
 
 
@@ -618,7 +618,7 @@ def plan_trial(
         run, task = open_finished_task(folder, "plan-trial")
         with name_damaged_key(folder):
             next_trials = task.plan_trial(run, model, limits)
-    print(next_trials.text())
+    print(next_trials.to_text())
     for file in next_trials.write(output_folder) if output_folder is not None else []:
         print(f"written: {file}")
 

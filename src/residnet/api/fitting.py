@@ -231,11 +231,11 @@ def free_run(
     split = split or ("test" if "test" in data.splits else next(iter(data.splits)))
     spec, divergence = model_list[0].spec, data.evaluation.divergence
     velocity_bounds = compute_velocity_limits(
-        np.array(spec.low), np.array(spec.high), divergence, spec.signals.live
+        np.array(spec.low), np.array(spec.high), divergence, spec.signals.dof
     )
     with forward_progress(progress):
         evaluations = evaluate_splits(
-            make_candidates([model.fitted for model in model_list], data.source),
+            make_candidates([model.fitted_model for model in model_list], data.source),
             {split: data.logs(split)},
             data.evaluation,
             step,

@@ -451,7 +451,8 @@ class RegressorsConfig(IdentifiedConfig):
             axis_fits[axis] = axis_solutions
         axis_solutions = [
             baseline.combine_axis_fits(
-                dict(zip(learned_axes, axis_candidates, strict=True)), axis_candidates[0].choice
+                dict(zip(learned_axes, axis_candidates, strict=True)),
+                axis_candidates[0].hyperparameters,
             )
             for axis_candidates in zip(*axis_fits.values(), strict=True)
         ]

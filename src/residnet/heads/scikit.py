@@ -323,13 +323,13 @@ class _PredictFunction(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None]:
         (flat_features,) = ctx.saved_tensors
         grad = grad_outputs[0]
-        flat_grad = grad.reshape(-1, ctx.head.dof)
+        flat_grad = grad.reshape(-1, ctx.head.n_dof)
         grad_input = torch.zeros_like(flat_features)
         for i in range(flat_features.shape[1]):
             feature_step = torch.zeros_like(flat_features)
             feature_step[:, i] = _DIFFERENCE_STEP
-            prediction_difference = ctx.head.asked(flat_features + feature_step) - ctx.head.asked(
-                flat_features - feature_step
-            )
+            prediction_difference = ctx.head.predict(
+                flat_features + feature_step
+            ) - ctx.head.predict(flat_features - feature_step)
             grad_input[:, i] = (flat_grad * prediction_difference).sum(1) / (2.0 * _DIFFERENCE_STEP)
         return grad_input.reshape(*grad.shape[:-1], flat_features.shape[1]), None

@@ -95,7 +95,7 @@ class Check:
         is_record_fault: see `Finding`.
         invalidates_samples: see `Finding`.
         on_subsample: it tells nothing of single samples, and evenly spread stretches of a long log say what
-            the whole says (`Record.few`).
+            the whole says (`LogStatistics.subsample`).
         function: the function; given a log under examination (or several) and the check.
     """
 
@@ -185,7 +185,7 @@ def run_checks(stage: str, statistics: Any) -> list[Finding]:
                 name in statistics for name in check_.required_channels
             ):
                 findings += check_.function(
-                    statistics.few if check_.on_subsample else statistics, check_
+                    statistics.subsample if check_.on_subsample else statistics, check_
                 )
     return findings
 

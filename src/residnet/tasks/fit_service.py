@@ -252,23 +252,32 @@ def write_monitoring_page(folder: Path, logs: Sequence[MonitoredLog]) -> Path:
             (
                 "alarm",
                 lambda log: flag_cell(
-                    "no" if log.since is None else f"after {log.since:.0f} s", log.since
+                    "no" if log.alarm_time is None else f"after {log.alarm_time:.0f} s",
+                    log.alarm_time,
                 ),
             ),
-            ("likeliest cause", lambda log: log.last.hypotheses[0].change.name),
-            ("score", lambda log: format_number(log.last.hypotheses[0].score), str),
+            ("likeliest cause", lambda log: log.final_verdict.hypotheses[0].change.name),
+            (
+                "score",
+                lambda log: format_number(log.final_verdict.hypotheses[0].test_statistic),
+                str,
+            ),
         ],
-        is_selected=lambda log: log.since is not None,
+        is_selected=lambda log: log.alarm_time is not None,
     )
     suspects = build_table(
         [(log, suspect) for log in logs for suspect in log.final_verdict.hypotheses],
         [
             ("log", lambda row: row[0].name),
             ("cause", lambda row: row[1].change.name),
-            ("score", lambda row: format_number(row[1].score), str),
-            ("size", lambda row: f"{format_number(row[1].size)} {row[1].change.unit}", str),
-            ("standard error", lambda row: format_number(row[1].error, 2), str),
-            ("the logs look as if", lambda row: row[1].change.words),
+            ("score", lambda row: format_number(row[1].test_statistic), str),
+            (
+                "size",
+                lambda row: f"{format_number(row[1].estimated_size)} {row[1].change.unit}",
+                str,
+            ),
+            ("standard error", lambda row: format_number(row[1].standard_error, 2), str),
+            ("the logs look as if", lambda row: row[1].change.description),
         ],
         group_key=lambda row: row[0].name,
     )
@@ -479,15 +488,19 @@ class NextTrials:
         return build_table(
             self.plan.candidates[:_MAX_SHOWN_TRIALS],
             [
-                ("manoeuvre", lambda trial: trial.flight.motion.name),
+                ("manoeuvre", lambda trial: trial.simulated_run.true_log.name),
                 ("time [min]", lambda trial: format_fixed(trial.duration_minutes, 1), str),
-                ("reach [m]", lambda trial: format_fixed(trial.reach, 0), str),
+                ("reach [m]", lambda trial: format_fixed(trial.max_distance, 0), str),
                 (
                     "narrower by [%]",
                     lambda trial: format_fixed(100 * trial.uncertainty_reduction, 1),
                     str,
                 ),
-                ("volume per minute", lambda trial: format_fixed(trial.volume, 2), str),
+                (
+                    "volume per minute",
+                    lambda trial: format_fixed(trial.volume_gain_per_minute, 2),
+                    str,
+                ),
             ],
             caption=f"Candidates for {self.model}, by what they narrow per minute.",
             is_selected=lambda trial: any(
