@@ -14,8 +14,9 @@ import torch
 from residnet.baselines.given import BelievedConfig, EquationsConfig
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
+from residnet.core.registry import find_vessel_files
 from residnet.physics.signals import SignalsConfig
-from residnet.physics.vessel import load_vessel, vessel_files
+from residnet.physics.vessel import load_vessel
 from residnet.tasks.fit import FitConfig
 
 FORCES = ("u", "v", "r", "tau_x", "tau_y", "tau_n")
@@ -51,7 +52,7 @@ def test_the_factor_is_that_of_the_matrices() -> None:
 
 def test_a_resolved_config_needs_no_vessel_file(tmp_path: Path) -> None:
     copy = tmp_path / "mine.yaml"
-    copy.write_text(vessel_files()["milliampere"].read_text())
+    copy.write_text(find_vessel_files()["milliampere"].read_text())
     resolved = BelievedConfig(vessel=str(copy)).without_file_references()
     copy.unlink()
     written = resolved.model_dump_json()

@@ -21,7 +21,7 @@ from residnet.core.errors import ConfigError, ResidnetError, UsageError
 from residnet.core.layout import VELOCITIES, DegreesOfFreedom
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
-from residnet.core.registry import load_kinds
+from residnet.core.registry import find_vessel_files, load_kinds
 from residnet.dynamics.store import ModelSpec, load_model, save_model
 from residnet.engine.compiled import CompiledRollout
 from residnet.engine.rollout import Rollout, trace_rollout
@@ -33,7 +33,6 @@ from residnet.heads.linear import RidgeConfig
 from residnet.io.readers import ReaderConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.physics.signals import SignalsConfig
-from residnet.physics.vessel import vessel_files
 from residnet.testing import (
     check_baseline,
     check_exporter,
@@ -352,7 +351,7 @@ def test_a_format_holds_what_its_layout_names(name: str, layout: str, tmp_path: 
     assert card["velocities"] == list(signals.velocities)
 
 
-@pytest.mark.parametrize("name", vessel_files())
+@pytest.mark.parametrize("name", find_vessel_files())
 def test_vessel(name: str) -> None:
     check_vessel(name)
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
+from residnet.core.registry import find_vessel_files
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.manoeuvres.base import Helm, Manoeuvre
@@ -33,7 +34,7 @@ from residnet.manoeuvres.trials import (
     simulate_trial_logs,
     simulate_wind,
 )
-from residnet.physics.vessel import load_vessel, vessel_files
+from residnet.physics.vessel import load_vessel
 
 STEP = 0.1
 CLEAN = {"u": 0.0, "v": 0.0, "r": 0.0}
@@ -66,7 +67,7 @@ def logs(noise: dict[str, Any] | None = None, **changes: Any) -> list[Log]:
 @pytest.fixture
 def windy(tmp_path: Path) -> str:
     """A vessel file with wind coefficients."""
-    content = yaml.safe_load(vessel_files()["wam_v_cal"].read_text())
+    content = yaml.safe_load(find_vessel_files()["wam_v_cal"].read_text())
     path = tmp_path / "windy.yaml"
     path.write_text(yaml.safe_dump(content | {"wind": WIND}, sort_keys=False))
     return str(path)
@@ -151,7 +152,7 @@ def test_the_true_wind_stands_in_the_log(windy: str) -> None:
 @pytest.mark.long
 def test_dead_time_needs_the_plants_own_step(tmp_path: Path) -> None:
     """Found when the config is read; the delay line itself enters no log."""
-    text = vessel_files()["example_rudder_boat"].read_text()
+    text = find_vessel_files()["example_rudder_boat"].read_text()
     text = text.replace("    # dead_time: 0.2 s ", "    dead_time: 0.2 s  # ")
     path = tmp_path / "late.yaml"
     path.write_text(text.replace("    # delay_step: 0.01 s ", "    delay_step: 0.02 s  # "))

@@ -13,6 +13,7 @@ from scipy.integrate import quad
 
 from residnet.core.config import load_config, validate_config
 from residnet.core.errors import ConfigError
+from residnet.core.registry import find_vessel_files
 from residnet.physics.environment import (
     GRAVITY,
     IrregularWaves,
@@ -22,7 +23,7 @@ from residnet.physics.environment import (
     WindLoadsConfig,
 )
 from residnet.physics.hull import FossenConfig
-from residnet.physics.vessel import load_vessel, vessel_files
+from residnet.physics.vessel import load_vessel
 
 SEA: dict[str, Any] = {
     "significant_height": 1.2,
@@ -210,7 +211,7 @@ def test_a_plant_feels_the_wind_relative_to_itself() -> None:
         "wind={kind: symmetric, frontal_area: 3, lateral_area: 6, length: 5, c_x: 0.7, c_y: 0.8,"
         " c_n: 0.1, source: made}"
     )
-    plant = load_config(vessel_files()["wam_v_cal"], [section], FossenConfig).build()
+    plant = load_config(find_vessel_files()["wam_v_cal"], [section], FossenConfig).build()
     assert plant.input_names[-2:] == ("wind_speed", "wind_dir")
     still = load_vessel("wam_v_cal").build()
     assert "wind_speed" not in still.input_names

@@ -15,17 +15,17 @@ from scipy.signal import TransferFunction, lsim
 from torch import Tensor
 
 from residnet.core.config import load_config
+from residnet.core.registry import find_vessel_files
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.engine.rollout import Rollout
 from residnet.physics.abkowitz import AbkowitzConfig
 from residnet.physics.hull import SPEED_REGIMES, classify_speed_regime, compute_froude_number
 from residnet.physics.vessel import VesselConfig, load_vessel
-from residnet.physics.vessel_file import vessel_files
 
 
 def plant_of(name: str, *overrides: str) -> Any:
-    return load_config(vessel_files()[name], list(overrides), VesselConfig).build()
+    return load_config(find_vessel_files()[name], list(overrides), VesselConfig).build()
 
 
 def rolled(model: Dynamics, x0: Tensor, w: Tensor) -> Tensor:
@@ -45,7 +45,7 @@ def test_matrices_of_a_hull_written_out() -> None:
     """M nu_dot + C nu + D nu = tau as document 003 eqs. (5)-(9) and W1, W2 have it."""
     skewed = ("rigid_body.x_G", 0.4), ("added_mass.Y_rdot", -60), ("added_mass.N_vdot", -90)
     overrides = [f"{name}.value={value}" for name, value in skewed]
-    vessel = load_config(vessel_files()["wam_v_cal"], overrides, VesselConfig)
+    vessel = load_config(find_vessel_files()["wam_v_cal"], overrides, VesselConfig)
     body, added, damping = vessel.rigid_body, vessel.added_mass, vessel.damping
     m, arm = body.m.value, body.m.value * body.x_G.value
     m11, m22 = m - added.X_udot.value, m - added.Y_vdot.value

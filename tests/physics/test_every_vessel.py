@@ -10,18 +10,18 @@ from torch import Tensor
 
 from residnet.core.config import load_config
 from residnet.core.names import CHANNEL_UNITS
+from residnet.core.registry import find_vessel_files
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import Rollout
 from residnet.physics.hull import SubmergedHullConfig
 from residnet.physics.plant import HullPlant, Plant
 from residnet.physics.vessel import VesselConfig, load_vessel
-from residnet.physics.vessel_file import vessel_files
 
-HULLS = [name for name in vessel_files() if not name.startswith("nomoto")]
+HULLS = [name for name in find_vessel_files() if not name.startswith("nomoto")]
 # the forces of a real hull: the published series of the Mariner has Y_0 and N_0, and the screw of
 # the REMUS turns one way
-SYMMETRIC = [name for name in vessel_files() if name not in ("mariner", "remus_100")]
+SYMMETRIC = [name for name in find_vessel_files() if name not in ("mariner", "remus_100")]
 ODD = {"y", "psi", "phi", "v", "r", "p", "delta", "nozzle", "tau_y", "tau_n", "force_y", "force_k",
        "force_n", "current_east", "force_east", "wind_dir", "_yaw_lag"}  # fmt: skip
 
@@ -52,7 +52,7 @@ def mirrored(values: Tensor, names: tuple[str, ...]) -> Tensor:
     return values[..., other] * torch.tensor(sign, dtype=values.dtype)
 
 
-@pytest.mark.parametrize("name", vessel_files())
+@pytest.mark.parametrize("name", find_vessel_files())
 def test_a_vessel_in_a_batch_with_gradients(name: str) -> None:
     vessel = load_vessel(name)
     assert vessel.name == name, "a vessel is called as its file"
@@ -82,7 +82,7 @@ def test_a_vessel_in_a_batch_with_gradients(name: str) -> None:
     assert {"x", "y", "psi", "u", "v", "r"} <= set(plant.state_names)
 
 
-@pytest.mark.parametrize("name", vessel_files())
+@pytest.mark.parametrize("name", find_vessel_files())
 def test_a_vessel_turns_to_starboard_where_it_is_steered(name: str) -> None:
     """From where trials start, at full drive, to one side and the other."""
     plant = load_vessel(name).build()
@@ -180,7 +180,7 @@ def test_energy_is_kept_without_damping_and_falls_with_it(
     name: str, overrides: tuple[str, ...]
 ) -> None:
     """Kinetic energy and that of weight and buoyancy, as if the mass matrix were symmetric."""
-    vessel = load_config(vessel_files()[name], list(overrides), VesselConfig)
+    vessel = load_config(find_vessel_files()[name], list(overrides), VesselConfig)
     plant = vessel.build().without_environment()
     assert isinstance(plant, HullPlant)
     n, random = plant.n_dof, torch.Generator().manual_seed(3)

@@ -11,10 +11,10 @@ import torch
 
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
+from residnet.core.registry import find_vessel_files
 from residnet.physics.hull import FossenConfig, RollingHullConfig
 from residnet.physics.parameters import Parameter
 from residnet.physics.vessel import VesselConfig, load_vessel
-from residnet.physics.vessel_file import vessel_files
 
 # vessel, override, what is said of it
 WRONG = [
@@ -72,7 +72,7 @@ WRONG = [
 @pytest.mark.parametrize(("name", "override", "message"), WRONG)
 def test_a_wrong_value_is_one_line(name: str, override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
-        load_config(vessel_files()[name], [override], VesselConfig).build()
+        load_config(find_vessel_files()[name], [override], VesselConfig).build()
     text = str(caught.value)
     assert "\n" not in text
     # where it is: the override, unless only the whole vessel is impossible
@@ -82,7 +82,7 @@ def test_a_wrong_value_is_one_line(name: str, override: str, message: str) -> No
 def test_a_mass_matrix_may_not_be_singular() -> None:
     overrides = ["mass.x_G=0.0", "mass.Y_rdot=-358.21502e-5", "mass.N_vdot=-358.21502e-5"]
     with pytest.raises(ConfigError, match=r"mass matrix is (singular|not positive definite)"):
-        load_config(vessel_files()["mariner"], overrides, VesselConfig).build()
+        load_config(find_vessel_files()["mariner"], overrides, VesselConfig).build()
 
 
 def test_units_are_converted_at_the_door() -> None:
@@ -94,7 +94,7 @@ def test_units_are_converted_at_the_door() -> None:
         "damping.X.u.unit=N s/m",
         "damping.N.r.unit=N m s/rad",
     ]
-    vessel = load_config(vessel_files()["wam_v_cal"], overrides, FossenConfig)
+    vessel = load_config(find_vessel_files()["wam_v_cal"], overrides, FossenConfig)
     source = vessel.rigid_body.m.source
     assert vessel.rigid_body.m == Parameter(value=315.0, unit="kg", source=source)
     assert vessel.length.value == pytest.approx(4.88)
@@ -147,7 +147,7 @@ def test_a_base_by_path(tmp_path: Path) -> None:
 
 def test_a_vessel_by_path_and_a_vessel_that_is_not_there(tmp_path: Path) -> None:
     copy = tmp_path / "mine.yaml"
-    copy.write_text(vessel_files()["wam_v_cal"].read_text())
+    copy.write_text(find_vessel_files()["wam_v_cal"].read_text())
     assert load_vessel(str(copy)) == load_vessel("wam_v_cal")
     with pytest.raises(ConfigError, match="did you mean 'wam_v_cal'"):
         load_vessel("wam_v_cla")

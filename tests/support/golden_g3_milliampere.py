@@ -30,10 +30,10 @@ from residnet.autopilot import (
     ReferenceFilterConfig,
 )
 from residnet.core.config import load_config
+from residnet.core.registry import find_vessel_files
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.physics.hull import MassMatrixConfig
 from residnet.physics.plant import HullPlant
-from residnet.physics.vessel import vessel_files
 
 DT, OPEN_DT = 0.02, 0.01
 EVERY = {"closed": 5, "open": 10}
@@ -98,7 +98,7 @@ def case_of(path: Path) -> Flight | OpenLoop:
 
 def vessel(scale: float) -> HullPlant:
     config = load_config(
-        vessel_files()["milliampere"], [f"scale={scale}", *UNLIMITED], MassMatrixConfig
+        find_vessel_files()["milliampere"], [f"scale={scale}", *UNLIMITED], MassMatrixConfig
     )
     return config.build()
 

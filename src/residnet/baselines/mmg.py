@@ -190,15 +190,20 @@ class MMGForces(nn.Module):
     ) -> None:
         super().__init__()
         self.columns = list(columns)
-        self.wake_slope, self.min_speed_squared = _WAKE_SLOPE, _MIN_SPEED_SQUARED
+        self.wake_slope = _WAKE_SLOPE
+        self.min_speed_squared = _MIN_SPEED_SQUARED
         self.length = float(hull.length)
         self.pressure_factor = 0.5 * hull.density * hull.length * hull.draught
-        self.mass, self.x_G = float(hull.mass), float(hull.x_G)
+        self.mass = float(hull.mass)
+        self.x_G = float(hull.x_G)
         self.inertia = hull.mass * ((hull.gyration * hull.length) ** 2 + hull.x_G**2)
-        self.density, self.diameter = float(hull.density), float(propeller.diameter)
+        self.density = float(hull.density)
+        self.diameter = float(propeller.diameter)
         self.k0, self.k1, self.k2 = propeller.thrust
         self.lift_factor = 0.5 * hull.density * rudder.area * rudder.lift_slope
-        self.x_P, self.x_R, self.race_share = propeller.x, rudder.x, rudder.race
+        self.x_P = propeller.x
+        self.x_R = rudder.x
+        self.race_share = rudder.race
 
     def forward(self, z: Tensor, theta: Tensor) -> Tensor:
         """Return nu_dot [..., 3] at channels z [..., nz] with parameters theta [..., 34].
@@ -211,15 +216,14 @@ class MMGForces(nn.Module):
             t_P, w_P0, C_2p, C_2n, t_R, a_H, x_H, gamma_p, gamma_n, l_R, epsilon, kappa,
         ) = theta.unbind(-1)  # fmt: skip
         selected_channels = [z[..., column] for column in self.columns]
-        u, v, r, n, delta = (
-            selected_channels[0],
-            selected_channels[1],
-            selected_channels[2],
-            selected_channels[3],
-            selected_channels[4],
-        )
+        u = selected_channels[0]
+        v = selected_channels[1]
+        r = selected_channels[2]
+        n = selected_channels[3]
+        delta = selected_channels[4]
         speed = torch.sqrt(u * u + v * v + self.min_speed_squared)
-        v_nondim, r_nondim = v / speed, r * self.length / speed
+        v_nondim = v / speed
+        r_nondim = r * self.length / speed
         # hull
         pressure = self.pressure_factor * speed * speed
         x_hull = (
@@ -285,7 +289,8 @@ class MMGForces(nn.Module):
         side_force = -normal_force * torch.cos(delta)
         # rigid body and added mass
         mass_scale = self.pressure_factor * self.length
-        mass_x, mass_y = self.mass + m_x * mass_scale, self.mass + m_y * mass_scale
+        mass_x = self.mass + m_x * mass_scale
+        mass_y = self.mass + m_y * mass_scale
         inertia = self.inertia + J_z * mass_scale * self.length**2
         mass_moment = self.x_G * self.mass
         surge = pressure * x_hull + thrust + x_rudder + mass_y * v * r + mass_moment * r * r
@@ -320,11 +325,9 @@ class MMGBaseline(ParametricBaseline):
     def __init__(self, force_model: MMGForces, priors: Iterable[ParameterPrior]) -> None:
         prior_mean, prior_std, _ = zip(*priors, strict=True)
         super().__init__(torch.tensor(prior_mean, dtype=torch.float64))
-        self.force_model, self.prior_mean, self.prior_std = (
-            force_model,
-            list(prior_mean),
-            list(prior_std),
-        )
+        self.force_model = force_model
+        self.prior_mean = list(prior_mean)
+        self.prior_std = list(prior_std)
 
     def forward(self, z: Tensor) -> Tensor:
         nu_dot: Tensor = self.force_model(z, self.theta.to(z.dtype))
@@ -359,10 +362,8 @@ class MMGBaseline(ParametricBaseline):
         """
         subsample = _subsample(samples)
         with torch.no_grad():
-            jacobian, variance = (
-                self.parameter_jacobian(subsample.z),
-                (subsample.target - self(subsample.z)).square().mean(0),
-            )
+            jacobian = self.parameter_jacobian(subsample.z)
+            variance = (subsample.target - self(subsample.z)).square().mean(0)
         return torch.einsum("bip,biq,i->pq", jacobian, jacobian, 1.0 / variance) / len(subsample)
 
     def prior(self) -> tuple[Tensor, Tensor]:
@@ -463,8 +464,10 @@ class MMGConfig(IdentifiedConfig):
         """
         assert isinstance(baseline, MMGBaseline)
         selected = select_manoeuvres(samples, self.manoeuvres)
-        subsample, independent_samples = _subsample(selected), len(selected) / self.correlation
-        free_index, (mean, precision) = baseline.free_indices(), baseline.prior()
+        subsample = _subsample(selected)
+        independent_samples = len(selected) / self.correlation
+        free_index = baseline.free_indices()
+        (mean, precision) = baseline.prior()
 
         def acceleration_residual(theta: Tensor) -> Tensor:
             baseline.theta[free_index] = theta

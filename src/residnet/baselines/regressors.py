@@ -69,11 +69,9 @@ class RegressorBaseline(ParametricBaseline):
         terms = list(dict.fromkeys(term for axis_terms in terms_by_axis for term in axis_terms))
         dof = get_dof(names)
         super().__init__(torch.zeros(dof.n_dynamic, len(terms), dtype=torch.float64))
-        self.n_dof, self.axis_names, self.output_names = (
-            dof.n_dynamic,
-            dof.dynamic_states,
-            dof.derivative_names,
-        )
+        self.n_dof = dof.n_dynamic
+        self.axis_names = dof.dynamic_states
+        self.output_names = dof.derivative_names
         self.library = TermLibrary(terms, names)
         term_mask = torch.tensor(
             [[term in axis_terms for term in terms] for axis_terms in terms_by_axis],
@@ -139,7 +137,8 @@ class RegressorBaseline(ParametricBaseline):
     def symmetry_precision(self, samples: Samples) -> Tensor:
         """Return the mean information of a sample [P, P] about what breaks the mirror symmetry."""
         phi, variance = self._terms_and_residual_variance(samples)
-        terms, energy = self.library.terms, phi.square().mean(0)
+        terms = self.library.terms
+        energy = phi.square().mean(0)
         images = mirror_terms(terms, samples.names)
         if images is None:
             # of single terms some parity may be known where that of all channels is not
@@ -187,7 +186,8 @@ class RegressorBaseline(ParametricBaseline):
         if not self.is_dissipative:
             return []
         free_index = self.free_indices().tolist()
-        slopes, theta = _own_velocity_slopes(self.library, samples), self.theta.detach()
+        slopes = _own_velocity_slopes(self.library, samples)
+        theta = self.theta.detach()
         undamped = [
             (axis, _find_undamped_term(theta[axis], slopes[axis])) for axis in range(self.n_dof)
         ]
@@ -445,7 +445,8 @@ class RegressorsConfig(IdentifiedConfig):
                     )
                 ):
                     # what fed energy beside this term may not without it
-                    destabilising, undamped = set(), undamped | new_undamped
+                    destabilising = set()
+                    undamped = undamped | new_undamped
                 else:
                     break
             axis_fits[axis] = axis_solutions

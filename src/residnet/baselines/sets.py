@@ -142,7 +142,8 @@ def _fossen_terms(roles: ChannelRoles) -> list[str]:
     if "z" in roles.dynamic_states:
         return submerged_terms(roles)
     hull_terms = (*HULL_TERMS, *(ROLL_TERMS if "p" in roles.dynamic_states else ()))
-    drives, steers = roles.require_assigned("fossen").drives, roles.steers
+    drives = roles.require_assigned("fossen").drives
+    steers = roles.steers
     control_terms = [term for drive in drives for term in _thrust_terms(drive)]
     control_terms += [term for steer in steers for term in _steering_terms(steer, drives)]
     return ["1", *roles.dynamic_states, *hull_terms, *control_terms]

@@ -108,7 +108,9 @@ class _NomotoBaselineConfig(SteeringBaselineConfig, ABC):
             },
             _lag_ratios("r", self.steer, ""),
         )
-        selected, axis_fits, parameters = select_manoeuvres(samples, self.manoeuvres), {}, []
+        selected = select_manoeuvres(samples, self.manoeuvres)
+        axis_fits = {}
+        parameters = []
         for axis, terms in enumerate(active_terms(self.axis_terms(), selected.names)):
             if len(terms) > 1:
                 axis_fits[axis] = self._fit_lag(baseline, selected, axis, terms)
@@ -134,11 +136,9 @@ class _NomotoBaselineConfig(SteeringBaselineConfig, ABC):
             names=terms,
             outputs=(ACCELERATION_NAMES[axis],),
         )
-        slope, standard_error, name = (
-            float(fit.coefficients[0, 0]),
-            float(fit.standard_errors[0, 0]),
-            VELOCITY_NAMES[axis],
-        )
+        slope = float(fit.coefficients[0, 0])
+        standard_error = float(fit.standard_errors[0, 0])
+        name = VELOCITY_NAMES[axis]
         if slope >= 0:
             raise FitError(
                 f"a Nomoto model needs {name} to settle, but {name}_dot rises with {name}"
@@ -329,8 +329,10 @@ class LinearSteadyConfig(SteeringBaselineConfig):
         First stands A, then B = -A Phi and -A Phi_bias, errors to first order as if those of A and
         Phi were independent.
         """
-        dynamic_samples, states = select_manoeuvres(samples, block.manoeuvre_kinds), block.states
-        phi, phi_standard_error = steady_fit.coefficients, steady_fit.standard_errors
+        dynamic_samples = select_manoeuvres(samples, block.manoeuvre_kinds)
+        states = block.states
+        phi = steady_fit.coefficients
+        phi_standard_error = steady_fit.standard_errors
         states_matrix = torch.stack([dynamic_samples.channel(name) for name in states], dim=1)
         (fit,) = LeastSquares().fit(
             states_matrix - dynamic_samples.channel(block.drive)[:, None] * phi[0] - phi[1],
@@ -338,7 +340,8 @@ class LinearSteadyConfig(SteeringBaselineConfig):
             dynamic_samples.group,
             names=states,
         )
-        a, a_standard_error = fit.coefficients, fit.standard_errors
+        a = fit.coefficients
+        a_standard_error = fit.standard_errors
         coefficients = torch.cat((a, -phi @ a))
         variance = (
             phi_standard_error.square() @ a.square() + phi.square() @ a_standard_error.square()

@@ -48,7 +48,8 @@ class ResidualHead(nn.Module, ABC):
 
     def __init__(self, names: Sequence[str] = ()) -> None:
         super().__init__()
-        self.n_dof, self.output_names = get_dof(names).n_dynamic, get_dof(names).derivative_names
+        self.n_dof = get_dof(names).n_dynamic
+        self.output_names = get_dof(names).derivative_names
         self.n_state = 0
         self.batch_ensemble_size = 1
         self.innovation_time_constant = 0.0
@@ -256,7 +257,8 @@ class Features(nn.Module):
 
     def __init__(self, feature_names: Sequence[str], names: Sequence[str], margin: float) -> None:
         super().__init__()
-        self.names, self.n_dof = tuple(feature_names), get_dof(names).n_dynamic
+        self.names = tuple(feature_names)
+        self.n_dof = get_dof(names).n_dynamic
         self.n_features = len(self.names)
         self.margin = margin
         self.index = _index_buffer([list(names).index(name) for name in feature_names])

@@ -76,7 +76,8 @@ class BasisHead(ClosedFormHead):
 
     def __init__(self, config: BasisConfig, names: Sequence[str]) -> None:
         super().__init__(names)
-        feature_names, dynamic_states = config.select_features(names), get_dof(names).dynamic_states
+        feature_names = config.select_features(names)
+        dynamic_states = get_dof(names).dynamic_states
         self.features = Features(feature_names, names, config.margin)
         magnitudes = [name for name in dynamic_states if name in feature_names]
         self.library = TermLibrary(

@@ -87,10 +87,8 @@ class ForceHead(ClosedFormHead):
         self.upper_velocities.copy_(velocities.amax(0))
         for feature_index, name in enumerate(self.feature_names):
             if name in ACCELERATION_NAMES:
-                self.inner.features.low[feature_index], self.inner.features.high[feature_index] = (
-                    -torch.inf,
-                    torch.inf,
-                )
+                self.inner.features.low[feature_index] = -torch.inf
+                self.inner.features.high[feature_index] = torch.inf
 
     def validate_samples(self, samples: Samples) -> None:
         self.inner.validate_samples(samples)
@@ -101,7 +99,8 @@ class ForceHead(ClosedFormHead):
         Raises:
             FitError: where none can, or the data do not determine any.
         """
-        runnable, errors = [], list[FitError]()
+        runnable = []
+        errors = list[FitError]()
         for solution in self.inner.fit_solutions(samples):
             try:
                 runnable.append(self._add_augmented_mass(solution))

@@ -91,10 +91,12 @@ class GeneticHead(EquationHead):
 
     def _sparse_search_terms(self, samples: Samples) -> list[list[Factors]]:
         """Return the factors of the terms that a sparse search finds for each output."""
-        search_settings, names = self.config.final, self.features.names
+        search_settings = self.config.final
+        names = self.features.names
         if search_settings is None:
             return []
-        candidate_settings, z = CandidatesConfig(), self.features.select_clamped(samples.z)
+        candidate_settings = CandidatesConfig()
+        z = self.features.select_clamped(samples.z)
         candidates = candidate_settings.generate_candidates(names)
         library = TermLibrary([candidate.term for candidate in candidates], names)
         is_nonsingular = candidate_settings.find_nonsingular_terms(library.terms, names, z)

@@ -142,7 +142,8 @@ class KernelHead(ClosedFormHead):
     def fit_solutions(self, samples: Samples) -> list[Solution]:
         score_paths = None
         if self.config.choose == "recursion":
-            group, t = samples.group.numpy(), samples.t.numpy()
+            group = samples.group.numpy()
+            t = samples.t.numpy()
             time_step = median_time_step(group, t)
             segment = torch.from_numpy(number_regular_segments(group, t, time_step))
             columns = [samples.names.index(name) for name in get_dof(samples.names).dynamic_states]

@@ -59,9 +59,13 @@ class GRUEnsembleHead(ResidualHead):
 
     def __init__(self, config: GRUEnsembleConfig, names: Sequence[str]) -> None:
         super().__init__(names)
-        self.batch_ensemble_size, self.n_state = config.members, config.hidden_size
-        self.training_step, self.innovation_time_constant = config.step, 2.0 * config.step
-        self.step_ratio, self.innovation_clip, self.min_gate = 1.0, _INNOVATION_CLIP_STD, _MIN_GATE
+        self.batch_ensemble_size = config.members
+        self.n_state = config.hidden_size
+        self.training_step = config.step
+        self.innovation_time_constant = 2.0 * config.step
+        self.step_ratio = 1.0
+        self.innovation_clip = _INNOVATION_CLIP_STD
+        self.min_gate = _MIN_GATE
         self.n_channels = len(names)
         self.features = Features(config.select_features(names), names, config.margin)
         self.scale = ResidualScale(self.n_dof)
@@ -77,18 +81,12 @@ class GRUEnsembleHead(ResidualHead):
             bound = 1.0 / math.sqrt(hidden_size)
             return nn.Parameter(torch.empty(config.members, *shape).uniform_(-bound, bound))
 
-        self.input_weight, self.hidden_weight = (
-            uniform_parameter(n_inputs, 3 * hidden_size),
-            uniform_parameter(hidden_size, 3 * hidden_size),
-        )
-        self.bias, self.bias_hidden = (
-            uniform_parameter(1, 3 * hidden_size),
-            uniform_parameter(1, hidden_size),
-        )
-        self.output_weight, self.skip_weight = (
-            uniform_parameter(hidden_size, self.n_dof),
-            uniform_parameter(n_inputs, self.n_dof),
-        )
+        self.input_weight = uniform_parameter(n_inputs, 3 * hidden_size)
+        self.hidden_weight = uniform_parameter(hidden_size, 3 * hidden_size)
+        self.bias = uniform_parameter(1, 3 * hidden_size)
+        self.bias_hidden = uniform_parameter(1, hidden_size)
+        self.output_weight = uniform_parameter(hidden_size, self.n_dof)
+        self.skip_weight = uniform_parameter(n_inputs, self.n_dof)
         self.bias_out = nn.Parameter(torch.zeros(config.members, 1, self.n_dof))
         with torch.no_grad():
             for weight in (self.output_weight, self.skip_weight):

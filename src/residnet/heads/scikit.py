@@ -29,8 +29,10 @@ from residnet.regression.estimator import Solution
 _DIFFERENCE_STEP = 0.1
 """Standard deviations of a feature over which a slope is taken: trees are flat in between."""
 _STATE = "_extra_state"
-_STORED_STATE, _STORED_SAMPLES = 1, 2
-"""First byte of the stored state: arrays of fitted estimators, or samples to fit them on again."""
+_STORED_STATE = 1
+"""First byte of a stored state that holds the arrays of fitted estimators."""
+_STORED_SAMPLES = 2
+"""First byte of a stored state that holds samples; the estimators are fitted again on loading."""
 _STORES_PICKLES = ("memory",)
 """Parameters that name a joblib store, which unpickles what it finds there."""
 

@@ -245,8 +245,10 @@ def _degrees(polynomial: Any) -> tuple[int, int]:
 
 def _require_support(state: Mapping[str, Any], columns: int) -> None:
     """Check the arrays that libsvm reads without a check of its own."""
-    vectors, weights = state["support_vectors_"], state["_dual_coef_"]
-    count, indices = state["_n_support"], state["support_"]
+    vectors = state["support_vectors_"]
+    weights = state["_dual_coef_"]
+    count = state["_n_support"]
+    indices = state["support_"]
     rows = len(vectors)
     shapes = (
         vectors.shape == (rows, columns)
@@ -314,7 +316,8 @@ def _restore_special(estimator: Any, state: dict[str, Any], columns: int) -> Non
             return
         boosted = np.empty((len(members), 1), dtype=object)
         boosted[:, 0] = members
-        estimator.estimators_, estimator.n_estimators_ = boosted, len(members)
+        estimator.estimators_ = boosted
+        estimator.n_estimators_ = len(members)
         estimator.n_trees_per_iteration_ = 1
         estimator._loss = estimator._get_loss(sample_weight=None)
         estimator.init_ = "zero" if state["start"] is None else _constant(state["start"], columns)
@@ -327,7 +330,8 @@ def _restore_special(estimator: Any, state: dict[str, Any], columns: int) -> Non
             raise StateError("has an index of neighbours, expected all distances ('brute')")
         if estimator._fit_X.shape != (len(estimator._y), columns):
             raise StateError("has neighbours of another shape")
-        estimator._tree, estimator.effective_metric_params_ = None, {}
+        estimator._tree = None
+        estimator.effective_metric_params_ = {}
         estimator.n_samples_fit_ = len(estimator._fit_X)
 
 
@@ -342,7 +346,8 @@ def _constant(value: Any, columns: int) -> Any:
 def _hold_tree(estimator: Any, tree: Any, columns: int) -> Any:
     """Return an estimator of one tree that predicts by it."""
     estimator.tree_ = tree
-    estimator.n_outputs_, estimator.n_features_in_ = 1, columns
+    estimator.n_outputs_ = 1
+    estimator.n_features_in_ = columns
     estimator.max_features_ = columns
     return estimator
 
@@ -372,7 +377,8 @@ def _split_nodes(stored: Any, kind: np.dtype[Any]) -> list[np.ndarray]:
     """
     if not isinstance(stored, dict) or not isinstance(stored.get("nodes"), dict):
         raise StateError("has no trees")
-    sizes, fields = np.asarray(stored["sizes"]), stored["nodes"]
+    sizes = np.asarray(stored["sizes"])
+    fields = stored["nodes"]
     if sizes.ndim != 1 or sizes.dtype.kind not in "iu" or (sizes < 1).any():
         raise StateError("has a tree without nodes")
     total = int(sizes.sum())
@@ -404,7 +410,8 @@ def _decode_trees(stored: Any, columns: int) -> list[Any]:
     if values.shape != (sum(map(len, parts)),):
         raise StateError("has trees without a value for each node")
     depths = stored["depths"]
-    trees, begin = [], 0
+    trees = []
+    begin = 0
     for nodes, depth in zip(parts, depths, strict=True):
         inner = nodes["left_child"] != -1
         children = (nodes["left_child"], nodes["right_child"])
@@ -445,14 +452,17 @@ def _restore_histogram_trees(estimator: Any, stored: Any, columns: int) -> None:
     if np.shape(estimator._baseline_prediction) != (1, 1):
         raise StateError("has no value that boosting begins from")
     mapper = _BinMapper()
-    mapper.is_categorical_, mapper.known_categories = np.zeros(columns, dtype=np.uint8), None
+    mapper.is_categorical_ = np.zeros(columns, dtype=np.uint8)
+    mapper.known_categories = None
     # without categories the mapper is asked for the number of columns alone
     mapper.bin_thresholds_ = [np.zeros(0)] * columns
-    estimator._bin_mapper, estimator._predictors = mapper, stages
+    estimator._bin_mapper = mapper
+    estimator._predictors = stages
     estimator._loss = estimator._get_loss(sample_weight=None)
     estimator._preprocessor = estimator.is_categorical_ = None
     estimator._is_categorical_remapped = None
-    estimator._n_features, estimator.n_trees_per_iteration_ = columns, 1
+    estimator._n_features = columns
+    estimator.n_trees_per_iteration_ = 1
 
 
 def _encode_kernel(kernel: Any) -> dict[str, Any]:

@@ -193,13 +193,12 @@ def find_best_delay(
     Raises:
         FitError: with fewer samples that have a past than terms.
     """
-    profile, libraries = (
-        np.zeros(max_delay + 1),
-        [TermLibrary(target_terms, names) for target_terms in terms],
-    )
+    profile = np.zeros(max_delay + 1)
+    libraries = [TermLibrary(target_terms, names) for target_terms in terms]
     for delay_steps in range(max_delay + 1):
         delayed = samples.with_delay(delay_steps, delayed_index, max_delay)
-        z, max_terms = torch.from_numpy(delayed.features), max(map(len, terms))
+        z = torch.from_numpy(delayed.features)
+        max_terms = max(map(len, terms))
         if len(z) <= max_terms:
             raise FitError(
                 f"delay: {len(z)} samples have a past of {max_delay} samples, {max_terms} terms need more;"
@@ -212,7 +211,8 @@ def find_best_delay(
             gram_inverse = np.linalg.pinv(
                 columns.T @ columns, rcond=_RANK_TOLERANCE, hermitian=True
             )
-            target_energy, projection = float(target @ target), columns.T @ target
+            target_energy = float(target @ target)
+            projection = columns.T @ target
             rss = max(target_energy - float(projection @ gram_inverse @ projection), 0.0)
             # what rounding leaves of a perfect fit is no evidence
             profile[delay_steps] += np.log(rss + _ROUNDING_SHARE * target_energy + _MIN_NORM) / len(
@@ -338,7 +338,8 @@ class SymbolicHead(EquationHead):
         They are without times where nothing looks along them.
         """
         features = samples.z.index_select(1, self.features.index).numpy()
-        target, group = samples.target.numpy(), samples.group.numpy()
+        target = samples.target.numpy()
+        group = samples.group.numpy()
         if not self.config.estimator.sequential and self.line.n_delayed == 0:
             return SegmentedSamples(features, target, group, 0.0)
         t = samples.t.numpy()
@@ -362,10 +363,8 @@ class SymbolicHead(EquationHead):
             allowed_terms=self._allowed_terms(samples),
             gammas=gammas,
         )
-        design_matrix, targets = (
-            torch.from_numpy(regression_rows.x),
-            torch.from_numpy(regression_rows.y),
-        )
+        design_matrix = torch.from_numpy(regression_rows.x)
+        targets = torch.from_numpy(regression_rows.y)
         return estimator.fit(
             design_matrix, targets, names=self.library.terms, outputs=self.output_names
         )
@@ -396,10 +395,8 @@ class SymbolicHead(EquationHead):
         """
         if self.line.n_delayed == 0:
             return 0, {}
-        is_possible, delayed_index = (
-            self._allowed_terms(samples).any(1).tolist(),
-            self.line.delayed_index.numpy(),
-        )
+        is_possible = self._allowed_terms(samples).any(1).tolist()
+        delayed_index = self.line.delayed_index.numpy()
         linear_terms = [
             coefficient.term
             for coefficient, is_term_possible in zip(self.candidates, is_possible, strict=True)

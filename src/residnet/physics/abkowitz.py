@@ -148,13 +148,15 @@ class AbkowitzConfig(VesselFile):
 
         The forces of the water are those of `AbkowitzForces`.
         """
-        mass_terms, length = self.mass, self.length.value
+        mass_terms = self.mass
+        length = self.length.value
         is_prime_system = self.units == "prime"
         mass_unit, length_unit = (
             (0.5 * self.density * length**3, length) if is_prime_system else (1.0, 1.0)
         )
         moment = mass_terms.m * mass_terms.x_G
-        mass_si, moment_si = mass_terms.m * mass_unit, moment * mass_unit * length_unit
+        mass_si = mass_terms.m * mass_unit
+        moment_si = moment * mass_unit * length_unit
         mass = [
             [mass_unit * (mass_terms.m - mass_terms.X_udot), 0.0, 0.0],
             [
@@ -183,20 +185,21 @@ class AbkowitzForces(ActuatorSystem):
     """The whole series as forces of rudder, propeller and motion: tau [..., 3] in N, N, N m."""
 
     def __init__(self, config: AbkowitzConfig) -> None:
-        rudder, shaft = config.rudder, config.shaft
-        servos, command_specs = (
-            [rudder.build_servo("delta")],
-            [CommandSpec("cmd_delta", "steer", rudder.limit)],
-        )
+        rudder = config.rudder
+        shaft = config.shaft
+        servos = [rudder.build_servo("delta")]
+        command_specs = [CommandSpec("cmd_delta", "steer", rudder.limit)]
         if shaft is not None:
             servos.append(shaft.build_servo("n"))
             command_specs.append(CommandSpec("cmd_n", "drive", shaft.n_max))
         super().__init__(*servos)
         self.command_specs = tuple(command_specs)
-        self.has_shaft, self.n_0 = shaft is not None, shaft.n_0 if shaft is not None else 1.0
+        self.has_shaft = shaft is not None
+        self.n_0 = shaft.n_0 if shaft is not None else 1.0
         self.command_names = tuple(command.name for command in command_specs)
         self.is_prime_system = config.units == "prime"
-        self.length, self.speed = config.length.value, config.speed
+        self.length = config.length.value
+        self.speed = config.speed
         self.delta_sign = float(config.delta_sign)
         self.pressure_area = 0.5 * config.density * self.length**2
         coefficient_rows = list(config.coefficients.values())
@@ -224,7 +227,10 @@ class AbkowitzForces(ActuatorSystem):
 
     def force(self, states: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         position = self.servo_positions(states, command)
-        u, v, r, delta = nu[..., 0], nu[..., 1], nu[..., 2], self.delta_sign * position[..., 0]
+        u = nu[..., 0]
+        v = nu[..., 1]
+        r = nu[..., 2]
+        delta = self.delta_sign * position[..., 0]
         dn = position[..., 1] - self.n_0 if self.has_shaft else torch.zeros_like(u)
         coefficients = self.coefficients.to(nu.dtype)
         if not self.is_prime_system:

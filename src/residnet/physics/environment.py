@@ -70,10 +70,8 @@ class SymmetricWindConfig(WindLoadConfig):
 
     def wind_forces(self, relative_x: Tensor, relative_y: Tensor) -> Tensor:
         """Return the forces [..., 4], in components: no angle, and smooth in a calm."""
-        frontal_factor, lateral_factor = (
-            0.5 * self.density * self.frontal_area,
-            0.5 * self.density * self.lateral_area,
-        )
+        frontal_factor = 0.5 * self.density * self.frontal_area
+        lateral_factor = 0.5 * self.density * self.lateral_area
         speed = torch.sqrt(relative_x * relative_x + relative_y * relative_y + 1e-12)
         y = lateral_factor * self.c_y * relative_y * speed
         n = -2.0 * lateral_factor * self.length * self.c_n * relative_x * relative_y
@@ -268,11 +266,9 @@ class IrregularWaves(nn.Module):
 
     def __init__(self, config: WavesConfig, n_rows: int, random: np.random.Generator) -> None:
         super().__init__()
-        n_frequencies, n_directions, peak_frequency = (
-            config.frequencies,
-            config.directions,
-            2 * np.pi / config.peak_period,
-        )
+        n_frequencies = config.frequencies
+        n_directions = config.directions
+        peak_frequency = 2 * np.pi / config.peak_period
         frequency_edges = np.linspace(0.5, 4.0, n_frequencies + 1) * peak_frequency
         omega = frequency_edges[:-1, None] + np.diff(frequency_edges)[:, None] * random.random(
             (n_rows, n_frequencies, n_directions)
@@ -297,11 +293,9 @@ class IrregularWaves(nn.Module):
         self.omega, self.direction, self.amplitude, self.phase = components
         self.wave_number = self.omega**2 / GRAVITY
         self.specific_weight = config.water_density * GRAVITY
-        self.length, self.breadth, self.draught = (
-            config.hull.length,
-            config.hull.breadth,
-            config.hull.draught,
-        )
+        self.length = config.hull.length
+        self.breadth = config.hull.breadth
+        self.draught = config.hull.draught
 
     def component_phases(self, north: Tensor, east: Tensor, t: float) -> Tensor:
         """Return the phase [B, K] in rad of every component at a place and time.
@@ -325,17 +319,18 @@ class IrregularWaves(nn.Module):
         following seas.
         """
         chi = self.direction - psi.unsqueeze(-1)
-        cos_chi, sin_chi, wave_number = torch.cos(chi), torch.sin(chi), self.wave_number
-        length, breadth = self.length, self.breadth
+        cos_chi = torch.cos(chi)
+        sin_chi = torch.sin(chi)
+        wave_number = self.wave_number
+        length = self.length
+        breadth = self.breadth
         bottom_decay = torch.exp(-wave_number * self.draught)
         sinc_length = torch.sinc(0.5 * wave_number * cos_chi * length / torch.pi)
         sinc_breadth = torch.sinc(0.5 * wave_number * sin_chi * breadth / torch.pi)
         pressure = self.specific_weight * (1.0 - bottom_decay)
         area_factor = length * breadth * sinc_length * sinc_breadth
-        moment_x, moment_y = (
-            _sine_first_moment(wave_number * cos_chi, length),
-            _sine_first_moment(wave_number * sin_chi, breadth),
-        )
+        moment_x = _sine_first_moment(wave_number * cos_chi, length)
+        moment_y = _sine_first_moment(wave_number * sin_chi, breadth)
         pressure_arm = (1.0 - bottom_decay * (1.0 + wave_number * self.draught)) / wave_number
         roll_response = self.specific_weight * (
             sin_chi * pressure_arm * area_factor - bottom_decay * length * sinc_length * moment_y

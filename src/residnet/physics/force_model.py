@@ -216,18 +216,14 @@ def augment_mass(
             ill-conditioned: the model cannot run forward.
     """
     axis_of_term = find_acceleration_terms(terms, names)
-    augmented_mass, other_terms = (
-        mass.clone(),
-        [j for j in range(len(terms)) if j not in axis_of_term],
-    )
+    augmented_mass = mass.clone()
+    other_terms = [j for j in range(len(terms)) if j not in axis_of_term]
     for j, axis in axis_of_term.items():
         augmented_mass[:, axis] += coefficients[j]
     # in units of the believed masses, so that an axis that has lost its mass shows
     scale = mass.diagonal().abs().sqrt()
-    eigenvalues, condition = (
-        torch.linalg.eigvals(augmented_mass).real,
-        float(torch.linalg.cond(augmented_mass / torch.outer(scale, scale))),
-    )
+    eigenvalues = torch.linalg.eigvals(augmented_mass).real
+    condition = float(torch.linalg.cond(augmented_mass / torch.outer(scale, scale)))
     if bool((eigenvalues <= 0).any()) or not condition < _MAX_CONDITION:
         raise FitError(
             f"{subject}: its mass matrix with the fitted accelerations has eigenvalues"

@@ -204,7 +204,9 @@ class HullConfig(HullVessel, ABC):
             [self.scale * value for value in axis_coefficients]
             for axis_coefficients in self.mass_matrix()
         ]
-        (surge, sway), coupling = (mass[0][0], mass[1][1]), self.scale * self.sway_yaw_coupling()
+        surge = mass[0][0]
+        sway = mass[1][1]
+        coupling = self.scale * self.sway_yaw_coupling()
         coefficients = coefficient_rows(self.damping, -self.scale)
         for axis_coefficients, coriolis in zip(
             coefficients,
@@ -235,8 +237,10 @@ class FossenConfig(HullConfig):
 
     def mass_matrix(self) -> list[list[float]]:
         """Return rigid body and added mass, [3, 3]."""
-        rigid_body, added_mass = self.rigid_body, self.added_mass
-        m, mass_moment = rigid_body.m.value, rigid_body.m.value * rigid_body.x_G.value
+        rigid_body = self.rigid_body
+        added_mass = self.added_mass
+        m = rigid_body.m.value
+        mass_moment = rigid_body.m.value * rigid_body.x_G.value
         return [
             [m - added_mass.X_udot.value, 0.0, 0.0],
             [0.0, m - added_mass.Y_vdot.value, mass_moment - added_mass.Y_rdot.value],
@@ -425,9 +429,11 @@ class RollingHullConfig(HullVessel):
 
         The water's Coriolis forces are among the terms, as far as the source has them (X_vr).
         """
-        rigid_body, added_mass = self.rigid_body, self.added_mass
+        rigid_body = self.rigid_body
+        added_mass = self.added_mass
         m = rigid_body.m.value
-        moment_x, moment_z = m * rigid_body.x_G.value, m * rigid_body.z_G.value
+        moment_x = m * rigid_body.x_G.value
+        moment_z = m * rigid_body.z_G.value
         roll_row = [
             -(moment_z + added_mass.K_vdot.value),
             rigid_body.I_x.value - added_mass.K_pdot.value,
@@ -541,7 +547,9 @@ class SubmergedHullConfig(HullVessel):
         and the moment -v x l - w x h (Kirchhoff; Fossen 2021, section 6.3). Weight and buoyancy
         act along the vertical in body axes (Fossen 2021, eq. (4.6)).
         """
-        rigid_body, added_mass, buoyancy = self.rigid_body, self.added_mass, self.buoyancy
+        rigid_body = self.rigid_body
+        added_mass = self.added_mass
+        buoyancy = self.buoyancy
         m, x, z = (parameter.value for parameter in (rigid_body.m, rigid_body.x_G, rigid_body.z_G))
         mass = torch.diag(
             torch.tensor(
@@ -562,8 +570,10 @@ class SubmergedHullConfig(HullVessel):
 
         axis_cycles = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
         for k, name in enumerate(SUBMERGED_LAYOUT.velocities):
-            momentum, angular_momentum = mass[:3, k].tolist(), mass[3:, k].tolist()
-            v, w = SUBMERGED_LAYOUT.velocities[:3], SUBMERGED_LAYOUT.velocities[3:]
+            momentum = mass[:3, k].tolist()
+            angular_momentum = mass[3:, k].tolist()
+            v = SUBMERGED_LAYOUT.velocities[:3]
+            w = SUBMERGED_LAYOUT.velocities[3:]
             for axis, a, b in axis_cycles:
                 for sign, i, j in ((-1.0, a, b), (1.0, b, a)):
                     add_term(axis, _format_velocity_product(w[i], name), sign * momentum[j])
@@ -575,7 +585,8 @@ class SubmergedHullConfig(HullVessel):
         buoyancy_force = buoyancy.density.value * GRAVITY * buoyancy.volume.value
         # the vertical along the body axes
         vertical_direction = ("sin(theta)", "cos(theta) sin(phi)", "cos(theta) cos(phi)")
-        signs, net_weight = (-1.0, 1.0, 1.0), weight - buoyancy_force
+        signs = (-1.0, 1.0, 1.0)
+        net_weight = weight - buoyancy_force
         levers = (
             weight * x - buoyancy_force * buoyancy.x_B.value,
             0.0,

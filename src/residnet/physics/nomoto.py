@@ -91,7 +91,8 @@ class NomotoConfig(NomotoVesselConfig):
 
     def state_space(self) -> SteeringStateSpace:
         """Return the model of r alone; v stays as it is."""
-        k, T = self.K.value, self.T.value
+        k = self.K.value
+        T = self.T.value
         return SteeringStateSpace(np.diag([0.0, -1.0 / T]), np.array([0.0, k / T]))
 
 
@@ -113,7 +114,8 @@ class SecondOrderSteeringConfig(NomotoVesselConfig, ABC):
 
     def companion_matrix(self) -> np.ndarray:
         """Return the companion form [2, 2] of the denominator."""
-        time_product, time_sum = self.T1.value * self.T2.value, self.T1.value + self.T2.value
+        time_product = self.T1.value * self.T2.value
+        time_sum = self.T1.value + self.T2.value
         return np.array([[0.0, 1.0], [-1.0 / time_product, -time_sum / time_product]])
 
 
@@ -131,12 +133,11 @@ class SecondOrderNomotoConfig(SecondOrderSteeringConfig):
 
     def state_space(self) -> SteeringStateSpace:
         """Return v, r and q."""
-        k, companion = self.K.value, self.companion_matrix()
+        k = self.K.value
+        companion = self.companion_matrix()
         direct_gain = -k * self.T3.value * companion[1, 0]
-        a, b = (
-            np.zeros((3, 3)),
-            np.array([0.0, direct_gain, -k * companion[1, 0] + companion[1, 1] * direct_gain]),
-        )
+        a = np.zeros((3, 3))
+        b = np.array([0.0, direct_gain, -k * companion[1, 0] + companion[1, 1] * direct_gain])
         a[1:, 1:] = companion
         return SteeringStateSpace(a, b, ("_yaw_lag",))
 
@@ -169,7 +170,9 @@ class SideslipNomotoConfig(SecondOrderSteeringConfig):
 
     def state_space(self) -> SteeringStateSpace:
         """Return v and r, from the companion form of the common denominator."""
-        k, k_v, companion = self.K.value, self.K_v.value, self.companion_matrix()
+        k = self.K.value
+        k_v = self.K_v.value
+        companion = self.companion_matrix()
         output_matrix = np.array([[k_v, k_v * self.T_v.value], [k, k * self.T3.value]])
         return SteeringStateSpace(
             output_matrix @ companion @ np.linalg.inv(output_matrix),
@@ -188,7 +191,8 @@ class NomotoVessel(Plant):
     def __init__(self, config: NomotoVesselConfig) -> None:
         super().__init__()
         a, b, internal_states = config.state_space()
-        self.speed, self.delta_max = config.speed, config.rudder.limit
+        self.speed = config.speed
+        self.delta_max = config.rudder.limit
         self.servo = config.rudder.build_servo("delta")
         self.n_steering_states = 2 + len(internal_states)
         self.steering_columns = slice(SWAY, SWAY + self.n_steering_states)
@@ -220,7 +224,8 @@ class NomotoVessel(Plant):
         return self.servo.position(x[:, self.rudder_columns], w[:, :1])[:, 0]
 
     def derivative(self, x: Tensor, w: Tensor) -> Tensor:
-        z, rudder_states = x[:, self.steering_columns], x[:, self.rudder_columns]
+        z = x[:, self.steering_columns]
+        rudder_states = x[:, self.rudder_columns]
         steering_derivative = z @ self.a.to(x.dtype).T + self.rudder_angle(x, w).unsqueeze(
             -1
         ) * self.b.to(x.dtype)

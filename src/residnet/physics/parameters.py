@@ -94,10 +94,8 @@ def parse_dimension(unit: str, mass: int = 1) -> tuple[int, int] | None:
         if name not in _BASE_DIMENSIONS:
             return None
         exponent = int(power or 1) * (-1 if sign == "/" else 1)
-        metre_power, second_power = (
-            metre_power + exponent * _BASE_DIMENSIONS[name][0],
-            second_power + exponent * _BASE_DIMENSIONS[name][1],
-        )
+        metre_power = metre_power + exponent * _BASE_DIMENSIONS[name][0]
+        second_power = second_power + exponent * _BASE_DIMENSIONS[name][1]
         mass_power += exponent * (name in ("kg", "N"))
     return (metre_power, second_power) if mass_power == mass else None
 

@@ -206,12 +206,12 @@ class HullPlant(Plant):
         initial_values: Mapping[str, float] | None = None,
     ) -> None:
         super().__init__()
-        self.hull, self.actuators, self.wind = hull, actuators, wind
+        self.hull = hull
+        self.actuators = actuators
+        self.wind = wind
         self.n_dof = len(hull.mass)
-        self.has_roll, self.is_submerged = (
-            self.n_dof == ROLLING_LAYOUT.n_dof,
-            self.n_dof == SUBMERGED_LAYOUT.n_dof,
-        )
+        self.has_roll = self.n_dof == ROLLING_LAYOUT.n_dof
+        self.is_submerged = self.n_dof == SUBMERGED_LAYOUT.n_dof
         self.has_environment = True
         self.state_names = (*_LAYOUT_OF_DOF[self.n_dof].state_names, *actuators.state_names)
         self.attitude_columns = (
@@ -261,7 +261,8 @@ class HullPlant(Plant):
         """
         if not self.actuators.is_force_constant_in_step:
             return w
-        n, c = self.n_dof, self.n_commands
+        n = self.n_dof
+        c = self.n_commands
         force = self.actuators.force(x[:, 2 * n :], w[:, :c], x[:, n : 2 * n])
         if self.has_environment:
             force = force + w[:, c : c + n]
@@ -279,7 +280,8 @@ class HullPlant(Plant):
         `is_force_included`: the actuators' forces are among the body forces already, and their states stand
         still.
         """
-        n, c = self.n_dof, self.n_commands
+        n = self.n_dof
+        c = self.n_commands
         pose, nu, actuator_states = torch.split(x, self.state_sizes, dim=-1)
         command = w.narrow(-1, 0, c)
         actuator_derivative = (
@@ -305,7 +307,8 @@ class HullPlant(Plant):
         current, current_derivative = self._current_in_body_axes(
             w[:, c + n], w[:, c + n + 1], pose, nu
         )
-        relative_velocity, tau = nu - current, w[:, c : c + n]
+        relative_velocity = nu - current
+        tau = w[:, c : c + n]
         if not is_force_included:
             tau = tau + self.actuators.force(actuator_states, command, relative_velocity)
         tau = tau + self._to_body_axes(w[:, c + n + 2], w[:, c + n + 3], pose)
@@ -360,12 +363,15 @@ class HullPlant(Plant):
             rotation = cross_product(current[..., :3], nu[..., 3:])
             return current, torch.cat((rotation, torch.zeros_like(rotation)), dim=-1)
         body_x, body_y = to_body(north, east, pose[..., -1])
-        zero, r = torch.zeros_like(body_x), nu[..., -1]
+        zero = torch.zeros_like(body_x)
+        r = nu[..., -1]
         if not self.has_roll:
             current = torch.stack((body_x, body_y, zero), dim=-1)
             return current, torch.stack((r * body_y, -r * body_x, zero), dim=-1)
-        cos_phi, sin_phi = torch.cos(pose[..., 2]), torch.sin(pose[..., 2])
-        heading_rate, p = r * cos_phi, nu[..., 2]
+        cos_phi = torch.cos(pose[..., 2])
+        sin_phi = torch.sin(pose[..., 2])
+        heading_rate = r * cos_phi
+        p = nu[..., 2]
         sway_derivative = -heading_rate * body_x * cos_phi - p * body_y * sin_phi
         current = torch.stack((body_x, body_y * cos_phi, zero, zero), dim=-1)
         return current, torch.stack((heading_rate * body_y, sway_derivative, zero, zero), dim=-1)

@@ -217,7 +217,8 @@ class Signals(nn.Module):
         if self.has_forces:
             columns.append(self.thrusters(w[..., : self.n_inputs]))
         if self.has_wind:
-            speed, direction = w[..., self.speed_column], w[..., self.direction_column]
+            speed = w[..., self.speed_column]
+            direction = w[..., self.direction_column]
             columns.append(
                 torch.stack((-speed * torch.cos(direction), -speed * torch.sin(direction)), dim=-1)
             )
@@ -240,7 +241,8 @@ class Signals(nn.Module):
             return torch.cat((dynamic_states(x, self.n_dof), p), dim=-1)
         n_known = p.shape[-1] - 2
         relative_x, relative_y = to_body(p[..., n_known], p[..., n_known + 1], x[..., 2])
-        relative_x, relative_y = relative_x - x[..., 3], relative_y - x[..., 4]
+        relative_x = relative_x - x[..., 3]
+        relative_y = relative_y - x[..., 4]
         # the offset keeps the gradient finite in a calm
         magnitude = torch.sqrt(relative_x * relative_x + relative_y * relative_y + 1e-8)
         return torch.cat(
@@ -255,8 +257,10 @@ class Signals(nn.Module):
 
 _MAX_ACCELERATION_STD = 10.0
 """Accelerations, in standard deviations, that are balanced half a range beyond the edge."""
-_MIN_RATE, _MAX_RATE = 0.05, 2.0
-"""Limits of the rate in 1/s at which velocities are pulled back."""
+_MIN_RATE = 0.05
+"""Lower limit of the restoring rate of the velocity guard, 1/s."""
+_MAX_RATE = 2.0
+"""Upper limit of the restoring rate of the velocity guard, 1/s."""
 _MIN_RANGE = 1e-9
 """Least width of a range, for channels that do not vary."""
 
@@ -282,7 +286,8 @@ class RestoringAcceleration(nn.Module):
     ) -> None:
         super().__init__()
         self.margin = margin
-        self.n_channels, self.n_dof = n_channels, n_dof
+        self.n_channels = n_channels
+        self.n_dof = n_dof
         self.low = nn.Buffer(torch.zeros(n_channels, dtype=torch.float64))
         self.high = nn.Buffer(torch.zeros(n_channels, dtype=torch.float64))
         self.restoring_rate = nn.Buffer(torch.zeros(n_dof, dtype=torch.float64))
@@ -290,10 +295,8 @@ class RestoringAcceleration(nn.Module):
     def calibrate(self, samples: Samples) -> None:
         """Take the ranges of the channels, and the rate from the accelerations."""
         channel_moments, target_moments = samples.running_moments()
-        lower, upper = (
-            channel_moments.minimum[: self.n_channels],
-            channel_moments.maximum[: self.n_channels],
-        )
+        lower = channel_moments.minimum[: self.n_channels]
+        upper = channel_moments.maximum[: self.n_channels]
         width = (upper - lower).clamp(min=_MIN_RANGE)
         self.low.copy_(lower - self.margin * width)
         self.high.copy_(upper + self.margin * width)
@@ -306,7 +309,8 @@ class RestoringAcceleration(nn.Module):
 
     def clamp(self, z: Tensor) -> Tensor:
         """Return channels z [..., nz], where those that left their range stand at its edge."""
-        lower, upper = self.low.to(z.dtype), self.high.to(z.dtype)
+        lower = self.low.to(z.dtype)
+        upper = self.high.to(z.dtype)
         clamped = z[..., : self.n_channels]
         # a refit differentiates this, and derivatives of minimum and maximum are slow
         clamped = torch.where(clamped > upper, upper, torch.where(clamped < lower, lower, clamped))

@@ -82,7 +82,8 @@ def parse_term(term: str, names: Sequence[str], *, functions: bool = True) -> tu
         if match["one"]:
             continue
         name = match["magnitude"] or match["inner"] or match["name"]
-        function, power = match["function"] or "", int(match["power"] or 1)
+        function = match["function"] or ""
+        power = int(match["power"] or 1)
         if function and (not functions or function not in TERM_FUNCTIONS):
             hint = (
                 suggest_name(function, TERM_FUNCTIONS)
@@ -167,10 +168,8 @@ class TermLibrary(nn.Module):
             [index for factor in factors for index in _factor_columns(factor, column_of_key)]
             for factors in parsed_terms
         ]
-        self.n_terms, self.max_factors = (
-            len(columns),
-            max([len(factor_columns) for factor_columns in columns], default=0),
-        )
+        self.n_terms = len(columns)
+        self.max_factors = max([len(factor_columns) for factor_columns in columns], default=0)
         padded_columns = [
             factor_columns + [0] * (self.max_factors - len(factor_columns))
             for factor_columns in columns

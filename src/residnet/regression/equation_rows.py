@@ -1,11 +1,11 @@
-"""Rows of a regression: samples, or integrals over short windows.
+"""Rows of a regression: samples (strong form), or integrals over short windows (weak form).
 
-Noise enters an equation twice: through the derivative on its left, which differentiation amplifies,
-and through the regressors on its right, which pull coefficients towards zero. Integrating both
-sides against a test function w that vanishes at the ends of a window, int w y dt = sum c_j int w
-f_j dt, takes the derivative off the noisy record (by parts, int w x_dot dt = -int w_dot x dt).
-Where accelerations are central differences (`savitzky_golay` over three samples) summing them is
-the same as summing by parts.
+Measurement noise affects a regression twice: differentiation amplifies the noise of the left side,
+and noise of the regressors biases the coefficients towards zero (attenuation). The weak form
+integrates both sides with a test function w that vanishes at the ends of a window,
+int w y dt = sum c_j int w f_j dt. Integration by parts, int w x_dot dt = -int w_dot x dt, moves the
+derivative from the noisy record to w. If accelerations are central differences (`savitzky_golay`
+over three samples), the weighted sum of accelerations equals the sum by parts.
 """
 
 from __future__ import annotations
@@ -21,15 +21,18 @@ from residnet.core.errors import ConfigError, FitError
 from residnet.core.stretches import find_run_bounds
 
 _MAX_BLOCK_NUMBERS = 8_000_000
-"""Numbers of windows held at a time."""
+"""Maximum number of array elements of the windows that are integrated at a time."""
 _MIN_VARIANCE = 1e-300
-"""Least variance or size that is divided by."""
+"""Lower bound of a variance in a denominator."""
 
 
 class RegressionRows(NamedTuple):
-    """The terms [N, J], targets [N, K] and stretches [N] of a regression.
+    """Rows of a regression.
 
-    A stretch of unbroken samples has a number, ascending.
+    Attributes:
+        x: terms [N, J].
+        y: targets [N, K].
+        segment: number of the uninterrupted segment of each row [N], ascending.
     """
 
     x: np.ndarray
@@ -38,31 +41,31 @@ class RegressionRows(NamedTuple):
 
 
 class RowBuilder(Config, ABC):
-    """A way to make rows of a regression from sampled terms.
+    """Method that computes the rows of a regression from sampled terms.
 
     Attributes:
-        sequential: whether rows are made of neighbouring samples, so that times must be known.
+        sequential: whether a row combines neighbouring samples, which needs the sample times.
     """
 
     sequential: ClassVar[bool] = True
 
     @abstractmethod
     def build_rows(self, samples: RegressionRows, time_step: float) -> RegressionRows:
-        """Return the rows of the regression.
+        """Compute the rows of the regression.
 
         Args:
-            samples: terms and targets at samples `time_step` seconds apart within each stretch.
-            time_step: time between samples, s.
+            samples: terms and targets, uniformly sampled within each segment.
+            time_step: sampling interval, s.
 
         Raises:
-            ConfigError: where a window holds too few samples.
-            FitError: where no stretch is as long as it must be.
+            ConfigError: if a window has too few samples.
+            FitError: if every segment is shorter than a window.
         """
 
 
 @final
 class SampleRows(RowBuilder):
-    """The samples themselves as rows."""
+    """Strong form: every sample is a row."""
 
     sequential: ClassVar[bool] = False
     kind: Literal["least_squares"] = "least_squares"
@@ -73,13 +76,13 @@ class SampleRows(RowBuilder):
 
 @final
 class WeakRows(RowBuilder):
-    """The weak form: both sides integrated over windows (Bortz, Messenger and others, 2021).
+    """Weak form: both sides are integrated over windows (Messenger and Bortz 2021).
 
-    The weight is (1 - s^2)^2, s from -1 to 1.
+    The test function is (1 - s^2)^2 with s from -1 to 1 over the window.
 
     Attributes:
         window: length of a window.
-        every: distance between windows as a share of their length.
+        every: distance between the starts of windows as a share of their length.
     """
 
     kind: Literal["weak"] = "weak"
@@ -91,25 +94,31 @@ class WeakRows(RowBuilder):
 
 
 RowsConfig = Annotated[SampleRows | WeakRows, Field(discriminator="kind")]
-"""Any way to make rows; its `kind` says which."""
+"""Configuration of any row builder, selected by `kind`."""
 
 
 def integrate_windows(
     samples: RegressionRows, time_step: float, window: float, stride_share: float
 ) -> RegressionRows:
-    """Return weighted sums over windows of `window` seconds within each stretch.
+    """Compute weighted sums over windows within each segment.
 
-    They are scaled so that a constant keeps its value.
+    The weights sum to one, so that a constant signal is unchanged.
+
+    Args:
+        samples: terms and targets, uniformly sampled within each segment.
+        time_step: sampling interval, s.
+        window: length of a window, s.
+        stride_share: distance between the starts of windows as a share of their length.
 
     Raises:
-        ConfigError: where a window holds fewer than three samples.
-        FitError: where no stretch is as long as a window.
+        ConfigError: if a window has fewer than three samples.
+        FitError: if every segment is shorter than a window.
     """
     window_samples = round(window / time_step)
     if window_samples < 3:
         raise ConfigError(
-            f"weak form: a window of {window:g} s holds {window_samples} samples of {time_step:g} s; set it to"
-            f" {3 * time_step:g} s or longer"
+            f"weak form: a window of {window:g} s has {window_samples} samples at an interval of"
+            f" {time_step:g} s; set it to {3 * time_step:g} s or longer"
         )
     window_coordinate = np.linspace(-1.0, 1.0, window_samples + 2)[1:-1]
     test_function = np.square(1.0 - np.square(window_coordinate))
@@ -120,10 +129,10 @@ def integrate_windows(
     )
     if not window_starts.size:
         raise FitError(
-            f"weak form: no unbroken stretch of samples is {window:g} s long; shorten the window or"
-            " give logs with fewer gaps"
+            f"weak form: every uninterrupted segment is shorter than the window of {window:g} s;"
+            " shorten the window or give logs with fewer gaps"
         )
-    # windows every so many samples, counted from the start of each stretch
+    # the stride is counted from the start of each segment
     window_starts = window_starts[
         (window_starts - segment_starts[window_starts])
         % max(round(stride_share * window_samples), 1)
@@ -131,6 +140,7 @@ def integrate_windows(
     ]
     columns = np.concatenate((samples.x, samples.y), axis=1)
     windows_per_block = max(_MAX_BLOCK_NUMBERS // (window_samples * columns.shape[1]), 1)
+    # blocks bound the memory of the windows
     block_sums = []
     windows = np.lib.stride_tricks.sliding_window_view(columns, window_samples, axis=0)
     for block_start in range(0, window_starts.size, windows_per_block):
@@ -146,41 +156,48 @@ def integrate_windows(
 
 
 def number_regular_segments(group: np.ndarray, t: np.ndarray, time_step: float) -> np.ndarray:
-    """Return the number of the unbroken stretch of each sample [N], ascending from 0.
+    """Return the number of the uninterrupted segment of each sample [N], ascending from 0.
 
     Args:
-        group: manoeuvre of each sample [N], ascending.
+        group: number of the manoeuvre of each sample [N], ascending.
         t: time of each sample within its manoeuvre [N], s.
-        time_step: time between neighbouring samples, s.
+        time_step: sampling interval, s.
     """
     is_break = (np.diff(group) != 0) | (np.abs(np.diff(t) - time_step) > 0.01 * time_step)
     return np.concatenate(([0], np.cumsum(is_break)))
 
 
 def median_time_step(group: np.ndarray, t: np.ndarray) -> float:
-    """Return the time between samples: the median distance of neighbours in one manoeuvre, s.
+    """Return the median time between neighbouring samples of a manoeuvre, s.
+
+    Args:
+        group: number of the manoeuvre of each sample [N], ascending.
+        t: time of each sample within its manoeuvre [N], s.
 
     Raises:
-        FitError: where no manoeuvre has two samples.
+        FitError: if no manoeuvre has two samples at different times.
     """
     time_differences = np.diff(t)[np.diff(group) == 0]
     if not time_differences.size or float(np.median(time_differences)) <= 0:
         raise FitError(
-            "no manoeuvre has two samples at different times; the step between samples is not known"
+            "no manoeuvre has two samples at different times, so the sampling interval is unknown;"
+            " give manoeuvres with several samples"
         )
     return float(np.median(time_differences))
 
 
 def effective_correlation_length(residual: np.ndarray) -> np.ndarray:
-    """Return how many neighbouring rows tell as much as one independent row, [K], at least 1.
+    """Estimate the integrated autocorrelation time of residuals [N, K] in rows, [K], at least 1.
 
-    1 + 2 sum rho over the first lags until rho is negative (initial positive sequence).
+    N rows have the information of N divided by this number of independent rows. The estimate is
+    1 + 2 sum rho over the lags before rho becomes insignificant (initial positive sequence
+    estimator, Geyer 1992).
     """
     n = len(residual)
     centred = residual - residual.mean(axis=0)
     spectrum = np.abs(np.fft.rfft(centred, 2 * n, axis=0)) ** 2
     covariance = np.fft.irfft(spectrum, axis=0)[:n]
     rho = covariance / np.maximum(covariance[0], _MIN_VARIANCE)
-    # noise of an estimate of zero: what is less than two of its deviations ends the sum
+    # 1 / sqrt(n) is the standard error of rho for white noise; below two of them rho is noise
     positive = np.cumprod(rho > 2.0 / np.sqrt(n), axis=0).astype(bool)
     return np.asarray(np.maximum(2.0 * np.where(positive, rho, 0.0).sum(axis=0) - 1.0, 1.0))

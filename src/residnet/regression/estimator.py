@@ -1,6 +1,6 @@
-"""The interface of estimators, from arrays to coefficients, in the habit of scikit-learn.
+"""Interface of the estimators, which compute coefficients from arrays as scikit-learn does.
 
-Regressors of many samples come in pieces, computed where they are needed instead of all at once.
+The regressors of long logs are evaluated in chunks of rows, so that they need not fit in memory.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ class Ratio(NamedTuple):
 
     Attributes:
         sign: factor of the ratio, 1 or -1.
-        numerator: term of the coefficient above; None stands for 1.
-        denominator: term of the coefficient below.
+        numerator: term whose coefficient is the numerator; None for a numerator of 1.
+        denominator: term whose coefficient is the denominator.
     """
 
     sign: float
@@ -32,21 +32,21 @@ class Ratio(NamedTuple):
     denominator: str
 
     def evaluate(self, coefficients: Mapping[str, float]) -> float:
-        """Return the parameter, from the coefficients of its output by term."""
+        """Compute the parameter from the coefficients of its output, given by term."""
         numerator_value = 1.0 if self.numerator is None else coefficients[self.numerator]
         return self.sign * numerator_value / coefficients[self.denominator]
 
 
 @dataclass(frozen=True)
 class Coefficient:
-    """One identified number with its standard error.
+    """An identified coefficient or parameter with its standard error.
 
     Attributes:
         axis: name of the output, such as u_dot.
-        term: regressor of that output, or the name of a parameter that follows from coefficients.
-        value: value of the coefficient of `term`, or of the parameter.
-        standard_error: its standard error.
-        ratio: how a parameter follows from coefficients; None for a coefficient.
+        term: regressor of that output, or the name of a parameter computed from coefficients.
+        value: estimate.
+        standard_error: standard error of the estimate.
+        ratio: formula of a parameter computed from coefficients; None for a coefficient.
     """
 
     axis: str
@@ -58,19 +58,19 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class Solution:
-    """One solution of a fit; a fit with a complexity to choose has several.
+    """A solution of a fit; an estimator with several candidate complexities returns several.
 
     Attributes:
-        hyperparameters: what sets it apart, for example {"ridge": 1e-4}; empty where there is nothing to
-            choose.
+        hyperparameters: settings of this solution, for example {"ridge": 1e-4}; empty if the
+            estimator has a single solution.
         state: arrays by name. A linear solution y = x coefficients + intercept has `coefficients`
-            [J, n] and, where it has one, `intercept` [n]; other kinds say what they have. Fitted to
-            a module they are names of its state_dict.
-        table: the coefficients with names and standard errors, where the fit knows them.
-        notes: what else there is to say about the fit, in terms of JSON.
-        neighbours: makes the solutions next to this one, to be tried where free runs find this one
-            best; None where there are none.
-        covariance: covariance of the coefficients of each output [n, J, J], where the fit knows it.
+            [J, n] and optionally `intercept` [n]. The solution of a module has the names of its
+            state_dict.
+        table: coefficients with names and standard errors; empty if they are not estimated.
+        notes: further results of the fit, serialisable as JSON.
+        neighbours: computes the solutions with neighbouring hyperparameters, which are tried if
+            free runs prefer this solution; None if the estimator offers no neighbours.
+        covariance: covariance of the coefficients of each output [n, J, J]; None if unknown.
     """
 
     hyperparameters: dict[str, Any]
@@ -87,7 +87,7 @@ class Solution:
 
     @property
     def intercept(self) -> Tensor:
-        """Return the intercept [n] of a linear solution, zeros where it has none."""
+        """Return the intercept [n] of a linear solution; zeros for a solution without intercept."""
         zero = self.coefficients.new_zeros(self.coefficients.shape[1])
         return self.state.get("intercept", zero)
 
@@ -96,7 +96,7 @@ class Solution:
         """Return the standard errors of the coefficients [J, n].
 
         Raises:
-            ValueError: where the fit knows none.
+            ValueError: if the estimator computed no covariance.
         """
         if self.covariance is None:
             raise ValueError("this solution has no standard errors")
@@ -109,12 +109,12 @@ class Solution:
 
 @final
 class ChunkedRegressors:
-    """A matrix of regressors [N, J] whose rows are computed where they are needed.
+    """A matrix of regressors [N, J] whose rows are evaluated chunk by chunk on iteration.
 
     Args:
-        evaluate: gives regressors [M, J] at channels [M, nz].
+        evaluate: function from channels [M, nz] to all regressors [M, J'].
         channels: channels [N, nz].
-        columns: which of the regressors are meant, J of them.
+        columns: indices of the J columns of this matrix among the J' regressors.
     """
 
     def __init__(
@@ -129,11 +129,11 @@ class ChunkedRegressors:
         return self.shape[0]
 
     def select_columns(self, columns: Sequence[int]) -> ChunkedRegressors:
-        """Return some of the regressors, by their place among these."""
+        """Return a matrix of some columns, given by their indices in this matrix."""
         return ChunkedRegressors(self.evaluate, self.channels, [self.columns[j] for j in columns])
 
     def __iter__(self) -> Iterator[tuple[slice, Tensor]]:
-        """Yield rows and the regressors there."""
+        """Yield slices of rows and the regressors of these rows."""
         for rows in iterate_row_chunks(len(self)):
             yield rows, self.evaluate(self.channels[rows])[:, self.columns]
             release_pages()
@@ -145,7 +145,7 @@ Regressors = Tensor | ChunkedRegressors
 def evaluate_regressors(
     evaluate: Callable[[Tensor], Tensor], channels: Tensor, columns: Sequence[int]
 ) -> Regressors:
-    """Return regressors at channels [N, nz]: a tensor, or pieces where there are many samples."""
+    """Evaluate regressors at channels [N, nz]: as a tensor, or in chunks if N is large."""
     if len(channels) > paged.MAX_SAMPLES_IN_MEMORY:
         return ChunkedRegressors(evaluate, channels, columns)
     values = evaluate(channels)
@@ -153,7 +153,7 @@ def evaluate_regressors(
 
 
 def iterate_chunks(x: Regressors) -> Iterator[tuple[slice, Tensor]]:
-    """Yield rows and the regressors there."""
+    """Yield slices of rows and the regressors of these rows."""
     if isinstance(x, ChunkedRegressors):
         yield from x
     else:
@@ -162,23 +162,23 @@ def iterate_chunks(x: Regressors) -> Iterator[tuple[slice, Tensor]]:
 
 
 def select_columns(x: Regressors, columns: Sequence[int]) -> Regressors:
-    """Return some columns of regressors."""
+    """Return the columns of these indices."""
     return x.select_columns(columns) if isinstance(x, ChunkedRegressors) else x[:, list(columns)]
 
 
 def to_dense(x: Regressors) -> Tensor:
-    """Return all regressors [N, J] in memory, for methods that need them at once."""
+    """Return all regressors [N, J] as one tensor, for methods that cannot work in chunks."""
     return torch.cat([chunk for _, chunk in x]) if isinstance(x, ChunkedRegressors) else x
 
 
 class EstimatorData(NamedTuple):
-    """What an estimator learns from; finite, with names for every column.
+    """Training data of an estimator: finite arrays with named columns.
 
     Attributes:
-        x: inputs [N, J], float64; pieces of them where there are many samples.
+        x: inputs [N, J], float64; evaluated in chunks if N is large.
         y: outputs [N, n], float64.
-        groups: number of the group of each sample [N]; None where nothing is known of groups.
-        names: of the columns of x.
+        groups: group number of each sample [N]; None if the samples have no groups.
+        names: names of the columns of x.
         outputs: names of the columns of y.
     """
 
@@ -190,7 +190,7 @@ class EstimatorData(NamedTuple):
 
 
 class Estimator(ABC):
-    """An estimator of y from x: the constructor only stores settings, `fit` takes the data."""
+    """Estimator of y from x: the constructor stores the settings, `fit` takes the data."""
 
     @final
     def fit(
@@ -202,68 +202,77 @@ class Estimator(ABC):
         names: Sequence[str] = (),
         outputs: Sequence[str] = (),
     ) -> list[Solution]:
-        """Return the solutions, first the one that the estimator itself prefers.
+        """Fit the data and return the solutions, the preferred one first.
 
-        Where the settings ask for alternatives, the solutions of other complexities follow, for a
-        criterion that the estimator does not know, such as the error of free runs.
+        If the settings request alternatives, solutions of other complexities follow. The caller
+        selects among them by a criterion of its own, such as the error of free runs.
 
         Args:
-            x: inputs [N, J], float64; pieces of them where there are many samples.
+            x: inputs [N, J], float64; evaluated in chunks if N is large.
             y: outputs [N, n], float64.
-            groups: number of the group of each sample [N]. Samples of one group, such as a
-                manoeuvre, belong together: cross-validation never splits them. None where nothing
-                is known of groups.
-            names: names of the columns of x; `x0`, `x1` and so on where empty.
-            outputs: names of the columns of y; `y0`, `y1` and so on where empty.
+            groups: group number of each sample [N]. Cross-validation never splits the samples of a
+                group, such as a manoeuvre. None if the samples have no groups.
+            names: names of the columns of x; `x0`, `x1` and so on if empty.
+            outputs: names of the columns of y; `y0`, `y1` and so on if empty.
 
         Raises:
-            FitError: where the data are not finite, or do not determine the coefficients.
+            FitError: if the data are not finite or do not determine the coefficients.
         """
-        column_labels = default_column_names(x, names, "x"), default_column_names(y, outputs, "y")
-        validate_data(x, y, *column_labels)
-        return self._solve(EstimatorData(x, y, groups, *column_labels))
+        input_names = default_column_names(x, names, "x")
+        output_names = default_column_names(y, outputs, "y")
+        validate_data(x, y, input_names, output_names)
+        return self._solve(EstimatorData(x, y, groups, input_names, output_names))
 
     @abstractmethod
     def _solve(self, data: EstimatorData) -> list[Solution]:
-        """Return the solutions of checked data, as `fit` does."""
+        """Return the solutions for validated data, the preferred one first."""
 
 
 def default_column_names(values: Regressors, names: Sequence[str], prefix: str) -> tuple[str, ...]:
-    """Return the names of columns, numbered ones where none are given."""
+    """Return the names of columns; the prefix and the column number if `names` is empty."""
     return tuple(names) or tuple(f"{prefix}{j}" for j in range(values.shape[1]))
 
 
 def require_finite(
     values: Tensor, names: Sequence[str], subject: str, first_sample: int = 0
 ) -> None:
-    """Check that all values [N, J] are finite; `first_sample` is the number of the first sample.
+    """Check that all values [N, J] are finite.
+
+    Args:
+        values: values [N, J].
+        names: names of the columns.
+        subject: noun for a column in the error message.
+        first_sample: number of the first sample of `values` in the whole record.
 
     Raises:
-        FitError: naming the column and the first sample that is not.
+        FitError: with the column and the first sample that is not finite.
     """
     is_invalid = ~torch.isfinite(values)
     if bool(is_invalid.any()):
         row, column = (int(index[0]) for index in is_invalid.nonzero(as_tuple=True))
         raise FitError(
-            f"{subject} '{names[column]}' is not finite at sample {first_sample + row}; mask or repair the"
-            " log"
+            f"{subject} '{names[column]}' is not finite at sample {first_sample + row};"
+            " mask or repair the log"
         )
 
 
 def validate_data(x: Regressors, y: Tensor, names: Sequence[str], outputs: Sequence[str]) -> None:
-    """Check that inputs [N, J] and outputs [N, n] are finite and that there are any.
+    """Check that inputs [N, J] and outputs [N, n] are finite, not empty and of equal length.
 
     Raises:
-        FitError: where they are not, or where their numbers of samples differ.
+        FitError: if a check fails.
     """
     if len(x) != len(y):
-        raise FitError(f"{len(x)} samples of the inputs, but {len(y)} of the outputs; give pairs")
+        raise FitError(
+            f"{len(x)} samples of the inputs, but {len(y)} of the outputs; give equal numbers"
+        )
     if len(x) == 0 or x.shape[1] == 0:
         raise FitError(
-            f"a regression needs samples and regressors, given {len(x)} samples of"
+            f"a regression needs samples and regressors, but the data have {len(x)} samples of"
             f" {x.shape[1]} regressors"
         )
-    names, outputs = default_column_names(x, names, "x"), default_column_names(y, outputs, "y")
+    names = default_column_names(x, names, "x")
+    outputs = default_column_names(y, outputs, "y")
     for rows, chunk in iterate_chunks(x):
         require_finite(chunk, names, "basis function", rows.start)
     for rows in iterate_row_chunks(len(y)):
@@ -271,42 +280,51 @@ def validate_data(x: Regressors, y: Tensor, names: Sequence[str], outputs: Seque
 
 
 def require_overdetermined(x: Regressors, subject: str) -> None:
-    """Check that there are more samples than columns, which are `subject`.
+    """Check that there are more samples than columns.
+
+    Args:
+        x: inputs [N, J].
+        subject: plural noun for the columns in the error message.
 
     Raises:
-        FitError: where there are not.
+        FitError: if there are not.
     """
     if len(x) <= x.shape[1]:
         raise FitError(
-            f"{len(x)} samples do not determine {x.shape[1]} {subject}; give more data or fewer terms"
+            f"{len(x)} samples do not determine {x.shape[1]} {subject};"
+            " give more data or fewer terms"
         )
 
 
 DEFAULT_FOLDS = 5
-"""Folds of a cross-validation where nobody asks for another number."""
+"""Default number of folds of a cross-validation."""
 
 
 def default_fold_count(groups: Tensor) -> int | None:
-    """Return five, or the number of groups [N] where there are fewer; None for a single group."""
+    """Return `DEFAULT_FOLDS`, or the number of groups if it is lower; None for a single group."""
     n_groups = torch.unique(groups).numel()
     return min(DEFAULT_FOLDS, n_groups) if n_groups > 1 else None
 
 
 def assign_group_folds(groups: Tensor | None, n_folds: int | None) -> Tensor:
-    """Return the fold of each sample [N], groups dealt out in turn; every group is a fold for None.
+    """Return the fold of each sample [N]; the groups are assigned to the folds in turn.
+
+    Args:
+        groups: group number of each sample [N].
+        n_folds: number of folds; None for a fold per group.
 
     Raises:
-        FitError: with fewer groups than folds, or fewer than two.
+        FitError: if there are fewer groups than folds, or fewer than two.
     """
     unique_groups = torch.unique(groups) if groups is not None else torch.zeros(0)
     if groups is None or (n_folds is None and unique_groups.numel() < 2):
         raise FitError(
-            "one run or segment only: nothing is left to cross-validate on; give more runs, or a"
-            " fixed order or penalty"
+            "cross-validation needs at least two runs or segments, but the data have one; give more"
+            " runs, or a fixed order or penalty"
         )
     if n_folds is not None and unique_groups.numel() < n_folds:
         raise FitError(
-            f"{n_folds} folds need as many manoeuvres, the training data have {unique_groups.numel()};"
-            " lower `n_folds`"
+            f"{n_folds} folds need at least {n_folds} manoeuvres, but the training data have"
+            f" {unique_groups.numel()}; lower `folds`"
         )
     return torch.searchsorted(unique_groups, groups) % (n_folds or unique_groups.numel())

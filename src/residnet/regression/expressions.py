@@ -1,10 +1,8 @@
 """Expressions in normal form: sums of products of channels and of functions of such sums.
 
-Equal expressions are equal objects.
-
-Genetic programming breeds trees; what a tree means is the sum of products that it comes to, whose
-terms get a coefficient each (document 000 sections 5.1.1 and 5.1.3). Here every product is a tuple
-of numbers of atoms, so that trees that mean the same share their columns and their fit.
+Genetic programming creates trees. The normal form of a tree is a sum of products whose terms get a
+coefficient each (document 000 sections 5.1.1 and 5.1.3). A product is a tuple of indices of atoms,
+so that trees of equal meaning compare equal and share their columns and their fit.
 """
 
 from __future__ import annotations
@@ -21,26 +19,30 @@ if TYPE_CHECKING:
 
 
 _MIN_ROOT_ARGUMENT = 1e-24
-"""What a root is taken of where its argument is less: its slope stays finite."""
+"""Lower bound of the argument of a square root, which bounds the derivative of the root."""
 
 Function = Literal["sum", "abs", "sin", "cos", "sqrt", "inv"]
-"""Functions of a sum: itself in brackets, magnitude, sine, cosine, and the protected square root
-and inverse (document 001 section 2.4).
+"""Functions of a sum: brackets, magnitude, sine, cosine, protected square root and inverse.
+
+Source of the protected functions: document 001 section 2.4.
 """
 FUNCTIONS: tuple[Function, ...] = ("sum", "abs", "sin", "cos", "sqrt", "inv")
 
 Product = tuple[int, ...]
-"""Numbers of atoms, ascending, as often as their power; () is 1."""
+"""Ascending indices of atoms, repeated according to their power; () is the constant 1."""
 Sum = dict[Product, float]
-"""Products and what they are multiplied by."""
+"""Sum of products: weight of each product."""
 CONSTANT_PRODUCT: Product = ()
 
 
 class ExpressionLimits(NamedTuple):
-    """The limits of an expression.
+    """Limits of an expression.
 
-    Terms of a sum, factors of a product, functions inside functions, and whether sums are
-    multiplied out.
+    Attributes:
+        terms: maximum number of terms of a sum.
+        degree: maximum number of factors of a product.
+        nesting: maximum depth of nested functions.
+        expand: whether products of sums are expanded.
     """
 
     terms: int = 50
@@ -50,11 +52,18 @@ class ExpressionLimits(NamedTuple):
 
 
 class TooLargeError(Exception):
-    """An expression beyond the limits; an individual that means it takes no part."""
+    """An expression exceeds the limits; the search discards the individual."""
 
 
 class Atom(NamedTuple):
-    """A channel, or a function of a sum of products: their factors and weights."""
+    """A channel, or a function of a sum of products.
+
+    Attributes:
+        channel: name of the channel; empty for a function.
+        function: name of the function; unused for a channel.
+        inner: products and weights of the argument of a function; empty for a channel.
+        nesting: depth of nested functions; 0 for a channel.
+    """
 
     channel: str
     function: Function = "sum"
@@ -63,9 +72,9 @@ class Atom(NamedTuple):
 
 
 class Algebra:
-    """The sums of products over named channels, kept in normal form.
+    """Algebra of sums of products of named channels in normal form.
 
-    |a|^2 = a^2, |a b| = |a| |b|, cos(-a) = cos a, sin(-a) = -sin a.
+    Simplifications: |a|^2 = a^2, |a b| = |a| |b|, cos(-a) = cos a, sin(-a) = -sin a.
     """
 
     def __init__(self, channels: Sequence[str], limits: ExpressionLimits | None = None) -> None:
@@ -76,14 +85,14 @@ class Algebra:
         self._product_cache: dict[tuple[Product, Product], Product] = {}
 
     def make_channel(self, name: str) -> Sum:
-        """Return a channel alone."""
+        """Return the sum that is a single channel."""
         return {(self.channels.index(name),): 1.0}
 
     def add(self, a: Sum, b: Sum, sign: float = 1.0) -> Sum:
         """Return a + sign b.
 
         Raises:
-            TooLargeError: beyond the limits.
+            TooLargeError: if the result exceeds the limits.
         """
         result = dict(a)
         for product, weight in b.items():
@@ -95,13 +104,14 @@ class Algebra:
         return self._require_within_limits(result)
 
     def multiply(self, a: Sum, b: Sum) -> Sum:
-        """Return a b, multiplied out or as a product of brackets.
+        """Return a b, expanded or as a product of brackets.
 
         Raises:
-            TooLargeError: beyond the limits.
+            TooLargeError: if the result exceeds the limits.
         """
         if not self.limits.expand:
-            a, b = self.bracket_sum(a), self.bracket_sum(b)
+            a = self.bracket_sum(a)
+            b = self.bracket_sum(b)
         if len(a) * len(b) > 4 * self.limits.terms:
             raise TooLargeError
         result: Sum = {}
@@ -120,11 +130,13 @@ class Algebra:
         """Return a function of a sum.
 
         Raises:
-            TooLargeError: beyond the limits.
+            TooLargeError: if the result exceeds the limits.
         """
+        # a function of a constant is a constant
         if all(product == CONSTANT_PRODUCT for product in a):
             value = float(apply_function(function, np.array([a.get(CONSTANT_PRODUCT, 0.0)]))[0])
             return {CONSTANT_PRODUCT: value} if value else {}
+        # multiplicative functions of a product are products of functions
         if len(a) == 1 and function in ("abs", "sqrt", "inv"):
             ((product, weight),) = a.items()
             factor = float(apply_function(function, np.array([weight]))[0])
@@ -136,6 +148,7 @@ class Algebra:
                     [atom for factor_product in factor_products for atom in factor_product]
                 ): factor
             }
+        # normalise the sign of the argument, so that f(a) and f(-a) share an atom
         if a[min(a)] > 0:
             return {self._normalise_function(function, a): 1.0}
         negated = {product: -weight for product, weight in a.items()}
@@ -143,7 +156,7 @@ class Algebra:
         return {self._normalise_function(function, negated): -1.0 if is_odd else 1.0}
 
     def bracket_sum(self, a: Sum) -> Sum:
-        """Return a sum of several terms as one factor."""
+        """Return a sum of several terms as one bracketed factor times its leading weight."""
         if len(a) <= 1:
             return a
         leading_weight = a[min(a)]
@@ -154,10 +167,10 @@ class Algebra:
         }
 
     def make_product(self, factors: Iterable[tuple[str, str, int]]) -> Product:
-        """Return a product of (function, channel, power); a function may be empty.
+        """Build a product of factors (function, channel, power); the function may be empty.
 
         Raises:
-            TooLargeError: beyond the limits.
+            TooLargeError: if the result exceeds the limits.
         """
         result: Sum = {CONSTANT_PRODUCT: 1.0}
         for function, name, power in factors:
@@ -173,7 +186,7 @@ class Algebra:
         return next(iter(result))
 
     def register_atom(self, function: Function, a: Sum) -> int:
-        """Return the number of a function of a sum in normal form."""
+        """Return the index of the atom of a function of a sum; add it if it is new."""
         nesting = 1 + max([self.atoms[i].nesting for product in a for i in product], default=0)
         atom = Atom("", function, tuple(sorted(a.items())), nesting)
         if atom not in self._atom_numbers:
@@ -182,7 +195,7 @@ class Algebra:
         return self._atom_numbers[atom]
 
     def count_factors(self, product: Product) -> int:
-        """Return the number of factors of a product, with those inside its functions."""
+        """Return the number of factors of a product, including those inside functions."""
         return sum(
             max([self.count_factors(p) for p, _ in self.atoms[i].inner], default=1)
             + bool(self.atoms[i].nesting)
@@ -190,7 +203,7 @@ class Algebra:
         )
 
     def complexity(self, product: Product) -> float:
-        """Return how complicated a product is among those of its degree."""
+        """Return a score by which products of equal degree are sorted, simplest first."""
         return len(set(product)) + sum(
             0.5 + 0.1 * len(self.atoms[atom_number].inner)
             for atom_number in product
@@ -198,7 +211,7 @@ class Algebra:
         )
 
     def _normalise_function(self, function: Function, a: Sum) -> Product:
-        """Return the product that a function of a sum is, a simpler one for a single atom."""
+        """Return the product of a function of a sum, simplified for a single atom."""
         ((first_product, weight),) = list(a.items())[:1]
         if (
             len(a) == 1
@@ -222,7 +235,7 @@ class Algebra:
         return (self.register_atom(function, a),)
 
     def _normalise_product(self, factors: list[int]) -> Product:
-        """Return the product in ascending order, with squares of magnitudes as squares."""
+        """Return the sorted product, with squared magnitudes replaced by squares."""
         atoms = sorted(factors)
         for i in {i for i in atoms if self.atoms[i].function == "abs" and atoms.count(i) > 1}:
             inner_terms = self.atoms[i].inner
@@ -249,16 +262,16 @@ class Algebra:
     def evaluate_products(
         self, products: Sequence[Product], data: Mapping[str, np.ndarray]
     ) -> np.ndarray:
-        """Return the values [P, N] of products at channels [N] each.
+        """Evaluate products at channels of N samples, [P, N].
 
-        They are infinite or not a number where they cannot be had.
+        Values are infinite or NaN on overflow.
         """
         columns = ProductEvaluator(self, data)
         return columns.evaluate(products)
 
 
 class ProductEvaluator:
-    """Atoms along data, each worked out once."""
+    """Evaluates products on data; every atom is evaluated once."""
 
     def __init__(self, algebra: Algebra, data: Mapping[str, np.ndarray]) -> None:
         self.algebra = algebra
@@ -267,7 +280,7 @@ class ProductEvaluator:
         self._row_of_atom = {i: i + 1 for i in range(len(rows))}
 
     def evaluate(self, products: Sequence[Product]) -> np.ndarray:
-        """Return the values [P, N] of products."""
+        """Evaluate products, [P, N]."""
         self._evaluate_atoms({i for product in products for i in product})
         max_factors = max([len(product) for product in products], default=0)
         index = np.array(
@@ -301,7 +314,7 @@ class ProductEvaluator:
 
 
 def apply_function(function: Function, x: np.ndarray) -> np.ndarray:
-    """Return a function of values."""
+    """Apply a function to values."""
     return np.asarray(_NUMPY_FUNCTIONS[function](x))
 
 
@@ -316,9 +329,9 @@ _NUMPY_FUNCTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 class ResizableModule(nn.Module):
-    """A module whose buffers take the shapes of what is loaded.
+    """Module whose buffers are resized to the shapes of a loaded state_dict.
 
-    How many terms an equation has, or samples a kernel, is known only from the data.
+    The number of terms of an equation, or of centres of a kernel, depends on the data.
     """
 
     def _load_from_state_dict(
@@ -334,7 +347,11 @@ class ResizableModule(nn.Module):
 
 
 class ProductLayer(ResizableModule):
-    """The products of columns: [..., C] -> [..., P], gathered by index [D, P]; column 0 is one."""
+    """Products of columns, [..., C] -> [..., P].
+
+    The buffer `index` [D, P] has the columns of the D factors of each product. Column 0 is the
+    constant 1, which pads products of fewer factors.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -342,7 +359,7 @@ class ProductLayer(ResizableModule):
 
     @torch.jit.unused
     def decode_products(self, atom_of_column: Mapping[int, int]) -> list[Product]:
-        """Return the atoms of each product, from those of the columns."""
+        """Return the products in terms of atoms, given the atom of each column."""
         return [
             tuple(sorted(atom_of_column[i] for i in column if i))
             for column in self.index.T.tolist()
@@ -357,7 +374,7 @@ class ProductLayer(ResizableModule):
 
 
 class FunctionLayer(ResizableModule):
-    """The columns with K functions of sums beside them: f_k(sum_m weight_km product_km)."""
+    """Appends K functions of sums, f_k(sum_m weight_km product_km), to the columns."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -367,19 +384,20 @@ class FunctionLayer(ResizableModule):
         self.root_floor = _MIN_ROOT_ARGUMENT
 
     def forward(self, columns: Tensor) -> Tensor:
-        """Return [..., C + K] for columns [..., C]."""
+        """Append the functions: [..., C] -> [..., C + K]."""
         if self.weight.shape[0] == 0:
             return columns
         inner_sums = (
             self.products(columns).unflatten(-1, self.weight.shape) * self.weight.to(columns.dtype)
         ).sum(-1)
+        # the protected inverse is 0 at 0; the inner `where` avoids NaN in the gradient
         is_zero = inner_sums == 0
         inverse = torch.where(
             is_zero,
             inner_sums,
             torch.where(is_zero, torch.ones_like(inner_sums), inner_sums).reciprocal(),
         )
-        # in the order of FUNCTIONS
+        # the order is that of FUNCTIONS
         values = torch.stack(
             (
                 inner_sums,
@@ -397,9 +415,9 @@ class FunctionLayer(ResizableModule):
 
 
 class ExpressionLibrary(nn.Module):
-    """The values of J terms from channels: [..., F] -> [..., J].
+    """Values of J terms from channels, [..., F] -> [..., J].
 
-    Functions of functions follow one level after the other.
+    Each level evaluates the functions of one nesting depth.
     """
 
     def __init__(self, nesting: int) -> None:
@@ -409,7 +427,7 @@ class ExpressionLibrary(nn.Module):
 
     @torch.jit.unused
     def decode_terms(self, channels: Sequence[str]) -> tuple[Algebra, list[Product]]:
-        """Return the terms again, for channels by name: `build_library_state` backwards."""
+        """Return the algebra and terms of the state, the inverse of `build_library_state`."""
         algebra = Algebra(channels, ExpressionLimits(nesting=len(self.levels)))
         atom_of_column: dict[int, int] = {i + 1: i for i in range(len(channels))}
         for level in self.levels:
@@ -445,7 +463,7 @@ class ExpressionLibrary(nn.Module):
 
 
 class CoefficientTable(ResizableModule):
-    """The coefficients [J, n] of the terms on each axis."""
+    """Coefficients [J, n] of the terms on each axis."""
 
     def __init__(self, outputs: int) -> None:
         super().__init__()
@@ -455,10 +473,14 @@ class CoefficientTable(ResizableModule):
 def build_library_state(
     algebra: Algebra, terms: Sequence[Product], nesting: int
 ) -> dict[str, Tensor]:
-    """Return the state of an `ExpressionLibrary` of these terms.
+    """Build the state of an `ExpressionLibrary`, with all nested functions of its terms.
 
-    It has all functions that they need, innermost first.
+    Args:
+        algebra: algebra of the terms.
+        terms: the J terms.
+        nesting: number of levels of the library.
     """
+    # collect the atoms inside functions, from the terms inwards
     required_atoms: set[int] = set()
     new_atoms = {i for product in terms for i in product}
     while new_atoms:
@@ -466,6 +488,7 @@ def build_library_state(
         new_atoms = {
             i for k in new_atoms for product, _ in algebra.atoms[k].inner for i in product
         } - required_atoms
+    # the columns of a level are those of the previous level and its functions
     function_atoms = sorted(i for i in required_atoms if algebra.atoms[i].nesting)
     column_of_atom = {i: i + 1 for i in range(len(algebra.channels))}
     state: dict[str, Tensor] = {}
@@ -510,27 +533,27 @@ TEXT_FORMATS = {
     "abs": "|{}|",
     **{name: name + "({})" for name in ("sin", "cos", "sqrt", "ssqrt", "inv")},
 }
-"""How functions are written in the term language."""
+"""Format of a function of an argument in the term language."""
 Factors = Sequence[tuple[str, str, int]]
-"""A product of (function, channel, power); no function stands for the channel itself."""
+"""Product of factors (function, channel, power); the function is empty for a plain channel."""
 
 
 def format_product(algebra: Algebra, product: Product) -> str:
-    """Return a product in plain text, channels before functions; `1` where it is empty.
+    """Format a product as plain text, channels before functions; `1` for the empty product.
 
-    It does not depend on the order in which atoms were found.
+    The text does not depend on the order in which the atoms were registered.
     """
     formatted_atoms = [
         (_format_atom(algebra, i), algebra.atoms[i].nesting, i) for i in set(product)
     ]
-    # channels in their own order, functions by what is written
+    # channels in the order of the algebra, functions alphabetically
     formatted_atoms.sort(key=lambda entry: (entry[1], entry[2] if not entry[1] else 0, entry[0]))
     atom_powers = [(text, product.count(i)) for text, _, i in formatted_atoms]
     return " ".join(text if power == 1 else f"{text}^{power}" for text, power in atom_powers) or "1"
 
 
 def format_sum(terms: Sequence[str], weights: Sequence[float]) -> str:
-    """Return a weighted sum of terms in plain text, six digits; weights of 1 are not written."""
+    """Format a weighted sum of terms with six digits; weights of 1 are omitted."""
     text_sum = ""
     for text, weight in zip(terms, weights, strict=True):
         number = f"{abs(weight):.6g}"
@@ -553,7 +576,7 @@ def _format_atom(algebra: Algebra, i: int) -> str:
 
 
 def terms_to_sympy(terms: Sequence[Factors], weights: Sequence[float]) -> sympy.Expr:
-    """Return a weighted sum of products of functions of channels as a SymPy expression."""
+    """Convert a weighted sum of products of functions of channels to a SymPy expression."""
     import sympy
 
     summands = []
@@ -567,7 +590,7 @@ def terms_to_sympy(terms: Sequence[Factors], weights: Sequence[float]) -> sympy.
 
 
 def products_to_sympy(algebra: Algebra, products: Sequence[tuple[Product, float]]) -> sympy.Expr:
-    """Return a weighted sum of products of an algebra as a SymPy expression."""
+    """Convert a weighted sum of products of an algebra to a SymPy expression."""
     import sympy
 
     def atom(i: int) -> Any:
@@ -601,17 +624,19 @@ def format_equation(
     channels: Sequence[str],
     comment: str = "",
 ) -> dict[str, str]:
-    """Return one equation in writing.
+    """Format an equation as plain text, LaTeX, SymPy and C.
 
     Args:
         name: left side, for example `u_dot`.
-        channels: channels that may appear, in the order of a function's arguments.
-        comment: what stands above the function in C.
+        right_hand_side: right side as plain text.
+        expression: right side as a SymPy expression.
+        channels: all channels, in the order of the arguments of the C function.
+        comment: comment above the C function; none if empty.
 
     Returns:
-        `right_hand_side`, plain with six digits; `latex`, with six digits; `sympy`, the right side with all
-        digits, for `sympy.sympify`; and `c`, a C99 function `double <name>(double <channel>, ...)`
-        with all digits, which has all channels as arguments and needs <math.h>.
+        `text` with six digits; `latex` with six digits; `sympy`, the right side with all digits for
+        `sympy.sympify`; and `c`, a C99 function `double <name>(double <channel>, ...)` with all
+        digits, which needs <math.h>.
     """
     import sympy
 

@@ -1,10 +1,10 @@
-"""Genetic programming of equations as document 000 does it (chapters 4 to 6), on the library DEAP.
+"""Genetic programming of equations by the method of document 000 (chapters 4 to 6), with DEAP.
 
-Individuals are trees over channels and operators. What a tree comes to is taken apart at + and -
-into terms, products multiplied out first where `split` says so; each term gets a coefficient by
-least squares, and the mean square error that is left is the fitness. Tournaments choose parents,
-one-point crossover and uniform mutation make the next generation within a limit of depth, and the
-search stops early on validation samples.
+Individuals are trees of channels and operators. The expression of a tree is split at + and - into
+terms, after expansion of products if `split` is `expand`. Least squares gives every term a
+coefficient, and the fitness is the mean squared error. Tournament selection, one-point crossover
+and uniform mutation with a depth limit create the next generation. The error on validation samples
+ends the search (early stopping).
 """
 
 from __future__ import annotations
@@ -50,55 +50,55 @@ from residnet.regression.sparse import (
 Operator = Literal["+", "-", "*", "/", "abs", "sin", "cos", "sqrt"]
 BINARY = {"+": "add", "-": "subtract", "*": "multiply", "/": "divide"}
 VALIDATION_BLOCKS = 8
-"""Blocks of the record that validation takes turns on where there are too few groups."""
+"""Number of blocks of the record used instead of groups if there are too few groups."""
 Terms = tuple[Product, ...]
 _SINGULARITY_TOLERANCE = 1e-13
-"""Share of a term's energy that must be left beside the terms before it; below it the Gram matrix
-counts as singular (section 5.1.2).
+"""Squared pivot of the Cholesky factor below which a Gram matrix counts as singular.
+
+Source: document 000 section 5.1.2.
 """
 _MIN_MEAN_SQUARE = 1e-300
-"""Least mean square of a target that errors are divided by."""
+"""Lower bound of the mean square of a target in a denominator."""
 _MIN_TERM_RMS = 1e-100
-"""Root mean square of a term below which it is not used."""
+"""Root mean square below which a term counts as zero."""
 _MAX_CACHE_NUMBERS = 40_000_000
-"""Numbers in the cache of columns before it is emptied."""
+"""Maximum number of array elements in the cache of columns; it is cleared above."""
 _MAX_BATCH_NUMBERS = 3_000_000
-"""Numbers in one batch of columns."""
+"""Maximum number of array elements in one batch of columns."""
 
 
 class EvolutionConfig(Config):
-    """How a population is bred; the defaults are Table 6.1's but for the population.
+    """Settings of the evolution; the defaults except the population are those of Table 6.1.
 
     Attributes:
         population: number of individuals.
-        generations: most generations after the first.
-        operators: of the trees; `/` is 0 at a divisor of 0 and `sqrt` takes the magnitude (document
-            001 section 2.4).
-        constants: range of random constants in trees; None for none. A term's factor is fitted, so
-            that they only matter within functions.
-        tournament: individuals among which a parent is the best.
-        crossover: share of an offspring generation from one-point crossover.
-        mutation: share from uniform mutation, which puts a full tree of depth 0 to 2 in a node's
-            place; the rest is copied.
-        depth: highest depth of a tree.
-        first_depth: least and largest depth of the first trees, half of them full, half grown.
-        genes: trees per individual (multigene form of document 001; there 5 of depth 3); of two
-            crossovers one then exchanges whole trees.
-        split: what gets a coefficient: every `gene`, every summand of the tree as it stands (`sum`,
-            section 5.1.1), or every summand when it is multiplied out (`expand`, section 5.1.3).
-        equal_terms: what becomes of a tree in which a term stands twice: its terms are added
-            (`merge`), or it takes no part (`reject`), as in the document, whose Gram matrix is then
-            singular (section 5.1.2).
-        max_terms: most terms of an individual; those with more take no part, nor those with
-            products of more than `max_degree` factors.
-        max_degree: most factors of a term.
-        nesting: most functions within functions; bars of a magnitude and brackets count.
-        elite: how many of the best go over unchanged.
-        goal: mean square error over the target's mean square, in training and validation, at which
-            the search ends.
-        patience: generations without a better validation error after which it ends.
-        rows: most training samples that the search looks at, evenly thinned; coefficients in the
-            result are fitted to all.
+        generations: maximum number of generations after the initial population.
+        operators: operators of the trees. `/` returns 0 for a divisor of 0 and `sqrt` uses the
+            magnitude of its argument (document 001 section 2.4).
+        constants: range of random constants in trees; None for no constants. Coefficients of terms
+            are fitted, so constants matter only as arguments of functions.
+        tournament: number of individuals in a selection tournament.
+        crossover: share of the offspring created by one-point crossover.
+        mutation: share created by uniform mutation, which replaces a node by a full tree of depth
+            0 to 2. The remaining offspring are copies.
+        depth: maximum depth of a tree.
+        first_depth: minimum and maximum depth of the initial trees (ramped half-and-half).
+        genes: number of trees per individual (multigene form of document 001, which uses 5 trees
+            of depth 3). With several trees, half of the crossovers exchange whole trees.
+        split: the parts of an individual that get a coefficient: every tree (`gene`), every summand
+            of a tree without expansion (`sum`, section 5.1.1), or every summand after expansion
+            (`expand`, section 5.1.3).
+        equal_terms: treatment of a tree with repeated terms: add them (`merge`), or discard the
+            individual (`reject`) as the document does, where the Gram matrix is singular (section
+            5.1.2).
+        max_terms: maximum number of terms of an individual; individuals with more are discarded.
+        max_degree: maximum number of factors of a term; individuals with more are discarded.
+        nesting: maximum depth of nested functions; magnitudes and brackets count as functions.
+        elite: number of best individuals copied unchanged to the next generation.
+        goal: relative mean squared error, in training and validation, at which the search ends.
+        patience: number of generations without a lower validation error after which it ends.
+        rows: maximum number of training samples of the search, thinned evenly; the coefficients of
+            the result are fitted to all samples.
     """
 
     population: int = Field(default=500, ge=2, le=100_000)
@@ -125,48 +125,47 @@ class EvolutionConfig(Config):
     def _validate_settings(self) -> EvolutionConfig:
         if self.crossover + self.mutation > 1:
             raise ValueError(
-                "crossover and mutation are shares of the offspring; together at most 1, given"
-                f" {self.crossover} + {self.mutation}"
+                "crossover and mutation: their sum is a share of the offspring and at most 1,"
+                f" but is {self.crossover} + {self.mutation}"
             )
         if not set(self.operators) & BINARY.keys():
-            raise ValueError("operators: trees need one of +, -, *, / at least")
+            raise ValueError("operators: give at least one of +, -, *, /")
         if not 0 <= self.first_depth[0] <= self.first_depth[1] <= self.depth:
             raise ValueError(
-                f"first_depth: expected least <= largest <= depth ({self.depth}), given"
+                f"first_depth: expected minimum <= maximum <= depth ({self.depth}), but got"
                 f" {list(self.first_depth)}"
             )
         if self.equal_terms == "reject" and self.split == "gene":
             raise ValueError(
-                "equal_terms: a gene is one term whatever stands in it; reject goes with split sum"
-                " or expand"
+                "equal_terms: reject needs split: sum or split: expand, because with split: gene"
+                " every tree is one term"
             )
         if self.elite >= self.population:
             raise ValueError(
-                f"elite: must leave room for offspring in a population of {self.population}, given"
+                f"elite: expected less than the population ({self.population}), but got"
                 f" {self.elite}"
             )
         return self
 
 
 def expression_limits(config: EvolutionConfig) -> ExpressionLimits:
-    """Return the limits of the terms of a search."""
+    """Return the limits of the expressions of a search."""
     return ExpressionLimits(
         config.max_terms, config.max_degree, config.nesting, config.split == "expand"
     )
 
 
 class EquationSearchConfig(Config):
-    """A search for the equations of several outputs.
+    """Settings of a search for the equations of several outputs.
 
     Attributes:
-        evolution: how equations are bred.
-        final: how the terms of the individual that wins are chosen from once more, by the extended
-            BIC on all samples, together with those of a sparse search of the usual candidates:
-            terms that genetic programming carries along without need go, and what it missed comes
-            in. None keeps the individual's, all of them and no others.
-        validate_every: number n of which every n-th manoeuvre validates during the search; with
-            fewer manoeuvres every n-th eighth of the samples.
-        seed: seed of the random choices; each axis has its own.
+        evolution: settings of the genetic programming.
+        final: settings of the final selection by the extended BIC on all samples, among the terms
+            of the best individual and the usual candidates of sparse regression. It removes
+            superfluous terms and adds missing ones. None for the terms of the individual.
+        validate_every: number n; every n-th manoeuvre is used for validation during the search.
+            With fewer than n manoeuvres every n-th eighth of the samples is used.
+        seed: random seed; each axis has a different one that is derived from it.
     """
 
     evolution: EvolutionConfig = Field(default_factory=EvolutionConfig)
@@ -176,13 +175,11 @@ class EquationSearchConfig(Config):
 
 
 class FitnessEvaluator:
-    """The errors of individuals on training and validation samples.
+    """Computes relative mean squared errors of individuals on training and validation samples.
 
-    They are mean square errors over the target's mean square on each.
-
-    Each distinct set of terms is fitted once in the whole search. A generation's new sets go
-    through together: columns of the terms that they share are computed once, then Gram matrices,
-    Cholesky factors and residuals are batched (document 000 eqs. (5.4)-(5.6)).
+    Each distinct set of terms is fitted once per search. The new sets of a generation share the
+    columns of their terms, and Gram matrices, Cholesky factors and residuals are computed in
+    batches (document 000 eqs. (5.4)-(5.6)).
     """
 
     def __init__(
@@ -192,7 +189,14 @@ class FitnessEvaluator:
         target: np.ndarray,
         is_training: np.ndarray,
     ) -> None:
-        """From channels [N], the target [N], and which samples [N] train."""
+        """Prepare the evaluation.
+
+        Args:
+            algebra: algebra of the channels.
+            data: channels [N] by name.
+            target: target [N].
+            is_training: which samples [N] are used for training; the others validate.
+        """
         order = np.argsort(~is_training, kind="stable")
         self._evaluator = ProductEvaluator(
             algebra,
@@ -200,7 +204,8 @@ class FitnessEvaluator:
         )
         self.n_train = int(is_training.sum())
         y = torch.from_numpy(np.asarray(target, dtype=np.float64)[order])
-        self.y, self.y_validation = y[: self.n_train], y[self.n_train :]
+        self.y = y[: self.n_train]
+        self.y_validation = y[self.n_train :]
         self.target_mean_square = [
             max(float(values.square().mean()), _MIN_MEAN_SQUARE)
             for values in (self.y, self.y_validation)
@@ -210,9 +215,9 @@ class FitnessEvaluator:
         self._clear_cache()
 
     def evaluate(self, individuals: Sequence[Terms | None]) -> list[tuple[float, float, Terms]]:
-        """Return (training error, validation error, terms that are left) of each.
+        """Return (training error, validation error, terms) of each set of terms.
 
-        Errors are infinite where there are no terms, or they are not independent.
+        Errors are infinite for an empty set, a non-finite term and linearly dependent terms.
         """
         new_term_sets = [
             terms
@@ -245,7 +250,7 @@ class FitnessEvaluator:
         self._is_usable = torch.zeros(0, dtype=torch.bool)
 
     def _cache_columns(self, products: set[Product]) -> None:
-        """Keep columns of unit mean square over the training samples."""
+        """Add the columns of products to the cache, scaled to unit mean square in training."""
         if (len(self._cache_rows) + len(products)) * self._cached_columns.shape[
             1
         ] > _MAX_CACHE_NUMBERS:
@@ -268,7 +273,8 @@ class FitnessEvaluator:
         columns = self._cached_columns[
             torch.tensor([[self._cache_rows[p] for p in terms] for terms in term_sets])
         ]
-        x, x_validation = columns[..., : self.n_train], columns[..., self.n_train :]
+        x = columns[..., : self.n_train]
+        x_validation = columns[..., self.n_train :]
         gram = x @ x.transpose(1, 2) / self.n_train
         cholesky_factor, info = torch.linalg.cholesky_ex(gram)
         right_hand_side = (x @ self.y / self.n_train)[..., None]
@@ -299,7 +305,7 @@ class FitnessEvaluator:
 
 @dataclass(frozen=True)
 class GenerationRecord:
-    """The best individual of a generation: relative mean square errors and number of terms."""
+    """Relative mean squared errors and number of terms of the best individual of a generation."""
 
     train: float
     validation: float
@@ -308,17 +314,17 @@ class GenerationRecord:
 
 @dataclass(frozen=True)
 class EvolutionResult:
-    """What a search found.
+    """Result of a search.
 
     Attributes:
-        terms: of the individual of the least validation error among the best of each generation.
-        train: its mean square error over the target's mean square on the training samples that the
-            search looked at.
-        validation: the same on all validation samples.
-        generation: when it appeared; 0 is the first population.
-        is_goal_reached: whether both errors came below the goal.
-        history: the best individual of each generation.
-        n_fitted: how many different sets of terms were fitted.
+        terms: terms of the individual of minimum validation error among the best individuals of
+            all generations.
+        train: its relative mean squared error on the thinned training samples.
+        validation: its relative mean squared error on all validation samples.
+        generation: generation in which it appeared; 0 is the initial population.
+        is_goal_reached: whether both errors are below the goal.
+        history: best individual of each generation.
+        n_fitted: number of distinct sets of terms that were fitted.
     """
 
     terms: Terms
@@ -331,7 +337,7 @@ class EvolutionResult:
 
 
 class Individual:
-    """Trees and, once it is known, minus the training error; DEAP's tournament reads `fitness`."""
+    """Trees of an individual and its errors; DEAP reads `fitness`, minus the training error."""
 
     __slots__ = ("fitness", "terms", "trees", "validation")
 
@@ -342,7 +348,7 @@ class Individual:
         self.terms: Terms = ()
 
     def copy(self) -> Individual:
-        """Return the same trees in lists of their own."""
+        """Return a copy whose trees can be changed independently."""
         return Individual([tree.__class__(tree) for tree in self.trees])
 
 
@@ -354,19 +360,20 @@ def evolve(
     config: EvolutionConfig,
     seed: int,
 ) -> EvolutionResult:
-    """Search the equation of one target.
+    """Search the equation of one target by genetic programming.
 
     Args:
-        algebra: of the channels, within `expression_limits` the config.
+        algebra: algebra of the channels with the limits of `expression_limits`.
         data: channels [N] by name.
-        target: what the equation is to give, [N].
-        is_training: which samples [N] train; the others validate.
-        seed: of all random choices.
+        target: target [N].
+        is_training: which samples [N] are used for training; the others validate.
+        config: settings of the evolution.
+        seed: random seed.
 
     Raises:
-        FitError: without training or validation samples, with values that are not finite, or where
-            no individual could be fitted.
-        UsageError: where DEAP is not installed.
+        FitError: if training or validation samples are missing, values are not finite, or no
+            individual can be fitted.
+        UsageError: if DEAP is not installed.
     """
     require_package("deap", "genetic programming", "gp")
     for name, values in [
@@ -374,11 +381,12 @@ def evolve(
         ("the target", target),
     ]:
         if not np.isfinite(values).all():
-            raise FitError(f"genetic programming: {name} is not finite in all samples; mask those")
+            raise FitError(f"genetic programming: {name} is not finite in all samples; mask these")
     if not 0 < is_training.sum() < len(is_training):
         raise FitError(
-            f"genetic programming: needs samples to train and to validate, given {int(is_training.sum())}"
-            f" of {len(is_training)} to train"
+            "genetic programming needs training and validation samples, but"
+            f" {int(is_training.sum())} of {len(is_training)} samples are for training; give more"
+            " manoeuvres"
         )
     training_rows = np.flatnonzero(is_training)
     thinned_index = (
@@ -395,7 +403,7 @@ def evolve(
         target[selected_rows],
         is_training[selected_rows],
     )
-    # DEAP draws from Python's own generator
+    # DEAP draws from the global generator of Python: seed it, and restore its state afterwards
     random_state = random.getstate()
     random.seed(seed)
     try:
@@ -405,7 +413,7 @@ def evolve(
 
 
 class _Evolution:
-    """One search."""
+    """Genetic programming of one equation with the operators of DEAP."""
 
     def __init__(
         self, algebra: Algebra, fitness: FitnessEvaluator, config: EvolutionConfig
@@ -413,7 +421,10 @@ class _Evolution:
         from deap import gp
 
         self.gp = gp
-        self.algebra, self.fitness, self.config = algebra, fitness, config
+        self.algebra = algebra
+        self.fitness = fitness
+        self.config = config
+        # the primitives are names only; `_tree_to_sum` evaluates trees to sums of products
         primitive_set = self.gp.PrimitiveSet("main", 0)
         for operator in self.config.operators:
             arity = 2 if operator in BINARY else 1
@@ -446,7 +457,7 @@ class _Evolution:
         )
 
     def run_evolution(self) -> EvolutionResult:
-        """Breed generations until the goal, the patience's end or the last one."""
+        """Evolve until the goal, the end of the patience or the last generation."""
         min_depth, max_depth = self.config.first_depth
         generate_tree = partial(self.gp.genHalfAndHalf, self.primitive_set, min_depth, max_depth)
         initial_population = [
@@ -458,12 +469,10 @@ class _Evolution:
         def record_generation(best: Individual) -> GenerationRecord:
             return GenerationRecord(-best.fitness, best.validation, len(best.terms))
 
-        best_individual, best_generation, history, is_goal_reached = (
-            population[0],
-            0,
-            [record_generation(population[0])],
-            False,
-        )
+        best_individual = population[0]
+        best_generation = 0
+        history = [record_generation(population[0])]
+        is_goal_reached = False
         for generation in range(self.config.generations + 1):
             is_goal_reached = (
                 max(-best_individual.fitness, best_individual.validation) <= self.config.goal
@@ -479,11 +488,12 @@ class _Evolution:
             )
             history.append(record_generation(population[0]))
             if population[0].validation < best_individual.validation:
-                best_individual, best_generation = population[0], generation + 1
+                best_individual = population[0]
+                best_generation = generation + 1
         if not best_individual.terms:
             raise FitError(
-                "genetic programming: no individual has terms that the data tell apart; give a"
-                " larger population or other operators"
+                "genetic programming: no individual has linearly independent terms on these data;"
+                " give a larger population or other operators"
             )
         return EvolutionResult(
             best_individual.terms,
@@ -496,7 +506,7 @@ class _Evolution:
         )
 
     def _make_offspring(self, population: Sequence[Individual]) -> list[Individual]:
-        """Return children of parents by tournament: crossover, mutation or a copy."""
+        """Create offspring of tournament winners by crossover, mutation or copying."""
         from deap import tools
 
         n_offspring = self.config.population - self.config.elite
@@ -514,14 +524,12 @@ class _Evolution:
         return offspring
 
     def _crossover(self, child: Individual, other_parent: Individual) -> None:
-        """Cross a tree of each at one point.
+        """Cross a random tree of the child with one of another parent, in place.
 
-        With several genes every other time whole ones are exchanged.
+        With several genes, half of the crossovers exchange whole trees.
         """
-        child_index, other_index = (
-            random.randrange(len(child.trees)),
-            random.randrange(len(other_parent.trees)),
-        )
+        child_index = random.randrange(len(child.trees))
+        other_index = random.randrange(len(other_parent.trees))
         if len(child.trees) > 1 and random.random() < 0.5:
             child.trees[child_index] = other_parent.trees[other_index]
         else:
@@ -530,14 +538,16 @@ class _Evolution:
             )
 
     def _evaluate_and_sort(self, individuals: list[Individual]) -> list[Individual]:
-        """Return the individuals with fitness, best first; of equals the one of fewer terms."""
+        """Evaluate individuals and sort them by fitness, ties by the number of terms."""
         results = self.fitness.evaluate([self._to_terms(individual) for individual in individuals])
         for individual, (train, validation, terms) in zip(individuals, results, strict=True):
-            individual.fitness, individual.validation, individual.terms = -train, validation, terms
+            individual.fitness = -train
+            individual.validation = validation
+            individual.terms = terms
         return sorted(individuals, key=lambda i: (-i.fitness, len(i.terms)))
 
     def _to_terms(self, individual: Individual) -> Terms | None:
-        """Return the terms of an individual; None beyond the limits or without any."""
+        """Return the terms of an individual; None if it has none or exceeds the limits."""
         products: set[Product] = set()
         try:
             for tree in individual.trees:
@@ -552,7 +562,7 @@ class _Evolution:
         return tuple(sorted(products)) if 0 < len(products) <= self.config.max_terms else None
 
     def _has_repeated_term(self, tree: Any) -> bool:
-        """Return whether a term stands twice among the branches at + and - from the root down."""
+        """Return whether the summands of a tree, split at + and - from the root, repeat a term."""
         seen_products: set[Product] = set()
         pending = [0]
         while pending:
@@ -568,7 +578,7 @@ class _Evolution:
         return False
 
     def _tree_to_sum(self, tree: Sequence[Any]) -> Sum:
-        """Return the sum that a tree in prefix order comes to."""
+        """Evaluate a tree in prefix order to a sum of products."""
         stack: list[Sum] = []
         for node in reversed(tree):
             if node.arity == 2:
@@ -587,26 +597,31 @@ class _Evolution:
 
 @final
 class GeneticEquations(Estimator):
-    """An equation of the inputs for each output, without intercept, by genetic programming.
+    """Genetic programming of an equation without intercept for each output.
 
-    A solution's state is that of an `ExpressionLibrary` under the name `library`, and the
-    coefficients of its terms [P, n], `weights.values`.
+    The state of a solution is that of an `ExpressionLibrary` with the prefix `library.`, and the
+    coefficients of its terms [P, n] as `weights.values`.
 
     Args:
-        extra_terms: factors (function, channel, power) of terms that the final choice has beside those
-            that are bred, by output; none where empty.
+        config: settings of the search.
+        extra_terms: additional candidates of the final selection per output, each a sequence of
+            factors (function, channel, power); no additional candidates if empty.
     """
 
     def __init__(
         self, config: EquationSearchConfig, extra_terms: Sequence[Sequence[Factors]] = ()
     ) -> None:
-        self.config, self.extra_terms = config, extra_terms
+        self.config = config
+        self.extra_terms = extra_terms
 
     def _solve(self, data: EstimatorData) -> list[Solution]:
-        x, (_, y, groups, names, outputs) = to_dense(data.x), data
-        config, n_outputs = self.config, y.shape[1]
+        x = to_dense(data.x)
+        _, y, groups, names, outputs = data
+        config = self.config
+        n_outputs = y.shape[1]
         algebra = Algebra(names, expression_limits(config.evolution))
-        values, target = x.numpy(), y.numpy()
+        values = x.numpy()
+        target = y.numpy()
         columns = {name: values[:, j] for j, name in enumerate(names)}
         groups = torch.zeros(len(x)) if groups is None else groups
         is_training = ~validation_mask(groups.numpy(), config.validate_every)
@@ -658,7 +673,7 @@ class GeneticEquations(Estimator):
 
 
 def _products_within_limits(algebra: Algebra, terms: Sequence[Factors]) -> tuple[Product, ...]:
-    """Return the terms of these factors that are within the limits of the algebra."""
+    """Return the products of factors that do not exceed the limits of the algebra."""
     products = []
     for factors in terms:
         with suppress(TooLargeError):
@@ -667,14 +682,14 @@ def _products_within_limits(algebra: Algebra, terms: Sequence[Factors]) -> tuple
 
 
 class EvolvedEquation(NamedTuple):
-    """The equation of one output.
+    """Equation of one output.
 
     Attributes:
-        search_result: what the search found.
+        search_result: result of the genetic programming.
         products: terms of the equation.
         values: coefficients of the terms.
         standard_errors: standard errors of the coefficients.
-        summary: what the data say about the equation.
+        summary: diagnostics of the equation.
     """
 
     search_result: EvolutionResult
@@ -693,18 +708,20 @@ def evolve_equation(
     seed: int,
     extra_products: Sequence[Product] = (),
 ) -> EvolvedEquation:
-    """Search an equation and fit it to all samples.
+    """Search an equation, select its terms and fit it to all samples.
 
     Args:
-        algebra: of the channels, within the limits of the search.
+        algebra: algebra of the channels with the limits of the search.
         data: channels [N] by name.
-        target: [N].
-        is_training: which samples train the search; the others validate.
-        extra_products: terms that the final choice has beside those that are bred.
+        target: target [N].
+        is_training: which samples [N] are used for training; the others validate.
+        config: settings of the search.
+        seed: random seed.
+        extra_products: additional candidates of the final selection.
 
     Raises:
-        FitError: where the data do not determine an equation.
-        UsageError: where DEAP is not installed.
+        FitError: if the data do not determine an equation.
+        UsageError: if DEAP is not installed.
     """
     search_result = evolve(algebra, data, target, is_training, config.evolution, seed)
     candidate_terms = search_result.terms
@@ -725,19 +742,20 @@ def evolve_equation(
         else find_equation(all_candidates, 0, config.final)
     )
     products = tuple(candidate_terms[names.index(name)] for name in equation_fit.terms)
-    coefficient_values, standard_errors = (
-        tuple(equation_fit.values.tolist()),
-        tuple(equation_fit.standard_errors.tolist()),
-    )
+    coefficient_values = tuple(equation_fit.values.tolist())
+    standard_errors = tuple(equation_fit.standard_errors.tolist())
     return EvolvedEquation(
         search_result, products, coefficient_values, standard_errors, equation_fit.summary(problem)
     )
 
 
 def validation_mask(group: np.ndarray, group_interval: int) -> np.ndarray:
-    """Return which samples [N] validate, from the numbers of their groups.
+    """Return which samples [N] are used for validation: those of every n-th group.
 
-    Every n-th group does where there are enough, else blocks of the record.
+    Args:
+        group: group number of each sample [N].
+        group_interval: number n. With fewer than n groups, `VALIDATION_BLOCKS` blocks of the record
+            are used instead.
     """
     group_index = np.unique(group, return_inverse=True)[1]
     if group_index.max(initial=0) + 1 < group_interval:

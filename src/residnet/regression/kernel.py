@@ -26,23 +26,23 @@ from residnet.regression.estimator import (
 from residnet.regression.expressions import ResizableModule
 
 _RANK_TOLERANCE = 1e-12
-"""Eigenvalues of the landmarks' kernel below this share of the largest are rounding."""
+"""Ratio to the largest eigenvalue, below which an eigenvalue of the kernel counts as zero."""
 _CHUNK_ROWS = 8192
-"""Most rows of features that are held at a time."""
+"""Maximum number of rows of features that are evaluated at a time."""
 _DIVERGENCE_LIMIT_STD = 10.0
-"""Standard deviations of a state beyond which it has run away, and its error stays what it is."""
+"""Number of standard deviations at which the state of a diverged free run is clipped."""
 
 
 @dataclass(frozen=True)
 class RegularizationPath:
-    """The fits with each of C penalties.
+    """Kernel ridge regressions with C penalties.
 
     Attributes:
-        coefficients: of the raw features, [C, P, 3].
-        errors: mean squared cross-validated errors [C, 3].
+        coefficients: coefficients of the features [C, P, n].
+        errors: mean squared cross-validated errors [C, n].
         effective_parameters: effective number of parameters, the trace of the smoother, [C].
-        sigma: of the kernel, where it has one.
-        support_points: samples that carry the function [P, F], where it has such.
+        sigma: parameter of the radial basis functions; 0 for other kernels.
+        support_points: centres of the radial basis functions [P, F]; empty for other kernels.
     """
 
     coefficients: Tensor
@@ -55,30 +55,31 @@ class RegularizationPath:
 def fit_dual_path(
     kernel: Tensor, y: Tensor, fold_index: Tensor, n_folds: int, penalties: Sequence[float]
 ) -> RegularizationPath:
-    """Return kernel ridge regressions alpha = (K + lambda I)^-1 Y for every penalty lambda.
+    """Solve kernel ridge regressions alpha = (K + lambda I)^-1 Y for every penalty lambda.
 
-    See document 001 section 3.2, correction M4.
-
-    A left-out fold needs no refit: with the smoother H = K (K + lambda I)^-1 its errors are (I -
-    H_ff)^-1 (Y - H Y)_f.
+    The errors on a fold f need no refit: with the smoother H = K (K + lambda I)^-1 they are
+    (I - H_ff)^-1 (Y - H Y)_f (document 001 section 3.2, correction M4).
 
     Args:
-        kernel: K of all samples with each other, [N, N].
-        y: targets [N, 3].
-        fold_index: number of each sample's fold [N].
-        penalties: lambda, absolute, positive.
+        kernel: kernel matrix K of all samples [N, N].
+        y: targets [N, n].
+        fold_index: fold of each sample [N].
+        n_folds: number of folds.
+        penalties: positive penalties lambda.
     """
     eigenvalues, eigenvectors = torch.linalg.eigh(kernel)
     eigenvalues = eigenvalues.clamp(min=0.0)
     projected = eigenvectors.T @ y
     fold_members = [torch.nonzero(fold_index == f).squeeze(1) for f in range(n_folds)]
-    coefficients, errors_by_penalty, effective_parameters = [], [], []
+    coefficients = []
+    errors_by_penalty = []
+    effective_parameters = []
     for penalty in penalties:
         alpha = eigenvectors @ (projected / (eigenvalues + penalty)[:, None])
         squared_error = torch.zeros(y.shape[1], dtype=y.dtype)
         for rows in fold_members:
             rows_of_fold = eigenvectors[rows]
-            # I - H = lambda (K + lambda I)^-1, so the penalty cancels
+            # I - H = lambda (K + lambda I)^-1, so the penalty cancels out
             left_out_errors = torch.linalg.solve(
                 (rows_of_fold / (eigenvalues + penalty)) @ rows_of_fold.T, alpha[rows]
             )
@@ -100,20 +101,21 @@ def fit_primal_path(
     n_folds: int,
     penalties: Sequence[float],
 ) -> RegularizationPath:
-    """Return ridge regressions min |Y - Phi W w|^2 + lambda |w|^2 for every penalty lambda.
+    """Solve ridge regressions min |Y - Phi W w|^2 + lambda |w|^2 for every penalty lambda.
 
-    They come from R factors of the folds.
+    The R factors of the folds are computed once and combined for every training set.
 
     Args:
-        features: raw features [n, P] of inputs [n, F].
-        whitening: W [P, Q], which makes the kernel the inner product of Phi W.
+        features: function from inputs [N, F] to the features Phi [N, P].
+        whitening: matrix W [P, Q], with which the kernel is the inner product of the rows of Phi W.
         x: inputs [N, F].
-        y: targets [N, 3].
-        fold_index: number of each sample's fold [N].
-        penalties: lambda, absolute, positive.
+        y: targets [N, n].
+        fold_index: fold of each sample [N].
+        n_folds: number of folds.
+        penalties: positive penalties lambda.
 
     Returns:
-        The path; its coefficients are W w.
+        The path with the coefficients W w.
     """
     fold_factors = [
         _accumulate_r_factor(features, whitening, x[fold_index == f], y[fold_index == f])
@@ -141,7 +143,7 @@ def fit_primal_path(
 def _accumulate_r_factor(
     features: Callable[[Tensor], Tensor], whitening: Tensor, x: Tensor, y: Tensor
 ) -> Tensor:
-    """Return the R factor of [Phi W, Y], gathered in chunks."""
+    """Compute the R factor of [Phi W, Y] chunk by chunk."""
     r_factor = torch.zeros(0, whitening.shape[1] + y.shape[1], dtype=y.dtype)
     for chunk_start in range(0, len(x), _CHUNK_ROWS):
         rows = slice(chunk_start, chunk_start + _CHUNK_ROWS)
@@ -159,9 +161,12 @@ def _qr_factor(matrix: Tensor) -> Tensor:
 def _ridge_weights(
     r_factor: Tensor, n_outputs: int, penalties: Sequence[float]
 ) -> tuple[Tensor, Tensor]:
-    """Return coefficients [C, Q, outputs] and effective numbers of parameters [C].
+    """Return ridge coefficients [C, Q, n] and effective numbers of parameters [C].
 
-    They come from the R factor of [Phi W, Y].
+    Args:
+        r_factor: R factor of [Phi W, Y].
+        n_outputs: number of outputs n.
+        penalties: the C penalties.
     """
     n_features = r_factor.shape[1] - n_outputs
     left_vectors, singular_values, right_vectors = torch.linalg.svd(
@@ -176,7 +181,7 @@ def _ridge_weights(
 
 
 class Kernel(ResizableModule, ABC):
-    """A function f(x) [..., n] of inputs [..., F]: features of a kernel times coefficients."""
+    """Kernel function f(x) [..., n] of inputs [..., F]: features times coefficients."""
 
     @abstractmethod
     def forward(self, x: Tensor) -> Tensor:
@@ -186,40 +191,48 @@ class Kernel(ResizableModule, ABC):
     def fit_paths(
         self, x: Tensor, y: Tensor, fold_index: Tensor, n_folds: int, penalties: Sequence[float]
     ) -> list[RegularizationPath]:
-        """Return fits with absolute penalties, one path for each setting of the kernel.
+        """Fit all penalties; return one path per setting of the kernel.
 
         Args:
             x: inputs [N, F].
             y: outputs [N, n].
-            fold_index: number of each sample's fold [N].
-            penalties: lambda, absolute, positive.
+            fold_index: fold of each sample [N].
+            n_folds: number of folds.
+            penalties: positive penalties lambda.
         """
 
     @abstractmethod
     def evaluate_features(self, path: RegularizationPath, x: Tensor) -> Tensor:
-        """Return the features [..., P] that the coefficients of a path belong to."""
+        """Return the features [..., P] whose coefficients the path has."""
 
     @abstractmethod
     def build_state(
         self, output_paths: Sequence[RegularizationPath], coefficients: Tensor
     ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """Return the settings of each output's path, and the state with coefficients [P, n]."""
+        """Return the kernel settings per output and the state of the module.
+
+        Args:
+            output_paths: selected path of each output.
+            coefficients: coefficients of the features [P, n].
+        """
 
     @abstractmethod
     def zero_state(self) -> dict[str, Tensor]:
-        """Return the state of the function that is zero."""
+        """Return the state of the zero function."""
 
 
 @final
 class RbfKernel(Kernel):
-    """A sum of radial basis functions, f_k(x) = sum_i c_ik exp(-gamma_k |x - x_i|^2).
+    """Sum of Gaussian radial basis functions, f_k(x) = sum_i c_ik exp(-gamma_k |x - x_i|^2).
 
-    gamma = 1 / (2 sigma) (document 001 section 3.2, correction M5: sigma is a squared length).
+    gamma = 1 / (2 sigma), where sigma is a squared length (document 001 section 3.2,
+    correction M5).
     """
 
     def __init__(self, config: RbfConfig, n_features: int, n_outputs: int = 3) -> None:
         super().__init__()
-        self.config, self.n_outputs = config, n_outputs
+        self.config = config
+        self.n_outputs = n_outputs
         self.points = nn.Buffer(torch.zeros(0, n_features, dtype=torch.float64))
         self.gamma = nn.Buffer(torch.ones(n_outputs, dtype=torch.float64))
         self.coefficients = nn.Buffer(torch.zeros(0, n_outputs, dtype=torch.float64))
@@ -237,10 +250,10 @@ class RbfKernel(Kernel):
     def fit_paths(
         self, x: Tensor, y: Tensor, fold_index: Tensor, n_folds: int, penalties: Sequence[float]
     ) -> list[RegularizationPath]:
-        """Return one path for each sigma; see `Kernel.paths`.
+        """Fit all penalties; return one path per sigma.
 
-        It is exact where there are no more than `exact_paths` samples, else by Nystroem's method on
-        landmarks.
+        Up to `exact` samples the kernel matrix is exact; with more samples the Nystroem method
+        approximates it from landmarks.
         """
         if len(x) <= self.config.exact:
             distances = squared_distances(x, x)
@@ -271,13 +284,13 @@ class RbfKernel(Kernel):
         return paths
 
     def evaluate_features(self, path: RegularizationPath, x: Tensor) -> Tensor:
-        """Return the kernel between x and the points that carry the function."""
+        """Return the kernel between the inputs and the centres of the path."""
         return torch.exp(-squared_distances(x, path.support_points) / (2 * path.sigma))
 
     def build_state(
         self, output_paths: Sequence[RegularizationPath], coefficients: Tensor
     ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """Return sigma of each output, and the points, gamma and coefficients."""
+        """Return sigma per output, and the centres, gamma and coefficients."""
         sigma = [path.sigma for path in output_paths]
         gamma = torch.tensor([0.5 / value for value in sigma], dtype=torch.float64)
         state = {
@@ -298,21 +311,21 @@ class RbfKernel(Kernel):
 
 @final
 class PolynomialKernel(Kernel):
-    """The kernel (slope x'x' + constant)^degree (document 001 section 3.2).
+    """Polynomial kernel (slope x'x' + constant)^degree (document 001 section 3.2).
 
-    It is fitted as the ridge regression on weighted products that it equals. The products are
-    finitely many, so that any number of samples is fitted exactly.
+    The kernel is an inner product of finitely many weighted monomials, so the primal ridge
+    regression on these is exact for any number of samples.
     """
 
     def __init__(self, config: PolynomialConfig, n_features: int, n_outputs: int = 3) -> None:
         super().__init__()
         self.degree = config.degree
         index_tuples = list(combinations_with_replacement(range(n_features + 1), config.degree))
-        # multinomial coefficients
+        # the squared weights of the monomials are multinomial coefficients
         repeat_counts = [
             prod(map(factorial, Counter(index_tuple).values())) for index_tuple in index_tuples
         ]
-        weights = [factorial(config.degree) // n_features for n_features in repeat_counts]
+        weights = [factorial(config.degree) // repeat_count for repeat_count in repeat_counts]
         self.index = nn.Buffer(
             torch.tensor(index_tuples, dtype=torch.long).T.contiguous(), persistent=False
         )
@@ -320,10 +333,11 @@ class PolynomialKernel(Kernel):
         self.coefficients = nn.Buffer(
             torch.zeros(len(index_tuples), n_outputs, dtype=torch.float64)
         )
-        self.slope, self.constant = config.slope**0.5, config.constant**0.5
+        self.slope = config.slope**0.5
+        self.constant = config.constant**0.5
 
     def weighted_products(self, x: Tensor) -> Tensor:
-        """Return the weighted products [..., P] of inputs [..., F], whose inner product it is."""
+        """Return the weighted monomials [..., P] of inputs [..., F]."""
         augmented = torch.cat((torch.full_like(x[..., :1], self.constant), x * self.slope), dim=-1)
         values = self.weight.to(x.dtype) * augmented.index_select(-1, self.index[0])
         for i in range(1, self.degree):
@@ -342,7 +356,7 @@ class PolynomialKernel(Kernel):
         ]
 
     def evaluate_features(self, path: RegularizationPath, x: Tensor) -> Tensor:
-        """Return the products [N, J] of inputs x [N, F]; they are the same for every path."""
+        """Return the weighted monomials [N, P] of inputs [N, F]; they do not depend on the path."""
         return self.weighted_products(x)
 
     def build_state(
@@ -355,16 +369,15 @@ class PolynomialKernel(Kernel):
 
 
 class RbfConfig(Config):
-    """The radial basis functions exp(-|x - x'|^2 / (2 sigma)) of standardised features.
+    """Radial basis functions exp(-|x - x'|^2 / (2 sigma)) of standardised features.
 
     Attributes:
         kind: name of the kernel.
-        sigma: candidates, in squared standard deviations of a feature (correction M5).
-        exact: number of samples up to which all of them carry the function, as in kernel ridge
-            regression; with more, landmarks do.
-        landmarks: number of samples that carry the function where there are more than `exact_paths`
-            (Nystroem's method), spread out by k-means++ seeding.
-        seed: seed of the choice of landmarks.
+        sigma: candidate values, in squared standard deviations of a feature (correction M5).
+        exact: number of samples up to which every sample is a centre (kernel ridge regression).
+        landmarks: number of centres for more than `exact` samples (Nystroem method), drawn by
+            k-means++ seeding.
+        seed: random seed of the landmarks.
     """
 
     kind: Literal["rbf"] = "rbf"
@@ -376,12 +389,12 @@ class RbfConfig(Config):
     seed: int = Field(default=0, ge=0)
 
     def build(self, n_features: int, n_outputs: int = 3) -> RbfKernel:
-        """Return the module for `count` features and a number of outputs."""
+        """Build the kernel module for a number of features and outputs."""
         return RbfKernel(self, n_features, n_outputs)
 
 
 class PolynomialConfig(Config):
-    """The polynomial kernel (slope x'x' + constant)^degree of standardised features.
+    """Polynomial kernel (slope x'x' + constant)^degree of standardised features.
 
     Degree 1 is ridge regression.
 
@@ -389,7 +402,7 @@ class PolynomialConfig(Config):
         kind: name of the kernel.
         degree: degree p of the polynomial.
         slope: factor theta of the inner product.
-        constant: constant c; with 0 only products of exactly `degree` features are left.
+        constant: constant c; with 0 the monomials have exactly `degree` factors.
     """
 
     kind: Literal["polynomial"] = "polynomial"
@@ -398,7 +411,7 @@ class PolynomialConfig(Config):
     constant: float = Field(default=1.0, ge=0)
 
     def build(self, n_features: int, n_outputs: int = 3) -> PolynomialKernel:
-        """Return the module for `count` features and a number of outputs."""
+        """Build the kernel module for a number of features and outputs."""
         return PolynomialKernel(self, n_features, n_outputs)
 
 
@@ -409,17 +422,17 @@ def squared_distances(x: Tensor, points: Tensor) -> Tensor:
 
 
 def kmeans_plus_plus_indices(x: Tensor, n_points: int, seed: int) -> Tensor:
-    """Return the indices [count] of samples that lie apart (k-means++).
+    """Draw the indices of `n_points` samples by k-means++ seeding (Arthur and Vassilvitskii 2007).
 
-    Each is drawn with a chance that grows with its squared distance to those before. There are
-    fewer than `count` where the samples have no more different values.
+    The probability of a sample is proportional to its squared distance to the nearest of the points
+    drawn before. Fewer indices are returned if the samples have fewer distinct values.
     """
     generator = torch.Generator().manual_seed(seed)
     first_index = int(torch.randint(len(x), (1,), generator=generator))
     squared_distance = (x - x[first_index]).square().sum(-1)
     indices = [first_index]
     while len(indices) < n_points and float(squared_distance.max()) > 0:
-        # by its cumulated sum: multinomial takes no more than 2^24 samples
+        # inverse of the cumulative sum, because torch.multinomial is limited to 2^24 samples
         cumulative_distance = squared_distance.cumsum(0)
         random_draw = torch.rand(1, generator=generator, dtype=x.dtype) * cumulative_distance[-1]
         indices.append(
@@ -430,21 +443,21 @@ def kmeans_plus_plus_indices(x: Tensor, n_points: int, seed: int) -> Tensor:
 
 
 class RecursiveErrors:
-    """Errors of a fit whose output integrates into one of its inputs, the others as measured.
+    """Errors of free runs in which one state is integrated and all other inputs are measured.
 
-    This is the first approach of document 001, section 4. Tuned so, each model looks good for
-    itself; together they may still drift apart, which is why the document gives the approach up.
-    Unbroken stretches of samples run side by side, padded by samples that do not count.
+    This is the first approach of document 001 section 4. It tunes every output alone; the coupled
+    free run may still diverge, which is why the document abandons the approach. Uninterrupted
+    segments are padded to equal length and integrated as a batch.
 
     Args:
         z: inputs of the fit [N, nz].
         target: outputs of the fit [N, n].
-        segment: number of the unbroken stretch of each sample, ascending [N].
-        time_step: time between neighbouring samples, s.
-        states: column of z that each output is the derivative of, [n].
+        segment: number of the uninterrupted segment of each sample [N], ascending.
+        time_step: sampling interval, s.
+        states: column of z of the state whose derivative each output is, [n].
 
     Raises:
-        FitError: where no two samples follow each other.
+        FitError: if no segment has two samples.
     """
 
     def __init__(
@@ -453,7 +466,8 @@ class RecursiveErrors:
         lengths = torch.unique_consecutive(segment, return_counts=True)[1].tolist()
         if max(lengths, default=0) < 2:
             raise FitError(
-                "choosing by recursion needs samples that follow each other; the masks leave none"
+                "selection by recursion needs consecutive samples, but the masks leave none; relax"
+                " the masks or select by cross-validation"
             )
         pad_sequence = torch.nn.utils.rnn.pad_sequence
         valid_masks = [torch.ones(length, dtype=torch.bool) for length in lengths]
@@ -464,13 +478,14 @@ class RecursiveErrors:
         self.states = tuple(states)
 
     def state_errors(self, output: int, predict: Callable[[Tensor], Tensor], n_fits: int) -> Tensor:
-        """Return mean square errors [C] of one state along all stretches, for C fits at once.
+        """Return the mean squared errors [C] of one state over all segments, for C fits at once.
 
-        What the state's measured derivative holds beside the output, such as the part of a
-        baseline, is taken as it was.
+        The part of the measured derivative that is not the output, such as the prediction of a
+        baseline, is added as measured.
 
         Args:
-            predict: from inputs [C, G, nz] to each fit's output [C, G].
+            output: index of the output.
+            predict: function from inputs [C, G, nz] to the output of each fit [C, G].
             n_fits: number of fits C.
         """
         column = self.states[output]
@@ -497,11 +512,11 @@ class RecursiveErrors:
 
 
 ScoringFunction = Callable[[Sequence[RegularizationPath]], Tensor]
-"""Errors [settings, penalties, n] of fits, one path for each setting of the kernel."""
+"""Computes errors [settings, penalties, n] from one path per setting of the kernel."""
 
 
 class _SettingIndices(NamedTuple):
-    """The kernel's setting and the penalty of each output, by number."""
+    """Indices of the kernel setting and of the penalty of each output."""
 
     settings: tuple[int, ...]
     penalties: tuple[int, ...]
@@ -511,18 +526,18 @@ class _SettingIndices(NamedTuple):
 class KernelRidge(Estimator):
     """Kernel ridge regression of every output, without intercept.
 
-    A solution's state is that of the kernel module, and `effective_parameters` [n], the effective number of
-    parameters of each output, which is the trace of the smoother.
+    The state of a solution is that of the kernel module and `effective` [n], the effective number
+    of parameters of each output (the trace of the smoother).
 
     Args:
-        kernel: module of the kernel, with the settings that are tried.
-        penalties: candidates for each sample: the document's lambda (scikit-learn's alpha) is
-            penalty * samples.
-        folds: folds of the cross-validation; None for one fold for each group.
-        scoring: errors by which each output chooses its setting and penalty; None for the
-            cross-validated ones.
-        has_alternatives: whether `fit` offers every setting and penalty for all outputs together, with
-            the neighbours of each, and no function at all, beside its own choice.
+        kernel: kernel module with its candidate settings.
+        penalties: candidate penalties per sample; lambda of document 001 and `alpha` of
+            scikit-learn are the penalty times the number of samples.
+        folds: number of folds of the cross-validation; None for a fold per group.
+        scoring: computes the errors by which setting and penalty are chosen per output; None for
+            the cross-validated errors.
+        has_alternatives: whether `fit` also returns every setting and penalty, shared by all
+            outputs, with its neighbours, and the zero function.
     """
 
     def __init__(
@@ -543,7 +558,8 @@ class KernelRidge(Estimator):
     def _solve(self, data: EstimatorData) -> list[Solution]:
         x, y = to_dense(data.x), data.y
         fold_index = assign_group_folds(data.groups, self.folds)
-        n_folds, n_penalties = int(fold_index.max()) + 1, len(self.penalties)
+        n_folds = int(fold_index.max()) + 1
+        n_penalties = len(self.penalties)
         absolute_penalties = [penalty * len(x) for penalty in self.penalties]
         with torch.no_grad():
             paths = self.kernel.fit_paths(x, y, fold_index, n_folds, absolute_penalties)
@@ -601,22 +617,21 @@ class KernelRidge(Estimator):
         )
 
         def neighbours() -> list[Solution]:
+            # the next lower and higher penalty of each output in turn
             neighbour_indices = []
             for output, (_, j) in output_settings:
                 for penalty_index in (j - 1, j + 1):
                     if 0 <= penalty_index < len(self.penalties):
-                        preceding, following = (
-                            setting_indices.penalties[:output],
-                            setting_indices.penalties[output + 1 :],
-                        )
+                        preceding = setting_indices.penalties[:output]
+                        following = setting_indices.penalties[output + 1 :]
                         neighbour_indices.append(
                             setting_indices._replace(
                                 penalties=(*preceding, penalty_index, *following)
                             )
                         )
             return [
-                self._build_solution(paths, penalty_index, notes)
-                for penalty_index in neighbour_indices
+                self._build_solution(paths, output_indices, notes)
+                for output_indices in neighbour_indices
             ]
 
         return Solution(

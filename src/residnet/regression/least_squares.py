@@ -1,4 +1,4 @@
-"""Least squares: linear, with standard errors that hold for correlated residuals, and damped."""
+"""Linear least squares with cluster-robust standard errors, and Levenberg-Marquardt descent."""
 
 from __future__ import annotations
 
@@ -27,20 +27,21 @@ from residnet.regression.estimator import (
 _COLLINEARITY_TOLERANCE = 1e-9
 """Share of the largest singular value below which centred columns count as collinear."""
 _MIN_COLLINEAR_LOAD = 0.1
-"""Share of the largest load from which a column is named among collinear ones."""
+"""Share of the largest loading above which an error message lists a column as collinear."""
 _ROUNDING_FACTOR = 10
-"""What rounding leaves of a zero eigenvalue, in units of columns times machine precision."""
+"""Rounding error of a zero eigenvalue, in units of columns times machine precision."""
 _MIN_EIGENVALUE = 1e-300
-"""Least eigenvalue that a condition number is divided by."""
+"""Lower bound of the eigenvalue in the denominator of a condition number."""
 _N_PENALTIES = 40
-"""Number of penalties on scikit-learn's own path of the elastic net."""
+"""Number of penalties on the regularisation path of scikit-learn's elastic net."""
 _MAX_ITERATIONS = 3000
-"""Most rounds of coordinate descent for one penalty."""
+"""Maximum number of coordinate-descent iterations per penalty."""
 _TOLERANCE = 1e-4
-"""Gap to the optimum at which coordinate descent ends."""
-_MIN_DAMPING, _MAX_DAMPING_TRIALS = 1e-8, 8
-"""Damping that changes no digit of a step that matters, and dampings tried before a point counts as
-the minimum."""
+"""Duality gap at which coordinate descent ends."""
+_MIN_DAMPING = 1e-8
+"""Damping that is too small to change a step; the least value after a failed undamped step."""
+_MAX_DAMPING_TRIALS = 8
+"""Number of dampings tried without a decrease before a point counts as the minimum."""
 
 Point = TypeVar("Point")
 
@@ -49,14 +50,14 @@ Point = TypeVar("Point")
 class LeastSquares(Estimator):
     """Ordinary least squares without intercept, or with relative ridge penalties.
 
-    Columns are scaled to unit root mean square first, so a penalty is a share of each column's own
-    energy. Standard errors are cluster-robust over groups: residuals at 10-20 Hz are far from
-    independent, and the textbook formula would claim several times the accuracy. With fewer than
-    two groups they are the textbook ones.
+    Columns are scaled to unit root mean square first, so that a penalty is relative to the energy
+    of each column. Standard errors are cluster-robust over groups (Liang and Zeger 1986), because
+    residuals at 10-20 Hz are strongly correlated and the formula for independent residuals
+    underestimates the errors several times. With fewer than two groups that formula is used.
 
     Args:
-        penalties: relative ridge penalties, 0 for ordinary least squares; of several `fit` returns
-            one solution each, from one Gram matrix.
+        penalties: relative ridge penalties, 0 for ordinary least squares. `fit` returns one
+            solution per penalty; all are computed from the same Gram matrix.
     """
 
     def __init__(self, penalties: Sequence[float] = (0.0,)) -> None:
@@ -74,11 +75,13 @@ class LeastSquares(Estimator):
                 if column_scale <= 0
             ]
             raise FitError(
-                f"regressor '{zero_columns[0]}' is zero in all {n_samples} samples; the data do not excite it:"
-                " leave it out or log it"
+                f"regressor '{zero_columns[0]}' is zero in all {n_samples} samples, so its"
+                " coefficient is not identifiable; remove the regressor or record data that excite it"
             )
+        # one pass over the data gives the normal equations of the scaled columns
         gram = _sum_over_chunks(x, lambda _, chunk: (chunk / scale).T @ (chunk / scale)) / n_samples
         cross = _sum_over_chunks(x, lambda rows, chunk: (chunk / scale).T @ y[rows]) / n_samples
+        # an eigenvalue at rounding level means collinear columns; report the two largest loadings
         eigenvalues, eigenvectors = torch.linalg.eigh(gram)
         condition = float(torch.sqrt(eigenvalues[-1] / eigenvalues[0].clamp(min=_MIN_EIGENVALUE)))
         rounding_error = (
@@ -89,11 +92,13 @@ class LeastSquares(Estimator):
                 names[i] for i in eigenvectors[:, 0].abs().argsort(descending=True)[:2].tolist()
             ]
             raise FitError(
-                f"the data cannot tell apart regressors '{collinear_names[0]}' and '{collinear_names[1]}' (condition"
-                f" {condition:.1e}); leave one out, excite them separately, or give a ridge penalty"
+                f"regressors '{collinear_names[0]}' and '{collinear_names[1]}' are collinear on"
+                f" these data (condition number {condition:.1e}); remove one, excite them"
+                " separately, or set a ridge penalty"
             )
         solutions = []
         for penalty in self.penalties:
+            # sandwich estimator of the covariance, in the units of the unscaled columns
             inverse = torch.linalg.inv(gram + penalty * torch.eye(n_columns, dtype=y.dtype))
             coefficients = inverse @ cross
             score_covariance = _score_covariance(x, y, scale, coefficients, gram, groups)
@@ -106,14 +111,12 @@ class LeastSquares(Estimator):
                 notes={"condition": condition},
                 covariance=covariance,
             )
-            estimates, standard_errors = (
-                solution.coefficients.tolist(),
-                solution.standard_errors.tolist(),
-            )
+            estimates = solution.coefficients.tolist()
+            standard_errors = solution.standard_errors.tolist()
             table = tuple(
-                Coefficient(output, name, estimates[n_columns][k], standard_errors[n_columns][k])
+                Coefficient(output, name, estimates[j][k], standard_errors[j][k])
                 for k, output in enumerate(outputs)
-                for n_columns, name in enumerate(names)
+                for j, name in enumerate(names)
             )
             solutions.append(replace(solution, table=table))
         return solutions
@@ -123,14 +126,18 @@ class LeastSquares(Estimator):
 class CentredLeastSquares(Estimator):
     """Ordinary least squares with an intercept, from a QR factorisation of the centred columns.
 
-    A QR factor keeps the digits of nearly collinear columns that a Gram matrix loses.
+    The QR factor of nearly collinear columns has twice the significant digits of their Gram matrix.
     """
 
     def _solve(self, data: EstimatorData) -> list[Solution]:
-        x, y, names = to_dense(data.x), data.y, data.names
+        x = to_dense(data.x)
+        y = data.y
+        names = data.names
         require_overdetermined(x, "basis functions")
-        mean_x, mean_y = x.mean(0), y.mean(0)
-        x_centred, y_centred = x - mean_x, y - mean_y
+        mean_x = x.mean(0)
+        mean_y = y.mean(0)
+        x_centred = x - mean_x
+        y_centred = y - mean_y
         _, singular_values, right_vectors = torch.linalg.svd(x_centred, full_matrices=False)
         if float(singular_values[-1]) <= _COLLINEARITY_TOLERANCE * float(singular_values[0]):
             column_loads = right_vectors[-1].abs()
@@ -138,8 +145,8 @@ class CentredLeastSquares(Estimator):
                 (column_loads > _MIN_COLLINEAR_LOAD * column_loads.max()).nonzero()[:, 0].tolist()
             )
             raise FitError(
-                f"basis functions {', '.join(names[j] for j in collinear_columns)} are collinear over these"
-                " samples; leave one out, or use ridge or plsr"
+                f"basis functions {', '.join(names[j] for j in collinear_columns)} are collinear on"
+                " these samples; remove one, or use ridge or plsr"
             )
         coefficients = torch.linalg.lstsq(x_centred, y_centred).solution
         state = {"coefficients": coefficients, "intercept": mean_y - mean_x @ coefficients}
@@ -152,13 +159,13 @@ class CentredLeastSquares(Estimator):
 
 @final
 class ElasticNet(Estimator):
-    """The elastic net of each output by itself, with an intercept; its penalty by cross-validation.
+    """Elastic net with an intercept, fitted per output, its penalty chosen by cross-validation.
 
-    Columns are taken as they are: scale them before.
+    Columns are not scaled; the caller scales them.
 
     Args:
-        l1_ratio: share of the absolute penalty, above 0; 1 is LASSO.
-        folds: folds of the cross-validation; None for one fold for each group.
+        l1_ratio: share of the L1 penalty, above 0; 1 is the lasso.
+        folds: number of folds of the cross-validation; None for a fold per group.
     """
 
     def __init__(self, l1_ratio: float = 1.0, *, folds: int | None = None) -> None:
@@ -176,7 +183,9 @@ class ElasticNet(Estimator):
             ((fold_index != k).nonzero()[:, 0].numpy(), (fold_index == k).nonzero()[:, 0].numpy())
             for k in range(int(fold_index.max()) + 1)
         ]
-        coefficients, intercepts, penalties = [], [], []
+        coefficients = []
+        intercepts = []
+        penalties = []
         for output in range(y.shape[1]):
             elastic_net = ElasticNetCV(
                 l1_ratio=self.l1_ratio,
@@ -186,8 +195,8 @@ class ElasticNet(Estimator):
                 tol=_TOLERANCE,
             )
             with warnings.catch_warnings():
-                # the smallest penalties of the path need not converge: cross-validation leaves
-                # them behind
+                # the smallest penalties of the path need not converge: cross-validation does not
+                # select them
                 warnings.simplefilter("ignore", ConvergenceWarning)
                 elastic_net.fit(x.numpy(), y[:, output].numpy())
             coefficients.append(torch.from_numpy(elastic_net.coef_))
@@ -208,9 +217,10 @@ def _score_covariance(
     gram: Tensor,
     groups: Tensor | None,
 ) -> Tensor:
-    """Return the spread of the score a'e of each output [n, J, J], for columns a = x / scale.
+    """Return the covariance of the score a'e of each output [n, J, J], for columns a = x / scale.
 
-    It is taken over groups where there are at least two, else as of independent residuals.
+    The covariance is that of the group sums of the score if there are at least two groups;
+    otherwise residuals are assumed independent.
     """
     n_samples, n_columns = x.shape
     n_outputs = y.shape[1]
@@ -233,7 +243,7 @@ def _score_covariance(
 
 
 def _sum_over_chunks(x: Regressors, contribution: Callable[[slice, Tensor], Tensor]) -> Tensor:
-    """Return the sum of what each piece of regressors gives."""
+    """Sum a function of rows and regressors over all chunks."""
     chunks = iter(iterate_chunks(x))
     rows, chunk = next(chunks)
     total = contribution(rows, chunk)
@@ -244,7 +254,7 @@ def _sum_over_chunks(x: Regressors, contribution: Callable[[slice, Tensor], Tens
 
 @dataclass(frozen=True)
 class DescentResult(Generic[Point]):
-    """Where a descent ended, and how many steps it took."""
+    """The minimizer of a descent and its number of accepted steps."""
 
     minimizer: Point
     n_steps: int
@@ -258,18 +268,20 @@ def minimize_levenberg_marquardt(
     min_relative_decrease: float,
     damping: float = 1e-3,
 ) -> DescentResult[Point]:
-    """Descend to a minimum by Levenberg's and Marquardt's method.
+    """Minimize a cost by the Levenberg-Marquardt method.
 
     Args:
-        initial_point: where the descent begins, whatever a point is.
-        linearize: linearises the problem at a point. It gives the cost there, and what a step with a
-            damping leads to: the cost at its end, and the point itself.
-        max_iterations: most steps.
-        min_relative_decrease: share of the cost that a step must gain for another one.
-        damping: of the first step, in units of the Hessian's diagonal; a tenth after a step that
-            gains, ten times after one that does not. 0 for Gauss-Newton as long as that gains.
+        initial_point: starting point, of any type that `linearize` accepts.
+        linearize: linearises the problem at a point. Returns the cost at the point, and a function
+            from a damping to the cost and the point after the damped step.
+        max_iterations: maximum number of accepted steps.
+        min_relative_decrease: relative decrease of the cost below which the descent ends.
+        damping: damping of the first step in units of the diagonal of the Hessian. It is divided
+            by ten after a step that decreases the cost and multiplied by ten after a step that does
+            not. With 0 the steps are Gauss-Newton steps while these decrease the cost.
     """
-    point, n_steps = initial_point, 0
+    point = initial_point
+    n_steps = 0
     while n_steps < max_iterations:
         cost, try_step = linearize(point)
         for _ in range(_MAX_DAMPING_TRIALS):
@@ -279,11 +291,9 @@ def minimize_levenberg_marquardt(
             damping = max(10.0 * damping, _MIN_DAMPING)
         else:
             break
-        point, n_steps, damping = (
-            trial_point,
-            n_steps + 1,
-            max(damping / 10.0, min(damping, _MIN_DAMPING)),
-        )
+        point = trial_point
+        n_steps = n_steps + 1
+        damping = max(damping / 10.0, min(damping, _MIN_DAMPING))
         if cost - trial_cost < min_relative_decrease * abs(cost):
             break
     return DescentResult(point, n_steps)

@@ -1,4 +1,4 @@
-"""Ridge regression and partial least squares from moments, cross-validated fold by fold.
+"""Cross-validated ridge regression and partial least squares from moments per fold.
 
 Sources: document 001 section 2.2 with correction M4; document 002 section 3.2, corrections J14 to
 J17.
@@ -26,28 +26,29 @@ from residnet.regression.estimator import (
 )
 
 CONSTANT_TOLERANCE = 1e-9
-"""Standard deviation below which, in units of its largest value, a column counts as constant."""
+"""Ratio of standard deviation to maximum magnitude below which a column counts as constant."""
 _MIN_LATENT_ENERGY = 1e-13
-"""Least energy of a latent variable in units of a column's: below it are rounding and columns that
-are sums of others, without a meaning.
+"""Minimum energy of a latent variable relative to that of a column.
+
+A latent variable of less energy is caused by rounding or by linearly dependent columns.
 """
 _EXPLAINED_TOLERANCE = 1e-13
-"""Share of the covariance up to which nothing is left to explain."""
+"""Share of the initial covariance below which the residual covariance counts as zero."""
 _MIN_NORM = 1e-300
-"""Least length that a vector is divided by."""
+"""Lower bound of a norm in a denominator."""
 _MAX_CONSECUTIVE_ORDER = 8
-"""Order up to which every order is offered as an alternative; above, steps of a quarter."""
+"""Order up to which `fit` offers every order; above it, the orders increase by a quarter."""
 
 
 class CentredMoments(NamedTuple):
-    """Moments about the means of a part of the samples.
+    """Central moments of a subset of the samples.
 
     Attributes:
         n_samples: number of samples.
-        mean_x: mean of x [J], less the shift of the moments.
-        mean_y: mean of y [n], less the shift of the moments.
-        xx: X'X about the means [J, J].
-        xy: X'Y about the means [J, n].
+        mean_x: mean of the shifted x [J].
+        mean_y: mean of the shifted y [n].
+        xx: X'X of the centred columns [J, J].
+        xy: X'Y of the centred columns [J, n].
     """
 
     n_samples: float
@@ -58,15 +59,15 @@ class CentredMoments(NamedTuple):
 
 
 class FoldMoments:
-    """Sums over each fold of [1, X, Y]' [1, X, Y], float64.
+    """Raw moments [1, X, Y]' [1, X, Y] of each fold, float64.
 
-    The data are passed once; a fold is left out by subtraction. X is shifted by its overall mean
-    before, which keeps the differences well conditioned.
+    The moments need one pass over the data, and those of a training set are the difference of the
+    total and a fold. X and Y are shifted by their overall means first, which avoids cancellation.
 
     Args:
-        sums: sums of each fold [F, 1 + J + n, 1 + J + n].
-        shift_x: what was taken from x before [J].
-        shift_y: what was taken from y before [n].
+        sums: moments of each fold [F, 1 + J + n, 1 + J + n].
+        shift_x: subtracted from x before [J].
+        shift_y: subtracted from y before [n].
     """
 
     def __init__(self, sums: Tensor, shift_x: Tensor, shift_y: Tensor) -> None:
@@ -80,21 +81,23 @@ class FoldMoments:
     def from_samples(
         cls, x: Regressors, y: Tensor, fold_index: Tensor, n_folds: int
     ) -> FoldMoments:
-        """Return the moments of x [N, J] and y [N, n], with the fold of each sample [N].
+        """Compute the moments of x [N, J] and y [N, n] with the fold of each sample [N].
 
-        A column that varies by rounding alone counts as zero, so that it gets no coefficient
-        instead of a huge one.
+        A column that varies by rounding errors only is replaced by zero, so that its coefficient is
+        zero instead of huge.
         """
         column_moments = RunningMoments(x.shape[1])
         for _, chunk in iterate_chunks(x):
             column_moments.add_rows(chunk)
         max_abs = torch.maximum(column_moments.minimum.abs(), column_moments.maximum.abs())
         is_constant = column_moments.std(correction=1) <= CONSTANT_TOLERANCE * max_abs
-        shift_x, shift_y = column_moments.mean.masked_fill(is_constant, 0.0), y.mean(0)
+        shift_x = column_moments.mean.masked_fill(is_constant, 0.0)
+        shift_y = y.mean(0)
         width = 1 + shift_x.numel() + shift_y.numel()
         sums = torch.zeros(n_folds, width, width, dtype=y.dtype)
         for rows, chunk in iterate_chunks(x):
-            outputs_chunk, fold_chunk = y[rows], fold_index[rows]
+            outputs_chunk = y[rows]
+            fold_chunk = fold_index[rows]
             chunk = chunk.masked_fill(is_constant, 0.0)
             augmented = torch.cat(
                 (torch.ones_like(outputs_chunk[:, :1]), chunk - shift_x, outputs_chunk - shift_y), 1
@@ -108,10 +111,10 @@ class FoldMoments:
     def from_grouped_samples(
         cls, x: Regressors, y: Tensor, groups: Tensor | None, n_folds: int | None
     ) -> FoldMoments:
-        """Return the moments for an estimator, in one fold where `groups` is None.
+        """Compute the moments with groups assigned to folds; one fold if `groups` is None.
 
         Raises:
-            FitError: with too few groups, or no more samples than columns.
+            FitError: if there are too few groups, or not more samples than columns.
         """
         fold_index = (
             assign_group_folds(groups, n_folds) if groups is not None else y.new_zeros(len(x))
@@ -120,7 +123,7 @@ class FoldMoments:
         return cls.from_samples(x, y, fold_index, int(fold_index.max()) + 1)
 
     def centre(self, summed_moments: Tensor) -> CentredMoments:
-        """Return the moments about the means, from summed moments."""
+        """Compute central moments from the raw moments of a subset."""
         n_regressors = self.n_regressors
         n_samples = float(summed_moments[0, 0])
         mean = summed_moments[0, 1:] / n_samples
@@ -136,9 +139,12 @@ class FoldMoments:
     def fold_squared_error(
         self, fold: int, coefficients: Tensor, training_moments: CentredMoments
     ) -> Tensor:
-        """Return the sums of squared errors on one fold [C, n] of models about a part's means.
+        """Return the sums of squared errors of C models on one fold, [C, n].
 
-        Their coefficients are [C, J, n].
+        Args:
+            fold: number of the test fold.
+            coefficients: coefficients of the models [C, J, n].
+            training_moments: moments of the training set, which give the intercepts.
         """
         n_regressors = self.n_regressors
         fold_sums = self.sums[fold]
@@ -146,30 +152,31 @@ class FoldMoments:
             "j,cjk->ck", training_moments.mean_x, coefficients
         )
         weights = torch.cat((intercept[:, None, :], coefficients), dim=1)
-        xx, xy, yy = (
-            fold_sums[: n_regressors + 1, : n_regressors + 1],
-            fold_sums[: n_regressors + 1, n_regressors + 1 :],
-            fold_sums[n_regressors + 1 :, n_regressors + 1 :].diagonal(),
-        )
+        xx = fold_sums[: n_regressors + 1, : n_regressors + 1]
+        xy = fold_sums[: n_regressors + 1, n_regressors + 1 :]
+        yy = fold_sums[n_regressors + 1 :, n_regressors + 1 :].diagonal()
         quadratic_form = torch.einsum("cik,ij,cjk->ck", weights, xx, weights)
         return yy - 2 * torch.einsum("cik,ik->ck", weights, xy) + quadratic_form
 
     def output_variance(self) -> Tensor:
         """Return the variance of each output over all samples [n]."""
-        n_regressors, summed_moments = self.n_regressors, self.sums.sum(0)
+        n_regressors = self.n_regressors
+        summed_moments = self.sums.sum(0)
         return (
             summed_moments[n_regressors + 1 :, n_regressors + 1 :].diagonal() / summed_moments[0, 0]
         )
 
 
 class _RegularizationPathEstimator(Estimator):
-    """An estimator whose models of all complexities come from moments, with an intercept.
+    """Estimator with an intercept that computes a path of models of increasing complexity.
+
+    A complexity is a ridge penalty or a number of latent variables.
 
     Args:
-        folds: folds of the cross-validation; None for one fold for each group.
-        is_scaled: whether columns are scaled to unit variance; else they are only centred.
-        has_alternatives: whether `fit` offers other complexities, and no coefficients at all, beside
-            its own choice.
+        folds: number of folds of the cross-validation; None for a fold per group.
+        is_scaled: whether columns are scaled to unit variance; otherwise they are only centred.
+        has_alternatives: whether `fit` also returns the other complexities and the model without
+            coefficients.
     """
 
     def __init__(self, *, folds: int | None, is_scaled: bool, has_alternatives: bool) -> None:
@@ -179,35 +186,37 @@ class _RegularizationPathEstimator(Estimator):
 
     @abstractmethod
     def compute_path(self, xx: Tensor, xy: Tensor, n_samples: float) -> Tensor:
-        """Return the coefficients [C, J, n] of C complexities, from moments of scaled columns."""
+        """Return the coefficients [C, J, n] of C complexities from moments of scaled columns."""
 
     @abstractmethod
     def select_complexities(
         self, errors: Tensor | None, variance: Tensor, n_complexities: int
     ) -> list[list[int]]:
-        """Return the complexity of each output [n], the preferred ones first.
+        """Return indices of complexities per output [n], one list per solution, preferred first.
 
         Args:
-            errors: cross-validated mean squared errors [C, n]; None where there are no folds.
-            variance: of each output [n]; infinite for one that is constant but for rounding.
+            errors: cross-validated mean squared errors [C, n]; None without folds.
+            variance: variance of each output [n]; infinite for a constant output.
+            n_complexities: number of complexities C.
         """
 
     @abstractmethod
     def describe_complexity(self, complexities: Sequence[int]) -> dict[str, Any]:
-        """Return what sets the complexities of the outputs apart; none for an empty list."""
+        """Return the hyperparameters of complexities per output; those of no model if empty."""
 
     def fit_notes(self, errors: Tensor, variance: Tensor) -> dict[str, Any]:
-        """Return what there is to say about cross-validated errors [C, n]."""
+        """Return the cross-validated errors [C, n] as notes of the fit."""
         return {"cross_validated_error": errors.tolist()}
 
     @final
     def _solve(self, data: EstimatorData) -> list[Solution]:
-        """Return the solution of the least cross-validated error, then the alternatives.
+        """Return the solution of minimum cross-validated error, then the alternatives.
 
-        Without groups there is no cross-validation, and nothing may be left to choose.
+        Without groups there is no cross-validation, and the settings must fix the complexity.
         """
         x, y, groups, _, _ = data
         moments = FoldMoments.from_grouped_samples(x, y, groups, self.folds)
+        # an infinite variance excludes constant outputs from relative errors
         variance = moments.output_variance()
         is_varying = variance > (CONSTANT_TOLERANCE * moments.shift_y).square()
         variance = torch.where(is_varying, variance, torch.inf)
@@ -219,14 +228,18 @@ class _RegularizationPathEstimator(Estimator):
         }
         summed_moments = moments.sums.sum(0)
         all_moments = moments.centre(summed_moments)
-        path, errors = self._fit_path(all_moments), None
+        # the path of all samples; without groups there are no cross-validated errors
+        path = self._fit_path(all_moments)
+        errors = None
         if groups is not None:
+            # every fold is predicted by the models fitted to the other folds
             training_moments = [
                 moments.centre(summed_moments - fold_sums) for fold_sums in moments.sums
             ]
             fold_paths = [
                 self._fit_path(fold_training_moments) for fold_training_moments in training_moments
             ]
+            # a path may end early, so compare only complexities that every fold has
             n_complexities = min(len(fold_path) for fold_path in fold_paths)
             squared_errors = [
                 moments.fold_squared_error(f, fold_path[:n_complexities], fold_training_moments)
@@ -260,7 +273,8 @@ class _RegularizationPathEstimator(Estimator):
         if self.is_scaled:
             scale = (moments.xx.diagonal() / moments.n_samples).sqrt()
             scale = torch.where(scale > 0, scale, torch.ones_like(scale))
-        xx, xy = moments.xx / torch.outer(scale, scale), moments.xy / scale[:, None]
+        xx = moments.xx / torch.outer(scale, scale)
+        xy = moments.xy / scale[:, None]
         return self.compute_path(xx, xy, moments.n_samples) / scale[None, :, None]
 
 
@@ -268,17 +282,17 @@ class _RegularizationPathEstimator(Estimator):
 class Ridge(_RegularizationPathEstimator):
     """Ridge regression of every output, with an intercept that is not penalised.
 
-    The choice of no coefficients has an empty list of penalties.
+    The solution without coefficients has an empty list of penalties.
 
     Args:
-        penalties: candidates, in units of a standardised column's energy: alpha = penalty N in
-            scikit-learn's terms.
-        folds: folds of the cross-validation that chooses; None for one fold for each group.
-        is_scaled: whether columns are scaled to unit variance; else they are only centred.
-        is_shared: whether all outputs share one penalty, that of the least sum of errors; else each
-            output takes its own.
-        has_alternatives: whether `fit` offers every penalty for all outputs, and no coefficients at
-            all, beside its own choice.
+        penalties: candidate penalties relative to the energy of a standardised column; the `alpha`
+            of scikit-learn is the penalty times the number of samples.
+        folds: number of folds of the cross-validation; None for a fold per group.
+        is_scaled: whether columns are scaled to unit variance; otherwise they are only centred.
+        is_shared: whether all outputs have the same penalty, which minimizes the sum of errors;
+            otherwise the penalty is chosen per output.
+        has_alternatives: whether `fit` also returns a solution per penalty, shared by all outputs,
+            and the solution without coefficients.
     """
 
     def __init__(
@@ -305,10 +319,12 @@ class Ridge(_RegularizationPathEstimator):
     def select_complexities(
         self, errors: Tensor | None, variance: Tensor, n_complexities: int
     ) -> list[list[int]]:
-        """Return the penalties of the least error, then each for all outputs."""
+        """Return the penalties of minimum error, then every penalty shared by all outputs."""
         n_outputs = variance.numel()
         if errors is None and n_complexities > 1:
-            raise FitError("several penalties, and without groups nothing can choose between them")
+            raise FitError(
+                "several penalties need groups for cross-validation; give groups or one penalty"
+            )
         errors = variance.new_zeros(1, n_outputs) if errors is None else errors
         best_indices = (
             [int(errors.sum(1).argmin())] * n_outputs
@@ -326,17 +342,17 @@ class Ridge(_RegularizationPathEstimator):
 
 @final
 class PLSR(_RegularizationPathEstimator):
-    """Partial least squares of all outputs together, with an intercept.
+    """Partial least squares with several outputs (PLS2) and an intercept.
 
-    Outputs that nothing explains get the solution of order 0, without coefficients.
+    Outputs without covariance with the columns get the solution of order 0, without coefficients.
 
     Args:
-        order: number of latent variables; None takes the least cross-validated error, summed over
-            the outputs in units of their variances.
-        max_order: highest order tried; None for the number of columns.
-        folds: folds of the cross-validation; None for one fold for each group.
-        is_scaled: whether columns are scaled to unit variance; else they are only centred.
-        has_alternatives: whether `fit` offers other orders, and none, beside its own choice.
+        order: number of latent variables; None for the minimum of the cross-validated error, which
+            is the mean over the outputs relative to their variances.
+        max_order: highest candidate order; None for the number of columns.
+        folds: number of folds of the cross-validation; None for a fold per group.
+        is_scaled: whether columns are scaled to unit variance; otherwise they are only centred.
+        has_alternatives: whether `fit` also returns other orders and the solution of order 0.
     """
 
     def __init__(
@@ -358,17 +374,20 @@ class PLSR(_RegularizationPathEstimator):
     def select_complexities(
         self, errors: Tensor | None, variance: Tensor, n_complexities: int
     ) -> list[list[int]]:
-        """Return the order given or of the least error, then those worth trying."""
-        n_outputs, order = variance.numel(), n_complexities
+        """Return the fixed order or that of minimum error, then alternative orders."""
+        n_outputs = variance.numel()
+        order = n_complexities
         if self.order is not None:
             order = min(self.order, n_complexities)
         elif errors is None:
-            raise FitError("the order is not given, and without groups nothing can choose it")
+            raise FitError(
+                "choosing the order needs groups for cross-validation; give groups or `order`"
+            )
         else:
             order = int((errors / variance).mean(1).argmin()) + 1
         orders = [order]
         if self.has_alternatives:
-            # each of the first few, then steps of a quarter
+            # every low order, then orders that increase by a quarter
             alternative_orders = [1]
             while alternative_orders[-1] < n_complexities:
                 step = (
@@ -384,7 +403,7 @@ class PLSR(_RegularizationPathEstimator):
         return {"order": complexities[0] + 1 if complexities else 0}
 
     def fit_notes(self, errors: Tensor, variance: Tensor) -> dict[str, Any]:
-        """Return the error by order, mean over outputs in units of their variances."""
+        """Return the cross-validated error per order, the mean over outputs of error / variance."""
         return {"cross_validated_share": (errors / variance).mean(1).tolist()}
 
 
@@ -396,19 +415,18 @@ def pls_path(
     is_joint: bool = True,
     mask: Tensor | None = None,
 ) -> Tensor:
-    """Return coefficients of partial least squares for every order, [A, ..., J, K].
+    """Compute the coefficients of partial least squares for every order, [A, ..., J, K].
 
-    Kernel algorithm of Dayal and MacGregor (1997), from moments alone. The path ends early where
-    nothing is left to explain, or to explain it with.
+    This is the kernel algorithm of Dayal and MacGregor (1997), which needs moments only. The path
+    ends early if the residual covariance or the energy of the next latent variable is zero.
 
     Args:
         xx: X'X of centred, scaled columns [..., J, J].
         xy: X'Y [..., J, K].
-        orders: number of latent variables; or that of each column of xy, ascending, [K]: a column
-            is left alone once its order is reached.
-        is_joint: whether the columns of xy are outputs of one model (PLS2); else each has a model of
-            its own (PLS1).
-        mask: 1 where a model has a regressor, 0 elsewhere, [J, K].
+        orders: number of latent variables; or the number for each column of xy, ascending, [K].
+        is_joint: whether the columns of xy are the outputs of one model (PLS2); otherwise every
+            column has its own model (PLS1).
+        mask: 1 for the regressors of each model, 0 for the others, [J, K].
     """
     residual_covariance = xy if mask is None else xy * mask
     min_covariance = _EXPLAINED_TOLERANCE * torch.linalg.vector_norm(
@@ -417,8 +435,10 @@ def pls_path(
     min_energy = _MIN_LATENT_ENERGY * float(xx.diagonal(dim1=-2, dim2=-1).max())
     loadings: list[Tensor] = []
     rotations: list[Tensor] = []
-    path_coefficients, path = torch.zeros_like(xy), []
+    path_coefficients = torch.zeros_like(xy)
+    path = []
     for step in range(orders if isinstance(orders, int) else int(orders.max())):
+        # orders ascend: the columns before `first_active` have all their latent variables
         first_active = 0 if isinstance(orders, int) else int((orders <= step).sum())
         active_covariance = residual_covariance[..., first_active:]
         if is_joint:
@@ -431,6 +451,7 @@ def pls_path(
             norm = torch.linalg.vector_norm(active_covariance, dim=-2, keepdim=True)
             r = w = active_covariance / norm.clamp(min=_MIN_NORM)
             is_active = norm > min_covariance[..., None, first_active:]
+        # rotate the weights so that they apply to the undeflated columns
         for previous_loading, previous_rotation in zip(loadings, rotations, strict=True):
             r = (
                 r
@@ -442,6 +463,7 @@ def pls_path(
         is_active = is_active & (energy > min_energy)
         if not bool(is_active.any()):
             break
+        # loadings, coefficients and deflation; models that have converged do not change
         safe_energy = torch.where(is_active, energy, 1.0)
         y_loading = torch.where(
             is_active, (r * active_covariance).sum(-2, keepdim=True) / safe_energy, 0.0

@@ -1,12 +1,10 @@
-"""Sparse regression: the few candidate columns, out of many, that make up a target.
+"""Sparse regression: select the few candidate terms that explain a target.
 
-They do so exactly, or as well as the data can tell.
-
-Everything works on one QR factorisation of [candidates | targets]: columns that the data cannot
-tell from simpler ones are set aside, then several orthogonal forward regressions side by side
-search the rest, and what there is no evidence for is trimmed. A QR factor keeps what its square,
-the Gram matrix, loses: candidates such as u, u cos(delta) and u |u| differ in the eighth digit on a
-log of small nozzle angles.
+The method works on a QR factorisation of [candidates | targets] in three steps. Candidates that
+are linearly dependent on simpler ones are removed. A beam search adds terms by orthogonal forward
+regression and scores the models by the extended BIC. Backward elimination removes the terms without
+evidence. The Gram matrix would lose half of the significant digits, and candidates such as u,
+u cos(delta) and u |u| differ in the eighth digit on a log of small nozzle angles.
 """
 
 from __future__ import annotations
@@ -27,49 +25,50 @@ from residnet.regression.equation_rows import effective_correlation_length
 from residnet.regression.estimator import Coefficient, Estimator, EstimatorData, Solution, to_dense
 
 _DEPENDENCE_TOLERANCE = 1e-12
-"""Share of a column's length that must be left beside simpler columns; below it rounding decides.
-"""
+"""Norm of a unit column after projection on simpler ones, below which it counts as dependent."""
 _MIN_NORM = 1e-300
-"""Length of a column or target from which it counts, and least divisor of a condition number."""
+"""Norm below which a column or target counts as zero; lower bound of a denominator."""
 _MIN_REPORTED_SHARE = 1e-6
-"""Least share of a simpler column in a dependent one at which it is named."""
+"""Minimum weight of a simpler column that is reported as a component of a dependent column."""
 _DUPLICATE_TOLERANCE = 1e-11
-"""Length of a unit column beside the chosen ones below which it adds nothing that rounding does
-not.
-"""
+"""Norm of a unit column after projection, below which only rounding errors remain."""
 _SPAN_TOLERANCE = 1e-9
-"""Length of a unit column beside the chosen ones up to which it is made up of them."""
+"""Norm of a unit column after projection, below which it lies in the span of the subset."""
 _NOISE_SHARE = 1e-9
-"""Unexplained share of a target from which data count as noisy."""
+"""Relative error of the best equation above which the data count as noisy."""
 _POSITIVE_EVIDENCE = 3.0
-"""Difference of the criterion from which one term more counts as evident: between positive and
-strong evidence (Kass and Raftery 1995).
+"""Increase of the BIC on removal of a term, up to which backward elimination removes it.
+
+It lies between positive and strong evidence (Kass and Raftery 1995).
 """
 _STRONG_EVIDENCE = 6.0
-"""Difference of the criterion above which one model is strongly preferred to another (ibid.)."""
+"""Difference of the BIC that is strong evidence for a model (Kass and Raftery 1995)."""
 _BEAM_WIDTH = 12
-"""Sets of columns of one size that are followed side by side: of 30 random problems with nine
-correlated columns 6 miss the best of all subsets once, 12 never.
+"""Number of subsets of one size in the beam search.
+
+On 30 random problems with nine correlated columns, a width of 6 missed the best of all subsets
+once and a width of 12 never.
 """
 _MAX_SIZES_WITHOUT_GAIN = 6
-"""Sizes without a gain of the criterion after which the search ends: an exact equation may gain
-nothing before its last term (a mass-spring-damper's three, the jets' from steps; 2 misses both).
+"""Number of consecutive sizes without a decrease of the criterion, after which the search ends.
+
+The criterion of an exact equation may decrease at its last term only. With 2, the search misses the
+three terms of a mass-spring-damper and the equations of water jets from steps.
 """
 
 
 class SparseSearchConfig(Config):
-    """The extent of a sparse search.
+    """Settings of a sparse search.
 
     Attributes:
-        max_terms: most terms of an equation on the way of the search; the result usually has fewer.
-        gamma: weight of the number of candidates in the extended BIC (Chen and Chen 2008), n
-            ln(RSS) + k ln(n) + 2 gamma ln(J over k); 0 is BIC.
+        max_terms: maximum number of terms during the search; the result usually has fewer.
+        gamma: weight of the number of candidates in the extended BIC (Chen and Chen 2008),
+            n ln(RSS) + k ln(n) + 2 gamma ln(J choose k); 0 for the BIC.
         precision: error relative to the target below which a fit counts as exact.
-        resolution: share of its length by which a term must differ from simpler ones to need no
-            further evidence where the data are noisy (or the unexplained share of the target, if
-            that is less). A term that differs by less is taken where the criterion strongly prefers
-            an equation with it. u|u| differs from u^2 by noise alone on a vessel that is at rest
-            for a moment and never goes astern.
+        resolution: relative norm by which a term must differ from simpler ones on noisy data. The
+            relative error of the best equation is used instead if it is lower. A term that differs
+            by less is selected only on strong evidence: u|u| differs from u^2 by noise only if the
+            vessel never moves astern.
     """
 
     max_terms: int = Field(default=30, ge=1, le=80)
@@ -80,20 +79,20 @@ class SparseSearchConfig(Config):
 
 @dataclass(frozen=True)
 class ReducedProblem:
-    """The candidates and targets in the coordinates of one QR factorisation.
+    """A regression of K targets on J candidates, reduced to the R factor of its columns.
 
     Attributes:
-        names: the J candidates that the data tell apart, simplest first.
-        degree: degree of each, ascending, [J].
-        scale: length of each column before it was scaled to one, [J].
-        r: columns of unit length in the new coordinates [J + K, J].
+        names: names of the linearly independent candidates, simplest first.
+        degree: degree of each candidate, ascending, [J].
+        scale: norm of each column before scaling to unit norm, [J].
+        r: unit columns in the coordinates of the QR factorisation [J + K, J].
         y: targets in the same coordinates [J + K, K].
-        independent_samples: as many independent rows as the correlated ones are worth for each target, [K].
-        rank: number of candidates that are independent, J.
-        condition: condition number of the scaled candidates.
-        unexcited: candidates that are zero in all samples.
-        dependent: candidate -> how simpler ones make it up on these data, for example {"u|u|":
-            {"u^2": 1.0}}.
+        independent_samples: effective number of independent samples of each target, [K].
+        rank: number of linearly independent candidates J.
+        condition: condition number of the unit columns.
+        unexcited: names of candidates that are zero in all samples.
+        dependent: removed candidate -> simpler candidates and their weights on these data, for
+            example {"u|u|": {"u^2": 1.0}}.
     """
 
     names: tuple[str, ...]
@@ -115,19 +114,18 @@ def reduce_problem(
     degree: Sequence[int],
     complexity: Sequence[float] = (),
 ) -> ReducedProblem:
-    """Return candidates and targets by one QR factorisation.
-
-    Columns that simpler ones make up are set aside.
+    """Reduce a regression by QR factorisation and remove linearly dependent candidates.
 
     Args:
         x: candidate columns [N, J].
         y: targets [N, K].
-        degree: of the columns: the stages of the search.
-        complexity: how complicated each column is, within its degree; the order given where empty.
+        names: names of the candidates.
+        degree: degree of each candidate, by which the stages of the search are ordered.
+        complexity: sort key of the candidates within a degree; their order if empty.
 
     Raises:
-        FitError: with values that are not finite, no candidate that is excited, or fewer samples
-            than candidates.
+        FitError: if values are not finite, all candidates are zero, or there are fewer samples than
+            candidates.
     """
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         non_finite = [
@@ -137,8 +135,8 @@ def reduce_problem(
         ]
         subject = f"term '{non_finite[0]}'" if non_finite else "the target"
         raise FitError(
-            f"sparse regression: {subject} is not finite in all samples; mask those or leave the"
-            " term out"
+            f"sparse regression: {subject} is not finite in all samples; mask these samples or"
+            " remove the term"
         )
     order = np.lexsort(
         (np.asarray(complexity) if len(complexity) else np.arange(x.shape[1]), np.asarray(degree))
@@ -147,8 +145,8 @@ def reduce_problem(
     excited = order[column_norm > _MIN_NORM]
     if not excited.size:
         raise FitError(
-            "sparse regression: every candidate term is zero in all samples; the data excite"
-            " nothing"
+            "sparse regression: every candidate term is zero in all samples; give data that"
+            " excite the terms"
         )
     if x.shape[0] <= excited.size + y.shape[1]:
         raise FitError(
@@ -183,10 +181,13 @@ def reduce_problem(
 
 
 def merge_similar_columns(reduced: ReducedProblem, resolution: float) -> ReducedProblem:
-    """Return the same without the candidates that hardly differ from simpler ones.
+    """Return the problem without the candidates that are nearly dependent on simpler ones.
 
-    They differ by no more than a share of their length.
+    Args:
+        reduced: problem with unit columns.
+        resolution: norm after projection on simpler columns, up to which a column is removed.
     """
+    # a removed column no longer hides others, so repeat until every column is distinct
     retained = list(range(len(reduced.names)))
     while True:
         orthogonal_norms = np.abs(np.diagonal(_r_factor(reduced.r[:, retained])))
@@ -194,6 +195,7 @@ def merge_similar_columns(reduced: ReducedProblem, resolution: float) -> Reduced
         if not dependent_columns:
             break
         retained = [i for i in retained if i not in dependent_columns]
+    # write the removed columns as combinations of simpler ones
     q, r_retained = np.linalg.qr(reduced.r[:, retained])
     dependent: dict[str, dict[str, float]] = {}
     for i in sorted({*range(len(reduced.names))} - {*retained}):
@@ -227,9 +229,9 @@ def _r_factor(x: np.ndarray) -> np.ndarray:
 
 
 def solve_least_squares(r: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return least-squares coefficients [p] of columns [R, p], and their triangle's inverse.
+    """Return the least-squares coefficients [p] of columns [R, p] and the inverse R factor [p, p].
 
-    The rows of the inverse [p, p] give standard errors.
+    The norms of the rows of the inverse are proportional to the standard errors.
     """
     q, r_factor = np.linalg.qr(r)
     r_inverse = np.linalg.inv(r_factor) if r_factor.size else r_factor
@@ -238,59 +240,64 @@ def solve_least_squares(r: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.nd
 
 @final
 class ForwardSearch:
-    """A search of one target [R] in columns of unit length [R, J], by the extended BIC.
+    """Search for a sparse equation of a target by the extended BIC.
 
     Args:
-        independent_samples: as many independent rows as the correlated ones are worth.
+        r: candidate columns of unit norm [R, J].
+        y: target [R].
+        independent_samples: effective number of independent samples.
+        config: settings of the search.
     """
 
     def __init__(
         self, r: np.ndarray, y: np.ndarray, independent_samples: float, config: SparseSearchConfig
     ) -> None:
-        self.r, self.y, self.independent_samples, self.config = r, y, independent_samples, config
+        self.r = r
+        self.y = y
+        self.independent_samples = independent_samples
+        self.config = config
         self.target_energy = float(y @ y)
         self.max_terms = min(config.max_terms, r.shape[1])
 
     def criterion(self, rss: np.ndarray | float, n_terms: int) -> np.ndarray:
-        """Return the criterion of models with `n_terms` terms and residual sums of squares `rss`.
+        """Return the extended BIC of models with `n_terms` terms and residual sums `rss`.
 
-        An error below `precision` of the target is no better than none.
+        Errors below `precision` of the target count as equal.
         """
         relative_rss = (
             np.maximum(np.asarray(rss), 0.0) / self.target_energy + self.config.precision**2
         )
-        n_candidates, gammaln = max(self.r.shape[1], n_terms), scipy.special.gammaln
+        n_candidates = max(self.r.shape[1], n_terms)
+        gammaln = scipy.special.gammaln
         log_combinations = (
             gammaln(n_candidates + 1) - gammaln(n_terms + 1) - gammaln(n_candidates - n_terms + 1)
         )
-        goodness_of_fit, size_penalty = (
-            self.independent_samples * np.log(relative_rss),
-            n_terms * np.log(self.independent_samples),
-        )
+        goodness_of_fit = self.independent_samples * np.log(relative_rss)
+        size_penalty = n_terms * np.log(self.independent_samples)
         return np.asarray(
             goodness_of_fit + size_penalty + 2.0 * self.config.gamma * log_combinations
         )
 
     def is_exact(self, rss: float) -> bool:
-        """Return whether a fit is as good as arithmetic allows."""
+        """Return whether a residual sum of squares is at the level of rounding errors."""
         return rss <= (2.0 * self.config.precision) ** 2 * self.target_energy
 
     def rss(self, subset: Sequence[int]) -> float:
-        """Return the residual sum of squares of the chosen columns."""
+        """Return the residual sum of squares of a subset of columns."""
         residual = self.project_out(subset)[1]
         return float(residual @ residual)
 
     def criterion_of(self, subset: Sequence[int]) -> float:
-        """Return the criterion of the chosen columns."""
+        """Return the extended BIC of a subset of columns."""
         return float(self.criterion(self.rss(subset), len(subset)))
 
     def project_out(
         self, subset: Sequence[int], other_columns: np.ndarray | None = None
     ) -> tuple[np.ndarray | None, np.ndarray]:
-        """Return what is left of columns [R, C] and of the target [R] beside chosen columns."""
+        """Return the components of columns [R, C] and of the target [R] orthogonal to a subset."""
         q = np.linalg.qr(self.r[:, list(subset)])[0]
         target = self.y
-        # twice: what the first projection rounded away
+        # the second projection removes the rounding errors of the first
         for _ in range(2):
             target = target - q @ (q.T @ target)
             other_columns = (
@@ -299,13 +306,14 @@ class ForwardSearch:
         return other_columns, target
 
     def beam_search(self) -> tuple[float, list[int]]:
-        """Return the best criterion on several ways forward side by side, and its columns.
+        """Search forward with a beam; return the best criterion and its subset of columns.
 
-        Each size keeps the best sets of the size before with one column more. A single way takes a
-        column that stands for two true ones and seldom finds back.
+        At each size the search keeps the best extensions of the subsets by one column. Greedy
+        forward selection often picks a column that replaces two true ones and cannot recover.
         """
         best_subset: tuple[float, list[int]] = (float(self.criterion(self.target_energy, 0)), [])
-        subsets, sizes_without_gain = np.zeros((1, 0), dtype=int), 0
+        subsets = np.zeros((1, 0), dtype=int)
+        sizes_without_gain = 0
         while subsets.shape[1] < self.max_terms and sizes_without_gain < _MAX_SIZES_WITHOUT_GAIN:
             rss_table = rss_with_one_added(self.r, self.y, subsets)
             order = np.argsort(rss_table, axis=None)[: 4 * _BEAM_WIDTH]
@@ -320,23 +328,23 @@ class ForwardSearch:
             subsets = extended[np.sort(unique_index)[:_BEAM_WIDTH]]
             leading_set = subsets[0].tolist()
             rss = self.rss(leading_set)
-            criterion_value, sizes_without_gain = (
-                float(self.criterion(rss, len(leading_set))),
-                sizes_without_gain + 1,
-            )
+            criterion_value = float(self.criterion(rss, len(leading_set)))
+            sizes_without_gain = sizes_without_gain + 1
             if criterion_value < best_subset[0]:
-                best_subset, sizes_without_gain = (criterion_value, leading_set), 0
+                best_subset = (criterion_value, leading_set)
+                sizes_without_gain = 0
             if self.is_exact(rss):
                 break
         return best_subset
 
     def backward_eliminate(self, subset: list[int]) -> list[int]:
-        """Return the columns without those, least useful first, for which there is no evidence.
+        """Remove the least significant columns while the criterion increases by too little.
 
-        Among many candidates one target in some dozens has a column that fits its noise well enough
-        for the criterion alone. Of an exact fit what it does not need goes.
+        With many candidates, some column fits the noise of one target in several dozen well enough
+        for the criterion alone. An exact fit loses every column that it does not need.
         """
-        subset, criterion_value = list(subset), self.criterion_of(subset)
+        subset = list(subset)
+        criterion_value = self.criterion_of(subset)
         while subset:
             estimate, inverse = solve_least_squares(self.r[:, subset], self.y)
             weakest = int((np.square(estimate) / np.square(inverse).sum(axis=1)).argmin())
@@ -345,19 +353,24 @@ class ForwardSearch:
             required_evidence = 0.0 if self.is_exact(self.rss(subset)) else _POSITIVE_EVIDENCE
             if reduced_criterion > criterion_value + required_evidence:
                 break
-            subset, criterion_value = reduced_subset, reduced_criterion
+            subset = reduced_subset
+            criterion_value = reduced_criterion
         return subset
 
 
 def rss_with_one_added(r: np.ndarray, y: np.ndarray, subsets: np.ndarray) -> np.ndarray:
-    """Return sums of squares [M, J] that each column leaves when added to sets of columns [M, p].
+    """Return the residual sums of squares [M, J] of M subsets, each extended by each column.
 
-    They are infinite where it adds nothing.
+    Args:
+        r: columns of unit norm [R, J].
+        y: target [R].
+        subsets: indices of the columns of M subsets [M, p].
+
+    Returns:
+        The sums; infinite for a column in the span of the subset.
     """
-    columns, target = (
-        np.repeat(r[None], len(subsets), axis=0),
-        np.repeat(y[None], len(subsets), axis=0),
-    )
+    columns = np.repeat(r[None], len(subsets), axis=0)
+    target = np.repeat(y[None], len(subsets), axis=0)
     if subsets.shape[1]:
         q = np.linalg.qr(r.T[subsets].transpose(0, 2, 1))[0]
         q_transposed = q.transpose(0, 2, 1)
@@ -374,19 +387,18 @@ def rss_with_one_added(r: np.ndarray, y: np.ndarray, subsets: np.ndarray) -> np.
 
 @dataclass(frozen=True)
 class SparseEquation:
-    """A target as a sum of few terms.
+    """A sparse equation of a target.
 
     Attributes:
-        terms: names, simplest first.
+        terms: names of the terms, simplest first.
         values: coefficients.
         standard_errors: standard errors of the coefficients.
-        relative_error: RMS error over RMS of the target.
-        is_exact: whether the error is at the precision of the arithmetic.
+        relative_error: RMS error divided by the RMS of the target.
+        is_exact: whether the error is at the level of rounding errors.
         criterion: extended BIC.
-        alternatives: term -> other candidates that could stand in its place as far as these data
-            can tell.
-        undecided: candidates left out whose coefficient could, within two standard errors, make up
-            a twentieth of the target: {name: that share}.
+        alternatives: term -> candidates that could replace it without strong evidence against them.
+        undecided: candidate -> upper bound (two standard errors) of its share of the target, for
+            candidates outside the equation whose bound exceeds 5 %.
     """
 
     terms: tuple[str, ...]
@@ -399,9 +411,10 @@ class SparseEquation:
     undecided: dict[str, float]
 
     def summary(self, problem: ReducedProblem) -> dict[str, Any]:
-        """Return what the data say about the equation, for fit.json.
+        """Return the diagnostics of the equation for fit.json.
 
-        It holds among the candidates that were searched.
+        Args:
+            problem: candidates of the search that selected the equation.
         """
         return {
             "error_share": self.relative_error,
@@ -415,15 +428,16 @@ class SparseEquation:
 
 
 EMPTY_EQUATION = SparseEquation((), np.zeros(0), np.zeros(0), 1.0, False, 0.0, {}, {})
-"""The equation without terms."""
+"""Equation without terms."""
 
 
 def find_equation(
     reduced: ReducedProblem, output_index: int, config: SparseSearchConfig
 ) -> tuple[SparseEquation, ReducedProblem]:
-    """Return the equation of one target, and the candidates that it was searched in.
+    """Search the equation of one target; return it with the candidates of the search.
 
-    These are fewer where noise hides what sets some apart.
+    On noisy data, candidates that differ by less than the noise are merged first. The equation of
+    all candidates is returned only if the criterion strongly prefers it.
     """
     full_equation = _search_by_degree(reduced, output_index, config)
     if full_equation.relative_error <= _NOISE_SHARE:
@@ -441,10 +455,10 @@ def find_equation(
 def _search_by_degree(
     reduced: ReducedProblem, output_index: int, config: SparseSearchConfig
 ) -> SparseEquation:
-    """Return the best equation.
+    """Search among the candidates up to each degree in turn and return the best equation.
 
-    Degrees are searched in turn, simplest first, until one explains the target exactly; otherwise
-    the criterion, which knows how many candidates each had to choose from, decides between them.
+    The search ends at the first degree with an exact equation. Otherwise the criterion, which
+    accounts for the number of candidates, decides between the degrees.
     """
     target_column = reduced.y[:, output_index]
     if float(target_column @ target_column) <= _MIN_NORM:
@@ -467,7 +481,7 @@ def _search_by_degree(
 def _make_search(
     reduced: ReducedProblem, output_index: int, config: SparseSearchConfig, n_candidates: int
 ) -> ForwardSearch:
-    """Return the search among the first `n_candidates` candidates."""
+    """Build the search among the first `n_candidates` candidates."""
     independent_samples = float(reduced.independent_samples[output_index])
     return ForwardSearch(
         reduced.r[:, :n_candidates], reduced.y[:, output_index], independent_samples, config
@@ -475,7 +489,7 @@ def _make_search(
 
 
 def fit_all_candidates(reduced: ReducedProblem, output_index: int) -> SparseEquation:
-    """Return all candidates that the data tell apart, by least squares."""
+    """Fit the equation of all linearly independent candidates by least squares."""
     search = _make_search(reduced, output_index, SparseSearchConfig(), reduced.rank)
     return build_equation(reduced, search, list(range(reduced.rank)))
 
@@ -483,7 +497,7 @@ def fit_all_candidates(reduced: ReducedProblem, output_index: int) -> SparseEqua
 def build_equation(
     reduced: ReducedProblem, search: ForwardSearch, subset: list[int]
 ) -> SparseEquation:
-    """Return the equation of the chosen columns, with what stands beside it."""
+    """Fit the equation of a subset of columns and compute its diagnostics."""
     subset = sorted(subset)
     rss = search.rss(subset)
     is_exact = search.is_exact(rss)
@@ -506,7 +520,7 @@ def build_equation(
 def _equivalent_terms(
     search: ForwardSearch, subset: list[int], names: np.ndarray
 ) -> dict[str, list[str]]:
-    """Return by term the candidates between which and it the data do not decide."""
+    """Return, per term, the candidates that could replace it without strong evidence against."""
     if not subset:
         return {}
     criterion_limit = search.criterion_of(subset) + _STRONG_EVIDENCE
@@ -522,7 +536,7 @@ def _equivalent_terms(
             for j in np.flatnonzero(criterion_row <= criterion_limit + _STRONG_EVIDENCE)
             if j not in subset
         ]
-        # the table loses digits by cancellation where a fit is exact
+        # the table has cancellation errors if a fit is exact, so compute the criterion again
         if equivalent := [
             str(names[j])
             for j in candidates
@@ -535,9 +549,9 @@ def _equivalent_terms(
 def _undecided_terms(
     search: ForwardSearch, subset: list[int], names: np.ndarray, residual_std: float
 ) -> dict[str, float]:
-    """Return the candidates whose coefficient the data leave so open that they could matter.
+    """Return candidates outside a subset that could contribute more than 5 % of the target.
 
-    Each has the share of the target within two standard errors.
+    The value is the upper bound of the share, two standard errors above the estimate.
     """
     columns, target = search.project_out(subset, search.r)
     assert columns is not None
@@ -559,17 +573,17 @@ def _undecided_terms(
 
 @final
 class SparseRegression(Estimator):
-    """Sparse regression without intercept, its length by the extended BIC.
+    """Sparse regression without intercept; the extended BIC selects the terms.
 
-    The notes of a solution have, under `equations`, what the data say about each output.
+    The notes of a solution have the diagnostics of each output under `equations`.
 
     Args:
-        degrees: degree of each candidate, [J]: the stages of the search; one stage where empty.
-        complexities: how complicated each candidate is within its degree, [J]; the order given where
-            empty.
+        search: settings of the search.
+        degrees: degree of each candidate, [J], by which the search proceeds; one degree if empty.
+        complexities: sort key of the candidates within a degree, [J]; their order if empty.
         allowed_terms: which candidates each output may have, [J, n] bool; None for all.
-        gammas: weights of the number of candidates in the extended BIC with which `goodness_of_fit` offers
-            alternatives, and no terms at all; none where empty.
+        gammas: weights of the extended BIC with which `fit` returns alternatives, followed by the
+            solution without terms; no alternatives if empty.
     """
 
     def __init__(
@@ -590,7 +604,7 @@ class SparseRegression(Estimator):
     def _solve(self, data: EstimatorData) -> list[Solution]:
         """Return the solution of the extended BIC, then the alternatives that differ from it.
 
-        Groups do not matter.
+        The groups of the samples are not used.
         """
         _, y, _, names, outputs = data
         problems = self._reduce_outputs(to_dense(data.x).numpy(), y.numpy(), names)
@@ -619,7 +633,7 @@ class SparseRegression(Estimator):
     def _reduce_outputs(
         self, x: np.ndarray, y: np.ndarray, names: Sequence[str]
     ) -> list[ReducedProblem]:
-        """Return the regression of each output, reduced to its QR factor; one for all if it can."""
+        """Reduce the regression of each output; outputs of equal candidates share a problem."""
         degrees = self.degrees or (1,) * len(names)
         all_allowed = torch.ones(len(names), y.shape[1], dtype=torch.bool)
         cache: dict[tuple[int, ...], ReducedProblem] = {}
@@ -628,12 +642,13 @@ class SparseRegression(Estimator):
             columns = tuple(mask.nonzero()[:, 0].tolist())
             if columns not in cache:
                 complexities = [self.complexities[j] for j in columns] if self.complexities else ()
-                reduce_arguments = (
+                cache[columns] = reduce_problem(
+                    x[:, columns],
+                    y,
                     [names[j] for j in columns],
                     [degrees[j] for j in columns],
                     complexities,
                 )
-                cache[columns] = reduce_problem(x[:, columns], y, *reduce_arguments)
             problems.append(cache[columns])
         return problems
 
@@ -683,7 +698,7 @@ class SparseRegression(Estimator):
 
 
 def coefficient_to_dict(coefficient: Coefficient) -> dict[str, Any]:
-    """Return a coefficient as it stands in the notes of a fit."""
+    """Return a coefficient as a dictionary for the notes of a fit."""
     return {
         "axis": coefficient.axis,
         "term": coefficient.term,

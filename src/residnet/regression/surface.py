@@ -1,6 +1,7 @@
 """Surface analysis: PLSR by model order and number of basis functions.
 
-The weakest basis functions are removed one by one (document 002 section 4.5).
+Backward elimination removes the basis function with the smallest coefficient until two remain
+(document 002 section 4.5).
 """
 
 from __future__ import annotations
@@ -25,15 +26,15 @@ from residnet.regression.shrinkage import CONSTANT_TOLERANCE, FoldMoments, pls_p
 
 @dataclass(frozen=True)
 class ErrorSurface:
-    """The errors over orders and numbers of basis functions, for each output by itself.
+    """Errors of each output by model order and number of basis functions.
 
     Attributes:
         error: mean squared error [K, A, J + 1] of output k with a + 1 latent variables and j basis
-            functions; NaN where there is no such model (fewer basis functions than latent
+            functions; NaN if the model does not exist (fewer basis functions than latent
             variables, or fewer than two).
-        standard_error: of that mean over the folds, [K, A, J + 1]; NaN with one fold.
-        removal: basis functions in the order of their removal, [K, A, J], -1 after the last one
-            that was removed.
+        standard_error: standard error of that mean over the folds, [K, A, J + 1]; NaN with one
+            fold.
+        removal: indices of basis functions in the order of their removal, [K, A, J]; padded by -1.
     """
 
     error: Tensor
@@ -41,27 +42,26 @@ class ErrorSurface:
     removal: Tensor
 
     def retained_columns(self, output: int, order: int, n_terms: int) -> list[int]:
-        """Return the `count` basis functions left for an output at model order `order_of_model` (from 1)."""
+        """Return the indices of the last `n_terms` basis functions of a model order (from 1)."""
         removed = self.removal[output, order - 1, : self.removal.shape[2] - n_terms].tolist()
         return [j for j in range(self.removal.shape[2]) if j not in removed]
 
     def minimum_error_model(self, output: int) -> tuple[int, int]:
-        """Return (order, count) of the least error of one output: the document's choice.
+        """Return (order, number of terms) of the minimum error of an output, as document 002 does.
 
-        It is optimistic where its folds also judge the result.
+        The estimate of the error is optimistic if the same folds also evaluate the result.
         """
         errors = torch.nan_to_num(self.error[output], nan=torch.inf).flatten()
         order_index, n_terms = divmod(int(errors.argmin()), self.error.shape[2])
         return order_index + 1, n_terms
 
     def one_standard_error_model(self, output: int) -> tuple[int, int]:
-        """Return the lowest (order, count) within one standard error of the least.
+        """Return (order, number of terms) of the simplest model within one standard error.
 
-        Of the lowest order it has the most basis functions.
-
-        The least cross-validated error of some 450 models is partly luck, and high orders on few
-        near-collinear columns explode elsewhere (Breiman's one-standard-error rule; a low order
-        shrinks, removing basis functions does not).
+        This is Breiman's one-standard-error rule. The simplest model is that of the lowest order
+        and, within this order, of the most basis functions: a low order shrinks the coefficients,
+        while removing basis functions does not. The minimum error of some 450 models is biased by
+        selection, and high orders on few nearly collinear columns extrapolate badly.
         """
         order, n_terms = self.minimum_error_model(output)
         error_limit = self.error[output, order - 1, n_terms] + torch.nan_to_num(
@@ -75,22 +75,23 @@ class ErrorSurface:
 def compute_error_surface(
     moments: FoldMoments, test_folds: Sequence[int] = (), max_order: int | None = None
 ) -> ErrorSurface:
-    """Return all models of the surface from moments alone, in one batch.
+    """Compute the errors of all models of the surface from moments, in one batch.
 
-    At every model order the basis function with the least |coefficient| on standardised columns is
-    removed, until the order or two are left.
+    At every model order the basis function with the smallest absolute standardised coefficient is
+    removed, until the number of basis functions equals the order or two.
 
     Args:
-        moments: sums by fold of basis functions [N, J] and outputs [N, K].
-        test_folds: folds that judge the models; these are fitted, and choose what to remove, on the
-            others. Empty: cross-validation over all folds.
+        moments: moments per fold of basis functions [N, J] and outputs [N, K].
+        test_folds: folds on which the models are evaluated. Fit and elimination use the other
+            folds. If empty, the errors are cross-validated over all folds.
         max_order: highest model order; None for the number of basis functions.
 
     Raises:
-        FitError: where a basis function is constant, or fewer than two are given.
+        FitError: if a basis function is constant, or fewer than two are given.
     """
     equations = _NormalEquations.gather(moments, test_folds)
-    n_outputs, n_columns = equations.covariance.shape[2], equations.gram.shape[1]
+    n_outputs = equations.covariance.shape[2]
+    n_columns = equations.gram.shape[1]
     n_orders = min(max_order or n_columns, n_columns)
     output_index = torch.arange(n_outputs).repeat(n_orders)
     order_of_model = torch.arange(1, n_orders + 1).repeat_interleave(n_outputs)
@@ -101,7 +102,7 @@ def compute_error_surface(
     )
     removal = torch.full((n_columns, n_orders * n_outputs), -1, dtype=torch.long)
     for n_terms in range(n_columns, 1, -1):
-        # columns are sorted by order: those that may still have `count` basis functions come first
+        # columns are sorted by order: the orders up to `n_terms` come first
         n_active = int((order_of_model <= n_terms).sum())
         path = pls_path(
             equations.gram,
@@ -131,13 +132,19 @@ def compute_error_surface(
 
 @dataclass(frozen=True)
 class _NormalEquations:
-    """The standardised normal equations.
+    """Standardised normal equations of P problems.
 
-    The first is fitted on all that may be used, the others on that less one fold each.
+    The first problem uses all training folds. In a cross-validation P - 1 problems follow, each
+    without one fold.
 
-    gram [P, J, J], covariance [P, J, K], scale and mean of the columns [P, J], mean of the outputs
-    [P, K]; `test_moments` are the sums [P', 1 + J + K, 1 + J + K] that the last P' problems are judged
-    on.
+    Attributes:
+        gram: Gram matrices [P, J, J].
+        covariance: covariances with the outputs [P, J, K].
+        scale: standard deviations of the columns [P, J].
+        mean_x: means of the columns [P, J].
+        mean_y: means of the outputs [P, K].
+        test_moments: moments [P', 1 + J + K, 1 + J + K] of the test samples of the last P'
+            problems.
     """
 
     gram: Tensor
@@ -149,21 +156,19 @@ class _NormalEquations:
 
     @classmethod
     def gather(cls, moments: FoldMoments, test_folds: Sequence[int]) -> _NormalEquations:
-        """Return the problems of moments by fold, judged on the folds `test` or on each in turn."""
+        """Build the problems evaluated on `test_folds`, or on each fold in turn if empty."""
         summed_moments = moments.sums.sum(0)
         test_sums = moments.sums[list(test_folds)].sum(0) if test_folds else summed_moments * 0.0
         training_sums = [summed_moments - test_sums] + (
             [] if test_folds else [summed_moments - moments.sums[f] for f in range(moments.n_folds)]
         )
         test_moments = test_sums.unsqueeze(0) if test_folds else moments.sums
-        centred = [moments.centre(moments_part) for moments_part in training_sums]
-        if centred[0][3].shape[0] < 2:
+        centred = [moments.centre(sums) for sums in training_sums]
+        if centred[0].xx.shape[0] < 2:
             raise FitError("a surface needs at least two basis functions")
-        n_samples = torch.tensor([moments_part[0] for moments_part in centred], dtype=torch.float64)
-        covariance_xx, covariance_xy = (
-            torch.stack([moments_part[3] for moments_part in centred]),
-            torch.stack([moments_part[4] for moments_part in centred]),
-        )
+        n_samples = torch.tensor([part.n_samples for part in centred], dtype=torch.float64)
+        covariance_xx = torch.stack([part.xx for part in centred])
+        covariance_xy = torch.stack([part.xy for part in centred])
         scale = (
             (covariance_xx.diagonal(dim1=1, dim2=2) / (n_samples[:, None] - 1)).clamp(min=0).sqrt()
         )
@@ -173,32 +178,36 @@ class _NormalEquations:
         ).sqrt() + moments.shift_x.abs()
         if bool((is_constant := scale <= CONSTANT_TOLERANCE * column_size).any()):
             raise FitError(
-                f"basis function number {int(is_constant.any(0).nonzero()[0, 0])} is constant; leave"
-                " it out (the intercept is there)"
+                f"basis function number {int(is_constant.any(0).nonzero()[0, 0])} is constant;"
+                " remove it, since the model has an intercept"
             )
         gram = covariance_xx / (scale[:, :, None] * scale[:, None, :])
         return cls(
             gram,
             covariance_xy / scale[:, :, None],
             scale,
-            torch.stack([moments_part[1] for moments_part in centred]),
-            torch.stack([moments_part[2] for moments_part in centred]),
+            torch.stack([part.mean_x for part in centred]),
+            torch.stack([part.mean_y for part in centred]),
             test_moments,
         )
 
     def test_errors(self, coefficients: Tensor, output_index: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the mean squared error [C] where judged, and its standard error over folds [C]."""
-        n_folds, n_columns = len(self.test_moments), self.gram.shape[1]
+        """Return the mean squared test error [C] and its standard error over the folds [C].
+
+        Args:
+            coefficients: standardised coefficients [P, J, C] of C models.
+            output_index: output of each model [C].
+        """
+        n_folds = len(self.test_moments)
+        n_columns = self.gram.shape[1]
         slopes = coefficients[-n_folds:] / self.scale[-n_folds:, :, None]
         intercept = self.mean_y[-n_folds:][:, output_index] - (
             self.mean_x[-n_folds:, :, None] * slopes
         ).sum(1)
         weights = torch.cat((intercept[:, None], slopes), dim=1)
-        xx, xy, yy = (
-            self.test_moments[:, : n_columns + 1, : n_columns + 1],
-            self.test_moments[:, : n_columns + 1, n_columns + 1 :],
-            self.test_moments[:, n_columns + 1 :, n_columns + 1 :],
-        )
+        xx = self.test_moments[:, : n_columns + 1, : n_columns + 1]
+        xy = self.test_moments[:, : n_columns + 1, n_columns + 1 :]
+        yy = self.test_moments[:, n_columns + 1 :, n_columns + 1 :]
         squares = (
             (weights * (xx @ weights)).sum(1)
             - 2 * (weights * xy[:, :, output_index]).sum(1)
@@ -214,12 +223,14 @@ class _NormalEquations:
 
 @final
 class SurfacePLSR(Estimator):
-    """PLSR of each output by itself, chosen by surface analysis (document 002 section 4.5.1).
+    """PLSR fitted per output, with surface analysis for the order and the basis functions.
+
+    Source: document 002 section 4.5.1.
 
     Args:
-        selection_rule: `one_standard_error_model`, the one-standard-error rule; or `minimum_error_model`, the bare minimum of the error.
-        test_groups: groups whose samples judge the models and fit none, as the document has it; empty for
-            cross-validation over all groups.
+        selection_rule: `simplest` for the one-standard-error rule, `least` for the minimum error.
+        test_groups: groups that are used to evaluate the models and not to fit them, as in the
+            document; empty for cross-validation over all groups.
     """
 
     def __init__(
@@ -232,16 +243,17 @@ class SurfacePLSR(Estimator):
         self.test_groups = tuple(test_groups)
 
     def _solve(self, data: EstimatorData) -> list[Solution]:
-        """Return the chosen solution; its `hyperparameters` has the order and the number of terms kept."""
+        """Return the selected solution with its order and number of terms."""
         x = to_dense(data.x)
         error_surface = self.error_surface(x, data.y, data.groups)
         return [self.solution_at_selection(error_surface, x, data.y, data.groups)]
 
     def error_surface(self, x: Tensor, y: Tensor, groups: Tensor | None) -> ErrorSurface:
-        """Return the errors of all models.
+        """Compute the errors of all models.
 
         Raises:
-            FitError: with fewer than two groups or basis functions, or one that is constant.
+            FitError: if there are fewer than two groups or basis functions, or if a basis function
+                is constant.
         """
         assign_group_folds(groups, None)
         moments = FoldMoments.from_grouped_samples(x, y, groups, None)
@@ -250,7 +262,7 @@ class SurfacePLSR(Estimator):
     def solution_at_selection(
         self, error_surface: ErrorSurface, x: Tensor, y: Tensor, groups: Tensor | None
     ) -> Solution:
-        """Return the solution that the surface of `x` and `y` leads to."""
+        """Fit the model that the selection rule chooses on the error surface."""
         if groups is not None and self.test_groups:
             is_training = ~torch.isin(groups, torch.tensor(self.test_groups))
             x, y = x[is_training], y[is_training]
@@ -260,9 +272,10 @@ class SurfacePLSR(Estimator):
             if self.selection_rule == "simplest"
             else error_surface.minimum_error_model
         )
-        std_x, std_y = x.std(0), y.std(0)
+        std_x = x.std(0)
+        std_y = y.std(0)
         is_varying = (std_y > CONSTANT_TOLERANCE * y.abs().amax(0)).tolist()
-        # an output that is constant but for rounding needs no basis function
+        # an output that varies by rounding errors only gets no basis function
         selected_models = [
             select_model(output) if is_varying[output] else (0, 0) for output in outputs
         ]

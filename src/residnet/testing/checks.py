@@ -174,7 +174,8 @@ def make_example_model(spec: ModelSpec) -> HybridDynamics:
     A head takes its scales from the example samples; a closed form is fitted on them too.
     """
     torch.manual_seed(0)
-    model, training_samples = spec.build(), make_example_samples(signals=spec.signals)
+    model = spec.build()
+    training_samples = make_example_samples(signals=spec.signals)
     spec.baseline.fit_preferred(model.baseline, training_samples)
     with torch.no_grad():
         residual_samples = model.head.residual_samples(
@@ -186,9 +187,14 @@ def make_example_model(spec: ModelSpec) -> HybridDynamics:
     return model.eval()
 
 
-_N_ROWS, _N_STEPS = 4, 12
-_TIME_STEP, _SHORT_SAMPLES = 0.1, 4
-"""Step of flights in s, and rows of one that ended at once."""
+_N_ROWS = 4
+"""Batch size of the contract checks."""
+_N_STEPS = 12
+"""Number of time steps of the contract checks."""
+_TIME_STEP = 0.1
+"""Time step of simulated manoeuvres, s."""
+_SHORT_SAMPLES = 4
+"""Number of samples of a truncated log, on which no index of a manoeuvre is defined."""
 
 
 def assert_true(condition: bool, message: str) -> None:
@@ -266,13 +272,12 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
     Raises:
         AssertionError: one line that says which contract is broken.
     """
-    subject, spec, n_dynamic = (
-        f"head {get_kind(type(config))}",
-        make_example_spec(config, signals),
-        signals.dof.n_dynamic,
-    )
+    subject = f"head {get_kind(type(config))}"
+    spec = make_example_spec(config, signals)
+    n_dynamic = signals.dof.n_dynamic
     _check_round_trip(config, HeadConfig, subject)
-    fitted_model, samples = make_example_model(spec), make_example_samples(signals=signals).z
+    fitted_model = make_example_model(spec)
+    samples = make_example_samples(signals=signals).z
     # what follows changes precision
     model = copy.deepcopy(fitted_model)
     head = model.head.eval()
@@ -284,7 +289,8 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
         return torch.zeros(n_rows, head.n_state, dtype=dtype)
 
     def run_steps(module: Any, channel_steps: Tensor) -> tuple[Tensor, Tensor]:
-        s, residuals = zero_memory(len(channel_steps), channel_steps.dtype), []
+        s = zero_memory(len(channel_steps), channel_steps.dtype)
+        residuals = []
         for k in range(channel_steps.shape[1]):
             rho, s = module(channel_steps[:, k], s)
             residuals.append(rho)
@@ -292,7 +298,8 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
 
     with torch.no_grad():
         for dtype in (torch.float32, torch.float64):
-            first_channels, s = z[:, 0].to(dtype), zero_memory(_N_ROWS, dtype)
+            first_channels = z[:, 0].to(dtype)
+            s = zero_memory(_N_ROWS, dtype)
             (rho, next_memory), (repeated, _) = (
                 head.to(dtype)(first_channels, s) for _ in range(2)
             )
@@ -349,10 +356,8 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
         far_residual, _ = head(farther_channels[None], zero_memory(1, z.dtype))
         far_sequence = head.teacher_forced_residuals(far_channels.expand(1, 200, -1))
         x = torch.cat((torch.zeros_like(z[:, 0, :3]), z[:, 0, :n_dynamic]), dim=-1)
-        w, s = (
-            z[..., n_dynamic : n_dynamic + model.signals.n_inputs],
-            torch.rand(_N_ROWS, model.n_state).to(z),
-        )
+        w = z[..., n_dynamic : n_dynamic + model.signals.n_inputs]
+        s = torch.rand(_N_ROWS, model.n_state).to(z)
         rollout = Rollout(model.double())
         model.positions = False
         states, _, memory = rollout(x, w, s)
@@ -368,7 +373,8 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
     assert_finite(
         far_sequence, f"{subject}: not finite after 200 steps outside of the training range"
     )
-    max_inside, max_outside = float(sequence_residuals.abs().max()), float(far_sequence.abs().max())
+    max_inside = float(sequence_residuals.abs().max())
+    max_outside = float(far_sequence.abs().max())
     assert_true(
         max_outside < 50 * max_inside + 10,
         f"{subject}: runs away outside of the training range ({max_outside:.3g}, inside {max_inside:.3g});"
@@ -383,7 +389,8 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
     assert gradient is not None
     assert_finite(gradient, f"{subject}: its gradient with respect to the channels is not finite")
     assert_true(float(gradient.abs().max()) > 0, f"{subject}: its gradient is zero everywhere")
-    parameter_counts, residual_std = head.parameter_counts(), head.residual_scale()
+    parameter_counts = head.parameter_counts()
+    residual_std = head.residual_scale()
     assert_true(
         len(parameter_counts) == n_dynamic
         and all(parameter_count >= 0 for parameter_count in parameter_counts),
@@ -510,7 +517,8 @@ def check_vessel(name: str, time_step: float = 0.1) -> None:
     w = torch.zeros(3, len(plant.input_names), dtype=torch.float64)
     half_drive = torch.full((3,), 0.5, dtype=torch.float64)
     w[:, : plant.n_commands] = plant.commands_for_demand(half_drive, 0.2 * half_drive)
-    initial_state, memory = x.clone(), dynamics.initial_state(3).to(x.dtype)
+    initial_state = x.clone()
+    memory = dynamics.initial_state(3).to(x.dtype)
     with torch.no_grad():
         for _ in range(100):
             x, memory = dynamics.step(x, w, memory)
@@ -560,7 +568,8 @@ def check_manoeuvre(
         message = f"{subject}: flown beside another one it does something else"
         assert_close(paired_states[row], single_states[0], 1e-9, message)
         assert_close(commands[row, :, :n_commands], inputs[0, :, :n_commands], 1e-9, message)
-    helm, length = Helm.from_plant(plant), load_vessel(vessel).length.value
+    helm = Helm.from_plant(plant)
+    length = load_vessel(vessel).length.value
     craft = SimulatedVessel(vessel, dynamics, helm, plant.n_commands, plant.make_initial_state(1))
     environment = TrialEnvironment(plant, DisturbanceConfig(), SensorsConfig(), 0)
     flight = simulate_manoeuvres(craft, [manoeuvre], environment, duration, _TIME_STEP)[0]
@@ -626,7 +635,8 @@ def check_reader(config: Config, file: Path) -> Log:
     reader: LogReader = getattr(config, "build")()  # noqa: B009  readers have no common base
     assert_true(isinstance(reader, LogReader), f"{subject}: build gives no LogReader")
     file = Path(file)
-    log, reread = reader.read(file), reader.read(file)
+    log = reader.read(file)
+    reread = reader.read(file)
     assert_true(log.name == file.stem, f"{subject}: names the log '{log.name}', not '{file.stem}'")
     assert_true(bool(log.channels), f"{subject}: the log has no channels")
     assert_true(log.t.dtype == np.float64, f"{subject}: time is {log.t.dtype}, not float64")
@@ -729,7 +739,10 @@ def check_exporter(exporter: Exporter) -> None:
             assert_close(value.to(torch.float64), expected, 1e-6, message)
 
 
-_PAST_STEPS, _FREE_STEPS = 6, 8
+_PAST_STEPS = 6
+"""Number of measured steps before a free run of the checks of exported models."""
+_FREE_STEPS = 8
+"""Number of steps of that free run."""
 _BAD_STEP_INDEX = 3
 """Step of bad values: good ones come before it and after it."""
 _FAR_VALUES = (1e38, -1e38, 1e20, -1e20, 1e9, -1e9, 1e5)
@@ -762,20 +775,21 @@ def check_bad_inputs(
     guard = GuardedDynamics(model.float().eval(), spec)
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
-        n_pose, n_dynamic = PLANAR_LAYOUT.pose_columns.stop, guard.dof
-        lower, upper = guard.ranges.lower[n_pose:], guard.ranges.upper[n_pose:]
+        n_pose = PLANAR_LAYOUT.pose_columns.stop
+        n_dynamic = guard.dof
+        lower = guard.ranges.lower[n_pose:]
+        upper = guard.ranges.upper[n_pose:]
         range_share = 0.05 + 0.9 * torch.rand(
             cases, _PAST_STEPS + _FREE_STEPS, lower.numel(), generator=generator
         )
         channels = lower + range_share * (upper - lower)
         pose = 40.0 * torch.rand(cases, _PAST_STEPS + _FREE_STEPS, 3, generator=generator) - 20.0
-        y, w = torch.cat((pose, channels[..., :n_dynamic]), dim=-1), channels[..., n_dynamic:]
-        x, w, past_states, past_inputs = (
-            y[:, _PAST_STEPS],
-            w[:, _PAST_STEPS:],
-            y[:, :_PAST_STEPS],
-            w[:, :_PAST_STEPS],
-        )
+        y = torch.cat((pose, channels[..., :n_dynamic]), dim=-1)
+        w = channels[..., n_dynamic:]
+        past_states = y[:, :_PAST_STEPS]
+        past_inputs = w[:, :_PAST_STEPS]
+        x = y[:, _PAST_STEPS]
+        w = w[:, _PAST_STEPS:]
         s = exported.warmup(past_states, past_inputs)
         assert_close(
             s, model.warmup(past_states, past_inputs), 1e-4, f"{subject}: warms up otherwise"
@@ -811,7 +825,9 @@ def _check_steps(
     """Step freely with one bad sample, then on with good ones."""
     columns = x.shape[1]
     for k in range(w.shape[1]):
-        state, inputs, memory = x, w[:, k], s
+        state = x
+        inputs = w[:, k]
+        memory = s
         if k == _BAD_STEP_INDEX:
             is_damaged = torch.rand(3, len(x), 1, generator=generator) < 0.5
             state = torch.where(
@@ -830,7 +846,8 @@ def _check_steps(
         if k == _BAD_STEP_INDEX:
             # what the controller measures next is good again, and so is what it remembers
             midpoints = 0.5 * (guard.ranges.lower + guard.ranges.upper).expand(len(x), -1)
-            measured_state, inputs = midpoints[:, :columns], midpoints[:, columns:]
+            measured_state = midpoints[:, :columns]
+            inputs = midpoints[:, columns:]
             for start_memory in (s, exported.initial_state(len(x))):
                 answer = exported.step(measured_state, inputs, start_memory)
                 _check_answer(
@@ -909,7 +926,9 @@ def _check_rollout(
         f"{subject}: a rollout gives the shapes {tuple(states.shape)} and {tuple(flags.shape)}",
     )
     assert_finite(states, f"{subject}: a rollout gives a state that is not finite")
-    next_state, memory, step_flags = first_state, s, []
+    next_state = first_state
+    memory = s
+    step_flags = []
     for k in range(w.shape[1]):
         next_state, memory, outside = exported.step(next_state, w[:, k], memory)
         step_flags.append(outside)
@@ -932,7 +951,8 @@ def _check_histories(
     subject: str,
 ) -> None:
     """Check that bad samples of a history are left out."""
-    y, w = past_states.clone(), past_inputs.clone()
+    y = past_states.clone()
+    w = past_inputs.clone()
     is_bad = torch.rand(y.shape[:2], generator=generator) < 0.4
     y[is_bad] = torch.nan
     w[is_bad.roll(1, dims=0)] = torch.inf
@@ -946,7 +966,8 @@ def _check_histories(
         f"{subject}: a history without a number leaves a memory",
     )
     repeated = past_states.clone()
-    repeated[:, 2], w = repeated[:, 1], past_inputs.clone()
+    repeated[:, 2] = repeated[:, 1]
+    w = past_inputs.clone()
     w[:, 2] = w[:, 1]
     missing_sample = past_states.clone()
     missing_sample[:, 2, 4] = torch.nan

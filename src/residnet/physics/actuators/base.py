@@ -182,7 +182,9 @@ class Servo(nn.Module):
         self, config: ServoConfig, limit: float, rate_limit: float | None, names: Sequence[str]
     ) -> None:
         super().__init__()
-        self.response, self.limit, self.n_actuators = config.response, limit, len(names)
+        self.response = config.response
+        self.limit = limit
+        self.n_actuators = len(names)
         self.has_lag = len(config.response.state_suffixes) > 0
         self.rate_limit = float("inf") if rate_limit is None else rate_limit
         suffixes = config.response.state_suffixes or (() if rate_limit is None else ("",))
@@ -415,7 +417,8 @@ class SteeredActuators(ActuatorSystem):
 
     def __init__(self, config: SteeredConfig) -> None:
         super().__init__(*config.build_servos())
-        self.config, self.command_specs = config, config.command_specs()
+        self.config = config
+        self.command_specs = config.command_specs()
         self.command_names = tuple(command.name for command in self.command_specs)
         dive_values = [
             command.max_value * (command.demand_axis == "dive") for command in self.command_specs

@@ -93,19 +93,22 @@ def fit_throttle_map(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:
             "throttle test: revolutions do not rise with the throttle; check the columns, their"
             " signs and units"
         )
-    max_throttle, max_n = float(np.abs(throttle).max()), float(np.abs(n).max())
+    max_throttle = float(np.abs(throttle).max())
+    max_n = float(np.abs(n).max())
     slope = max_n / max_throttle
     at_bound = np.abs(n) > 0.97 * max_n
     is_saturated = (
         at_bound.sum() >= _SATURATION_POINTS
         and np.ptp(np.abs(throttle[at_bound])) > 0.05 * max_throttle
     )
-    initial, scale = [slope, 0.0], [slope, 0.1 * max_n]
+    initial = [slope, 0.0]
+    scale = [slope, 0.1 * max_n]
     if is_saturated:
         below_bound = ~at_bound
         if np.unique(throttle[below_bound]).size >= 2:
             initial[0] = scale[0] = float(np.polyfit(throttle[below_bound], n[below_bound], 1)[0])
-        initial, scale = [*initial, float(np.median(np.abs(n[at_bound])))], [*scale, max_n]
+        initial = [*initial, float(np.median(np.abs(n[at_bound])))]
+        scale = [*scale, max_n]
 
     def residual(parameters: np.ndarray) -> np.ndarray:
         bound = parameters[2] if is_saturated else np.inf
@@ -113,7 +116,8 @@ def fit_throttle_map(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:
 
     estimates, half_width = _fit_with_intervals(residual, initial, scale, n.size)
     if not is_saturated:
-        estimates, half_width = [*estimates, max_n], [*half_width, 0.0]
+        estimates = [*estimates, max_n]
+        half_width = [*half_width, 0.0]
     slope_estimate, offset, n_max = (
         IntervalEstimate(value_k, value_k - half_width_k, value_k + half_width_k, "1/s")
         for value_k, half_width_k in zip(estimates, half_width, strict=True)
@@ -140,10 +144,8 @@ def simulate_shaft(
     max_change = rate_limit * np.diff(t)
     for k in range(1, t.size):
         # the command that acted over the interval, with its share where it changed inside
-        previous_command, next_command = (
-            command[max(command_index[k - 1], 0)],
-            command[max(command_index[k], 0)],
-        )
+        previous_command = command[max(command_index[k - 1], 0)]
+        next_command = command[max(command_index[k], 0)]
         new_command_share = (
             1.0
             if previous_command == next_command
@@ -217,7 +219,8 @@ def fit_step_response(
         n_samples,
         is_serial=True,
     )
-    rate_limit, dead_time = abs(estimates[0]), max(estimates[1], 0.0)
+    rate_limit = abs(estimates[0])
+    dead_time = max(estimates[1], 0.0)
     return StepResponse(
         IntervalEstimate(
             rate_limit, rate_limit - half_widths[0], rate_limit + half_widths[0], "1/s^2"

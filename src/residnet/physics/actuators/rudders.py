@@ -70,7 +70,8 @@ class PropellerShaftConfig(ShaftConfig, ThrustConfig):
 
     def thrust_at(self, n: Tensor, u: Tensor) -> Tensor:
         """Return the thrust [N] at n [1/s] and speed through the water u [m/s], any shape."""
-        forward, reverse = self.forward, self.reverse
+        forward = self.forward
+        reverse = self.reverse
         forward_thrust = (forward[0] + n * (forward[1] + n * forward[2])).clamp(min=0.0)
         reverse_thrust = (reverse[0] + n * (reverse[1] + n * reverse[2])).clamp(max=0.0)
         static_thrust = torch.where(
@@ -114,8 +115,10 @@ class RudderPropellerConfig(SteeredConfig):
         return self.rudder.build_servo("delta"), self.propeller.build_servo("n")
 
     def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        rudder, propeller = self.rudder, self.propeller
-        delta, u = position[..., 0], nu[..., 0]
+        rudder = self.rudder
+        propeller = self.propeller
+        delta = position[..., 0]
+        u = nu[..., 0]
         lift_factor = 0.5 * self.density * rudder.area
         lift_factor *= 6.13 * rudder.aspect_ratio / (rudder.aspect_ratio + 2.25)
         disc_area = 0.25 * math.pi * propeller.diameter**2
@@ -343,7 +346,8 @@ class WaterJetsConfig(SteeredConfig):
 
         Source: document 000 eq. (6.16).
         """
-        speed_curve, revolutions_curve = self.speed, self.revolutions
+        speed_curve = self.speed
+        revolutions_curve = self.revolutions
         reference_thrust = speed_curve.a0.value + u * (
             speed_curve.a1.value + u * speed_curve.a2.value
         )
@@ -416,10 +420,8 @@ class TorpedoFinsConfig(ServoConfig, SteeredConfig):
     def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         delta, delta_s, n = position.unbind(-1)
         dynamic_pressure = 0.5 * self.density * nu[..., 0].square()
-        side_force, lift = (
-            -dynamic_pressure * self.rudder * delta,
-            -dynamic_pressure * self.planes * delta_s,
-        )
+        side_force = -dynamic_pressure * self.rudder * delta
+        lift = -dynamic_pressure * self.planes * delta_s
         drag = -side_force * delta - lift * delta_s
         advance_product = self.wake * nu[..., 0] / self.diameter * n.clamp(min=0.0)
         thrust, torque = (

@@ -143,7 +143,8 @@ class ThrusterForces(nn.Module):
         )
         geometry = [[thruster.x, thruster.y, thruster.angle] for thruster in thrusters]
         x, y, angle = torch.tensor(geometry, dtype=torch.float64).unbind(-1)
-        surge_share, sway_share = torch.cos(angle), torch.sin(angle)
+        surge_share = torch.cos(angle)
+        sway_share = torch.sin(angle)
         lever = x * sway_share - y * surge_share
         self.thrust_configuration = nn.Buffer(
             torch.stack((surge_share, sway_share, lever), dim=-1), persistent=False
@@ -257,7 +258,8 @@ class AzimuthThrusters(ForceActuators):
     """Revolutions and angles of k thrusters -> tau [..., 3] (document 002 eqs. (5.1), (5.2))."""
 
     def __init__(self, config: AzimuthThrustersConfig) -> None:
-        shaft, azimuth = config.shaft, config.azimuth
+        shaft = config.shaft
+        azimuth = config.azimuth
         names = [thruster_position.name for thruster_position in config.places]
         super().__init__(
             shaft.build_servo(*(f"n_{name}" for name in names)),
@@ -272,7 +274,8 @@ class AzimuthThrusters(ForceActuators):
         self.coefficients = list(config.thrust)
         self.slope_coefficients = [i * c for i, c in enumerate(config.thrust)][1:]
         # tau = map [3, 2k] of the components forward, then to starboard, of every thruster
-        unit_row, zero_row = [1.0] * self.n_thrusters, [0.0] * self.n_thrusters
+        unit_row = [1.0] * self.n_thrusters
+        zero_row = [0.0] * self.n_thrusters
         matrix_rows = [
             unit_row + zero_row,
             zero_row + unit_row,
@@ -306,7 +309,8 @@ class AzimuthThrusters(ForceActuators):
         thrust_table = self.thrust_table.to(force.dtype)
         upper_index = torch.searchsorted(thrust_table[1].contiguous(), force.contiguous())
         upper_index = upper_index.clamp(1, thrust_table.shape[1] - 1)
-        lower, upper = thrust_table[0][upper_index - 1], thrust_table[0][upper_index]
+        lower = thrust_table[0][upper_index - 1]
+        upper = thrust_table[0][upper_index]
         fraction = (force - thrust_table[1][upper_index - 1]) / (
             thrust_table[1][upper_index] - thrust_table[1][upper_index - 1]
         )
@@ -340,10 +344,8 @@ class AzimuthThrusters(ForceActuators):
         together; each thruster saturates.
         """
         lever = self.thrust_configuration[2].abs().sum() / 2.0
-        surge_share, yaw_share = (
-            drive.clamp(-1, 1) * self.n_thrusters,
-            steer.clamp(-1, 1) * lever.to(drive.dtype),
-        )
+        surge_share = drive.clamp(-1, 1) * self.n_thrusters
+        yaw_share = steer.clamp(-1, 1) * lever.to(drive.dtype)
         normalised_force = torch.stack((surge_share, torch.zeros_like(drive), yaw_share), dim=-1)
         return self.allocate(normalised_force * self.max_thrust)
 
