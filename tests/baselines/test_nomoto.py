@@ -40,7 +40,7 @@ def made(noise: float = 0.0, count: int = 600, groups: int = 12, seed: int = 0) 
 
 
 def parameters(config: Any, samples: Samples) -> dict[str, Any]:
-    table = config.fit(config.build(samples.names), samples)
+    table = config.fit_preferred(config.build(samples.names), samples)
     return {entry.term: entry for entry in table if entry.ratio is not None}
 
 

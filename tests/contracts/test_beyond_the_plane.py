@@ -225,7 +225,7 @@ def test_a_drafted_model_swings_as_its_vessel() -> None:
     model = make_example_spec(None, SUBMERGED_SIGNALS).model_copy(update=changes).build().double()
     baseline: Any = model.baseline
     with torch.no_grad():
-        row = baseline.outputs.index("p_dot")
+        row = baseline.output_names.index("p_dot")
         baseline.theta[row, baseline.library.terms.index("cos(theta) sin(phi)")] = -(rate**2)
         x = torch.zeros(1, 12, dtype=torch.float64)
         x[0, ATTITUDE[0]] = 0.05

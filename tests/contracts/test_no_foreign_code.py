@@ -23,13 +23,13 @@ FORBIDDEN_METHODS = {
 }  # fmt: skip
 
 EXCEPTIONS = {
-    ("dynamics/free_runs.py", "import pickle"): "writes a structure to hash it; nothing is read",
+    ("engine/free_runs.py", "import pickle"): "writes a structure to hash it; nothing is read",
     ("core/processes.py", "from joblib"): "`cpu_count` alone, which counts cores",
     ("tasks/sweep.py", "from joblib"): "`cpu_count` alone, which counts cores",
     ("export/torchscript.py", "torch.jit.load"): "the file that the same call has just written",
     ("__init__.py", "importlib.import_module"): "names of residnet's own modules",
     ("core/registry.py", "importlib.import_module"): "paths in residnet's own tables of parts",
-    ("documents/__init__.py", "importlib.import_module"): "names of residnet's own modules",
+    ("studies/__init__.py", "importlib.import_module"): "names of residnet's own modules",
     ("runs/task.py", "importlib.import_module"): "`page` of the task's class",
     ("export/onnx_file.py", "importlib.import_module"): "names of packages in the source",
     ("heads/scikit.py", "importlib.import_module"): "on the allow-list, or with --trust",

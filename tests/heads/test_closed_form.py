@@ -98,8 +98,8 @@ def test_cross_validation_of_linear_heads_equals_explicit_refits(
     config: Any, settings: Any
 ) -> None:
     head = calibrated(config, MIXED)
-    notes = head.solve(MIXED)
-    x, y = head.basis(MIXED.z).numpy(), MIXED.target.numpy()
+    notes = head.fit_preferred(MIXED)
+    x, y = head.basis_functions(MIXED.z).numpy(), MIXED.target.numpy()
     error = np.zeros((len(settings), 3))
     for f in range(4):
         own, rest = np.equal(FOLD, f), np.not_equal(FOLD, f)
@@ -123,18 +123,18 @@ def test_free_runs_are_offered_every_order_and_none() -> None:
     config = PlsrConfig()
     head = calibrated(config)
     found = head.fit_solutions(SAMPLES)
-    orders = [solution.choice["order"] for solution in found]
+    orders = [solution.hyperparameters["order"] for solution in found]
     assert orders[0] == int(np.argmin(found[0].notes["cross_validated_share"])) + 1
     assert orders[1:9] == [1, 2, 3, 4, 5, 6, 7, 8]
     assert orders[-2:] == [23, 0]
-    x, y = head.basis(SAMPLES.z).numpy(), SAMPLES.target.numpy()
+    x, y = head.basis_functions(SAMPLES.z).numpy(), SAMPLES.target.numpy()
     for solution, order in [*zip(found, orders, strict=True)][:9]:
         head.load_state_dict(solution.state, strict=False)
         truth = refitted(config, order, x, y, len(x))(x)
         np.testing.assert_allclose(answer(head), truth, atol=1e-8 * y.std())
     head.load_state_dict(found[-1].state, strict=False)
     assert not answer(head).any()
-    assert calibrated(PlsrConfig(order=100)).solve(SAMPLES)["order"] == 23
+    assert calibrated(PlsrConfig(order=100)).fit_preferred(SAMPLES)["order"] == 23
     for single in (PlsrConfig(order=3), PlsrConfig(choose="one_step")):
         assert len(calibrated(single).fit_solutions(SAMPLES)) == 1
 
@@ -144,9 +144,9 @@ def test_free_runs_are_offered_one_penalty_for_all_axes_and_none() -> None:
     config = RidgeConfig(penalties=penalties)
     head = calibrated(config)
     found = head.fit_solutions(SAMPLES)
-    offered = [solution.choice["penalty"] for solution in found[1:]]
+    offered = [solution.hyperparameters["penalty"] for solution in found[1:]]
     assert offered == [*([penalty] * 3 for penalty in penalties), []]
-    x, y = head.basis(SAMPLES.z).numpy(), SAMPLES.target.numpy()
+    x, y = head.basis_functions(SAMPLES.z).numpy(), SAMPLES.target.numpy()
     for solution, penalty in zip(found[1:], penalties, strict=False):
         head.load_state_dict(solution.state, strict=False)
         truth = refitted(config, penalty, x, y, len(x))(x)
@@ -154,7 +154,7 @@ def test_free_runs_are_offered_one_penalty_for_all_axes_and_none() -> None:
     (single,) = calibrated(RidgeConfig(penalties=penalties, choose="one_step")).fit_solutions(
         SAMPLES
     )
-    assert single.choice == found[0].choice
+    assert single.hyperparameters == found[0].hyperparameters
 
 
 @pytest.mark.parametrize("kind", [PlsrConfig, RidgeConfig, KernelConfig])
@@ -164,21 +164,21 @@ def test_few_manoeuvres_make_fewer_folds_unless_they_are_named(kind: Any) -> Non
         calibrated(config, few) for config in (kind(), kind(folds=3), kind(folds=5))
     )
     for head in (usual, three):
-        head.solve(few)
+        head.fit_preferred(few)
     for name, value in three.state_dict().items():
         torch.testing.assert_close(usual.state_dict()[name], value, rtol=0, atol=0)
     with pytest.raises(FitError, match="5 folds need as many manoeuvres, the training data have 3"):
-        five.solve(few)
+        five.fit_preferred(few)
 
 
 def test_named_terms_and_features_and_a_residual_of_nothing() -> None:
     head = calibrated(PlsrConfig(features=("u", "r"), terms=("u|u|", "u r", "r|r|"), order=3))
     u, r = (SAMPLES.z[:, i] / SAMPLES.z[:, i].std(correction=0) for i in (0, 2))
     wanted = torch.stack((u * u.abs(), u * r, r * r.abs()), dim=1)
-    np.testing.assert_allclose(head.basis(SAMPLES.z), wanted, rtol=1e-12)
+    np.testing.assert_allclose(head.basis_functions(SAMPLES.z), wanted, rtol=1e-12)
     assert list(head.library.terms) == ["u|u|", "u r", "r|r|"]
     head = calibrated(PlsrConfig())
-    notes = head.solve(SAMPLES.with_target(torch.zeros_like(SAMPLES.target)))
+    notes = head.fit_preferred(SAMPLES.with_target(torch.zeros_like(SAMPLES.target)))
     assert notes["order"] == 0
     assert not answer(head).any()
 
@@ -208,7 +208,7 @@ def test_columns_that_say_nothing_get_nothing(kind: Any) -> None:
 
     def solved(terms: tuple[str, ...], samples: Samples = of) -> tuple[Any, np.ndarray]:
         head = calibrated(kind(terms=terms, choose="one_step"), samples)
-        head.solve(samples)
+        head.fit_preferred(samples)
         return head, answer(head, samples.z)
 
     _, plain = solved(("u", "v", "r"))
@@ -255,7 +255,7 @@ def test_kernel_ridge_equals_scikit_learn(
     form: RbfConfig | PolynomialConfig, penalty: float
 ) -> None:
     head = calibrated(kernel(form, penalty))
-    notes = head.solve(SAMPLES)
+    notes = head.fit_preferred(SAMPLES)
     alpha, x = penalty * len(SAMPLES), standardised(SAMPLES.z)
     if isinstance(form, RbfConfig):
         gamma = 1 / (2 * form.sigma[0])
@@ -274,7 +274,7 @@ def test_kernel_ridge_equals_scikit_learn(
 
 def test_terms_are_features_too() -> None:
     head = calibrated(kernel(PolynomialConfig(), 1e-3, terms=("u|u|", "u v")))
-    head.solve(SAMPLES)
+    head.fit_preferred(SAMPLES)
     low, high = SAMPLES.z.numpy().min(0), SAMPLES.z.numpy().max(0)
 
     def columns(z: torch.Tensor) -> np.ndarray:
@@ -306,7 +306,7 @@ def test_cross_validation_of_kernels_equals_explicit_refits(
     penalties = (1e-6, 1e-3, 10.0)
     head = calibrated(kernel(form, *penalties, folds=4), MIXED)
     (only,) = head.fit_solutions(MIXED)
-    notes = head.solve(MIXED)
+    notes = head.fit_preferred(MIXED)
     x, y = standardised(MIXED.z), MIXED.target.numpy()
     errors = np.array(notes["cross_validated_error"])
     for i, found in enumerate(errors):
@@ -319,10 +319,10 @@ def test_cross_validation_of_kernels_equals_explicit_refits(
         np.testing.assert_allclose(found, error / len(x), rtol=1e-7)
     # each axis takes its own setting
     best = [np.unravel_index(errors[..., axis].argmin(), errors.shape[:2]) for axis in range(3)]
-    assert only.choice["penalty"] == [penalties[j] for _, j in best]
-    assert only.choice["penalty"][1] == 10.0 > only.choice["penalty"][0]
+    assert only.hyperparameters["penalty"] == [penalties[j] for _, j in best]
+    assert only.hyperparameters["penalty"][1] == 10.0 > only.hyperparameters["penalty"][0]
     if isinstance(form, RbfConfig):
-        assert only.choice["sigma"] == [form.sigma[i] for i, _ in best]
+        assert only.hyperparameters["sigma"] == [form.sigma[i] for i, _ in best]
 
 
 def kernel_refitted(
@@ -353,7 +353,7 @@ def test_landmarks_that_are_all_samples_give_the_exact_fit() -> None:
     )
     exact, all_of_them, few = (calibrated(kernel(form, 1e-4)) for form in forms)
     for head in (exact, all_of_them, few):
-        head.solve(SAMPLES)
+        head.fit_preferred(SAMPLES)
     assert (len(all_of_them.kernel.points), len(few.kernel.points)) == (300, 80)
     np.testing.assert_allclose(answer(all_of_them, NEW), answer(exact, NEW), atol=1e-7)
     apart = answer(few, NEW) - answer(exact, NEW)
@@ -370,23 +370,23 @@ def test_free_runs_are_offered_joint_settings_then_single_steps_around_the_best(
     head = calibrated(KernelConfig(kernel=RbfConfig(sigma=(3.0, 30.0)), penalties=penalties))
     found = head.fit_solutions(SAMPLES)
     joint = [([s] * 3, [p] * 3) for s in (3.0, 30.0) for p in penalties]
-    assert [(s.choice["sigma"], s.choice["penalty"]) for s in found[1:-1]] == joint
+    assert [(s.hyperparameters["sigma"], s.hyperparameters["penalty"]) for s in found[1:-1]] == joint
     head.load_state_dict(found[-1].state, strict=False)
-    assert found[-1].choice == {"penalty": []}
+    assert found[-1].hyperparameters == {"penalty": []}
     assert np.abs(answer(head, NEW)).max() == 0.0
     assert found[5].neighbours is not None
     near = list(found[5].neighbours())
-    assert {tuple(s.choice["penalty"]) for s in near} == {
+    assert {tuple(s.hyperparameters["penalty"]) for s in near} == {
         tuple(p if axis == k else 1e-4 for k in range(3)) for axis in range(3) for p in (1e-6, 1e-2)
     }
-    assert all(s.choice["sigma"] == [30.0] * 3 for s in near)
+    assert all(s.hyperparameters["sigma"] == [30.0] * 3 for s in near)
     # the axes whose penalty stays answer as before
     head.load_state_dict(found[5].state, strict=False)
     before = answer(head, NEW)
     for solution in near:
         head.load_state_dict(solution.state, strict=False)
         changed = np.abs(answer(head, NEW) - before).max(0) > 1e-12
-        assert changed.tolist() == [p != 1e-4 for p in solution.choice["penalty"]]
+        assert changed.tolist() == [p != 1e-4 for p in solution.hyperparameters["penalty"]]
 
 
 def test_recursion_is_a_free_run_of_one_velocity() -> None:
@@ -403,7 +403,7 @@ def test_recursion_is_a_free_run_of_one_velocity() -> None:
     sigmas, penalties = (2.0, 20.0), (1e-3, 1.0)
     settings = {"choose": "recursion", "folds": 2, "margin": 100.0}
     head = calibrated(kernel(RbfConfig(sigma=sigmas), *penalties, **settings), known)
-    notes = head.solve(known)
+    notes = head.fit_preferred(known)
     mean, std = z.mean(0), z.std(0)
     error = np.zeros((2, 2, 3))
     for i, j, axis in np.ndindex(2, 2, 3):
@@ -441,7 +441,7 @@ PROCESS: dict[str, Any] = {
 def test_the_answers_of_a_pipeline_are_those_of_scikit_learn(pipeline: list[Any]) -> None:
     config = validate_config({"pipeline": pipeline, "samples": 100}, SklearnConfig, "here")
     head = calibrated(config)
-    head.solve(SAMPLES)
+    head.fit_preferred(SAMPLES)
     x, spread = head.features(SAMPLES.z).numpy(), head.residual_scale().numpy()
     rows = torch.linspace(0, len(x) - 1, 100).long()
     for axis in range(3):

@@ -52,7 +52,7 @@ def samples(mass_sign: float = 1.0, count: int = 3000, groups: int = 10) -> Samp
         for spread in ([0.6, 0.4, 0.2], [0.2, 0.2, 0.05])
     )
     with torch.no_grad():
-        tau = hull("milliampere_half").required(mass_sign * nu_dot, nu)
+        tau = hull("milliampere_half").required_force(mass_sign * nu_dot, nu)
     return sampled(torch.cat((nu, tau), dim=-1), nu_dot, NAMES, groups=groups)
 
 
@@ -114,8 +114,8 @@ def test_a_free_run_is_the_true_ferrys(model: Any) -> None:
         for k in range(500):
             if k % 10 == 0:
                 x, s = model.step(x, w, s)
-            a = (w - true.required(none, nu)) @ inverse.T
-            nu = nu + h * (w - true.required(none, nu + 0.5 * h * a)) @ inverse.T
+            a = (w - true.required_force(none, nu)) @ inverse.T
+            nu = nu + h * (w - true.required_force(none, nu + 0.5 * h * a)) @ inverse.T
     # the residual is held over steps of 0.1 s
     torch.testing.assert_close(x[:, 3:], nu, rtol=0, atol=2e-3)
 
@@ -165,7 +165,7 @@ def test_only_the_solutions_that_run_forward_are_offered() -> None:
     with torch.no_grad():
         residual = model.head.residual_samples(of, model.baseline(of.z))
     model.head.calibrate(residual)
-    offered = [solution.choice["penalty"] for solution in model.head.fit_solutions(residual)]
+    offered = [solution.hyperparameters["penalty"] for solution in model.head.fit_solutions(residual)]
     assert offered == [[100.0] * 3, []]
 
 

@@ -336,7 +336,7 @@ def test_the_residual_in_the_mirror_is_the_mirror_of_the_residual(kind: str, sce
 
 def test_scales_are_those_of_both_sides() -> None:
     head, known = mirrored("mlp", RUDDER), one_sided(RUDDER)
-    inner: Any = head.inner.features  # type: ignore[union-attr]
+    inner: Any = head.inner_head.features  # type: ignore[union-attr]
     sign = torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0], dtype=torch.float64)
     both = torch.cat((known.z, known.z * sign))
     torch.testing.assert_close(inner.mean, both.mean(0))

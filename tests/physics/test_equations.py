@@ -52,7 +52,7 @@ def test_matrices_of_a_hull_written_out() -> None:
     m23, m32 = arm - added.Y_rdot.value, arm - added.N_vdot.value
     mass = np.array([[m11, 0, 0], [0, m22, m23], [0, m32, body.I_z.value - added.N_rdot.value]])
     nu, tau = scattered([1.5, 0.6, 0.4]), scattered([300.0] * 3, seed=1)
-    got = vessel.hull()(nu, tau).numpy()
+    got = vessel.build_hull()(nu, tau).numpy()
     for (u, v, r), force, out in zip(nu.numpy(), tau.numpy(), got, strict=True):
         value = {
             "u": u, "v": v, "r": r, "u|u|": u * abs(u), "v|v|": v * abs(v), "r|r|": r * abs(r),
@@ -87,7 +87,7 @@ def test_jets_thrust_as_printed_saturate_and_turn_to_the_side_that_is_asked_for(
     config: Any = load_vessel("odin_jets").actuators
 
     def thrust(rpm: float, u: float = 0.0) -> float:
-        return float(config.thrust(*torch.tensor([[rpm / 60], [u]], dtype=torch.float64)))
+        return float(config.jet_thrust(*torch.tensor([[rpm / 60], [u]], dtype=torch.float64)))
 
     assert thrust(0) == pytest.approx(118, abs=0.5)
     assert thrust(168) == pytest.approx(-90, abs=0.5)
@@ -142,7 +142,7 @@ def test_allocation_makes_the_wanted_forces_with_least_thrust() -> None:
     tau = torch.from_numpy(np.random.default_rng(0).normal(size=(200, 3)) * [150, 150, 150])
     command = thrusters.allocate(tau)
     torch.testing.assert_close(thrusters.force(tau[:, :0], command, tau), tau, rtol=1e-9, atol=1e-9)
-    thrust, angle = thrusters.thrust(command[:, :2]), command[:, 2:]
+    thrust, angle = thrusters.thrust_at(command[:, :2]), command[:, 2:]
     parts = torch.cat((thrust * torch.cos(angle), thrust * torch.sin(angle)), dim=1).numpy()
     rows = np.array([[1, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1.8, -1.8]])
     np.testing.assert_allclose(parts, tau.numpy() @ np.linalg.pinv(rows).T, atol=1e-9)
@@ -287,18 +287,18 @@ def test_coriolis_of_the_rigid_body_may_stand_outside_the_series() -> None:
         [[0.0, 0.0, 0.3, np.sqrt(SERVICE**2 - 0.25), 0.5, 0.008, -0.2]], dtype=torch.float64
     )
     w = torch.zeros(1, len(a.input_names), dtype=torch.float64)
-    torch.testing.assert_close(a.derivative(x, w), b.rate(x, w), rtol=1e-9, atol=1e-14)
+    torch.testing.assert_close(a.derivative(x, w), b.derivative(x, w), rtol=1e-9, atol=1e-14)
 
 
 def test_revolutions_enter_where_the_series_knows_them() -> None:
     shaft = "shaft={n_0: 1.5, n_max: 2, n_rate: 0.1}"
     plant = plant_of("mariner", shaft, "coefficients.X.dn=400.0e-5", "coefficients.X.dn^2=50.0e-5")
-    assert plant.inputs[:2] == ("cmd_delta", "cmd_n")
+    assert plant.input_names[:2] == ("cmd_delta", "cmd_n")
     x = plant.approach(2)
     assert x[:, 7].tolist() == [1.5, 1.5]
     x[1, 7] = 1.8
-    w = torch.zeros(2, len(plant.inputs), dtype=torch.float64)
-    rate = plant.rate(x, w)
+    w = torch.zeros(2, len(plant.input_names), dtype=torch.float64)
+    rate = plant.derivative(x, w)
     share = 0.3 / 1.5
     force = (400e-5 * share + 50e-5 * share**2) * SERVICE**2 / LENGTH / (840e-5)
     assert float(rate[1, 3] - rate[0, 3]) == pytest.approx(force)
@@ -342,7 +342,7 @@ def test_steps_of_the_rudder_as_the_transfer_functions_say(name: str, dt: float)
         # lsim holds inputs over a step and is exact in it
         _, truth, _ = lsim((function.num, function.den), rudder, np.arange(400) * dt, interp=False)
         np.testing.assert_allclose(
-            states[:-1, plant.state.index(channel)], truth, rtol=0, atol=1e-11 * np.ptp(truth)
+            states[:-1, plant.state_names.index(channel)], truth, rtol=0, atol=1e-11 * np.ptp(truth)
         )
     if "v" not in known:
         assert not states[:, 4].any()

@@ -118,7 +118,7 @@ def test_calm_water_held_forces_and_the_recorded_step_are_the_same_vessel(name: 
     w[:, full.n_commands :] = 0.0
     # a vessel with wind coefficients meets the air that it drives through
     full.wind = None
-    assert calm.input_names == full.actuators.commands
+    assert calm.input_names == full.actuators.command_names
     after = PlantDynamics(full, 0.05, substeps=2).step(x, w, x[:, :0])[0]
     command = w[:, : calm.n_commands]
     for model in (PlantDynamics(calm, 0.05, 2), RecordedPlantDynamics(calm, 0.05, 2)):

@@ -68,7 +68,7 @@ def step_test(level: float, seed: int = 0, count: int = 300) -> Trial:
     n, out = torch.zeros(1, 2, dtype=torch.float64), []
     for value in np.append(np.zeros(late), command[:-late]):
         out.append(float(n[0, 0]))
-        n = UNIT.advance(n, torch.full((1, 2), value, dtype=torch.float64), dt)
+        n = UNIT.advance_step(n, torch.full((1, 2), value, dtype=torch.float64), dt)
     noise = np.random.default_rng([seed, level < 0]).normal(size=t.size) * 25.0 / 60
     return t[:count], command[:count], (np.array(out) + noise)[:count]
 
@@ -86,7 +86,7 @@ def test_rate_limit_and_dead_time() -> None:
 
 
 def thrust(n: np.ndarray) -> np.ndarray:
-    return UNIT.forces.thrust(torch.from_numpy(n)[:, None])[:, 0].numpy()  # type: ignore[no-any-return]
+    return UNIT.thruster_forces.thrust_at(torch.from_numpy(n)[:, None])[:, 0].numpy()  # type: ignore[no-any-return]
 
 
 def bollard_test(seed: int = 0, noise: float = 5.0) -> Trial:

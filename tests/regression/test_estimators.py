@@ -154,7 +154,7 @@ def test_the_chosen_elastic_net_is_scikit_learns_at_its_penalty(seed: int) -> No
 @pytest.mark.parametrize("kind", ["plsr", "ridge", "elastic net", "surface", "rbf"])
 def test_without_groups_nothing_is_chosen(kind: str) -> None:
     x, y = (torch.from_numpy(part) for part in drawn(60, 4, 2))
-    with pytest.raises(FitError, match=r"groups|one run or segment only"):
+    with pytest.raises(FitError, match="groups|at least two runs"):
         ALL[kind](4, 2).fit(x, y)
 
 
@@ -180,7 +180,7 @@ def test_a_group_is_never_split_between_folds() -> None:
     groups = torch.tensor([3, 3, 5, 5, 5, 7, 8, 8, 11])
     assert assign_group_folds(groups, 2).tolist() == [0, 0, 1, 1, 1, 0, 1, 1, 0]
     assert assign_group_folds(groups, None).tolist() == [0, 0, 1, 1, 1, 2, 3, 3, 4]
-    with pytest.raises(FitError, match="3 folds need as many manoeuvres, the training data have 2"):
+    with pytest.raises(FitError, match=r"3 folds.* have 2; lower `folds`"):
         assign_group_folds(torch.tensor([0, 0, 1]), 3)
 
 
