@@ -41,8 +41,8 @@ from residnet.identification.prepared import prepare_splits
 from residnet.manoeuvres.trials import simulate_trial_logs
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import RunModelStore
-from residnet.tasks.fit import FitConfig
-from residnet.tasks.fit_outcome import divergence_limit
+from residnet.tasks.fit.config import FitConfig
+from residnet.tasks.fit.outcome import divergence_limit
 
 Judged = tuple[RunErrors, Band]
 Found = dict[tuple[str, str, int], list[Judged]]

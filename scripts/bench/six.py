@@ -23,7 +23,7 @@ from residnet.core.log import Log
 from residnet.identification.fitter import FitStore, Fitter
 from residnet.identification.prepared import prepare_splits
 from residnet.manoeuvres.trials import ManoeuvreRun, SimulatedTrials, build_plant, simulate_trials
-from residnet.tasks.fit import FitConfig
+from residnet.tasks.fit.config import FitConfig
 
 _DETERMINED, _ASKED, _NOTHING = 2.5, 5.0, 1e-9
 

@@ -575,7 +575,7 @@ def monitor(
         content.append({"refit": refit_result.to_json()})
     document = json.dumps(content, indent=1)
     if output_folder is not None:
-        from residnet.tasks.fit_service import write_monitoring_page
+        from residnet.tasks.fit.service import write_monitoring_page
 
         with record_folder(output_folder):
             lines.append(f"page: {write_monitoring_page(output_folder, monitored_logs)}")

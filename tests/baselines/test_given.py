@@ -17,7 +17,7 @@ from residnet.core.errors import ConfigError
 from residnet.core.registry import find_vessel_files
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
-from residnet.tasks.fit import FitConfig
+from residnet.tasks.fit.config import FitConfig
 
 FORCES = ("u", "v", "r", "tau_x", "tau_y", "tau_n")
 HULLS = ("milliampere", "odin_forces", "odin_jets", "wam_v_cal", "example_rudder_boat")

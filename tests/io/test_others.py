@@ -13,7 +13,7 @@ from residnet.core.log import Log
 from residnet.quality import Finding, inspect_log_set
 from residnet.quality.others import dead_commands
 from residnet.quality.statistics import LogStatistics
-from residnet.tasks.fit import FitConfig
+from residnet.tasks.fit.config import FitConfig
 from residnet.tasks.registry import load_task
 
 # fleets that no limit was chosen on

@@ -14,7 +14,8 @@ from made_run import stored
 
 from residnet.report.blocks import Cell, Table, Text
 from residnet.report.figure import Figure
-from residnet.studies import build_study_sections
+from residnet.report.run_reader import RunFiles
+from residnet.studies import moreno2019
 from residnet.studies.moreno2019 import grid_errors, grid_figures
 
 MODELS = (
@@ -56,7 +57,7 @@ def made(run: Path, models: tuple[str, ...] = MODELS) -> Path:
 
 
 def test_tables_hold_the_errors_of_the_records(tmp_path: Path) -> None:
-    (section,) = build_study_sections("moreno2019", made(tmp_path))
+    (section,) = moreno2019.sections(RunFiles(made(tmp_path)))
     errors, _, figure, _ = section.blocks
     content = json.loads((tmp_path / "study.json").read_text())
     found = {(row["model"], row["split"]) for row in content["rows"]}
@@ -102,6 +103,6 @@ def test_the_curves_are_what_the_search_tried() -> None:
 
 
 def test_a_run_without_the_optional_package_says_what_it_lacks(tmp_path: Path) -> None:
-    (section,) = build_study_sections("moreno2019", made(tmp_path, MODELS[:-1]))
+    (section,) = moreno2019.sections(RunFiles(made(tmp_path, MODELS[:-1])))
     said = of_kind(section.blocks[0], Text)
     assert "Not run: symbolic regression, GPTIPS settings" in str(said)

@@ -15,7 +15,7 @@ from residnet.core.errors import UsageError
 from residnet.report.blocks import Table
 from residnet.report.figure import Figure
 from residnet.report.run_reader import RunFiles
-from residnet.studies import build_study_sections, woo2018
+from residnet.studies import woo2018
 
 KINDS = ("zigzag", "acceleration_deceleration", "three_two_one_one")
 MODELS = ("zero", "nomoto", "nomoto_side_slip", "baseline", "lstm_printed", "lstm_rate", "lstm")
@@ -86,7 +86,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_seven_figures_and_two_tables(study: Path) -> None:
-    (section,) = build_study_sections("woo2018", study)
+    (section,) = woo2018.sections(RunFiles(study))
     stills = [
         path
         for block in section.blocks
@@ -131,4 +131,4 @@ def test_figures_show_the_stored_numbers_of_the_typical_run(study: Path) -> None
 
 def test_a_missing_manoeuvre_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=f"needs a test manoeuvre of kind {KINDS[0]}"):
-        build_study_sections("woo2018", made_study(tmp_path / "run", kinds=KINDS[1:]))
+        woo2018.sections(RunFiles(made_study(tmp_path / "run", kinds=KINDS[1:])))

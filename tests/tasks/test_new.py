@@ -24,7 +24,7 @@ from residnet.identification.recipe import choose_window_length, make_evaluation
 from residnet.io.readers import ReaderConfig
 from residnet.io.sources import read_split_logs
 from residnet.tasks.drafting import write_new_config
-from residnet.tasks.fit import FitConfig
+from residnet.tasks.fit.config import FitConfig
 from residnet.tasks.registry import load_task
 
 

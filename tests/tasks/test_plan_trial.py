@@ -12,7 +12,7 @@ from read_page import Page, plain
 
 from residnet.core.log import Log
 from residnet.manoeuvres.closed_loop import Zigzag
-from residnet.tasks.fit_service import NextTrials
+from residnet.tasks.fit.service import NextTrials
 
 
 def trial(name: str, volume: float) -> Any:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, final
 
 from pydantic import Field
@@ -387,6 +388,34 @@ def torch_threads(threads: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(previous_threads)
+
+
+class PackageTask(Task):
+    """A task of two modules: `config` holds its settings, `execute` the work.
+
+    A config is then read without importing what its work needs. `execute` lies beside the module
+    of the class and has the functions `execute(config, folder)`, optionally `check(config)`, and
+    one for each command of the task.
+    """
+
+    @final
+    @classmethod
+    def executor(cls) -> ModuleType:
+        """Return the module that carries the task out, imported now."""
+        return importlib.import_module(f"{cls.__module__.rpartition('.')[0]}.execute")
+
+    @final
+    def call_executor(self, function: str, *arguments: Any, **options: Any) -> Any:
+        """Call a function of the executor with this config as its first argument."""
+        return getattr(self.executor(), function)(self, *arguments, **options)
+
+    def execute(self, folder: RunFolder) -> TaskOutcome:
+        outcome: TaskOutcome = self.call_executor("execute", folder)
+        return outcome
+
+    def check(self) -> None:
+        if hasattr(self.executor(), "check"):
+            self.call_executor("check")
 
 
 class ComputingTask(Task):

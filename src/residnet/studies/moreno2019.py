@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from residnet.report.figure import (
     style_family,
 )
 from residnet.report.figure_files import write_figure
+from residnet.report.fit_studies import FitStudy
 from residnet.report.run_reader import RunFiles, StoredWindow
 from residnet.runs.folder import RunFolder
 from residnet.studies import load_published
@@ -316,3 +317,16 @@ def grid_figures(notes: Mapping[str, Any]) -> list[Figure]:
             )
         )
     return figures
+
+
+class Moreno2019Study(FitStudy):
+    """Figures 5, 6 and 8 of document 001 for a fit of its models."""
+
+    name: ClassVar[str] = "moreno2019"
+    models: ClassVar[tuple[str, ...]] = (
+        *("baseline", "rbf_joint", "rbf_each", "p1_joint", "p1_each", "p2_joint", "p2_each"),
+        "symbolic",
+    )
+
+    def sections(self, run: RunFiles) -> list[Section]:
+        return sections(run)

@@ -9,7 +9,7 @@ on training and unseen data, and a zigzag with its track (18).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -35,6 +35,7 @@ from residnet.report.figure import (
     tick_labels,
 )
 from residnet.report.figure_files import write_figure
+from residnet.report.fit_studies import FitStudy
 from residnet.report.run_reader import RunFiles, StoredWindow
 from residnet.runs.folder import RunFolder
 from residnet.studies import load_published
@@ -356,3 +357,16 @@ def _error_figure(
     return _numbered_figure(
         number, f"Errors of the {group} models", _RATIO_CAPTION, styles, panels_and_traces, 2
     )
+
+
+class Woo2018Study(FitStudy):
+    """The figures of document 003 for a fit of its models."""
+
+    name: ClassVar[str] = "woo2018"
+    models: ClassVar[tuple[str, ...]] = (
+        *("baseline", "nomoto", "nomoto_side_slip"),
+        *("lstm_printed", "lstm_rate", "lstm"),
+    )
+
+    def sections(self, run: RunFiles) -> list[Section]:
+        return sections(run)

@@ -170,7 +170,7 @@ def draft_fit_config(
         choose_integrator,
         make_evaluation_settings,
     )
-    from residnet.tasks.fit import FitConfig
+    from residnet.tasks.fit.config import FitConfig
 
     preparation_recipe = PreparationPlan.from_logs(
         list(draft_logs.complete_logs.values()), inputs, dof

@@ -29,7 +29,7 @@ from residnet.quality import (
 )
 
 if TYPE_CHECKING:
-    from residnet.tasks.fit import FitConfig
+    from residnet.tasks.fit.config import FitConfig
 
 _ILL_CONDITIONED = 1e6
 """Condition number from which regressors leave their coefficients to the noise."""
@@ -148,7 +148,7 @@ def _load_logs_task(config: Path) -> tuple[Any, FitConfig | None]:
     """
     # logs that need no config need neither models nor torch
     from residnet.io.sources import MeasuredLogs
-    from residnet.tasks.fit import FitConfig
+    from residnet.tasks.fit.config import FitConfig
     from residnet.tasks.import_logs import ImportConfig
     from residnet.tasks.registry import load_task
 

@@ -41,7 +41,7 @@ from residnet.runs.task import Task
 
 _TASK_BASE, _DOCUMENTS = "residnet.runs.task:Task", "residnet.studies"
 SINGLE_TASKS = {
-    "fit": "residnet.tasks.fit:FitConfig",
+    "fit": "residnet.tasks.fit.config:FitConfig",
     "import": "residnet.tasks.import_logs:ImportConfig",
     "simulate": "residnet.tasks.simulate:SimulateConfig",
     "study": "residnet.tasks.study:StudyConfig",

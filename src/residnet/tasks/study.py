@@ -42,7 +42,7 @@ from residnet.report.figure_files import write_figures
 from residnet.report.run_reader import JsonObject, RunFiles
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import PartName, SummaryMetric, Task, TaskOutcome
-from residnet.tasks.fit import FitConfig
+from residnet.tasks.fit.config import FitConfig
 
 if TYPE_CHECKING:
     import pandas as pd

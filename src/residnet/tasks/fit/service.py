@@ -64,7 +64,7 @@ from residnet.report.page import write_page
 from residnet.runs.folder import Provenance, RunFolder
 from residnet.runs.model_store import RunModelStore
 from residnet.runs.task import TaskOutcome
-from residnet.tasks.fit_outcome import (
+from residnet.tasks.fit.outcome import (
     EXTERNAL_SPLIT,
     build_fit_outcome,
     divergence_limit,
@@ -74,7 +74,7 @@ from residnet.tasks.fit_outcome import (
 from residnet.training.left_out import left_open
 
 if TYPE_CHECKING:
-    from residnet.tasks.fit import FitConfig
+    from residnet.tasks.fit.config import FitConfig
 
 _MAX_NAMED_CAUSES = 3
 """Causes that are named."""

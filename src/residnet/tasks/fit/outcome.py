@@ -29,7 +29,7 @@ from residnet.runs.folder import RunFolder
 from residnet.runs.task import ExportWriters, SummaryMetric, TaskOutcome
 
 if TYPE_CHECKING:
-    from residnet.tasks.fit import FitConfig
+    from residnet.tasks.fit.config import FitConfig
 
 EXTERNAL_SPLIT = "external"
 """Name of the split of logs that no fit has seen."""

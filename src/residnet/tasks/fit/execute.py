@@ -1,0 +1,282 @@
+"""Carry out the task `fit`: identify, evaluate, write the results, and serve its commands."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from residnet.core.config import dump_config
+from residnet.core.errors import DataError, UsageError
+from residnet.core.names import suggest_name
+from residnet.core.progress import begin_stage, log_message
+from residnet.dynamics.store import load_model, model_names
+from residnet.evaluation.band import bands_content
+from residnet.evaluation.goodness import build_goodness_content
+from residnet.evaluation.soundness import build_sanity_content
+from residnet.evaluation.verdict import list_model_objections, rate_model, write_verdict
+from residnet.export.vessel import ExportedVessel
+from residnet.identification.fit import fit_models
+from residnet.identification.fitter import FittedModel, check_fit
+from residnet.identification.identified import (
+    build_goodness_rows,
+    build_residual_table,
+    build_term_table,
+    evaluate_splits,
+    make_candidates,
+)
+from residnet.identification.prepared import (
+    check_window_fits,
+    convert_to_motion_through_water,
+    prepare_splits,
+)
+from residnet.io.sources import LogsBySplit
+from residnet.manoeuvres.trials import SimulatedTrials, make_dummy_logs
+from residnet.report.run_reader import RunFiles
+from residnet.report.sections.verdict import collect_evidence
+from residnet.runs.folder import Provenance, RunFolder, require_apart
+from residnet.runs.model_store import RunModelStore
+from residnet.runs.task import ExportRequest, FinishedRun, TaskOutcome
+from residnet.tasks.fit.booklet import require_flyable, write_booklet
+from residnet.tasks.fit.outcome import (
+    EXTERNAL_SPLIT,
+    build_fit_outcome,
+    divergence_limit,
+    read_external_logs,
+    write_evaluation,
+    write_inspection,
+)
+
+if TYPE_CHECKING:
+    from residnet.identification.settings import FitSettings
+    from residnet.tasks.fit.config import FitConfig
+    from residnet.tasks.fit.service import MonitoredLog, NextTrials, RefitResult
+
+_MODEL_ALIASES = ("predictor", "selected")
+"""Names that stand for a model: the model reported first, and the single model chosen."""
+
+
+def check(config: FitConfig) -> None:
+    """Check that the logs hold what every part of the fit asks for, without fitting.
+
+    Measured logs are read. In the place of simulated ones, which take long to fly, stand logs
+    of the same channels, lengths and kinds.
+
+    Raises:
+        ResidnetError: what the run itself would refuse before it fits anything.
+    """
+    settings: FitSettings = config
+    if isinstance(config.data, SimulatedTrials):
+        logs: LogsBySplit = {"train": [], "validation": [], "test": []}
+        split_names = config.data.assign_splits(config.data.draw_manoeuvres())
+        for log, split in zip(make_dummy_logs(config.data), split_names, strict=True):
+            logs[split].append(log)
+        # what masks leave of a motion is not known before it is flown
+        prepare = config.prepare.model_copy(update={"masks": ()})
+        settings = config.model_copy(update={"prepare": prepare})
+    else:
+        logs = config.load_logs()
+        config.cache_logs(logs)
+    fitter = check_fit(prepare_splits(logs, settings), config)
+    if config.booklet is not None:
+        name = config.booklet.model
+        spec = fitter.build_spec(name, "baseline", config.all_baselines[name])
+        require_flyable(config.booklet, FittedModel(spec, spec.build(), {}))
+
+
+def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:
+    """Fit all models, judge them in free run, and write what was found.
+
+    Logs that ran in currents are taken through the water.
+
+    Raises:
+        ResidnetError: where the logs cannot be used, or do not determine a model.
+    """
+    begin_stage(f"{config.name}: reading logs")
+    raw_logs = config.load_logs()
+    write_inspection(folder, raw_logs, config)
+    logs = prepare_splits(raw_logs, config)
+    log_message("  " + ", ".join(f"{split} {len(members)} logs" for split, members in logs.items()))
+    logs, currents = convert_to_motion_through_water(logs, config)
+    if config.current is not None:
+        folder.write_json(folder.path / "currents.json", currents)
+    identified_models = fit_models(logs, config, store=RunModelStore(folder))
+    begin_stage("free runs")
+    fitted_models, time_step = list(identified_models.values()), config.prepare.grid.step
+    if config.bands is not None:
+        bands = {entry.name: entry.bands for entry in fitted_models}
+        folder.write_json(folder.bands, bands_content(config.name, bands))
+    evaluation_logs = {str(split): logs[split] for split in config.evaluation.splits}
+    evaluations = identified_models.evaluate(evaluation_logs, config.data)
+    selection = identified_models.select_models(evaluations)
+    predictor_text = (
+        "" if selection.default_ensemble is None else f"; predictor: {selection.default_ensemble}"
+    )
+    log_message(f"  selected: {selection.selected}{predictor_text}")
+    folder.write_json(folder.selection, selection.to_json())
+    folder.write_json(folder.sanity, build_sanity_content(identified_models.sanity_findings))
+    names = (selection.selected, selection.selected_ensemble, selection.default_model)
+    write_evaluation(folder, config, evaluations, names, logs)
+    for table_path, result_table in {
+        folder.residuals: build_residual_table(fitted_models, logs["test"]),
+        folder.path / "terms.parquet": build_term_table(fitted_models, logs["test"]),
+    }.items():
+        if len(result_table):
+            folder.write_table(table_path, result_table)
+    goodness_by_split = build_goodness_rows(fitted_models, logs, time_step)
+    folder.write_json(
+        folder.goodness, build_goodness_content(config.name, goodness_by_split, time_step)
+    )
+    failure = ""
+    if config.booklet is not None:
+        refitted = identified_models[config.booklet.model]
+        try:
+            log_message(
+                "  "
+                + write_booklet(
+                    folder, config.booklet, refitted, logs, identified_models.velocity_limits
+                )
+            )
+        except DataError as error:
+            # the fit itself is done, and its report is worth having
+            failure = str(error)
+    exports = {
+        name: partial(export_model, config, ExportRequest(folder, name))
+        for name in config.export.models
+    }
+    return build_fit_outcome(folder, "test", exports, failure)
+
+
+def evaluate_on_logs(
+    config: FitConfig,
+    run: RunFolder,
+    logs: Sequence[Path],
+    output_folder: Path | None,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+) -> FinishedRun:
+    """Free-run every model of a fit on logs that it has never seen.
+
+    Its reader, masks, protocols and scales are used; `zero` comes first, then the config's
+    order.
+
+    Args:
+        output_folder: folder of the results; RUN/external-<time> where none is given.
+        resume: carry out an interrupted evaluation of the same logs again in its folder.
+        overwrite: replace an earlier evaluation in its folder.
+
+    Raises:
+        DataError: where a log cannot be used or is too short.
+        UsageError: where a path or a channel is missing, or the folder may not be used.
+    """
+    folder_path = output_folder or run.path / time.strftime("external-%Y%m%dT%H%M%S")
+    resolved = dump_config(config)
+    # before the logs are read, which may take long
+    require_apart(folder_path, [run.resolved_config])
+    RunFolder(folder_path).require_usable(resolved, resume=resume, overwrite=overwrite)
+    input_paths, raw_logs, prepared = read_external_logs(config, logs)
+    for log in prepared:
+        check_window_fits(log, config)
+    provenance = Provenance(run.resolved_config, (), config.seed, input_paths, time.time())
+    if resume:
+        provenance.require_same_inputs(RunFolder(folder_path))
+    if overwrite:
+        require_apart(folder_path, input_paths)
+
+    def evaluate_models(folder: RunFolder) -> TaskOutcome:
+        store, model_order = RunModelStore(run), ["zero", *config.model_names]
+        fitted_models = [store.load(name) for name in store.names()]
+        fitted_models.sort(key=lambda model: (*model_order, model.name).index(model.name))
+        log_message(f"{config.name}: {len(prepared)} logs, {len(fitted_models)} models")
+        write_inspection(folder, {EXTERNAL_SPLIT: raw_logs}, config)
+        is_simulated = isinstance(config.data, SimulatedTrials) and all(
+            "vessel" in log.meta for log in raw_logs
+        )
+        models = [
+            candidate
+            for candidate in make_candidates(fitted_models, config.data)
+            if candidate.model_kind != "truth" or is_simulated
+        ]
+        limit = divergence_limit(fitted_models[0].spec, config)
+        evaluations = evaluate_splits(
+            models, {EXTERNAL_SPLIT: prepared}, config.evaluation, config.prepare.grid.step, limit
+        )
+        # bands, and why the model was selected, are the fit's own; the report shows them
+        for source_path, target_path in (
+            (run.bands, folder.bands),
+            (run.selection, folder.selection),
+        ):
+            if source_path.is_file():
+                folder.write(target_path, source_path.read_text(encoding="utf-8"))
+        fit_metrics = run.read_metrics()
+        selected = str(fit_metrics["selected"])
+        predictor = str(fit_metrics.get("predictor", selected))
+        names = (selected, fit_metrics.get("selected_ensemble"), predictor)
+        write_evaluation(folder, config, evaluations, names, {EXTERNAL_SPLIT: prepared})
+        return build_fit_outcome(folder, EXTERNAL_SPLIT)
+
+    with RunFolder(folder_path).lock():
+        folder = RunFolder.create(folder_path, resolved, resume=resume, overwrite=overwrite)
+        return config.run_in_folder(folder, provenance, evaluate_models)
+
+
+def export_model(config: FitConfig, request: ExportRequest) -> Path:
+    """Export one model of a fit, and return the file.
+
+    `predictor` stands for the one that is reported first, `selected` for the single one chosen
+    on validation data.
+
+    Raises:
+        UsageError: where there is no such model.
+        WithheldError: where it is worse than doing without it, but for `asked.anyway`.
+        ExportError: where the exported model does not agree with the one that it came from.
+    """
+    run, name, metrics = request.run, request.model, request.run.read_metrics()
+    model_name = str(metrics.get(name, metrics["selected"])) if name in _MODEL_ALIASES else name
+    available_models = model_names(run.models)
+    if model_name not in available_models:
+        raise UsageError(
+            f"{run.path}: no model '{name}'{suggest_name(name, [*_MODEL_ALIASES, *available_models])}"
+        )
+    spec, model = load_model(run.models / model_name)
+    rows = [
+        row for row in metrics["rows"] if row["model"] == model_name and row["manoeuvre"] == "all"
+    ]
+    found = collect_evidence(RunFiles(run.path), model_name)
+    # a model without free runs on the split that counts has no verdict
+    sentences = write_verdict(found) if model_name in found.rows_by_model else []
+    judged = (rate_model(found), sentences)
+    return request.write(
+        ExportedVessel(spec, model, rows), list_model_objections(found), model_name, judged
+    )
+
+
+def monitor_run(
+    config: FitConfig,
+    run: RunFolder,
+    logs: Sequence[Path],
+    model: str,
+    settings: Mapping[str, Any],
+    refit_folder: Path | None,
+) -> tuple[list[MonitoredLog], RefitResult | None]:
+    """Test new logs for changes, and refit the model; see `FitConfig.monitor`."""
+    from residnet.tasks.fit.service import FittedModelService, require_refit_folder, run_refit
+
+    if refit_folder is not None:
+        require_refit_folder(run, refit_folder, config)
+    service = FittedModelService(config, run, logs, model, settings)
+    monitored_logs = service.monitor_logs()
+    refit_result = None if refit_folder is None else run_refit(service, refit_folder)
+    return monitored_logs, refit_result
+
+
+def plan_trial(
+    config: FitConfig, run: RunFolder, model: str, trial_limits: Mapping[str, Any]
+) -> NextTrials:
+    """Plan the next trials for a refitted baseline; see `FitConfig.plan_trial`."""
+    from residnet.tasks.fit.service import plan_next_trials
+
+    return plan_next_trials(config, run, model, trial_limits)
