@@ -711,7 +711,11 @@ def run_sweep_trial(
             task, overrides = config.build_trial(values, f"{config.name}.{number:05d}")
             with on_progress(make_pruning_callback(config, folder, trial_id)):
                 task.run(
-                    source=config.base, overrides=overrides, out=run.path, resume=True, report=False
+                    source=config.base,
+                    overrides=overrides,
+                    output_folder=run.path,
+                    resume=True,
+                    report=False,
                 )
     except optuna.TrialPruned:
         is_pruned = True
