@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field
 
 from residnet.core.config import Config, Seconds
 from residnet.core.layout import DYNAMIC_STATES, EXTRA_STATES, HEADING, PLANAR_LAYOUT, VELOCITIES
-from residnet.dynamics.store import BandTable
+
+if TYPE_CHECKING:
+    from residnet.dynamics.store import BandTable
 
 
 def band_channels(states: np.ndarray, position_radius: np.ndarray) -> np.ndarray:
@@ -272,6 +274,9 @@ class Band:
 
     def to_table(self) -> BandTable:
         """Return what an exported model carries: half widths that take every run for the same."""
+        # reading a config or a report does not wait for PyTorch
+        from residnet.dynamics.store import BandTable
+
         columns = dict(zip(self.channels, self.unconditional_width.T.tolist(), strict=True))
         metadata = {"level": self.level, "logs": self.n_logs, "cautions": self.cautions}
         return BandTable.model_validate({**metadata, "steps": self.steps.tolist(), **columns})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,9 +32,11 @@ from residnet.evaluation.band import (
     weighted_quantile,
     width_factors,
 )
-from residnet.evaluation.freerun import FreeRunErrors, Prediction
 from residnet.evaluation.protocol import Window
-from residnet.preprocessing.prepare import PreparedLog
+
+if TYPE_CHECKING:
+    from residnet.evaluation.freerun import FreeRunErrors, Prediction
+    from residnet.preprocessing.prepare import PreparedLog
 
 _MASKED_CHANNELS = tuple(PLANAR_LAYOUT.band_channels.index(name) for name in ("u", "v", "position"))
 """Channels that are scored over usable samples alone."""
@@ -75,6 +77,9 @@ def compute_run_errors(
     errors: FreeRunErrors | None = None,
 ) -> list[RunErrors]:
     """Return the errors of one model's free runs over W windows, their first samples left out."""
+    # reports of finished runs read this module and do not wait for PyTorch
+    from residnet.evaluation.freerun import FreeRunErrors
+
     errors = (
         FreeRunErrors.from_predictions(windows, predictions, logs) if errors is None else errors
     )

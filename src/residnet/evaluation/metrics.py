@@ -17,17 +17,13 @@ from residnet.core.layout import PLANAR_LAYOUT, VELOCITIES, DegreesOfFreedom
 from residnet.core.names import POSE_ERROR_UNITS
 from residnet.evaluation.band import BandsByModel
 from residnet.evaluation.bands import band_limits, compute_run_errors, count_coverage
-from residnet.evaluation.freerun import (
-    Candidate,
-    FreeRun,
-    FreeRunErrors,
-    compute_integration_errors,
-)
 from residnet.evaluation.verdict import MIN_LOGS_FOR_INTERVAL, describe_divergence
-from residnet.preprocessing.prepare import PreparedLog
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from residnet.evaluation.freerun import Candidate, FreeRun
+    from residnet.preprocessing.prepare import PreparedLog
 
 
 CONFIDENCE_LEVEL = 0.95
@@ -252,6 +248,9 @@ class ProtocolEvaluation:
         logs: Sequence[PreparedLog],
         scales: Mapping[str, float],
     ) -> None:
+        # reports of finished runs read this module and do not wait for PyTorch
+        from residnet.evaluation.freerun import FreeRunErrors
+
         self.free_run, self.candidates, self.logs = free_run, candidates, logs
         self.dof = logs[0].dof
         self.state_scales = np.array([scales.get(name, 1.0) for name in self.dof.dynamic_states])
@@ -404,6 +403,8 @@ class ProtocolEvaluation:
             measured velocities are off in each of `Live.ends`; and by model the mean of each over
             the windows, with `intervals` for as many new logs, see `prediction_intervals`.
         """
+        from residnet.evaluation.freerun import compute_integration_errors
+
         any_errors, mean_speeds = next(iter(self.errors.values())), self._mean_speeds()
         max_steps = int(any_errors.window_lengths.max()) - 1
         horizon_steps = [round(seconds / dt) for seconds in _HORIZONS]
@@ -460,6 +461,8 @@ class ProtocolEvaluation:
         """
         if self.dof.fixed_states:
             return {}
+        from residnet.evaluation.freerun import compute_integration_errors
+
         states_by_length: dict[int, list[np.ndarray]] = {}
         for log, window_slice in self.log_slices:
             states_by_length.setdefault(window_slice.stop - window_slice.start, []).append(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -14,7 +14,9 @@ from residnet.core.errors import DataError
 from residnet.core.layout import PLANAR_LAYOUT, ROLL_LAYOUT, SIX_DOF_LAYOUT
 from residnet.core.names import suggest_name
 from residnet.core.stretches import find_run_bounds
-from residnet.preprocessing.prepare import PreparedLog
+
+if TYPE_CHECKING:
+    from residnet.preprocessing.prepare import PreparedLog
 
 
 @dataclass(frozen=True)
