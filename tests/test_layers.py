@@ -5,11 +5,19 @@ imports in circles.
 from __future__ import annotations
 
 import ast
+import json
+import subprocess
+import sys
+import tomllib
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
+import yaml
+from tiny import TINY
+
 import residnet
+from residnet.core.registry import import_object
 
 ROOT = Path(residnet.__file__).parent
 # lowest first; packages of one row may not import each other, except where ALLOWED says so
@@ -20,7 +28,6 @@ LAYERS = [
     {"baselines", "heads"},
     {"dynamics"},
     {"engine"},
-    {"autopilot"},
     {"manoeuvres"},
     {"preprocessing"},
     {"io"},
@@ -36,9 +43,30 @@ LAYERS = [
     {"exits", "terminal"},
     {"cli", "__main__", "api", "testing"},
 ]
-ALLOWED = {("__main__", "cli"), ("autopilot", "manoeuvres")}
+# optional packages: the core imports none of them, they may import all of the core
+WINGS = {file.parent.name for file in ROOT.glob("*/entry_points.toml")}
+# the studies compare controllers of the autopilot wing
+ALLOWED = {("__main__", "cli"), ("studies", "autopilot")}
 RANK = {package: rank for rank, packages in enumerate(LAYERS) for package in packages}
+RANK |= dict.fromkeys(WINGS, len(LAYERS))
 FILES = sorted(ROOT.rglob("*.py"))
+
+
+RUN_COMMANDS = """
+import json, sys
+import residnet
+from residnet.__main__ import main
+commands, wings = json.loads(sys.argv[1])
+for command in commands:
+    sys.argv = ["residnet", *command]
+    try:
+        main()
+    except SystemExit as end:
+        assert not end.code, (command, end.code)
+print("loaded:", sorted(m for m in sys.modules if m.split(".")[:1] == ["residnet"]
+                        and m.split(".")[1:2] and m.split(".")[1] in wings))
+"""
+"""Runs commands in one process and prints the modules of wings that they have imported."""
 
 
 def module_of(path: Path) -> str:
@@ -102,6 +130,40 @@ def test_nothing_imports_upwards() -> None:
             assert RANK[other] < RANK[own] or (own, other) in ALLOWED, (
                 f"{module} imports {target}: {own} stands below {other} or beside it"
             )
+
+
+def test_every_entry_point_of_a_wing_leads_to_its_own_package() -> None:
+    assert "autopilot" in WINGS
+    for wing in WINGS:
+        text = (ROOT / wing / "entry_points.toml").read_text()
+        for parts in tomllib.loads(text)["entry-points"].values():
+            for object_path in parts.values():
+                assert object_path.startswith(f"residnet.{wing}."), object_path
+                assert import_object(object_path) is not None
+
+
+def test_core_commands_load_no_wing(tmp_path: Path) -> None:
+    """Lists, a fit with an export, and another export import no module of a wing."""
+    config = {**TINY, "heads": {"ridge": TINY["heads"]["ridge"]}, "export": {"models": ["ridge"]}}
+    del config["training"], config["ensembles"]
+    (tmp_path / "fit.yaml").write_text(yaml.safe_dump(config))
+    catalogues = ("tasks", "heads", "baselines", "manoeuvres", "readers", "vessels", "formats")
+    commands = [
+        *(["list", catalogue] for catalogue in catalogues),
+        ["run", "fit.yaml", "--out", "run"],
+        ["export", "run", "--model", "ridge", "--format", "c", "--anyway"],
+    ]
+    finished = subprocess.run(
+        [sys.executable, "-c", RUN_COMMANDS, json.dumps([commands, sorted(WINGS)])],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert finished.returncode == 0, finished.stderr
+    assert (tmp_path / "run" / "report.html").is_file(), finished.stderr
+    assert list((tmp_path / "run" / "exports").glob("*.c")), finished.stderr
+    assert finished.stdout.splitlines()[-1] == "loaded: []"
 
 
 def test_no_circles() -> None:

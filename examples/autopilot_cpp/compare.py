@@ -75,12 +75,12 @@ def fly(
 
 def eager(folder: Path, card: dict[str, Any]) -> Any:
     """The policy without compilation: the same operations, called one by one from Python."""
+    from residnet.autopilot.export import guard_policy
     from residnet.autopilot.heading.controllers import (
         NetworkPolicySpec,
         ObservedPolicySpec,
         load_recurrent,
     )
-    from residnet.export.policy import guard_policy
 
     kinds = {"observed": ObservedPolicySpec, "network": NetworkPolicySpec}
     policy = load_recurrent(folder, kinds[card["kind"]])

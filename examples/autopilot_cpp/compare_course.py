@@ -63,11 +63,15 @@ def eager(run: Path, card: dict[str, Any]) -> Any:
     """Policy and guidance of a course run without compilation, planned again: the same operations,
     called one by one from Python.
     """
+    from residnet.autopilot.export import GuardedCoursePolicy
+    from residnet.autopilot.tasks.course import CourseTaskConfig
+    from residnet.autopilot.tasks.course_run import (
+        load_policy,
+        open_autopilot_run,
+        plan_with_guidance,
+    )
     from residnet.core.config import load_config
-    from residnet.export.policy import GuardedCoursePolicy
     from residnet.runs.folder import RunFolder
-    from residnet.tasks.course import CourseTaskConfig
-    from residnet.tasks.course_run import load_policy, open_autopilot_run, plan_with_guidance
 
     folder = RunFolder.open(run)
     config = load_config(folder.resolved_config, [], CourseTaskConfig)

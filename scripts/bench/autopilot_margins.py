@@ -26,7 +26,7 @@ import pandas as pd
 import yaml
 from large_data import called
 
-from residnet.tasks.own_autopilot import draft_autopilot_config
+from residnet.autopilot.tasks.design import draft_autopilot_config
 
 DEG = 180.0 / math.pi
 

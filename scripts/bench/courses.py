@@ -31,11 +31,11 @@ from residnet.autopilot.courses.config import (
 from residnet.autopilot.guidance import CourseGuidance, DriftEstimate, TrackKeeping
 from residnet.autopilot.heading.classical import HeadingPD
 from residnet.autopilot.heading.controllers import ControlTask
+from residnet.autopilot.heading.steering_variation import Vessels
 from residnet.autopilot.heading.vessels import SteeredPlant
+from residnet.autopilot.tasks.course_run import simulate_course
 from residnet.core.errors import ResidnetError
-from residnet.dynamics.steering_variation import Vessels
 from residnet.physics.vessel import load_vessel
-from residnet.tasks.course_run import simulate_course
 
 Array = NDArray[np.float64]
 RUDDER = math.radians(5.0)

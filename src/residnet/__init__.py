@@ -22,9 +22,7 @@ if TYPE_CHECKING:
     from residnet.api.tasks import (
         RunResult,
         SimulationResult,
-        autopilot,
         baseline,
-        design_autopilot,
         head,
         list_available,
         manoeuvre,
@@ -32,6 +30,7 @@ if TYPE_CHECKING:
         simulate,
         vessel,
     )
+    from residnet.autopilot.api import design_autopilot, train_autopilot
     from residnet.core.errors import ResidnetError
     from residnet.core.log import Log
     from residnet.core.progress import Progress
@@ -46,9 +45,9 @@ _HOME = {
     "api.models": "Model Monitor export_model load save trust",
     "api.fitting": "FreeRuns Models fit free_run metrics select_model",
     "api.tasks": (
-        "RunResult SimulationResult autopilot baseline design_autopilot head list_available"
-        " manoeuvre run simulate vessel"
+        "RunResult SimulationResult baseline head list_available manoeuvre run simulate vessel"
     ),
+    "autopilot.api": "design_autopilot train_autopilot",
 }
 
 __all__ = [
@@ -63,7 +62,6 @@ __all__ = [
     "RunResult",
     "SimulationResult",
     "__version__",
-    "autopilot",
     "baseline",
     "design_autopilot",
     "draft_config",
@@ -82,6 +80,7 @@ __all__ = [
     "save",
     "select_model",
     "simulate",
+    "train_autopilot",
     "trust",
     "vessel",
 ]

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, final
 
 import typer
+from typer.core import TyperGroup
+from typer.main import get_command
 
 from residnet.core.errors import ResidnetError
 from residnet.core.ownership import Manifest, find_manifest, record_folder, require_replaceable
 from residnet.core.progress import Progress, ProgressCallback, on_progress
+from residnet.core.wings import read_wing_entry_points
 from residnet.exits import run_cli
 
 if TYPE_CHECKING:
@@ -224,8 +228,29 @@ class ProgressLogFile:
             self._buffer = ""
 
 
+class _WingGroup(TyperGroup):
+    """The commands of the core, and those of wings, which are imported when they are called."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return [*super().list_commands(ctx), *self._wing_commands()]
+
+    # the class of a command depends on the version of typer
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if (command := super().get_command(ctx, cmd_name)) is not None:
+            return command
+        if (object_path := self._wing_commands().get(cmd_name)) is None:
+            return None
+        module, _, name = object_path.partition(":")
+        return get_command(getattr(importlib.import_module(module), name))
+
+    @staticmethod
+    def _wing_commands() -> Mapping[str, str]:
+        return read_wing_entry_points().get("residnet.commands", {})
+
+
 app = typer.Typer(
     name="residnet",
+    cls=_WingGroup,
     help=(
         "Identify models of real vessels from logs: a baseline from physics, a learned residual,"
         " validation in free run, and export for controllers."
@@ -670,49 +695,6 @@ def export(
                 ExportRequest(run, model, output_file, file_format, allows_objections)
             )
     print(exported_file)
-
-
-@app.command()
-def autopilot(
-    source: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="RUN|LOGS...|K,T",
-            help="A finished fit, logs with turns, or K in 1/s and T in s, such as 0.31,7.4.",
-        ),
-    ],
-    output_file: Annotated[
-        Path, typer.Option("--out", metavar="CONFIG", help="Config to write, and the run's name.")
-    ] = Path("my_autopilot.yaml"),
-    rudder: Annotated[
-        str | None,
-        typer.Option(help="Largest rudder angle; that of the logs, or 20 deg, if not given."),
-    ] = None,
-    rate: Annotated[
-        str | None, typer.Option(help="Rate of the steering gear; from the logs if not given.")
-    ] = None,
-    speed: Annotated[str | None, typer.Option(help="Speed at which K and T hold.")] = None,
-    draft: Annotated[bool, typer.Option("--draft", help="Write the config alone.")] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace earlier files and an earlier run.")
-    ] = False,
-    trust: Trust = False,
-    quiet: QuietOption = False,
-) -> None:
-    """Train a heading autopilot for your vessel under the conditions that its logs show."""
-    from residnet.tasks.own_autopilot import draft_autopilot_config
-    from residnet.tasks.registry import load_task
-
-    with show_progress(quiet=quiet):
-        config = draft_autopilot_config(
-            source, output_file, rudder=rudder, rate=rate, speed=speed, overwrite=overwrite
-        )
-        print(f"config: {config}")
-        if draft:
-            return
-        finished_run = load_task(config, []).run(source=config, overwrite=overwrite)
-    print_result(finished_run)
-    print(f"next: residnet export {finished_run.folder.path} --format c")
 
 
 @app.command()

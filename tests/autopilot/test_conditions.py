@@ -27,9 +27,9 @@ from residnet.autopilot.heading.conditions import (
     with_nominal_rows,
 )
 from residnet.autopilot.heading.controllers import ControlTask, PdConfig, PidConfig, PtosConfig
+from residnet.autopilot.heading.steering_variation import HEADING
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.heading.vessels import SteeredPlant
-from residnet.dynamics.steering_variation import HEADING
 from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180

@@ -19,14 +19,14 @@ from residnet.autopilot.heading.conditions import (
     simulate_heading_steps,
 )
 from residnet.autopilot.heading.controllers import ControlTask, DepthConfig, DepthPolicySpec
+from residnet.autopilot.heading.steering_variation import DEPTH, VariedPlant
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.heading.vessels import SteeredPlant
+from residnet.autopilot.tasks.autopilot import AutopilotConfig
 from residnet.core.errors import ConfigError, FitError
 from residnet.dynamics.simulated import PlantDynamics
-from residnet.dynamics.steering_variation import DEPTH, VariedPlant
 from residnet.engine.rollout import Rollout
 from residnet.physics.vessel import load_vessel
-from residnet.tasks.autopilot import AutopilotConfig
 
 DEG = math.pi / 180
 CONFIG = Path(__file__).parents[2] / "configs" / "autopilot_remus_depth.yaml"

@@ -18,21 +18,21 @@ from scipy.integrate import solve_ivp
 from torch import Tensor
 
 from residnet.autopilot import BangBangHeading, ClosedLoop, HeadingPD, Policy, RecordedReference
+from residnet.autopilot.evaluation import build_sea_row
 from residnet.autopilot.heading.classical import RatedBangBangHeading
 from residnet.autopilot.heading.conditions import ClosedLoopTrajectories, simulate_heading_steps
 from residnet.autopilot.heading.controllers import BangBangConfig, ControlTask, PdConfig, PidConfig
+from residnet.autopilot.heading.predictive import DocumentAutopilot, Predictor, SimulatedPredictor
+from residnet.autopilot.heading.steering_variation import DEPTH, HEADING
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.heading.vessels import SteeredModel, SteeredPlant
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.errors import ConfigError
 from residnet.dynamics.simulated import PlantDynamics
-from residnet.dynamics.steering_variation import DEPTH, HEADING
 from residnet.engine.rollout import Rollout
-from residnet.evaluation.autopilots import build_sea_row
 from residnet.physics.nomoto import NomotoVessel
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
-from residnet.studies.gouletas2020.law import DocumentAutopilot, Predictor, SimulatedPredictor
 from residnet.testing.checks import SUBMERGED_SIGNALS, make_example_spec
 
 DEG = math.pi / 180

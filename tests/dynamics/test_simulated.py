@@ -18,12 +18,12 @@ from scipy.integrate import solve_ivp
 from tiny_tasks import TINY_TASKS
 from torch import Tensor
 
+from residnet.autopilot.heading.steering_variation import VariedPlant
 from residnet.autopilot.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError, ExportError
 from residnet.core.frames import to_body
 from residnet.dynamics.base import Dynamics, Integrator
 from residnet.dynamics.simulated import MOST_STEPS, InAmbientCurrent, PlantDynamics, check_steps
-from residnet.dynamics.steering_variation import VariedPlant
 from residnet.engine import trace as lowering
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import Rollout

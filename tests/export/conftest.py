@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from residnet.export import policy, vessel
+from residnet.autopilot import export as policy
+from residnet.export import vessel
 
 STEPS = 60
 

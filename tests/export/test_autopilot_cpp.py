@@ -11,9 +11,9 @@ import pytest
 import torch
 from exported_policies import observed
 
+from residnet.autopilot.export import ExportedHeading
 from residnet.dynamics.store import save_model
 from residnet.export import get_exporter
-from residnet.export.policy import ExportedHeading
 
 SOURCE = Path(__file__).parents[2] / "examples" / "autopilot_cpp"
 pytestmark = [

@@ -16,21 +16,22 @@ from exported_models import built
 from exported_policies import DEG, DT, LIMIT, SETTINGS, SPEED, observed
 from torch import Tensor
 
+from residnet.autopilot import export as policy
 from residnet.autopilot.courses.course_plan import Course
-from residnet.autopilot.guidance import CourseGuidance, DriftEstimate
-from residnet.autopilot.heading.controllers import DepthPolicySpec, NetworkPolicySpec
-from residnet.autopilot.heading.policies import OBSERVER_MEMORY
-from residnet.core.errors import UsageError
-from residnet.engine.rollout import Rollout
-from residnet.export import get_exporter, policy
-from residnet.export.base import Exportable
-from residnet.export.c import compile_shared_library
-from residnet.export.policy import (
+from residnet.autopilot.export import (
     COURSE_MEASUREMENTS,
     ExportedController,
     ExportedCoursePolicy,
     ExportedHeading,
 )
+from residnet.autopilot.guidance import CourseGuidance, DriftEstimate
+from residnet.autopilot.heading.controllers import DepthPolicySpec, NetworkPolicySpec
+from residnet.autopilot.heading.policies import OBSERVER_MEMORY
+from residnet.core.errors import UsageError
+from residnet.engine.rollout import Rollout
+from residnet.export import get_exporter
+from residnet.export.base import Exportable
+from residnet.export.c import compile_shared_library
 from residnet.export.vessel import ExportedVessel
 from residnet.testing.checks import assert_finite, assert_true, replace_entries
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from residnet.autopilot.tasks.design import identify_steering
 from residnet.core.errors import DataError, FitError
 from residnet.core.log import Log
-from residnet.tasks.own_autopilot import identify_steering
 
 
 def sailed(

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from residnet.autopilot.manoeuvres import SEGMENTS, FourCorner
 from residnet.autopilot.motion import MotionPIDConfig
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
@@ -27,7 +28,6 @@ from residnet.manoeuvres.closed_loop import (
     restart_wait,
     update_steadiness,
 )
-from residnet.manoeuvres.courses import SEGMENTS, FourCorner
 from residnet.manoeuvres.open_loop import MultiSine, RandomSteps
 from residnet.manoeuvres.trials import (
     DisturbanceConfig,

@@ -17,6 +17,8 @@ from made_run import made_run, write_json
 from read_page import Page, plain
 from tiny import write_yaml
 
+from residnet.autopilot.report import course
+from residnet.autopilot.report import heading as autopilot
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.evaluation.metrics import bootstrap_intervals, make_resampling_blocks
@@ -24,7 +26,7 @@ from residnet.report.blocks import Section
 from residnet.report.fit import fit_sections
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections import autopilot, course, manoeuvres
+from residnet.report.sections import manoeuvres
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Task
 from residnet.tasks import study

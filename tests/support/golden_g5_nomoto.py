@@ -25,6 +25,7 @@ from kinds import of_kind
 from torch import Tensor
 
 from residnet.autopilot import BangBangHeading, ClosedLoop, HeadingPD, Policy, RecordedReference
+from residnet.autopilot.heading.predictive import DocumentAutopilot, SimulatedPredictor
 from residnet.dynamics.base import Dynamics
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import Source
@@ -34,7 +35,6 @@ from residnet.physics.hull import RollingHullConfig
 from residnet.physics.nomoto import NomotoConfig, NomotoVessel
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
-from residnet.studies.gouletas2020.law import DocumentAutopilot, SimulatedPredictor
 
 GAIN, TIME = 3.47, 3.94
 LIMIT = float(np.radians(5.0))

@@ -12,11 +12,11 @@ import torch
 from read_page import plain
 from tiny import call, read_json, write_yaml
 
+from residnet.autopilot.evaluation import describe_limit_cycles, list_policy_objections
+from residnet.autopilot.report.heading import cost_sentences
+from residnet.autopilot.tasks.autopilot import AutopilotConfig
+from residnet.autopilot.tasks.autopilot_run import load_trained_policy
 from residnet.core.config import load_config
-from residnet.evaluation.autopilots import describe_limit_cycles, list_policy_objections
-from residnet.report.sections.autopilot import cost_sentences
-from residnet.tasks.autopilot import AutopilotConfig
-from residnet.tasks.autopilot_run import load_trained_policy
 
 pytestmark = pytest.mark.long
 

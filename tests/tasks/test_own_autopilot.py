@@ -12,11 +12,11 @@ import pytest
 from pydantic import ValidationError
 
 from residnet.autopilot.heading.turning import NomotoModel
+from residnet.autopilot.tasks.autopilot import AutopilotConfig, minimum_turn_time
+from residnet.autopilot.tasks.design import draft_autopilot_config
 from residnet.core.config import load_config, load_mapping
 from residnet.core.errors import UsageError
 from residnet.core.progress import on_progress
-from residnet.tasks.autopilot import AutopilotConfig, minimum_turn_time
-from residnet.tasks.own_autopilot import draft_autopilot_config
 
 GAIN, TIME, GEAR, DELAY, NOISE, SPEED = 0.31, 7.4, 6.0, 0.3, 0.15, 2.5
 

@@ -14,11 +14,11 @@ from residnet.autopilot.heading.conditions import (
 )
 from residnet.autopilot.heading.controllers import ObservedPolicySpec, PtosConfig
 from residnet.autopilot.heading.policies import ObservedPolicy
+from residnet.autopilot.heading.steering_variation import HEADING
 from residnet.autopilot.heading.vessels import SteeredPlant
-from residnet.dynamics.steering_variation import HEADING
+from residnet.autopilot.training.config import PolicyTraining
+from residnet.autopilot.training.fit import PolicyFit, train_policy
 from residnet.physics.vessel import load_vessel
-from residnet.training.policies.config import PolicyTraining
-from residnet.training.policies.fit import PolicyFit, train_policy
 
 VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())
 CONDITIONS = ConditionsConfig(dt=0.1, duration=6.0, hold=0.0, delay=(0.0, 0.3))

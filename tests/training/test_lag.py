@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
+from residnet.autopilot.actuator_lag import fit_lag, followed
 from residnet.autopilot.motion import ActuatorLag
 from residnet.core.errors import FitError
-from residnet.training.lag import fit_lag, followed
 
 DT = 0.1
 

@@ -11,14 +11,14 @@ import pytest
 import torch
 
 from residnet.autopilot.heading.controllers import ControlTask
-from residnet.autopilot.heading.vessels import SteeredPlant
-from residnet.physics.vessel import load_vessel
-from residnet.studies.gouletas2020.autopilot import simulate_rudder_responses, train_predictor
-from residnet.studies.gouletas2020.law import (
+from residnet.autopilot.heading.predictive import (
     DocumentConfig,
     PredictiveConfig,
     PredictorTraining,
 )
+from residnet.autopilot.heading.vessels import SteeredPlant
+from residnet.autopilot.training.predictor import simulate_rudder_responses, train_predictor
+from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180
 LIMIT = 5 * DEG

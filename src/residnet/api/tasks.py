@@ -6,7 +6,6 @@ import json
 import tempfile
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, final, get_args
 
@@ -42,7 +41,6 @@ from residnet.physics.vessel import load_vessel
 from residnet.physics.vessel_file import VesselFile
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Task
-from residnet.tasks.own_autopilot import draft_autopilot_config
 from residnet.tasks.registry import TaskConfig, list_catalogue
 from residnet.tasks.simulate import Programme
 
@@ -388,84 +386,3 @@ def _parse_overrides(overrides: Any) -> list[str]:
     raise UsageError(
         f"run: overrides: expected a list or a mapping, given {describe_type(overrides)}"
     )
-
-
-def design_autopilot(
-    source: PathLikeArg | Sequence[PathLikeArg],
-    config: PathLikeArg = "my_autopilot.yaml",
-    *,
-    rudder: str | None = None,
-    rate: str | None = None,
-    speed: str | None = None,
-    folder: PathLikeArg | None = None,
-    overwrite: bool = False,
-    progress: ProgressCallback | None = None,
-) -> RunResult:
-    """Train a heading autopilot for one's own vessel, as `residnet autopilot` does.
-
-    Args:
-        source: logs, the folder of a finished fit, or `K,T` in 1/s and s.
-        config: file to write; the vessel's file lies beside it.
-        rudder: largest angle that controllers may use, with its unit; None for that of the logs.
-        rate: of the steering gear, with its unit; None for what the logs show.
-        speed: at which K and T hold, with its unit; None for the mean of the logs.
-        folder: where the run is kept; without one it vanishes with the result.
-        overwrite: replace earlier files and an earlier run.
-        progress: is told how far the training is.
-
-    Raises:
-        DataError: where logs lack rudder or yaw rate.
-        FitError: where the logs show no answer to the rudder.
-
-    Example:
-        residnet.design_autopilot("0.31,7.4", rate="6 deg/s", folder="runs/own")
-    """
-    sources = [source] if isinstance(source, str | PathLike) else source
-    steering_options = {"rudder": rudder, "rate": rate, "speed": speed}
-    config_path = parse_path(config, "own_autopilot")
-    config_file = draft_autopilot_config(
-        [str(source_entry) for source_entry in sources],
-        config_path,
-        overwrite=overwrite,
-        **steering_options,
-    )
-    return run(config_file, folder=folder, overwrite=overwrite, progress=progress)
-
-
-def autopilot(
-    vessel: str,
-    rudder: float | str,
-    *,
-    peers: Mapping[str, Any] | None = None,
-    folder: PathLikeArg | None = None,
-    name: str = "autopilot",
-    progress: ProgressCallback | None = None,
-    **settings: Any,
-) -> RunResult:
-    """Train heading autopilots through a vessel and compare them with tuned classical controllers.
-
-    The arguments are the keys of a config of the task `autopilot`, and give the same numbers.
-
-    Args:
-        vessel: name of a vessel, or path of its file.
-        rudder: largest rudder angle that controllers may use, in rad or with a unit.
-        peers: classical controllers by name: a kind such as `pd`, or settings.
-        folder: where the run is kept; without one it vanishes with the result.
-        name: of the run.
-        progress: is told how far the training is.
-        settings: further keys: test, the step of heading that all are compared in; policies,
-            learned controllers by name; conditions, predictive, floor, seed and so on.
-
-    Raises:
-        ConfigError: where a setting is wrong.
-
-    Example:
-        residnet.autopilot("nomoto_oceanos", "5 deg", test={"duration": 12}, conditions={},
-                           policies={"mine": {"start": None}})
-    """
-    peer_settings = {
-        peer: {"kind": controller_kind} if isinstance(controller_kind, str) else controller_kind
-        for peer, controller_kind in (peers or {}).items()
-    }
-    config = {"task": "autopilot", "name": name, "vessel": vessel, "rudder": rudder}
-    return run({**config, "peers": peer_settings, **settings}, folder=folder, progress=progress)

@@ -8,8 +8,10 @@ A package declares its part in its own pyproject.toml, for example
 and `kind: tide` works in YAML, in Python and in `residnet list heads`. A part that cannot be loaded
 is kept with its fault: it says so where it is used, and disturbs nothing else.
 
-residnet's own kinds stand in a table by name and `module:Class`. A kind is imported when a config
-names it, and `residnet list` reads its first line from the source: neither waits for PyTorch.
+The kinds of the core are listed in a table by name and `module:Class`. A wing of residnet (a package
+that the core never imports, such as `residnet.autopilot`) declares its kinds in the same form in its
+file entry_points.toml. A kind is imported when a config names it, and `residnet list` reads its first
+line from the source: neither waits for PyTorch.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from pydantic_core import CoreSchema, core_schema, to_json
 import residnet
 from residnet.core.errors import Terminated, UsageError
 from residnet.core.files import find_config_folder
+from residnet.core.wings import read_wing_entry_points
 
 
 @dataclass(frozen=True)
@@ -146,14 +149,19 @@ class PluginUnion:
     Attributes:
         group: of the entry points; one that nobody names is closed to other packages.
         base: `module:Class` that the configs of other packages must extend.
-        builtin: residnet's own kinds, each as `module:Class`.
+        core_kinds: the kinds of the core, each as `module:Class`.
         key: field that tells the kinds apart.
     """
 
     group: str
     base: str
-    builtin: Mapping[str, str]
+    core_kinds: Mapping[str, str]
     key: str = "kind"
+
+    @functools.cached_property
+    def builtin(self) -> Mapping[str, str]:
+        """The kinds that come with residnet, those of the core first, each as `module:Class`."""
+        return {**self.core_kinds, **read_wing_entry_points().get(self.group, {})}
 
     def entry_point_parts(self) -> list[EntryPointPart]:
         """Return the kinds of other packages, each checked against what a kind has to be."""

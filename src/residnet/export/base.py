@@ -130,6 +130,13 @@ class Exportable(ABC):
     def build_step_module(self, dtype: torch.dtype) -> nn.Module:
         """Return a module whose `forward` is the step, without checks of shapes."""
 
+    def build_initial_state(self, dtype: torch.dtype) -> nn.Module | None:
+        """Return the module that maps the first measurement to the memory; None for a zero memory.
+
+        A controller has one: exported C then holds a function `initial_state`.
+        """
+        return None
+
     @abstractmethod
     def card_contents(self) -> dict[str, Any]:
         """Return what the card says of this kind of thing."""

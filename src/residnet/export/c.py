@@ -38,7 +38,6 @@ from residnet.export.base import (
     run_in_sufficient_precision,
     write_card,
 )
-from residnet.export.policy import ExportedController
 from residnet.export.vessel import ExportedVessel
 
 _MAX_SCALAR_OPERATIONS: Final = 1100
@@ -439,17 +438,12 @@ def generate_c_source(
             "INPUTS": (argument_sizes[1], unit_texts["inputs"]),
             "MEMORY": (argument_sizes[2], "entries of the memory s"),
         }
-    elif isinstance(exported, ExportedController):
+    elif (initial_state := exported.build_initial_state(torch.float64)) is not None:
         description_key, introduction = (
             "policy",
             "a policy, written by residnet. All arrays are the caller's.",
         )
-        initial_function = lowered(
-            exported.build_controller(torch.float64).initial_state,
-            exported.arguments[:1],
-            ["s"],
-            label,
-        )
+        initial_function = lowered(initial_state, exported.arguments[:1], ["s"], label)
         functions.append(
             CFunction("initial_state", "memory at the first measurement", initial_function)
         )

@@ -37,9 +37,7 @@ if TYPE_CHECKING:
         | DepthStepFamily
     )
 else:
-    _OPEN, _CLOSED, _COURSES = (
-        f"residnet.manoeuvres.{name}" for name in ("open_loop", "closed_loop", "courses")
-    )
+    _OPEN, _CLOSED = "residnet.manoeuvres.open_loop", "residnet.manoeuvres.closed_loop"
     ManoeuvreConfig = Annotated[
         Any,
         PluginUnion(
@@ -58,8 +56,6 @@ else:
                 "depth_step": f"{_CLOSED}:DepthStep",
                 "spiral": f"{_CLOSED}:Spiral",
                 "stopping": f"{_CLOSED}:Stopping",
-                "waypoints": f"{_COURSES}:Waypoints",
-                "four_corner": f"{_COURSES}:FourCorner",
                 "replay": f"{_OPEN}:Replay",
             },
         ),

@@ -288,6 +288,11 @@ class Manoeuvre(Config, ABC):
         """What the manoeuvre ends at, in words; None where it lasts as long as it is given time."""
         return None
 
+    @property
+    def marked_positions(self) -> Sequence[tuple[float, float]]:
+        """Positions (north, east) in m that figures of the track mark, such as way-points."""
+        return ()
+
     def duration_within(self, duration: float) -> float:
         """Return the seconds that the manoeuvre is given, in a programme of `duration`."""
         return duration if self.duration is None else self.duration

@@ -201,7 +201,7 @@ class Task(Config):
         """
 
     section_module: ClassVar[str]
-    """Module of `residnet.report.sections` that a run's page is from."""
+    """Full name of the module whose `sections` build the report's page."""
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
@@ -211,7 +211,7 @@ class Task(Config):
         """
         from residnet.report.run_reader import RunFiles
 
-        module = importlib.import_module(f"residnet.report.sections.{cls.section_module}")
+        module = importlib.import_module(cls.section_module)
         sections: Sequence[Section] = module.sections(RunFiles(run.path))
         return sections
 

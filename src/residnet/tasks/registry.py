@@ -46,8 +46,6 @@ SINGLE_TASKS = {
     "simulate": "residnet.tasks.simulate:SimulateConfig",
     "study": "residnet.tasks.study:StudyConfig",
     "actuators": "residnet.tasks.actuators:ActuatorsTaskConfig",
-    "autopilot": "residnet.tasks.autopilot:AutopilotConfig",
-    "course": "residnet.tasks.course:CourseTaskConfig",
     "ferry_study": f"{_DOCUMENTS}.jervan2020.ferry:FerryStudyConfig",
     "force_residual": f"{_DOCUMENTS}.jervan2020.measured:ForceResidualConfig",
     "breeding": f"{_DOCUMENTS}.halvorsen2019.breeding:BreedingTaskConfig",

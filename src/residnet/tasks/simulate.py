@@ -301,7 +301,7 @@ class SimulateConfig(ComputingTask):
         data: trials as the task `fit` draws and splits them: logs/<split>/<log>.parquet.
     """
 
-    section_module: ClassVar[str] = "manoeuvres"
+    section_module: ClassVar[str] = "residnet.report.sections.manoeuvres"
 
     task: Literal["simulate"]
     programme: Programme | None = None

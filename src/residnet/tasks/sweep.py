@@ -441,7 +441,7 @@ class SweepConfig(Task):
         runner: where trials run.
     """
 
-    section_module: ClassVar[str] = "sweep"
+    section_module: ClassVar[str] = "residnet.report.sections.sweep"
 
     task: Literal["sweep"]
     base: BaseConfig

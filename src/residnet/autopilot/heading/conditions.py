@@ -18,12 +18,12 @@ from torch import Tensor
 
 from residnet.autopilot.base import Policy, ReferenceInInputs
 from residnet.autopilot.heading.controllers import ControlTask, TunableConfig
+from residnet.autopilot.heading.steering_variation import DEPTH, HEADING, Axis, PushedSteering
 from residnet.autopilot.heading.vessels import SteeredVessel
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import ExportError, FitError
 from residnet.core.frames import wrap_angle
 from residnet.dynamics.simulated import check_steps
-from residnet.dynamics.steering_variation import DEPTH, HEADING, Axis, PushedSteering
 from residnet.engine.free_runs import compiled
 from residnet.engine.rollout import FreeRun, Rollout, Source
 from residnet.physics.environment import JonswapSpectrumConfig

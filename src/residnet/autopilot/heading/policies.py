@@ -16,9 +16,9 @@ from torch import Tensor, nn
 
 from residnet.autopilot.base import Policy
 from residnet.autopilot.heading.classical import HeadingLaw
+from residnet.autopilot.heading.steering_variation import DEPTH, HEADING, Axis
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.core.frames import wrap_angle
-from residnet.dynamics.steering_variation import DEPTH, HEADING, Axis
 
 
 class AnglePolicy(Policy, ABC):

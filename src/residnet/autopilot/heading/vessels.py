@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from residnet.autopilot.heading.steering_variation import HEADING, Axis, VariedModel, VariedPlant
 from residnet.autopilot.heading.turning import (
     Array,
     ManoeuvreRecord,
@@ -22,7 +23,6 @@ from residnet.core.errors import ConfigError, FitError
 from residnet.core.names import suggest_name
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.steering_variation import HEADING, Axis, VariedModel, VariedPlant
 from residnet.manoeuvres.actuated import commanded
 from residnet.physics.plant import HullPlant, Plant
 from residnet.physics.symmetry import get_dof

@@ -21,7 +21,6 @@ from residnet.core.format import (
 )
 from residnet.core.log import Log
 from residnet.manoeuvres.closed_loop import Spiral, Zigzag
-from residnet.manoeuvres.courses import Waypoints
 from residnet.manoeuvres.open_loop import Replay
 from residnet.manoeuvres.trials import ManoeuvreRun
 from residnet.report.blocks import (
@@ -402,8 +401,8 @@ def _trial_curves(
                 curve = (time, factor * np.asarray(log[channel][was_simulated], dtype=float))
                 panel[name] = step_curve(*curve) if channel.startswith("cmd_") else curve
     track["start"] = (np.zeros(1), np.zeros(1))
-    if isinstance(manoeuvre, Waypoints):
-        north, east = np.array(manoeuvre.points).T
+    if manoeuvre.marked_positions:
+        north, east = np.array(manoeuvre.marked_positions).T
         track["way-point"] = (east - y0, north - x0)
     if isinstance(manoeuvre, Zigzag) and "psi" in factors:
         reversal_changes = np.array([-1.0, 1.0]) * manoeuvre.heading

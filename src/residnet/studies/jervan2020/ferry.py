@@ -17,6 +17,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
+from residnet.autopilot.evaluation import mean_squares_by_axis
 from residnet.autopilot.guidance import CrossingConfig
 from residnet.autopilot.motion import ReferenceFilterConfig
 from residnet.baselines.given import BelievedConfig, HullEquations
@@ -29,7 +30,6 @@ from residnet.core.layout import ACCELERATIONS, HEADING, POSE, POSITION, VELOCIT
 from residnet.core.names import STATE_NAMES, suggest_name
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.engine.rollout import Rollout
-from residnet.evaluation.autopilots import mean_squares_by_axis
 from residnet.export.feed_forward import ExportedForce, RequiredForce
 from residnet.heads.base import ZeroHead
 from residnet.manoeuvres.closed_loop import ZigzagFamily

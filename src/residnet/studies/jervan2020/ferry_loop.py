@@ -15,6 +15,7 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.autopilot.base import ClosedLoop, ReferenceInInputs
+from residnet.autopilot.evaluation import TrackingMetrics, compute_tracking_metrics
 from residnet.autopilot.guidance import Crossing, CrossingConfig
 from residnet.autopilot.heading.conditions import compile_or_fallback
 from residnet.autopilot.motion import (
@@ -45,7 +46,6 @@ from residnet.dynamics.simulated import PlantDynamics
 from residnet.engine.compiled import CompiledRollout
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import FreeRun, Rollout, Source
-from residnet.evaluation.autopilots import TrackingMetrics, compute_tracking_metrics
 from residnet.physics.actuators import ForceActuators
 from residnet.physics.force_model import ForceModel
 from residnet.physics.hull import HullConfig

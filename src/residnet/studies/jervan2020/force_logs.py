@@ -14,6 +14,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from residnet.autopilot.actuator_lag import fit_lag, followed
 from residnet.core.config import Config, ConfigPath, Seconds
 from residnet.core.errors import ConfigError, DataError, FitError
 from residnet.core.layout import ACCELERATIONS, PLANAR_LAYOUT, POSE, VELOCITIES
@@ -26,7 +27,6 @@ from residnet.io.readers import ReaderConfig
 from residnet.io.split import assign_log_names, check_leaks, match_patterns
 from residnet.preprocessing.prepare import PrepareConfig, prepare_log
 from residnet.studies.jervan2020.residual import AXES, ForceRecord
-from residnet.training.lag import fit_lag, followed
 
 _ChannelTriple = tuple[str, str, str]
 _MIN_LOGS_FOR_FOLDS = 3

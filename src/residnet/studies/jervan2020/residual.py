@@ -19,6 +19,8 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
+from residnet.autopilot.actuator_lag import fit_lag, followed
+from residnet.autopilot.evaluation import mean_squares_by_axis
 from residnet.autopilot.motion import ActuatorLag
 from residnet.baselines.given import BelievedConfig, HullEquations
 from residnet.core.config import Config
@@ -27,7 +29,6 @@ from residnet.core.format import format_number
 from residnet.core.frames import to_body
 from residnet.core.layout import ACCELERATIONS, HEADING, POSE, VELOCITIES
 from residnet.core.names import ACCELERATION_NAMES, VELOCITY_NAMES
-from residnet.evaluation.autopilots import mean_squares_by_axis
 from residnet.physics.force_model import (
     FERRY_TERMS,
     MOTION_CHANNELS,
@@ -59,7 +60,6 @@ from residnet.report.figure import (
     tick_labels,
 )
 from residnet.studies.study import StudyResults, find_figures, format_notes
-from residnet.training.lag import fit_lag, followed
 
 AXES = ("surge", "sway", "yaw")
 _FORCE_NAMES = ("surge force", "sway force", "yaw moment")

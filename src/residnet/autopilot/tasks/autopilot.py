@@ -22,21 +22,21 @@ from residnet.autopilot.heading.controllers import (
     TunableConfig,
     angle_law_of,
 )
+from residnet.autopilot.heading.predictive import DocumentConfig, PredictiveConfig
+from residnet.autopilot.heading.steering_variation import DEPTH, HEADING, Axis
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.heading.vessels import SteeredModel, SteeredPlant
+from residnet.autopilot.training.config import PolicyTraining
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Seconds
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.progress import log_message
 from residnet.dynamics.simulated import check_steps
-from residnet.dynamics.steering_variation import DEPTH, HEADING, Axis
 from residnet.dynamics.store import chosen_model, load_model
 from residnet.manoeuvres.trials import DisturbanceConfig, WindConfig
 from residnet.physics.environment import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, ExportRequest, PartName, TaskOutcome
-from residnet.studies.gouletas2020.law import DocumentConfig, PredictiveConfig
-from residnet.training.policies.config import PolicyTraining
 
 AnyController = Annotated[ClassicalController | DocumentConfig, Field(discriminator="kind")]
 
@@ -205,7 +205,7 @@ class AutopilotConfig(ComputingTask):
     safe: Literal["hold", "amidships"] = "amidships"
 
     supported_commands: ClassVar[tuple[str, ...]] = ("report", "export")
-    section_module: ClassVar[str] = "autopilot"
+    section_module: ClassVar[str] = "residnet.autopilot.report.heading"
 
     @model_validator(mode="after")
     def _validate_names(self) -> Self:
@@ -459,13 +459,13 @@ class AutopilotConfig(ComputingTask):
         Raises:
             FitError: where tuning or training fails.
         """
-        from residnet.tasks.autopilot_run import run_autopilot
+        from residnet.autopilot.tasks.autopilot_run import run_autopilot
 
         return run_autopilot(self, folder)
 
     def export_model(self, request: ExportRequest) -> Path:
         """Export a policy of a finished run for controllers; returns the file."""
-        from residnet.tasks.autopilot_run import export_policy
+        from residnet.autopilot.tasks.autopilot_run import export_policy
 
         return export_policy(self, request)
 

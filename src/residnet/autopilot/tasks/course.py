@@ -13,6 +13,8 @@ from pydantic import Field, model_validator
 from residnet.autopilot.courses.config import BuoyCourseConfig, plan_course, smallest_turn
 from residnet.autopilot.courses.course_check import Protocol
 from residnet.autopilot.guidance import AnyLineOfSight
+from residnet.autopilot.heading.steering_variation import Vessels
+from residnet.autopilot.tasks.autopilot import AnyController, AutopilotConfig
 from residnet.core.config import (
     Config,
     ExistingPath,
@@ -24,10 +26,8 @@ from residnet.core.config import (
 from residnet.core.errors import ConfigError
 from residnet.core.names import suggest_name
 from residnet.dynamics.simulated import check_steps
-from residnet.dynamics.steering_variation import Vessels
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, ExportRequest, PartName, TaskOutcome
-from residnet.tasks.autopilot import AnyController, AutopilotConfig
 
 
 class CourseSpreadConfig(Config):
@@ -133,7 +133,7 @@ class CourseTaskConfig(ComputingTask):
         return self.spread.seed if self.spread else 0
 
     supported_commands: ClassVar[tuple[str, ...]] = ("report", "export")
-    section_module: ClassVar[str] = "course"
+    section_module: ClassVar[str] = "residnet.autopilot.report.course"
 
     def load_autopilot_config(self) -> AutopilotConfig:
         """Return the config of the autopilot, from its run folder or its file.
@@ -195,12 +195,12 @@ class CourseTaskConfig(ComputingTask):
             ConfigError: where no course fits the vessel's turns.
             FitError: where training fails.
         """
-        from residnet.tasks.course_run import run_course
+        from residnet.autopilot.tasks.course_run import run_course
 
         return run_course(self, folder)
 
     def export_model(self, request: ExportRequest) -> Path:
         """Write a policy with the guidance of a course, named after both; returns the file."""
-        from residnet.tasks.course_run import export_course
+        from residnet.autopilot.tasks.course_run import export_course
 
         return export_course(self, request)

@@ -19,6 +19,7 @@ from residnet.autopilot.heading.turning import (
     SteeringResponse,
     fit_response,
 )
+from residnet.autopilot.tasks.autopilot import REFERENCE_STEERING, minimum_turn_time
 from residnet.core.config import (
     Config,
     MetresPerSecond,
@@ -36,7 +37,6 @@ from residnet.io.drafting.questions import DraftNotes
 from residnet.io.drafting.reading import find_log_files, read_drafted
 from residnet.preprocessing.channel_values import estimate_noise_std
 from residnet.preprocessing.motion import MotionConfig, complete_motion
-from residnet.tasks.autopilot import REFERENCE_STEERING, minimum_turn_time
 from residnet.tasks.registry import open_finished_task
 
 _RUDDER_CHANNELS = ("cmd_delta", "delta")

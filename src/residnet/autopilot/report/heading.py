@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from residnet.autopilot.evaluation import describe_limit_cycles, list_unsuitable_conditions
 from residnet.autopilot.heading.conditions import settled_time
 from residnet.core.format import DEGREES_PER_RADIAN, format_signed
-from residnet.evaluation.autopilots import describe_limit_cycles, list_unsuitable_conditions
 from residnet.report.blocks import Block, Code, Column, Section, Table, Text, build_table, flag_cell
 from residnet.report.figure import (
     ZERO_LINE_STYLE,

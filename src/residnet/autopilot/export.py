@@ -20,9 +20,9 @@ from torch import Tensor, nn
 from residnet.autopilot.courses.course_plan import Course
 from residnet.autopilot.guidance import CourseGuidance, TrackKeeping
 from residnet.autopilot.heading.policies import MAX_DEPTH, HeadingPolicy
+from residnet.autopilot.heading.steering_variation import DEPTH, HEADING
 from residnet.core.errors import ExportError
 from residnet.core.version import __version__
-from residnet.dynamics.steering_variation import DEPTH, HEADING
 from residnet.export.base import Exportable, LoadedExport, RoundingError
 from residnet.export.torchscript import get_size, require_shape, trace_function
 
@@ -342,6 +342,17 @@ class _UncheckedStep(nn.Module):
         return results
 
 
+class _InitialState(nn.Module):
+    """The memory of a controller at its first measurement, for formats that hold functions."""
+
+    def __init__(self, controller: GuardedPolicy | GuardedCoursePolicy) -> None:
+        super().__init__()
+        self.controller = controller
+
+    def forward(self, y: Tensor) -> Tensor:
+        return self.controller.initial_state(y)
+
+
 def guard_policy(
     policy: HeadingPolicy, fallback: FallbackCommand, dtype: torch.dtype = torch.float32
 ) -> GuardedPolicy:
@@ -428,6 +439,9 @@ class ExportedController(Exportable):
 
     def build_step_module(self, dtype: torch.dtype) -> nn.Module:
         return _UncheckedStep(self.build_controller(dtype)).eval()
+
+    def build_initial_state(self, dtype: torch.dtype) -> nn.Module:
+        return _InitialState(self.build_controller(dtype)).eval()
 
     def card_contents(self) -> dict[str, Any]:
         module, policy = self.build_controller(self.precisions[0]), self.policy

@@ -76,6 +76,10 @@ class Waypoints(Manoeuvre):
         return ClosedLoop(AllocatedPolicy(autopilot, to_commands), self.build_guidance(helm.state))
 
     @property
+    def marked_positions(self) -> Sequence[tuple[float, float]]:
+        return self.points
+
+    @property
     def end_condition(self) -> str:
         return f"the last of {len(self.points)} way-points"
 

@@ -22,6 +22,8 @@ from residnet.autopilot.courses.config import (
 )
 from residnet.autopilot.courses.course_check import Protocol
 from residnet.autopilot.courses.turns import SteadyTurn
+from residnet.autopilot.evaluation import CourseRun, build_course_row, build_ensemble_row
+from residnet.autopilot.export import ExportedCoursePolicy
 from residnet.autopilot.guidance import (
     AnyLineOfSight,
     CourseGuidance,
@@ -32,25 +34,23 @@ from residnet.autopilot.guidance import (
 )
 from residnet.autopilot.heading.controllers import ControlTask
 from residnet.autopilot.heading.policies import HeadingPolicy
+from residnet.autopilot.heading.steering_variation import NOMINAL, Vessels
 from residnet.autopilot.heading.turning import NomotoModel
+from residnet.autopilot.report.course import COURSES_FILE, SPREAD_FILE, TRACKS_FILE, tables_text
+from residnet.autopilot.tasks.autopilot import AnyController, AutopilotConfig
+from residnet.autopilot.tasks.autopilot_run import load_trained_policy
+from residnet.autopilot.training.predictor import load_predictive_controller
 from residnet.core.errors import ExportError
 from residnet.core.files import read_json
 from residnet.core.progress import log_message
 from residnet.dynamics.simulated import InAmbientCurrent
-from residnet.dynamics.steering_variation import NOMINAL, Vessels
 from residnet.engine.rollout import Rollout
-from residnet.evaluation.autopilots import CourseRun, build_course_row, build_ensemble_row
 from residnet.evaluation.metrics import SCHEMA
-from residnet.export.policy import ExportedCoursePolicy
-from residnet.report.sections.course import COURSES_FILE, SPREAD_FILE, TRACKS_FILE, tables_text
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ExportRequest, SummaryMetric, TaskOutcome
-from residnet.studies.gouletas2020.autopilot import load_predictive_controller
-from residnet.tasks.autopilot import AnyController, AutopilotConfig
-from residnet.tasks.autopilot_run import load_trained_policy
 
 if TYPE_CHECKING:
-    from residnet.tasks.course import CourseTaskConfig
+    from residnet.autopilot.tasks.course import CourseTaskConfig
 
 _COLUMN_UNITS = {
     "course_time": "s",

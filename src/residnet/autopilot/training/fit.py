@@ -23,11 +23,11 @@ from residnet.autopilot.heading.conditions import (
 )
 from residnet.autopilot.heading.policies import HeadingPolicy
 from residnet.autopilot.heading.vessels import SteeredVessel
+from residnet.autopilot.training.config import PolicyTraining
 from residnet.core.errors import ExportError
 from residnet.core.progress import log_message
 from residnet.engine.rollout import FreeRun
 from residnet.preprocessing.data_module import EpochDataModule
-from residnet.training.policies.config import PolicyTraining
 from residnet.training.trainer import EpochTraining, run_epochs
 
 _LATE = 1.0 / 3.0

@@ -11,6 +11,26 @@ import pandas as pd
 import torch
 
 from residnet.autopilot.base import Policy
+from residnet.autopilot.evaluation import (
+    METRIC_UNITS,
+    N_QUIET_RUNS,
+    build_sea_row,
+    build_step_row,
+    build_time_series,
+    build_variation_grid,
+    compute_run_metrics,
+    describe_limit_cycles,
+    draw_heading_changes,
+    draw_variations,
+    evaluate_limit_cycles,
+    evaluate_under_conditions,
+    list_policy_objections,
+    list_unsuitable_conditions,
+    simulate_steps,
+    simulate_steps_in_waves,
+    simulate_steps_in_wind,
+)
+from residnet.autopilot.export import ExportedHeading
 from residnet.autopilot.heading.conditions import (
     ClosedLoopSimulation,
     ConditionsConfig,
@@ -30,32 +50,7 @@ from residnet.autopilot.heading.controllers import (
 )
 from residnet.autopilot.heading.policies import SIGHT_CONSTANTS, DepthPolicy, ObservedPolicy
 from residnet.autopilot.heading.vessels import SteeredPlant
-from residnet.core.progress import begin_stage, log_message, report_progress
-from residnet.dynamics.store import rebuilt
-from residnet.engine.compiled import CompiledRollout
-from residnet.evaluation.autopilots import (
-    METRIC_UNITS,
-    N_QUIET_RUNS,
-    build_sea_row,
-    build_step_row,
-    build_time_series,
-    build_variation_grid,
-    compute_run_metrics,
-    describe_limit_cycles,
-    draw_heading_changes,
-    draw_variations,
-    evaluate_limit_cycles,
-    evaluate_under_conditions,
-    list_policy_objections,
-    list_unsuitable_conditions,
-    simulate_steps,
-    simulate_steps_in_waves,
-    simulate_steps_in_wind,
-)
-from residnet.evaluation.metrics import SCHEMA
-from residnet.export.policy import ExportedHeading
-from residnet.physics.vessel import load_vessel
-from residnet.report.sections.autopilot import (
+from residnet.autopilot.report.heading import (
     CONDITIONS_FILE,
     RESPONSES_FILE,
     VESSELS_FILE,
@@ -65,14 +60,23 @@ from residnet.report.sections.autopilot import (
     effort_table,
     settling_table,
 )
+from residnet.autopilot.training.fit import train_policy
+from residnet.autopilot.training.predictor import train_or_resume_controller
+from residnet.core.progress import begin_stage, log_message, report_progress
+from residnet.dynamics.store import rebuilt
+from residnet.engine.compiled import CompiledRollout
+from residnet.evaluation.metrics import SCHEMA
+from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import RunModelStore
 from residnet.runs.task import ExportRequest, SummaryMetric, TaskOutcome
-from residnet.studies.gouletas2020.autopilot import train_or_resume_controller
-from residnet.training.policies.fit import train_policy
 
 if TYPE_CHECKING:
-    from residnet.tasks.autopilot import AnyController, AutopilotConfig, EvaluationConditions
+    from residnet.autopilot.tasks.autopilot import (
+        AnyController,
+        AutopilotConfig,
+        EvaluationConditions,
+    )
 
 Controllers = dict[str, tuple[str, Policy]]
 """Kind (policy, classical, floor and others) and controller by name."""

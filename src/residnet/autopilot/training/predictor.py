@@ -15,6 +15,12 @@ from torch import Tensor, nn
 
 from residnet.autopilot.base import Policy
 from residnet.autopilot.heading.controllers import ControlTask
+from residnet.autopilot.heading.predictive import (
+    NetworkPredictor,
+    PredictiveConfig,
+    PredictorTraining,
+    SimulatedPredictor,
+)
 from residnet.autopilot.heading.vessels import SteeredVessel
 from residnet.core.errors import UsageError
 from residnet.core.format import DEGREES_PER_RADIAN
@@ -23,12 +29,6 @@ from residnet.engine.rollout import Rollout
 from residnet.preprocessing.data_module import RowsDataModule
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import RunModelStore
-from residnet.studies.gouletas2020.law import (
-    NetworkPredictor,
-    PredictiveConfig,
-    PredictorTraining,
-    SimulatedPredictor,
-)
 from residnet.training.trainer import EpochTraining, run_epochs
 
 
