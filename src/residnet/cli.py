@@ -151,7 +151,7 @@ def _progress_bars() -> Iterator[ProgressCallback]:
 
 
 def interactive_prompt() -> AnswerCallback | None:
-    """Return what asks the user; None where nobody sits at the terminal."""
+    """Return what asks the user; None if nobody sits at the terminal."""
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         return None
     return _prompt_for_answer
@@ -502,7 +502,7 @@ def _collect_log_paths(run: Path, *path_groups: list[Path] | None) -> list[Path]
     """Return the logs that a command line names.
 
     Raises:
-        UsageError: where there is none.
+        UsageError: if there is none.
     """
     from residnet.core.errors import UsageError
 
@@ -768,7 +768,7 @@ def compare(
     ] = Path("comparison"),
     quiet: QuietOption = False,
 ) -> None:
-    """Set finished fits side by side: errors on common logs, paired intervals, configs."""
+    """Set finished fits in parallel: errors on common logs, paired intervals, configs."""
     from residnet.core.run_loader import name_damaged_key
     from residnet.tasks.compare import compare_runs
 

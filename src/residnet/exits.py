@@ -76,7 +76,7 @@ def run_cli(command: Callable[[], object]) -> None:
         command: what parses the arguments and does the work.
 
     Raises:
-        SystemExit: with the exit code, where it is not 0.
+        SystemExit: with the exit code, if it is not 0.
     """
     signals = _SignalHandler()
     # a service may start a command with closed streams
@@ -165,7 +165,7 @@ def write_crash_file(error: BaseException) -> Path | None:
     """Write versions, command, config and traceback to a file, and return the file.
 
     It stands in the current folder, or where that cannot be written in the folder for temporary
-    files; None where neither can be. Passwords, tokens and the name of the user are left out, and
+    files; None if neither can be. Passwords, tokens and the name of the user are left out, and
     the environment is not looked at.
     """
     import platform

@@ -71,14 +71,14 @@ def read_logs(
         time: column that holds time, in s, or (column, unit).
         manoeuvre: kind of manoeuvre of every file; `folder` takes the name of each file's folder.
         reader: kind or settings of a reader, in place of `channels`.
-        progress: is told how far the reading is.
+        progress: called with the progress of the reading.
 
     Returns:
         The logs in the order of the files: channels [T] in SI units and radians.
 
     Raises:
-        UsageError: where there is no such file, or a column or unit is wrong.
-        DataError: where the contents of a file cannot be used.
+        UsageError: if there is no such file, or a column or unit is wrong.
+        DataError: if the contents of a file cannot be used.
 
     Example:
         logs = residnet.read_logs("trials/*.csv", channels={"u": ("speed", "kn"), ...})
@@ -179,8 +179,8 @@ def inspect(
         level is above `note`.
 
     Raises:
-        UsageError: where a log lacks an input, or a path is wrong.
-        DataError: where a log cannot be examined.
+        UsageError: if a log lacks an input, or a path is wrong.
+        DataError: if a log cannot be examined.
 
     Example:
         findings = residnet.inspect(logs); findings[findings.level != "note"]
@@ -223,15 +223,15 @@ def draft_config(
         folder: where the config will lie; its paths start from there.
         answer: is given each question that the logs leave open, and returns its answer; None takes
             the defaults.
-        progress: is told how far the reading is.
+        progress: called with the progress of the reading.
 
     Returns:
         The draft: `config` for `residnet.run`, `guesses` as pairs of key and reason, `text` as
         YAML with comments, and `save(file)`.
 
     Raises:
-        UsageError: where a path does not exist, or nothing in the logs drives the vessel.
-        DataError: where no log can be used.
+        UsageError: if a path does not exist, or nothing in the logs drives the vessel.
+        DataError: if no log can be used.
 
     Example:
         draft = residnet.draft_config("trials/"); draft.save("my_boat.yaml"); residnet.run("my_boat.yaml")
@@ -274,7 +274,7 @@ class Dataset:
         """Return the prepared logs of a split.
 
         Raises:
-            UsageError: where there is no such split.
+            UsageError: if there is no such split.
         """
         if split not in self.splits or not self.splits[split]:
             raise UsageError(f"the data have no split '{split}'{suggest_name(split, self.splits)}")
@@ -309,7 +309,7 @@ def prepare(
         step: of the grid in s.
         held_channels: channels whose last value holds until the next; others are interpolated.
         settings_from: data whose settings are taken over; all logs then form the split `external`.
-        progress: is told how far the work is.
+        progress: called with the progress of the work.
         settings: further keys of the sections `signals` (exogenous, forces, velocities),
             `prepare` (masks, derivative, motion, trim, hold, beside) and `evaluation` (protocols,
             selection, scales, groups, divergence) of a config, as YAML has them; without
@@ -319,9 +319,9 @@ def prepare(
         The data: y, smooth [T, 3 + n], nu_dot [T, n], w [T, m] of each log, float64, SI.
 
     Raises:
-        ConfigError: where a setting is wrong.
-        UsageError: where a channel is missing, or no inputs are named.
-        DataError: where a log holds nothing to learn from or to predict, or splits share data.
+        ConfigError: if a setting is wrong.
+        UsageError: if a channel is missing, or no inputs are named.
+        DataError: if a log holds nothing to learn from or to predict, or splits share data.
 
     Example:
         data = residnet.prepare(logs, ["n_port", "n_stbd"])

@@ -107,12 +107,12 @@ class FreeRuns:
 
         Args:
             log: name of the log; the first where None.
-            selection: `models`, their names, all but `zero` where there are none; `protocol`,
+            selection: `models`, their names, all but `zero` if there are none; `protocol`,
                 `manoeuvre` where there is such a one, else the first; `window`, number of the
                 window in the log, the longest where None.
 
         Raises:
-            UsageError: where there is no such log, model, protocol or window.
+            UsageError: if there is no such log, model, protocol or window.
         """
         return self._plot(log, True, **selection)
 
@@ -124,7 +124,7 @@ class FreeRuns:
             selection: as of `plot_track`.
 
         Raises:
-            UsageError: where there is no such log, model, protocol or window.
+            UsageError: if there is no such log, model, protocol or window.
         """
         return self._plot(log, False, **selection)
 
@@ -201,11 +201,11 @@ def free_run(
     Args:
         models: from `fit` or `load`; one or several.
         data: from `prepare`.
-        split: of the data; `test` where there is one, else the first.
+        split: of the data; `test` if there is one, else the first.
         progress: is told how far the free runs are.
 
     Raises:
-        UsageError: where the data have no such split, or a model has other inputs or another step.
+        UsageError: if the data have no such split, or a model has other inputs or another step.
 
     Example:
         runs = residnet.free_run(models, data); runs.metrics
@@ -358,7 +358,7 @@ def fit(
         baselines: further baselines by name.
         threads: of PyTorch; one is fastest for these small products, and part of what makes a fit
             repeatable.
-        workers: models that may be fitted side by side, each in a process of its own, where they
+        workers: models that may be fitted in parallel, each in a process of its own, where they
             take long; the numbers stay the same. With more than one, a script has to keep its calls
             under `if __name__ == "__main__":`, since each process imports it again.
         trust: allow classes of scikit-learn whose fitted state is not stored as data; they can run
@@ -366,12 +366,12 @@ def fit(
         progress: is told what is being fitted, and how far it is.
         settings: further keys of a fit, as YAML has them: recipe, effort, base_of, forces,
             ensembles, means, training, refit, current, bands, seed, and integrator, which is
-            that of `residnet new` for the recipe where it is not given.
+            that of `residnet new` for the recipe if it is not given.
 
     Raises:
-        ConfigError: where a setting is wrong.
-        FitError: where the data do not determine a part.
-        DataError: where a split holds no sample or no window.
+        ConfigError: if a setting is wrong.
+        FitError: if the data do not determine a part.
+        DataError: if a split holds no sample or no window.
 
     Example:
         models = residnet.fit(logs); models.selected, models.metrics
@@ -435,7 +435,7 @@ def metrics(
         diverged"), position_error_end (m), heading_error_end (rad).
 
     Raises:
-        UsageError: where there is no such split or manoeuvre.
+        UsageError: if there is no such split or manoeuvre.
 
     Example:
         residnet.metrics(models, split="test")

@@ -87,7 +87,7 @@ class Model:
 
     @property
     def coefficients(self) -> pd.DataFrame:
-        """Identified coefficients: axis, term, value, standard_error; no row where there are none.
+        """Identified coefficients: axis, term, value, standard_error; no row if there are none.
 
         The coefficients are SI.
         """
@@ -102,10 +102,10 @@ class Model:
         Args:
             x: states [B, 6] or [6].
             w: inputs [B, m] or [m], held over the step.
-            s: memory [B, n_state] from the step before or from `warmup`; empty where None.
+            s: memory [B, n_state] from the step before or from `warmup`; empty if None.
 
         Raises:
-            UsageError: where a shape does not fit or a number is not finite.
+            UsageError: if a shape does not fit or a number is not finite.
 
         Example:
             x, s = model.step(x, w, s)
@@ -124,10 +124,10 @@ class Model:
         Args:
             x0: initial states [B, 6] or [6].
             w: inputs [B, T, m] or [T, m], each held over its step.
-            s: memory [B, n_state] from `warmup`; empty where None.
+            s: memory [B, n_state] from `warmup`; empty if None.
 
         Raises:
-            UsageError: where a shape does not fit or a number is not finite.
+            UsageError: if a shape does not fit or a number is not finite.
 
         Example:
             track = model.rollout(x0, w)[:, :2]
@@ -148,7 +148,7 @@ class Model:
             w_history: inputs [B, T, m] or [T, m] at the same samples.
 
         Raises:
-            UsageError: where a shape does not fit or a number is not finite.
+            UsageError: if a shape does not fit or a number is not finite.
 
         Example:
             s = model.warmup(log.y[:50], log.w[:50])
@@ -231,7 +231,7 @@ def save(model: Model, folder: PathLikeArg, *, overwrite: bool = False) -> Path:
         overwrite: replace a model that stands there.
 
     Raises:
-        UsageError: where a model stands there already.
+        UsageError: if a model stands there already.
 
     Example:
         residnet.save(models["lstm"], "models/lstm")
@@ -256,12 +256,12 @@ def load(folder: PathLikeArg, name: str | None = None, *, trust: bool = False) -
     Args:
         folder: of a model, or of a finished run.
         name: of the model in the run; `selected` is the single one that validation data chose;
-            where not given, the one that is reported first.
+            if not given, the one that is reported first.
         trust: allow classes of scikit-learn whose fitted state is not stored as data; they can run
             code, so only for sources that you trust.
 
     Raises:
-        UsageError: where there is no such model.
+        UsageError: if there is no such model.
 
     Example:
         model = residnet.load("runs/quickstart", "selected")
@@ -326,10 +326,10 @@ def export_model(
         allows_objections: whether a model is wanted that is worse, too; its card says so.
 
     Raises:
-        WithheldError: where it is worse than `zero` or the baseline, but for `allows_objections`.
-        ConfigError: where there is no such format.
-        UsageError: where the format cannot hold such a model.
-        ExportError: where what was written does not reproduce the model.
+        WithheldError: if it is worse than `zero` or the baseline, but for `allows_objections`.
+        ConfigError: if there is no such format.
+        UsageError: if the format cannot hold such a model.
+        ExportError: if what was written does not reproduce the model.
 
     Example:
         card = residnet.export_model(models["lstm"], "lstm.pt")
@@ -390,8 +390,8 @@ class Monitor:
             `stretch`, `false_alarm`, `group` in s.
 
     Raises:
-        UsageError: where an argument is of another kind.
-        DataError: where the clean data are too few.
+        UsageError: if an argument is of another kind.
+        DataError: if the clean data are too few.
 
     Example:
         monitor = residnet.Monitor(models["baseline"], data); verdict = monitor.step(y, w)
@@ -442,8 +442,8 @@ class Monitor:
             empty the model is as it was.
 
         Raises:
-            UsageError: where the data are of another kind, or the model has no parameters to move.
-            DataError: where a log holds no window.
+            UsageError: if the data are of another kind, or the model has no parameters to move.
+            DataError: if a log holds no window.
         """
         require_instance(new_data, Dataset, "Monitor.refit: expected data from residnet.prepare")
         change_detector = self._detector.detector

@@ -57,7 +57,7 @@ def list_available(part_kind: PartKind) -> pd.DataFrame:
         part_kind: vessels, heads, baselines, manoeuvres, readers, tasks or formats (of exports).
 
     Raises:
-        UsageError: where it is none of these.
+        UsageError: if it is none of these.
 
     Example:
         residnet.list_available("heads")
@@ -81,7 +81,7 @@ def head(kind: PartLike, *, trust: bool = False, **settings: Any) -> FeatureConf
         settings: of the head, as YAML has them.
 
     Raises:
-        ConfigError: where there is no such kind, or a setting is wrong.
+        ConfigError: if there is no such kind, or a setting is wrong.
 
     Example:
         residnet.head("lstm", hidden_size=16)
@@ -101,7 +101,7 @@ def baseline(kind: PartLike, **settings: Any) -> IdentifiedConfig:
         settings: of the baseline, as YAML has them.
 
     Raises:
-        ConfigError: where there is no such kind, or a setting is wrong.
+        ConfigError: if there is no such kind, or a setting is wrong.
 
     Example:
         residnet.baseline("regressors", sets=["fossen"])
@@ -119,7 +119,7 @@ def manoeuvre(kind: PartLike, **settings: Any) -> Manoeuvre:
         settings: of the manoeuvre; SI numbers, or texts with a unit such as "20 deg".
 
     Raises:
-        ConfigError: where there is no such kind, or a setting is wrong.
+        ConfigError: if there is no such kind, or a setting is wrong.
 
     Example:
         residnet.manoeuvre("zigzag", drive=0.6, steer=0.4, heading="20 deg")
@@ -137,7 +137,7 @@ def vessel(name: str) -> VesselFile:
         name: one of `list_available("vessels")`, or the path of a YAML file.
 
     Raises:
-        ConfigError: where there is no such vessel or its file is wrong.
+        ConfigError: if there is no such vessel or its file is wrong.
 
     Example:
         residnet.vessel("wam_v_cal").length.value
@@ -193,8 +193,8 @@ def simulate(
             noise, disturbance, initial, length, reader, seed.
 
     Raises:
-        ConfigError: where a setting is wrong, or the vessel cannot fly a manoeuvre.
-        DataError: where a motion is not finite from its first step on.
+        ConfigError: if a setting is wrong, or the vessel cannot fly a manoeuvre.
+        DataError: if a motion is not finite from its first step on.
 
     Example:
         trials = residnet.simulate("wam_v_cal", {"kind": "zigzag", "drive": 0.6, "steer": 0.4,
@@ -252,7 +252,7 @@ class RunResult:
         """Rows of metrics.json as a table.
 
         Raises:
-            UsageError: where the task has none.
+            UsageError: if the task has none.
         """
         import pandas as pd
 
@@ -273,7 +273,7 @@ class RunResult:
             name: of the file, as `file_names` has it.
 
         Raises:
-            UsageError: where there is no such file, or it is no text, JSON or Parquet.
+            UsageError: if there is no such file, or it is no text, JSON or Parquet.
 
         Example:
             result.read("indices.json")["rows"]
@@ -295,14 +295,14 @@ class RunResult:
             ) from error
 
     def load_model(self, name: str = "predictor", *, trust: bool = False) -> Model:
-        """Return a model of a fit, the one that is reported first where none is named.
+        """Return a model of a fit, the one that is reported first if none is named.
 
         Args:
             name: of the model.
             trust: as of `load`.
 
         Raises:
-            UsageError: where the run has no such model.
+            UsageError: if the run has no such model.
         """
         return load(self.folder, name, trust=trust)
 
@@ -338,8 +338,8 @@ def run(
         progress: is told what is being done, and how far it is.
 
     Raises:
-        ConfigError: where the config is wrong.
-        ResidnetError: where the input does not allow it, or a result fails a check.
+        ConfigError: if the config is wrong.
+        ResidnetError: if the input does not allow it, or a result fails a check.
 
     Example:
         result = residnet.run("quickstart.yaml", overrides={"seed": 3}); result.metrics

@@ -43,7 +43,7 @@ def parse_part(value: PartLike, description: str, **settings: Any) -> dict[str, 
         settings: further keys.
 
     Raises:
-        UsageError: where it is none of these.
+        UsageError: if it is none of these.
     """
     if isinstance(value, str):
         return {"kind": value, **to_builtin(settings)}
@@ -58,7 +58,7 @@ def parse_named_parts(value: Any, description: str) -> dict[str, Any]:
     """Return parts by name, from a list of kinds or a mapping from names to parts.
 
     Raises:
-        UsageError: where it is neither.
+        UsageError: if it is neither.
     """
     if isinstance(value, str):
         return {value: parse_part(value, description)}
@@ -78,7 +78,7 @@ def parse_path(value: Any, description: str) -> Path:
     """Return the given value as a path, ~ expanded.
 
     Raises:
-        UsageError: where it is none.
+        UsageError: if it is none.
     """
     if isinstance(value, str | PathLike) and str(value):
         return Path(value).expanduser()
@@ -99,7 +99,7 @@ def forward_progress(progress: ProgressCallback | None) -> AbstractContextManage
     """Return a context that sends progress to a callback; without one, whoever listens goes on.
 
     Raises:
-        UsageError: where it cannot be called.
+        UsageError: if it cannot be called.
     """
     if progress is None:
         return nullcontext()

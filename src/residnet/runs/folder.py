@@ -109,7 +109,7 @@ class RunFolder:
             resume: continue a run of the same configuration.
 
         Raises:
-            UsageError: where the folder exists and may not be used, or holds a run of another
+            UsageError: if the folder exists and may not be used, or holds a run of another
                 configuration.
         """
         folder = cls(path)
@@ -157,7 +157,7 @@ class RunFolder:
         Where the system or its disk knows no locks, nothing is held.
 
         Raises:
-            UsageError: where another process runs into it.
+            UsageError: if another process runs into it.
         """
         self.path.mkdir(parents=True, exist_ok=True)
         try:
@@ -190,7 +190,7 @@ class RunFolder:
         """Open the folder of a finished run.
 
         Raises:
-            UsageError: where there is no run, it is not finished, or a result is not as it was
+            UsageError: if there is no run, it is not finished, or a result is not as it was
                 written.
         """
         folder = cls(path)
@@ -250,7 +250,7 @@ class RunFolder:
         """Return the contents of summary.json.
 
         Raises:
-            UsageError: where the file is not readable.
+            UsageError: if the file is not readable.
         """
         content = read_json(self.summary)
         sentences = content.get("verdict")
@@ -262,12 +262,12 @@ class RunFolder:
         """Return the contents of metrics.json.
 
         Raises:
-            UsageError: where there is no such file, or it is not readable.
+            UsageError: if there is no such file, or it is not readable.
         """
         return read_json(self.metrics)
 
     def read_fit_notes(self, model: str) -> dict[str, Any]:
-        """Return what models/<model>/fit.json tells of a model's fit; empty where there is none."""
+        """Return what models/<model>/fit.json tells of a model's fit; empty if there is none."""
         path = self.models / model / "fit.json"
         return read_json(path) if path.is_file() else {}
 
@@ -378,7 +378,7 @@ class Provenance:
     """What a run is made from.
 
     Attributes:
-        config_path: the file that describes it; None where Python called.
+        config_path: the file that describes it; None if Python called.
         overrides: of the config's keys.
         seed: of everything random.
         input_paths: inputs whose contents the run depends on.
@@ -395,7 +395,7 @@ class Provenance:
         """Check that no input file has changed since an interrupted run in the folder began.
 
         Raises:
-            UsageError: where one has.
+            UsageError: if one has.
         """
         if not folder.provenance.is_file():
             return

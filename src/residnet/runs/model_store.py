@@ -30,14 +30,14 @@ class RunModelStore(FitStore):
         return list(model_names(self.folder.models))
 
     def load_finished(self, name: str) -> FittedModel | None:
-        """Return a model that is there whole; None where it is not."""
+        """Return a model that is there whole; None if it is not."""
         return self.load(name) if (self.folder.models / name / "model.json").is_file() else None
 
     def load(self, name: str) -> FittedModel:
         """Return a model with its notes.
 
         Raises:
-            UsageError: where there is none of that name, or a file of it has changed since.
+            UsageError: if there is none of that name, or a file of it has changed since.
         """
         verify_checksums(self.folder.models / name)
         content = read_json(self.folder.bands) if self.folder.bands.is_file() else {}
@@ -60,10 +60,10 @@ class RunModelStore(FitStore):
         """Fill a module with the weights that an interrupted run had trained, and freeze it.
 
         Returns:
-            The notes of its training; None where it had not ended.
+            The notes of its training; None if it had not ended.
 
         Raises:
-            UsageError: where the weights or the notes are not as they were written.
+            UsageError: if the weights or the notes are not as they were written.
         """
         folder = self.folder.models / name
         if not (folder / "model.json").is_file():

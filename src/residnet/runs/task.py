@@ -1,4 +1,4 @@
-"""What every kind of run has in common: its folder, its order of work and its verbs."""
+"""Base classes of tasks: settings, the order of work in a run folder, and commands."""
 
 from __future__ import annotations
 
@@ -30,21 +30,22 @@ if TYPE_CHECKING:
     from residnet.report.browser import InteractiveFigures
 
 PartName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
-"""Of a part of a run: a model, a controller, a variant."""
+"""Name of a part of a run: a model, a controller or a variant."""
 ExportWriters = Mapping[str, Callable[[], Path]]
-"""What writes each export and returns its file, by the name of the model."""
+"""Functions that write an export and return its file, by the name of the model."""
 
 
 class ExportRequest(NamedTuple):
-    """Which model of a finished run is exported, and how.
+    """A request to export one model of a finished run.
 
     Attributes:
         run: the finished run.
-        model: its name; `predictor` and `selected` stand for the one that the run puts first.
-        output_path: file to write; where None, exports/<model> with the format's suffix, or for formats of
-            C exports/<run> for the model that is reported first and exports/<run>_<model> else.
+        model: name of the model; `predictor` is the model that the run reports first, `selected`
+            the single model chosen on validation data.
+        output_path: file to write. If None, it is exports/<model> with the suffix of the format;
+            for C formats exports/<run> for the predictor and exports/<run>_<model> otherwise.
         file_format: one of `residnet list formats`.
-        allows_objections: whether a model is wanted that is worse than doing without it, too.
+        allows_objections: also export a model that is worse than its reference.
     """
 
     run: RunFolder
@@ -60,18 +61,19 @@ class ExportRequest(NamedTuple):
         stem: str = "",
         judged: tuple[str, Sequence[str]] | None = None,
     ) -> Path:
-        """Write what was asked for; returns the file.
+        """Write the export file; returns its path.
 
         Args:
-            exported: the model, its policy or its force.
-            objections: what speaks against it; its card names them.
-            stem: name of the file where none was asked for; that of the model where empty.
-            judged: level and sentences of the verdict on this model; None for those of the run.
+            exported: the model, policy or force model to export.
+            objections: reasons not to use the model; the model card lists them.
+            stem: file name without suffix if the request names none; empty for the model's name.
+            judged: level and sentences of the verdict on this model; None for the verdict of the
+                run.
 
         Raises:
-            ConfigError: where there is no such format.
-            WithheldError: where something speaks against it, but for `allows_objections`.
-            ExportError: where the file does not reproduce it.
+            ConfigError: if there is no such format.
+            WithheldError: if there are objections and `allows_objections` is False.
+            ExportError: if the file does not reproduce the model.
         """
         from residnet.export import get_exporter
         from residnet.export.base import require_releasable
@@ -80,7 +82,7 @@ class ExportRequest(NamedTuple):
         export_format = get_exporter(self.file_format)
         name = stem or exported.name
         if export_format.default_name_from_run:
-            # the file's name becomes part of all symbols, and models of two runs have one name
+            # the file name becomes part of all C symbols: models of two runs must not collide
             run = re.sub(r"\W", "_", self.run.path.resolve().name, flags=re.ASCII)
             name = run if self.model == "predictor" else f"{run}_{name}"
         base_path = self.output_path or self.run.exported_models / f"{name}{export_format.suffix}"
@@ -98,10 +100,15 @@ class ExportRequest(NamedTuple):
         return file
 
     def resolve_model_name(self, names: Collection[str]) -> str:
-        """Return the name that is asked for; `predictor` and `selected` are the only one there is.
+        """Return the name of the requested model.
+
+        `predictor` and `selected` resolve to the only name if there is just one.
+
+        Args:
+            names: names of all models of the run.
 
         Raises:
-            UsageError: where there is none of that name.
+            UsageError: if there is no model of that name.
         """
         if self.model in ("predictor", "selected") and len(names) == 1:
             return next(iter(names))
@@ -109,43 +116,41 @@ class ExportRequest(NamedTuple):
             suggestion = (
                 suggest_name(self.model, names) or f"; give one with --model: {', '.join(names)}"
             )
-            raise UsageError(
-                f"{self.run.path}: nothing to export is named '{self.model}'{suggestion}"
-            )
+            raise UsageError(f"{self.run.path}: no model '{self.model}' to export{suggestion}")
         return self.model
 
 
 class SummaryMetric(NamedTuple):
-    """A number that sums a run up, in SI units.
+    """A main figure of a run, in SI units.
 
     Attributes:
         value: the number.
-        unit: its unit; `-` for a number without one.
+        unit: its unit; `-` for a dimensionless number.
     """
 
     value: float
     unit: str = "-"
 
     def to_json(self) -> dict[str, Any]:
-        """Return the figure as summary.json holds it; a value that is not finite becomes null."""
+        """Return the entry of summary.json; a value that is not finite becomes null."""
         value = float(self.value)
         return {"value": value if math.isfinite(value) else None, "unit": self.unit}
 
 
 @dataclass(frozen=True)
 class TaskOutcome:
-    """What a run found.
+    """The results of a run in brief.
 
     Attributes:
-        verdict: whole sentences for a reader who reads nothing else.
+        verdict: complete sentences for a reader who reads nothing else.
         summary_metrics: main figures by name.
         table: text for the terminal; empty for none.
-        failure: a line where a result fails a check; the run is complete, and ends as a `DataError`
-            with this line.
-        level: of the verdict, of `residnet.evaluation.verdict.LEVELS`; empty where none was passed.
-        exports: what writes each model for controllers once the report stands, by its name; one
-            that fails is reported, and the complete run ends as an `ExportError`. One that is
-            withheld is reported alone.
+        failure: message if a result failed a check; the run is complete and ends with a
+            `DataError` of this message. Empty if all checks passed.
+        level: level of the verdict, one of `residnet.evaluation.verdict.LEVELS`; empty for none.
+        exports: functions that write each model for controllers, by its name; they are called
+            after the report is written. If one fails, the complete run ends with an `ExportError`;
+            a withheld model is only reported.
     """
 
     verdict: Sequence[str] = ()
@@ -158,11 +163,11 @@ class TaskOutcome:
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A run that came to its end.
+    """A completed run.
 
     Attributes:
-        folder: where everything stands.
-        outcome: what the run found.
+        folder: the run folder.
+        outcome: its results in brief.
         exports: files for controllers that it wrote.
     """
 
@@ -172,14 +177,14 @@ class FinishedRun:
 
 
 class Task(Config):
-    """A kind of run: one YAML file that is checked, carried out in a folder and reported.
+    """Settings of a run and the methods that check, carry out and report it.
 
-    A subclass adds a `task` of type `Literal["its_name"]` and the keys of its own, and says how it
-    is carried out and which sections its report has.
+    A subclass adds the field `task` of type `Literal["its_name"]` and its own keys, and implements
+    `execute` and the sections of the report.
 
     Attributes:
-        task: the kind of run.
-        name: of the run; its folder is runs/<name> unless another is given.
+        task: name of the task.
+        name: name of the run; its folder is runs/<name> unless another one is chosen.
         description: a sentence for the head of the report.
     """
 
@@ -188,16 +193,16 @@ class Task(Config):
     description: str = ""
 
     supported_commands: ClassVar[tuple[str, ...]] = ("report",)
-    """Commands that a finished run answers to; each but `report` is a method of the task."""
+    """Commands that a finished run supports; each but `report` is a method of the task."""
 
     @abstractmethod
     def execute(self, folder: RunFolder) -> TaskOutcome:
-        """Do the work, and write the results into the folder.
+        """Carry the task out and write its results into the run folder.
 
-        What the folder holds already from an interrupted run may be used.
+        Results of an interrupted run in the folder may be reused.
 
         Raises:
-            ResidnetError: where the input does not allow it.
+            ResidnetError: if the input does not allow it.
         """
 
     section_module: ClassVar[str]
@@ -207,7 +212,7 @@ class Task(Config):
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         """Draw the figures of a finished run and return the sections of its report.
 
-        Everything is taken from the folder alone; verdict, provenance and configuration are added.
+        Only the run folder is read. The caller adds verdict, provenance and configuration.
         """
         from residnet.report.run_reader import RunFiles
 
@@ -216,18 +221,18 @@ class Task(Config):
         return sections
 
     def check(self) -> None:
-        """Check what reading the config does not show, without running.
+        """Check what the validation of the config cannot: files, models and packages.
 
         Raises:
-            ResidnetError: where a file, a model or a package is missing or does not fit.
+            ResidnetError: if a file, a model or a package is missing or does not fit.
         """
 
     def input_files(self) -> Sequence[Path]:
-        """Return the files whose contents the run depends on."""
+        """Return the files whose contents determine the results."""
         return ()
 
     def provenance_seed(self) -> int:
-        """Return the seed that stands in the provenance."""
+        """Return the seed that the provenance records."""
         return 0
 
     @final
@@ -242,20 +247,22 @@ class Task(Config):
         report: bool = True,
         on_open: Callable[[Path], None] | None = None,
     ) -> FinishedRun:
-        """Carry the task out, from an empty folder to the finished mark.
+        """Check the task, carry it out in a run folder, and mark the run as finished.
 
         Args:
-            output_folder: run folder; runs/<name> where not given.
+            source: file of the config; None for a config made in Python.
+            overrides: `key=value` overrides of the config, for the provenance.
+            output_folder: run folder; None for runs/<name>.
             resume: continue an interrupted run in its folder.
             overwrite: replace an earlier run in its folder.
-            report: draw the report and export; without them a run ends after its results.
-            on_open: is told the run folder as soon as it stands; None for nobody.
+            report: write report and exports; if False, the run ends after its results.
+            on_open: called with the run folder after it is created.
 
         Raises:
-            ResidnetError: where the input does not allow it, or a result fails a check.
+            ResidnetError: if the input does not allow it, or a result fails a check.
         """
         folder_path, resolved_yaml = self.resolve_folder(output_folder), dump_config(self)
-        # before the check, which may read much
+        # refuse an unusable folder before the check, which may read large files
         RunFolder(folder_path).require_usable(resolved_yaml, resume=resume, overwrite=overwrite)
         self.check()
         provenance = Provenance(
@@ -278,7 +285,7 @@ class Task(Config):
 
     @final
     def resolve_folder(self, output_folder: Path | None) -> Path:
-        """Return the run folder: the one that was asked for, else runs/<name>."""
+        """Return the requested run folder, or runs/<name> if none was requested."""
         return output_folder or Path("runs") / self.name
 
     @final
@@ -290,16 +297,22 @@ class Task(Config):
         *,
         report: bool = True,
     ) -> FinishedRun:
-        """Carry work out in the one order: provenance, work, report, exports, finished mark.
+        """Write provenance, results, report, exports and the finished mark, in this order.
 
-        The report stands before anything is exported, and is written again with what came of it.
+        The report is written before the exports, and a second time with their outcome.
+
+        Args:
+            folder: the run folder.
+            provenance: source, overrides, seed and inputs of the run.
+            work: computes the results and writes them into the folder.
+            report: write report and exports.
 
         Raises:
-            ResidnetError: where the work does, or where its outcome fails a check.
-            ExportError: where the run is complete, but a model could not be exported.
+            ResidnetError: if the work fails, or its outcome fails a check.
+            ExportError: if the run is complete, but a model could not be exported.
         """
         provenance.write(folder)
-        # of an earlier run in this folder
+        # exports of an earlier run in this folder must not appear in the new report
         folder.manifest.remove_if_owned(folder.path / EXPORTS)
         with self.reserve_resources():
             outcome = work(folder)
@@ -310,7 +323,7 @@ class Task(Config):
                 "level": outcome.level,
             }
             folder.write_summary(self.task, outcome.verdict, **summary_fields, is_finished=False)
-            # the last time, since the report shows it and must come out the same again
+            # final version: the report shows it and must be reproducible
             provenance.write(folder)
             verdict, files, export_errors = (
                 list(outcome.verdict),
@@ -339,7 +352,7 @@ class Task(Config):
 
     @classmethod
     def write_report(cls, run: RunFolder) -> Path:
-        """Write figures and report from the run folder alone; returns the page's path."""
+        """Write figures and report from the run folder alone; returns the path of the page."""
         return cls._write_page(run, cls.report_sections(run))
 
     @classmethod
@@ -364,12 +377,12 @@ class Task(Config):
 
     @contextmanager
     def reserve_resources(self) -> Iterator[None]:
-        """Hold what the work needs of the machine while it is carried out."""
+        """Configure the machine for the duration of the work, such as the number of threads."""
         yield
 
     @classmethod
     def unsupported_verb_error(cls, run: RunFolder) -> UsageError:
-        """Return the error that names the verbs that a run has."""
+        """Return the error that lists the commands that a run supports."""
         task = load_mapping(run.resolved_config).get("task")
         return UsageError(
             f"{run.path}: the run is of task '{task}'; it has: {', '.join(cls.supported_commands)}"
@@ -378,7 +391,7 @@ class Task(Config):
 
 @contextmanager
 def torch_threads(threads: int) -> Iterator[None]:
-    """Set PyTorch's number of threads, put back in the end, and keep freed memory for tensors."""
+    """Set the number of PyTorch threads within the context; freed memory is kept for tensors."""
     import torch
 
     retain_freed_memory()
@@ -422,8 +435,8 @@ class ComputingTask(Task):
     """A task that computes with PyTorch.
 
     Attributes:
-        threads: of PyTorch; part of what makes a run repeatable. One is fastest for the small
-            products of these models.
+        threads: number of PyTorch threads; results depend on it in the last digits. One thread is
+            fastest for the small matrix products of these models.
     """
 
     threads: int = Field(default=1, ge=1, le=1_024)
@@ -437,9 +450,9 @@ class ComputingTask(Task):
 def _write_exports(
     folder: RunFolder, exports: ExportWriters
 ) -> tuple[list[Path], list[ResidnetError]]:
-    """Write all exports, and exports.json, which says what came of each; return files and faults.
+    """Write all exports and exports.json, which lists their outcomes; returns files and errors.
 
-    A model that cannot be exported does not keep the others, or the run, from coming to their end.
+    If one model cannot be exported, the other exports and the run still complete.
     """
     files, errors, rows = list[Path](), list[ResidnetError](), []
     for name, write_export in exports.items():

@@ -100,8 +100,8 @@ class ActuatorTest(Config):
         cell are left out.
 
         Raises:
-            UsageError: where a column is missing.
-            DataError: where a cell is no number, or no row is complete.
+            UsageError: if a column is missing.
+            DataError: if a cell is no number, or no row is complete.
         """
         keys = [key for key in type(self).model_fields if key not in ("files", "thrusters")]
         return [_read_columns(path, [getattr(self, key) for key in keys]) for path in self.files]
@@ -190,7 +190,7 @@ class ActuatorsTaskConfig(Task):
         """Check that the logs can be read.
 
         Raises:
-            ResidnetError: where a column is missing or holds what is no number.
+            ResidnetError: if a column is missing or holds what is no number.
         """
         for test in self._configured_tests():
             test.read_columns()
@@ -205,7 +205,7 @@ class ActuatorsTaskConfig(Task):
         actuators.yaml holds the lines for the section `actuators` of a vessel file.
 
         Raises:
-            ResidnetError: where the logs cannot be used or do not determine the actuators.
+            ResidnetError: if the logs cannot be used or do not determine the actuators.
         """
         throttle_data = step_data = bollard_data = None
         test_names, main_estimates = [], dict[str, IntervalEstimate]()

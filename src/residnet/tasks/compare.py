@@ -1,4 +1,4 @@
-"""`residnet compare`: finished fits side by side over common windows, and what they differ in."""
+"""`residnet compare`: finished fits in parallel over common windows, and what they differ in."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def compare_runs(paths: Sequence[Path], output_folder: Path) -> tuple[str, Path]
         paths: folders of the runs; the first is what the others are compared with.
 
     Raises:
-        UsageError: where a folder holds no finished fit, or the page cannot be written.
+        UsageError: if a folder holds no finished fit, or the page cannot be written.
     """
     runs = open_fit_runs(paths)
     comparisons = compare_paired(runs)
@@ -112,7 +112,7 @@ def open_fit_runs(paths: Sequence[Path]) -> list[EvaluatedRun]:
     """Return the runs in folders.
 
     Raises:
-        UsageError: where there is no finished fit in one of them, or fewer than two are named.
+        UsageError: if there is no finished fit in one of them, or fewer than two are named.
     """
     if len(paths) < 2:
         raise UsageError("compare: name at least two runs")

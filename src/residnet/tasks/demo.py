@@ -77,7 +77,7 @@ def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:
         folder: that a folder for each layout is made in.
 
     Raises:
-        UsageError: where they exist already, or cannot be written.
+        UsageError: if they exist already, or cannot be written.
     """
     manifest = Manifest(folder)
     for name in LAYOUTS:

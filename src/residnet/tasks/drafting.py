@@ -81,7 +81,7 @@ class ConfigDraft:
         """Write the config as YAML with its comments; returns the path of the file.
 
         Raises:
-            UsageError: where the file cannot be written, or is not residnet's to replace.
+            UsageError: if the file cannot be written, or is not residnet's to replace.
         """
         path = Path(file)
         with write_owned(path) as partial:
@@ -102,8 +102,8 @@ def write_new_config(
         answer_question: asks the user; None takes every default.
 
     Raises:
-        UsageError: where the file exists already, or a path does not.
-        DataError: where no log can be used.
+        UsageError: if the file exists already, or a path does not.
+        DataError: if no log can be used.
     """
     if output_file.suffix not in (".yaml", ".yml"):
         raise UsageError(
@@ -141,8 +141,8 @@ def draft_fit_config(
         answer_question: answers questions; None takes every default and marks it.
 
     Raises:
-        UsageError: where a path does not exist, or nothing drives the vessel in the logs.
-        DataError: where no log can be used.
+        UsageError: if a path does not exist, or nothing drives the vessel in the logs.
+        DataError: if no log can be used.
     """
     draft_notes = DraftNotes(answer_question)
     draft_logs = _DraftLogs(find_log_files(paths), draft_notes)
@@ -433,7 +433,7 @@ def _split_logs(
     """Return the folder of the logs and their split.
 
     Raises:
-        DataError: where nothing that can be prepared is left of the logs for a split.
+        DataError: if nothing that can be prepared is left of the logs for a split.
     """
     paths = {log.name: path for path, log in usable_logs.items()}
     common_folder = Path(os.path.commonpath([path.resolve().parent for path in usable_logs]))
@@ -538,7 +538,7 @@ _FORCE_CHANNELS = ("tau_x", "tau_y", "tau_n")
 
 
 def choose_inputs(logs: Sequence[Log], draft_notes: DraftNotes) -> tuple[str, ...]:
-    """Return the channels that drive the vessel; empty where the logs hold none.
+    """Return the channels that drive the vessel; empty if the logs hold none.
 
     Those that stay where they are, what was ordered beside what was measured, and one of two that
     move alike are left out.
@@ -723,7 +723,7 @@ def _are_duplicates(first: np.ndarray, second: np.ndarray) -> bool:
 
 
 def missing_control(names: Sequence[str], dof: DegreesOfFreedom = SURGE_SWAY_YAW) -> str:
-    """Return what no input does, `drives` or `steers`; empty where both are done.
+    """Return what no input does, `drives` or `steers`; empty if both are done.
 
     A vessel that does not turn needs none that steers, one that does not move none that drives.
 

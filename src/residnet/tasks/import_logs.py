@@ -45,7 +45,7 @@ class ImportConfig(Task):
 
     Attributes:
         reader: how the recordings are read.
-        root: folder that `logs` start from; the current folder where not given.
+        root: folder that `logs` start from; the current folder if not given.
         logs: files, folders (for readers of folders) or patterns such as `raw_*`.
     """
 
@@ -60,7 +60,7 @@ class ImportConfig(Task):
         The smallest recording of each kind of file is read, unless it is large.
 
         Raises:
-            ResidnetError: where a pattern matches nothing, or a recording cannot be read as the
+            ResidnetError: if a pattern matches nothing, or a recording cannot be read as the
                 config says.
         """
         reader = self.reader.build()
@@ -82,8 +82,8 @@ class ImportConfig(Task):
         """Read the recordings, and write logs and findings.
 
         Raises:
-            UsageError: where a recording, topic or package is missing.
-            DataError: where a recording cannot be used; those before it have been written.
+            UsageError: if a recording, topic or package is missing.
+            DataError: if a recording cannot be used; those before it have been written.
         """
         paths = self._find_paths()
         reader, names = self.reader.build(), assign_log_names(paths)

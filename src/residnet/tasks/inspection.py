@@ -56,7 +56,7 @@ class InspectionResult:
         """Write the findings as JSON.
 
         Raises:
-            UsageError: where the file cannot be written.
+            UsageError: if the file cannot be written.
         """
         with write_owned(file) as temporary_path:
             temporary_path.write_text(json.dumps(self.content, indent=1) + "\n")
@@ -66,11 +66,11 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult
     """Return what the doctor finds in each log and between them.
 
     Args:
-        config: a run or import whose channel map reads them; None where they describe themselves,
+        config: a run or import whose channel map reads them; None if they describe themselves,
             or to have a map drafted.
 
     Raises:
-        ResidnetError: where a path does not exist, the config cannot be used, or the only log
+        ResidnetError: if a path does not exist, the config cannot be used, or the only log
             cannot be read.
     """
     task, fit_config = (None, None) if config is None else _load_logs_task(config)
@@ -144,7 +144,7 @@ def _load_logs_task(config: Path) -> tuple[Any, FitConfig | None]:
     """Return the task of a config that says how its logs are read, and the same if it is a fit.
 
     Raises:
-        ConfigError: where it is no config of logs.
+        ConfigError: if it is no config of logs.
     """
     # logs that need no config need neither models nor torch
     from residnet.io.sources import MeasuredLogs

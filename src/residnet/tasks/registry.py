@@ -1,6 +1,8 @@
-"""Kinds of run, their configs read, finished runs opened, and what `residnet list` and `runs` show.
+"""The registry of tasks: read configs, open finished runs, list parts and runs.
 
-Nothing here waits for PyTorch: a task is imported when a config names it.
+A task is imported when a config names it, so that this module does not wait for PyTorch. The entry
+of a task names the class of its settings. A task that is a package, such as `fit`, has its work in
+the module `execute` beside it (`residnet.runs.task.PackageTask`).
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ SINGLE_TASKS = {
     "breeding": f"{_DOCUMENTS}.halvorsen2019.breeding:BreedingTaskConfig",
     "sea_trial": f"{_DOCUMENTS}.halvorsen2019.sea_trial:SeaTrialTaskConfig",
 }
-"""All but the sweep, which varies any of these."""
+"""All tasks but the sweep, which varies any of these."""
 _ALL_TASKS = {**SINGLE_TASKS, "sweep": "residnet.tasks.sweep:SweepConfig"}
 TaskConfig = Annotated[Task, PluginUnion("residnet.tasks", _TASK_BASE, _ALL_TASKS, key="task")]
 SweepableConfig = Annotated[
@@ -70,24 +72,24 @@ _AGE_UNITS = (("d", 86_400.0), ("h", 3_600.0), ("min", 60.0), ("s", 1.0))
 
 
 def load_task(path: Path, overrides: Sequence[str] = ()) -> Task:
-    """Return the task of a config file with overrides.
+    """Read the task of a config file with overrides.
 
     Args:
         path: YAML file, or the name of a config that comes with residnet, such as `quickstart`.
-        overrides: `dotted.key=value`, in order; `~dotted.key` takes a key away.
+        overrides: `dotted.key=value`, in order; `~dotted.key` removes a key.
 
     Raises:
-        ConfigError: one line with file or override, key, fault and the nearest valid name.
+        ConfigError: one line with file or override, key, error and the nearest valid name.
     """
     task: Task = load_config(resolve_config_file(path), overrides, TaskConfig)
     return task
 
 
 def resolve_config_file(path: Path) -> Path:
-    """Return the file of a config: the path itself, or that of a shipped config of this name.
+    """Return the file of a config: the path itself, or the shipped config of this name.
 
     Raises:
-        ConfigError: where there is neither; the message names the nearest shipped config.
+        ConfigError: if neither exists; the message names the nearest shipped config.
     """
     try:
         if path.is_file() or path.suffix or path.is_absolute():
@@ -106,15 +108,13 @@ def resolve_config_file(path: Path) -> Path:
 def get_task_class(run: RunFolder) -> type[Task]:
     """Return the class of a run's task, by the name in its resolved.yaml.
 
-    The class alone can write the report, so that a run can be reported whose inputs have gone.
+    The class is enough to write the report, even if the inputs of the run no longer exist.
 
     Raises:
-        UsageError: where there is no such task, or it cannot be used.
+        UsageError: if there is no such task, or it cannot be used.
     """
-    plugin_union, name = (
-        get_plugin_union(TaskConfig),
-        str(load_mapping(run.resolved_config).get("task")),
-    )
+    plugin_union = get_plugin_union(TaskConfig)
+    name = str(load_mapping(run.resolved_config).get("task"))
     if name not in (task_names := plugin_union.kind_names()):
         raise UsageError(f"{run.resolved_config}: no task '{name}'{suggest_name(name, task_names)}")
     task_type: type[Task] | EntryPointPart = plugin_union.find_kind(name)
@@ -124,39 +124,39 @@ def get_task_class(run: RunFolder) -> type[Task]:
 
 
 def open_finished_task(path: Path, command: str) -> tuple[RunFolder, Any]:
-    """Return the folder and the config of a finished run whose task answers to a verb.
+    """Return folder and config of a finished run whose task supports a command.
 
     Raises:
-        UsageError: where there is no finished run, or its task lacks the verb.
+        UsageError: if there is no finished run, or its task does not support the command.
     """
     run = RunFolder.open(path)
     task_type = get_task_class(run)
     if command not in task_type.supported_commands:
-        # said before the config is read: its inputs may have gone
+        # raised before the config is read: its inputs may no longer exist
         raise task_type.unsupported_verb_error(run)
     return run, load_config(run.resolved_config, [], task_type)
 
 
 def report_run(path: Path) -> Path:
-    """Write figures and report of a finished run from its folder alone; returns the page's path.
+    """Write figures and report of a finished run from its folder alone; returns the page.
 
     Raises:
-        UsageError: where there is no finished run, or its task is not known.
+        UsageError: if there is no finished run, or its task is unknown.
     """
     run = RunFolder.open(path)
     require_free_space(path)
     require_recorded(path)
-    # before the figures are drawn
+    # refuse to replace files of the user before any figure is drawn
     run.manifest.require_recorded_unchanged(run.report.name, run.figures.name)
     with name_damaged_key(path):
         page = get_task_class(run).write_report(run)
-    # a study writes its comparison anew with the report
+    # the report of a study rewrites its comparison file
     write_checksums(path)
     return page
 
 
 def list_catalogue(part_kind: str) -> list[tuple[str, str]]:
-    """Return names and one-line descriptions of what there is, third-party parts included.
+    """Return names and one-line descriptions of all parts of a kind, third-party ones included.
 
     Args:
         part_kind: `vessels`, `heads`, `manoeuvres`, `readers`, `tasks`, `baselines`, `formats` or
@@ -192,22 +192,25 @@ def _vessel_description(name: str, file: Path) -> str:
 
 
 def list_runs(folder: Path) -> list[dict[str, Any]]:
-    """Return what lies below a folder of runs, the newest first.
+    """Describe the runs below a folder, the newest first.
 
-    Each entry has run, task, state (`finished`, `unfinished` or `damaged`), best (name, value and
-    unit of its first main figure, or None) and age in s.
+    Returns:
+        One entry for each run: run, task, state (`finished`, `unfinished` or `damaged`), best
+        (name, value and unit of its first main figure, or None) and age in s.
 
     Raises:
-        UsageError: where the folder does not exist.
+        UsageError: if the folder does not exist.
     """
     if not folder.is_dir():
-        raise UsageError(f"{folder}: no such folder; runs lie in runs/ unless --out says otherwise")
+        raise UsageError(
+            f"{folder}: no such folder; runs are in the folder runs unless --out was given"
+        )
     entries = [_describe_run(file.parent) for file in folder.rglob("resolved.yaml")]
     return sorted(entries, key=lambda entry: float(entry["age"]))
 
 
 def format_runs(folder: Path, entries: Sequence[Mapping[str, Any]]) -> str:
-    """Return the runs as a table for the terminal."""
+    """Format the list of runs as a table for the terminal."""
     if not entries:
         return f"{folder}: no runs"
 

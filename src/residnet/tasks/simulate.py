@@ -56,7 +56,7 @@ from residnet.runs.task import ComputingTask, SummaryMetric, TaskOutcome
 _MAX_SHOWN_ROWS = 24
 """Manoeuvres whose indices are shown on the terminal; more stand in a file."""
 DEFAULT_TIME_STEP = 0.05
-"""Step in s between the samples of a simulation, where none is given."""
+"""Step in s between the samples of a simulation, if none is given."""
 
 
 class ModelChoice(Config):
@@ -66,7 +66,7 @@ class ModelChoice(Config):
         run: folder of the run.
         name: of the model; `selected` is the one chosen on validation data.
         actuators: vessel (name or file) whose actuators turn commands into the model's inputs; the
-            programme's vessel where absent.
+            programme's vessel if absent.
         inputs: instead of a vessel's actuators, each input of the model by its share in drive and
             steer, with limits and rates.
     """
@@ -87,7 +87,7 @@ class ModelChoice(Config):
         """The folder of the model in its run.
 
         Raises:
-            UsageError: where the run holds no such model.
+            UsageError: if the run holds no such model.
         """
         return self.run / "models" / chosen_model(self.run, self.name)
 
@@ -102,10 +102,10 @@ class Programme(Config):
         families: further ones drawn at random by `seed`.
         duration: of manoeuvres that give none; for one with a stop condition the time after which
             it has failed.
-        step: of the logs; that of the model where there is one, else 0.05 s.
+        step: of the logs; that of the model if there is one, else 0.05 s.
         substeps: steps of the vessel within one step of the logs.
         initial: states (by name) that trials start from, where not as the vessel's kind does.
-        length: of the hull for indices in lengths; that of the vessel where absent.
+        length: of the hull for indices in lengths; that of the vessel if absent.
         reader: of logs that are replayed.
         noise: of the sensors; indices are taken from the motion itself.
         disturbance: a learned model feels only the wind, if it was fitted with it.
@@ -167,7 +167,7 @@ class Programme(Config):
         """The manoeuvres, with the logs of replays read.
 
         Raises:
-            ResidnetError: where a log cannot be read.
+            ResidnetError: if a log cannot be read.
         """
         manoeuvres, reader = self.sample_manoeuvres(), self.reader.build()
         for manoeuvre in manoeuvres:
@@ -177,7 +177,7 @@ class Programme(Config):
 
     @property
     def hull_length(self) -> float | None:
-        """The length of the hull in m; None where it is not known."""
+        """The length of the hull in m; None if it is not known."""
         vessel = self.vessel or (self.model.actuators if self.model is not None else None)
         is_length_given = self.length is not None or vessel is None
         return self.length if is_length_given else load_vessel(str(vessel)).length.value
@@ -186,7 +186,7 @@ class Programme(Config):
         """Return what flies, each with what surrounds it: the vessel, then the model.
 
         Raises:
-            UsageError: where one of them cannot fly the manoeuvres.
+            UsageError: if one of them cannot fly the manoeuvres.
         """
         model = None if self.model is None else self._build_model_craft(self.model)
         step = self.step or (DEFAULT_TIME_STEP if model is None else model[0].dynamics.dt)
@@ -205,7 +205,7 @@ class Programme(Config):
         """Build everything that flies, and the source of every manoeuvre.
 
         Raises:
-            ResidnetError: where that is not possible.
+            ResidnetError: if that is not possible.
         """
         times = torch.arange(2, dtype=torch.float64) * (self.step or DEFAULT_TIME_STEP)
         for craft, _ in self.build_crafts():
@@ -322,7 +322,7 @@ class SimulateConfig(ComputingTask):
         """Check that models and logs are there and fit the manoeuvres.
 
         Raises:
-            ResidnetError: where they do not.
+            ResidnetError: if they do not.
         """
         if self.programme is not None:
             self.programme.check()
@@ -350,7 +350,7 @@ class SimulateConfig(ComputingTask):
         config lists are a failure.
 
         Raises:
-            UsageError: where something cannot fly the manoeuvres.
+            UsageError: if something cannot fly the manoeuvres.
         """
         if self.programme is not None:
             flights_by_craft = [

@@ -98,8 +98,8 @@ class StudyConfig(Task):
         """Check that every variant is a valid fit, holds the model and finds its files.
 
         Raises:
-            ConfigError: where one does not.
-            UsageError: where one has no such model.
+            ConfigError: if one does not.
+            UsageError: if one has no such model.
         """
         for variant in self.variants:
             fit = load_config(self.base, self.build_overrides(variant, self.seeds[0]), FitConfig)
@@ -121,7 +121,7 @@ class StudyConfig(Task):
         """Fit all variants and write the comparison; runs that are there already are kept.
 
         Raises:
-            ResidnetError: where a variant cannot be run, or the system ends a process.
+            ResidnetError: if a variant cannot be run, or the system ends a process.
         """
         folder_by_job = {
             (variant, seed): folder.path / "variants" / f"{variant}.{seed}"
@@ -247,7 +247,7 @@ def compute_window_errors(run: Path, model: str, split: str) -> pd.DataFrame:
         diverged has the error of `zero`) and diverged.
 
     Raises:
-        DataError: where the run holds no such model or split.
+        DataError: if the run holds no such model or split.
     """
     import pandas as pd
 

@@ -200,7 +200,7 @@ class FreeRunObjective(Config):
 
     @property
     def monitored_model(self) -> str | None:
-        """The model whose training may be ended early; None where it is not named."""
+        """The model whose training may be ended early; None if it is not named."""
         return None if self.model == "selected" else self.model
 
     @property
@@ -212,7 +212,7 @@ class FreeRunObjective(Config):
         """Check that runs of a task have this objective.
 
         Raises:
-            UsageError: where the task is no fit, or has no such model.
+            UsageError: if the task is no fit, or has no such model.
         """
         if task.task != "fit":
             raise UsageError(
@@ -229,7 +229,7 @@ class FreeRunObjective(Config):
         """Return the objective of a finished run.
 
         Raises:
-            DataError: where the run has no such error.
+            DataError: if the run has no such error.
         """
         files = RunFiles(run.path)
         model = files.selected if self.model == "selected" else self.model
@@ -269,7 +269,7 @@ class FigureObjective(Config):
         """Check that the figure may be sought.
 
         Raises:
-            UsageError: where the task is a fit, whose main figures are errors on test data.
+            UsageError: if the task is a fit, whose main figures are errors on test data.
         """
         if task.task == "fit":
             raise UsageError(
@@ -281,7 +281,7 @@ class FigureObjective(Config):
         """Return the objective of a finished run.
 
         Raises:
-            DataError: where the run has no such figure.
+            DataError: if the run has no such figure.
         """
         summary_figures = run.read_summary()["figures"]
         if self.name not in summary_figures:
@@ -293,7 +293,7 @@ class FigureObjective(Config):
 
 
 class ProcessesConfig(Config):
-    """Processes of this machine, side by side.
+    """Processes of this machine, in parallel.
 
     Attributes:
         kind: of the runner.
@@ -356,7 +356,7 @@ class RayConfig(Config):
         """Check that Ray is installed.
 
         Raises:
-            MissingPackageError: where it is not.
+            MissingPackageError: if it is not.
         """
         require_package("ray", "runner.kind: ray", "ray")
 
@@ -370,7 +370,7 @@ class RayConfig(Config):
         """Hold a connection to Ray, whose processes end with this one.
 
         Raises:
-            FitError: where the cluster cannot be reached, or ends a trial that was not lost.
+            FitError: if the cluster cannot be reached, or ends a trial that was not lost.
         """
         self.require_available()
         import ray
@@ -483,7 +483,7 @@ class SweepConfig(Task):
             values: by key, as the distributions know them.
 
         Raises:
-            ConfigError: where they do not make a valid config.
+            ConfigError: if they do not make a valid config.
         """
         trial_values = {key: values[key] for key in self.space}
         value_overrides = [
@@ -498,7 +498,7 @@ class SweepConfig(Task):
         The ends of a range are tried, each with the first values of the other keys.
 
         Raises:
-            ResidnetError: where one does not, or the objective does not fit the task.
+            ResidnetError: if one does not, or the objective does not fit the task.
         """
         require_package("optuna", "task sweep", "sweep")
         self.runner.require_available()
@@ -522,7 +522,7 @@ class SweepConfig(Task):
         """Carry out all trials and write what they found; those that are done already are kept.
 
         Raises:
-            ResidnetError: where the system ends a process, or a journal is damaged.
+            ResidnetError: if the system ends a process, or a journal is damaged.
         """
         journal = folder.path / JOURNAL_FILE
         for file in (journal, journal.with_name(f"{JOURNAL_FILE}.lock")):
@@ -577,7 +577,7 @@ def open_optuna_study(config: SweepConfig, folder: Path) -> optuna.Study:
     """Return the study of a sweep, new or as an interrupted sweep left it.
 
     Raises:
-        UsageError: where the journal is damaged.
+        UsageError: if the journal is damaged.
     """
     import optuna
     from optuna.storages import JournalStorage
@@ -625,7 +625,7 @@ class TrialQueue:
                 study.enqueue_trial(dict(zip(config.space, values, strict=True)))
 
     def start_next(self) -> optuna.Trial | None:
-        """Return the next trial to be carried out; None where all have begun."""
+        """Return the next trial to be carried out; None if all have begun."""
         import optuna
 
         if self._interrupted:
@@ -678,7 +678,7 @@ class TrialResult(NamedTuple):
     """How a trial ended.
 
     Attributes:
-        value: of the objective; None where there is none.
+        value: of the objective; None if there is none.
         is_pruned: whether it was ended early.
         error_message: one line where it failed; else empty.
         seconds: that its run took.
@@ -737,7 +737,7 @@ def run_sweep_trial(
 def make_pruning_callback(
     config: SweepConfig, folder: Path, number: int
 ) -> Callable[[Progress], None] | None:
-    """Return what hears of a trial's progress; None where no trial is ended early."""
+    """Return what hears of a trial's progress; None if no trial is ended early."""
     if config.pruning is None:
         return None
     import optuna

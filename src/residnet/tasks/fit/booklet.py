@@ -49,7 +49,7 @@ def write_booklet(
         limit: [n] of what moves beyond which a free run has diverged.
 
     Raises:
-        ResidnetError: where the model cannot fly the manoeuvres, or no interval can be had.
+        ResidnetError: if the model cannot fly the manoeuvres, or no interval can be had.
     """
     import pandas as pd
 
@@ -113,8 +113,8 @@ def require_flyable(config: BookletConfig, fitted_model: FittedModel) -> None:
     """Check that a model can be steered through the booklet's manoeuvres; nothing is flown.
 
     Raises:
-        ConfigError: where an input or a state is not the model's.
-        UsageError: where the model lacks what a manoeuvre needs.
+        ConfigError: if an input or a state is not the model's.
+        UsageError: if the model lacks what a manoeuvre needs.
     """
     craft = _build_craft(config, fitted_model, config.inputs)
     make_manoeuvre_source(
@@ -259,7 +259,7 @@ def _make_page(
     """One manoeuvre with its indices by flight, beside those of the log that it repeats.
 
     Raises:
-        DataError: where the fitted model itself does not end the manoeuvre, or diverges.
+        DataError: if the fitted model itself does not end the manoeuvre, or diverges.
     """
     manoeuvre, name = flights[0].manoeuvre, flights[0].true_log.name
     if flights[0].fault_text:

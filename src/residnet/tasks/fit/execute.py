@@ -92,7 +92,7 @@ def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:
     Logs that ran in currents are taken through the water.
 
     Raises:
-        ResidnetError: where the logs cannot be used, or do not determine a model.
+        ResidnetError: if the logs cannot be used, or do not determine a model.
     """
     begin_stage(f"{config.name}: reading logs")
     raw_logs = config.load_logs()
@@ -164,13 +164,13 @@ def evaluate_on_logs(
     order.
 
     Args:
-        output_folder: folder of the results; RUN/external-<time> where none is given.
+        output_folder: folder of the results; RUN/external-<time> if none is given.
         resume: carry out an interrupted evaluation of the same logs again in its folder.
         overwrite: replace an earlier evaluation in its folder.
 
     Raises:
-        DataError: where a log cannot be used or is too short.
-        UsageError: where a path or a channel is missing, or the folder may not be used.
+        DataError: if a log cannot be used or is too short.
+        UsageError: if a path or a channel is missing, or the folder may not be used.
     """
     folder_path = output_folder or run.path / time.strftime("external-%Y%m%dT%H%M%S")
     resolved = dump_config(config)
@@ -230,9 +230,9 @@ def export_model(config: FitConfig, request: ExportRequest) -> Path:
     on validation data.
 
     Raises:
-        UsageError: where there is no such model.
-        WithheldError: where it is worse than doing without it, but for `asked.anyway`.
-        ExportError: where the exported model does not agree with the one that it came from.
+        UsageError: if there is no such model.
+        WithheldError: if it is worse than doing without it, but for `asked.anyway`.
+        ExportError: if the exported model does not agree with the one that it came from.
     """
     run, name, metrics = request.run, request.model, request.run.read_metrics()
     model_name = str(metrics.get(name, metrics["selected"])) if name in _MODEL_ALIASES else name

@@ -180,7 +180,7 @@ def read_external_logs(
     They are read as the fit read its own; canonical files are recognised by their own mark.
 
     Raises:
-        ResidnetError: where a file cannot be read.
+        ResidnetError: if a file cannot be read.
     """
     data = config.data
     fit_reader = CanonicalConfig() if isinstance(data, SimulatedTrials) else data.reader

@@ -90,7 +90,7 @@ class MonitoredLog:
 
     Attributes:
         name: of the log.
-        alarm_time: time in s from its start to the first alarm; None where there was none.
+        alarm_time: time in s from its start to the first alarm; None if there was none.
         final_verdict: the verdict at its end.
         window_seconds: length of its windows in s.
         scores: the largest score of any cause after each of them.
@@ -108,7 +108,7 @@ class MonitoredLog:
         return len(self.scores)
 
     def to_json(self) -> dict[str, Any]:
-        """Return what was found as JSON takes it."""
+        """Return the result as JSON."""
         return {
             "log": self.name,
             "windows": self.n_windows,
@@ -153,8 +153,8 @@ class FittedModelService:
         settings: of `MonitorConfig`.
 
     Raises:
-        UsageError: where there is no such model or path.
-        DataError: where a log cannot be used, or clean logs are too few.
+        UsageError: if there is no such model or path.
+        DataError: if a log cannot be used, or clean logs are too few.
     """
 
     def __init__(
@@ -184,7 +184,7 @@ class FittedModelService:
         """Watch the logs one after the other; what is looked back over goes on between them.
 
         Raises:
-            DataError: where a log holds no window.
+            DataError: if a log holds no window.
         """
         online_detector, monitored = OnlineChangeDetector(self.detector), []
         for log in self.logs:
@@ -299,7 +299,7 @@ class RefitResult:
 
     Attributes:
         recursive_refit: the changes that were put into the model.
-        folder: of the new run; None where the monitor named no change to refit.
+        folder: of the new run; None if the monitor named no change to refit.
         old: mean free-run error (NRMSE) of the old model on the logs that were held out.
         new: that of the new one.
         worth: whether the new one is better by more than a paired interval leaves open.
@@ -330,7 +330,7 @@ class RefitResult:
         return [*lines, f"refit: on the logs held out: {error_text}", f"refit: {conclusion}"]
 
     def to_json(self) -> dict[str, Any]:
-        """Return what was found as JSON takes it."""
+        """Return the result as JSON."""
         has_run = self.folder is not None
         return {
             "changes": [
@@ -355,7 +355,7 @@ def require_refit_folder(run: RunFolder, output_folder: Path, config: FitConfig)
     """Check that a refit may write its run, before any work.
 
     Raises:
-        UsageError: where the folder exists, or lies within that of the old run.
+        UsageError: if the folder exists, or lies within that of the old run.
     """
     if output_folder.resolve().is_relative_to(run.path.resolve()):
         raise UsageError(
@@ -374,8 +374,8 @@ def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
         service: the model, the watch over it and the new logs.
 
     Raises:
-        UsageError: where the folder may not be used, or the model has no parameters to move.
-        DataError: where there are fewer than two logs, or one is too short.
+        UsageError: if the folder may not be used, or the model has no parameters to move.
+        DataError: if there are fewer than two logs, or one is too short.
     """
     config, original_model = service.config, service.fitted_model
     if len(service.logs) < 2:
