@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from residnet.io.readers.clock_repair import repair_clock
 from residnet.io.readers.quantities import mask_interpolated_headings
-from residnet.io.readers.written import repair_clock
 
 T = 0.1 * np.arange(300)
 COLUMNS = [np.sin(T)]

@@ -24,13 +24,13 @@ from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.io.drafting.questions import DraftNotes, Question
 from residnet.io.drafting.tables import draft_tables
-from residnet.io.readers import ReaderConfig
-from residnet.io.words import (
+from residnet.io.header_vocabulary import (
     match_input_channel,
     match_state_channel,
     parse_header_unit,
     parse_name,
 )
+from residnet.io.readers import ReaderConfig
 from residnet.tasks.inspection import inspect_logs
 
 GERMAN = Style(

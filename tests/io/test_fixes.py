@@ -11,8 +11,8 @@ import pytest
 
 from residnet.core.errors import DataError
 from residnet.core.log import Log
+from residnet.io.readers.angles import parse_degrees
 from residnet.io.readers.tables import CsvConfig
-from residnet.io.readers.written import parse_degrees
 
 pytest.importorskip("pyproj")
 T = np.arange(0.0, 60.0, 0.2)
@@ -81,7 +81,7 @@ def test_ways_to_write_a_latitude(cell: str) -> None:
         ("N59S", "is no latitude"),
         ("-59N", "is no latitude"),
         ("59E", "no hemisphere of latitude"),
-        ("10 30 O", "O is east to some"),
+        ("10 30 O", "set letter_o"),
         ("noon", "is no latitude"),
     ],
 )

@@ -16,7 +16,7 @@ from residnet.core.log import Log
 from residnet.io.drafting.reading import read_mixed_formats
 from residnet.io.readers import ReaderConfig
 from residnet.io.readers.base import hash_files
-from residnet.io.readers.joined import estimate_clock_offset, group_trip_files
+from residnet.io.readers.joined_files import estimate_clock_offset, group_trip_files
 
 LATE = {0: 12.3, 1: -31.7, 2: 5.05}
 """What the clock of the motors shows less than that of the receiver, in s."""
@@ -149,7 +149,7 @@ def test_a_shift_that_is_given_and_what_is_wrong(tmp_path: Path) -> None:
     reader = validate_config(reader_of(shift={"cmd": -7.0}), ReaderConfig, "here").build()
     read, both = reader.read(tmp_path / "pos1.csv"), [tmp_path / "pos1.csv", tmp_path / "cmd1.csv"]
     np.testing.assert_array_equal(read["k"], t**2)
-    assert reader.files(both[0]) == both
+    assert reader.list_member_files(both[0]) == both
     assert read.meta["parts"] == {"pos": hash_files(both[:1]), "cmd": hash_files(both[1:])}
     assert reader.select_logs(sorted(tmp_path.iterdir())) == [tmp_path / "pos1.csv"]
     with pytest.raises(DataError, match="its name holds no 'pos'"):

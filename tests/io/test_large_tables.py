@@ -11,7 +11,8 @@ import pytest
 from residnet.core.config import validate_config
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.io.readers import ReaderConfig, texts
+from residnet.io.readers import ReaderConfig
+from residnet.io.readers import text_tables
 from residnet.io.readers.base import LogReader
 
 
@@ -23,8 +24,8 @@ def reader(kind: str = "csv") -> LogReader:
 
 
 def in_pieces(path: Path, monkeypatch: pytest.MonkeyPatch, *, rows: int) -> Log:
-    monkeypatch.setattr(texts, "_PIECE", rows)
-    monkeypatch.setattr(texts, "_BLOCK", 10 * rows)
+    monkeypatch.setattr(text_tables, "_CHUNK_ROWS", rows)
+    monkeypatch.setattr(text_tables, "_BLOCK_BYTES", 10 * rows)
     return reader().read(path)
 
 

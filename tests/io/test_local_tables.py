@@ -14,7 +14,7 @@ from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.units import canonical_unit, to_si
 from residnet.io.readers import ReaderConfig
-from residnet.io.readers.written import detect_date_order, is_date_column, parse_texts
+from residnet.io.readers.timestamps import detect_date_order, is_date_column, parse_texts
 
 SPELT = {
     "deg/min": "deg/min|° / MIN|度/分",
@@ -134,7 +134,7 @@ def test_an_excel_sheet(tmp_path: Path) -> None:
     ("time", "message"),
     [
         ({"column": "t", "unit": "date", "zone": "Europe/Berlim"}, "no time zone is called"),
-        ({"column": "t", "zone": "UTC"}, "zone is for dates; set unit: date"),
+        ({"column": "t", "zone": "UTC"}, "zone applies to dates only; set unit: date"),
         ({"column": "t", "unit": "m"}, r"time.unit: unit 'm' does not measure \[s\]"),
     ],
 )

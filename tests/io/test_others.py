@@ -222,7 +222,7 @@ def test_gusts_on_straight_runs_are_no_dead_rudder(fleets: list[Fleet]) -> None:
 
 def test_a_log_of_one_sample_is_passed_over(fleets: list[Fleet]) -> None:
     fleet = fleets[0]
-    short = fleet.logs[0].rows(slice(1)).replace(name="short")
+    short = fleet.logs[0].select_rows(slice(1)).replace(name="short")
     assert found([short, *fleet.logs], fleet) == found(fleet.logs, fleet)
 
 

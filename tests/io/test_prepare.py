@@ -77,7 +77,7 @@ def test_a_channel_that_nothing_uses_changes_nothing(kind: str, step: float) -> 
         for content in (channels, {**channels, "voltage": other})
     )
     assert alone.trainable.sum() > 100
-    for name in ("y", "smooth", "nu_dot", "w", "piece", "usable", "good"):
+    for name in ("y", "smoothed", "nu_dot", "w", "segment", "usable", "trainable"):
         np.testing.assert_array_equal(getattr(alone, name), getattr(beside, name))
 
 

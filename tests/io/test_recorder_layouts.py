@@ -22,7 +22,7 @@ from residnet.io.readers import ReaderConfig
 from residnet.io.readers.detect import AutoConfig, detect_recording_format
 from residnet.io.readers.formats.topic_folder import TopicFolderConfig
 from residnet.io.readers.recording import ALL_FIELDS
-from residnet.io.readers.texts import detect_encoding
+from residnet.io.readers.text_tables import detect_encoding
 from residnet.io.split import extract_segment
 from residnet.tasks.drafting import choose_inputs
 
@@ -221,9 +221,9 @@ def test_times_that_are_days_whole_seconds_or_beside_a_counter(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b"1,2,3\n4,5,6\n7,8,9\n", "no line holds names of columns"),
+        (b"1,2,3\n4,5,6\n7,8,9\n", "no line with column names"),
         (b"\xff\xfea\x00\x00\xd8;\x00b\x00\n\x001\x00", "not UTF-16 text"),
-        (b"name,vessel\na,b\nc,d\n", "names of columns|hold numbers"),
+        (b"name,vessel\na,b\nc,d\n", "column names|hold numbers"),
         ("\n".join(GERMAN).encode().replace(b"0,4", b"\x00\x00\x00"), r"zero byte|no text"),
         (
             b"time,speed,Latitude,Longitude\n0,1,54 68.1N,10 2.3E\n1,2,54 18.2N,10 2.4E\n",

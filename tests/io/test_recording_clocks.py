@@ -10,8 +10,8 @@ from printed_times import EPOCH, printed
 
 from residnet.core.errors import DataError, UsageError
 from residnet.io.readers.recording import Recording, Series
+from residnet.io.readers.timestamps import parse_numbers, parse_texts
 from residnet.io.readers.topics import align_clocks, topic_statistics
-from residnet.io.readers.written import parse_numbers, parse_texts
 
 RNG = np.random.default_rng(7)
 

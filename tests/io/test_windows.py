@@ -74,13 +74,13 @@ def expected_starts(length: int) -> list[int]:
 def test_windows_start_where_the_loop_says_and_hold_the_logs_samples(length: int) -> None:
     starts = STORE.find_starts(length)
     assert starts.tolist() == expected_starts(length)
-    names = ("y", "smooth", "nu_dot", "w", "usable", "good")
+    names = ("y", "smoothed", "nu_dot", "w", "usable", "trainable")
     taken = {name: STORE.take_windows(getattr(STORE, name), starts, length) for name in names}
     for i, row in enumerate(starts.tolist()):
         number, k = ROWS[row]
         for name, values in taken.items():
             own = getattr(LOGS[number], name)[k : k + length]
-            if name in ("y", "smooth"):
+            if name in ("y", "smoothed"):
                 # positions are counted from the log's start
                 own = own - np.concatenate((LOGS[number].y[0, :2], np.zeros(4)))
             np.testing.assert_array_equal(values[i].numpy(), own)
@@ -120,7 +120,7 @@ def test_too_long_a_window_is_one_line_and_unknown_values_reach_no_tensor() -> N
             wanted()
         assert "\n" not in str(caught.value)
     assert bool(np.isnan(np.concatenate([log.y for log in LOGS])).any())
-    for name in ("y", "smooth", "nu_dot", "w"):
+    for name in ("y", "smoothed", "nu_dot", "w"):
         assert bool(torch.isfinite(getattr(STORE, name)).all())
 
 
@@ -169,7 +169,7 @@ def test_a_data_module_gives_whole_windows_stage_by_stage(
     starts = WindowSampler(STORE.find_starts(5), 4, 2).draw_epoch(9, 2)[1]
     for row, start in enumerate(starts.tolist()):
         whole = slice(start, start + 5)
-        for part in ("y", "smooth", "nu_dot", "w", "recorded", "usable", "good"):
+        for part in ("y", "smoothed", "nu_dot", "w", "recorded", "usable", "trainable"):
             assert torch.equal(getattr(anywhere, part)[row], getattr(STORE, part)[whole])
     past, w_past = STORE.take_history(starts, 2)
     assert torch.equal(anywhere.past_y, past)

@@ -1,1 +1,1 @@
-"""Files of measured logs: readers, the map of their channels, drafted configs and splits."""
+"""Input of measured logs: readers, channel maps, drafted configs and splits of the data."""

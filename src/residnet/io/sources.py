@@ -1,4 +1,4 @@
-"""Where a run's logs come from: measured files through a reader, or simulated sea trials."""
+"""Sources of the logs of a run: measured files, or simulated sea trials."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ LogsBySplit = dict[str, list[Log]]
 
 
 class MeasuredLogs(Config):
-    """Logs on disk, read through one channel map and split by file.
+    """Measured logs in files, read by one reader and assigned to splits.
 
     Attributes:
         reader: format of the files and the channel map.
-        split: which files are for training, validation and test.
+        split: files for training, validation and test.
     """
 
     kind: Literal["measured"] = "measured"
@@ -36,11 +36,10 @@ DataConfig = Annotated[MeasuredLogs | SimulatedTrials, Field(discriminator="kind
 
 
 def read_split_logs(config: MeasuredLogs | SimulatedTrials) -> LogsBySplit:
-    """Return the logs of a run by split (train, validation, test).
+    """Return the logs of each split (train, validation, test).
 
     Raises:
-        ResidnetError: where a file is missing or its contents cannot be used, or two splits share
-            measurements.
+        ResidnetError: if a file is missing or cannot be used, or two splits share measurements.
     """
     if isinstance(config, SimulatedTrials):
         manoeuvres = config.draw_manoeuvres()
@@ -50,7 +49,8 @@ def read_split_logs(config: MeasuredLogs | SimulatedTrials) -> LogsBySplit:
         ):
             logs_by_split[split].append(log)
         return logs_by_split
-    reader, paths = config.reader.build(), config.split.list_files()
+    reader = config.reader.build()
+    paths = config.split.list_files()
     names_by_path = assign_log_names(paths)
     logs_by_path: dict[Path, Log] = {}
     n_samples = 0
@@ -58,6 +58,7 @@ def read_split_logs(config: MeasuredLogs | SimulatedTrials) -> LogsBySplit:
         report_progress("reading logs", file_index, len(paths))
         loaded_log = reader.read(path).replace(name=names_by_path[path])
         n_samples += len(loaded_log)
+        # from this number of samples on, logs are memory-mapped
         logs_by_path[path] = (
             loaded_log if n_samples <= paged.MAX_SAMPLES_IN_MEMORY else loaded_log.move_to_disk()
         )
@@ -77,14 +78,15 @@ def read_split_logs(config: MeasuredLogs | SimulatedTrials) -> LogsBySplit:
             if not logs_of_split:
                 kinds_text = ", ".join(sorted({log.manoeuvre for log in logs_by_path.values()}))
                 raise DataError(
-                    f"split: no log of {split} is of its manoeuvre (there are {kinds_text})"
+                    f"split: {split} has no log of the requested manoeuvre (the logs have"
+                    f" {kinds_text}); correct `manoeuvre`"
                 )
     check_leaks(logs_by_split)
     return logs_by_split
 
 
 def list_input_files(config: MeasuredLogs | SimulatedTrials) -> list[Path]:
-    """Return files whose contents the run depends on."""
+    """Return all files whose contents a run depends on; none if it is simulated."""
     if isinstance(config, SimulatedTrials):
         return []
     reader = config.reader.build()

@@ -20,6 +20,7 @@ from residnet.core.config import Config, ConfigPath, Seconds, load_mapping, vali
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.core.names import STATE_NAMES, suggest_name
+from residnet.io.header_vocabulary import SPLIT_NAMES
 from residnet.io.readers.base import list_files
 from residnet.io.readers.detect import LOG_ENDINGS, detect_recording_format, is_text_table
 from residnet.preprocessing.motion import remove_pauses
@@ -39,12 +40,6 @@ _SPLIT_SHARES = (
     ("test", 0.8, 1.0),
 )
 """Stretches of each log where there are fewer."""
-_SPLITS_BY_NAME = {
-    **dict.fromkeys(("train", "training"), "train"),
-    **dict.fromkeys(("validation", "valid", "val", "dev"), "validation"),
-    **dict.fromkeys(("test", "testing"), "test"),
-}
-"""What folders and files of a split are called."""
 _MAX_SHARED_ROWS = 100
 """Rows that two logs may share before one is a copy of part of the other."""
 
@@ -340,7 +335,7 @@ def splits_from_names(logs: Sequence[Log]) -> list[str]:
         path = Path(str(log.meta.get("source", "")).lower())
         name_parts = [re.split(r"[\W_\d]+", path.stem)[0], *reversed(path.parent.parts)]
         split_names.append(
-            next((_SPLITS_BY_NAME[word] for word in name_parts if word in _SPLITS_BY_NAME), "")
+            next((SPLIT_NAMES[word] for word in name_parts if word in SPLIT_NAMES), "")
         )
     has_several_training_logs = split_names.count("train") + split_names.count("validation") > 1
     return (

@@ -15,7 +15,7 @@ from residnet.core.config import Config, ExistingPath
 from residnet.core.errors import DataError, UsageError
 from residnet.core.format import DASH, format_interval, format_number
 from residnet.core.names import suggest_name, to_si
-from residnet.io.readers.texts import open_as_utf8
+from residnet.io.readers.text_tables import open_as_utf8
 from residnet.physics.actuators.identify import (
     IntervalEstimate,
     StepResponse,

@@ -41,7 +41,7 @@ from residnet.io.split import (
     split_logs,
     splits_from_names,
 )
-from residnet.io.words import (
+from residnet.io.header_vocabulary import (
     PLANE_PATTERN,
     match_input_channel,
     match_state_channel,

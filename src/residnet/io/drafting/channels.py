@@ -18,15 +18,7 @@ from residnet.core.layout import DegreesOfFreedom
 from residnet.core.names import BOW_WIND_CHANNELS, CHANNEL_UNITS, port_starboard_pairs
 from residnet.core.units import si_unit, to_si, unit_names
 from residnet.io.drafting.questions import DraftNotes
-from residnet.io.readers.quantities import (
-    COSINE_SUFFIX,
-    QUATERNION,
-    SINE_SUFFIX,
-    normalize_quaternion,
-    project_fixes,
-    quaternion_yaw,
-)
-from residnet.io.words import (
+from residnet.io.header_vocabulary import (
     guess_scaling,
     guess_unit_from_size,
     infer_unit,
@@ -34,6 +26,14 @@ from residnet.io.words import (
     match_depth_channel,
     parse_header_unit,
     parse_name,
+)
+from residnet.io.readers.quantities import (
+    COSINE_SUFFIX,
+    QUATERNION,
+    SINE_SUFFIX,
+    normalize_quaternion,
+    project_fixes,
+    quaternion_yaw,
 )
 from residnet.preprocessing.channel_values import NEGLIGIBLE_MOTION_SHARE
 from residnet.preprocessing.derivatives import fit_local_polynomials

@@ -45,10 +45,19 @@ from residnet.io.drafting.tables import (
     match_channels,
     preview_table,
 )
+from residnet.io.header_vocabulary import (
+    MOTION_CHANNELS,
+    PLANE_PATTERN,
+    guess_scaling,
+    infer_unit,
+    match_input_channel,
+    match_state_channel,
+    parse_name,
+)
 from residnet.io.readers import ReaderConfig
 from residnet.io.readers.compose import extract_heading, extract_position
 from residnet.io.readers.detect import AutoConfig, detect_log_kind, suggest_conversion
-from residnet.io.readers.joined import group_trip_files
+from residnet.io.readers.joined_files import group_trip_files
 from residnet.io.readers.messages import extend_with_standard_messages, is_ned_format
 from residnet.io.readers.quantities import (
     QUATERNION,
@@ -65,15 +74,6 @@ from residnet.io.readers.recording import ALL_FIELDS, Recording, Series
 from residnet.io.readers.tables import read_column_names
 from residnet.io.readers.topics import align_clocks
 from residnet.io.split import assign_log_names, find_logs
-from residnet.io.words import (
-    MOTION_CHANNELS,
-    PLANE_PATTERN,
-    guess_scaling,
-    infer_unit,
-    match_input_channel,
-    match_state_channel,
-    parse_name,
-)
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 
 # how well position, heading and velocities of a recording that is taken as it is fit together, of 1

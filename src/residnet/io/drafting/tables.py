@@ -27,7 +27,21 @@ from residnet.io.drafting.channels import (
     find_sin_cos_pairs,
 )
 from residnet.io.drafting.questions import DraftNotes
+from residnet.io.header_vocabulary import (
+    DATE_PART_NAMES,
+    GERMANIC_PATTERN,
+    MOTION_CHANNELS,
+    REVOLUTION_PATTERN,
+    find_mismatched_unit,
+    match_input_channel,
+    match_state_channel,
+    normalize_name,
+    parse_header_unit,
+    parse_name,
+)
+from residnet.io.readers.angles import AngleForm, LetterO, hemisphere_signs, parse_degrees
 from residnet.io.readers.base import require_file
+from residnet.io.readers.clock_repair import find_unique_rows, repair_clock
 from residnet.io.readers.quantities import COSINE_SUFFIX, QUATERNION, SINE_SUFFIX
 from residnet.io.readers.tables import (
     TABLE_KINDS,
@@ -36,28 +50,13 @@ from residnet.io.readers.tables import (
     read_json_head,
     read_parquet_head,
 )
-from residnet.io.readers.texts import read_table_head
-from residnet.io.readers.written import (
-    AngleForm,
-    LetterO,
+from residnet.io.readers.text_tables import read_table_head
+from residnet.io.readers.timestamps import (
     detect_date_order,
     detect_unix_unit,
-    find_unique_rows,
-    hemisphere_signs,
     infer_time_unit,
     is_date_column,
-    parse_degrees,
     parse_texts,
-    repair_clock,
-)
-from residnet.io.words import (
-    MOTION_CHANNELS,
-    find_mismatched_unit,
-    match_input_channel,
-    match_state_channel,
-    normalize_name,
-    parse_header_unit,
-    parse_name,
 )
 from residnet.preprocessing.channel_values import (
     INTERVAL_TOLERANCE,
@@ -71,25 +70,15 @@ if TYPE_CHECKING:
 _HEAD_READERS = {"parquet": read_parquet_head, "json_lines": read_json_head}
 _OPENING_BRACKET = re.compile(r"[\[(]")
 _NAME_OVER_UNIT = re.compile(r"(?P<name>.*\S)\s+/\s+(?P<unit>\S.*)")
-_REVOLUTION_PATTERN = re.compile(
-    r"rpm|rev|1/s|hz|turns|u/?min|umdr|drehz|toeren|tours|giri|varv", re.IGNORECASE
-)
 _DRIVE_PATTERN = re.compile(r"^(?:cmd_)?(?:n(?=_|$)|thrust)")
 _PULSE_RANGE = (900.0, 2100.0)
 """Pulses in us that servos and speed controllers take."""
-_PARTS_OF_TIME = (
-    *("year", "yyyy", "jahr", "month", "mm", "monat", "day", "dd", "tag", "hour", "hours", "hh"),
-    *("stunde", "minute", "minutes", "min", "second", "seconds", "sekunde", "ss"),
-)
 _DATE_PATTERN = r"\d\s*[-./年]\s*\w{1,9}\s*[-./月]"
 _DOTTED_TIME_PATTERN = r"^\d\d?\.\d\d\.\d\d[.,]"
 """How a time of day begins that has points between its parts."""
 _ANGLE_FORMS: tuple[AngleForm, ...] = ("number", "ddmm")
 _MAX_ANGLE = {"latitude": 90.0, "longitude": 180.0}
 _HEMISPHERES = {"latitude": {"N", "S"}, "longitude": {"E", "W", "O"}}
-_GERMANIC_PATTERN = re.compile(
-    r"breite|l(?:ae|a)nge|breedte|lengte|zeit|tijd|kurs|koers|ruder|roer"
-)
 ColumnSettings = Mapping[str, Mapping[str, Any]]
 """Column -> what its entry in a channel map says beside column and unit."""
 _MAX_FULL_PREVIEWS = 24
@@ -554,7 +543,7 @@ def _rename_pulsed_drives(
             [preview.numeric_columns.get(column, np.zeros(0)) for preview in sheets]
         )
         values = values[np.isfinite(values)]
-        if _DRIVE_PATTERN.match(channel) and values.size and not _REVOLUTION_PATTERN.search(column):
+        if _DRIVE_PATTERN.match(channel) and values.size and not REVOLUTION_PATTERN.search(column):
             are_integers = bool((values == np.round(values)).all())
             are_pulses = (
                 are_integers and values.min() >= _PULSE_RANGE[0] and values.max() <= _PULSE_RANGE[1]
@@ -686,7 +675,7 @@ def preview_table(path: Path, rows: int = 20_000) -> TablePreview:
         table, reader_settings = (
             _preview_excel(path, rows) if table_kind == "excel" else read_table_head(path, rows)
         )
-    columns, other_sheets = _append_units(table), table.attrs.get("others", ())
+    columns, other_sheets = _append_units(table), table.attrs.get("other_sheets", ())
     # pandas copies all that is told of a table for each of its columns
     table.columns, table.attrs = pd.Index(list(columns)), {}
     if table.empty:
@@ -723,7 +712,9 @@ def _append_units(table: pd.DataFrame) -> dict[str, str]:
     """Return the names of columns with the units beneath them or in cells -> their names alone."""
     cell_units = table.attrs.get("units", ())
     names = [str(name).strip() for name in table.columns]
-    unit_rows = [[_parse_unit_cell(cell) for cell in row] for row in table.attrs.get("between", [])]
+    unit_rows = [
+        [_parse_unit_cell(cell) for cell in row] for row in table.attrs.get("unit_rows", [])
+    ]
     units = max(unit_rows, key=lambda row: sum(map(bool, row)), default=[])
     units = units if 2 * sum(map(bool, units)) >= len([name for name in names if name]) else []
     units = cell_units if any(cell_units) else units
@@ -755,7 +746,7 @@ def _preview_excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]
     ]
     name = next(iter([*numeric_sheets, *names]))
     table = tables[name]
-    table.attrs["others"] = tuple(numeric_sheets[1:])
+    table.attrs["other_sheets"] = tuple(numeric_sheets[1:])
     return table, {"kind": "excel", **({"sheet": name} if name != names[0] else {})}
 
 
@@ -780,7 +771,7 @@ def detect_clock(preview: TablePreview) -> TableClock:
     """Return the time of a table."""
     time_columns = [name for name in preview.column_names if parse_name(name).has_all("time")]
     part_columns = [
-        name for name in preview.numeric_columns if normalize_name(name) in _PARTS_OF_TIME
+        name for name in preview.numeric_columns if normalize_name(name) in DATE_PART_NAMES
     ]
     has_time_text = any(
         preview.text_columns[name].astype("string").str.contains(":").any()
@@ -1018,7 +1009,7 @@ def _guess_letter_o(preview: TablePreview, column: str) -> tuple[LetterO | None,
     if len(letters) > 1:
         return ("east" if "W" in letters else "west"), f"O stands beside {min(letters - {'O'})}"
     is_germanic = any(
-        _GERMANIC_PATTERN.search(normalize_name(name)) for name in preview.column_names
+        GERMANIC_PATTERN.search(normalize_name(name)) for name in preview.column_names
     )
     meaning: LetterO = "east" if is_germanic else "west"
     return meaning, f"the letter O is taken as {meaning}, by the language of the columns' names"

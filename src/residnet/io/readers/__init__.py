@@ -1,4 +1,4 @@
-"""Readers of logs: one row per format."""
+"""Readers of log files and the registry of their formats."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ else:
                 "parquet": "residnet.io.readers.tables:ParquetConfig",
                 "excel": "residnet.io.readers.tables:ExcelConfig",
                 "json_lines": "residnet.io.readers.tables:JsonLinesConfig",
-                "joined": "residnet.io.readers.joined:JoinedConfig",
+                "joined": "residnet.io.readers.joined_files:JoinedConfig",
                 "canonical": "residnet.io.readers.base:CanonicalConfig",
                 "csv_topics": "residnet.io.readers.formats.topic_folder:TopicFolderConfig",
                 "rosbag": "residnet.io.readers.formats.rosbag:RosbagConfig",
-                "mat": "residnet.io.readers.formats.trees:MatConfig",
-                "hdf5": "residnet.io.readers.formats.trees:Hdf5Config",
+                "mat": "residnet.io.readers.formats.matlab_hdf5:MatConfig",
+                "hdf5": "residnet.io.readers.formats.matlab_hdf5:Hdf5Config",
                 "nmea": "residnet.io.readers.formats.nmea:NmeaConfig",
                 "moos": "residnet.io.readers.formats.moos:MoosConfig",
                 "ulog": "residnet.io.readers.formats.ulog:UlogConfig",
@@ -35,4 +35,4 @@ else:
             },
         ),
     ]
-"""Config of any reader, those of other packages included; its `kind` says which."""
+"""Config of any reader, including readers of other packages; `kind` selects the reader."""

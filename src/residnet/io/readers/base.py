@@ -1,4 +1,4 @@
-"""What all readers of logs share, and the reader of residnet's own Parquet logs (`Log.save`)."""
+"""Base classes and helpers of log readers, and the reader of canonical logs (`Log.save`)."""
 
 from __future__ import annotations
 
@@ -18,51 +18,51 @@ from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, suggest_name, truncate
 from residnet.core.progress import report_progress
 
-# recordings below this size are read before anybody waits, bytes
+# smaller recordings are read in less than a second and need no progress bar, bytes
 _PROGRESS_MIN_BYTES = 50_000_000
 REPORT_INTERVAL = 5000
-"""Messages or lines between two reports of a reader; chosen by hand: many a second of reading."""
+"""Messages or lines between two progress reports of a reader (some ten reports per second)."""
 LARGE_FOLDER_BYTES = 300_000_000
-"""Bytes of a folder above which topics that nobody wants are not read."""
+"""Size of a folder in bytes above which a reader skips topics that the config does not use."""
 
 
 class LogReader(ABC):
-    """Reads one file format into the canonical `Log`."""
+    """Reader of one file format, which returns canonical logs."""
 
     def select_logs(self, paths: Sequence[Path]) -> list[Path]:
-        """Return the files that are logs by themselves; others only belong to these."""
+        """Return the files that name a log; a reader of several files per log drops the others."""
         return list(paths)
 
     def list_member_files(self, path: Path) -> list[Path]:
-        """Return the files that a log is made of: itself, those below a folder, those beside it."""
+        """Return all files that a log consists of, for example the files in a folder."""
         return list_files(path)
 
     @abstractmethod
     def read(self, path: Path) -> Log:
-        """Return the log in one file, in SI units, psi unwrapped, time strictly increasing.
+        """Read one log in SI units with unwrapped psi and strictly increasing time.
 
-        The log's name is the file's stem; `meta` holds `source`, `sha256`, `rows_read` and
-        `rows_dropped`.
+        The name of the log is the stem of the file. `meta` has the keys `source`, `sha256`,
+        `rows_read` and `rows_dropped`.
 
         Raises:
-            UsageError: where the file or a column is missing, or a unit does not fit.
-            DataError: where the contents cannot be used.
+            UsageError: if the file or a column is missing, or a unit has the wrong dimension.
+            DataError: if the contents cannot be used.
         """
 
 
 class ConfiguredReader(Config, LogReader):
-    """A reader that is its own config."""
+    """Reader whose settings are its own fields."""
 
     def build(self) -> Self:
-        """Return the reader of this config: itself."""
+        """Return this object, which is config and reader in one."""
         return self
 
 
 class ReaderKind(Config, ABC):
-    """The config of a reader that another package offers: its `kind` and how the reader is built.
+    """Base class of reader configs in other packages.
 
     Attributes:
-        kind: a `Literal` with the name of the entry point in the group `residnet.readers`.
+        kind: `Literal` with the name of the entry point in the group `residnet.readers`.
     """
 
     kind: str
@@ -73,10 +73,10 @@ class ReaderKind(Config, ABC):
 
 
 def require_file(path: Path) -> None:
-    """Stop where `path` is not a file."""
+    """Raise `UsageError` unless `path` is a file; the message suggests similar names."""
     if path.is_dir():
         raise UsageError(
-            f"{path}: is a folder, a log file was expected; name one file or a pattern such as"
+            f"{path}: is a folder, a log file was expected; give one file or a pattern such as"
             f" '{path}/*.csv'"
         )
     if not path.is_file():
@@ -89,9 +89,12 @@ def require_file(path: Path) -> None:
 
 
 def describe_provenance(path: Path, rows_read: int, rows_dropped: int) -> dict[str, Any]:
-    """Return where a log comes from: `source`, `sha256`, `rows_read`, `rows_dropped`.
+    """Return the provenance of a log for its `meta`.
 
-    The SHA-256 is that of the file's bytes.
+    Args:
+        path: file of the log; `sha256` is the hash of its bytes.
+        rows_read: number of rows in the file.
+        rows_dropped: number of these rows that the log does not contain.
     """
     return {
         "source": str(path),
@@ -102,15 +105,18 @@ def describe_provenance(path: Path, rows_read: int, rows_dropped: int) -> dict[s
 
 
 def require_samples(path: Path, t: np.ndarray) -> None:
-    """Stop where a log is too short to have a time step."""
+    """Raise `DataError` if a log has fewer than two samples, and therefore no time step."""
     if t.size < 2:
         raise DataError(f"{path}: {t.size} usable rows, at least 2 are needed; leave the file out")
 
 
 def require_increasing(path: Path, t: np.ndarray, row_label: Callable[[int], str]) -> None:
-    """Stop where time [T] in s repeats or runs backwards.
+    """Raise `DataError` if time repeats or runs backwards.
 
-    `row_label` names the row of a sample in the file.
+    Args:
+        path: file of the log.
+        t: times [T] in s.
+        row_label: index of a sample -> its row in the file, for the message.
     """
     violations = np.flatnonzero(~(np.diff(t) > 0.0))
     if violations.size:
@@ -124,22 +130,22 @@ def require_increasing(path: Path, t: np.ndarray, row_label: Callable[[int], str
         )
         raise DataError(
             f"{path}: time {problem} from {row_label(i)} ({t[i]:.13g} s) to {row_label(i + 1)}"
-            f" ({t[i + 1]:.13g} s), {violations.size} such steps in all; delete the repeated rows, or"
-            " split the file where its clock restarts"
+            f" ({t[i + 1]:.13g} s), {violations.size} such steps in total; delete the repeated"
+            " rows, or split the file where its clock restarts"
         )
 
 
 def require_values(path: Path, channel: str, column: str, values: np.ndarray) -> None:
-    """Stop where a channel [T] holds no number at all."""
+    """Raise `DataError` if a channel [T] has no finite value."""
     if not np.isfinite(values).any():
         raise DataError(
             f"{path}: column '{column}' (channel {channel}) holds no number in any of {values.size}"
-            " rows; take it out of the channel map"
+            " rows; remove it from the channel map"
         )
 
 
 def hash_files(files: Sequence[Path]) -> str:
-    """Return the SHA-256 of one file's bytes, or of the digests of several in order, as hex."""
+    """Return the SHA-256 of one file, or of the concatenated hashes of several, as hex."""
     checksums = [sha256(file) for file in files]
     return (
         checksums[0]
@@ -149,26 +155,27 @@ def hash_files(files: Sequence[Path]) -> str:
 
 
 def list_files(path: Path) -> list[Path]:
-    """Return a file itself, or all files below a folder, in order."""
+    """Return all files below a folder in sorted order; for a file, the file alone."""
     return sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
 
 
 def sum_file_sizes(files: Iterable[Path]) -> int:
-    """Return the bytes of all files."""
+    """Return the total size of files in bytes."""
     return sum(file.stat().st_size for file in files)
 
 
 ProgressCallback = Callable[[float], None]
-"""Reports how far a reader is, in the unit of its total."""
+"""Function that a reader calls with its progress, in the unit of the total."""
 
 
 @contextmanager
 def reading_progress(name: str, size: int, total: float) -> Iterator[ProgressCallback]:
-    """Report the reading of a large recording to whoever listens to progress.
+    """Provide a callback by which a reader reports its progress in a large recording.
 
     Args:
-        size: its bytes; nothing is reported of a small recording.
-        total: what the reader counts to.
+        name: name of the recording.
+        size: size in bytes; small recordings are not reported.
+        total: value of the callback's argument at the end.
     """
     if size < _PROGRESS_MIN_BYTES:
         yield lambda done: None
@@ -180,7 +187,16 @@ def reading_progress(name: str, size: int, total: float) -> Iterator[ProgressCal
 
 @contextmanager
 def optional_import(extra: str, package: str, feature: str) -> Iterator[None]:
-    """Import the package of a format; where it is not installed, say which extra brings it."""
+    """Turn the failed import of an optional package into an error that names its extra.
+
+    Args:
+        extra: extra of residnet that installs the package.
+        package: name of the package.
+        feature: file format or function that needs it, as subject of the message.
+
+    Raises:
+        UsageError: if the package is not installed.
+    """
     try:
         yield
     except ImportError as error:
@@ -192,7 +208,12 @@ def optional_import(extra: str, package: str, feature: str) -> Iterator[None]:
 
 @contextmanager
 def wrap_read_errors(path: Path, file_description: str) -> Iterator[None]:
-    """Damaged files fail in every layer of a library: tell so in one line, as what they are not."""
+    """Turn any exception of a library on a damaged file into a `DataError` of one line.
+
+    Args:
+        path: file that is read.
+        file_description: expected kind of file with its article, for example "a bag".
+    """
     try:
         yield
     except ResidnetError:
@@ -204,26 +225,25 @@ def wrap_read_errors(path: Path, file_description: str) -> Iterator[None]:
 
 @final
 class CanonicalConfig(ConfiguredReader):
-    """Logs that residnet wrote: they hold names, units and masks, so nothing is declared."""
+    """Reader of logs that residnet wrote; they contain channel names, units and masks."""
 
     kind: Literal["canonical"] = "canonical"
 
     def read(self, path: Path) -> Log:
-        """Return the log in `path`; see `LogReader.read`.
+        """Read one log; see `LogReader.read`.
 
         Raises:
-            UsageError: where the file is missing, is no canonical log, or gives a known channel
-                another unit than its SI unit.
-            DataError: where time does not increase, the file holds no samples, or a channel holds
-                no number.
+            UsageError: if the file is missing, is no canonical log, or has a known channel in
+                another unit than SI.
+            DataError: if time does not increase, or the log or a channel has no values.
         """
         require_file(path)
         log = Log.load(path)
         for name, unit in log.units.items():
             if unit != CHANNEL_UNITS.get(name, unit):
                 raise UsageError(
-                    f"{path}: channel {name} is in [{unit}], a canonical log holds it in"
-                    f" [{CHANNEL_UNITS[name]}]; convert it and save again"
+                    f"{path}: channel {name} is in [{unit}], [{CHANNEL_UNITS[name]}] was expected"
+                    " in a canonical log; convert it and save again"
                 )
         t = log.t
         require_samples(path, t)

@@ -1,4 +1,4 @@
-"""Recognition of a file's reader, by content first and ending second, without a config."""
+"""Detection of file formats by content and file extension, without a config."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from residnet.core.log import Log
 from residnet.io.readers.base import require_file
 from residnet.io.readers.compose import RecordingConfig
 from residnet.io.readers.formats.ardupilot import ArduPilotConfig
+from residnet.io.readers.formats.matlab_hdf5 import Hdf5Config, MatConfig
 from residnet.io.readers.formats.moos import MoosConfig
 from residnet.io.readers.formats.nmea import NmeaConfig
 from residnet.io.readers.formats.rosbag import RosbagConfig
 from residnet.io.readers.formats.topic_folder import TopicFolderConfig
-from residnet.io.readers.formats.trees import Hdf5Config, MatConfig
 from residnet.io.readers.formats.ulog import UlogConfig
 from residnet.io.readers.recording import FieldFilter, Recording
 from residnet.io.readers.tables import TABLE_KINDS
-from residnet.io.readers.texts import read_table_head
+from residnet.io.readers.text_tables import read_table_head
 
-# in the order in which they are asked: content that cannot be mistaken first, endings last
+# formats with unambiguous content are tested first, formats known by their extension last
 _RECORDING_CONFIGS: tuple[type[RecordingConfig], ...] = (
     RosbagConfig,
     TopicFolderConfig,
@@ -36,7 +36,7 @@ LOG_ENDINGS = (
     *(ending for ending in TABLE_KINDS if ending != ".json"),
     *(ending for config in _RECORDING_CONFIGS for ending in config.endings),
 )
-"""Endings of files that may be logs; a .json beside them rather tells of them."""
+"""Extensions of files that may be logs; .json files usually hold metadata."""
 _PANDAS_READERS = {
     **dict.fromkeys((".gz", ".zip", ".bz2", ".xz"), "pandas.read_csv(file)"),
     **dict.fromkeys((".xls", ".ods"), "pandas.read_excel(file)"),
@@ -49,28 +49,37 @@ _PANDAS_READERS = {
     **dict.fromkeys((".gpx", ".xml"), "pandas.read_xml(file, xpath='//*[@lat]')"),
     ".nc": "xarray.open_dataset(file).to_dataframe().reset_index()",
 }
-"""Ending -> how Python gets the table in such a file."""
+"""Extension -> Python expression that reads such a file as a table."""
 
 
 @dataclass(frozen=True)
 class RecordingFormat:
-    """A format of recordings, and its config for standard messages."""
+    """Format of a recording.
+
+    Attributes:
+        name: name of the format for messages.
+        config: reader, which maps standard messages without further settings.
+    """
 
     name: str
     config: type[RecordingConfig]
 
 
 def suggest_conversion(ending: str) -> str:
-    """Return how a file with such an ending, which no reader knows, becomes a log."""
+    """Return an instruction to convert a file of an unsupported format to csv.
+
+    Args:
+        ending: extension of the file, with its dot.
+    """
     pandas_call = _PANDAS_READERS.get(ending, "pandas.DataFrame(rows, columns=[...])")
     return (
-        "write such rows as csv with a line of names, in Python"
+        "convert it to csv with a line of column names, in Python"
         f" {pandas_call}.to_csv('log.csv', index=False)"
     )
 
 
 def is_text_table(path: Path) -> bool:
-    """Return whether a file of any ending holds lines of names and numbers, or is JSON."""
+    """Return whether a file is a text table with two or more numeric columns, or JSON."""
     if path.suffix.lower() == ".json":
         return True
     try:
@@ -82,9 +91,9 @@ def is_text_table(path: Path) -> bool:
 
 @final
 class AutoConfig(RecordingConfig):
-    """Any recording that describes itself, recognised by its content and ending.
+    """Reader of any recording format that describes its contents, with automatic detection.
 
-    The kinds of single formats have settings of their own.
+    The readers of single formats have further settings.
     """
 
     kind: Literal["auto"] = "auto"
@@ -94,20 +103,20 @@ class AutoConfig(RecordingConfig):
         if recording_format is None:
             names = ", ".join(name for config in _RECORDING_CONFIGS for name in config.formats)
             raise UsageError(
-                f"{path}: does not say what its columns are; give a channel map with --config"
-                f" (formats that need none: {names}, canonical Parquet)"
+                f"{path}: the format does not describe its columns; give a channel map with"
+                f" --config (formats that need none: {names}, canonical Parquet)"
             )
         return recording_format.config().load(path, field_filter)
 
 
 def detect_recording_format(path: Path) -> RecordingFormat | None:
-    """Return the format of a recording.
+    """Detect the format of a recording from its first bytes and its extension.
 
-    None where it is none that describes itself (a csv table, a foreign Parquet file, anything
-    else).
+    Returns:
+        The format; None for tables (csv, Parquet) and unknown files, which need a channel map.
 
     Raises:
-        UsageError: where there is nothing at `path`.
+        UsageError: if `path` does not exist.
     """
     head = b""
     if not path.is_dir():
@@ -122,13 +131,15 @@ def detect_recording_format(path: Path) -> RecordingFormat | None:
 
 
 def detect_log_kind(path: Path) -> str:
-    """Return the kind of a log: canonical, table, or the name of a format of recordings."""
+    """Return `canonical`, `table`, or the name of the recording format of a log.
+
+    Raises:
+        UsageError: if the format is unknown.
+    """
     if Log.is_canonical_log(path):
         return "canonical"
     recording = detect_recording_format(path)
     ending = path.suffix.lower()
     if recording is None and ending not in TABLE_KINDS and not is_text_table(path):
-        raise UsageError(
-            f"{path}: is of no format that residnet knows; {suggest_conversion(ending)}"
-        )
+        raise UsageError(f"{path}: residnet cannot read this format; {suggest_conversion(ending)}")
     return "table" if recording is None else recording.name

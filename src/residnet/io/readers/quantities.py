@@ -1,4 +1,4 @@
-"""Where a log's channels, position, heading and velocity come from, in which unit and frame."""
+"""Configs of channels, position, heading and velocity: their fields, units, signs and frames."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from residnet.core.frames import unwrap_angle
 from residnet.core.log import Remark
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.units import canonical_unit, si_unit, to_si
+from residnet.io.readers.angles import AngleForm, LetterO
 from residnet.io.readers.base import optional_import
-from residnet.io.readers.written import AngleForm, LetterO
 from residnet.preprocessing.motion import Antenna
 
 Frame = Literal["as_measured", "ned", "enu", "body_fsd", "body_fpu"]
@@ -28,17 +28,17 @@ _NEGATE = (-1.0, 0.0)
 _EAST_TO_NORTH = (-1.0, math.pi / 2.0)
 _EARTH_CHANNELS = ("x", "y", "z", "psi", "wind_dir", "current_north", "current_east")
 QUATERNION = ("qx", "qy", "qz", "qw")
-"""Channels of a table that become a heading together, where it has none."""
+"""Channels with the parts of a quaternion, from which tables without a heading derive it."""
 COSINE_SUFFIX, SINE_SUFFIX = "_cos", "_sin"
-"""What stands behind an angle's name in those of its cosine and sine."""
+"""Suffixes of channels with the cosine and the sine of an angle."""
 _FORWARD_CHANNELS = ("u", "p", "phi", "u_dot", "tau_x")
 _STARBOARD_OR_DOWN_CHANNELS = ("v", "r", "w", "q", "theta", "v_dot", "r_dot", "tau_y", "tau_n")
-# frame -> channel -> (factor, offset [SI]) that brings the channel to residnet's frame.
-# x and y have no entry in enu: "x" there means east to some and the north column to others, so the
-# map must name the north column itself.
+# frame -> channel -> (factor, offset in SI) of the conversion to residnet's frame.
+# x and y have no entry in enu, because "x" may be the east or the north column there: the channel
+# map must name the north column.
 _FRAME_CONVERSIONS: dict[str, dict[str, tuple[float, float]]] = {
     "ned": dict.fromkeys((*_EARTH_CHANNELS, "qw"), _IDENTITY),
-    # the frame of a quaternion is told at its scalar part
+    # the frame of a quaternion is a setting of its scalar part
     "enu": {"psi": _EAST_TO_NORTH, "wind_dir": _EAST_TO_NORTH, "z": _NEGATE, "qw": _IDENTITY},
     "body_fsd": dict.fromkeys((*_FORWARD_CHANNELS, *_STARBOARD_OR_DOWN_CHANNELS), _IDENTITY),
     "body_fpu": {
@@ -52,14 +52,14 @@ class Conversion(Config):
     """Unit, sign and frame of one foreign channel.
 
     Attributes:
-        unit: its unit, for example `deg/s`.
-        offset: taken from the column's number first, in the column's own unit: the neutral of a
-            servo, for example 1500.
-        scale: what the rest is multiplied by to be in `unit`, for example 0.07 where 1000 us more
-            are 70 deg more.
-        sign: -1 turns it around.
-        frame: `as_measured` (nothing to convert), `ned`, `body_fsd` (forward, starboard, down),
-            `enu` (angles counter-clockwise from east) or `body_fpu` (forward, port, up).
+        unit: unit of the scaled values, for example `deg/s`.
+        offset: number that is subtracted first, in counts of the source: for example the neutral
+            position 1500 of a servo.
+        scale: factor from counts of the source to `unit`, for example 0.07 if 1000 us are 70 deg.
+        sign: -1 reverses the direction.
+        frame: frame of the source: `as_measured` (no conversion), `ned`, `body_fsd` (forward,
+            starboard, down), `enu` (angles counter-clockwise from east) or `body_fpu` (forward,
+            port, up).
     """
 
     unit: str
@@ -69,16 +69,19 @@ class Conversion(Config):
     frame: Frame = "as_measured"
 
     def require_valid_channel(self, name: str) -> None:
-        """Stop where this cannot be the channel `name`.
+        """Check that unit and frame are possible for a channel.
+
+        Args:
+            name: name of the channel.
 
         Raises:
-            ValueError: where the name is no channel's, the unit is unknown or of another dimension,
-                or the frame says nothing about the channel.
+            ValueError: if the name is reserved, the unit is unknown or has another dimension, or
+                the frame does not define the channel.
         """
         if name == "t" or name.startswith("mask:"):
-            raise ValueError(f"'{name}' cannot name a channel; time has its own key")
+            raise ValueError(f"'{name}' is no name of a channel; set time with the key `time`")
         if self.scale == 0.0:
-            raise ValueError(f"channel {name}: scale must not be zero, all would be the same")
+            raise ValueError(f"channel {name}: scale is zero, another factor was expected")
         try:
             conversion_factor(self.unit, CHANNEL_UNITS.get(name))
         except ValueError as error:
@@ -89,25 +92,30 @@ class Conversion(Config):
                 or "none"
             )
             raise ValueError(
-                f"channel {name}: frame '{self.frame}' says nothing about it (frames that do:"
-                f" {valid_frames}); map the column that already holds this quantity, with sign: -1 where"
-                " it points the other way"
+                f"channel {name}: frame '{self.frame}' does not define it (frames that do:"
+                f" {valid_frames}); map the column with this quantity, with sign: -1 if it has the"
+                " opposite direction"
             )
 
     def si_unit_of(self, name: str) -> str:
-        """Return the SI unit of channel `name`."""
+        """Return the SI unit of the values that a channel of this name receives."""
         return si_unit(canonical_unit(self.unit, CHANNEL_UNITS.get(name)))
 
     def magnitude_in_si(self, name: str, values: np.ndarray) -> np.ndarray:
-        """Return the size of the values [T] of channel `name` in SI, whatever their frame."""
+        """Return the absolute values [T] of a channel in SI, before any conversion of frames."""
         gain = to_si(self.unit, CHANNEL_UNITS.get(name)) * self.scale
         magnitude: np.ndarray = np.abs(gain * (values - self.offset))
         return magnitude
 
     def convert(self, name: str, raw_values: np.ndarray) -> np.ndarray:
-        """Return the values [T] of channel `name` in residnet's unit, sign and frame.
+        """Convert values to residnet's unit, sign and frame.
 
-        psi unwrapped.
+        Args:
+            name: name of the channel; `psi` is also unwrapped.
+            raw_values: values [T] of the source.
+
+        Returns:
+            Values [T] in SI.
         """
         frame_factor, frame_offset = (
             _FRAME_CONVERSIONS[self.frame][name] if self.frame != "as_measured" else _IDENTITY
@@ -118,17 +126,23 @@ class Conversion(Config):
 
 
 _STEP_TOLERANCE = 0.2
-"""Share by which the steps of an interpolation may differ, whose ends are rounded."""
+"""Relative difference that the rounded steps of a linear interpolation may have."""
 _MIN_SWEEP_RATIO = 10.0
-"""Times that a step of such an interpolation exceeds the steps of an ordinary turn."""
+"""Smallest ratio of a step in such an interpolation to the median step."""
 
 
 def mask_interpolated_headings(psi: np.ndarray) -> np.ndarray:
-    """Return headings [T] in rad, unwrapped; NaN where the recorder made them up.
+    """Unwrap headings, and remove samples that a recorder interpolated across the wrap.
 
-    A recorder that resamples by straight lines goes from 359 to 1 deg by way of 180. Such samples
-    lie in a run of even steps from one edge of the circle to the other, far larger than the steps
-    before and behind it: a vessel gathers and loses its rate of turn.
+    A recorder that interpolates linearly goes from 359 deg over 180 deg to 1 deg. Such samples form
+    a run of equal steps across the full circle. The steps are far larger than those before and
+    after the run, whereas the yaw rate of a vessel changes gradually.
+
+    Args:
+        psi: headings [T] in rad.
+
+    Returns:
+        Unwrapped headings [T] in rad, NaN for interpolated samples.
     """
     unwrapped = unwrap_angle(psi)
     finite_indices = np.flatnonzero(np.isfinite(psi))
@@ -146,21 +160,21 @@ def mask_interpolated_headings(psi: np.ndarray) -> np.ndarray:
         sweep_steps = step[start:stop]
         if sweep_steps.size < 2 or not sweep_sign[start]:
             continue
-        # the steps into and out of the interpolation may be cut short
+        # the first and the last step may be shorter
         largest_step = np.abs(sweep_steps).max()
         is_even = np.abs(sweep_steps[1:-1]) >= (1.0 - _STEP_TOLERANCE) * largest_step
         neighbour_step = np.append(
             typical_step[max(start - 2, 0) : start], typical_step[stop : stop + 2]
         ).max(initial=0.0)
         spans_circle = 2.0 * np.pi - abs(sweep_steps.sum()) < largest_step + 2.0 * neighbour_step
-        # the short way round goes on as the vessel turned, and the long way does not
+        # the step of the short way around the circle must suit the neighbouring steps better
         short_way_step = (2.0 * np.pi - abs(sweep_steps.sum())) / sweep_steps.size
         is_sudden = largest_step - neighbour_step > abs(short_way_step - neighbour_step)
         if is_even.all() and spans_circle and is_sudden:
             is_interpolated[start + 1 : stop] = True
     if not is_interpolated.any():
         return unwrapped
-    # where two follow each other, the sample between them lies on neither end
+    # a sample between two interpolated ones is interpolated too
     is_interpolated[1:-1] |= is_interpolated[:-2] & is_interpolated[2:]
     measured_indices = finite_indices[~is_interpolated]
     unwrapped[finite_indices[is_interpolated]] = np.nan
@@ -169,19 +183,18 @@ def mask_interpolated_headings(psi: np.ndarray) -> np.ndarray:
 
 
 class ChannelMap(Conversion):
-    """One channel of a foreign table.
+    """Entry of a channel map: one column of a table as one channel.
 
     Attributes:
-        column: name of the column, as the file's header has it.
-        form: of numbers that are angles: `number`, or `ddmm` for degrees and minutes in one, as
-            receivers write 5954.321 for 59 degrees and 54.321 minutes. Latitudes and longitudes
-            such as `59°54.321'N` or `59 54 19.3 N` are read in either case.
-        hemisphere: column with the letters N and S or E and W that belong to the numbers; null
-            where there is none.
-        letter_o: what the letter O means in longitudes, `east` (Ost, Oost) or `west` (Oeste, Ouest,
-            Ovest); null refuses it.
-        hold: the last value holds until the next, as of commands that are recorded when they
-            change; rows that hold nothing else are left out.
+        column: name of the column in the header.
+        form: notation of angles: `number` for decimal degrees, `ddmm` for degrees and minutes in
+            one number (5954.321 is 59 degrees and 54.321 minutes). Latitudes and longitudes such as
+            `59°54.321'N` or `59 54 19.3 N` are accepted in both cases.
+        hemisphere: column with the hemispheres N, S, E or W of the numbers; null if there is none.
+        letter_o: meaning of the letter O in longitudes, `east` (Ost, Oost) or `west` (Oeste, Ouest,
+            Ovest); null rejects it.
+        hold: whether a value is valid until the next one (zero-order hold), as for commands that
+            are recorded when they change; rows with such channels only are left out.
     """
 
     column: str
@@ -192,24 +205,30 @@ class ChannelMap(Conversion):
 
     @property
     def is_angle(self) -> bool:
-        """Whether its cells may be degrees with minutes or letters."""
+        """Whether cells may be angles with minutes or hemispheres."""
         return self.form != "number" or self.hemisphere is not None
 
     def require_valid_channel(self, name: str) -> None:
-        """Stop where this cannot be the channel `name`; see `Conversion.require_fit`.
+        """Check the entry; see `Conversion.require_valid_channel`.
 
         Raises:
-            ValueError: also where degrees with minutes are in another unit.
+            ValueError: also if degrees with minutes have another unit.
         """
         super().require_valid_channel(name)
         if self.is_angle and canonical_unit(self.unit) != "deg":
             raise ValueError(
-                f"channel {name}: `form` and `hemisphere` are for degrees; set unit: deg"
+                f"channel {name}: `form` and `hemisphere` apply to degrees; set unit: deg"
             )
 
 
 def conversion_factor(unit: str, expected: str | None) -> float:
-    """Return `to_si` for validators: pydantic adds the key path to a ValueError only."""
+    """Return the factor of a unit to SI, with errors for validators.
+
+    pydantic adds the path of the key to a `ValueError` only.
+
+    Raises:
+        ValueError: if the unit is unknown or has another dimension than `expected`.
+    """
     try:
         return to_si(unit, expected)
     except UsageError as error:
@@ -231,17 +250,18 @@ SpeedUnit = Annotated[str, _unit_validator("m/s")]
 
 @final
 class FieldMap(Conversion):
-    """One channel of a log from one field of a topic.
+    """Mapping of one field of a topic to one channel.
 
     Attributes:
-        topic: topic, message type or table; may be left out where the recording has only one.
+        topic: topic, message type or table; optional if the recording has only one.
         field: path of the field, for example `twist.linear.x`.
-        sender: takes only the rows of one sender, where several publish to the topic.
-        hold: the last value holds until the next (commands); otherwise values are interpolated.
-        longest_gap: longest step that is interpolated across or held over, s; null takes a second.
-            Slow topics may always step over three of their usual steps.
-        required: stops where the recording has no such topic or no number in it; otherwise the log
-            lacks the channel, and says so.
+        sender: sender whose rows are used, if several publish to the topic.
+        hold: whether a value is valid until the next one (zero-order hold, for commands); otherwise
+            values are interpolated linearly.
+        longest_gap: longest step in s that is interpolated or held; null means one second. Three
+            median steps of the topic are always allowed.
+        required: whether a missing topic or field is an error; otherwise the log lacks the channel
+            and has a remark.
     """
 
     topic: str | None = None
@@ -253,13 +273,13 @@ class FieldMap(Conversion):
 
 
 class Origin(Config):
-    """The origin of a local tangent plane on the WGS 84 ellipsoid.
+    """Origin of a local tangent plane on the WGS 84 ellipsoid.
 
-    Plain numbers are rad, so write `63.44 deg`.
+    Numbers without a unit are rad, so write `63.44 deg`.
 
     Attributes:
-        latitude: in rad, north positive.
-        longitude: in rad, east positive.
+        latitude: latitude in rad, positive north.
+        longitude: longitude in rad, positive east.
     """
 
     latitude: Radians = Field(ge=-1.5708, le=1.5708)
@@ -267,10 +287,10 @@ class Origin(Config):
 
 
 class TopicSource(Config):
-    """Fields of one topic.
+    """Base class of quantities that are computed from fields of one topic.
 
     Attributes:
-        topic: that holds the fields; may be left out where the recording has only one.
+        topic: topic with the fields; optional if the recording has only one.
     """
 
     topic: str | None = None
@@ -278,16 +298,16 @@ class TopicSource(Config):
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Fields that are read."""
+        """Paths of the fields."""
         return tuple(str(getattr(self, name)) for name in self.field_keys)
 
 
 class AntennaSource(TopicSource):
-    """What is measured at an antenna.
+    """Base class of quantities that are measured at an antenna.
 
     Attributes:
-        antenna: where it stands; the log holds what belongs to the vessel's centre. A velocity off
-            the centre needs the yaw rate r as a channel.
+        antenna: position of the antenna in body axes. The log has the quantity at the vessel's
+            origin; for a velocity this needs the yaw rate r as a channel.
     """
 
     antenna: Antenna = Field(default_factory=Antenna)
@@ -295,13 +315,13 @@ class AntennaSource(TopicSource):
 
 @final
 class GeodeticPosition(AntennaSource):
-    """Latitude and longitude, brought to a local tangent plane (north, east) with PROJ.
+    """Position from latitude and longitude, projected to a local tangent plane with PROJ.
 
     Attributes:
-        latitude: field.
-        longitude: field.
-        unit: of both.
-        origin: of the plane; null takes the first fix, which is written into the log's meta.
+        latitude: field of the latitude.
+        longitude: field of the longitude.
+        unit: unit of both.
+        origin: origin of the plane; null takes the first fix and writes it to the log's meta.
     """
 
     kind: Literal["geodetic"] = "geodetic"
@@ -314,12 +334,12 @@ class GeodeticPosition(AntennaSource):
 
 @final
 class LocalPosition(AntennaSource):
-    """Position in a local frame that the source made.
+    """Position in a local frame of the source.
 
     Attributes:
-        north: field of the northward component (in ENU the one that the source calls y).
-        east: field of the eastward component.
-        unit: of both.
+        north: field of the northward component (y of a source in ENU).
+        east: field of the eastward component (x of a source in ENU).
+        unit: unit of both.
     """
 
     kind: Literal["local"] = "local"
@@ -330,17 +350,18 @@ class LocalPosition(AntennaSource):
 
 
 PositionConfig = Annotated[GeodeticPosition | LocalPosition, Field(discriminator="kind")]
-"""Where x and y come from."""
+"""Source of x and y."""
 
 
 @final
 class QuaternionHeading(TopicSource):
-    """Heading from a quaternion; its sign, which flips in many sources, does not matter.
+    """Heading from a quaternion of either sign.
 
     Attributes:
-        field: path whose x, y, z, w are meant, for example `pose.pose.orientation`.
-        frame: `ned` (yaw clockwise from north) or `enu` (REP-103: counter-clockwise from east).
-        roll: writes the angles of roll and pitch as channels phi and theta too.
+        field: path of the quaternion with the parts x, y, z, w, for example
+            `pose.pose.orientation`.
+        frame: `ned` (yaw clockwise from north) or `enu` (REP 103: counter-clockwise from east).
+        roll: whether roll and pitch become the channels phi and theta.
     """
 
     kind: Literal["quaternion"] = "quaternion"
@@ -352,14 +373,14 @@ class QuaternionHeading(TopicSource):
 
 @final
 class AngleHeading(TopicSource):
-    """Heading as an angle; wraps are taken out.
+    """Heading from an angle, which is unwrapped.
 
     Attributes:
-        field: of the angle.
-        unit: its unit.
+        field: field of the angle.
+        unit: unit of the angle.
         frame: `ned` (clockwise from north, a compass) or `enu` (counter-clockwise from east).
-        offset: added after conversion, rad: the mounting angle of a compass or of a pair of
-            antennas.
+        offset: angle in rad that is added after the conversion: the mounting angle of a compass or
+            of a pair of antennas.
     """
 
     kind: Literal["angle"] = "angle"
@@ -371,19 +392,19 @@ class AngleHeading(TopicSource):
 
 
 HeadingConfig = Annotated[QuaternionHeading | AngleHeading, Field(discriminator="kind")]
-"""Where psi comes from."""
+"""Source of psi."""
 
 
 @final
 class DerivedVelocity(Config):
-    """u, v, r from position and heading, by Savitzky-Golay polynomials at the positions' rate.
+    """Velocities u, v, r from position and heading by a Savitzky-Golay filter.
 
-    Position and heading are smoothed by them too.
+    The filter runs at the sampling rate of the positions and smooths position and heading too.
 
     Attributes:
-        window: length of the polynomials for translation, s.
-        yaw_window: the same for heading; null takes `window`.
-        order: of the polynomials.
+        window: length of the filter for positions in s.
+        yaw_window: length of the filter for headings in s; null takes `window`.
+        order: order of the polynomials.
     """
 
     kind: Literal["derived"] = "derived"
@@ -394,14 +415,14 @@ class DerivedVelocity(Config):
 
 @final
 class EarthFixedVelocity(AntennaSource):
-    """u, v from northward and eastward velocity of the antenna.
+    """Velocities u, v from the northward and eastward velocity of the antenna.
 
-    They are turned into body axes and moved to the vessel's centre.
+    They are rotated to body axes and transformed to the vessel's origin.
 
     Attributes:
-        north: field of the northward component (in ENU the one that the source calls y).
-        east: field of the eastward component.
-        unit: of both.
+        north: field of the northward component (y of a source in ENU).
+        east: field of the eastward component (x of a source in ENU).
+        unit: unit of both.
     """
 
     kind: Literal["earth_fixed"] = "earth_fixed"
@@ -413,15 +434,15 @@ class EarthFixedVelocity(AntennaSource):
 
 @final
 class CourseSpeedVelocity(AntennaSource):
-    """u, v from course and speed over ground of the antenna.
+    """Velocities u, v from course and speed over ground of the antenna.
 
-    They are turned into body axes and moved to the vessel's centre.
+    They are rotated to body axes and transformed to the vessel's origin.
 
     Attributes:
         course: field of the course over ground, clockwise from north.
         speed: field of the speed over ground.
-        course_unit: of the course.
-        speed_unit: of the speed.
+        course_unit: unit of the course.
+        speed_unit: unit of the speed.
     """
 
     kind: Literal["course_speed"] = "course_speed"
@@ -435,23 +456,25 @@ class CourseSpeedVelocity(AntennaSource):
 VelocityConfig = Annotated[
     DerivedVelocity | EarthFixedVelocity | CourseSpeedVelocity, Field(discriminator="kind")
 ]
-"""Where u, v (and r) come from; velocities in body axes are plain channels."""
+"""Source of u, v (and r); velocities in body axes are mapped as channels instead."""
 
 
 def source_channels(
     position: PositionConfig | None, heading: HeadingConfig | None, velocity: VelocityConfig | None
 ) -> list[str]:
-    """Return the channels that sources give."""
+    """Return the names of the channels that configured sources provide."""
     sources = {("x", "y"): position, ("psi",): heading, ("u", "v"): velocity}
     return [name for names, source in sources.items() if source is not None for name in names]
 
 
 @final
 class UniformClock(Config):
-    """A uniform grid; where the recording has dates, on whole multiples of its step in Unix time.
+    """Uniform clock.
+
+    In a recording with dates the samples are at integer multiples of the step in Unix time.
 
     Attributes:
-        step: between samples, s.
+        step: time between samples in s.
     """
 
     kind: Literal["uniform"] = "uniform"
@@ -460,10 +483,11 @@ class UniformClock(Config):
 
 @final
 class TopicClock(Config):
-    """The samples of one topic, whatever its rate.
+    """Clock with the samples of one topic, which need not be uniform.
 
     Attributes:
-        topic: null takes the topic of position, else of heading, else of the first channel.
+        topic: topic; null takes that of the position, else of the heading, else of the first
+            channel.
     """
 
     kind: Literal["topic"] = "topic"
@@ -471,20 +495,20 @@ class TopicClock(Config):
 
 
 ClockConfig = Annotated[UniformClock | TopicClock, Field(discriminator="kind")]
-"""The clock of the log."""
+"""Clock of the log."""
 
 
 @dataclass(frozen=True)
 class ChannelPlan:
-    """Which parts of a recording become which channels.
+    """Mapping of a recording to channels.
 
     Attributes:
-        channels: name -> field of a topic.
+        channels: channel -> field of a topic.
         position: source of x and y.
         heading: source of psi.
-        velocity: source of u, v (and r) where no channels are.
-        conversions: what was converted without a setting for it, for the log's meta.
-        remarks: what was noticed while deciding.
+        velocity: source of u, v (and r) if they are not mapped as channels.
+        conversions: automatic conversions of frames, as text for the log's meta.
+        remarks: remarks on ambiguous messages.
     """
 
     channels: Mapping[str, FieldMap] = field(default_factory=dict)
@@ -498,21 +522,22 @@ class ChannelPlan:
 def project_to_tangent_plane(
     latitude: np.ndarray, longitude: np.ndarray, latitude_0: float, longitude_0: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return north and east [T] in m of points of the WGS 84 ellipsoid.
+    """Project points of the WGS 84 ellipsoid to the tangent plane at an origin.
 
-    They lie on the plane that touches the ellipsoid at the origin.
-
-    Topocentric coordinates (EPSG method 9837); heights are taken as zero, which shifts a point at
-    100 m height and 1 km distance by 16 mm.
+    The result are topocentric coordinates (EPSG method 9837) for zero height, which shifts a point
+    at 100 m height and 1 km distance by 16 mm.
 
     Args:
-        latitude: [T] rad.
-        longitude: [T] rad.
-        latitude_0: of the origin, rad.
-        longitude_0: of the origin, rad.
+        latitude: latitudes [T] in rad.
+        longitude: longitudes [T] in rad.
+        latitude_0: latitude of the origin in rad.
+        longitude_0: longitude of the origin in rad.
+
+    Returns:
+        North and east coordinates [T] in m.
 
     Raises:
-        UsageError: where pyproj is not installed.
+        UsageError: if pyproj is not installed.
     """
     with optional_import("geo", "pyproj", "a position in latitude and longitude"):
         from pyproj import Transformer
@@ -534,15 +559,18 @@ def project_to_tangent_plane(
 def project_fixes(
     latitude: np.ndarray, longitude: np.ndarray, origin: tuple[float, float] | None = None
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float] | None, int]:
-    """Return north and east [T] in m, the origin, and how many fixes were none.
+    """Project fixes to a tangent plane, without samples at latitude 0, longitude 0.
 
-    Receivers without a fix report latitude 0, longitude 0. There is no origin where there is no
-    fix, or one beyond a pole.
+    Receivers without a fix report latitude 0, longitude 0.
 
     Args:
-        latitude: [T] rad.
-        longitude: [T] rad.
-        origin: of the plane, rad; None takes the first fix.
+        latitude: latitudes [T] in rad.
+        longitude: longitudes [T] in rad.
+        origin: latitude and longitude of the origin in rad; None takes the first fix.
+
+    Returns:
+        North and east coordinates [T] in m; the origin in rad (None without any fix, or if a
+        latitude exceeds 90 deg); the number of samples at latitude 0, longitude 0.
     """
     is_null_fix = (latitude == 0.0) & (longitude == 0.0)
     is_valid = np.isfinite(latitude) & np.isfinite(longitude) & ~is_null_fix
@@ -558,7 +586,7 @@ def project_fixes(
 def normalize_quaternion(
     x: np.ndarray, y: np.ndarray, z: np.ndarray, w: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Return quaternions [T] of length one, x, y, z, w; NaN where they are empty."""
+    """Return the parts x, y, z, w of unit quaternions, [T] each; NaN for quaternions of zeros."""
     norm = np.sqrt(x * x + y * y + z * z + w * w)
     is_valid = np.isfinite(norm) & (norm > 0.5)
     safe_norm = np.where(is_valid, norm, 1.0)
@@ -566,6 +594,6 @@ def normalize_quaternion(
 
 
 def quaternion_yaw(x: np.ndarray, y: np.ndarray, z: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """Return the rotation [T] about the vertical axis in rad of quaternions of length one."""
+    """Return the yaw angle [T] of unit quaternions in rad (Fossen 2021, section 2.2)."""
     yaw: np.ndarray = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return yaw

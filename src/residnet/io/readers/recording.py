@@ -1,4 +1,4 @@
-"""A recording: many series, each with its own clock, before they become one log."""
+"""Recordings: series (topics) with separate clocks, from which one log is built."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from residnet.core.names import suggest_name
 
 @dataclass(frozen=True)
 class TimeStamps:
-    """The times of a column.
+    """Times of one column.
 
     Attributes:
-        ns: [T] int64, whole ns; Unix time where `is_absolute`, and any number where a time is missing.
-        is_absolute: whether the source gave dates or Unix time.
-        valid: [T] bool, where there is a time; None where there is one everywhere.
-        remarks: what was noticed.
-        seconds: [T] numbers that are seconds without a date as they stand, to the last bit.
+        ns: times [T] in ns, int64; Unix time if `is_absolute`; arbitrary for missing times.
+        is_absolute: whether the source contains dates or Unix time.
+        valid: whether each time exists, bool [T]; None if all exist.
+        remarks: remarks on corrections.
+        seconds: float times [T] in s of a source without dates, without any rounding; else None.
     """
 
     ns: np.ndarray
@@ -37,7 +37,11 @@ class TimeStamps:
     seconds: np.ndarray | None = None
 
     def seconds_since(self, start: int | None) -> np.ndarray:
-        """Return the times [T] in s from `start`, Unix time in ns, where they are absolute."""
+        """Return times [T] in s.
+
+        Args:
+            start: Unix time in ns from which absolute times count; ignored for other times.
+        """
         if self.seconds is not None:
             return self.seconds
         seconds: np.ndarray = (self.ns - (start or 0 if self.is_absolute else 0)) * 1e-9
@@ -46,19 +50,19 @@ class TimeStamps:
 
 @dataclass(frozen=True)
 class Series:
-    """One topic, message type or table.
+    """Rows of one topic, message type or table.
 
     Attributes:
-        name: topic or table, as its source names it.
-        message_type: message type, for example `sensor_msgs/msg/NavSatFix`; empty where the source has
-            none.
-        fields: path -> values [T], float64, in the source's units; NaN where a cell is empty.
-        stamp: time [T] in s by the sender's clock (header stamp), from the recording's epoch; None
-            where messages carry none.
-        arrival: time [T] in s by the recorder's clock, from the same epoch; None where the source
-            has none.
-        sender: who sent each row [T] (frame id, node or instance), where the source says.
-        remarks: what was noticed while reading.
+        name: name of the topic or table in the source.
+        message_type: message type, for example `sensor_msgs/msg/NavSatFix`; empty if the source has
+            no types.
+        fields: path -> values [T], float64, in the units of the source; NaN for empty cells.
+        stamp: time of measurement [T] in s on the sender's clock (header stamp), from the epoch of
+            the recording; None if messages have no stamp.
+        arrival: time of arrival [T] in s on the recorder's clock, from the same epoch; None if the
+            source has none.
+        sender: sender of each row [T] (frame id, node or instance); None if unknown.
+        remarks: remarks from reading.
     """
 
     name: str
@@ -74,7 +78,7 @@ class Series:
 
     @property
     def clock(self) -> np.ndarray:
-        """Time [T] in s: the stamp where there is one, else the arrival."""
+        """Time [T] in s: the stamp if it exists, otherwise the arrival."""
         times = self.stamp if self.stamp is not None else self.arrival
         return np.zeros(0) if times is None else times
 
@@ -83,10 +87,7 @@ class Series:
         return {normalize_field_path(path): path for path in reversed(self.fields)}
 
     def has_field(self, path: str) -> bool:
-        """Return whether there is a field of this path.
-
-        `pose.position.x`, `pose/position/x` and `pose_position_x` are the same.
-        """
+        """Return whether a field exists; `pose.position.x` equals `pose_position_x`."""
         return path in self.fields or normalize_field_path(path) in self._path_by_key
 
     def __getitem__(self, path: str) -> np.ndarray:
@@ -99,7 +100,7 @@ class Series:
         return self.fields[name]
 
     def select_rows(self, mask: np.ndarray) -> Series:
-        """Return the rows at which `mask` ([T] bool, or indices) points."""
+        """Return the series with the rows of a boolean mask [T] or of indices."""
         stamp, arrival, sender = (
             None if column is None else column[mask]
             for column in (self.stamp, self.arrival, self.sender)
@@ -108,13 +109,22 @@ class Series:
         return dataclasses.replace(self, fields=fields, stamp=stamp, arrival=arrival, sender=sender)
 
     def shift_back(self, stamp: float, arrival: float) -> Series:
-        """Return the series with stamps and arrivals moved back by so many s."""
+        """Return the series with earlier times.
+
+        Args:
+            stamp: time in s to subtract from the stamps.
+            arrival: time in s to subtract from the arrivals.
+        """
         clocks = ((self.stamp, stamp), (self.arrival, arrival))
         shifted = [None if clock is None else clock - seconds for clock, seconds in clocks]
         return dataclasses.replace(self, stamp=shifted[0], arrival=shifted[1])
 
     def rows_of_sender(self, sender: str) -> Series:
-        """Return the rows of one sender."""
+        """Return the series with the rows of one sender.
+
+        Raises:
+            UsageError: if the sender is unknown.
+        """
         senders = (
             []
             if self.sender is None
@@ -127,26 +137,25 @@ class Series:
         return self.select_rows(self.sender == sender)
 
     def with_remarks(self, *remarks: Remark) -> Series:
-        """Return the series with further remarks."""
+        """Return the series with additional remarks."""
         return dataclasses.replace(self, remarks=(*self.remarks, *remarks))
 
 
 _MAX_LISTED_SERIES = 20
-"""Series of a recording that a message names."""
+"""Largest number of series that a message lists."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What one file or folder holds.
+    """Contents of one recorded file or folder.
 
     Attributes:
-        path: where it lies.
-        series: by name.
-        epoch: Unix time in whole ns that all times count from; None where the start of
-            their count is not known.
+        path: path of the file or folder.
+        series: name -> series.
+        epoch: Unix time in ns from which all times count; None if the source has no dates.
         files: files that were read.
-        remarks: what was noticed about the recording as a whole.
-        unread_series: names of series that the source holds and that were not wanted.
+        remarks: remarks on the recording.
+        unread_series: names of series that exist but were not requested.
     """
 
     path: Path
@@ -158,7 +167,7 @@ class Recording:
 
     @property
     def describe_contents(self) -> str:
-        """What it holds in words: each series with its type, or its fields where it has none."""
+        """Text with the name of each series and its message type, or its fields without a type."""
         descriptions = [
             f"{name} ({series.message_type.rsplit('/', 1)[-1] or ', '.join(list(series.fields)[:6])})"
             for name, series in self.series.items()
@@ -175,12 +184,19 @@ class Recording:
         )
 
     def __getitem__(self, topic: str | None) -> Series:
-        """Return one series; None names the only one. A leading slash may be left out."""
+        """Return one series.
+
+        Args:
+            topic: name, with or without a leading slash; None if the recording has only one.
+
+        Raises:
+            UsageError: if the series does not exist or is ambiguous.
+        """
         if topic is None:
             if len(self.series) == 1:
                 return next(iter(self.series.values()))
             raise UsageError(
-                f"{self.path}: holds {len(self.series)} topics, name one with `topic`"
+                f"{self.path}: contains {len(self.series)} topics, select one with `topic`"
                 f" ({', '.join(list(self.series)[:12])})"
             )
         name = match_topic(topic, self.series)
@@ -193,33 +209,38 @@ class Recording:
 
 @final
 class MessageBuffer:
-    """Messages of one kind as they come: whole ns, and a row of numbers each."""
+    """Growing buffer of messages: a time in ns and a row of numbers each.
+
+    Args:
+        names: names of the numbers.
+    """
 
     def __init__(self, names: Iterable[str]) -> None:
         self.names = list(names)
-        self.ns, self._rows = array("q"), array("d")
+        self.ns = array("q")
+        self._rows = array("d")
 
     def add(self, ns: int, field_values: Iterable[float]) -> None:
-        """Append one message."""
+        """Append one message with its time in ns and its numbers."""
         self.ns.append(ns)
         self._rows.extend(field_values)
 
     @property
     def times(self) -> np.ndarray:
-        """Whole ns [T]."""
+        """Times [T] in ns."""
         return np.frombuffer(self.ns, dtype=np.int64)
 
     @property
     def fields(self) -> dict[str, np.ndarray]:
-        """Name -> numbers [T]."""
+        """Name -> values [T]."""
         rows = np.frombuffer(self._rows, dtype=np.float64).reshape(len(self.ns), len(self.names))
         return {name: rows[:, i] for i, name in enumerate(self.names)}
 
 
 class RawSeries(NamedTuple):
-    """A series whose times are whole ns, before it is known where the recording begins.
+    """Series with times in ns, before the epoch of the recording is known.
 
-    Attributes are those of `Series`.
+    Attributes: see `Series`.
     """
 
     message_type: str
@@ -237,7 +258,15 @@ def build_recording(
     remarks: Iterable[Remark] = (),
     unread_series: Iterable[str] = (),
 ) -> Recording:
-    """Return the recording of series whose times count from the first whole second of all dates."""
+    """Build a recording; its epoch is the first full second of all absolute times.
+
+    Args:
+        path: path of the file or folder.
+        topics: name -> series.
+        files: files that were read.
+        remarks: remarks on the recording.
+        unread_series: names of series that were not read.
+    """
     clocks = [
         clock for raw_series in topics.values() for clock in raw_series[2:4] if clock is not None
     ]
@@ -265,15 +294,12 @@ def build_recording(
 
 
 def match_topic(topic: str, names: Iterable[str]) -> str | None:
-    """Return the one of `names` that means `topic`, a leading slash aside.
-
-    None where there is none.
-    """
+    """Return the name that equals a topic except for a leading slash, or None."""
     return next((name for name in names if name.strip("/") == topic.strip("/")), None)
 
 
 def normalize_field_path(path: str) -> str:
-    """Return a field's path with every separator as one underscore.
+    """Return a field's path with underscores as separators.
 
     Exporters write `pose.position.x`, `pose/position/x` or `pose_position_x`.
     """
@@ -281,31 +307,31 @@ def normalize_field_path(path: str) -> str:
 
 
 CLOCK_ONLY_FIELD = "(clock)"
-"""Stands for a field where only the times of a topic are wanted."""
+"""Name of a field for requests of a topic's times only."""
 
 
 @final
 class FieldFilter:
-    """Topics and fields that are to be read.
+    """Filter of the topics and fields that a reader loads.
 
     Args:
-        topic_fields: pairs of topic (None: the only one there is) and field; None wants everything. An
-            empty field wants all of its topic.
+        topic_fields: pairs of topic (None accepts any) and field (an empty one accepts all fields);
+            None accepts everything.
     """
 
     def __init__(self, topic_fields: Iterable[tuple[str | None, str]] | None = None) -> None:
         self._topic_fields = None if topic_fields is None else tuple(topic_fields)
 
     def __call__(self, topic: str) -> bool:
-        """Return whether anything of a topic is wanted."""
+        """Return whether any field of a topic is accepted."""
         return self._topic_fields is None or any(
             self._matches_topic(name, topic) for name, _ in self._topic_fields
         )
 
     def accepts_field(self, topic: str, path: str) -> bool:
-        """Return whether a field, a part of it or what it is a part of is wanted.
+        """Return whether a field, one of its parts or one of its parents is accepted.
 
-        `orientation.w` is a part of `orientation`, and `value[0]` of `value`.
+        `orientation.w` is a part of `orientation`, and `value[0]` is a part of `value`.
         """
         field_key = normalize_field_path(path)
         fields = [

@@ -1,7 +1,7 @@
-"""Readers of tables (csv, Parquet, Excel, JSON lines), each column by its entry in a channel map.
+"""Readers of tables (csv, Parquet, Excel, JSON lines) with a channel map.
 
-Everything foreign is converted here, once: units to SI, signs and frames to NED and body axes
-forward-starboard-down, psi unwrapped.
+All conversions take place here: units to SI, signs and frames to NED and to body axes (forward,
+starboard, down); psi is unwrapped.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from residnet.core.frames import unwrap_angle
 from residnet.core.log import Log, Remark, make_remark
 from residnet.core.names import suggest_name, truncate
 from residnet.core.units import canonical_unit, to_si
+from residnet.io.readers.angles import hemisphere_signs, parse_degrees
 from residnet.io.readers.base import (
     ConfiguredReader,
     ProgressCallback,
@@ -35,6 +36,7 @@ from residnet.io.readers.base import (
     require_values,
     wrap_read_errors,
 )
+from residnet.io.readers.clock_repair import find_unique_rows, repair_clock
 from residnet.io.readers.quantities import (
     COSINE_SUFFIX,
     QUATERNION,
@@ -45,7 +47,7 @@ from residnet.io.readers.quantities import (
     project_fixes,
     quaternion_yaw,
 )
-from residnet.io.readers.texts import (
+from residnet.io.readers.text_tables import (
     coerce_numeric,
     find_column_positions,
     find_header,
@@ -53,15 +55,7 @@ from residnet.io.readers.texts import (
     open_as_utf8,
     read_csv,
 )
-from residnet.io.readers.written import (
-    DateOrder,
-    find_unique_rows,
-    hemisphere_signs,
-    parse_degrees,
-    parse_texts,
-    parse_zone,
-    repair_clock,
-)
+from residnet.io.readers.timestamps import DateOrder, parse_texts, parse_zone
 from residnet.preprocessing.channel_values import is_fill_value, is_implausible, max_magnitude
 from residnet.preprocessing.motion import add_true_wind
 
@@ -69,34 +63,33 @@ if TYPE_CHECKING:
     import pandas as pd
 
 DATE_UNIT = "date"
-"""Stands for a unit where a column holds dates."""
+"""Value of `unit` for columns of dates."""
 TABLE_KINDS = {
     **dict.fromkeys((".csv", ".tsv", ".txt", ".dat"), "csv"),
     ".xlsx": "excel",
     ".parquet": "parquet",
     **dict.fromkeys((".jsonl", ".ndjson", ".json"), "json_lines"),
 }
-"""Ending of a table -> its kind of reader; a table does not say what its columns are."""
+"""File extension -> `kind` of the reader for tables, which need a channel map."""
 FIX_CHANNELS = ("latitude", "longitude")
 _HEADER_SEARCH_ROWS = 60
-"""Rows of a sheet among which names are looked for."""
+"""Rows of a sheet in which the header is searched."""
 _MAX_LIST_COLUMNS = 16
-"""Most entries of a list in JSON that become columns."""
+"""Longest JSON list whose entries become columns."""
 _MIN_TABLE_ROWS = 20
-"""Rows of a JSON document that are no note beside its log but a table; by choice."""
+"""Number of rows from which a second list in a JSON document counts as a table."""
 
 
 class TimeColumn(Config):
-    """The column that holds time, and its unit.
+    """Column of time and its unit.
 
     Attributes:
         column: name of the column.
-        unit: unit of its numbers, for example `ms`; `date` for dates and times of day, as
+        unit: unit of the numbers, for example `ms`; `date` for dates and times of day, for example
             `2024-05-03T12:00:00.5+02:00`, `03.05.2024 12:00:00,5` or `12:00:00.5`.
-        date: column with the dates, where `column` holds times of day; null for none.
-        zone: time zone of dates that name none, for example `Europe/Berlin`; null leaves them
-            without one.
-        order: of day, month and year in dates: `dmy`, `mdy` or `ymd`; null takes it from the cells.
+        date: column of dates if `column` has times of day; null if there is none.
+        zone: time zone of dates without one, for example `Europe/Berlin`; null takes them as UTC.
+        order: order of day, month and year in dates: `dmy`, `mdy` or `ymd`; null detects it.
     """
 
     column: str
@@ -124,33 +117,33 @@ class TimeColumn(Config):
             name for name in ("date", "zone", "order") if getattr(self, name) is not None
         ]
         if date_settings and self.unit != DATE_UNIT:
-            raise ValueError(f"{date_settings[0]} is for dates; set unit: {DATE_UNIT}")
+            raise ValueError(f"{date_settings[0]} applies to dates only; set unit: {DATE_UNIT}")
         return self
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns that hold time."""
+        """Names of the columns of time and date."""
         return (self.column,) if self.date is None else (self.column, self.date)
 
 
 class TableConfig(ConfiguredReader, ABC):
-    """The part that all tables have in common.
+    """Base class of the readers of tables.
 
     Attributes:
-        time: column of the time.
-        channels: canonical names (or names of your own) and the columns that they are taken from,
-            all of which must exist; `latitude` and `longitude` become x, y where these are not
-            there, `qx`, `qy`, `qz`, `qw` become the heading psi where there is none, and of any
-            angle its cosine and sine do, as `psi_cos` and `psi_sin`.
-        manoeuvre: kind of manoeuvre of every file; `folder` takes the name of each file's folder,
-            null says that it is not known.
+        time: column of time.
+        channels: channel name (canonical or user-defined) -> column, which must exist. `latitude`
+            and `longitude` become x and y unless these are mapped; `qx`, `qy`, `qz`, `qw` become
+            the heading psi unless it is mapped; the cosine and sine of an angle (`psi_cos` and
+            `psi_sin`) become the angle.
+        manoeuvre: type of manoeuvre of every file; `folder` takes the name of each file's folder;
+            null means unknown.
     """
 
     time: TimeColumn
     channels: dict[str, ChannelMap] = Field(min_length=1)
     manoeuvre: str | None = None
     row_format: ClassVar[str] = "row {0}"
-    """How a user calls a row of the table, by its number from 1, and from 2 behind a header."""
+    """Format of a row number in messages: {0} counts rows from 1, {1} also counts one header."""
 
     @field_validator("channels")
     @classmethod
@@ -161,42 +154,52 @@ class TableConfig(ConfiguredReader, ABC):
         if quaternion_names and len(quaternion_names) < len(QUATERNION):
             missing_names = ", ".join(name for name in QUATERNION if name not in channels)
             raise ValueError(
-                f"an attitude needs all of {', '.join(QUATERNION)}; add {missing_names}"
+                f"a quaternion needs all of {', '.join(QUATERNION)}; add {missing_names}"
             )
         return channels
 
     @abstractmethod
     def load(self, path: Path, columns: Sequence[str], advance: ProgressCallback) -> pd.DataFrame:
-        """Return the columns side by side, in order; `advance` is told the share that is read.
+        """Read columns of a file.
 
-        Its `attrs` may hold `n_lines_above`, lines above the values beside one header, and `is_truncated`, whether
-        the file ends within a last row that is left out.
+        Args:
+            path: file of the table.
+            columns: names of the columns to read.
+            advance: callback that receives the fraction of the file that has been read.
+
+        Returns:
+            The columns in the requested order. `attrs` may have `n_lines_above` (lines above the
+            values minus one header), `is_truncated` (whether an incomplete last row was dropped)
+            and `units` (unit in the cells of each column).
 
         Raises:
-            UsageError: where a column is missing.
-            DataError: where the file cannot be read.
+            UsageError: if a column is missing.
+            DataError: if the file cannot be read.
         """
 
     def read(self, path: Path) -> Log:
-        """Return the log in `path`.
+        """Read one log.
 
-        See `LogReader.read`. Fill values far from all else (-999, 9.97e36) count as missing, and
-        are counted. Rows without a measurement at either end, and blank rows, are dropped and
-        counted; other rows keep NaN where a channel was not measured.
+        See `LogReader.read`. Isolated fill values (-999, 9.97e36) become NaN and are counted. Blank
+        rows, and rows without a measurement at both ends, are dropped and counted. In other rows a
+        channel without a measurement is NaN.
         """
         import pandas as pd
 
         require_file(path)
-        time, channel_maps = self.time, self.channels
+        time = self.time
+        channel_maps = self.channels
         columns = [*time.columns, *(entry.column for entry in channel_maps.values())]
         hemisphere_columns = [
             entry.hemisphere for entry in channel_maps.values() if entry.hemisphere
         ]
         with reading_progress(path.name, path.stat().st_size, 1.0) as advance:
             table = self.load(path, [*columns, *hemisphere_columns], advance)
-        # pandas copies all that is told of a table for each of its columns
-        attributes, table.attrs = table.attrs, {}
-        n_lines_above, is_truncated = attributes.get("above", 0), bool(attributes.get("cut"))
+        # pandas would copy the attrs of a table to each of its columns
+        attributes = table.attrs
+        table.attrs = {}
+        n_lines_above = attributes.get("n_lines_above", 0)
+        is_truncated = bool(attributes.get("is_truncated"))
         rows = len(table) + is_truncated
         cells = dict(
             zip([*columns, *hemisphere_columns], (cells for _, cells in table.items()), strict=True)
@@ -204,7 +207,7 @@ class TableConfig(ConfiguredReader, ABC):
         self._require_matching_units(path, attributes.get("units", ()))
         t, start_ns, findings = self._parse_times(path, cells, n_lines_above)
         raw = {name: self._parse_channel(path, name, cells, n_lines_above) for name in channel_maps}
-        # each column is let go where its channel is made
+        # free the table before the channels are copied
         del table, cells
         measured = np.zeros(t.size, dtype=bool)
         for values in raw.values():
@@ -212,9 +215,9 @@ class TableConfig(ConfiguredReader, ABC):
         undated_rows = np.flatnonzero(measured & ~np.isfinite(t))
         if undated_rows.size:
             raise DataError(
-                f"{path}: {self._format_row(undated_rows[0] + n_lines_above)} has measurements but no time in column"
-                f" '{time.column}' ({undated_rows.size} such rows); delete them or restore their"
-                " time"
+                f"{path}: {self._format_row(undated_rows[0] + n_lines_above)} has measurements but"
+                f" no time in column '{time.column}' ({undated_rows.size} such rows); delete them"
+                " or restore their time"
             )
         for name, values in raw.items():
             raw[name], new_findings = self._mask_implausible(path, name, values, n_lines_above)
@@ -226,16 +229,14 @@ class TableConfig(ConfiguredReader, ABC):
         require_samples(path, sample_rows)
         if (np.diff(t[sample_rows]) < 0.0).all():
             sample_rows = sample_rows[::-1]
-            text = "the rows stand with the newest first, and are read from the last one on"
+            text = "the rows are in reverse order of time; the order is corrected"
             findings.append(make_remark("note", "newest_first", text))
         raw_columns = [*raw.values()]
         is_not_duplicate = find_unique_rows(
             t[sample_rows], (_take_rows(values, sample_rows) for values in raw_columns)
         )
         if not is_not_duplicate.all():
-            text = (
-                f"{int((~is_not_duplicate).sum())} rows repeat the one before them and are left out"
-            )
+            text = f"{int((~is_not_duplicate).sum())} rows repeat the previous row and are left out"
             findings.append(
                 make_remark("note", "copied_rows", text, rows=float((~is_not_duplicate).sum()))
             )
@@ -244,7 +245,7 @@ class TableConfig(ConfiguredReader, ABC):
         for name in hold_names:
             raw[name] = pd.Series(raw[name]).ffill().to_numpy()
         if hold_names and len(hold_names) < len(raw):
-            # a row of commands alone belongs to the next sample of the motion
+            # a row with commands only has no sample of the motion; its values are held
             measured_channels = [
                 values[sample_rows] for name, values in raw.items() if name not in hold_names
             ]
@@ -268,20 +269,23 @@ class TableConfig(ConfiguredReader, ABC):
             n_interpolated = int((np.isfinite(raw_channel) & ~np.isfinite(channels[name])).sum())
             if name == "psi" and n_interpolated:
                 text = (
-                    f"{n_interpolated} headings were interpolated by the recorder from 359 to 1 deg by way"
-                    " of 180; they are left empty"
+                    f"{n_interpolated} headings were interpolated by the recorder from 359 deg over"
+                    " 180 deg to 1 deg; they count as missing"
                 )
                 findings.append(make_remark("note", "heading_interpolated", text))
         channels, new_findings = _to_local_plane(path, channels, channel_maps)
         findings += new_findings
         if channels.keys() >= {*QUATERNION} and "psi" not in channels:
-            # where qw has the frame `enu`, the heading counts anticlockwise from east
+            # the frame of a quaternion is set at qw: in `enu` yaw is counter-clockwise from east
             yaw = quaternion_yaw(
                 *normalize_quaternion(*(channels.pop(name) for name in QUATERNION))
             )
             if not np.isfinite(yaw).any():
                 columns = [channel_maps[name].column for name in QUATERNION]
-                raise DataError(f"{path}: {', '.join(columns)} hold no attitude, all are empty")
+                raise DataError(
+                    f"{path}: {', '.join(columns)} contain no quaternion, all rows are empty; remove"
+                    " them from the channel map"
+                )
             channels["psi"] = unwrap_angle(
                 np.pi / 2.0 - yaw if channel_maps["qw"].frame == "enu" else yaw
             )
@@ -291,7 +295,8 @@ class TableConfig(ConfiguredReader, ABC):
             if cosine_name.endswith(COSINE_SUFFIX)
         ]:
             if name + SINE_SUFFIX in channels and name not in channels:
-                sine, cosine = channels.pop(name + SINE_SUFFIX), channels.pop(name + COSINE_SUFFIX)
+                sine = channels.pop(name + SINE_SUFFIX)
+                cosine = channels.pop(name + COSINE_SUFFIX)
                 channels[name] = unwrap_angle(np.arctan2(sine, cosine))
         derived_units = {"x": "m", "y": "m"}
         units = {
@@ -312,12 +317,17 @@ class TableConfig(ConfiguredReader, ABC):
         return add_true_wind(log)
 
     def _require_matching_units(self, path: Path, cell_units: Sequence[str]) -> None:
-        """Stop where cells name another unit than the channel map; `written` are those of cells."""
-        time, channel_maps = self.time, self.channels.values()
+        """Raise `DataError` if cells contain another unit than the channel map declares.
+
+        Args:
+            path: file of the table.
+            cell_units: unit in the cells of each column, or an empty string.
+        """
+        time = self.time
         time_units = [(name, time.unit) for name in time.columns]
-        # with a scale, the map says what its numbers mean
+        # a column with a scale factor may contain counts of any unit
         channel_units = [
-            (item.column, "" if item.scale != 1.0 else item.unit) for item in channel_maps
+            (item.column, "" if item.scale != 1.0 else item.unit) for item in self.channels.values()
         ]
         for (column, unit), cell_unit in zip(
             [*time_units, *channel_units], cell_units, strict=False
@@ -334,7 +344,11 @@ class TableConfig(ConfiguredReader, ABC):
     def _parse_times(
         self, path: Path, cells: Mapping[str, pd.Series], n_lines_above: int
     ) -> tuple[np.ndarray, int | None, list[Remark]]:
-        """Return the times [T] in s, from Unix time in ns where there are dates, and remarks."""
+        """Convert the column of time.
+
+        Returns:
+            Times [T] in s; the Unix time in ns that they count from (None without dates); remarks.
+        """
         time = self.time
         texts = cells[time.column]
         if time.unit != DATE_UNIT:
@@ -358,7 +372,7 @@ class TableConfig(ConfiguredReader, ABC):
     def _parse_channel(
         self, path: Path, name: str, cells: Mapping[str, pd.Series], n_lines_above: int
     ) -> np.ndarray:
-        """Return one channel [T] as it stands in the table, NaN where empty."""
+        """Return one channel [T] in the unit of its column, NaN for empty cells."""
         import pandas as pd
 
         entry = self.channels[name]
@@ -367,7 +381,7 @@ class TableConfig(ConfiguredReader, ABC):
         if not entry.is_angle and not is_text:
             return self._parse_numbers(path, cells[column], column, n_lines_above)
         if canonical_unit(entry.unit) != "deg":
-            raise DataError(f"{path}: column '{column}' is written in degrees; set unit: deg")
+            raise DataError(f"{path}: the angles in column '{column}' are degrees; set unit: deg")
         try:
             angles = parse_degrees(cells[column], name, entry.form, entry.letter_o)
             if entry.hemisphere is not None:
@@ -380,7 +394,7 @@ class TableConfig(ConfiguredReader, ABC):
     def _parse_numbers(
         self, path: Path, column: pd.Series, name: str, n_lines_above: int
     ) -> np.ndarray:
-        """Return the cells of one column as float64 [T], NaN where empty."""
+        """Return the cells of one column as float64 [T], NaN for empty cells."""
         import pandas as pd
 
         numeric = (
@@ -397,17 +411,23 @@ class TableConfig(ConfiguredReader, ABC):
         if invalid_rows.size:
             i = int(invalid_rows[0])
             raise DataError(
-                f"{path}: {self._format_row(i + n_lines_above)}, column '{name}': '{truncate(column.iloc[i])}' is not"
-                f" a finite number ({invalid_rows.size} such cells in {len(column)} rows); leave cells"
-                " without a measurement empty, and check `delimiter` and `decimal`"
+                f"{path}: {self._format_row(i + n_lines_above)}, column '{name}':"
+                f" '{truncate(column.iloc[i])}' is not a finite number ({invalid_rows.size} such"
+                f" cells in {len(column)} rows); leave cells without a measurement empty, and check"
+                " `delimiter` and `decimal`"
             )
         return values
 
     def _mask_implausible(
         self, path: Path, name: str, values: np.ndarray, n_lines_above: int
     ) -> tuple[np.ndarray, list[Remark]]:
-        """Return a channel [T] without fill values; stop at one that no vessel can have."""
-        entry, findings = self.channels[name], []
+        """Return a channel [T] without fill values, and remarks.
+
+        Raises:
+            DataError: if a value exceeds what any vessel reaches.
+        """
+        entry = self.channels[name]
+        findings = []
         is_fill = is_fill_value(values)
         if is_fill.any():
             count = int(is_fill.sum())
@@ -419,24 +439,26 @@ class TableConfig(ConfiguredReader, ABC):
         if implausible_rows.size:
             i = int(implausible_rows[0])
             raise DataError(
-                f"{path}: {self._format_row(i + n_lines_above)}, column '{entry.column}': {values[i]:g} makes"
-                f" {name} larger than {max_magnitude(unit):g} {unit}, which no vessel reaches"
-                f" ({implausible_rows.size} such cells); correct or empty them, or correct the unit"
+                f"{path}: {self._format_row(i + n_lines_above)}, column '{entry.column}':"
+                f" {values[i]:g} makes {name} larger than {max_magnitude(unit):g} {unit}, which no"
+                f" vessel reaches ({implausible_rows.size} such cells); correct or empty them, or"
+                " correct the unit"
             )
         return values, findings
 
 
 @final
 class CsvConfig(TableConfig):
-    """Text tables with a line of column names; lines above it, and units beneath it, are skipped.
+    """Reader of text tables with a line of column names.
 
-    The names' line is the first one that holds the time's and all channels' columns.
+    The header is the first line that contains the names of all required columns. Lines above it,
+    and units below it, are skipped.
 
     Attributes:
-        delimiter: between cells; a blank stands for any number of blanks and tabulators.
-        decimal: sign of the decimals, `.` or `,`.
-        encoding: of the text, for example `cp1252` for a file that an older Windows wrote; null
-            finds it by the bytes themselves, UTF-16, cp932 and gb18030 included.
+        delimiter: separator of cells; a blank means any number of blanks and tabs.
+        decimal: decimal sign, `.` or `,`.
+        encoding: encoding of the text, for example `cp1252` for files of older Windows programs;
+            null detects it.
     """
 
     kind: Literal["csv"] = "csv"
@@ -454,7 +476,8 @@ class CsvConfig(TableConfig):
             return codecs.lookup(encoding).name
         except LookupError as error:
             raise ValueError(
-                f"no encoding is called '{encoding}'; usual are utf-8, utf-16, cp1252 and cp932"
+                f"no encoding is called '{encoding}'; common ones are utf-8, utf-16, cp1252 and"
+                " cp932"
             ) from error
 
     def load(self, path: Path, columns: Sequence[str], advance: ProgressCallback) -> pd.DataFrame:
@@ -463,10 +486,12 @@ class CsvConfig(TableConfig):
 
 @final
 class ExcelConfig(TableConfig):
-    """Sheets of Excel files (.xlsx); lines above the column names, and units beneath, are skipped.
+    """Reader of sheets in Excel files (.xlsx).
+
+    Rows above the column names, and units below them, are skipped.
 
     Attributes:
-        sheet: name of the sheet; null takes the first.
+        sheet: name of the sheet; null takes the first one.
     """
 
     kind: Literal["excel"] = "excel"
@@ -478,13 +503,13 @@ class ExcelConfig(TableConfig):
         selected = table.iloc[
             :, find_column_positions(path, [str(name) for name in table.columns], columns)
         ]
-        selected.attrs["above"] = table.attrs["above"] - 1
+        selected.attrs["n_lines_above"] = table.attrs["n_lines_above"] - 1
         return coerce_numeric(selected)
 
 
 @final
 class ParquetConfig(TableConfig):
-    """Parquet tables that residnet did not write."""
+    """Reader of Parquet tables that residnet did not write."""
 
     kind: Literal["parquet"] = "parquet"
 
@@ -501,18 +526,17 @@ class ParquetConfig(TableConfig):
 
 @final
 class JsonLinesConfig(TableConfig):
-    """Files with a JSON object a line (.jsonl, .ndjson), or a document (.json) that holds a table.
+    """Reader of JSON: one object per line (.jsonl, .ndjson), or a document (.json) with a table.
 
-    A column is a key, `nav.lat` one within; entries of lists are counted from zero: `imu.q[0]`. The
-    table of a document is its longest list of objects, or the lists of one length beside each
-    other.
+    A column is a key; `nav.lat` is a nested key, `imu.q[0]` the first entry of a list. The table of
+    a document is its longest list of objects, or a group of lists of equal length.
     """
 
     kind: Literal["json_lines"] = "json_lines"
     row_format: ClassVar[str] = "object {0}"
 
     def load(self, path: Path, columns: Sequence[str], advance: ProgressCallback) -> pd.DataFrame:
-        """Return the columns of JSON lines; an object without a key has an empty cell there."""
+        """Read columns; an object without a key has an empty cell."""
         import pandas as pd
 
         lines = _JsonObjectReader(path)
@@ -524,12 +548,12 @@ class JsonLinesConfig(TableConfig):
         table = pd.DataFrame({i: [row.get(n) for row in rows] for i, n in enumerate(columns)})
         table = table.infer_objects()
         table.columns = pd.Index(list(columns))
-        table.attrs["cut"] = lines.is_truncated
+        table.attrs["is_truncated"] = lines.is_truncated
         return coerce_numeric(table)
 
 
 def _take_rows(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return values [T] at rows [K]; themselves, and no copy, where these are all in order."""
+    """Return the values [T] at rows [K], without a copy if these are all rows in order."""
     is_identity = rows.size == values.size and rows[0] == 0
     return values if is_identity else np.asarray(values[rows])
 
@@ -537,7 +561,19 @@ def _take_rows(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
 def _to_local_plane(
     path: Path, channels: dict[str, np.ndarray], channel_maps: Mapping[str, ChannelMap]
 ) -> tuple[dict[str, np.ndarray], list[Remark]]:
-    """Return channels with x, y in place of latitude and longitude, and where they count from."""
+    """Replace latitude and longitude by x and y on a local tangent plane.
+
+    Args:
+        path: file of the log, for messages.
+        channels: channels in SI.
+        channel_maps: entries of the channel map.
+
+    Returns:
+        The channels, and remarks on the origin of the plane.
+
+    Raises:
+        DataError: if the angles are no latitudes, or no fix exists.
+    """
     if not channels.keys() >= {*FIX_CHANNELS} or {"x", "y"} & channels.keys():
         return channels, []
     latitude, longitude = (channels[name] for name in FIX_CHANNELS)
@@ -545,11 +581,15 @@ def _to_local_plane(
     max_latitude = float(np.abs(latitude[np.isfinite(latitude)]).max(initial=0.0))
     if channel_maps["latitude"].si_unit_of("latitude") != "rad" or max_latitude > np.pi / 2:
         raise DataError(
-            f"{path}: latitude reaches {np.degrees(max_latitude):.4g} deg, which none does; give the unit"
-            " of its column (deg), and `form: ddmm` for degrees and minutes in one number"
+            f"{path}: latitude reaches {np.degrees(max_latitude):.4g} deg, at most 90 deg is"
+            " possible; give the unit of its column (deg), and `form: ddmm` for degrees and minutes"
+            " in one number"
         )
     if origin is None:
-        raise DataError(f"{path}: latitude and longitude hold no fix")
+        raise DataError(
+            f"{path}: latitude and longitude contain no fix; remove them from the channel map, or"
+            " leave the file out"
+        )
     origin_deg = [float(np.degrees(angle)) for angle in origin]
     text = (
         f"x, y are north and east of the first fix, latitude {origin_deg[0]:.6f} deg, longitude"
@@ -557,21 +597,27 @@ def _to_local_plane(
     )
     remarks = [make_remark("note", "origin", text, latitude=origin[0], longitude=origin[1])]
     if n_null_fixes:
-        text = f"{n_null_fixes} fixes at latitude 0, longitude 0 are no fixes; left empty"
+        text = f"{n_null_fixes} positions at latitude 0, longitude 0 are no fixes; they are missing"
         remarks.append(make_remark("note", "no_fix", text, count=float(n_null_fixes)))
     other_channels = {name: values for name, values in channels.items() if name not in FIX_CHANNELS}
     return {"x": north, "y": east, **other_channels}, remarks
 
 
 def read_excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> pd.DataFrame:
-    """Return a sheet as its cells are, with the line above its values that holds names as names.
-
-    Its `attrs` hold `n_lines_above`, the number of lines above the values, and `between`, the cells of the
-    lines between names and values.
+    """Read a sheet and detect its row of column names.
 
     Args:
-        sheet: its name; None takes the first.
-        rows: how many are read; None for all.
+        path: Excel file.
+        sheet: name of the sheet; None takes the first one.
+        rows: largest number of rows to read; None reads all.
+
+    Returns:
+        The cells below the header. `attrs` has `n_lines_above` (rows above the values) and
+        `unit_rows` (cells of the rows between names and values).
+
+    Raises:
+        UsageError: if the sheet does not exist.
+        DataError: if the file cannot be read.
     """
     import pandas as pd
 
@@ -587,13 +633,13 @@ def read_excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> 
         for row in cells.head(_HEADER_SEARCH_ROWS).itertuples(index=False)
     ]
     header_row, first_value_row = find_header(head_rows) or (0, 1)
-    # with the names among them, all columns were of objects
+    # the names in the first rows made all columns object columns
     table = cells.iloc[first_value_row:].infer_objects()
     table.columns = pd.Index(make_names_unique(head_rows[header_row] if head_rows else []))
     table = table.dropna(how="all")
     table.attrs |= {
-        "above": first_value_row,
-        "between": head_rows[header_row + 1 : first_value_row],
+        "n_lines_above": first_value_row,
+        "unit_rows": head_rows[header_row + 1 : first_value_row],
     }
     return table
 
@@ -602,8 +648,8 @@ def list_sheet_names(path: Path) -> list[str]:
     """Return the names of the sheets of an Excel file, in order.
 
     Raises:
-        UsageError: where openpyxl is not installed.
-        DataError: where the file cannot be read.
+        UsageError: if openpyxl is not installed.
+        DataError: if the file cannot be read.
     """
     with optional_import("excel", "openpyxl", "an Excel sheet"):
         import openpyxl
@@ -620,8 +666,8 @@ def _read_parquet_names(path: Path) -> list[str]:
         except UnicodeDecodeError as error:
             name = truncate(bytes(error.object).decode("latin-1"), 60)
             raise DataError(
-                f"{path}: '{name}', the name of a column, is no UTF-8 text; rename it where it is"
-                " written"
+                f"{path}: the column name '{name}' is no UTF-8 text; rename the column in the"
+                " program that writes it"
             ) from error
 
 
@@ -629,30 +675,33 @@ def read_parquet_head(path: Path, rows: int) -> pd.DataFrame:
     """Return the first rows of a Parquet file.
 
     Raises:
-        DataError: where it cannot be read.
+        DataError: if the file cannot be read.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     with wrap_read_errors(path, "a Parquet file"):
-        # an index of pandas is a column as its reader sees it
+        # an index of pandas counts as a column
         batch = next(pq.ParquetFile(path).iter_batches(batch_size=rows))
         table: pd.DataFrame = pa.Table.from_batches([batch]).to_pandas(ignore_metadata=True)
         return table
 
 
 def read_json_head(path: Path, rows: int) -> pd.DataFrame:
-    """Return the first rows of a file of JSON lines, a column for each key."""
+    """Return the first rows of a JSON table, with a column for each key."""
     import pandas as pd
 
     objects = list(islice(_JsonObjectReader(path), rows))
     if not objects:
-        raise DataError(f"{path}: the file is empty; an object a line was expected")
+        raise DataError(f"{path}: the file is empty; one JSON object per line was expected")
     return coerce_numeric(pd.DataFrame(objects).infer_objects())
 
 
 def read_column_names(path: Path) -> tuple[str, ...]:
-    """Return what tells tables of the same columns: their names, or the first line of a text."""
+    """Return a key that is equal for tables with the same columns.
+
+    It is the column names of a Parquet file, the first line of a text, and empty for other formats.
+    """
     table_kind = TABLE_KINDS.get(path.suffix.lower(), "csv")
     if table_kind == "parquet":
         return tuple(_read_parquet_names(path))
@@ -664,10 +713,11 @@ def read_column_names(path: Path) -> tuple[str, ...]:
 
 @final
 class _JsonObjectReader:
-    """The objects of a file, flat: `nav.lat` is a key within, `imu.q[0]` an entry of a list."""
+    """Iterator over the flattened objects of a JSON file; nested keys become `nav.lat`, `q[0]`."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self.is_truncated = path, False
+        self._path = path
+        self.is_truncated = False
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         n_objects = 0
@@ -685,18 +735,22 @@ class _JsonObjectReader:
                         yield from _expand_signal_k(value)
                         n_objects += 1
                 except (ValueError, RecursionError) as error:
-                    # a recorder that was switched off ends within a line
+                    # the last line is incomplete if the recorder was switched off
                     self.is_truncated = n_objects > 0 and not line.endswith(b"\n")
                     if self.is_truncated:
                         return
                     raise DataError(
-                        f"{self._path}: line {line_number}, '{truncate(text, 60)}', is no JSON object;"
-                        " give files with one object a line"
+                        f"{self._path}: line {line_number}, '{truncate(text, 60)}', is no JSON"
+                        " object; give files with one object per line"
                     ) from error
 
 
 def _parse_json_table(path: Path, file: Path) -> Sequence[Mapping[str, Any]] | None:
-    """Return the objects of the table that one JSON document holds; None for an object a line."""
+    """Return the rows of the table in a JSON document; None if the file has one object per line.
+
+    Raises:
+        DataError: if the document contains no table or several.
+    """
     if path.suffix.lower() != ".json":
         return None
     try:
@@ -706,7 +760,7 @@ def _parse_json_table(path: Path, file: Path) -> Sequence[Mapping[str, Any]] | N
     tables = dict(_find_json_tables(document))
     if not tables:
         raise DataError(
-            f"{path}: holds no table; a list of objects, or lists of one length by name, were"
+            f"{path}: contains no table; a list of objects, or named lists of equal length, were"
             " expected"
         )
     longest_name = max(tables, key=lambda name: len(tables[name]))
@@ -720,8 +774,8 @@ def _parse_json_table(path: Path, file: Path) -> Sequence[Mapping[str, Any]] | N
             f"{name} ({len(tables[name])} rows)" for name in [longest_name, *other_names]
         )
         raise DataError(
-            f"{path}: holds several tables, {table_sizes}; write each into a file of its own, all with a"
-            " time: files whose names differ in that word alone are read as one log"
+            f"{path}: contains several tables, {table_sizes}; write each with its time to a"
+            " separate file: files whose names differ in one word only are read as one log"
         )
     return tables[longest_name]
 
@@ -729,7 +783,10 @@ def _parse_json_table(path: Path, file: Path) -> Sequence[Mapping[str, Any]] | N
 def _find_json_tables(
     value: Any, name: str = ""
 ) -> Iterator[tuple[str, Sequence[Mapping[str, Any]]]]:
-    """Yield name and rows of the tables in a value: lists of objects, and lists side by side."""
+    """Yield name and rows of each table in a JSON value.
+
+    A table is a list of objects, or a group of named lists of equal length.
+    """
     if isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
         yield name, value
     if not isinstance(value, dict):
@@ -753,7 +810,7 @@ def _find_json_tables(
 
 
 def _expand_signal_k(value: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Yield the rows that an object holds: one, or one for each update of Signal K."""
+    """Yield the rows of an object: one, or one for each update of a Signal K message."""
     updates = value.get("updates")
     if not isinstance(updates, list) or "context" not in value:
         yield _flatten_json(value)
@@ -764,9 +821,10 @@ def _expand_signal_k(value: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _flatten_json(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the numbers and texts of a nested object, by keys such as `nav.lat` and `q[0]`."""
     flattened: dict[str, Any] = {}
     if value.get("type") == "Point" and isinstance(value.get("coordinates"), list):
-        # of GeoJSON (RFC 7946, section 3.1.1)
+        # GeoJSON, RFC 7946, section 3.1.1
         coordinates = zip(("longitude", "latitude"), value["coordinates"], strict=False)
         value = dict(coordinates)
     for key, entry in value.items():
@@ -774,7 +832,7 @@ def _flatten_json(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         if isinstance(entry, dict):
             flattened |= _flatten_json(entry, f"{name}.")
         elif isinstance(entry, list):
-            # scans and pictures are no channels
+            # longer lists are scans or images, not channels
             entry = entry if len(entry) <= _MAX_LIST_COLUMNS else []
             flattened |= _flatten_json({f"{name}[{i}]": part for i, part in enumerate(entry)})
         else:

@@ -1,8 +1,8 @@
-"""The topics of a recording: one clock for all, rates, gaps, publishers, lags and levers.
+"""Clocks and checks of topics: offsets, delays, rates, gaps, publishers, lags and lever arms.
 
-A header stamp says when something was measured, an arrival when somebody wrote it down. Stamps are
-preferred; topics without one keep their arrivals, brought from the recorder's clock to the
-senders'.
+A header stamp is the time of a measurement on the sender's clock, an arrival the time of its
+recording on the recorder's clock. Stamps are preferred. Arrivals of topics without stamps are
+converted to the senders' clock.
 """
 
 from __future__ import annotations
@@ -14,41 +14,43 @@ import numpy as np
 
 from residnet.core.frames import rotate
 from residnet.core.log import Log, Remark, make_remark
+from residnet.io.readers.clock_repair import repeats_previous_row
 from residnet.io.readers.recording import Recording, Series, match_topic, normalize_field_path
-from residnet.io.readers.written import repeats_previous_row
 from residnet.preprocessing.statistics import estimate_agreement
 
-# zones differ by whole quarters of an hour
+# time zones differ by multiples of a quarter of an hour, s
 _QUARTER_HOUR = 900.0
-# share of the messages that are taken to arrive without delay
+# quantile of the delays that counts as undelayed
 _PROMPT_QUANTILE = 0.01
-# offsets below this are delays of the transport, not of a clock, and no lags, s
+# smaller offsets are delays of the transport, not offsets of a clock, s
 _MIN_OFFSET = 0.1
-# rows out of order that sorting mends: their share, and how far back they lie, s
-_MAX_UNORDERED_SHARE, _MAX_BACKWARD_STEP = 0.01, 1.0
-# a gap is this many times the usual step, and this many seconds
-_GAP_STEPS, _GAP_SECONDS = 5.0, 0.5
-# rows below which nothing is said about publishers, lags and levers
+# limits for the correction of unordered rows by sorting: their share, and the step back in s
+_MAX_UNORDERED_SHARE = 0.01
+_MAX_BACKWARD_STEP = 1.0
+# a gap is longer than both: so many median steps, and so many seconds
+_GAP_STEPS = 5.0
+_GAP_SECONDS = 0.5
+# fewest rows for checks of publishers, lags and lever arms
 _MIN_ROWS = 100
-# shortest step by which lags are looked for, s
+# shortest step of the grid on which lags are estimated, s
 _MIN_LAG_STEP = 0.05
-# correlation that calls two signals the same quantity
+# smallest correlation of two signals of the same quantity
 _MIN_CORRELATION = 0.9
 _MIN_LEVER_ARM = 0.2
-"""Distance of two points of a vessel, m, that is worth telling; chosen by hand."""
+"""Shortest lever arm in m that is reported."""
 
 
 def align_clocks(
     recording: Recording, delays: Mapping[str, float | None], zone: float | None = None
 ) -> Recording:
-    """Return the recording with one clock for all: offsets removed, rows of every series in order.
+    """Bring all topics of a recording to one clock and sort their rows.
 
     Args:
-        delays: topic -> time in s by which its rows are older than their time says; they are moved
-            back by it. None takes the usual latency of the topics that have stamps and arrivals,
-            for one that has arrivals only.
-        zone: time by which the recorder's clock is ahead of UTC, s; None estimates it from topics
-            with stamp and arrival.
+        recording: recording as loaded.
+        delays: topic -> delay in s that is subtracted from its times. None subtracts the median
+            latency of the topics with stamps and arrivals, if this topic has arrivals only.
+        zone: offset of the recorder's clock from UTC in s; None estimates it from topics with
+            stamps and arrivals.
     """
     series = {name: _drop_constant_stamps(topic) for name, topic in recording.series.items()}
     delays_by_topic = {
@@ -56,7 +58,7 @@ def align_clocks(
         for name, topic in series.items()
         if topic.stamp is not None and topic.arrival is not None and len(topic)
     }
-    # of the messages that arrive at once
+    # the fastest messages have no transport delay: their delay is the offset of the clock
     prompt_delays = {
         name: float(np.quantile(delay, _PROMPT_QUANTILE)) for name, delay in delays_by_topic.items()
     }
@@ -84,7 +86,7 @@ def align_clocks(
             delay = latency if topic.stamp is None else 0.0
         topic = _sort_and_deduplicate(topic)
         if delay:
-            text = f"topic {name}: moved back by {delay:g} s, as the config asks"
+            text = f"topic {name}: times are reduced by the configured delay of {delay:g} s"
             delay_remark = make_remark("note", "delay_corrected", text, delay=delay)
             topic = topic.shift_back(delay, delay).with_remarks(delay_remark)
         aligned[name] = topic
@@ -92,7 +94,7 @@ def align_clocks(
 
 
 def _drop_constant_stamps(topic: Series) -> Series:
-    """Return the series without stamps that carry no time."""
+    """Return the series without its stamps if all of them are equal."""
     if topic.stamp is None or topic.arrival is None or len(topic) < 2 or np.ptp(topic.stamp):
         return topic
     rows = len(topic)
@@ -104,9 +106,14 @@ def _drop_constant_stamps(topic: Series) -> Series:
 def _estimate_recorder_offset(
     prompt_delays: Sequence[float], zone: float | None
 ) -> tuple[float, list[Remark]]:
-    """Return the seconds that the recorder's clock is ahead of the senders', and remarks.
+    """Estimate the offset of the recorder's clock from the senders' clocks.
 
-    `prompt_delays` is arrival less stamp of the promptest messages of each topic, s.
+    Args:
+        prompt_delays: arrival minus stamp of the fastest messages of each topic in s.
+        zone: offset from UTC in s; None rounds it to quarters of an hour.
+
+    Returns:
+        The offset in s, and remarks.
     """
     if not prompt_delays:
         return zone or 0.0, []
@@ -117,14 +124,14 @@ def _estimate_recorder_offset(
     if zone:
         text = (
             f"the recorder's clock is {zone / 3600.0:+g} h from the header stamps (a time zone);"
-            " arrivals are moved by it"
+            " arrivals are corrected"
         )
         remarks.append(make_remark("note", "time_zone", text, offset=zone))
     if 0.0 <= zone_residual <= _MIN_OFFSET:
         return zone, remarks
     text = (
-        f"the recorder's clock is {zone_residual:+.3f} s from the header stamps of {len(prompt_delays)} topics;"
-        " arrivals are moved by it"
+        f"the recorder's clock is {zone_residual:+.3f} s from the header stamps of"
+        f" {len(prompt_delays)} topics; arrivals are corrected"
     )
     return median_offset, [
         *remarks,
@@ -133,26 +140,33 @@ def _estimate_recorder_offset(
 
 
 def _check_latency(name: str, delays: np.ndarray, offset: float) -> list[Remark]:
-    """Return what the delays [T] of a topic tell, s, arrivals being on the senders' clock."""
-    median_latency, max_latency = float(np.median(delays)), float(delays.max())
+    """Return remarks on the latency of a topic.
+
+    Args:
+        name: name of the topic.
+        delays: arrival minus stamp [T] in s, with the offset of the recorder's clock removed.
+        offset: delay of the fastest messages in s.
+    """
+    median_latency = float(np.median(delays))
+    max_latency = float(delays.max())
     if abs(offset) > _MIN_OFFSET:
         text = (
-            f"topic {name}: stamps are {offset:+.3f} s from those of the other topics (of messages"
-            " that arrive at once); its sender has another clock or stamps late: correct it with"
+            f"topic {name}: stamps have an offset of {offset:+.3f} s from those of other topics"
+            " (fastest messages); its sender has another clock or stamps late: correct it with"
             " `delays`"
         )
         return [make_remark("will mislead", "clock_offset", text, offset=offset)]
     if max_latency > _MIN_OFFSET:
         text = (
-            f"topic {name}: receive latency is {median_latency:.4f} s (median) and reaches {max_latency:.3f} s;"
-            " header stamps are used"
+            f"topic {name}: receive latency is {median_latency:.4f} s (median) and at most"
+            f" {max_latency:.3f} s; header stamps are used"
         )
         return [make_remark("note", "latency", text, median=median_latency, maximum=max_latency)]
     return []
 
 
 def _sort_and_deduplicate(topic: Series) -> Series:
-    """Return the rows in order of time, none twice."""
+    """Return the series with sorted rows and unique times."""
     if len(topic) < 2:
         return topic
     time_steps = np.diff(topic.clock)
@@ -163,18 +177,19 @@ def _sort_and_deduplicate(topic: Series) -> Series:
     if not repeated_rows.size:
         return topic
     is_copy = repeats_previous_row(topic.fields.values(), repeated_rows)
-    n_copies, n_conflicts = int(is_copy.sum()), int((~is_copy).sum())
-    # of rows with one time the last is the newest
+    n_copies = int(is_copy.sum())
+    n_conflicts = int((~is_copy).sum())
+    # of rows with equal times the last one is the newest
     deduplicated = topic.select_rows(np.append(np.diff(topic.clock) != 0.0, True))
     if n_copies:
-        text = f"topic {topic.name}: {n_copies} rows repeat the row before; left out"
+        text = f"topic {topic.name}: {n_copies} rows repeat the previous row; left out"
         deduplicated = deduplicated.with_remarks(
             make_remark("note", "duplicate_rows", text, rows=n_copies)
         )
     if n_conflicts:
         text = (
-            f"topic {topic.name}: {n_conflicts} rows have the time of the row before but other values"
-            " (several senders?); the last of each time is kept"
+            f"topic {topic.name}: {n_conflicts} rows have the time of the previous row but other"
+            " values (several senders?); the last row of each time is used"
         )
         deduplicated = deduplicated.with_remarks(
             make_remark("will mislead", "repeated_stamps", text, rows=n_conflicts)
@@ -183,6 +198,16 @@ def _sort_and_deduplicate(topic: Series) -> Series:
 
 
 def _repair_order(topic: Series, n_backward: int, max_backward_step: float) -> Series:
+    """Return the series with increasing times.
+
+    A few unordered rows are sorted. Otherwise stamps are replaced by arrivals minus the median
+    latency if the arrivals increase; else the remark is fatal.
+
+    Args:
+        topic: series with decreasing times.
+        n_backward: number of steps back.
+        max_backward_step: largest step back in s.
+    """
     figures = {"steps": float(n_backward), "farthest": max_backward_step}
     description = f"backwards {n_backward} times, by up to {max_backward_step:.3g} s"
     is_sortable = (
@@ -198,8 +223,8 @@ def _repair_order(topic: Series, n_backward: int, max_backward_step: float) -> S
     ):
         median_latency = float(np.median(arrival - stamp))
         text = (
-            f"topic {topic.name}: header stamps run {description}; arrival times less the median latency"
-            f" of {median_latency:.3g} s are used instead"
+            f"topic {topic.name}: header stamps run {description}; arrival times minus the median"
+            f" latency of {median_latency:.3g} s are used instead"
         )
         order_remark = make_remark(
             "will mislead", "stamps_run_backwards", text, **figures, latency=median_latency
@@ -215,14 +240,14 @@ def _repair_order(topic: Series, n_backward: int, max_backward_step: float) -> S
 
 
 def topic_statistics(series: Series) -> list[Remark]:
-    """Return the remarks on a series whose rows are in order."""
+    """Return remarks on rate, gaps, empty fields and publishers of a sorted series."""
     if not len(series):
-        return [make_remark("note", "empty_topic", f"topic {series.name}: holds no rows")]
+        return [make_remark("note", "empty_topic", f"topic {series.name}: has no rows")]
     remarks = []
     empty_fields = [path for path, values in series.fields.items() if np.isnan(values).all()]
     if empty_fields:
         field_list = ", ".join(empty_fields[:6]) + (", ..." if len(empty_fields) > 6 else "")
-        text = f"topic {series.name}: {len(empty_fields)} fields hold no number ({field_list})"
+        text = f"topic {series.name}: {len(empty_fields)} fields have no values ({field_list})"
         remarks.append(make_remark("note", "empty_columns", text, fields=len(empty_fields)))
     if len(series) < 3:
         return remarks
@@ -230,8 +255,8 @@ def topic_statistics(series: Series) -> list[Remark]:
     median_step, max_step = float(np.median(step)), float(step.max())
     rate = (len(series) - 1) / float(series.clock[-1] - series.clock[0])
     text = (
-        f"topic {series.name}: {len(series)} rows, {rate:.3g} Hz, step {median_step:.3g} s (median),"
-        f" spread {float(np.std(step)):.2g} s, longest {max_step:.3g} s"
+        f"topic {series.name}: {len(series)} rows, {rate:.3g} Hz, median step {median_step:.3g} s,"
+        f" standard deviation {float(np.std(step)):.2g} s, longest step {max_step:.3g} s"
     )
     figures = {"rows": len(series), "rate": rate, "step": median_step, "longest": max_step}
     remarks.append(make_remark("note", "topic_rate", text, **figures))
@@ -239,8 +264,8 @@ def topic_statistics(series: Series) -> list[Remark]:
     if n_gaps:
         gap_time = float(series.clock[int(np.argmax(step))])
         text = (
-            f"topic {series.name}: {n_gaps} gaps, the longest {max_step:.3g} s at {gap_time:.1f} s; nothing"
-            " is interpolated across"
+            f"topic {series.name}: {n_gaps} gaps, the longest {max_step:.3g} s at {gap_time:.1f} s;"
+            " gaps are not interpolated"
         )
         remarks.append(
             make_remark("note", "topic_gaps", text, gaps=n_gaps, longest=max_step, at=gap_time)
@@ -249,12 +274,15 @@ def topic_statistics(series: Series) -> list[Remark]:
 
 
 def _detect_multiple_publishers(series: Series, step: np.ndarray) -> list[Remark]:
-    """Return a remark where several publishers share the topic.
+    """Return a remark if several publishers share a topic.
 
-    They are recognised by the sender that the source names, else by values that leap away and come
-    straight back (A, B, A) while rows follow each other at irregular short steps, as two trains of
-    messages on one track do, or by such leaps alone where nearly every row is one and they are
-    wide.
+    They are detected from the sender of each row. Without senders, values that jump and return
+    immediately (A, B, A) indicate two publishers, if the steps between rows are irregular and
+    short, or if nearly all rows have such jumps and the jumps are wide.
+
+    Args:
+        series: sorted series.
+        step: time steps [T - 1] in s.
     """
     if series.sender is not None:
         names = [str(name) for name in dict.fromkeys(series.sender.tolist())]
@@ -262,7 +290,7 @@ def _detect_multiple_publishers(series: Series, step: np.ndarray) -> list[Remark
         if len(names) > 1 and n_alternations >= len(names):
             text = (
                 f"topic {series.name}: rows of {len(names)} senders alternate"
-                f" ({', '.join(names[:6])}); name one with `sender`"
+                f" ({', '.join(names[:6])}); select one with `sender`"
             )
             figures = {"senders": len(names), "turns": n_alternations}
             return [make_remark("will mislead", "several_publishers", text, **figures)]
@@ -286,10 +314,10 @@ def _detect_multiple_publishers(series: Series, step: np.ndarray) -> list[Remark
         )
         if is_bursty or is_mixed or is_alternating:
             text = (
-                f"topic {series.name}: several publishers seem to write to it: field {path} leaps"
-                f" away and straight back in {return_share:.0%} of the rows, {short_step_share:.0%} of the steps"
-                " are shorter than a fifth of the mean; do not use it unless the source tells its"
-                " senders apart"
+                f"topic {series.name}: probably several publishers: field {path} jumps and returns"
+                f" in {return_share:.0%} of the rows, {short_step_share:.0%} of the steps are"
+                " shorter than a fifth of the mean; use it only if the source distinguishes its"
+                " senders"
             )
             share_figures = {"returns": return_share, "short_steps": short_step_share}
             return [make_remark("will mislead", "several_publishers", text, **share_figures)]
@@ -297,17 +325,17 @@ def _detect_multiple_publishers(series: Series, step: np.ndarray) -> list[Remark
 
 
 def _measure_value_jumps(values: np.ndarray) -> tuple[float, float, float]:
-    """Return the share of rows that change twice, that come back, and the leaps' width.
+    """Return statistics of the jumps in values [T].
 
-    A row comes back to the value before; the width is a share of the values' range.
+    Returns:
+        The share of rows that change in two consecutive steps, the share that returns to the value
+        two rows before, and the median width of the latter jumps relative to the range of values.
     """
     lower, upper = np.quantile(values, (0.01, 0.99))
     change = np.abs(np.diff(values))
-    first_change, second_change, two_step_change = (
-        change[:-1],
-        change[1:],
-        np.abs(values[2:] - values[:-2]),
-    )
+    first_change = change[:-1]
+    second_change = change[1:]
+    two_step_change = np.abs(values[2:] - values[:-2])
     is_jump = (first_change > 0.0) & (second_change > 0.0)
     is_return = is_jump & (two_step_change <= 0.1 * np.minimum(first_change, second_change))
     relative_width = (
@@ -321,9 +349,12 @@ def _measure_value_jumps(values: np.ndarray) -> tuple[float, float, float]:
 def check_unused_topics(
     unused_series: Sequence[Series], log: Log, start_time: float
 ) -> list[Remark]:
-    """Return the remarks on velocities and positions in topics that the log was not made of.
+    """Return remarks on lags and lever arms of topics that the log does not use.
 
-    `start` is the log's first sample on the recording's clock, s.
+    Args:
+        unused_series: series with possible velocities and positions.
+        log: log of the recording.
+        start_time: time of the log's first sample on the clock of the recording in s.
     """
     rates: dict[str, np.ndarray] = {n: log[n] for n in ("u", "v", "r") if n in log.channels}
     if {"u", "v", "psi"} <= set(log.channels):
@@ -344,6 +375,7 @@ def check_unused_topics(
 
 
 def _interpolate_finite(t: np.ndarray, clock: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Interpolate the finite values at times t, NaN outside of their range."""
     is_finite = np.isfinite(values)
     interpolated: np.ndarray = np.interp(
         t, clock[is_finite], values[is_finite], left=np.nan, right=np.nan
@@ -354,12 +386,19 @@ def _interpolate_finite(t: np.ndarray, clock: np.ndarray, values: np.ndarray) ->
 def _detect_lag(
     series: Series, path: str, t: np.ndarray, clock: np.ndarray, rates: dict[str, np.ndarray]
 ) -> list[Remark]:
+    """Return a remark if a field follows a velocity of the log with a lag.
+
+    Args:
+        series: series with the field.
+        path: path of the field.
+        t: times of the series [T] in s on the log's clock.
+        clock: times of the log [K] in s.
+        rates: velocities of the log [K] by name.
+    """
     step = max(float(np.median(np.diff(t))), _MIN_LAG_STEP)
     grid = np.arange(t[0], t[-1], step)
-    values, rates_on_grid = (
-        _interpolate_finite(grid, t, series[path]),
-        {n: _interpolate_finite(grid, clock, r) for n, r in rates.items()},
-    )
+    values = _interpolate_finite(grid, t, series[path])
+    rates_on_grid = {n: _interpolate_finite(grid, clock, r) for n, r in rates.items()}
     matches = {
         name: match
         for name in rates_on_grid
@@ -372,18 +411,20 @@ def _detect_lag(
         or abs(matches[name].lag) < _MIN_OFFSET
     ):
         return []
-    correlation, lag = abs(matches[name].correlation), matches[name].lag
+    correlation = abs(matches[name].correlation)
+    lag = matches[name].lag
     is_finite = np.isfinite(values) & np.isfinite(rates_on_grid[name])
     correlation_without_lag = abs(
         float(np.corrcoef(values[is_finite], rates_on_grid[name][is_finite])[0, 1])
     )
-    # a lag is reported only where it explains a good part of what the two differ by
+    # report a lag only if it explains more than 30 % of the unexplained correlation
     if 1.0 - correlation > 0.7 * (1.0 - correlation_without_lag):
         return []
     description = f"{'lags' if lag > 0.0 else 'leads'} {name} of the log by {abs(lag):.2f} s"
     text = (
-        f"topic {series.name}: {path} {description} (correlation {correlation:.3f}, {correlation_without_lag:.3f} without the"
-        " lag); give the topic's `delays` before it is used"
+        f"topic {series.name}: {path} {description} (correlation {correlation:.3f},"
+        f" {correlation_without_lag:.3f} without the lag); set `delays` of the topic before it is"
+        " used"
     )
     figures = {
         "lag": lag,
@@ -394,9 +435,15 @@ def _detect_lag(
 
 
 def _detect_lever_arm(series: Series, t: np.ndarray, log: Log) -> list[Remark]:
-    """Return whether a topic's positions turn about the log's.
+    """Return a remark if a topic has positions of another point of the vessel than the log.
 
-    Both then belong to different points of the vessel.
+    The difference of both positions is fitted by a constant vector in body axes (the lever arm)
+    plus a constant vector in earth axes.
+
+    Args:
+        series: series with possible positions.
+        t: times of the series [T] in s on the log's clock.
+        log: log of the recording.
     """
     prefixes = [f"{parent}position" for parent in ("pose.", "pose.pose.", "")]
     prefix = next(
@@ -410,21 +457,21 @@ def _detect_lever_arm(series: Series, t: np.ndarray, log: Log) -> list[Remark]:
     x, y, psi = (
         _interpolate_finite(t, log.t[is_finite], log[name][is_finite]) for name in ("x", "y", "psi")
     )
-    first_coordinate, second_coordinate = series[f"{prefix}.x"], series[f"{prefix}.y"]
+    first_coordinate = series[f"{prefix}.x"]
+    second_coordinate = series[f"{prefix}.y"]
     is_usable = np.isfinite(first_coordinate) & np.isfinite(second_coordinate) & np.isfinite(x)
     if is_usable.sum() < _MIN_ROWS or np.ptp(psi[is_usable]) < np.pi / 3:
         return []
-    c, s, unit_column = (
-        np.cos(psi[is_usable]),
-        np.sin(psi[is_usable]),
-        np.ones(int(is_usable.sum())),
-    )
+    c = np.cos(psi[is_usable])
+    s = np.sin(psi[is_usable])
+    unit_column = np.ones_like(c)
     columns = np.block(
         [
             [np.stack((c, -s, unit_column, 0.0 * unit_column), 1)],
             [np.stack((s, c, 0.0 * unit_column, unit_column), 1)],
         ]
     )
+    # the source may have its axes in either order
     best_fit = (np.inf, np.zeros(4), 0.0)
     for north, east in (
         (first_coordinate, second_coordinate),
@@ -444,9 +491,10 @@ def _detect_lever_arm(series: Series, t: np.ndarray, log: Log) -> list[Remark]:
     if lever_length < _MIN_LEVER_ARM or residual > 0.5 * offset_std or residual > lever_length:
         return []
     text = (
-        f"topic {series.name}: its positions and the log's belong to points {lever_length:.2f} m apart:"
-        f" the log's lies at ({lever_arm[0]:.2f}, {lever_arm[1]:.2f}) m (forward, starboard) of it, rest"
-        f" {residual:.3f} m; give `position.antenna` where the log's is an antenna"
+        f"topic {series.name}: its positions and those of the log are {lever_length:.2f} m from"
+        f" each other: the position of the log is ({lever_arm[0]:.2f}, {lever_arm[1]:.2f}) m"
+        f" (forward, starboard) from that of the topic, residual {residual:.3f} m; set"
+        " `position.antenna` if the log has the position of an antenna"
     )
     figures = {
         "forward": float(lever_arm[0]),

@@ -30,8 +30,8 @@ from residnet.io.readers.recording import (
     TimeStamps,
     build_recording,
 )
-from residnet.io.readers.texts import detect_encoding_of_head, open_as_utf8
-from residnet.io.readers.written import parse_texts
+from residnet.io.readers.text_tables import detect_encoding_of_head, open_as_utf8
+from residnet.io.readers.timestamps import parse_texts
 
 _SENTENCE = re.compile(rb"^(?P<before>[^$!]*)(?P<sentence>[$!][A-Z]{2}[A-Z0-9]{2,4},[\x20-\x7e]*)")
 # a sentence, to its checksum where it has one, at the start of a line or behind a time

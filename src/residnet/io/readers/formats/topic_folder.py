@@ -15,6 +15,7 @@ from pydantic import Field
 from residnet.core.errors import DataError
 from residnet.core.log import Level, Remark, make_remark
 from residnet.core.names import truncate
+from residnet.io.header_vocabulary import ARRIVAL_COLUMN_NAMES, match_state_channel, parse_name
 from residnet.io.readers.base import (
     LARGE_FOLDER_BYTES,
     reading_progress,
@@ -22,7 +23,7 @@ from residnet.io.readers.base import (
     sum_file_sizes,
 )
 from residnet.io.readers.compose import RecordingConfig
-from residnet.io.readers.joined import group_trip_files
+from residnet.io.readers.joined_files import group_trip_files
 from residnet.io.readers.recording import (
     ALL_FIELDS,
     FieldFilter,
@@ -32,20 +33,18 @@ from residnet.io.readers.recording import (
     build_recording,
     normalize_field_path,
 )
-from residnet.io.readers.texts import detect_encoding_of_head, open_as_utf8
-from residnet.io.readers.written import (
+from residnet.io.readers.text_tables import detect_encoding_of_head, open_as_utf8
+from residnet.io.readers.timestamps import (
     detect_unix_unit,
     infer_time_unit,
     parse_numbers,
     parse_texts,
 )
-from residnet.io.words import match_state_channel, parse_name
 
 if TYPE_CHECKING:
     import pandas as pd
 
 _ENDINGS = (".csv", ".tsv", ".txt")
-_ARRIVAL_COLUMNS = ("time", "Time", "t", "timestamp", "rosbagTimestamp", "%time", "stamp", "date")
 _CLOCK_WITH_UNIT = re.compile(r"(?:time|timestamp)s?\s*[\[(]", re.IGNORECASE)
 """A time whose unit stands behind it."""
 _MAX_MULTIPLEXED = 16
@@ -73,7 +72,7 @@ def is_topic_folder(path: Path) -> bool:
         cells = dict(zip(names, value_rows[0], strict=False)) if value_rows else {}
         with contextlib.suppress(ValueError):
             start_times[file] = float(
-                cells.get(_find_clock_column(names, _ARRIVAL_COLUMNS) or "", "")
+                cells.get(_find_clock_column(names, ARRIVAL_COLUMN_NAMES) or "", "")
             )
     if any(_find_stamp_columns(head) is not None for head in headers.values()):
         return True
@@ -86,7 +85,7 @@ def is_topic_folder(path: Path) -> bool:
     timed_headers = [
         head
         for head in headers.values()
-        if (clock_column := _find_clock_column(head, _ARRIVAL_COLUMNS)) in _ARRIVAL_COLUMNS
+        if (clock_column := _find_clock_column(head, ARRIVAL_COLUMN_NAMES)) in ARRIVAL_COLUMN_NAMES
         or (clock_column is not None and has_common_date)
     ]
     has_different_headers = (
@@ -121,7 +120,7 @@ class TopicFolderConfig(RecordingConfig):
     """
 
     kind: Literal["csv_topics"] = "csv_topics"
-    time: tuple[str, ...] = Field(default=_ARRIVAL_COLUMNS, min_length=1)
+    time: tuple[str, ...] = Field(default=ARRIVAL_COLUMN_NAMES, min_length=1)
     delimiter: str = Field(default=",", min_length=1, max_length=1)
     formats: ClassVar = {"folder of csv files": lambda path, head: is_topic_folder(path)}
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 import re
 import unicodedata
 from functools import lru_cache
+from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 
 from residnet.core.errors import UsageError
 from residnet.core.names import ACCELERATION_NAMES, BOW_WIND_CHANNELS, CHANNEL_UNITS, get_si_unit
@@ -20,23 +22,62 @@ from residnet.core.units import canonical_unit, is_unit, si_unit
 _IN_BRACKETS = re.compile(r"[\[({]([^\])}]*)[\])}]")
 _FULL_RUDDER_DEG = 35.0
 """Angle in deg of a rudder that is hard over, as most are built."""
-_GERMAN_UNITS = {"grad": "deg", "grad/s": "deg/s", "grad/min": "deg/min"}
-_SUFFIXES: dict[str, dict[str, str]] = {
-    "m": {"m": "m"},
-    "s": {"s": "s", "ms": "ms"},
-    "m/s": {"ms": "m/s", "mps": "m/s"},
-    "m/s^2": {"ms2": "m/s^2", "mps2": "m/s^2", "mpss": "m/s^2"},
-    "rad/s": {"degps": "deg/s", "degs": "deg/s", "radps": "rad/s", "rads": "rad/s", "rps": "rad/s"},
-    "rad/s^2": {"degps2": "deg/s^2", "radps2": "rad/s^2"},
-    "1/s": {"rps": "1/s"},
-    "N": {"n": "N"},
-    "N m": {"nm": "N m"},
-}
-"""SI unit of a quantity -> suffix behind an underscore of a name -> unit.
 
-The quantity decides what a suffix means: `_ms` is m/s behind a speed and milliseconds behind a
-time, `_rps` is rad/s behind a yaw rate and revolutions behind a propeller.
-"""
+
+def _load_vocabulary() -> dict[str, Any]:
+    """Return the names and words of `header_vocabulary.yaml`, which users do not edit."""
+    text = resources.files("residnet.io").joinpath("header_vocabulary.yaml").read_text("utf-8")
+    vocabulary: dict[str, Any] = yaml.safe_load(text)
+    return vocabulary
+
+
+_VOCABULARY = _load_vocabulary()
+_UNIT_NAMES: dict[str, str] = _VOCABULARY["unit_names"]
+"""Foreign name of a unit -> unit."""
+_UNIT_SUFFIXES: dict[str, dict[str, str]] = _VOCABULARY["unit_suffixes"]
+"""SI unit of a quantity -> suffix behind an underscore of a name -> unit."""
+MONTH_NUMBERS: dict[str, int] = {
+    word: number for number, words in enumerate(_VOCABULARY["months"], 1) for word in words.split()
+}
+"""First three letters of a month -> its number, from 1."""
+DATE_PART_NAMES = tuple(_VOCABULARY["date_parts"].split())
+"""Normalized names of columns that hold one part of a date or of a time of day."""
+TIME_VECTOR_NAMES = tuple(_VOCABULARY["time_vectors"].split())
+"""Names of time vectors in MATLAB and HDF5 files, in order of precedence."""
+ARRIVAL_COLUMN_NAMES = tuple(_VOCABULARY["arrival_columns"].split())
+"""Names of the arrival time in csv files of topics, in order of precedence."""
+SPLIT_NAMES: dict[str, str] = _VOCABULARY["split_names"]
+"""Name of a folder or file -> split."""
+GERMANIC_PATTERN = re.compile("|".join(_VOCABULARY["germanic_words"].split()))
+"""German and Dutch words, in which the letter O means east."""
+REVOLUTION_PATTERN = re.compile("|".join(_VOCABULARY["revolution_patterns"].split()), re.IGNORECASE)
+"""Words for revolutions."""
+
+
+class _ConceptWords(NamedTuple):
+    """Words that stand for a concept: parts of words, and complete words."""
+
+    parts: tuple[str, ...]
+    words: frozenset[str]
+
+
+_CONCEPTS = {
+    concept: _ConceptWords(
+        tuple(entry.get("parts", "").split()), frozenset(entry.get("words", "").split())
+    )
+    for concept, entry in _VOCABULARY["concepts"].items()
+}
+_PARTS_AND_WORDS = frozenset(
+    word for entry in _CONCEPTS.values() for word in (*entry.parts, *entry.words)
+)
+_ASCII_WORDS = frozenset(word for word in _PARTS_AND_WORDS if word.isascii())
+# compounds are not made of words of one or two letters
+_COMPOUND_WORDS = frozenset(word for word in _ASCII_WORDS if len(word) > 2)
+_ACTUATOR_WORDS = frozenset(
+    word
+    for concept in ("rudder", "planes", "propeller", "engine", "revolutions", "throttle", "servo")
+    for word in (*_CONCEPTS[concept].parts, *_CONCEPTS[concept].words)
+)
 
 
 def parse_header_unit(column: str, expected: str | None) -> str | None:
@@ -56,10 +97,10 @@ def parse_header_unit(column: str, expected: str | None) -> str | None:
             else []
         )
         stem, _, suffix = column.strip().rpartition("_")
-        if stem and (unit := _SUFFIXES.get(expected, {}).get(suffix.casefold())):
+        if stem and (unit := _UNIT_SUFFIXES.get(expected, {}).get(suffix.casefold())):
             return unit
     for text in texts:
-        unit = _GERMAN_UNITS.get(text.casefold(), text)
+        unit = _UNIT_NAMES.get(text.casefold(), text)
         if len(unit) == 1 and unit.isalpha() and text not in _IN_BRACKETS.findall(column):
             # a letter at the end is rather a name
             continue
@@ -171,110 +212,6 @@ def is_pulse(channel: str, values: np.ndarray) -> bool:
     return bool(lower >= 800.0 and upper <= 2300.0 and upper > 1200.0)
 
 
-# what a name may be about -> parts of words, and whole words behind a bar
-_CONCEPT_WORDS: dict[str, str] = {
-    "time": "zeit timestamp tiempo temps tijd tidspunkt klockslag klokkeslett horodatage 時刻 時間"
-    " 日時 micros millis czas время 时间 aika 시간 시각 | t time stamp tid sec secs seconds"
-    " elapsed hora heure uhrzeit datum date datetime fecha utc dato tempo ora orario zaman"
-    " sure",
-    "north": "north nord norte noord hochwert 北 север polnoc pohjoinen kuzey 북쪽 북방 | n"
-    " northing",
-    "east": "east ost oste este oost rechtswert ostwert ostkoord ostricht 東 восток 东 ostlig"
-    " wschod itainen 동쪽 동방 | e easting est leste dogu",
-    "position": "posit posic posisj coordin koordinat coorden coordonn 位置 posiz pozyc полож |"
-    " pos local utm pose ned enu xpos ypos posx posy px py konum 위치",
-    "x": "| x xpos posx px",
-    "y": "| y ypos posy py",
-    "latitude": "latit breitengrad breedte bredde breddegrad 緯度 纬度 широт szerokosc 위도 enlem"
-    " | lat breite",
-    "longitude": "longitude longitud longitudine langengrad lengte lengde 経度 经度 долгот dlugosc"
-    " 경도 boylam | lon lng long laenge lange",
-    "heading": "heading steuerkurs gierwinkel rumbo voorliggende heng kurswinkel 船首方位 方位"
-    " 回頭角 船首角 方位角 針路 lacet guinada giringsvinkel girvinkel gierhoek kompaskoers"
-    " kompasskurs курс 艏向 航向 선수각 선수방위 침로 | kompas psi yaw hdg cap koers kurs"
-    " kompass compass koersen kompassi peiling hdt proa prua rotta stavriktning rumo pruva"
-    " rota",
-    "ground": "ground grund fond grond grunn 対地 | cog sog smg cmg",
-    "course": "course | cog cmg",
-    "rate": "rate taux geschwind vitesse velocidad velocita snelheid hastighet 速度 角速度 回頭率"
-    " taxa скорост predkosc 속도 hizi | speed velo velocity rot",
-    "turn": "turn dreh gier wende drei giring 回頭 旋回 virage girat giro guin accostat sving"
-    " svang guinada 转艏 поворот donus 선회 | rot angvelo yaw lacet girhastighet",
-    "turn_rate": "turnrate drehrate gierrate wenderate drehgeschwind giergeschwind wendegeschwind"
-    " angvelo yawrate draaisnelheid giersnelheid svinghastighet dreiehastighet drejehastighed"
-    " bochtaanwijzer girhastighet 回頭角速度 回頭率 旋回角速度 转艏角速度 선회율 선회각속도"
-    " 회두각속도 | rot yawrate wz gyroz zgyro omega gz",
-    "angular": "angul winkelgeschwind hoeksnelheid vinkelhastighet 角速度 углов katowa 각속도 |"
-    " gyro gyr gyrz acisal",
-    "speed": "speed velo 風速 geschwind vitesse velocidad velocita snelheid hastighet 速度 船速"
-    " fahrt vaart 速力 скорост predkosc 속도 속력 | velo sog stw fart vel spd log tws hiz hizi"
-    " surat vw aws",
-    "surge": "surge langsgeschw laengsgeschw longitudinal avance avante voraus vooruit voorwaart"
-    " fremover forover fremad 前後 langs avanzamento avanco 纵向 framat продольн | u forward"
-    " ahead corredera",
-    "sway": "sway quergeschw seitlich lateral dwars tverr sideveis sidelaens 左右 derive deriva"
-    " transvers verlijering scarroccio avdrift abatimiento querdrift 横流 querab sidewards"
-    " sideways 横向 sidled попереч | v vm quer trans",
-    "rudder": "rudder ruder gouvernail timon roer rorv roder rorutslag 舵 safran barre руль 타각"
-    " dumen | delta rudder rud ror rsa steering helm pala leme ster tiller rorkult barra pinne"
-    " ruderpinne",
-    "planes": "sternplane diveplane hydroplane tiefenruder hohenruder elevator dybderor djuproder"
-    " hoogteroer 潜舵 横舵 升降舵 | plane planes",
-    "propeller": "propel schraube helice schroef 推進 プロペラ propulseur 螺旋桨 винт srub pervane"
-    " 프로펠러 | prop screw shaft welle eje arbre aksel 軸 elica cpp",
-    "engine": "engine motor maschine maquina moteur hovedmaskin 主機 двигат silnik makine 엔진"
-    " 모터 | main motoru fan",
-    "revolutions": "drehzahl revolution umdreh tours toerental omdreining turtall varvtal regime"
-    " giri 回転 revoluc 转速 оборот obrot rotac 회전수 devir devri | rpm erpm rps rev revs n",
-    "thrust": "thrust schub poussee empuje stuwkracht skyv 推力 тяг spinta empuxo 추력 itki",
-    "torque": "torque drehmoment couple koppel dreiemoment トルク",
-    "power": "power leistung puissance potencia vermogen effekt 出力",
-    "throttle": "throttle actuator gashebel gashendel gasspak gasreglage acelerador accelerateur"
-    " manetta スロットル lever hebel 油门 | gas pwm gaz esc thr",
-    "azimuth": "azimu schottel pod | azi nozzle alpha",
-    "servo": "servo rcou",
-    "force": "force kraft fuerza kracht 力 tau",
-    "wind": "wind vind vent viento 風 风 ветер wiatr 풍속 풍향 ruzgar | tws twd vento vw twa aws"
-    " awa",
-    "true": "true wahr vrai verdadero real reel ware sann 真 | tws twd",
-    "relative": "relativ apparent scheinb aparente schijnb tilsyn 相対 gemessen measured | aws awa",
-    "direction": "direction direzion richtung riktning direccion richting retning angle winkel"
-    " 方向 風向 | dir twd from angulo hoek vinkel twa awa",
-    "angle": "angle winkel angulo hoek vinkel lage 角 | ang angolo",
-    "roll": "roll roulis balanceo krenging krangung 横揺 kranken slagside 横摇 横倾 крен przechyl"
-    " 횡동요 | phi heel yalpa",
-    "pitch": "pitch tangage cabeceo stampf | theta trim cpp",
-    "heave": "heave vertical tauch sink pilonnement arfada 升沉 上下揺 | hiv descent",
-    "acceleration": "accel beschleun versnell akselerasjon 加速 | udot vdot rdot dot acc",
-    "command": "command soll setpoint consigne befehl gevraagd onsket 指令 demand reference"
-    " desired задан 명령 komut | cmd set ref des order ordre ordered comando",
-    "port": "backbord babord babor bakboord 左舷 portside bombordo sinistra лев 좌현 iskele | port"
-    " bb ps left links izquierda izquierdo gauche venstre",
-    "starboard": "starboard steuerbord tribord estribor stuurboord styrbord 右舷 estibordo dritta"
-    " прав 우현 sancak | stbd sb stb right rechts derecha derecho droite hoyre",
-    "current": "current stromung courant corriente stroming 潮流",
-    "depth": "depth tiefe profond profund diepte dybde 水深 수심 derinlik",
-    "voltage": "volt spannung tension battery batterie bateria batteri | amp ampere current_a batt"
-    " bat bus solar supply",
-    "bow": "| bow bug proue proa boeg baug fwd fore",
-    "stern": "| stern heck poupe popa hek akter aft",
-    "difference": "differen | diff",
-    "index": "| index idx id number nr no num count counter flag valid",
-    "age": "| age alter",
-    "machinery": "temperat pressure presion pression fuel kraftstoff carburant oil cool kuhl load"
-    " consumption verbrauch hours stunden alarm druck | temp last water",
-    "estimate": "estimat filtered hat mean | est",
-    "measured": "| meas measured actual ist",
-    "allocated": "alloc",
-}
-
-_COMPOUND_WORDS = frozenset(
-    word
-    for words in _CONCEPT_WORDS.values()
-    for word in words.split()
-    if len(word) > 2 and word.isascii()
-)
-"""All words that compounds are made of."""
 MOTION_CHANNELS = (
     "x",
     "y",
@@ -315,24 +252,14 @@ class ParsedName(NamedTuple):
         return self.concepts.isdisjoint(names)
 
 
-_LETTER_MAP = str.maketrans({"ß": "ss", "ø": "o", "Ø": "O", "æ": "ae", "ł": "l", "ı": "i"})
-_GREEK_NAMES = {
-    "ψ̇": "r",
-    "ψ": "psi",
-    "δ": "delta",
-    "φ": "phi",
-    "ϕ": "phi",
-    "θ": "theta",
-    "τ": "tau",
-}
-"""Greek letters that stand alone."""
+_LETTER_MAP = str.maketrans(_VOCABULARY["letters"])
 
 
 @lru_cache(maxsize=4096)
 def normalize_name(name: str) -> str:
     """Return a name in lower case and plain letters, its words apart, its units left out."""
     text = _IN_BRACKETS.sub(" ", name)
-    for sign, replacement in _GREEK_NAMES.items():
+    for sign, replacement in _VOCABULARY["greek_letters"].items():
         text = re.sub(rf"(?<![^\W_]){sign}(?![^\W_\d])", replacement, text)
     # StB is one word
     text = re.sub(r"(?<![^\W_])[A-Z][a-z][A-Z](?![^\W_])", lambda word: word[0].lower(), text)
@@ -365,30 +292,15 @@ def parse_name(name: str) -> ParsedName:
         compound_part for token in tokens_without_digits for compound_part in _split_compound(token)
     ]
     concepts = {
-        concept
-        for concept in _CONCEPT_WORDS
-        if _mentions_concept(concept, text, tokens_without_digits)
+        concept for concept in _CONCEPTS if _mentions_concept(concept, text, tokens_without_digits)
     }
     return ParsedName(text, frozenset(concepts), number)
-
-
-_VOCABULARY = frozenset(
-    word
-    for words in _CONCEPT_WORDS.values()
-    for word in words.replace("|", " ").split()
-    if word.isascii()
-)
-_ACTUATOR_WORDS = frozenset(
-    word
-    for thing in ("rudder", "planes", "propeller", "engine", "revolutions", "throttle", "servo")
-    for word in _CONCEPT_WORDS[thing].replace("|", " ").split()
-)
 
 
 def _split_side(token: str) -> tuple[str, ...]:
     """Return an actuator and its side, of `deltal` or `rpmr`; other tokens as they are."""
     is_glued = (
-        token[-1:] in ("l", "r") and token not in _VOCABULARY and token[:-1] in _ACTUATOR_WORDS
+        token[-1:] in ("l", "r") and token not in _ASCII_WORDS and token[:-1] in _ACTUATOR_WORDS
     )
     return (token[:-1], token[-1]) if is_glued else (token,)
 
@@ -408,14 +320,21 @@ def _split_compound(token: str) -> tuple[str, ...]:
 
 
 def _mentions_concept(concept: str, text: str, tokens: list[str]) -> bool:
-    word_parts, _, complete_words = _CONCEPT_WORDS[concept].partition("|")
-    if set(complete_words.split()) & set(tokens):
+    """Return whether a normalized name mentions a concept.
+
+    Args:
+        concept: key of `concepts` in the vocabulary.
+        text: the name.
+        tokens: its words without digits, and the parts of compounds.
+    """
+    entry = _CONCEPTS[concept]
+    if not entry.words.isdisjoint(tokens):
         return True
-    # the German word for speed holds the wind
+    # the German "Geschwindigkeit" (speed) contains "wind"
     text = text.replace("geschwind", "") if concept == "wind" else text
     return any(
-        word_part in text if len(word_part) > 3 or not word_part.isascii() else word_part in tokens
-        for word_part in word_parts.split()
+        part in text if len(part) > 3 or not part.isascii() else part in tokens
+        for part in entry.parts
     )
 
 

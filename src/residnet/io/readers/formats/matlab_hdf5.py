@@ -14,6 +14,7 @@ from residnet.core.config import Config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Remark, make_remark
 from residnet.core.names import to_si
+from residnet.io.header_vocabulary import TIME_VECTOR_NAMES
 from residnet.io.readers.base import optional_import, require_file, wrap_read_errors
 from residnet.io.readers.compose import RecordingConfig
 from residnet.io.readers.quantities import conversion_factor
@@ -25,15 +26,11 @@ from residnet.io.readers.recording import (
     TimeStamps,
     build_recording,
 )
-from residnet.io.readers.written import parse_numbers, parse_texts
+from residnet.io.readers.timestamps import parse_numbers, parse_texts
 
 if TYPE_CHECKING:
     import h5py
 
-_CLOCK_NAMES = (
-    *("t", "time", "Time", "timestamp", "TIME", "T", "stamp", "time_s", "t_s", "utc", "datenum"),
-    *("Zeit", "zeit", "tiempo", "temps", "tijd", "tempo", "tid"),
-)
 # MATLAB's day 719529 is 1 January 1970
 _DATENUM_1970, _SECONDS_PER_DAY = 719_529.0, 86_400.0
 _MAX_COLUMNS = 64
@@ -292,7 +289,7 @@ def _find_clocks(
 ) -> dict[str, tuple[str, np.ndarray]]:
     """Return group -> path of its time and the time itself."""
     clocks = {}
-    for clock_name in _CLOCK_NAMES if time.column is None else (time.column,):
+    for clock_name in TIME_VECTOR_NAMES if time.column is None else (time.column,):
         for path, values in leaves.items():
             group, _, vector_name = path.rpartition("/")
             if vector_name == clock_name and values.size > 1 and values.size == max(values.shape):

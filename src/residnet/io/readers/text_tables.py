@@ -1,4 +1,4 @@
-"""Text tables: encoding, where names and values stand, whether every line is whole, cells."""
+"""Text tables: detection of encoding, delimiter and header, checks of lines, parsing of cells."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import io
 import re
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TextIO
@@ -18,20 +18,25 @@ import numpy as np
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import suggest_name, truncate
 from residnet.core.units import canonical_unit, is_unit
+from residnet.io.header_vocabulary import parse_name
 from residnet.io.readers.base import ProgressCallback
 
 if TYPE_CHECKING:
     import pandas as pd
 
 WHITESPACE_DELIMITER = " "
-"""Stands for any number of blanks and tabulators between cells."""
-# lines among which names are looked for: of a described table, and of one that nobody described
-_HEADER_SEARCH_LINES, _SNIFFED_LINES = 200, 60
+"""Delimiter of tables whose cells are separated by any number of blanks and tabs."""
+_HEADER_SEARCH_LINES = 200
+"""Lines in which the header of a table with a channel map is searched."""
+_SNIFFED_LINES = 60
+"""Lines from which the format of a table without a channel map is detected."""
 _MAX_UNIT_LINES = 3
-"""Most lines with units and the like between names and values."""
-# pieces of this many rows stay in the cache while they are parsed
+"""Largest number of lines with units or remarks between column names and values."""
+# chunks of this size stay in the processor's cache while they are parsed
 _CHUNK_ROWS = 20_000
-_HEAD_BYTES, _BLOCK_BYTES, _SCAN_BYTES = 1 << 16, 1 << 18, 1 << 20
+_HEAD_BYTES = 1 << 16
+_BLOCK_BYTES = 1 << 18
+_SCAN_BYTES = 1 << 20
 _COMMENT_SIGNS = (b"#", b"%", b"//")
 _COMMENT_PREFIX = re.compile(r"\s*(?:#|%|//)\s+")
 _NUMBER = re.compile(
@@ -41,11 +46,11 @@ _TIME = re.compile(r"\d{1,4}\s*[-./:年時h]\s*\d")
 _UNIT = r"(?:[^\W\d_]|[°%µ])\S*"
 _FRACTION = rf"\s*-?\d+{{}}\d+(?:[eE][-+]?\d+)?\s*(?:{_UNIT})?"
 _WITH_UNIT = re.compile(rf"(?P<number>[-+]?[\d.,'’ \u00a0\u202f]*\d)\s*(?P<unit>{_UNIT})")
-"""A number with its unit behind it, as in `1450 rpm`."""
+"""A number followed by its unit, as in `1450 rpm`."""
 _HEMISPHERES = frozenset("NSEW")
-"""Behind a number they rather tell the side of the globe than newtons or seconds."""
+"""Letters that behind a number mean a hemisphere rather than newtons or seconds."""
 _EXTRA_COLUMN = "beyond the last column"
-# the longer marks first: one of UTF-32 begins as one of UTF-16 does
+# longer marks first: the mark of UTF-32 (little endian) starts with that of UTF-16
 _BYTE_ORDER_MARKS = {
     codecs.BOM_UTF8: "utf-8",
     codecs.BOM_UTF32_LE: "utf-32",
@@ -53,31 +58,26 @@ _BYTE_ORDER_MARKS = {
     codecs.BOM_UTF16_LE: "utf-16",
     codecs.BOM_UTF16_BE: "utf-16",
 }
-# Chinese looks like narrow kana in a Japanese encoding
-_JAPANESE = re.compile(r"\A[^\uff61-\uff9f]*[\u3040-\u30ff\u4e00-\u9fff]")
-_CHINESE = re.compile(r"[\u4e00-\u9fa5]{2}")
-# its bytes make Chinese signs as well; those of Chinese words make more than Hangul
-_KOREAN = re.compile(
-    r"\A[\x00-\x7f°±²³µ·]*(?:[\uac00-\ud7a3]{2}[\x00-\x7f°±²³µ·\uac00-\ud7a3]*)+\Z"
-)
-_CYRILLIC, _LETTER_RUN = (
-    re.compile(rb"[\xc0-\xff\xa8\xb0\xb8\xb9]+"),
-    re.compile(rb"[\xc0-\xff]{4}"),
-)
-_POLISH = re.compile(r"[a-z][³¹¿¼¾][a-z]")
-_LATIN = re.compile(r"[\x00-\x7fÀ-ÿ°º²³µ·±´×–’]*")
-_ASCII = bytes(range(128))
+_ENCODINGS = ("cp1252", "cp1250", "cp1251", "cp932", "cp949", "gb18030")
+"""Encodings of recorders that do not write Unicode, the most frequent one first."""
+_MAX_ENCODING_LINES = 200
+"""Lines with other than ASCII characters from which an encoding is detected."""
 
 
 class Header(NamedTuple):
-    """The names of a table's columns, and the number of lines above the first one with values."""
+    """Header of a text table.
+
+    Attributes:
+        names: column names.
+        n_lines_above: number of lines above the first line with values.
+    """
 
     names: tuple[str, ...]
     n_lines_above: int
 
 
 def make_names_unique(names: Sequence[str]) -> list[str]:
-    """Return names of which each stands once: copies are counted, nameless columns too."""
+    """Return unique column names: repeated names and empty names receive a number."""
     unique_names: list[str] = []
     for position, name in enumerate(names):
         is_repeated = name and list(names).count(name) > 1
@@ -90,7 +90,17 @@ def make_names_unique(names: Sequence[str]) -> list[str]:
 
 
 def find_column_positions(path: Path, header: Sequence[str], columns: Sequence[str]) -> list[int]:
-    """Return where the wanted columns stand in the header."""
+    """Return the indices of columns in a header.
+
+    Args:
+        path: file of the table, for messages.
+        header: all column names, which may repeat.
+        columns: required names; of a repeated name `name.0` is the first column.
+
+    Raises:
+        UsageError: if a column is missing.
+        DataError: if a required name is ambiguous.
+    """
     names = make_names_unique(header)
     for column in columns:
         if column in names:
@@ -98,7 +108,7 @@ def find_column_positions(path: Path, header: Sequence[str], columns: Sequence[s
         count = list(header).count(column)
         if count > 1:
             raise DataError(
-                f"{path}: column '{column}' stands {count} times in the header; write"
+                f"{path}: the header contains column '{column}' {count} times; write"
                 f" '{column}.0' for the first, '{column}.1' for the second"
             )
         raise UsageError(f"{path}: no column '{column}'{suggest_name(column, names)}")
@@ -113,23 +123,32 @@ def read_csv(
     encoding: str | None,
     advance: ProgressCallback,
 ) -> pd.DataFrame:
-    """Return the wanted columns of a text table, in order.
-
-    Its `attrs` hold `n_lines_above`, the number of lines above the values less one, `is_truncated`, whether the last
-    line was left out because the file ends within it, and `units`, those in the cells of each
-    column.
+    """Read columns of a text table.
 
     Args:
-        columns: names of the wanted columns.
-        encoding: of the text; None finds it.
-        advance: is told the share that is read.
+        path: file of the table.
+        columns: names of the columns to read.
+        delimiter: separator of cells.
+        decimal: decimal sign.
+        encoding: encoding of the text; None detects it.
+        advance: callback that receives the fraction of the file that has been read.
+
+    Returns:
+        The columns in the requested order. `attrs` has `n_lines_above` (lines above the values
+        minus one), `is_truncated` (whether an incomplete last line was dropped) and `units` (the
+        unit in the cells of each column, or an empty string).
+
+    Raises:
+        UsageError: if a column is missing.
+        DataError: if the file is no regular table in this encoding.
     """
     import pandas as pd
 
     with open_as_utf8(path, encoding) as file:
         try:
             header = _find_header_with_columns(path, delimiter, file, columns)
-            n_columns, size = len(header.names), max(1, file.stat().st_size)
+            n_columns = len(header.names)
+            size = max(1, file.stat().st_size)
             try:
                 column_positions = find_column_positions(path, header.names, columns)
             except UsageError as error:
@@ -143,7 +162,7 @@ def read_csv(
                 )
                 for chunk in pd.read_csv(stream, **pandas_options, chunksize=_CHUNK_ROWS):
                     for position, column_chunks in chunks.items():
-                        # a copy, or the other columns would stay
+                        # without a copy the chunk with all columns would stay in memory
                         column_chunks.append(chunk[position].copy())
                     advance(min(1.0, stream.tell() / size))
         except UnicodeDecodeError as error:
@@ -174,19 +193,27 @@ def read_csv(
     table.columns = pd.Index(column_positions)
     table = table.iloc[: -1 if is_truncated else None]
     units = [parsed_columns[position][1] for position in column_positions]
-    table.attrs |= {"above": header.n_lines_above - 1, "cut": is_truncated, "units": units}
+    table.attrs |= {
+        "n_lines_above": header.n_lines_above - 1,
+        "is_truncated": is_truncated,
+        "units": units,
+    }
     return table
 
 
 def _pandas_options(
     delimiter: str, decimal: str, skipped_lines: tuple[int, Iterable[int]], names: Iterable[Any]
 ) -> dict[str, Any]:
-    """Return how pandas reads the values of a table.
+    """Return the arguments of `pandas.read_csv` for the values of a table.
 
-    `skipped_lines` are the number of lines above the values, and the numbers of lines of comments.
+    Args:
+        delimiter: separator of cells.
+        decimal: decimal sign.
+        skipped_lines: number of lines above the values, and indices of comment lines.
+        names: column labels.
     """
     return {
-        # a byte order mark is no part of the first name
+        # utf-8-sig keeps a byte order mark out of the first name
         "encoding": "utf-8-sig",
         "sep": r"\s+" if delimiter == WHITESPACE_DELIMITER else delimiter,
         "decimal": decimal,
@@ -201,9 +228,15 @@ def _pandas_options(
 
 
 def coerce_numeric(table: pd.DataFrame, decimal: str = ".") -> pd.DataFrame:
-    """Return a table whose texts are numbers where they hold some; `attrs` hold `units` in cells.
+    """Convert columns of text to numbers where all cells are numbers.
 
-    The units are those of each column, empty where its cells name none.
+    Args:
+        table: columns of text or numbers.
+        decimal: decimal sign.
+
+    Returns:
+        The converted table; `attrs["units"]` has the unit in the cells of each column, or an empty
+        string.
     """
     import pandas as pd
 
@@ -214,16 +247,19 @@ def coerce_numeric(table: pd.DataFrame, decimal: str = ".") -> pd.DataFrame:
     return coerced_table
 
 
-_LOOKED_AT = 100
-"""Cells of a column that may show at once that it holds words."""
+_N_SAMPLED_CELLS = 100
+"""Number of cells that are tested first; most columns of text are rejected from these."""
 
 
 def _coerce_column(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
-    """Return a column whose numbers have no signs between thousands, and no marks for none (---).
+    """Convert one column to numbers.
 
-    Where each cell names the same unit (`1450 rpm`), it is returned, and else nothing. A column
-    that then still holds a word stays as it is, and so does one in which every cell could as well
-    have three decimals.
+    Thousands separators, marks of missing values (`---`) and a unit common to all cells (`1450
+    rpm`) are removed. A column with a remaining word is not converted. Neither is one whose cells
+    all have exactly one separator, which could also be a decimal sign before three digits.
+
+    Returns:
+        The column, converted or unchanged, and the unit in its cells or an empty string.
     """
     import pandas as pd
 
@@ -245,8 +281,8 @@ def _coerce_column(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
     ):
         return cells, ""
     unit, unitless_cells = _strip_unit(cells)
-    # where one of the first cells is a word, such as a date, so is the column: no copies of all
-    head = unitless_cells.iloc[:_LOOKED_AT].map(normalize_number)
+    # a word among the first cells rejects the column before all cells are copied
+    head = unitless_cells.iloc[:_N_SAMPLED_CELLS].map(normalize_number)
     if pd.to_numeric(head, errors="coerce").isna().sum() != head.isna().sum():
         return cells, ""
     separator_counts = {
@@ -261,9 +297,10 @@ def _coerce_column(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
 
 
 def _strip_unit(cells: pd.Series) -> tuple[str, pd.Series]:
-    """Return the unit that stands behind each number of a column, and the cells without it.
+    """Split a unit that follows the number in every cell from the cells.
 
-    The unit is empty, and the cells are as they were, where any cell is no number with that unit.
+    Returns:
+        The unit and the cells without it, or an empty string and the unchanged cells.
     """
     filled_cells = cells.dropna()
     unit_text = _parse_trailing_unit(str(filled_cells.iloc[0]).strip()) if len(filled_cells) else ""
@@ -277,7 +314,7 @@ def _strip_unit(cells: pd.Series) -> tuple[str, pd.Series]:
 
 
 def _parse_trailing_unit(cell: str) -> str:
-    """Return the unit behind a number, as it is written; empty for none."""
+    """Return the text of the unit behind a number, or an empty string."""
     match = _WITH_UNIT.fullmatch(cell)
     if match is None or match["unit"] in _HEMISPHERES or not is_unit(match["unit"]):
         return ""
@@ -285,9 +322,18 @@ def _parse_trailing_unit(cell: str) -> str:
 
 
 def read_table_head(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
-    """Return the first rows of a text table whose form nobody described, and its reader's settings.
+    """Read the first rows of a text table and detect its format.
 
-    The `attrs` of the rows hold `thousands_separator`: the cells of the lines between names and values.
+    Args:
+        path: file of the table.
+        rows: largest number of rows to read.
+
+    Returns:
+        The rows, with the cells of the lines between names and values in `attrs["unit_rows"]`, and
+        the settings `kind`, `delimiter` and `decimal` of a reader.
+
+    Raises:
+        DataError: if the file is empty or no table.
     """
     import pandas as pd
 
@@ -302,12 +348,12 @@ def read_table_head(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]
             )
         if "---" in lines and any(line.startswith("header:") for line in lines):
             raise DataError(
-                f"{path}: holds messages as `ros2 topic echo` prints them; record a bag"
-                " (`ros2 bag record`), or write them as csv, in Python pandas.json_normalize("
+                f"{path}: contains the output of `ros2 topic echo`; record a bag"
+                " (`ros2 bag record`), or convert it to csv, in Python pandas.json_normalize("
                 "list(yaml.safe_load_all(open(file)))).to_csv('log.csv', index=False)"
             )
         delimiter, cells, (header_row, n_lines_above) = _detect_delimiter(path, lines)
-        # a comma between cells is none within numbers
+        # a comma that separates cells is no decimal sign
         sampled_cells = [cell for row in cells[1:50] for cell in row] if delimiter != "," else []
         n_decimal_commas, n_decimal_points = (
             sum(bool(re.fullmatch(_FRACTION.format(sign), cell)) for cell in sampled_cells)
@@ -325,7 +371,7 @@ def read_table_head(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]
                 skipped_lines
             )
             if n_rows_seen >= n_lines_above + rows:
-                # behind the rows that are read nothing has to be passed over
+                # comments behind the requested rows need not be known
                 break
         pandas_options = _pandas_options(
             delimiter, decimal, (n_lines_above, comments), [*names, _EXTRA_COLUMN]
@@ -338,16 +384,24 @@ def read_table_head(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]
             reason = truncate(" ".join(str(error).split()), 200)
             raise DataError(f"{path}: not a regular table ({reason})") from error
     table = coerce_numeric(table, decimal)
-    table.attrs["between"] = cells[header_row + 1 : n_lines_above]
+    table.attrs["unit_rows"] = cells[header_row + 1 : n_lines_above]
     reader_settings = {"kind": "csv"} | ({"delimiter": delimiter} if delimiter != "," else {})
     return table, reader_settings | ({"decimal": ","} if decimal == "," else {})
 
 
 def _detect_delimiter(path: Path, lines: list[str]) -> tuple[str, list[list[str]], tuple[int, int]]:
-    """Return the delimiter whose cells are names over values in most lines, and where they stand.
+    """Return the delimiter that splits most lines into a regular table with a header.
+
+    Args:
+        path: file of the table, for messages.
+        lines: first lines of the file.
 
     Returns:
-        The delimiter, the cells of the first lines, and the places of the names and first values.
+        The delimiter, the cells of the first lines, and the indices of the line of names and of the
+        first line of values.
+
+    Raises:
+        DataError: if no delimiter gives a table with a header.
     """
     candidates: list[tuple[int, int, tuple[str, list[list[str]], tuple[int, int]]]] = []
     text = "".join(lines[:_SNIFFED_LINES])
@@ -362,10 +416,9 @@ def _detect_delimiter(path: Path, lines: list[str]) -> tuple[str, list[list[str]
         if header_position is None:
             continue
         names = rows[header_position[0]]
-        n_columns, n_named_columns = (
-            len(names),
-            max((i for i, name in enumerate(names, 1) if name), default=0),
-        )
+        n_columns = len(names)
+        # the last columns may have no name and no cells
+        n_named_columns = max((i for i, name in enumerate(names, 1) if name), default=0)
         value_rows = [row for row in rows[header_position[1] :] if any(row)]
         n_regular_rows = sum(
             n_named_columns <= len(row) <= n_columns or (len(row) == n_columns + 1 and not row[-1])
@@ -375,19 +428,19 @@ def _detect_delimiter(path: Path, lines: list[str]) -> tuple[str, list[list[str]
             candidates.append((n_regular_rows, n_columns, (delimiter, rows, header_position)))
     if not candidates and sum(map(bool, map(str.strip, lines))) == 1:
         raise DataError(
-            f"{path}: holds one line ('{truncate(lines[0], 60)}') and no row of numbers below it; was"
-            " the recording stopped at once? Leave the file out"
+            f"{path}: contains one line ('{truncate(lines[0], 60)}') and no row of numbers below"
+            " it; leave the file out"
         )
     if not candidates:
         raise DataError(
-            f"{path}: no line holds names of columns above its numbers; write one, with the sign"
-            f" between them that stands between numbers (its first line: '{truncate(lines[0], 60)}')"
+            f"{path}: no line with column names above the numbers; add one with the delimiter of"
+            f" the numbers (first line: '{truncate(lines[0], 60)}')"
         )
     return max(candidates, key=lambda entry: entry[:2])[2]
 
 
 def _split_line(line: str, delimiter: str) -> list[str]:
-    """Return the cells of one line; a line that is no table's is one cell."""
+    """Return the cells of one line; a line that the csv parser rejects is one cell."""
     if delimiter == WHITESPACE_DELIMITER:
         return line.split()
     try:
@@ -398,14 +451,24 @@ def _split_line(line: str, delimiter: str) -> list[str]:
 
 
 def _is_value(cell: str) -> bool:
-    """Return whether a cell holds a number, with or without its unit, a date or a time of day."""
+    """Return whether a cell is a number, with or without a unit, a date or a time of day."""
     return bool(_NUMBER.fullmatch(cell) or _TIME.match(cell) or _parse_trailing_unit(cell))
 
 
 def _find_header_with_columns(
     path: Path, delimiter: str, file: Path, columns: Sequence[str]
 ) -> Header:
-    """Return the first line of a text table that holds all the names; else its first line."""
+    """Return the first line with all required names as header, or the first line of the file.
+
+    Args:
+        path: file of the table, for messages.
+        delimiter: separator of cells.
+        file: the same text in UTF-8.
+        columns: required names.
+
+    Raises:
+        DataError: if the file is empty or its first line is no header.
+    """
     required_names = set(columns)
 
     def iter_rows(stream: TextIO) -> Iterator[tuple[int, list[str]]]:
@@ -417,7 +480,7 @@ def _find_header_with_columns(
             yield reader.line_num, [cell.strip() for cell in row]
 
     names: list[str] | None = None
-    # number of a line, its cells, and those without the sign of a comment
+    # line number, cells, and cells without the sign of a comment
     rows: list[tuple[int, list[str], list[str]]] = []
     with file.open(newline="", encoding="utf-8-sig") as stream:
         try:
@@ -439,8 +502,8 @@ def _find_header_with_columns(
         except csv.Error as error:
             if names is None:
                 raise DataError(
-                    f"{path}: line 1 is no header with column names ({error}); a quotation mark may"
-                    " be open, or lines are missing at the beginning"
+                    f"{path}: line 1 is no header with column names ({error}); check for an"
+                    " unclosed quotation mark, or for missing lines at the beginning"
                 ) from error
     if names is None and (not rows or not any(rows[0][2])):
         raise DataError(
@@ -456,8 +519,9 @@ def _find_header_with_columns(
 
 
 def _count_unit_lines(rows: Sequence[Sequence[str]], column_positions: Iterable[int]) -> int:
-    """Return how many of the first rows hold words, such as units, where values are wanted."""
-    column_positions, count = list(column_positions), 0
+    """Return how many of the first rows have text, such as units, in the given columns."""
+    column_positions = list(column_positions)
+    count = 0
     for row in rows[:_MAX_UNIT_LINES]:
         cells = [row[i] for i in column_positions if i < len(row)]
         if not any(cells) or any(map(_is_value, cells)):
@@ -467,16 +531,17 @@ def _count_unit_lines(rows: Sequence[Sequence[str]], column_positions: Iterable[
 
 
 def find_header(rows: Sequence[Sequence[str]]) -> tuple[int, int] | None:
-    """Return which of the first rows holds names, and which is the first with values.
-
-    None where no row above the values can be one of names.
+    """Find the row of column names and the first row of values.
 
     Args:
-        rows: cells of the first rows, without the blanks around them.
+        rows: cells of the first rows, without surrounding blanks.
+
+    Returns:
+        The indices of both rows; None if no row above the values can be a header.
     """
     n_filled = [sum(map(bool, row)) for row in rows]
     n_values = [sum(map(_is_value, row)) for row in rows]
-    # what most rows look like is the table
+    # the second half of the rows belongs to the table, whatever precedes it
     later_counts = sorted(n_filled[len(n_filled) // 2 :])
     typical_count = later_counts[len(later_counts) // 2] if rows else 0
     for header_row, row in enumerate(rows):
@@ -486,20 +551,20 @@ def find_header(rows: Sequence[Sequence[str]]) -> tuple[int, int] | None:
         first_value_row = (
             header_row + 1 + _count_unit_lines(rows[header_row + 1 :], range(len(row)))
         )
-        # a title of several cells has names beneath it, a table has values
+        # below a title of several cells are names, below a header are values
         following_rows = rows[first_value_row : first_value_row + 3]
         if following_rows and not any(
             sum(map(_is_value, cells)) >= 0.3 * typical_count for cells in following_rows
         ):
             continue
-        # groups above the names are passed over
+        # skip a row that groups columns: it repeats names, and the row below it does not
         while (
             header_row + 1 < first_value_row
             and _has_repeated_cells(rows[header_row])
             and not _has_repeated_cells(rows[header_row + 1])
         ):
             header_row += 1
-        # so is a table about the columns that stands above theirs
+        # skip a smaller table above, which describes the columns
         nested_header = find_header(rows[first_value_row:])
         if nested_header is not None:
             names = rows[first_value_row + nested_header[0]]
@@ -519,28 +584,39 @@ def _has_repeated_cells(row: Sequence[str]) -> bool:
 
 
 def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tuple[bool, list[int]]:
-    """Look at every line of values: as many cells each as the header; blank lines do not count.
+    """Check that every line has as many cells as the header.
 
-    A parser fills short lines with nothing and reads on; cells that slipped by one column would be
-    numbers like any other. A delimiter more or less at the end of every line makes no cell.
+    pandas fills short lines with NaN and shifts cells silently. Blank lines are accepted, and so is
+    an additional or a missing delimiter at the end of all lines.
+
+    Args:
+        path: file of the table, for messages.
+        delimiter: separator of cells.
+        header: header of the table.
+        file: the same text in UTF-8.
 
     Returns:
-        Whether the file ends within its last line, and the numbers of lines, from 0, that hold
-        none: they begin with `#`, `%` or `//`, or repeat the names.
+        Whether the file ends within its last line, and the indices of lines without values, which
+        begin with `#`, `%` or `//`, or repeat the column names.
+
+    Raises:
+        DataError: if a line has another number of cells, or a zero byte.
     """
-    n_columns, n_lines_above = len(header.names), header.n_lines_above
-    # names that are missing at the end are those of cells that are not there
+    n_columns = len(header.names)
+    n_lines_above = header.n_lines_above
+    # columns without a name at the end may have no cells
     n_named_columns = max(
         (i for i, name in enumerate(header.names, start=1) if name), default=n_columns
     )
-    is_truncated, n_lines = _is_truncated(file, delimiter, n_named_columns), 0
+    is_truncated = _is_truncated(file, delimiter, n_named_columns)
+    n_lines = 0
     comments: list[int] = []
     for first_line, block, is_last_block in _iter_line_blocks(file):
         if b"\x00" in block:
             line_index = first_line + block[: block.index(b"\x00")].count(b"\n") + 1
             raise DataError(
-                f"{path}: line {line_index} holds a zero byte, which no text has; the file is damaged or"
-                " not UTF-8, write it again"
+                f"{path}: line {line_index} contains a zero byte; the file is damaged or not UTF-8,"
+                " export it again"
             )
         cells = _count_cells(block, delimiter, n_columns)
         is_irregular = (cells != n_columns) & (cells != 0)
@@ -551,7 +627,7 @@ def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tupl
         comments += [first_line + i for i in skipped_lines]
         is_irregular[[i for i in skipped_lines if i < is_irregular.size]] = False
         if is_irregular.any():
-            # rarely so: an empty cell more at the end of lines, or without names
+            # rare, therefore tested only now: an empty cell or a column without a name at the end
             rows = _split_lines(block)
             sign = delimiter.encode()
             has_trailing_delimiter = np.array([row.rstrip(b" ").endswith(sign) for row in rows])
@@ -566,28 +642,34 @@ def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tupl
         if is_irregular.any():
             line_index = int(np.argmax(is_irregular))
             raise DataError(
-                f"{path}: line {first_line + line_index + 1} has {cells[line_index]} cells, the header {n_columns}"
-                f" ({int(is_irregular.sum())} such lines nearby); check `delimiter` and `decimal`, or delete"
-                " the damaged lines"
+                f"{path}: line {first_line + line_index + 1} has {cells[line_index]} cells, the"
+                f" header {n_columns} ({int(is_irregular.sum())} such lines nearby); check"
+                " `delimiter` and `decimal`, or delete the damaged lines"
             )
         n_lines = first_line + cells.size
     return is_truncated and n_lines - 1 not in comments[-1:], comments
 
 
 def _iter_line_blocks(path: Path) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield blocks of whole lines: the number of the first, its bytes, and whether it is the last.
+    """Yield blocks of complete lines, with line ends of one byte.
 
-    Line ends are one byte each, and an open quote takes its line ends along.
+    A block ends outside quotation marks, because a quoted cell may contain line ends.
+
+    Yields:
+        The index of the first line, the bytes, and whether this is the last block.
     """
     with path.open("rb") as stream:
-        pending, line_number = b"", 0
+        pending = b""
+        line_number = 0
         while True:
             block = stream.read(_BLOCK_BYTES)
-            text, tail = pending + block, b""
+            text = pending + block
+            tail = b""
             if b"\r" in text:
-                # the other half of a line end may stand in the next block
+                # the \n of a Windows line end may be in the next block
                 if block and text.endswith(b"\r"):
-                    text, tail = text[:-1], b"\r"
+                    text = text[:-1]
+                    tail = b"\r"
                 text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
             if not block:
                 if text:
@@ -608,11 +690,17 @@ def _split_lines(block: bytes) -> list[bytes]:
 def _find_comment_lines(
     block: bytes, delimiter: str, names: Sequence[str], n_lines_above: int
 ) -> list[int]:
-    """Return which lines below those `n_lines_above` are comments, or the names again."""
-    header_cells, longest_name = (
-        list(names),
-        max(names, key=len, default="").encode() or _COMMENT_SIGNS[0],
-    )
+    """Return the indices of lines in a block that are comments or repeat the column names.
+
+    Args:
+        block: complete lines.
+        delimiter: separator of cells.
+        names: column names.
+        n_lines_above: number of lines at the start of the block to ignore; may be negative.
+    """
+    header_cells = list(names)
+    # a search for bytes excludes most blocks without splitting them into lines
+    longest_name = max(names, key=len, default="").encode() or _COMMENT_SIGNS[0]
     offset = 0
     for _ in range(n_lines_above):
         offset = block.find(b"\n", offset) + 1 or len(block)
@@ -631,7 +719,13 @@ def _find_comment_lines(
 
 
 def _count_cells(block: bytes, delimiter: str, n_columns: int) -> np.ndarray:
-    """Return the number of cells of each line, usually `wide`; 0 where it is blank."""
+    """Return the number of cells in each line, int [K]; 0 for blank lines.
+
+    Args:
+        block: complete lines.
+        delimiter: separator of cells.
+        n_columns: expected number, for which a fast test exists.
+    """
     if delimiter == WHITESPACE_DELIMITER:
         return np.array([len(line.split()) for line in _split_lines(block)], dtype=np.int64)
     if b'"' in block:
@@ -640,11 +734,11 @@ def _count_cells(block: bytes, delimiter: str, n_columns: int) -> np.ndarray:
         try:
             return np.array([len(row) if any(row) or len(row) > 1 else 0 for row in reader])
         except csv.Error:
-            # a cell of more than 128 kB: an open quote has swallowed the lines after it
+            # a cell of more than 128 kB: an unclosed quotation mark includes the following lines
             return np.ones(1, dtype=np.int64)
     delimiter_bytes = delimiter.encode()
     if n_columns > 1 and len(delimiter_bytes) == 1:
-        # the usual block: every so many marks one is the end of a line, the others are delimiters
+        # fast test of regular blocks: n_columns - 1 delimiters and a line end, repeated
         separator_bytes = block.translate(
             None, bytes({*range(256)} - {delimiter_bytes[0], ord("\n")})
         )
@@ -662,7 +756,8 @@ def _count_cells(block: bytes, delimiter: str, n_columns: int) -> np.ndarray:
 def _is_truncated(path: Path, delimiter: str, n_columns: int) -> bool:
     """Return whether the file ends within its last line.
 
-    It has no end, and too few cells or a last cell shorter than any in that column shortly before.
+    Such a line has no line end, and either too few cells or a last cell that is shorter than those
+    of the 50 previous lines.
     """
     with path.open("rb") as stream:
         size = stream.seek(0, io.SEEK_END)
@@ -672,11 +767,9 @@ def _is_truncated(path: Path, delimiter: str, n_columns: int) -> bool:
         return False
     lines = [line for line in tail.replace(b"\r", b"\n").split(b"\n") if line.strip()]
     delimiter_bytes = None if delimiter == WHITESPACE_DELIMITER else delimiter.encode()
-    last_cells, previous_lines = (
-        lines[-1].split(delimiter_bytes),
-        [line.split(delimiter_bytes) for line in lines[-51:-1]],
-    )
-    # the first of several lines may itself be cut, by the tail, or be the header
+    last_cells = lines[-1].split(delimiter_bytes)
+    previous_lines = [line.split(delimiter_bytes) for line in lines[-51:-1]]
+    # the first line of the tail may itself be incomplete, or be the header
     last_cell_lengths = [
         len(cells[-1].strip())
         for cells in previous_lines[1:]
@@ -692,56 +785,60 @@ def _is_truncated(path: Path, delimiter: str, n_columns: int) -> bool:
 
 
 def detect_encoding(path: Path) -> str:
-    """Return the encoding of a text file: by its byte order mark, else by what its bytes can be.
+    """Return the encoding of a text file.
 
-    Text without a mark is UTF-8 where all of it can be, else UTF-16, Russian (cp1251), Polish
-    (cp1250), Western European (cp1252), Japanese (cp932), Korean (cp949) or Chinese (gb18030).
+    A byte order mark decides first, then whether the complete file is UTF-8. Otherwise the
+    encodings of Western and Central Europe, Russia, Japan, Korea and China are compared:
+    charset-normalizer excludes those that give implausible characters. A header has too few words
+    for its language statistics, so the encoding wins in which most cells are known column names.
     """
+    from charset_normalizer import from_bytes
+
     with path.open("rb") as stream:
         bom_encoding = _encoding_from_bom(stream.read(_HEAD_BYTES))
         if bom_encoding is not None:
             return bom_encoding
         stream.seek(0)
         block = _find_non_utf8_block(stream)
-        if not block:
-            return "utf-8"
-        non_ascii = block.translate(None, _ASCII)
-        # words of Cyrillic are runs of such letters; a Latin one stands among plain letters
-        if _CYRILLIC.fullmatch(non_ascii) and _LETTER_RUN.search(block):
-            return "cp1251"
-        western = block.decode("cp1252", errors="replace")
-        if _POLISH.search(western):
-            return "cp1250"
-        # a Latin letter and the next one may look like one Japanese sign, but not the other way
-        if _LATIN.fullmatch(western):
-            return "cp1252"
-        for name, pattern in (
-            ("cp932", _JAPANESE),
-            ("cp949", _KOREAN),
-            ("gb18030", _CHINESE),
-            ("cp1252", re.compile("")),
-        ):
-            with suppress(UnicodeDecodeError):
-                if pattern.search(block.decode(name)):
-                    return name
-        # it gives every byte a sign: numbers can be read, and names stay names
-        return "latin-1"
+    if not block:
+        return "utf-8"
+    # numbers say nothing about an encoding, and lines often repeat
+    foreign_lines = dict.fromkeys(line for line in block.split(b"\n") if not line.isascii())
+    sample = b"\n".join(list(foreign_lines)[:_MAX_ENCODING_LINES])
+    candidates: list[tuple[int, float, int]] = []
+    for match in from_bytes(sample, cp_isolation=list(_ENCODINGS), preemptive_behaviour=False):
+        cells = {cell for line in str(match).splitlines() for cell in re.split(r"[,;|\t]", line)}
+        n_concepts = sum(len(parse_name(cell).concepts) for cell in cells if not cell.isascii())
+        # encodings that give the same text are one match
+        candidates += [
+            (-n_concepts, match.chaos, _ENCODINGS.index(name))
+            for name in match.could_be_from_charset
+            if name in _ENCODINGS
+        ]
+    # latin-1 decodes every byte, so that numbers and ASCII names remain readable
+    return _ENCODINGS[min(candidates)[2]] if candidates else "latin-1"
 
 
 def detect_encoding_of_head(head: bytes) -> str:
-    """Return the encoding of a text from its first bytes alone."""
+    """Return the encoding of a text from its first bytes: a Unicode encoding, UTF-8 by default."""
     return _encoding_from_bom(head) or "utf-8"
 
 
 @contextmanager
 def open_as_utf8(path: Path, encoding: str | None = None) -> Iterator[Path]:
-    """Yield a file that holds the text of `path` in UTF-8, perhaps behind a byte order mark.
+    """Provide the text of a file in UTF-8, possibly with a byte order mark.
 
-    It is `path` itself where that is UTF-8, or else a temporary one, gone after the context. Zero
-    bytes at its end, with which recorders fill what they have not written, are left out.
+    Zero bytes at the end, which some recorders write in advance, are removed.
 
     Args:
-        encoding: its name; None finds it.
+        path: file of the text.
+        encoding: encoding of the file; None detects it.
+
+    Yields:
+        `path` itself if it is UTF-8, otherwise a temporary copy that is deleted afterwards.
+
+    Raises:
+        DataError: if the file is not text in this encoding.
     """
     name = codecs.lookup(encoding or detect_encoding(path)).name
     is_multibyte = name.startswith(("utf-16", "utf-32"))
@@ -754,13 +851,13 @@ def open_as_utf8(path: Path, encoding: str | None = None) -> Iterator[Path]:
     content = path.read_bytes()
     content = content.rstrip(b"\0") if has_trailing_zeros else content
     try:
-        # half a sign at the end is left out
+        # an incremental decoder ignores an incomplete character at the end
         text = codecs.getincrementaldecoder(name)().decode(content)
     except UnicodeError as error:
         error_position = getattr(error, "start", 0)
         raise DataError(
-            f"{path}: not {name.upper()} text (near byte {error_position}); save the file as UTF-8, or give its"
-            " `encoding`"
+            f"{path}: not {name.upper()} text (near byte {error_position}); save the file as UTF-8,"
+            " or give its `encoding`"
         ) from error
     with tempfile.TemporaryDirectory() as folder:
         utf8_copy = Path(folder) / path.name
@@ -769,7 +866,7 @@ def open_as_utf8(path: Path, encoding: str | None = None) -> Iterator[Path]:
 
 
 def _encoding_from_bom(head: bytes) -> str | None:
-    """Return the encoding that a mark, or the zeros of wide signs, tell; None for neither."""
+    """Return a Unicode encoding from the byte order mark or the zero bytes of UTF-16, else None."""
     for mark, name in _BYTE_ORDER_MARKS.items():
         if head.startswith(mark):
             return name
@@ -783,7 +880,7 @@ def _encoding_from_bom(head: bytes) -> str | None:
 
 
 def _find_non_utf8_block(stream: BinaryIO) -> bytes:
-    """Return the first block that is no UTF-8, whole lines of it; empty where all of it is."""
+    """Return the complete lines of the first block that is not UTF-8; empty if all blocks are."""
     decoder = codecs.getincrementaldecoder("utf-8")()
     while block := stream.read(_SCAN_BYTES):
         try:

@@ -23,7 +23,7 @@ from residnet.io.readers.tables import (
     JsonLinesConfig,
     ParquetConfig,
 )
-from residnet.io.readers.written import detect_unix_unit
+from residnet.io.readers.timestamps import detect_unix_unit
 from residnet.preprocessing.align import GridConfig, resample_at
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.preprocessing.statistics import OverlappingBlocks
