@@ -1,4 +1,4 @@
-"""What is learned on top of the baseline: one config class per kind."""
+"""Residual heads, which learn what the baseline does not explain: one config class per kind."""
 
 from __future__ import annotations
 
@@ -29,4 +29,4 @@ else:
             },
         ),
     ]
-"""Config of any head, those of other packages included; its `kind` says which."""
+"""Configuration of any head, including heads of other packages, selected by `kind`."""

@@ -1,4 +1,4 @@
-"""The interface of residual heads, and the scaling and guard that all of them share."""
+"""Interface of residual heads, and the scaling and clamping that they share."""
 
 from __future__ import annotations
 
@@ -24,26 +24,34 @@ from residnet.regression.estimator import Solution
 from residnet.regression.shrinkage import CONSTANT_TOLERANCE
 
 _MIN_STD = 1e-9
-"""Least standard deviation of a residual that a network's output is scaled by, SI."""
+"""Lower bound of the standard deviation by which the output of a network is scaled, SI."""
 
 
 class ResidualHead(nn.Module, ABC):
-    """A head: the residual rho [B, n] from channels z [B, nz] and memory s [B, n_state].
+    """Residual head: computes the residual rho [B, n] from channels z [B, nz] and memory s.
 
-    It is in m/s^2, m/s^2 and rad/s^2, on top of the baseline.
+    The residual is added to the acceleration of the baseline, in m/s^2 and rad/s^2. The memory s
+    [B, n_state] is the hidden state of a recurrent head; a memoryless head has n_state = 0. A head
+    must be scriptable by TorchScript unless it has an `export_error`.
 
-    A memoryless head has n_state = 0. Every head is scriptable, however its parameters were found,
-    but those with a `export_error`.
+    A head needs `forward` only. The other methods have defaults: `calibrate` calibrates the
+    `Features` and `ResidualScale` modules of the head, and `warmup` and `teacher_forced_residuals`
+    call `forward` step by step.
 
     Attributes:
-        output_names: names of what it gives.
-        batch_ensemble_size: number of networks that it holds; rows are then those of one after the other.
-        innovation_time_constant: time in s over which it wants to know how wrong accelerations were predicted: n
-            channels more, behind the others; 0 for none.
-        export_error: why no format of export can hold it; empty where they can.
+        output_names: names of the accelerations that the residual corrects.
+        n_dof: number of these accelerations n.
+        n_state: number of memory values per row.
+        batch_ensemble_size: number K of networks evaluated as one batch; rows are K consecutive
+            blocks, one per network.
+        innovation_time_constant: time constant in s of the low-pass filter of the one-step
+            prediction errors of the accelerations (innovations), which are appended to the
+            channels as n further columns; 0 for a head without innovations.
+        export_error: reason why no export format supports the head; empty if it can be exported.
 
     Args:
-        names: channels of the model, which say what moves; u, v and r where they say nothing.
+        names: channels of the model, which determine the degrees of freedom; surge, sway and yaw if
+            empty.
     """
 
     def __init__(self, names: Sequence[str] = ()) -> None:
@@ -56,30 +64,41 @@ class ResidualHead(nn.Module, ABC):
         self.export_error = ""
 
     def set_step(self, dt: float) -> None:
-        """Take the step of the model in s; most heads need none."""
+        """Set the time step of the model in s; the default ignores it."""
 
     @abstractmethod
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, n] at channels z [B, nz], and the memory for the next step.
+        """Compute the residual of one time step.
 
-        Called once per step; the memory is [B, n_state].
+        Args:
+            z: channels [B, nz].
+            s: memory [B, n_state].
+
+        Returns:
+            The residual [B, n] and the memory for the next step [B, n_state].
         """
 
     def teacher_forced_residuals(self, z: Tensor) -> Tensor:
-        """Return residuals [B, T, n] along measured channels [B, T, nz], from an empty memory.
-
-        In other words, teacher forcing.
-        """
-        return self.forward(z, z[..., :0])[0]
+        """Return the residuals [B, T, n] of measured channels [B, T, nz], from a zero memory."""
+        if self.n_state == 0:
+            return self.forward(z, z[..., :0])[0]
+        s = torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)
+        residuals: list[Tensor] = []
+        for k in range(z.shape[1]):
+            rho, s = self.forward(z[:, k], s)
+            residuals.append(rho)
+        return torch.stack(residuals, dim=1)
 
     def combine_accelerations(self, baseline_acceleration: Tensor, rho: Tensor) -> Tensor:
-        """Return nu_dot [..., n] from the baseline's `baseline_acceleration` and this head's residual, [..., n]."""
+        """Return nu_dot [..., n] from the acceleration of the baseline and the residual."""
         return baseline_acceleration + rho
 
     def residual_samples(self, samples: Samples, baseline_acceleration: Tensor) -> Samples:
-        """Return the samples with what the baseline leaves as target, in this head's space.
+        """Return the samples with the residual of the baseline as target.
 
-        The baseline's accelerations are `baseline_acceleration` [N, n].
+        Args:
+            samples: samples whose target is the measured acceleration [N, n].
+            baseline_acceleration: acceleration of the baseline [N, n].
         """
         residuals = paged.allocate_rows(len(samples), samples.target.shape[1])
         for rows in paged.iterate_row_chunks(len(samples)):
@@ -87,37 +106,40 @@ class ResidualHead(nn.Module, ABC):
         return samples.with_target(residuals)
 
     def set_inertia(self, mass: Tensor | None) -> None:
-        """Take the inertia [3, 3] of the baseline, None where it knows no forces.
+        """Set the inertia matrix of the baseline [3, 3]; the default ignores it.
 
-        Most heads need none.
+        Args:
+            mass: inertia matrix; None if the baseline does not model forces.
 
         Raises:
-            ConfigError: where a head needs one and there is none.
+            ConfigError: if the head needs the matrix and it is None.
         """
 
     def effective_baseline(self, baseline: nn.Module) -> nn.Module:
-        """Return the baseline as this head changes it.
-
-        Its acceleration plus the residual is nu_dot.
-        """
+        """Return the baseline to which the residual is added, by default the baseline itself."""
         return baseline
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Return the memory [B, n_state] that past channels [B, T, nz], oldest first, leave."""
-        return torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)
+        """Return the memory [B, n_state] after past channels [B, T, nz], oldest first."""
+        s = torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)
+        if self.n_state > 0:
+            for k in range(z.shape[1]):
+                _, s = self.forward(z[:, k], s)
+        return s
 
     def memory_bounds(self) -> tuple[Tensor, Tensor]:
-        """Return the least and the largest value [n_state] that each entry of the memory can have.
+        """Return the lower and upper bounds [n_state] of the memory, by default infinite.
 
-        An exported model refuses a memory beyond it. Heads that do not say it take any number.
+        An exported model rejects a memory outside these bounds.
         """
         limit = torch.full((self.n_state,), torch.inf, dtype=torch.float64)
         return -limit, limit
 
     def calibrate(self, samples: Samples) -> None:
-        """Take scales and ranges from the training samples; called once, before the fit.
+        """Calibrate the scales and ranges on the training samples, once before the fit.
 
-        The features, the scale and the bound that a head is made of take theirs by themselves.
+        The default calibrates all submodules of the types `Features`, `ResidualScale` and
+        `RestoringAcceleration`.
         """
         for module in self.modules():
             if isinstance(module, Features | ResidualScale | RestoringAcceleration):
@@ -126,47 +148,49 @@ class ResidualHead(nn.Module, ABC):
     def residual_scale(self) -> Tensor:
         """Return the standard deviation of the residual on the training samples, [n], float64.
 
-        A one-step loss is measured in it; ones where a head keeps none.
+        The one-step loss is normalised by it. The default is that of the `ResidualScale` of the
+        head, or ones if it has none.
         """
+        for module in self.modules():
+            if isinstance(module, ResidualScale):
+                return module.std
         return torch.ones(self.n_dof, dtype=torch.float64)
 
     def parameter_counts(self) -> list[float]:
-        """Return the number of fitted parameters of each axis, all trained ones for each."""
+        """Return the number of fitted parameters per axis, by default all parameters for each."""
         return [float(sum(parameter.numel() for parameter in self.parameters()))] * self.n_dof
 
 
 class ClosedFormHead(ResidualHead):
-    """A head whose parameters come from a closed-form solution."""
+    """Residual head whose parameters are fitted in closed form instead of by gradient descent."""
 
     def validate_samples(self, samples: Samples) -> None:
-        """Check that samples are of as many manoeuvres as the fit divides them into.
+        """Check that the samples have enough manoeuvres for the folds of the fit.
 
         Raises:
-            FitError: where they are not.
+            FitError: if they have fewer.
         """
 
     @abstractmethod
     def fit_solutions(self, samples: Samples) -> list[Solution]:
         """Fit samples whose target is the residual [N, n].
 
-        The solution that one-step errors choose stands first, then those that free runs may prefer.
+        Returns:
+            The solution with the lowest one-step error, then the candidates for a selection by free
+            runs.
 
         Raises:
-            FitError: where the data do not determine the parameters.
+            FitError: if the data do not determine the parameters.
         """
 
     def fit_preferred(self, samples: Samples) -> dict[str, Any]:
-        """Fill the buffers with the first of `fit_solutions` and return the notes of the fit."""
+        """Load the first solution of `fit_solutions` and return the notes of the fit."""
         preferred = self.fit_solutions(samples)[0]
         self.load_state_dict(preferred.state, strict=False)
         return preferred.hyperparameters | preferred.notes
 
     def parameter_counts(self) -> list[float]:
-        """Return the number of fitted parameters of each axis.
-
-        Coefficients [J, n] and intercepts [n] that are not zero, where a head does not count
-        otherwise.
-        """
+        """Return the number of nonzero coefficients and intercepts per axis."""
         coefficients = [
             values.reshape(-1, self.n_dof)
             for name, values in self.named_buffers()
@@ -176,18 +200,18 @@ class ClosedFormHead(ResidualHead):
 
 
 class EquationHead(ClosedFormHead):
-    """A closed-form head that is a sum of few terms."""
+    """Closed-form head whose residual is a sum of terms, written as an equation."""
 
     @abstractmethod
     def format_terms(self) -> list[str]:
-        """Return the terms in writing, [J]."""
+        """Return the J terms as plain text."""
 
     @abstractmethod
     def evaluate_terms(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the terms [T, J] along channels z [T, nz], and their coefficients [J, n]."""
+        """Return the terms [T, J] at channels z [T, nz], and their coefficients [J, n]."""
 
     def term_contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
-        """Return each term of an axis times its coefficient [T], along channels z [T, nz]."""
+        """Return each term of an axis times its coefficient [T], at channels z [T, nz]."""
         with torch.no_grad():
             terms, weights = self.evaluate_terms(z)
             term_contributions = (terms * weights[:, axis].to(z.dtype)).numpy()
@@ -200,23 +224,22 @@ class EquationHead(ClosedFormHead):
 
 
 class FeatureConfig(Config):
-    """The channels that a head sees, and how far beyond the training range it follows them.
+    """Input features of a head and their clamping outside the training range.
 
     Attributes:
         features: names of channels; empty for all.
-        margin: share of the training range that it is widened by. Features are held at the edges of
-            the wider range; outside, the residual stays what it was at the edge instead of running
-            away.
+        margin: share by which the training range is widened. Features are clamped to the wider
+            range, so that the residual is constant outside of it and does not diverge.
     """
 
     features: tuple[str, ...] = ()
     margin: float = Field(default=0.1, ge=0)
 
     def select_features(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Return the names of the features among the channels `format_terms`.
+        """Return the names of the features among the channels `names`.
 
         Raises:
-            ConfigError: where a feature is no channel.
+            ConfigError: if a feature is not a channel.
         """
         for name in self.features:
             if name in ACCELERATION_NAMES and name not in names:
@@ -226,13 +249,14 @@ class FeatureConfig(Config):
                 )
             if name not in names:
                 raise ConfigError(
-                    f"head feature '{name}' is not a channel of the model{suggest_name(name, names)}"
+                    f"head feature '{name}' is not a channel of the model"
+                    f"{suggest_name(name, names)}"
                 )
         return self.features or active_channels(names)
 
 
 class BaseHeadConfig(FeatureConfig, ABC):
-    """The config of a head that another package offers: its `kind` and how the head is built.
+    """Configuration of a head of another package.
 
     Attributes:
         kind: a `Literal` with the name of the entry point in the group `residnet.heads`.
@@ -242,17 +266,17 @@ class BaseHeadConfig(FeatureConfig, ABC):
 
     @abstractmethod
     def build(self, names: Sequence[str]) -> ResidualHead:
-        """Return the head, its numbers not yet found, for channels `format_terms`.
+        """Build the head, not yet fitted, for channels `names`.
 
         Raises:
-            ConfigError: where a channel that it needs is missing.
+            ConfigError: if a required channel is missing.
         """
 
 
 class Features(nn.Module):
-    """The selected, guarded and standardised channels: z [..., nz] -> [..., F].
+    """Selects, clamps and standardises channels, z [..., nz] -> [..., F].
 
-    They are near zero mean and unit variance on the training data.
+    Features have zero mean and unit variance on the training data.
     """
 
     def __init__(self, feature_names: Sequence[str], names: Sequence[str], margin: float) -> None:
@@ -268,9 +292,9 @@ class Features(nn.Module):
         self.high = nn.Buffer(torch.full((self.n_features,), torch.inf, dtype=torch.float64))
 
     def calibrate(self, samples: Samples) -> None:
-        """Take mean, standard deviation and range of each feature from the samples.
+        """Compute the mean, standard deviation and range of each feature.
 
-        A constant feature is left unscaled.
+        A constant feature is not scaled.
         """
         channel_moments, _ = samples.running_moments()
         lower, upper, std = (
@@ -286,11 +310,11 @@ class Features(nn.Module):
         self.high.copy_(upper + range_margin)
 
     def select_clamped(self, z: Tensor) -> Tensor:
-        """Return the selected channels [..., F], held at the edge of the training range."""
+        """Return the selected channels [..., F], clamped to the training range."""
         return self.clamp(z.index_select(-1, self.index))
 
     def clamp(self, features: Tensor) -> Tensor:
-        """Return channels that are selected already [..., F], held at the edge of the range."""
+        """Clamp selected channels [..., F] to the training range."""
         return torch.minimum(
             torch.maximum(features, self.low.to(features.dtype)), self.high.to(features.dtype)
         )
@@ -305,27 +329,24 @@ def _index_buffer(indices: Sequence[int]) -> nn.Buffer:
 
 
 class ResidualScale(nn.Module):
-    """The scale between a network's output near one and accelerations.
-
-    It is the standard deviation of the residual on the training samples.
-    """
+    """Scales network outputs by the standard deviation of the residual on the training samples."""
 
     def __init__(self, dof: int = PLANAR_LAYOUT.n_dof) -> None:
         super().__init__()
         self.std = nn.Buffer(torch.ones(dof, dtype=torch.float64))
 
     def calibrate(self, samples: Samples) -> None:
-        """Take the standard deviation of each axis from the samples' target."""
+        """Compute the standard deviation of the target of each axis."""
         self.std.copy_(samples.running_moments()[1].std().clamp(min=_MIN_STD))
 
     def forward(self, network_output: Tensor) -> Tensor:
-        """Return residual accelerations [..., n] for outputs [..., n] near one."""
+        """Return residual accelerations [..., n] of normalised outputs [..., n]."""
         return network_output * self.std.to(network_output.dtype)
 
 
 @final
 class ZeroHead(ResidualHead):
-    """A head without a residual, rho = 0: the baseline alone."""
+    """Head with the residual rho = 0, so that the model is the baseline."""
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         return zero_acceleration(z, self.n_dof), s

@@ -1,7 +1,4 @@
-"""Heads that are linear in basis functions of the channels.
-
-Their solutions differ, their evaluation does not.
-"""
+"""Heads that are linear in basis functions of the channels, with a choice of estimators."""
 
 from __future__ import annotations
 
@@ -30,21 +27,21 @@ from residnet.regression.estimator import (
 
 
 class BasisConfig(FeatureConfig, ABC):
-    """The basis functions of a head.
+    """Basis functions of a head and the selection of its complexity.
 
     Attributes:
-        space: what the residual is: `acceleration`, what the baseline leaves of nu_dot; or `force`,
-            tau - F(nu_dot, nu) of a baseline of kind believed, whose features are accelerations and
-            velocities and whose terms are affine in the accelerations.
-        terms: basis functions by name (see `residnet.physics.terms`), in units of each feature's
-            standard deviation; empty: all products of the features up to `degree` and x|x| of the
-            velocities, or in force space the thirty of document 002 (4.12).
-        degree: highest degree of the products where `terms` is empty.
-        choose: what the complexity is chosen by: `free_run`, error of free runs on validation data,
-            which may find that no residual at all is best; or `one_step`, cross-validated error of
+        space: space of the residual. `acceleration` is nu_dot minus the baseline. `force` is
+            tau - F(nu_dot, nu) of a baseline of kind `believed`; its features are accelerations and
+            velocities, and its terms are affine in the accelerations.
+        terms: names of basis functions (see `residnet.physics.terms`) of features scaled by their
+            standard deviations. If empty, all products of the features up to `degree` and x|x| of
+            the velocities; in force space the thirty terms of document 002 (4.12).
+        degree: maximum degree of the products if `terms` is empty.
+        choose: criterion of the complexity. `free_run` is the error of free runs on validation
+            data, with no residual as a candidate; `one_step` is the cross-validated error of the
             accelerations.
-        folds: number of folds of the cross-validation; a manoeuvre is never split between folds.
-            null for five, or one for each manoeuvre where there are fewer.
+        folds: number of folds of the cross-validation, which never splits a manoeuvre; null for
+            five folds, or the number of manoeuvres if it is lower.
     """
 
     space: Literal["acceleration", "force"] = "acceleration"
@@ -60,19 +57,20 @@ class BasisConfig(FeatureConfig, ABC):
         ]
         if self.space == "acceleration" and acceleration_terms:
             raise ValueError(
-                f"terms: '{acceleration_terms[0]}' names an acceleration, which only a residual in force space"
+                f"terms: '{acceleration_terms[0]}' names an acceleration, which only a residual in"
+                f" force space"
                 " may (space: force)"
             )
         return self
 
     @abstractmethod
     def build_estimator(self, n_folds: int | None) -> Estimator:
-        """Return the estimator of the coefficients, cross-validated over so many folds."""
+        """Build the estimator of the coefficients with a number of cross-validation folds."""
 
 
 @final
 class BasisHead(ClosedFormHead):
-    """A head that is linear in basis functions: intercept + phi(features / std) coefficients."""
+    """Head that is linear in basis functions, intercept + phi(features / std) coefficients."""
 
     def __init__(self, config: BasisConfig, names: Sequence[str]) -> None:
         super().__init__(names)
@@ -94,7 +92,7 @@ class BasisHead(ClosedFormHead):
     def basis_functions(self, z: Tensor) -> Tensor:
         """Return the basis functions [..., J] at channels z [..., nz].
 
-        Features are scaled but not centred, so that names keep their meaning.
+        Features are scaled but not centred, so that a product term is the product of its channels.
         """
         values: Tensor = self.library(
             self.features.select_clamped(z) / self.features.std.to(z.dtype)

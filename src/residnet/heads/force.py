@@ -1,6 +1,7 @@
-"""Residuals in force space of a believed hull, eps = tau - F(nu_dot, nu).
+"""Heads that correct the force model of a hull, with the residual eps = tau - F(nu_dot, nu).
 
-They are affine in nu_dot to run forward (document 002 (3.19)-(3.24)).
+The residual is affine in nu_dot, so that the model can be solved for nu_dot in a free run (document
+002 (3.19)-(3.24)).
 """
 
 from __future__ import annotations
@@ -22,16 +23,16 @@ from residnet.physics.signals import FORCE_CHANNELS
 from residnet.regression.estimator import Solution
 
 _CONSTANT_FORCE_STD = 1e-9
-"""Standard deviation of a force in N or N m up to which it never varies."""
+"""Standard deviation in N or N m below which a force counts as constant."""
 
 
 @final
 class ForceHead(ClosedFormHead):
-    """A force eps = A nu_dot + b(z) by a head of basis functions over accelerations and channels.
+    """Force residual eps = A nu_dot + b(z), with basis functions of accelerations and channels.
 
-    Every stage of the integrator solves (M + A) nu_dot = tau - C nu - D nu - b: with the believed
-    baseline's acceleration nu_dot_0 this is nu_dot = (M + A)^-1 M nu_dot_0 - (M + A)^-1 b, of which
-    b is evaluated once per step.
+    Every stage of the integrator solves (M + A) nu_dot = tau - C nu - D nu - b. With the
+    acceleration nu_dot_0 of the baseline, nu_dot = (M + A)^-1 M nu_dot_0 - (M + A)^-1 b, where b is
+    evaluated once per time step.
     """
 
     def __init__(self, basis_head: BasisHead) -> None:
@@ -58,9 +59,9 @@ class ForceHead(ClosedFormHead):
         self.inverse.copy_(torch.linalg.inv(mass))
 
     def residual_samples(self, samples: Samples, baseline_acceleration: Tensor) -> Samples:
-        """Return samples over accelerations and channels with the lack-of-fit as target.
+        """Return samples of accelerations and channels whose target is the force residual.
 
-        It is tau - F(nu_dot, nu) = M (nu_dot_0 - nu_dot) (3.20).
+        The target is tau - F(nu_dot, nu) = M (nu_dot_0 - nu_dot) (document 002 (3.20)).
         """
         force = (baseline_acceleration - samples.target) @ self.mass.T
         return Samples(
@@ -73,10 +74,7 @@ class ForceHead(ClosedFormHead):
         )
 
     def calibrate(self, samples: Samples) -> None:
-        """Take scales and ranges of the features from the samples.
-
-        Accelerations are solved for and never held.
-        """
+        """Calibrate the features; accelerations are not clamped, because they are solved for."""
         self.inner.calibrate(samples)
         channel_std = dict(zip(samples.names, samples.z.std(0).tolist(), strict=True))
         self.constant_forces = [
@@ -94,10 +92,10 @@ class ForceHead(ClosedFormHead):
         self.inner.validate_samples(samples)
 
     def fit_solutions(self, samples: Samples) -> list[Solution]:
-        """Return those solutions of the basis functions that can run forward.
+        """Return the solutions of the basis functions with a positive definite mass M + A.
 
         Raises:
-            FitError: where none can, or the data do not determine any.
+            FitError: if no solution has one, or the data determine no solution.
         """
         runnable = []
         errors = list[FitError]()
@@ -113,7 +111,7 @@ class ForceHead(ClosedFormHead):
         return runnable
 
     def _add_augmented_mass(self, solution: Solution) -> Solution:
-        """Return a solution with the mass that it makes, in the names of this head's state."""
+        """Return a solution with its mass M + A, with the names of the state of this head."""
         coefficients = solution.state["coefficients"].clone()
         for j, axis in self.acceleration_terms.items():
             coefficients[j] /= self.inner.features.std[
@@ -139,15 +137,12 @@ class ForceHead(ClosedFormHead):
         return Solution(solution.hyperparameters, state, notes=notes)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return -(M + A)^-1 b [..., 3], what the part without accelerations does to nu_dot.
-
-        It is taken at channels z [..., nz]; the memory is empty.
-        """
+        """Return the acceleration -(M + A)^-1 b [..., 3] at channels z [..., nz]."""
         residual_load, s = self.inner(torch.cat((zero_acceleration(z), z), dim=-1), s)
         return -(residual_load @ self.inverse.to(z.dtype).T), s
 
     def combine_accelerations(self, baseline_acceleration: Tensor, rho: Tensor) -> Tensor:
-        """Return nu_dot [..., 3] from the believed one and the part without accelerations."""
+        """Return nu_dot [..., 3] from nu_dot_0 of the baseline and the residual of `forward`."""
         return baseline_acceleration @ self.gain.to(baseline_acceleration.dtype).T + rho
 
     def residual_force(self, nu_dot: Tensor, z: Tensor) -> Tensor:
@@ -164,7 +159,7 @@ class ForceHead(ClosedFormHead):
 
 @final
 class AugmentedMassBaseline(nn.Module):
-    """A baseline's acceleration [..., 3] under another mass: (M + A)^-1 M nu_dot_0."""
+    """Baseline with the mass M + A: its acceleration [..., 3] is (M + A)^-1 M nu_dot_0."""
 
     def __init__(self, baseline: nn.Module, inertia_ratio: Tensor) -> None:
         super().__init__()

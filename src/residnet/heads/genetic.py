@@ -1,4 +1,4 @@
-"""The genetic head: an equation bred by genetic programming (document 000)."""
+"""Residual equation found by genetic programming (document 000)."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from residnet.regression.sparse import SparseRegression
 
 
 class GeneticConfig(FeatureConfig, EquationSearchConfig):
-    """An equation for each axis, in SI units, by genetic programming.
+    """Equation of the residual of each axis in SI units, found by genetic programming.
 
-    Fitting needs the extra `gp`, using a fitted model does not.
+    Fitting needs the extra `gp`; using a fitted model does not.
 
     Attributes:
         kind: name of the head.
-        optional: leave the head out of a fit where the extra is not installed, and say so, instead
-            of stopping.
+        optional: whether a fit skips the head with a warning if the extra is not installed, instead
+            of ending with an error.
     """
 
     kind: Literal["genetic"] = "genetic"
     optional: bool = False
 
     def build(self, names: Sequence[str]) -> GeneticHead:
-        """Return the module for channels `format_terms`."""
+        """Build the head for channels `names`."""
         return GeneticHead(self, names)
 
 
 @final
 class GeneticHead(EquationHead):
-    """A head whose residual is terms(features) coefficients.
+    """Head with the residual terms(features) coefficients.
 
-    Over the baseline `still` it is the equation of the acceleration itself.
+    With the baseline `still` it is an equation of the acceleration.
     """
 
     def __init__(self, config: GeneticConfig, names: Sequence[str]) -> None:
@@ -72,14 +72,14 @@ class GeneticHead(EquationHead):
         return [format_product(algebra, product) for product in products]
 
     def fit_solutions(self, samples: Samples) -> list[Solution]:
-        """Return the equations of the best individuals of the three searches.
+        """Search an equation for each axis.
 
-        Where their terms are chosen from once more, those of a sparse search are among them: with
-        noise it finds more equations than breeding does, and in a hundredth of the time.
+        The final selection also considers the terms of a sparse search. On noisy data this search
+        finds more of the true equations than genetic programming, in a hundredth of the time.
 
         Raises:
-            FitError: where the data do not determine an equation.
-            UsageError: where DEAP is not installed.
+            FitError: if the data do not determine an equation.
+            UsageError: if DEAP is not installed.
         """
         return GeneticEquations(self.config, self._sparse_search_terms(samples)).fit(
             self.features.select_clamped(samples.z),
@@ -90,7 +90,7 @@ class GeneticHead(EquationHead):
         )
 
     def _sparse_search_terms(self, samples: Samples) -> list[list[Factors]]:
-        """Return the factors of the terms that a sparse search finds for each output."""
+        """Return the factors of the terms that a sparse search selects for each output."""
         search_settings = self.config.final
         names = self.features.names
         if search_settings is None:

@@ -29,23 +29,22 @@ from residnet.regression.shrinkage import CONSTANT_TOLERANCE
 
 
 class KernelConfig(FeatureConfig):
-    """A kernel ridge regression of each residual on standardised features, without intercept.
+    """Kernel ridge regression of each residual on standardised features, without intercept.
 
     Attributes:
         kernel: radial basis functions (`rbf`) or a polynomial (`polynomial`).
-        terms: further features, made of the others, such as `n|n|`: the kernel of degree p has
-            products of these too. A polynomial of low degree in the revolutions is a poor thrust.
-        penalties: candidates, for each sample: the document's lambda (scikit-learn's alpha) is
-            penalty * samples.
-        choose: what chooses. `free_run`, jointly: the setting of the kernel and one penalty for all
-            axes by the error of free runs on validation data, then the penalty of each axis in turn
-            for as long as free runs gain, or no residual at all (document 001 section 4, second
-            approach); `one_step`: setting and penalty of each axis for itself by cross-validated
-            errors of accelerations; `recursive_errors`: of each axis for itself by the error of its own
-            velocity in free run along the training records, the other velocities as measured (first
-            approach).
-        folds: number of folds of the cross-validation; a manoeuvre is never split between folds.
-            null for five, or one for each manoeuvre where there are fewer.
+        terms: additional features computed from the features, such as `n|n|`, which a polynomial of
+            low degree in the revolutions approximates poorly.
+        penalties: candidate penalties per sample; lambda of document 001 and `alpha` of
+            scikit-learn are the penalty times the number of samples.
+        choose: criterion of the kernel setting and the penalties. `free_run` minimizes the error of
+            free runs on validation data, first over the setting and a shared penalty, then over the
+            penalty of each axis in turn, with no residual as a candidate (document 001 section 4,
+            second approach). `one_step` minimizes the cross-validated error of the acceleration of
+            each axis. `recursion` minimizes, for each axis, the error of its velocity in a free run
+            with the other velocities as measured (first approach).
+        folds: number of folds of the cross-validation, which never splits a manoeuvre; null for
+            five folds, or the number of manoeuvres if it is lower.
     """
 
     kind: Literal["kernel"] = "kernel"
@@ -60,13 +59,13 @@ class KernelConfig(FeatureConfig):
     folds: int | None = Field(default=None, ge=2, le=1_000)
 
     def build(self, names: Sequence[str]) -> KernelHead:
-        """Return the module for channels `names`."""
+        """Build the head for channels `names`."""
         return KernelHead(self, names)
 
 
 @final
 class TermFeatures(nn.Module):
-    """The standardised terms [..., J] of guarded channels [..., F]."""
+    """Computes standardised terms [..., J] of clamped channels [..., F]."""
 
     def __init__(self, terms: Sequence[str], channels: Sequence[str]) -> None:
         super().__init__()
@@ -76,10 +75,10 @@ class TermFeatures(nn.Module):
         self.std = nn.Buffer(torch.ones(self.n_terms, dtype=torch.float64))
 
     def calibrate(self, channels: Tensor) -> None:
-        """Take mean and standard deviation from the training samples of the channels [N, F].
+        """Compute mean and standard deviation from training samples of the channels [N, F].
 
         Raises:
-            FitError: where a term is constant.
+            FitError: if a term is constant.
         """
         values = self.library(channels)
         std = values.std(0, correction=0)
@@ -104,7 +103,7 @@ class TermFeatures(nn.Module):
 
 @final
 class KernelHead(ClosedFormHead):
-    """A head rho [..., n] = f(standardised features), f in the space of a kernel."""
+    """Head with the residual rho [..., n] = f(standardised features), f a kernel function."""
 
     def __init__(self, config: KernelConfig, names: Sequence[str]) -> None:
         super().__init__(names)
@@ -133,7 +132,7 @@ class KernelHead(ClosedFormHead):
         )
 
     def parameter_counts(self) -> list[float]:
-        """Return the effective number of parameters of each axis, the trace of the smoother."""
+        """Return the effective number of parameters per axis, the trace of the smoother."""
         return [float(n_effective) for n_effective in self.effective]
 
     def validate_samples(self, samples: Samples) -> None:
@@ -179,7 +178,7 @@ class KernelHead(ClosedFormHead):
     def _recursion_errors(
         self, recursive_errors: RecursiveErrors, paths: Sequence[RegularizationPath]
     ) -> Tensor:
-        """Return mean square errors of velocities that run alone, [settings, penalties, n]."""
+        """Return mean squared errors of single-velocity free runs, [settings, penalties, n]."""
         n_penalties = len(self.config.penalties)
         errors = torch.zeros(len(paths), n_penalties, self.n_dof, dtype=torch.float64)
         for i, path in enumerate(paths):

@@ -1,4 +1,4 @@
-"""Ridge regression (document 001 section 2.2, correction M4) and PLSR over basis functions."""
+"""Ridge regression (document 001 section 2.2, correction M4) and PLSR on basis functions."""
 
 from __future__ import annotations
 
@@ -20,11 +20,10 @@ from residnet.regression.shrinkage import PLSR, Ridge
 class LinearBasisConfig(BasisConfig, ABC):
     @final
     def build(self, names: Sequence[str]) -> ClosedFormHead:
-        """Return the module for channels `names`, in the space that the config names.
+        """Build the head for channels `names`, in acceleration or force space.
 
         Raises:
-            ConfigError: where a term is not understood, or in force space not affine in the
-                accelerations.
+            ConfigError: if a term is invalid or, in force space, not affine in the accelerations.
         """
         if self.space == "acceleration":
             return BasisHead(self, names)
@@ -38,12 +37,12 @@ class LinearBasisConfig(BasisConfig, ABC):
 
 
 class PlsrConfig(LinearBasisConfig):
-    """A PLSR of the three residuals together.
+    """Partial least squares regression of the residuals of all axes in one model.
 
     Attributes:
-        order: number of latent variables; None chooses it as `choose` says. One-step errors are
-            summed over the axes, each in units of its variance.
-        max_order: highest number of latent variables that is tried.
+        order: number of latent variables; null to select it by `choose`. One-step errors are
+            summed over the axes relative to their variances.
+        max_order: highest candidate number of latent variables.
     """
 
     kind: Literal["plsr"] = "plsr"
@@ -51,7 +50,7 @@ class PlsrConfig(LinearBasisConfig):
     max_order: int = Field(default=40, ge=1)
 
     def build_estimator(self, n_folds: int | None) -> Estimator:
-        """Return PLSR of all axes, other orders on offer where free runs choose."""
+        """Build the PLSR estimator, with alternative orders if free runs select."""
         has_alternatives = self.choose == "free_run" and self.order is None
         return PLSR(
             self.order, max_order=self.max_order, folds=n_folds, has_alternatives=has_alternatives
@@ -59,12 +58,13 @@ class PlsrConfig(LinearBasisConfig):
 
 
 class RidgeConfig(LinearBasisConfig):
-    """A ridge regression of each residual.
+    """Ridge regression of the residual of each axis.
 
     Attributes:
-        penalties: candidates, in units of a standardised column's energy: alpha = penalty * samples
-            in scikit-learn's terms. By one-step errors each axis takes its own; free runs choose
-            between those, one penalty for all axes, and no residual (an empty list in fit.json).
+        penalties: candidate penalties relative to the energy of a standardised column; `alpha` of
+            scikit-learn is the penalty times the number of samples. One-step errors select a
+            penalty per axis. Free runs select among these, a shared penalty, and no residual (an
+            empty list in fit.json).
     """
 
     kind: Literal["ridge"] = "ridge"
@@ -73,5 +73,5 @@ class RidgeConfig(LinearBasisConfig):
     )
 
     def build_estimator(self, n_folds: int | None) -> Estimator:
-        """Return ridge regression, every penalty on offer where free runs choose."""
+        """Build the ridge estimator, with all penalties as alternatives if free runs select."""
         return Ridge(self.penalties, folds=n_folds, has_alternatives=self.choose == "free_run")

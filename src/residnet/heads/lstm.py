@@ -1,4 +1,4 @@
-"""Long short-term memory: a residual with a hidden state (document 003 eq. (17), correction W4)."""
+"""Residual head with long short-term memory (document 003 eq. (17), correction W4)."""
 
 from __future__ import annotations
 
@@ -17,27 +17,26 @@ from residnet.physics.signals import RestoringAcceleration
 from residnet.physics.symmetry import get_dof
 
 _MAX_CELL_STATE = 1e3
-"""Largest cell state that a memory may hold: a gain of at most one each step, the gates open."""
+"""Upper bound of the magnitude of a plausible cell state; activations saturate far below."""
 
 
 class LstmConfig(FeatureConfig):
-    """An LSTM for all axes, or one for each.
+    """LSTM for all axes, or an LSTM per axis.
 
     Attributes:
         hidden_size: number of hidden units.
-        readout: number of units of a tanh layer between (memory, features) and the residual; 0
-            reads the memory alone by a linear map, as document 003 does.
-        memory: features that the memory sees; empty for all. A memory of the commands alone is the
-            same in free run as along measurements: it can hold the state of an actuator, but no
-            measured acceleration. Needs `readout`, which sees all features.
-        activation: function of block input and output; document 003 uses softsign in place of the
-            usual tanh.
-        dropout: share of hidden outputs dropped before the readout while training.
-        per_axis: one network for each of surge, sway, yaw, as document 003 has it.
-        axis_features: channels of each axis' network, where they differ; needs `per_axis`.
-        mirror: make the residual mirror-symmetric between port and starboard by construction.
-        restoring: velocities that leave their training range are pulled back into it, so that a
-            network that stands alone cannot run away.
+        readout: number of units of a tanh layer between (hidden state, features) and the residual;
+            0 for a linear readout of the hidden state, as in document 003.
+        memory: features that the LSTM receives; empty for all. An LSTM of the commands only has the
+            same states in a free run and in teacher forcing: it can represent actuator dynamics but
+            not infer measured accelerations. Needs `readout`, which receives all features.
+        activation: activation of block input and output; softsign in document 003 instead of tanh.
+        dropout: dropout probability of the hidden outputs before the readout.
+        per_axis: whether surge, sway and yaw have a network each, as in document 003.
+        axis_features: channels of the network of each axis if they differ; needs `per_axis`.
+        mirror: whether the residual is mirror-symmetric between port and starboard by construction.
+        restoring: whether a restoring acceleration acts on velocities outside their training range,
+            so that a network without a baseline cannot diverge.
     """
 
     kind: Literal["lstm"] = "lstm"
@@ -67,7 +66,7 @@ class LstmConfig(FeatureConfig):
         return self
 
     def build(self, names: Sequence[str]) -> ResidualHead:
-        """Return the module for channels `names`."""
+        """Build the head for channels `names`."""
         head = LstmHead(self, names)
         return MirroredHead(head, names) if self.mirror else head
 
@@ -89,11 +88,9 @@ class LstmConfig(FeatureConfig):
 
 
 class LSTMCell(nn.Module):
-    """An LSTM layer with a single bias per gate.
+    """LSTM layer with one bias per gate, evaluated step by step or over sequences.
 
-    It is stepped by a cell and run over sequences with the same weights.
-
-    Memory s [B, 2H] holds h and c side by side. 4 H (F + H + 1) parameters.
+    The memory s [B, 2H] is the concatenation of h and c. The layer has 4 H (F + H + 1) parameters.
     """
 
     def __init__(self, n_inputs: int, hidden_size: int, uses_softsign: bool) -> None:
@@ -118,7 +115,7 @@ class LSTMCell(nn.Module):
         return self.step_from_gates(features @ self.input_weight.T + self.bias, s)
 
     def step_from_gates(self, gates: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return output and memory as `forward` does, from the features' share [B, 4H]."""
+        """Return output and memory as `forward`, given the input part of the gates [B, 4H]."""
         hidden, previous_cell = s.split([self.hidden_size, self.hidden_size], dim=-1)
         gates = gates + hidden @ self.hidden_weight.T
         # one operation over all numbers is quicker than three over parts that lie apart
@@ -134,43 +131,48 @@ class LSTMCell(nn.Module):
         return hidden, torch.cat((hidden, cell), dim=-1)
 
     def memory_bounds(self) -> tuple[Tensor, Tensor]:
-        """Return the least and largest memory [2H]: outputs below one, cells as gates allow.
+        """Return the lower and upper bounds of the memory [2H].
 
-        A cell gains at most one each step and could go on for ever where its gates stay open; it
-        is taken for wrong beyond 1,000, where it has long saturated.
+        Hidden outputs are bounded by one. A cell state can grow by one per step without limit, but
+        beyond 1,000 it counts as invalid, since the activation has saturated long before.
         """
         bound = self.bias.detach().new_ones(2 * self.hidden_size)
         bound[self.hidden_size :] = _MAX_CELL_STATE
         return -bound, bound
 
     def run_sequence(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return outputs [B, T, H] for features [B, T, F], and the memory [B, 2H] after them.
+        """Return outputs [B, T, H] for features [B, T, F], and the memory [B, 2H] at the end.
 
-        It starts from an empty memory.
+        The initial memory is zero.
         """
-        return self.along(features, features.new_zeros((features.shape[0], 2 * self.hidden_size)))
+        return self.run_from_memory(
+            features, features.new_zeros((features.shape[0], 2 * self.hidden_size))
+        )
 
-    def along(self, f: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return outputs [B, T, H] for features [B, T, F] from memory s [B, 2H] on, and the last.
+    def run_from_memory(self, features: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return outputs [B, T, H] for features [B, T, F], and the memory [B, 2H] at the end.
 
-        The last is the memory [B, 2H] after them.
+        The initial memory is s [B, 2H].
         """
-        if f.shape[1] == 0:
-            return f.new_zeros((f.shape[0], 0, self.hidden_size)), s
+        if features.shape[1] == 0:
+            return features.new_zeros((features.shape[0], 0, self.hidden_size)), s
+        # the fused kernel of torch is several times as fast, but has tanh activations only
         if not self.uses_softsign:
             weights = [self.input_weight, self.hidden_weight, self.bias, self.zero_bias]
-            start = [part.unsqueeze(0).contiguous() for part in s.chunk(2, dim=-1)]
-            out, h, c = torch.lstm(f, start, weights, True, 1, 0.0, self.training, False, True)
-            return out, torch.cat((h[0], c[0]), dim=-1)
+            initial = [part.unsqueeze(0).contiguous() for part in s.chunk(2, dim=-1)]
+            sequence, h, c = torch.lstm(
+                features, initial, weights, True, 1, 0.0, self.training, False, True
+            )
+            return sequence, torch.cat((h[0], c[0]), dim=-1)
         outputs: list[Tensor] = []
-        for k in range(f.shape[1]):
-            h, s = self.forward(f[:, k], s)
+        for k in range(features.shape[1]):
+            h, s = self.forward(features[:, k], s)
             outputs.append(h)
         return torch.stack(outputs, dim=1), s
 
 
 class LstmNetwork(nn.Module):
-    """The features, LSTM and readout of one or all axes; `n_outputs` numbers per sample."""
+    """Features, LSTM and readout for one or all axes, with `n_outputs` outputs per sample."""
 
     def __init__(
         self, config: LstmConfig, feature_names: Sequence[str], n_outputs: int, names: Sequence[str]
@@ -203,7 +205,7 @@ class LstmNetwork(nn.Module):
         self.readout = nn.Sequential(*hidden_layers, output_layer)
 
     def memory_inputs(self, features: Tensor) -> Tensor:
-        """Return the features that the memory sees."""
+        """Return the features that the LSTM receives."""
         return (
             features.index_select(-1, self.memory_input_index)
             if self.has_memory_selection
@@ -211,7 +213,7 @@ class LstmNetwork(nn.Module):
         )
 
     def readout_residual(self, hidden: Tensor, features: Tensor) -> Tensor:
-        """Return scaled residuals [..., outputs] from outputs [..., H] and features [..., F]."""
+        """Return residuals [..., n_outputs] from LSTM outputs [..., H] and features [..., F]."""
         hidden = self.dropout(hidden)
         residual: Tensor = self.readout(
             torch.cat((hidden, features), dim=-1) if self.has_readout_layer else hidden
@@ -219,13 +221,13 @@ class LstmNetwork(nn.Module):
         return residual
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return [B, outputs] and the new memory after one step of channels [B, nz]."""
+        """Return outputs [B, n_outputs] and the memory after one step of channels [B, nz]."""
         features = self.features(z)
         hidden, s = self.cell(self.memory_inputs(features), s)
         return self.readout_residual(hidden, features), s
 
     def run_sequence(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return [B, T, outputs] for channels [B, T, nz], and the memory after them."""
+        """Return outputs [B, T, n_outputs] for channels [B, T, nz], and the memory at the end."""
         features = self.features(z)
         hidden, s = self.cell.run_sequence(self.memory_inputs(features))
         return self.readout_residual(hidden, features), s
@@ -233,7 +235,7 @@ class LstmNetwork(nn.Module):
 
 @final
 class LstmHead(ResidualHead):
-    """A head with memory; s packs (h, c) of each network."""
+    """LSTM head; the memory s is the concatenation of (h, c) of all networks."""
 
     def __init__(self, config: LstmConfig, names: Sequence[str]) -> None:
         super().__init__(names)
@@ -269,7 +271,7 @@ class LstmHead(ResidualHead):
     def combine_networks(
         self, residuals: list[Tensor], memories: list[Tensor], nu: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return residual and memory of all networks, from those of each, at velocities nu."""
+        """Combine residuals and memories of the networks, at velocities nu."""
         # joining a single part would copy it
         rho: Tensor = self.scale(
             residuals[0] if len(residuals) == 1 else torch.cat(residuals, dim=-1)

@@ -1,9 +1,7 @@
-"""Heads that are mirror-symmetric by construction, and the quick tanh that networks share.
+"""Heads that are mirror-symmetric by construction, and a fast hyperbolic tangent.
 
-What happens to starboard happens, mirrored, to port.
-
-A hull is symmetric to better than the data can tell, and knowing it halves what a network has to
-learn.
+Hulls are symmetric between port and starboard within the accuracy of the data. Building in this
+symmetry halves the range of states that a network has to learn.
 """
 
 from __future__ import annotations
@@ -21,12 +19,11 @@ from residnet.physics.symmetry import get_axis_parities, mirror_channels
 
 
 def fast_tanh(x: Tensor, min_size: int = 8_192) -> Tensor:
-    """Return the hyperbolic tangent of x [...], by way of the logistic function where x is large.
+    """Compute the hyperbolic tangent of x [...], for large tensors from the logistic function.
 
-    On processors torch computes its sigmoid several times as fast as its tanh, and the two with
-    gradients in 55 % of the time. Both ways agree to the rounding of numbers near one. Traced
-    graphs keep to torch's own, and so do fewer than `min_size` numbers, for which three operations take
-    longer than one.
+    On CPUs the sigmoid of torch is several times as fast as its tanh; with gradients this takes
+    55 % of the time. Results agree within rounding errors. Traced graphs and tensors of fewer than
+    `min_size` elements use the tanh of torch, where one operation is faster than three.
     """
     is_traced = False
     if not torch.jit.is_scripting():  # type: ignore[attr-defined]
@@ -38,7 +35,7 @@ def fast_tanh(x: Tensor, min_size: int = 8_192) -> Tensor:
 
 @final
 class Tanh(nn.Module):
-    """The hyperbolic tangent as a layer, without parameters."""
+    """Layer of the fast hyperbolic tangent, without parameters."""
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the hyperbolic tangent of x [...]."""
@@ -47,11 +44,10 @@ class Tanh(nn.Module):
 
 @final
 class MirroredHead(ResidualHead):
-    """A head rho = (g(z) + M g(M z)) / 2 of an inner head g; M mirrors port and starboard.
+    """Head with the residual rho = (g(z) + M g(M z)) / 2 of an inner head g.
 
-    Both halves go through in one batch of twice the size.
-
-    The memory holds that of both halves side by side.
+    M mirrors port and starboard. Channels and mirror images are evaluated as one batch of twice the
+    size, and the memory is the concatenation of both memories.
     """
 
     def __init__(self, inner: ResidualHead, names: Sequence[str]) -> None:
@@ -73,9 +69,9 @@ class MirroredHead(ResidualHead):
         )
 
     def calibrate(self, samples: Samples) -> None:
-        """Take scales from the samples and their mirror images.
+        """Calibrate the inner head on the samples and their mirror images.
 
-        So the mirror of a known state is known too.
+        The training range is then mirror-symmetric.
         """
         mirrored = samples.z.index_select(1, self.mirror_index) * self.mirror_sign
         symmetric_samples = Samples(
@@ -123,6 +119,6 @@ class MirroredHead(ResidualHead):
         return torch.cat((s[:batch_size], s[batch_size:]), dim=-1)
 
     def memory_bounds(self) -> tuple[Tensor, Tensor]:
-        """Return the least and largest memory [n_state], the inner head's for both halves."""
+        """Return the bounds of the memory [n_state], those of the inner head twice."""
         lower, upper = self.inner_head.memory_bounds()
         return lower.repeat(2), upper.repeat(2)

@@ -1,4 +1,4 @@
-"""Multi-layer perceptron: a memoryless residual of the present state and inputs."""
+"""Multi-layer perceptron: a memoryless residual of the current state and inputs."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _UnitCount = Annotated[int, Field(ge=1, le=10_000)]
 
 
 class MlpConfig(FeatureConfig):
-    """A network of layers with one activation.
+    """Multi-layer perceptron with one activation function.
 
-    The output layer starts near zero, so that training starts from the baseline.
+    The output layer is initialised near zero, so that training starts from the baseline.
 
     Attributes:
         hidden: number of units of each hidden layer.
-        activation: function after each hidden layer.
-        dropout: share of units dropped while training.
-        mirror: make the residual mirror-symmetric between port and starboard by construction.
+        activation: activation function of the hidden layers.
+        dropout: dropout probability of the hidden units.
+        mirror: whether the residual is mirror-symmetric between port and starboard by construction.
     """
 
     kind: Literal["mlp"] = "mlp"
@@ -42,14 +42,14 @@ class MlpConfig(FeatureConfig):
     mirror: bool = False
 
     def build(self, names: Sequence[str]) -> ResidualHead:
-        """Return the module for channels `names`."""
+        """Build the head for channels `names`."""
         head = MlpHead(self, names)
         return MirroredHead(head, names) if self.mirror else head
 
 
 @final
 class MlpHead(ResidualHead):
-    """A head rho = std * net(features)."""
+    """Head with the residual rho = std * network(features)."""
 
     def __init__(self, config: MlpConfig, names: Sequence[str]) -> None:
         super().__init__(names)

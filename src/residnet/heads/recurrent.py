@@ -1,4 +1,4 @@
-"""Recurrent networks that run side by side: K sets of weights in one program."""
+"""Ensembles of recurrent networks that are evaluated as one batch."""
 
 from __future__ import annotations
 
@@ -15,27 +15,28 @@ from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualS
 from residnet.physics.signals import RestoringAcceleration
 
 _INNOVATION_CLIP_STD = 4.0
-"""Standard deviations of the residual at which what was predicted wrong counts no further."""
+"""Number of standard deviations of the residual at which innovations are clipped."""
 _MIN_GATE = 1e-13
-"""Least share of a memory that is kept: float32 knows its logarithm."""
+"""Lower bound of the update gate, so that its logarithm is finite in float32."""
 
 
 class GRUEnsembleConfig(FeatureConfig):
-    """K gated recurrent units (Cho and others 2014) whose weights are found side by side.
+    """Ensemble of K gated recurrent units (Cho et al. 2014), trained as one batch.
 
-    Their gates are shares of a memory kept over `step`; over a shorter step of the model as many
-    roots of them are taken. So networks that are trained in coarse steps run in fine ones.
+    The update gate is the share of the memory retained over `step`. At a shorter time step of the
+    model the corresponding root of the gate is used, so that networks trained at a coarse step run
+    at a fine one.
 
-    Beside the channels they see by what the measured past was predicted wrong: the error of the
-    acceleration, low-passed over two of their steps. In a free run it decays, and the memory holds
-    what it told.
+    The networks also receive the innovations, which are the one-step prediction errors of the
+    acceleration in the measured past, low-pass filtered over two steps. In a free run the
+    innovations decay, and the memory retains the information.
 
     Attributes:
-        members: number of networks; each runs on states of its own, and velocities are averaged.
-        hidden_size: number of hidden units of each.
-        step: that the gates belong to.
-        restoring: velocities that leave their training range are pulled back into it, so that
-            networks that stand alone cannot run away.
+        members: number of networks; each predicts its own states, and velocities are averaged.
+        hidden_size: number of hidden units of each network.
+        step: time step of the gates.
+        restoring: whether a restoring acceleration acts on velocities outside their training range,
+            so that networks without a baseline cannot diverge.
     """
 
     kind: Literal["recurrent"] = "recurrent"
@@ -45,16 +46,16 @@ class GRUEnsembleConfig(FeatureConfig):
     restoring: bool = False
 
     def build(self, names: Sequence[str]) -> ResidualHead:
-        """Return the module for channels `names`."""
+        """Build the head for channels `names`."""
         return GRUEnsembleHead(self, names)
 
 
 @final
 class GRUEnsembleHead(ResidualHead):
-    """K networks with leading axes of weights; rows are those of one network after the other.
+    """Ensemble of K recurrent networks whose weights have a leading axis of size K.
 
-    Rows of z [K B, nz (+ n)] and s [K B, H] belong to the network that their K-th part belongs to.
-    Behind the channels may stand the errors of accelerations that the past was predicted with.
+    Rows of z [K B, nz (+ n)] and s [K B, H] are K consecutive blocks of B rows, one per network.
+    The n innovations may be appended to the channels.
     """
 
     def __init__(self, config: GRUEnsembleConfig, names: Sequence[str]) -> None:
@@ -99,9 +100,9 @@ class GRUEnsembleHead(ResidualHead):
         return self.scale.std
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return residuals [K B, n] at channels z [K B, nz (+ n)] and memories for the next step.
+        """Return residuals [K B, n] and the next memories at channels z [K B, nz (+ n)].
 
-        Where no errors stand behind the channels they are zero.
+        Innovations are zero if they are not appended to the channels.
         """
         if z.shape[-1] > self.n_channels:
             z, innovation = z.split([self.n_channels, self.n_dof], dim=-1)
@@ -125,7 +126,7 @@ class GRUEnsembleHead(ResidualHead):
         return rho, hidden.reshape(-1, self.n_state)
 
     def update_memory(self, input_gates: Tensor, s: Tensor) -> Tensor:
-        """Return the outputs [K, B, H] from the features' share [K, B, 3 H] and memories."""
+        """Return the next memories [K, B, H], given the input part of the gates [K, B, 3 H]."""
         hidden_size = self.n_state
         hidden = s.reshape(self.batch_ensemble_size, -1, hidden_size)
         # splits in place of slices: their gradients are joined and not added up
@@ -156,6 +157,6 @@ class GRUEnsembleHead(ResidualHead):
         return s
 
     def memory_bounds(self) -> tuple[Tensor, Tensor]:
-        """Return the least and largest memory [H]: units are mixtures of hyperbolic tangents."""
+        """Return the bounds of the memory [H]; units are convex combinations of tanh values."""
         bound = self.bias.detach().new_ones(self.n_state)
         return -bound, bound

@@ -1,9 +1,9 @@
-"""Regressors of scikit-learn as heads, judged in free run as every other one.
+"""Regressors of scikit-learn as residual heads.
 
 The fitted state of the estimators in `residnet.heads.scikit_state.FITTED` is stored as arrays and
-restored without a fit and without a pickle. Other classes of scikit-learn need `--trust`: their
-constructors and fits run when a config names them, and they are fitted again when they are loaded.
-Predictions are made in Python: no format of export holds them.
+restored without a fit and without a pickle. Other classes of scikit-learn need `--trust`: a config
+can run their constructors and fits, and they are fitted again on loading. Predictions need Python,
+so that these heads cannot be exported.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ from residnet.heads.scikit_state import FITTED, KERNELS, StateError, decode, enc
 from residnet.regression.estimator import Solution
 
 _DIFFERENCE_STEP = 0.1
-"""Standard deviations of a feature over which a slope is taken: trees are flat in between."""
+"""Step of central differences in standard deviations of a feature; trees are flat locally."""
 _STATE = "_extra_state"
 _STORED_STATE = 1
 """First byte of a stored state that holds the arrays of fitted estimators."""
 _STORED_SAMPLES = 2
 """First byte of a stored state that holds samples; the estimators are fitted again on loading."""
 _STORES_PICKLES = ("memory",)
-"""Parameters that name a joblib store, which unpickles what it finds there."""
+"""Parameters that configure a joblib cache, which unpickles its files."""
 
 
 class SklearnConfig(FeatureConfig):
-    """A pipeline of scikit-learn that ends in a regressor, fitted for each axis.
+    """Pipeline of scikit-learn that ends in a regressor, fitted per axis.
 
-    Features and targets come standardised.
+    Features and targets are standardised.
 
     Attributes:
-        pipeline: its steps by dotted name below `sklearn`, each a name or a mapping from the name
-            to its parameters; a parameter may be such a name or mapping itself. Classes outside of
-            `residnet.heads.scikit_state.FITTED` need `--trust`.
-        samples: of the training logs that it is fitted on at most, evenly spread.
+        pipeline: steps of the pipeline. A step is a dotted name below `sklearn`, or a mapping from
+            the name to the parameters, whose values may again be names or mappings. Classes outside
+            of `residnet.heads.scikit_state.FITTED` need `--trust`.
+        samples: maximum number of training samples, thinned evenly.
     """
 
     kind: Literal["sklearn"] = "sklearn"
@@ -61,26 +61,30 @@ class SklearnConfig(FeatureConfig):
         estimators = [make_estimator(step) for step in steps]
         final_step = estimators[-1]
         if not callable(getattr(final_step, "predict", None)):
-            raise ValueError(f"the last step, {type(final_step).__name__}, is no regressor")
+            raise ValueError(
+                f"the last step, {type(final_step).__name__}, is not a regressor; end the pipeline"
+                " with one"
+            )
         for estimator in estimators[:-1]:
             if not callable(getattr(estimator, "transform", None)):
                 raise ValueError(
-                    f"{type(estimator).__name__} is no transformer; only the last step predicts"
+                    f"{type(estimator).__name__} is not a transformer; only the last step may be a"
+                    " regressor"
                 )
         return steps
 
     @property
     def is_storable(self) -> bool:
-        """Whether all of it stands on the allow-list, so that its fitted state can be stored."""
+        """Whether all classes are on the allow-list, so that the fitted state can be stored."""
         return all(_is_listed(step, FITTED) for step in self.pipeline)
 
     def build(self, names: Sequence[str]) -> ClosedFormHead:
-        """Return the module for channels `names`."""
+        """Build the head for channels `names`."""
         return SklearnHead(self, names)
 
 
 def _parse_step(step: Any) -> tuple[str, Mapping[str, Any]] | None:
-    """Return the name and the parameters of a part of a pipeline; None for a plain value."""
+    """Return the class name and parameters of a step; None for a plain value."""
     if isinstance(step, str) and step.startswith("sklearn."):
         return step, {}
     if isinstance(step, Mapping) and len(step) == 1:
@@ -91,68 +95,74 @@ def _parse_step(step: Any) -> tuple[str, Mapping[str, Any]] | None:
 
 
 def _is_listed(step: Any, names: Any) -> bool:
-    """Return whether a class and all classes among its parameters are on their allow-lists."""
-    named = _parse_step(step)
-    if named is None or named[0] not in names:
+    """Return whether a class and the classes in its parameters are on the allow-lists."""
+    parsed_step = _parse_step(step)
+    if parsed_step is None:
         return False
-    return all(_is_listed(value, KERNELS) for value in named[1].values() if _parse_step(value))
+    class_name, parameters = parsed_step
+    if class_name not in names:
+        return False
+    return all(_is_listed(value, KERNELS) for value in parameters.values() if _parse_step(value))
 
 
 def make_estimator(step: Any, *, listed: Any = FITTED) -> Any:
-    """Return the object of a step, not yet fitted, with a fixed seed where it takes one.
+    """Construct the estimator of a step, not yet fitted, with a fixed random seed.
 
     Args:
-        step: its name, or a mapping from the name to the parameters.
-        listed: names that are allowed without `--trust`.
+        step: class name, or a mapping from the class name to the parameters.
+        listed: class names that are allowed without `--trust`.
 
     Raises:
-        ValueError: where there is no such class or parameter, or it is not allowed.
+        ValueError: if the class or a parameter does not exist or is not allowed.
     """
-    named = _parse_step(step)
-    if named is None:
-        raise ValueError(f"{step!r} names nothing below `sklearn`, for example sklearn.svm.SVR")
-    name, parameters = named
+    parsed_step = _parse_step(step)
+    if parsed_step is None:
+        raise ValueError(
+            f"{step!r} is not a class below `sklearn`; give a name such as sklearn.svm.SVR"
+        )
+    name, parameters = parsed_step
     if name not in listed and not is_trusted():
         raise ValueError(
             f"'{name}' is not among the classes of scikit-learn whose fitted state is stored as"
-            f" data{suggest_name(name, listed)}; docs/howto/head.md lists them. Give --trust (in Python"
-            " trust=True) only for configs and runs whose source you trust"
+            f" data{suggest_name(name, listed)}; docs/howto/head.md lists them. Give --trust (in"
+            " Python trust=True) only for configs and runs whose source you trust"
         )
-    module, _, kind = name.rpartition(".")
+    module_name, _, class_name = name.rpartition(".")
     try:
-        made = getattr(importlib.import_module(module), kind)
+        estimator_class = getattr(importlib.import_module(module_name), class_name)
     except (ImportError, AttributeError):
         raise ValueError(f"scikit-learn has no '{name}'") from None
-    if not inspect.isclass(made):
-        raise ValueError(f"'{name}' is no class of scikit-learn")
+    if not inspect.isclass(estimator_class):
+        raise ValueError(f"'{name}' is not a class of scikit-learn")
     settings = {key: _parameter(name, key, value) for key, value in parameters.items()}
-    known = inspect.signature(made).parameters
-    if "random_state" in known:
+    if "random_state" in inspect.signature(estimator_class).parameters:
         settings.setdefault("random_state", 0)
     if name == "sklearn.neighbors.KNeighborsRegressor":
-        # a tree of neighbours is an object of compiled code, which cannot be stored as data
+        # the search tree is an object of compiled code, which cannot be stored as arrays
         algorithm = settings.setdefault("algorithm", "brute")
         if algorithm != "brute":
-            raise ValueError(f"{name}: algorithm: expected 'brute', found {algorithm}")
+            raise ValueError(f"{name}: algorithm: expected 'brute', got {algorithm}")
     try:
-        estimator = made(**settings)
-        # scikit-learn checks parameters when it fits; here it names the key in the config
+        estimator = estimator_class(**settings)
+        # scikit-learn validates parameters at the fit; an error here shows the key of the config
         if hasattr(estimator, "_validate_params"):
             estimator._validate_params()
     except (TypeError, ValueError) as error:
-        first = next(iter(str(error).splitlines()), "")
-        raise ValueError(f"{name}: {first}") from None
+        first_line = next(iter(str(error).splitlines()), "")
+        raise ValueError(f"{name}: {first_line}") from None
     return estimator
 
 
 def _parameter(owner: str, key: str, value: Any) -> Any:
-    """Return a parameter of an estimator: a plain value, a list of these, or an allowed kernel.
+    """Convert a parameter: a plain value, a list of plain values, or an allowed kernel.
 
     Raises:
-        ValueError: where it is none of these, or names a store of pickles.
+        ValueError: if the value is of another type, or configures a cache of pickles.
     """
     if key in _STORES_PICKLES and value is not None:
-        raise ValueError(f"{owner}: {key}: is a store of pickles, which residnet does not open")
+        raise ValueError(
+            f"{owner}: {key}: is a cache of pickles, which residnet does not open; remove it"
+        )
     if _parse_step(value):
         return make_estimator(value, listed=KERNELS)
     if isinstance(value, list | tuple):
@@ -160,18 +170,20 @@ def _parameter(owner: str, key: str, value: Any) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
         return value
     raise ValueError(
-        f"{owner}: {key}: expected a number, a text or a list of these, found"
+        f"{owner}: {key}: expected a number, a string or a list of these, got"
         f" {type(value).__name__}"
     )
 
 
 @final
 class SklearnHead(ClosedFormHead):
-    """A head rho [..., n] that asks a fitted pipeline for each axis."""
+    """Head whose residual rho [..., n] is predicted by a fitted pipeline per axis."""
 
     def __init__(self, config: SklearnConfig, names: Sequence[str]) -> None:
         super().__init__(names)
-        self.export_error = "scikit-learn predicts in Python, which no format of export holds"
+        self.export_error = (
+            "predictions of scikit-learn need Python, which no export format contains"
+        )
         self.config = config
         self.features = Features(config.select_features(names), names, config.margin)
         self.scale = ResidualScale(self.n_dof)
@@ -183,10 +195,10 @@ class SklearnHead(ClosedFormHead):
         return self.scale.std
 
     def fit_solutions(self, samples: Samples) -> list[Solution]:
-        """Fit the pipelines, and return their state.
+        """Fit the pipelines and return their state.
 
         Raises:
-            FitError: where scikit-learn refuses the samples.
+            FitError: if scikit-learn rejects the samples.
         """
         rows = torch.linspace(0, len(samples) - 1, min(len(samples), self.config.samples)).long()
         with torch.no_grad():
@@ -209,7 +221,7 @@ class SklearnHead(ClosedFormHead):
         return [Solution({}, {_STATE: stored}, notes={"fitted_on": len(rows)})]
 
     def _fit(self, x: np.ndarray, y: np.ndarray) -> list[list[Any]]:
-        """Return the fitted steps of each axis, from features [N, F] and targets [N, n]."""
+        """Fit the steps of each axis to features [N, F] and targets [N, n]."""
         axes = []
         for i, name in enumerate(self.output_names):
             steps = [make_estimator(step) for step in self.config.pipeline]
@@ -219,20 +231,20 @@ class SklearnHead(ClosedFormHead):
                     columns = step.fit_transform(columns, y[:, i])
                 steps[-1].fit(columns, y[:, i])
             except (TypeError, ValueError) as error:
-                first = next(iter(str(error).splitlines()), "")
-                raise FitError(f"scikit-learn cannot fit {name}: {first}") from None
+                first_line = next(iter(str(error).splitlines()), "")
+                raise FitError(f"scikit-learn cannot fit {name}: {first_line}") from None
             axes.append(steps)
         return axes
 
     def get_extra_state(self) -> Tensor:
-        """Return the fitted pipelines as bytes [N]; none before a fit."""
+        """Return the fitted pipelines as bytes [N]; no bytes before a fit."""
         return torch.from_numpy(self.stored)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Restore the pipelines from what `get_extra_state` returned.
+        """Restore the pipelines from the bytes of `get_extra_state`.
 
         Raises:
-            UsageError: where the state does not belong to this pipeline, or needs `--trust`.
+            UsageError: if the state does not match this pipeline, or needs `--trust`.
         """
         stored = np.ascontiguousarray(state.detach().cpu().numpy())
         if stored.dtype != np.uint8 or stored.ndim != 1:
@@ -243,7 +255,7 @@ class SklearnHead(ClosedFormHead):
         if np.array_equal(stored, self.stored):
             return
         if len(stored) < 5:
-            raise UsageError("a head of kind sklearn: its state is cut off; run the fit again")
+            raise UsageError("a head of kind sklearn: its state is truncated; run the fit again")
         self.sample_count = int(stored[1:5].copy().view("<u4")[0])
         content = stored[5:]
         if stored[0] == _STORED_STATE and self.config.is_storable:
@@ -253,7 +265,9 @@ class SklearnHead(ClosedFormHead):
             try:
                 training_data = content.copy().view(np.float64).reshape(self.sample_count, width)
             except ValueError:
-                raise UsageError("a head of kind sklearn: its samples are cut off") from None
+                raise UsageError(
+                    "a head of kind sklearn: its samples are truncated; run the fit again"
+                ) from None
             self.axis_pipelines = self._fit(
                 training_data[:, : -self.n_dof], training_data[:, -self.n_dof :]
             )
@@ -265,26 +279,31 @@ class SklearnHead(ClosedFormHead):
         self.stored = stored
 
     def _restore(self, content: bytes) -> list[list[Any]]:
-        """Return the steps of each axis with their stored state, after a trial prediction."""
+        """Restore the steps of each axis, and check them by a trial prediction."""
         axes = [[make_estimator(step) for step in self.config.pipeline] for _ in self.output_names]
         names = [_parse_step(step)[0] for step in self.config.pipeline]  # type: ignore[index]
-        again = "restore the model, or run the fit again with this version of scikit-learn"
+        remedy = "restore the model, or run the fit again with this version of scikit-learn"
         try:
             decode(
-                content, [list(zip(names, a, strict=True)) for a in axes], self.features.n_features
+                content,
+                [list(zip(names, steps, strict=True)) for steps in axes],
+                self.features.n_features,
             )
         except StateError as error:
-            raise UsageError(f"a head of kind sklearn: its state {error}; {again}") from None
+            raise UsageError(f"a head of kind sklearn: its state {error}; {remedy}") from None
         try:
-            answers = [_predict(steps, np.zeros((2, self.features.n_features))) for steps in axes]
-            complete = all(part.shape == (2,) for part in answers)
+            trial_features = np.zeros((2, self.features.n_features))
+            predictions = [_predict(steps, trial_features) for steps in axes]
+            is_scalar = all(prediction.shape == (2,) for prediction in predictions)
         except Exception as error:
-            first = next(iter(str(error).splitlines()), "")
+            first_line = next(iter(str(error).splitlines()), "")
             raise UsageError(
-                f"a head of kind sklearn: its state gives no prediction ({first}); {again}"
+                f"a head of kind sklearn: its state gives no prediction ({first_line}); {remedy}"
             ) from None
-        if not complete:
-            raise UsageError(f"a head of kind sklearn: it predicts several values; {again}")
+        if not is_scalar:
+            raise UsageError(
+                f"a head of kind sklearn: it predicts several values per sample; {remedy}"
+            )
         return axes
 
     def predict(self, x: Tensor) -> Tensor:
@@ -300,7 +319,7 @@ class SklearnHead(ClosedFormHead):
         return self.scale(standardised_residual), s
 
     def parameter_counts(self) -> list[float]:
-        """Return the numbers that each axis was fitted on: nothing else bounds its freedom."""
+        """Return the number of training samples per axis, which bounds the degrees of freedom."""
         return [float(self.sample_count)] * self.n_dof
 
 
@@ -312,7 +331,7 @@ def _predict(steps: Sequence[Any], rows: np.ndarray) -> np.ndarray:
 
 
 class _PredictFunction(torch.autograd.Function):
-    """The answer of fitted pipelines, with slopes by central differences."""
+    """Prediction of fitted pipelines, differentiated by central differences."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, head: SklearnHead) -> Tensor:

@@ -1,10 +1,9 @@
-"""Fitted estimators of scikit-learn as arrays: which there are, and how one is stored and restored.
+"""Storage of fitted estimators of scikit-learn as arrays, without pickles.
 
-No pickle is written or opened, and nothing is fitted when an estimator is restored. An estimator is
-made by its constructor from checked parameters; then the few attributes that its `predict` or
-`transform` reads are set. Each is a number, a text, an array or a list of arrays. Compiled code of
-scikit-learn trusts indices that it finds in them (nodes of trees, numbers of support vectors), so
-these are checked before.
+An estimator is restored by its constructor with validated parameters; then the attributes that
+`predict` or `transform` reads are set. Each is a number, a string, an array or a list of arrays.
+The compiled code of scikit-learn does not check indices in these arrays (nodes of trees, numbers of
+support vectors), so they are validated here.
 """
 
 from __future__ import annotations
@@ -80,9 +79,9 @@ FITTED: Final[Mapping[str, tuple[str, ...]]] = {
     "sklearn.kernel_approximation.Nystroem": ("components_", "normalization_"),
     "sklearn.kernel_approximation.RBFSampler": ("random_weights_", "random_offset_"),
 }
-"""Estimators whose fitted state is stored, each with the attributes that a prediction reads.
+"""Estimators whose fitted state can be stored, with the attributes that a prediction reads.
 
-Those of trees and boosted trees are stored by `_encode_trees`.
+Trees and boosted trees are stored by `_encode_trees`.
 """
 KERNELS: Final = frozenset(
     f"sklearn.gaussian_process.kernels.{name}"
@@ -98,22 +97,22 @@ KERNELS: Final = frozenset(
         "WhiteKernel",
     )
 )
-"""Covariance functions of a Gaussian process; their numbers are stored."""
+"""Covariance functions of a Gaussian process; their parameters are stored."""
 _FORESTS = ("RandomForestRegressor", "ExtraTreesRegressor")
 _SINGLE_TREES = ("DecisionTreeRegressor", "ExtraTreeRegressor")
-_MOST_FEATURES = 100_000
-"""Columns between two steps of a pipeline; a polynomial of high degree has no more by far."""
+_MAX_FEATURES = 100_000
+"""Maximum number of columns between two steps, above that of any useful polynomial."""
 
 
 class StateError(ValueError):
-    """The error of a stored estimator that does not fit its description."""
+    """A stored state does not match its estimator."""
 
 
 def encode(pipelines: Sequence[Sequence[tuple[str, Any]]]) -> bytes:
-    """Return fitted pipelines as one safetensors file.
+    """Encode fitted pipelines as a safetensors file.
 
     Args:
-        pipelines: one of each axis, a list of the name in `FITTED` and the fitted estimator.
+        pipelines: pipeline of each axis, a list of (name in `FITTED`, fitted estimator).
     """
     from safetensors.numpy import save
 
@@ -131,7 +130,7 @@ def encode(pipelines: Sequence[Sequence[tuple[str, Any]]]) -> bytes:
             return value
         if isinstance(value, Mapping):
             return {"mapping": {str(key): store(part) for key, part in value.items()}}
-        raise StateError(f"holds a {type(value).__name__}, which cannot be stored")
+        raise StateError(f"contains a {type(value).__name__}, which cannot be stored")
 
     index = []
     for steps in pipelines:
@@ -148,15 +147,15 @@ def encode(pipelines: Sequence[Sequence[tuple[str, Any]]]) -> bytes:
 
 
 def decode(content: bytes, pipelines: Sequence[Sequence[tuple[str, Any]]], width: int) -> None:
-    """Fill estimators, made but not fitted, with the state that `encode` stored.
+    """Restore the state of constructed, not fitted estimators from the bytes of `encode`.
 
     Args:
         content: safetensors file.
-        pipelines: as of `encode`; the estimators are changed.
+        pipelines: pipeline of each axis, a list of (name, estimator); the estimators are changed.
         width: number of features of the first steps.
 
     Raises:
-        StateError: where the content does not belong to such pipelines.
+        StateError: if the content does not match the pipelines.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load
@@ -165,7 +164,7 @@ def decode(content: bytes, pipelines: Sequence[Sequence[tuple[str, Any]]], width
         arrays = load(content)
         index = json.loads(arrays.pop("index").tobytes())
     except (SafetensorError, KeyError, ValueError, RecursionError) as error:
-        raise StateError(f"is no stored pipeline ({error})") from None
+        raise StateError(f"is not a stored pipeline ({error})") from None
 
     def restore(value: Any, depth: int = 0) -> Any:
         if depth > 8:
@@ -181,11 +180,11 @@ def decode(content: bytes, pipelines: Sequence[Sequence[tuple[str, Any]]], width
         return value
 
     if not isinstance(index, list) or len(index) != len(pipelines):
-        raise StateError(f"does not hold {len(pipelines)} pipelines")
+        raise StateError(f"does not contain {len(pipelines)} pipelines")
     for stored, steps in zip(index, pipelines, strict=True):
         names = [part.get("class") if isinstance(part, dict) else None for part in stored]
         if names != [name for name, _ in steps]:
-            raise StateError(f"holds {names}, expected {[name for name, _ in steps]}")
+            raise StateError(f"contains {names}, expected {[name for name, _ in steps]}")
         columns = width
         for part, (name, estimator) in zip(stored, steps, strict=True):
             state = part.get("state")
@@ -197,40 +196,40 @@ def decode(content: bytes, pipelines: Sequence[Sequence[tuple[str, Any]]], width
             except StateError as error:
                 raise StateError(f"{name} {error}") from None
             except Exception as error:
-                # whatever scikit-learn raises on a state that does not belong to it
-                first = next(iter(str(error).splitlines()), "")
-                raise StateError(f"{name} cannot be restored ({first})") from None
+                # scikit-learn raises errors of many types on an inconsistent state
+                first_line = next(iter(str(error).splitlines()), "")
+                raise StateError(f"{name} cannot be restored ({first_line})") from None
 
 
 def _width_after(estimator: Any, columns: int) -> int:
-    """Return the number of columns that a step gives to the next one."""
+    """Return the number of output columns of a step, by a trial transformation."""
     if not hasattr(estimator, "transform") or hasattr(estimator, "predict"):
         return 1
     with np.errstate(all="ignore"):
         width = np.asarray(estimator.transform(np.zeros((1, columns)))).shape
-    if len(width) != 2 or not 1 <= width[1] <= _MOST_FEATURES:
-        raise StateError(f"gives columns of the shape {width}")
+    if len(width) != 2 or not 1 <= width[1] <= _MAX_FEATURES:
+        raise StateError(f"returns columns of the shape {width}")
     return int(width[1])
 
 
 def _fill(estimator: Any, name: str, state: dict[str, Any], columns: int) -> None:
-    """Set the fitted attributes of one estimator, after they have been checked."""
-    fitted = {key: state.pop(key, None) for key in FITTED[name]}
+    """Validate and set the fitted attributes of an estimator."""
+    attributes = {key: state.pop(key, None) for key in FITTED[name]}
     features = state.pop("n_features_in_", columns)
     if features != columns or isinstance(features, bool):
         raise StateError(f"was fitted on {features} columns, and its step has {columns}")
-    for key, value in fitted.items():
+    for key, value in attributes.items():
         if isinstance(value, dict):
             raise StateError(f"has a mapping as {key}")
     if name.rpartition(".")[2] in ("SVR", "NuSVR"):
-        _require_support(fitted, columns)
-        fitted["shape_fit_"] = tuple(fitted["shape_fit_"])
+        _require_support(attributes, columns)
+        attributes["shape_fit_"] = tuple(attributes["shape_fit_"])
     if name.endswith(".PolynomialFeatures") and not (
-        0 <= int(fitted["n_output_features_"]) <= _MOST_FEATURES
-        and (fitted["_min_degree"], fitted["_max_degree"]) == _degrees(estimator)
+        0 <= int(attributes["n_output_features_"]) <= _MAX_FEATURES
+        and (attributes["_min_degree"], attributes["_max_degree"]) == _degrees(estimator)
     ):
         raise StateError("has other degrees than its description")
-    vars(estimator).update(fitted)
+    vars(estimator).update(attributes)
     estimator.n_features_in_ = columns
     if "n_jobs" in vars(estimator):
         estimator.n_jobs = None
@@ -238,13 +237,13 @@ def _fill(estimator: Any, name: str, state: dict[str, Any], columns: int) -> Non
 
 
 def _degrees(polynomial: Any) -> tuple[int, int]:
-    """Return the lowest and the highest degree of `PolynomialFeatures`."""
+    """Return the minimum and maximum degree of `PolynomialFeatures`."""
     degree = polynomial.degree
     return (0, degree) if isinstance(degree, int) else (degree[0], degree[1])
 
 
 def _require_support(state: Mapping[str, Any], columns: int) -> None:
-    """Check the arrays that libsvm reads without a check of its own."""
+    """Validate the arrays of a support vector machine, which libsvm reads unchecked."""
     vectors = state["support_vectors_"]
     weights = state["_dual_coef_"]
     count = state["_n_support"]
@@ -265,52 +264,54 @@ def _require_support(state: Mapping[str, Any], columns: int) -> None:
     )
     samples = state["shape_fit_"]
     if not shapes or len(samples) != 2 or not all(type(size) is int for size in samples):
-        raise StateError("has support vectors that do not belong together")
+        raise StateError("has inconsistent arrays of support vectors")
     if samples[1] != columns or (rows and not 0 <= indices.min() <= indices.max() < samples[0]):
-        raise StateError("has support vectors beyond its samples")
+        raise StateError("has indices of support vectors outside its samples")
 
 
 # ------------------------------------------------------------------- trees, boosting, kernels
 
 
 def _encode_special(estimator: Any) -> dict[str, Any]:
-    """Return what of an estimator is no plain attribute: its trees or its covariance function."""
-    kind = type(estimator).__name__
-    if kind in _SINGLE_TREES:
+    """Encode the trees or the covariance function of an estimator."""
+    class_name = type(estimator).__name__
+    if class_name in _SINGLE_TREES:
         return {"trees": _encode_trees([estimator.tree_])}
-    if kind in _FORESTS:
+    if class_name in _FORESTS:
         return {"trees": _encode_trees([tree.tree_ for tree in estimator.estimators_])}
-    if kind == "GradientBoostingRegressor":
-        start = estimator.init_
+    if class_name == "GradientBoostingRegressor":
+        initial = estimator.init_
         trees = [tree.tree_ for tree in estimator.estimators_.ravel()]
         return {
             "trees": _encode_trees(trees),
-            "start": None if isinstance(start, str) else float(start.constant_.item()),
+            "start": None if isinstance(initial, str) else float(initial.constant_.item()),
         }
-    if kind == "HistGradientBoostingRegressor":
+    if class_name == "HistGradientBoostingRegressor":
         if estimator.is_categorical_ is not None:
             raise StateError("has categories, which cannot be stored")
         nodes = [predictor.nodes for stage in estimator._predictors for predictor in stage]
-        return {"trees": {"sizes": np.array([len(n) for n in nodes]), "nodes": _fields(nodes)}}
-    if kind == "GaussianProcessRegressor":
+        return {"trees": {"sizes": np.array([len(n) for n in nodes]), "nodes": _node_fields(nodes)}}
+    if class_name == "GaussianProcessRegressor":
         return {"kernel": _encode_kernel(estimator.kernel_)}
     return {}
 
 
 def _restore_special(estimator: Any, state: dict[str, Any], columns: int) -> None:
-    """Set what `_encode_special` returned."""
-    kind = type(estimator).__name__
-    if kind in _SINGLE_TREES:
+    """Restore the state of `_encode_special`."""
+    class_name = type(estimator).__name__
+    if class_name in _SINGLE_TREES:
         (tree,) = _decode_trees(state["trees"], columns)
-        _hold_tree(estimator, tree, columns)
-    elif kind in _FORESTS or kind == "GradientBoostingRegressor":
+        _set_tree(estimator, tree, columns)
+    elif class_name in _FORESTS or class_name == "GradientBoostingRegressor":
         from sklearn.tree import DecisionTreeRegressor, ExtraTreeRegressor
 
-        member = ExtraTreeRegressor if kind == "ExtraTreesRegressor" else DecisionTreeRegressor
+        member = (
+            ExtraTreeRegressor if class_name == "ExtraTreesRegressor" else DecisionTreeRegressor
+        )
         trees = _decode_trees(state["trees"], columns)
-        members = [_hold_tree(member(), tree, columns) for tree in trees]
+        members = [_set_tree(member(), tree, columns) for tree in trees]
         estimator.n_outputs_ = 1
-        if kind in _FORESTS:
+        if class_name in _FORESTS:
             estimator.estimators_ = members
             estimator.estimator_ = member()
             return
@@ -321,13 +322,13 @@ def _restore_special(estimator: Any, state: dict[str, Any], columns: int) -> Non
         estimator.n_trees_per_iteration_ = 1
         estimator._loss = estimator._get_loss(sample_weight=None)
         estimator.init_ = "zero" if state["start"] is None else _constant(state["start"], columns)
-    elif kind == "HistGradientBoostingRegressor":
+    elif class_name == "HistGradientBoostingRegressor":
         _restore_histogram_trees(estimator, state["trees"], columns)
-    elif kind == "GaussianProcessRegressor":
+    elif class_name == "GaussianProcessRegressor":
         estimator.kernel_ = _decode_kernel(state["kernel"])
-    elif kind == "KNeighborsRegressor":
+    elif class_name == "KNeighborsRegressor":
         if estimator._fit_method != "brute" or not isinstance(estimator.effective_metric_, str):
-            raise StateError("has an index of neighbours, expected all distances ('brute')")
+            raise StateError("has a search tree of neighbours, expected the algorithm 'brute'")
         if estimator._fit_X.shape != (len(estimator._y), columns):
             raise StateError("has neighbours of another shape")
         estimator._tree = None
@@ -336,15 +337,15 @@ def _restore_special(estimator: Any, state: dict[str, Any], columns: int) -> Non
 
 
 def _constant(value: Any, columns: int) -> Any:
-    """Return the regressor of a constant, from which boosting begins."""
+    """Return the constant regressor that initialises boosting."""
     from sklearn.dummy import DummyRegressor
 
-    start = DummyRegressor(strategy="constant", constant=float(value))
-    return start.fit(np.zeros((1, columns)), np.array([float(value)]))
+    regressor = DummyRegressor(strategy="constant", constant=float(value))
+    return regressor.fit(np.zeros((1, columns)), np.array([float(value)]))
 
 
-def _hold_tree(estimator: Any, tree: Any, columns: int) -> Any:
-    """Return an estimator of one tree that predicts by it."""
+def _set_tree(estimator: Any, tree: Any, columns: int) -> Any:
+    """Set the tree of an estimator of a single tree and return the estimator."""
     estimator.tree_ = tree
     estimator.n_outputs_ = 1
     estimator.n_features_in_ = columns
@@ -352,28 +353,28 @@ def _hold_tree(estimator: Any, tree: Any, columns: int) -> Any:
     return estimator
 
 
-def _fields(nodes: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the fields of the nodes of all trees, one tree behind the other."""
-    joined = np.concatenate(nodes)
-    return {name: joined[name] for name in joined.dtype.names or ()}
+def _node_fields(nodes: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the fields of the nodes of all trees, concatenated."""
+    all_nodes = np.concatenate(nodes)
+    return {name: all_nodes[name] for name in all_nodes.dtype.names or ()}
 
 
 def _encode_trees(trees: Sequence[Any]) -> dict[str, Any]:
-    """Return trees as the fields of their nodes and one value a node."""
+    """Encode trees as the fields of their nodes and a value per node."""
     states = [tree.__getstate__() for tree in trees]
     return {
         "sizes": np.array([state["node_count"] for state in states]),
         "depths": np.array([state["max_depth"] for state in states]),
         "values": np.concatenate([state["values"].reshape(-1) for state in states]),
-        "nodes": _fields([state["nodes"] for state in states]),
+        "nodes": _node_fields([state["nodes"] for state in states]),
     }
 
 
-def _split_nodes(stored: Any, kind: np.dtype[Any]) -> list[np.ndarray]:
-    """Return the nodes of each tree as structured arrays of scikit-learn's own type.
+def _split_nodes(stored: Any, node_dtype: np.dtype[Any]) -> list[np.ndarray]:
+    """Return the nodes of each tree as structured arrays of the type of scikit-learn.
 
     Raises:
-        StateError: where a field is missing or of another length.
+        StateError: if a field is missing or has the wrong length.
     """
     if not isinstance(stored, dict) or not isinstance(stored.get("nodes"), dict):
         raise StateError("has no trees")
@@ -382,64 +383,66 @@ def _split_nodes(stored: Any, kind: np.dtype[Any]) -> list[np.ndarray]:
     if sizes.ndim != 1 or sizes.dtype.kind not in "iu" or (sizes < 1).any():
         raise StateError("has a tree without nodes")
     total = int(sizes.sum())
-    joined = np.zeros(total, dtype=kind)
-    for name in kind.names or ():
+    all_nodes = np.zeros(total, dtype=node_dtype)
+    for name in node_dtype.names or ():
         values = fields.get(name)
         if not isinstance(values, np.ndarray) or values.shape != (total,):
-            raise StateError(f"has nodes without {name}; fit it again with this scikit-learn")
-        if not np.array_equal(values.astype(joined[name].dtype), values, equal_nan=True):
+            raise StateError(
+                f"has nodes without {name}; run the fit again with this version of scikit-learn"
+            )
+        if not np.array_equal(values.astype(all_nodes[name].dtype), values, equal_nan=True):
             raise StateError(f"has nodes whose {name} is out of range")
-        joined[name] = values
-    return np.split(joined, np.cumsum(sizes)[:-1])
+        all_nodes[name] = values
+    return np.split(all_nodes, np.cumsum(sizes)[:-1])
 
 
 def _require_nodes(inner: np.ndarray, children: Sequence[np.ndarray], size: int) -> None:
-    """Check that every inner node leads to later nodes of its tree: a walk then always ends."""
-    places = np.flatnonzero(inner)
+    """Check that the children of a node follow it in its tree, so that traversal terminates."""
+    node_indices = np.flatnonzero(inner)
     for child in children:
-        if not ((places < child[inner]) & (child[inner] < size)).all():
-            raise StateError("has a tree whose nodes lead out of it or back")
+        if not ((node_indices < child[inner]) & (child[inner] < size)).all():
+            raise StateError("has a tree whose nodes have invalid children")
 
 
 def _decode_trees(stored: Any, columns: int) -> list[Any]:
-    """Return the trees that `_encode_trees` stored."""
+    """Decode the trees of `_encode_trees`."""
     from sklearn.tree import _tree
 
-    parts = _split_nodes(stored, _tree.NODE_DTYPE)
+    nodes_of_trees = _split_nodes(stored, _tree.NODE_DTYPE)
     values = np.asarray(stored["values"], dtype=float)
-    if values.shape != (sum(map(len, parts)),):
+    if values.shape != (sum(map(len, nodes_of_trees)),):
         raise StateError("has trees without a value for each node")
     depths = stored["depths"]
     trees = []
-    begin = 0
-    for nodes, depth in zip(parts, depths, strict=True):
+    first_node = 0
+    for nodes, depth in zip(nodes_of_trees, depths, strict=True):
         inner = nodes["left_child"] != -1
         children = (nodes["left_child"], nodes["right_child"])
         _require_nodes(inner, children, len(nodes))
         feature = nodes["feature"][inner]
         if not ((feature >= 0) & (feature < columns)).all():
-            raise StateError("has a tree that asks for a feature it does not have")
+            raise StateError("has a tree that reads a feature it does not have")
         tree = _tree.Tree(columns, np.array([1], dtype=np.intp), 1)
         tree.__setstate__(
             {
                 "max_depth": int(depth),
                 "node_count": len(nodes),
                 "nodes": nodes,
-                "values": values[begin : begin + len(nodes)].reshape(-1, 1, 1).copy(),
+                "values": values[first_node : first_node + len(nodes)].reshape(-1, 1, 1).copy(),
             }
         )
-        begin += len(nodes)
+        first_node += len(nodes)
         trees.append(tree)
     return trees
 
 
 def _restore_histogram_trees(estimator: Any, stored: Any, columns: int) -> None:
-    """Set the trees of histogram boosting."""
+    """Restore the trees of histogram boosting."""
     from sklearn.ensemble._hist_gradient_boosting.binning import _BinMapper
     from sklearn.ensemble._hist_gradient_boosting.common import PREDICTOR_RECORD_DTYPE
     from sklearn.ensemble._hist_gradient_boosting.predictor import TreePredictor
 
-    none = np.zeros((0, 8), dtype=np.uint32)
+    no_categories = np.zeros((0, 8), dtype=np.uint32)
     stages = []
     for nodes in _split_nodes(stored, PREDICTOR_RECORD_DTYPE):
         inner = nodes["is_leaf"] == 0
@@ -447,14 +450,14 @@ def _restore_histogram_trees(estimator: Any, stored: Any, columns: int) -> None:
         _require_nodes(inner, children, len(nodes))
         feature = nodes["feature_idx"][inner]
         if nodes["is_categorical"].any() or not ((feature >= 0) & (feature < columns)).all():
-            raise StateError("has a tree that asks for a feature it does not have")
-        stages.append([TreePredictor(nodes, none, none)])
+            raise StateError("has a tree that reads a feature it does not have")
+        stages.append([TreePredictor(nodes, no_categories, no_categories)])
     if np.shape(estimator._baseline_prediction) != (1, 1):
-        raise StateError("has no value that boosting begins from")
+        raise StateError("has no initial value of boosting")
     mapper = _BinMapper()
     mapper.is_categorical_ = np.zeros(columns, dtype=np.uint8)
     mapper.known_categories = None
-    # without categories the mapper is asked for the number of columns alone
+    # without categories, only the number of columns is read from the mapper
     mapper.bin_thresholds_ = [np.zeros(0)] * columns
     estimator._bin_mapper = mapper
     estimator._predictors = stages
@@ -466,7 +469,7 @@ def _restore_histogram_trees(estimator: Any, stored: Any, columns: int) -> None:
 
 
 def _encode_kernel(kernel: Any) -> dict[str, Any]:
-    """Return a covariance function as its name and its parameters."""
+    """Encode a covariance function as its name and its parameters."""
     name = f"sklearn.gaussian_process.kernels.{type(kernel).__name__}"
     if name not in KERNELS:
         raise StateError(f"has the kernel {type(kernel).__name__}, which cannot be stored")
@@ -478,13 +481,13 @@ def _encode_kernel(kernel: Any) -> dict[str, Any]:
 
 
 def _decode_kernel(stored: Any) -> Any:
-    """Return the covariance function that `_encode_kernel` stored."""
+    """Decode the covariance function of `_encode_kernel`."""
     from sklearn.gaussian_process import kernels
 
     if not isinstance(stored, dict) or stored.get("kernel") not in KERNELS:
         raise StateError("has a kernel that is not allowed")
-    made: Callable[..., Any] = getattr(kernels, stored["kernel"].rpartition(".")[2])
-    return made(
+    kernel_class: Callable[..., Any] = getattr(kernels, stored["kernel"].rpartition(".")[2])
+    return kernel_class(
         **{
             key: _decode_kernel(value) if isinstance(value, dict) else value
             for key, value in stored["parameters"].items()

@@ -1,7 +1,4 @@
-"""The symbolic head: an equation of few terms (documents 000 and 001).
-
-It is that of the residual, or of the whole acceleration.
-"""
+"""Symbolic head: a sparse equation of the residual or of the acceleration (documents 000, 001)."""
 
 from __future__ import annotations
 
@@ -33,20 +30,20 @@ from residnet.regression.expressions import format_equation, format_sum, terms_t
 from residnet.regression.sparse import SparseRegression, SparseSearchConfig
 
 _ROUNDING_SHARE = 1e-14
-"""Share of the energy of a target that rounding leaves."""
+"""Relative residual energy below which a fit is at the level of rounding errors."""
 _RANK_TOLERANCE = 1e-10
-"""Share of the largest eigenvalue up to which one is what rounding leaves."""
+"""Ratio to the largest eigenvalue below which an eigenvalue counts as zero."""
 _MIN_NORM = 1e-300
-"""Keeps the logarithm of the error of a target of zeros finite, and least length of a term."""
+"""Lower bound of the norm of a term and of the argument of the logarithm of an error."""
 
 
 class DelayConfig(Config):
-    """A delay that the fit finds, one for all of its channels.
+    """Input delay that is identified by the fit, common to all delayed channels.
 
     Attributes:
-        channels: inputs that act late.
-        longest: longest delay that is tried, in steps of the grid; the memory holds as many
-            samples, and whether there was one.
+        channels: delayed inputs.
+        longest: maximum candidate delay in time steps; the memory of the head contains this number
+            of samples and a flag.
     """
 
     channels: tuple[str, ...] = Field(min_length=1)
@@ -54,11 +51,11 @@ class DelayConfig(Config):
 
 
 class DelayLine(nn.Module):
-    """The channels with some of them as they were `delay_steps` ago.
+    """Delay line that delays some of the channels by `delay_steps` time steps.
 
-    The memory holds the last `max_delay` values of these, oldest first, and behind them 1 once there
-    was a sample, 0 before. What lies before the first sample is taken to be like it: zeros would
-    be no state of the vessel, and a term that divides by one of them would be no number.
+    The memory contains the last `max_delay` values of the delayed channels, oldest first, and a
+    flag that is 1 after the first sample. Before the first sample the channels are assumed equal to
+    it, because zeros are not a plausible state and a term that divides by them is undefined.
     """
 
     def __init__(self, config: DelayConfig | None, names: Sequence[str]) -> None:
@@ -81,7 +78,7 @@ class DelayLine(nn.Module):
         self.steps = nn.Buffer(torch.zeros(1, dtype=torch.float64))
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return channels [B, nz] with the late ones delayed, and the next memory [B, n_state]."""
+        """Delay channels [B, nz] by the memory; return them and the next memory [B, n_state]."""
         if self.n_delayed == 0:
             return z, s
         current = z.index_select(-1, self.delayed_index)
@@ -97,11 +94,11 @@ class DelayLine(nn.Module):
         return z.index_copy(-1, self.delayed_index, delayed), next_memory
 
     def _repeat_to_line(self, current: Tensor) -> Tensor:
-        """Return the line [..., longest * count] that late channels [..., count] fill alone."""
+        """Return the delay line [..., max_delay * C] filled with the delayed channels [..., C]."""
         return current.unsqueeze(-2).repeat_interleave(self.max_delay, dim=-2).flatten(-2)
 
     def delay_sequence(self, z: Tensor) -> Tensor:
-        """Return channels [..., T, nz] with the late ones delayed, from an empty memory."""
+        """Delay channels [..., T, nz], from an empty memory."""
         if self.n_delayed == 0:
             return z
         undelayed = z.index_select(-1, self.delayed_index)
@@ -116,7 +113,7 @@ class DelayLine(nn.Module):
         )
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Return the memory [B, n_state] after channels [B, T, nz]; zeros without any."""
+        """Return the memory [B, n_state] after channels [B, T, nz]; zeros for T = 0."""
         if self.n_delayed == 0 or z.shape[1] == 0:
             return z.new_zeros((z.shape[0], self.n_state))
         undelayed = z.index_select(-1, self.delayed_index)
@@ -127,7 +124,7 @@ class DelayLine(nn.Module):
         return torch.cat((buffered, torch.ones_like(buffered[:, :1])), dim=-1)
 
     def memory_bounds(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the least and largest memory [n_state], from those of all channels [nz]."""
+        """Return the bounds of the memory [n_state] from those of the channels [nz]."""
         if self.n_delayed == 0:
             return lower[:0], upper[:0]
         lower_memory, upper_memory = (
@@ -140,13 +137,13 @@ class DelayLine(nn.Module):
 
 
 class SegmentedSamples(NamedTuple):
-    """The samples of a fit with what lies before them.
+    """Samples of a fit in uninterrupted segments, which allows delays.
 
     Attributes:
         features: features [N, F].
-        target: outputs [N, n].
-        segment: number of the unbroken stretch of each sample, ascending [N].
-        time_step: time between neighbouring samples, s.
+        target: targets [N, n].
+        segment: number of the uninterrupted segment of each sample, ascending [N].
+        time_step: sampling interval, s.
     """
 
     features: np.ndarray
@@ -157,9 +154,12 @@ class SegmentedSamples(NamedTuple):
     def with_delay(
         self, delay_steps: int, delayed_index: np.ndarray, min_past: int = 0
     ) -> SegmentedSamples:
-        """Return samples with the features `delayed_index` from `delay_steps` before.
+        """Return the samples with some features delayed.
 
-        Those are left out that have no past of so many samples, and of `min_past`.
+        Args:
+            delayed_index: indices of the delayed features.
+            delay_steps: delay in samples.
+            min_past: samples with fewer preceding samples in their segment are removed.
         """
         n_past = max(delay_steps, min_past)
         current = np.arange(n_past, len(self.segment))
@@ -178,20 +178,20 @@ def find_best_delay(
     delayed_index: np.ndarray,
     max_delay: int,
 ) -> tuple[int, np.ndarray]:
-    """Return the delay at which terms explain their targets best, and the profile of errors.
+    """Select the delay of minimum least-squares error; return it and the error profile.
 
-    The delay is in steps; the profile is the mean over targets of ln(RSS) for each delay [longest +
-    1]. All delays are judged on the same samples (document 000 section 5.3.4).
+    The profile [max_delay + 1] is the mean over the targets of ln(RSS) for each delay, evaluated on
+    the same samples for all delays (document 000 section 5.3.4).
 
     Args:
-        samples: samples.
-        terms: of each target.
-        names: of the features.
-        delayed_index: places of those that act late.
-        max_delay: longest delay, in steps.
+        samples: samples in segments.
+        terms: terms of each target.
+        names: names of the features.
+        delayed_index: indices of the delayed features.
+        max_delay: maximum delay in time steps.
 
     Raises:
-        FitError: with fewer samples that have a past than terms.
+        FitError: if there are fewer samples with a sufficient past than terms.
     """
     profile = np.zeros(max_delay + 1)
     libraries = [TermLibrary(target_terms, names) for target_terms in terms]
@@ -201,7 +201,8 @@ def find_best_delay(
         max_terms = max(map(len, terms))
         if len(z) <= max_terms:
             raise FitError(
-                f"delay: {len(z)} samples have a past of {max_delay} samples, {max_terms} terms need more;"
+                f"delay: {len(z)} samples have {max_delay} preceding samples, which is too few for"
+                f" {max_terms} terms;"
                 " give longer logs or a shorter delay"
             )
         for library, target in zip(libraries, delayed.target.T, strict=True):
@@ -222,25 +223,25 @@ def find_best_delay(
 
 
 _GAMMAS = (0.0, 0.5, 1.0)
-"""Weights of the number of candidates that are offered where free runs choose: from BIC up."""
+"""Weights gamma of the extended BIC of the alternatives if free runs select."""
 _MAX_DELAY_ROUNDS = 6
-"""Most rounds of the search for a delay."""
+"""Maximum number of iterations of the search for a delay."""
 
 
 class SymbolicConfig(FeatureConfig):
-    """An equation for each axis, in SI units, by sparse regression.
+    """Equation of each axis in SI units, identified by sparse regression.
 
     Attributes:
-        candidates: which terms the equations may have, by type.
-        terms: names of the candidates, instead of types.
-        search: how far the search goes.
-        estimator: what a row of the regression is: a sample, or a window of the weak form.
-        symmetric: leave out of each axis the terms that a vessel with port/starboard symmetry
-            cannot have there, as far as the mirror images of its channels are known.
-        delay: inputs that act late; none where left out.
-        choose: what the length of the equations is chosen by: `one_step`, extended BIC of the
-            accelerations; or `free_run`, error of free runs on validation data, between shorter and
-            longer equations and none.
+        candidates: candidate terms, given by types.
+        terms: names of candidate terms; if given, they replace `candidates`.
+        search: settings of the search.
+        estimator: rows of the regression: samples, or windows of the weak form.
+        symmetric: whether the candidates of each axis exclude terms that violate port/starboard
+            symmetry, for channels with a known mirror image.
+        delay: delayed inputs; null for no delay.
+        choose: criterion of the number of terms. `one_step` is the extended BIC of the
+            accelerations; `free_run` is the error of free runs on validation data, with shorter and
+            longer equations and no residual as candidates.
     """
 
     kind: Literal["symbolic"] = "symbolic"
@@ -253,15 +254,15 @@ class SymbolicConfig(FeatureConfig):
     choose: Literal["one_step", "free_run"] = "one_step"
 
     def build(self, names: Sequence[str]) -> SymbolicHead:
-        """Return the module for channels `format_terms`."""
+        """Build the head for channels `names`."""
         return SymbolicHead(self, names)
 
 
 @final
 class SymbolicHead(EquationHead):
-    """A head rho [..., n] = phi(features) coefficients, most of them zero.
+    """Head with the residual rho [..., n] = phi(features) coefficients, with sparse coefficients.
 
-    Over the baseline `still` it is the equation of the acceleration itself.
+    With the baseline `still` it is an equation of the acceleration.
     """
 
     def __init__(self, config: SymbolicConfig, names: Sequence[str]) -> None:
@@ -283,15 +284,12 @@ class SymbolicHead(EquationHead):
         )
 
     def candidate_values(self, features: Tensor) -> Tensor:
-        """Return all candidate terms [..., J] of chosen features [..., F].
-
-        The features are held at the edge of the training range.
-        """
+        """Return all candidate terms [..., J] of features [..., F], which are clamped."""
         term_values: Tensor = self.library(self.features.clamp(features))
         return term_values
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, n] at channels z [B, nz], and the late inputs as memory."""
+        """Return the residual [B, n] at channels z [B, nz], and the next delay line."""
         features, s = self.line(self.features.select_clamped(z), s)
         return self.candidate_values(features) @ self.coefficients.to(z.dtype), s
 
@@ -303,7 +301,7 @@ class SymbolicHead(EquationHead):
         return self.line.warmup(self.features.select_clamped(z))
 
     def memory_bounds(self) -> tuple[Tensor, Tensor]:
-        """Return the least and largest late inputs: those that the features are held between."""
+        """Return the bounds of the delay line, those of the clamped features."""
         return self.line.memory_bounds(self.features.low, self.features.high)
 
     def format_terms(self) -> list[str]:
@@ -314,13 +312,13 @@ class SymbolicHead(EquationHead):
         return self.candidate_values(features), self.coefficients
 
     def fit_solutions(self, samples: Samples) -> list[Solution]:
-        """Return the equations of the extended BIC, then what free runs may prefer.
+        """Fit the equations of the extended BIC, then alternatives for free runs.
 
-        Those are the equations of weaker and stronger penalties, and none.
+        The alternatives are the equations with other weights gamma, and no equation.
 
         Raises:
-            FitError: where the samples do not tell the candidates apart, or hold no stretch as long
-                as the estimator or the delay needs.
+            FitError: if the candidates are linearly dependent on the samples, or no segment is as
+                long as the rows or the delay require.
         """
         samples_with_past = self._segment_samples(samples)
         delay_steps, delay_notes = self._fit_delay(samples_with_past)
@@ -333,9 +331,9 @@ class SymbolicHead(EquationHead):
         ]
 
     def _segment_samples(self, samples: Samples) -> SegmentedSamples:
-        """Return features, targets and stretches of the samples.
+        """Return features, targets and segments of the samples.
 
-        They are without times where nothing looks along them.
+        Sample times are needed only for rows of the weak form and delays.
         """
         features = samples.z.index_select(1, self.features.index).numpy()
         target = samples.target.numpy()
@@ -370,7 +368,7 @@ class SymbolicHead(EquationHead):
         )
 
     def _allowed_terms(self, samples: SegmentedSamples) -> Tensor:
-        """Return which candidates each axis may have, [J, n] bool."""
+        """Return the mask of the candidates of each axis, [J, n]."""
         channels = self.features.names
         is_allowed = torch.ones(self.library.n_terms, self.n_dof, dtype=torch.bool)
         if not self.config.terms:
@@ -388,10 +386,11 @@ class SymbolicHead(EquationHead):
         return is_allowed
 
     def _fit_delay(self, samples: SegmentedSamples) -> tuple[int, dict[str, Any]]:
-        """Return the delay in steps, and the notes about it.
+        """Identify the delay; return it in time steps, and the notes of the fit.
 
-        It is the one that fits best with the terms of degree one, then with those that are found at
-        it, until it stays.
+        The iteration starts with the delay of minimum error for the terms of degree one. It
+        alternates between the terms at a delay and the best delay for these terms, until the delay
+        does not change.
         """
         if self.line.n_delayed == 0:
             return 0, {}

@@ -76,7 +76,8 @@ class LeastSquares(Estimator):
             ]
             raise FitError(
                 f"regressor '{zero_columns[0]}' is zero in all {n_samples} samples, so its"
-                " coefficient is not identifiable; remove the regressor or record data that excite it"
+                " coefficient is not identifiable; remove the regressor or record data that"
+                " excite it"
             )
         # one pass over the data gives the normal equations of the scaled columns
         gram = _sum_over_chunks(x, lambda _, chunk: (chunk / scale).T @ (chunk / scale)) / n_samples
