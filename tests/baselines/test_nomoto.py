@@ -63,7 +63,7 @@ def test_errors_of_parameters_are_their_spread() -> None:
     ]
     for name in LAGS | SLIP:
         values = np.array([run[name].value for run in runs])
-        claimed = np.sqrt(np.mean([run[name].error ** 2 for run in runs]))
+        claimed = np.sqrt(np.mean([run[name].standard_error ** 2 for run in runs]))
         assert 0.7 < claimed / values.std() < 1.4, name
 
 

@@ -167,7 +167,7 @@ def test_few_manoeuvres_make_fewer_folds_unless_they_are_named(kind: Any) -> Non
         head.fit_preferred(few)
     for name, value in three.state_dict().items():
         torch.testing.assert_close(usual.state_dict()[name], value, rtol=0, atol=0)
-    with pytest.raises(FitError, match="5 folds need as many manoeuvres, the training data have 3"):
+    with pytest.raises(FitError, match="5 folds need .* have 3; lower `folds`"):
         five.fit_preferred(few)
 
 
@@ -224,7 +224,7 @@ def test_columns_that_say_nothing_get_nothing(kind: Any) -> None:
         solved(("v", "u"), replace(of, z=spoiled))
     with pytest.raises(FitError, match="10 samples do not determine 23 basis functions"):
         solved((), of.select(torch.arange(400) % 40 == 0))
-    with pytest.raises(FitError, match="one run or segment only"):
+    with pytest.raises(FitError, match="at least two runs"):
         solved(("u",), sampled(z, target, NAMES))
 
 
@@ -453,21 +453,21 @@ def test_the_answers_of_a_pipeline_are_those_of_scikit_learn(pipeline: list[Any]
 
 def test_no_format_exports_it() -> None:
     spec = make_example_spec(SklearnConfig(samples=100))
-    with pytest.raises(ExportError, match=r"example: scikit-learn predicts in Python.*export ano"):
+    with pytest.raises(ExportError, match=r"example: .*scikit-learn need Python.*export ano"):
         ExportedVessel(spec, make_example_model(spec))
 
 
 @pytest.mark.parametrize(
     ("pipeline", "said"),
     [
-        (["os.system"], "names nothing below `sklearn`"),
+        (["os.system"], "is not a class below `sklearn`"),
         (["sklearn.svm.SVX"], r"'sklearn.svm.SVX' is not among.*did you mean 'sklearn.svm.SVR'"),
         (["sklearn.datasets.load_iris"], "is not among the classes"),
         ([{"sklearn.svm.SVR": {"C": "much"}}], "The 'C' parameter of SVR must be a float"),
-        (["sklearn.svm.SVR", "sklearn.svm.SVR"], "SVR is no transformer"),
-        ([{"sklearn.svm.SVR": {"kernel": {"os.system": {}}}}], "kernel: expected a number, a text"),
+        (["sklearn.svm.SVR", "sklearn.svm.SVR"], "SVR is not a transformer"),
+        ([{"sklearn.svm.SVR": {"kernel": {"os.system": {}}}}], "kernel: expected a number, a string"),
         ([{"sklearn.svm.SVR": {"D": 1}}], "unexpected keyword argument 'D'"),
-        (["sklearn.preprocessing.StandardScaler"], "is no regressor"),
+        (["sklearn.preprocessing.StandardScaler"], "is not a regressor"),
         ([], "at least 1"),
     ],
 )

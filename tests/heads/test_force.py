@@ -97,7 +97,7 @@ def test_the_mass_and_the_accelerations_are_the_true_ferrys(model: Any) -> None:
 )
 def test_the_thirty_basis_functions_hold_it_too(config: Any) -> None:
     model = fitted(config, samples())
-    assert model.head.inner.library.count == 30
+    assert model.head.inner.library.n_terms == 30
     of = samples()
     with torch.no_grad():
         torch.testing.assert_close(model.one_step(of.z[None])[0], of.target, rtol=0, atol=1e-3)

@@ -79,7 +79,7 @@ def test_a_stored_pipeline_predicts_the_same_without_a_fit(
     save_model(tmp_path / "model", spec, model)
     no_fit()
     stored = load_model(tmp_path / "model")[1]
-    x = np.random.default_rng(0).normal(size=(50, model.head.features.count))
+    x = np.random.default_rng(0).normal(size=(50, model.head.features.n_features))
     before = model.head.asked(torch.from_numpy(x))
     assert before.std() > 0
     assert torch.equal(stored.head.asked(torch.from_numpy(x)), before)
@@ -88,18 +88,18 @@ def test_a_stored_pipeline_predicts_the_same_without_a_fit(
 
 
 HOSTILE: list[tuple[str, str, Any, str]] = [
-    ("sklearn.tree.DecisionTreeRegressor", "left_child", 0, "lead out of it or back"),
-    ("sklearn.tree.DecisionTreeRegressor", "left_child", 10**9, "lead out of it or back"),
+    ("sklearn.tree.DecisionTreeRegressor", "left_child", 0, "invalid children"),
+    ("sklearn.tree.DecisionTreeRegressor", "left_child", 10**9, "invalid children"),
     ("sklearn.tree.DecisionTreeRegressor", "feature", 10**6, "a feature it does not have"),
     ("sklearn.tree.DecisionTreeRegressor", "feature", -7, "a feature it does not have"),
-    ("sklearn.ensemble.RandomForestRegressor", "right_child", 10**9, "lead out of it or back"),
+    ("sklearn.ensemble.RandomForestRegressor", "right_child", 10**9, "invalid children"),
     ("sklearn.ensemble.GradientBoostingRegressor", "feature", 10**6, "a feature it does not have"),
-    ("sklearn.ensemble.HistGradientBoostingRegressor", "left", 10**9, "lead out of it or back"),
+    ("sklearn.ensemble.HistGradientBoostingRegressor", "left", 10**9, "invalid children"),
     ("sklearn.ensemble.HistGradientBoostingRegressor", "feature_idx", 99, "it does not have"),
     ("sklearn.ensemble.HistGradientBoostingRegressor", "is_categorical", 1, "it does not have"),
-    ("sklearn.svm.SVR", "_n_support", 10**8, "do not belong together"),
-    ("sklearn.svm.SVR", "support_", 10**8, "beyond its samples"),
-    ("sklearn.svm.SVR", "dual_coef_", None, "do not belong together"),
+    ("sklearn.svm.SVR", "_n_support", 10**8, "inconsistent arrays"),
+    ("sklearn.svm.SVR", "support_", 10**8, "outside its samples"),
+    ("sklearn.svm.SVR", "dual_coef_", None, "inconsistent arrays"),
     ("sklearn.linear_model.Ridge", "coef_", None, "gives no prediction"),
     ("sklearn.kernel_ridge.KernelRidge", "X_fit_", None, "gives no prediction"),
     ("sklearn.neural_network.MLPRegressor", "coefs_", None, "gives no prediction"),
@@ -139,7 +139,7 @@ def test_a_cut_state_is_refused(length: int) -> None:
     state["head._extra_state"] = state["head._extra_state"][:length]
     if length == 0:
         # the state of a head that is not fitted yet
-        assert restored(spec, state).head.axes == []
+        assert restored(spec, state).head.axis_pipelines == []
         return
     with pytest.raises(UsageError, match="a head of kind sklearn: its state"):
         restored(spec, state)
@@ -166,7 +166,7 @@ MEMORY = [
 def test_a_store_of_pickles_is_refused_with_and_without_trust() -> None:
     with pytest.raises(ConfigError, match="FeatureAgglomeration' is not among"):
         _config(MEMORY)
-    with trusting(), pytest.raises(ConfigError, match="memory: is a store of pickles"):
+    with trusting(), pytest.raises(ConfigError, match="memory: is a cache of pickles"):
         _config(MEMORY)
 
 
@@ -178,7 +178,7 @@ def test_other_classes_need_trust_at_the_fit_and_at_the_load(tmp_path: Path) -> 
         model = make_example_model(spec)
         save_model(tmp_path / "model", spec, model)
         stored = load_model(tmp_path / "model")[1]
-    x = torch.randn(9, model.head.features.count)
+    x = torch.randn(9, model.head.features.n_features)
     assert torch.equal(stored.head.asked(x), model.head.asked(x))
     with pytest.raises(ConfigError, match=r"BaggingRegressor' is not among.*--trust"):
         load_model(tmp_path / "model")

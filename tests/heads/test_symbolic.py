@@ -214,7 +214,7 @@ def test_errors_by_delay_are_those_of_refits_across_gaps(shift: int) -> None:
         left = y[now] - x @ np.linalg.lstsq(x, y[now], rcond=None)[0]
         assert profile[steps] == pytest.approx(np.log(left @ left), abs=1e-9)
     assert found == shift
-    with pytest.raises(FitError, match="delay: 0 samples have a past of 300"):
+    with pytest.raises(FitError, match="delay: 0 samples have 300 preceding"):
         find_best_delay(past, [terms], ("u", "tau"), index, 300)
 
 

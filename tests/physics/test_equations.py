@@ -103,7 +103,7 @@ def test_jets_thrust_as_printed_saturate_and_turn_to_the_side_that_is_asked_for(
     torch.testing.assert_close(
         actuators.force(nu[:, :0], beyond, nu), actuators.force(nu[:, :0], limits, nu)
     )
-    command = actuators.demand(*torch.tensor([[0.5, 0.5], [0.3, -0.3]], dtype=torch.float64))
+    command = actuators.commands_for_demand(*torch.tensor([[0.5, 0.5], [0.3, -0.3]], dtype=torch.float64))
     tau = actuators.force(nu[:, :0], command, nu)
     assert float(tau[0, 2]) > 0 > float(tau[1, 2])
     torch.testing.assert_close(tau[:, 2], -3.82 * tau[:, 1])
@@ -294,7 +294,7 @@ def test_revolutions_enter_where_the_series_knows_them() -> None:
     shaft = "shaft={n_0: 1.5, n_max: 2, n_rate: 0.1}"
     plant = plant_of("mariner", shaft, "coefficients.X.dn=400.0e-5", "coefficients.X.dn^2=50.0e-5")
     assert plant.input_names[:2] == ("cmd_delta", "cmd_n")
-    x = plant.approach(2)
+    x = plant.make_initial_state(2)
     assert x[:, 7].tolist() == [1.5, 1.5]
     x[1, 7] = 1.8
     w = torch.zeros(2, len(plant.input_names), dtype=torch.float64)

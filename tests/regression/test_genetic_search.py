@@ -228,7 +228,7 @@ def test_bad_samples_are_told() -> None:
     config, algebra = EvolutionConfig(population=10), Algebra(NAMES)
     with pytest.raises(FitError, match="the target is not finite"):
         evolve(algebra, DATA, np.full(200, np.nan), TRAIN, config, 0)
-    with pytest.raises(FitError, match="to train and to validate, given 200 of 200"):
+    with pytest.raises(FitError, match="200 of 200 samples are for training"):
         evolve(algebra, DATA, NOISY, np.ones(200, dtype=bool), config, 0)
     with pytest.raises(FitError, match="no individual"):
         evolve(Algebra(("a",)), {"a": np.zeros(200)}, NOISY, TRAIN, config, 0)
@@ -237,11 +237,11 @@ def test_bad_samples_are_told() -> None:
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"crossover": 0.8, "mutation": 0.3}, "together at most 1"),
-        ({"operators": ["abs"]}, "trees need one of"),
+        ({"crossover": 0.8, "mutation": 0.3}, "crossover and mutation: .*at most 1"),
+        ({"operators": ["abs"]}, "operators: "),
         ({"first_depth": [2, 12]}, "first_depth"),
         ({"population": 5, "elite": 5}, "elite"),
-        ({"equal_terms": "reject", "split": "gene"}, "reject goes with"),
+        ({"equal_terms": "reject", "split": "gene"}, "equal_terms: reject"),
     ],
 )
 def test_impossible_settings(config: dict[str, Any], message: str) -> None:

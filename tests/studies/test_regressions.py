@@ -112,6 +112,6 @@ def test_what_cannot_be_fitted_is_refused() -> None:
         fitted(ForceRegressionData(TERMS, double, data.y, double.std(0), data.fold), kind="ols")
     single = ForceRegressionData(TERMS, data.x, data.y, data.scale, torch.zeros_like(data.fold))
     for kind in ("plsr", "surface", "ridge", "lasso"):
-        with pytest.raises(FitError, match="one run or segment only"):
+        with pytest.raises(FitError, match="at least two runs"):
             fitted(single, kind=kind)
     assert fitted(single, kind="plsr", order=2).notes["order"] == 2

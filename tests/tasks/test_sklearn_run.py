@@ -52,7 +52,7 @@ def test_the_plain_head_runs_to_its_end(command: Command, tmp_path: Path) -> Non
     assert load(run, "boosting").module.head.axes
     ended = command("export", run, "--model", "boosting", "--anyway")
     assert (ended.code, ended.err.count("\n")) == (1, 1)
-    assert "scikit-learn predicts in Python" in ended.err
+    assert "scikit-learn need Python" in ended.err
 
 
 def test_other_classes_need_trust(command: Command, tmp_path: Path) -> None:
@@ -79,13 +79,13 @@ def test_no_command_opens_a_store_of_pickles(
     config = write_yaml(tmp_path / "memory.yaml", _config(MEMORY))
     ended = command("run", config, "--out", tmp_path / "run", *trust)
     assert (ended.code, ended.err.count("\n")) == (2, 1)
-    assert ("is a store of pickles" if trust else "is not among") in ended.err
+    assert ("is a cache of pickles" if trust else "is not among") in ended.err
     stranger = tmp_path / "stranger"
     shutil.copytree(tiny_run, stranger)
     _plant(stranger, MEMORY)
     ended = command("export", stranger, "--model", "ridge", *trust)
     assert (ended.code, ended.err.count("\n")) == (2, 1)
-    assert ("is a store of pickles" if trust else "is not among") in ended.err
+    assert ("is a cache of pickles" if trust else "is not among") in ended.err
 
 
 def _plant(run: Path, head: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""The known part, identified from data: one config class per kind."""
+"""Baselines, the physical part of a model: one config class per kind."""
 
 from __future__ import annotations
 
@@ -28,4 +28,4 @@ else:
             },
         ),
     ]
-"""Config of any baseline, those of other packages included; its `kind` says which."""
+"""Configuration of any baseline, including those of other packages, selected by `kind`."""

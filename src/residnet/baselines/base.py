@@ -1,4 +1,4 @@
-"""The interfaces of baselines: the part of the dynamics that is known or identified first."""
+"""Interfaces of baselines, the part of the dynamics that is fixed or identified first."""
 
 from __future__ import annotations
 
@@ -17,35 +17,31 @@ from residnet.regression.estimator import Coefficient, Solution
 
 
 class Baseline(nn.Module, ABC):
-    """A baseline: accelerations [..., n] from channels z [..., nz], without memory.
+    """Memoryless model of the accelerations [..., n] at channels z [..., nz].
 
-    They are in m/s^2, m/s^2 and rad/s^2.
+    Accelerations are in m/s^2 and rad/s^2. A subclass needs `forward` only.
     """
 
     @abstractmethod
     def forward(self, z: Tensor) -> Tensor:
-        """Return nu_dot [..., n] at channels z [..., nz] (see `residnet.physics.signals`)."""
+        """Compute nu_dot [..., n] at channels z [..., nz] (see `residnet.physics.signals`)."""
 
     @abstractmethod
     def parameter_counts(self) -> list[float]:
-        """Return the number of fitted parameters of each axis."""
+        """Return the number of fitted parameters per axis."""
 
     def inertia_matrix(self) -> Tensor | None:
-        """Return the inertia [3, 3] between forces and accelerations, float64.
-
-        None where a baseline knows no forces.
-        """
+        """Return the inertia matrix [3, 3], float64; None if the baseline models no forces."""
         return None
 
 
 class ParametricBaseline(Baseline, ABC):
-    """A baseline of which all that was fitted stands in `theta`.
+    """Baseline whose fitted values are all elements of the parameter `theta`.
 
-    Its parameters can be moved through free runs and drawn at random.
+    The parameters can be refitted on free runs and sampled from their distribution.
 
     Args:
-        theta: numbers of any shape, kept as the parameter `theta`; the P of them that may move are
-            named by `free_indices`.
+        theta: initial values of any shape. The P free parameters are given by `free_indices`.
     """
 
     def __init__(self, theta: Tensor) -> None:
@@ -54,16 +50,16 @@ class ParametricBaseline(Baseline, ABC):
 
     @abstractmethod
     def free_indices(self) -> Tensor:
-        """Return the places [P] in theta, flattened, of the parameters that may move."""
+        """Return the indices [P] of the free parameters in the flattened theta."""
 
     @final
     def get_free(self) -> Tensor:
-        """Return the free parameters [P] as they are."""
+        """Return the current values of the free parameters [P]."""
         return self.theta.detach().flatten()[self.free_indices()].clone()
 
     @final
     def set_free(self, values: Tensor) -> None:
-        """Set the free parameters to values [P]."""
+        """Set the values of the free parameters [P]."""
         with torch.no_grad():
             flat_theta = self.theta.detach().clone().flatten()
             flat_theta[self.free_indices()] = values.to(flat_theta.dtype)
@@ -71,7 +67,7 @@ class ParametricBaseline(Baseline, ABC):
 
     @abstractmethod
     def free_parameter_names(self) -> list[tuple[str, str]]:
-        """Return (axis, term) of each free parameter, as the table of coefficients has them [P]."""
+        """Return the P pairs (axis, term) of the free parameters as in the coefficient table."""
 
     @final
     def parameter_jacobian(self, z: Tensor) -> Tensor:
@@ -90,37 +86,37 @@ class ParametricBaseline(Baseline, ABC):
 
     @abstractmethod
     def mean_information(self, samples: Samples) -> Tensor:
-        """Return the information [P, P] that a sample's accelerations hold, mean over samples.
+        """Return the Fisher information [P, P] of the accelerations per sample.
 
-        It is about the free parameters.
+        The information concerns the free parameters and is the mean over the samples.
         """
 
     @abstractmethod
     def prior(self) -> tuple[Tensor, Tensor]:
-        """Return the prior mean [P] and precision [P] of the free parameters, before any trial.
+        """Return the prior mean [P] and precision [P] of the free parameters.
 
-        The precision is zero where nothing is known before.
+        The precision of a parameter without prior is zero.
         """
 
     @abstractmethod
     def symmetry_precision(self, samples: Samples) -> Tensor:
-        """Return the information [P, P] about what a mirror-symmetric vessel cannot have.
+        """Return the precision matrix [P, P] of a prior for port/starboard symmetry.
 
-        It is zero where nothing is known of the mirror. Terms of the wrong parity, and differences
-        between a coefficient and that of the term's mirror image, cost by it.
+        It penalises terms of the wrong parity and differences between the coefficients of a term
+        and its mirror image. It is zero for terms with an unknown mirror image.
         """
 
     def destabilising_terms(self) -> list[int]:
-        """Return the free parameters, counted among these, whose sign feeds energy as they are.
+        """Return indices of free parameters whose current sign is that of negative damping.
 
-        Empty for a baseline whose form does not allow it, or that is not asked to look.
+        The list is empty for a baseline that excludes negative damping or does not check for it.
         """
         return []
 
     def undamped_terms(self, samples: Samples) -> list[int]:
-        """Return the free parameters that feed an axis where most of the samples are not damped.
+        """Return indices of free parameters that cause negative damping at most samples.
 
-        They are counted among the free ones, at most one of each axis; empty as for `destabilising_terms`.
+        There is at most one per axis. The list is empty as for `destabilising_terms`.
         """
         return []
 
@@ -128,60 +124,65 @@ class ParametricBaseline(Baseline, ABC):
     def refresh_table(
         self, table: Sequence[Coefficient], standard_errors: Tensor
     ) -> list[Coefficient]:
-        """Return the table of coefficients as theta is now.
+        """Return the coefficient table with the current values of theta.
 
-        Standard errors [P] are those of the free parameters; errors of ratios stay as they were.
+        Args:
+            table: coefficient table of the fit.
+            standard_errors: standard errors of the free parameters [P]. The standard errors of
+                ratios are not changed.
         """
 
 
 class IdentifiedConfig(Config, ABC):
-    """A kind of baseline and how it is identified."""
+    """Configuration of a baseline and of its identification."""
 
     kind: str
 
     def without_file_references(self) -> Self:
-        """Return the config without references to files, as it is kept with a model."""
+        """Return the config without references to files, for storage with a model."""
         return self
 
     @abstractmethod
     def build(self, names: Sequence[str]) -> Baseline:
-        """Return the module, its numbers not yet found, for channels `names`.
+        """Build the baseline, not yet fitted, for channels `names`.
 
         Raises:
-            ConfigError: where a channel that it needs is missing.
+            ConfigError: if a required channel is missing.
         """
 
     def validate_samples(self, samples: Samples) -> None:
-        """Check that samples hold the manoeuvres that this baseline is identified from.
+        """Check that the samples contain the manoeuvres required for the identification.
 
         Raises:
-            FitError: where they do not.
+            FitError: if they do not.
         """
 
     @abstractmethod
     def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """Identify from samples whose target is the measured acceleration.
+        """Identify the baseline from samples whose target is the measured acceleration.
 
-        There are several solutions where free runs are to choose between them.
+        Returns:
+            The solution; or several candidates for a selection by free runs, the preferred one
+            first.
 
         Raises:
-            FitError: where the data do not determine a coefficient.
+            FitError: if the data do not determine a coefficient.
         """
 
     @final
     def fit_preferred(self, baseline: Baseline, samples: Samples) -> list[Coefficient]:
-        """Fill the baseline with the first of `fit_solutions` and return its coefficients."""
+        """Load the first solution of `fit_solutions` and return its coefficient table."""
         preferred = self.fit_solutions(baseline, samples)[0]
         baseline.load_state_dict(preferred.state, strict=False)
         return list(preferred.table)
 
 
 def require_channels(names: Sequence[str], required: Sequence[str], subject: str) -> None:
-    """Check that channels exist, velocities live, and nothing rolls.
+    """Check that channels exist, required velocities are modelled and roll is not.
 
     Raises:
-        ConfigError: naming the first that does not.
-        UsageError: where the model rolls.
+        ConfigError: with the first missing channel.
+        UsageError: if the model includes roll.
     """
     dof = get_dof(names)
     dof.require_no_roll(subject)
@@ -194,21 +195,21 @@ def require_channels(names: Sequence[str], required: Sequence[str], subject: str
             )
         if name not in names:
             raise ConfigError(
-                f"{subject} needs the channel '{name}', but the model has {', '.join(names)}; add it to"
-                " signals"
+                f"{subject} needs the channel '{name}', but the model has {', '.join(names)};"
+                " add it to signals"
             )
 
 
 def select_manoeuvres(samples: Samples, kinds: Sequence[str]) -> Samples:
-    """Return the samples of some kinds of manoeuvre, all where `kinds` is empty.
+    """Return the samples of some kinds of manoeuvre; all samples if `kinds` is empty.
 
     Raises:
-        FitError: where there are none.
+        FitError: if there are no such samples.
     """
     selected = samples.select_manoeuvres(kinds)
     if len(selected) == 0:
         raise FitError(
-            f"no sample is of the manoeuvres {list(kinds)} that the baseline is fitted on; kinds in"
+            f"no sample is of the manoeuvres {list(kinds)} on which the baseline is fitted; kinds in"
             f" the data: {sorted(set(samples.kinds))}"
         )
     return selected

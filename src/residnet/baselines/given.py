@@ -1,4 +1,4 @@
-"""Known parts as they are given: a vessel file's hull, published equations, or nothing at all."""
+"""Baselines with fixed coefficients: the hull of a vessel file, published equations, or none."""
 
 from __future__ import annotations
 
@@ -28,11 +28,14 @@ TermCoefficients = dict[str, float]
 
 @final
 class FixedBaseline(Baseline):
-    """A baseline nu_dot = theta [n, J] phi(z) [..., J] whose numbers stay as they were given.
+    """Baseline nu_dot = theta [n, J] phi(z) [..., J] with fixed coefficients.
 
     Args:
-        coefficients_by_axis: coefficients of u_dot, v_dot and r_dot by term; what else moves has none.
-        is_fitted: whether the numbers were fitted, if to other data (correction E9 of document 000).
+        coefficients_by_axis: coefficients of u_dot, v_dot and r_dot by term; other states have no
+            terms.
+        names: channels of the model.
+        is_fitted: whether the coefficients were fitted to other data (correction E9 of document
+            000).
     """
 
     def __init__(
@@ -69,13 +72,13 @@ class FixedBaseline(Baseline):
         return phi @ self.theta.to(z.dtype).T
 
     def parameter_counts(self) -> list[float]:
-        """Return the number of terms of each axis where they were fitted, else zeros."""
+        """Return the number of terms per axis if they were fitted to data, otherwise zeros."""
         return [float(n_terms) * self.is_fitted for n_terms in (self.theta != 0).sum(1)]
 
     def inertia_matrix(self) -> Tensor | None:
-        """Return the inertia [3, 3], the inverse of what forces do to accelerations.
+        """Return the inertia matrix [3, 3], the inverse of the coefficients of the forces.
 
-        None where that has no inverse, or the vessel rolls.
+        None if they have no inverse, or the model includes roll.
         """
         terms = self.library.terms
         columns = [terms.index(name) for name in FORCE_CHANNELS if name in terms]
@@ -87,18 +90,18 @@ class FixedBaseline(Baseline):
 
 
 class FixedBaselineConfig(IdentifiedConfig, ABC):
-    """A known part of which nothing is identified."""
+    """Configuration of a baseline with fixed coefficients."""
 
     @final
     def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """Return one solution without numbers: there is nothing to fit."""
+        """Return a solution without state, because there are no parameters to fit."""
         return [Solution({}, {})]
 
 
 class ZeroBaselineConfig(FixedBaselineConfig):
-    """No known part, velocities held: the model `zero`, and a black box where a head is set on it.
+    """Baseline with zero accelerations (constant velocity).
 
-    The head learns the whole acceleration.
+    A head on this baseline is a black-box model, which learns the acceleration itself.
     """
 
     kind: Literal["still"] = "still"
@@ -108,10 +111,10 @@ class ZeroBaselineConfig(FixedBaselineConfig):
 
 
 class AxisCoefficients(Config):
-    """Accelerations as sums of terms.
+    """Coefficients of accelerations that are sums of terms.
 
     Attributes:
-        u: coefficients of u_dot by term; a term that is left out is zero.
+        u: coefficients of u_dot by term; missing terms are zero.
         v: coefficients of v_dot by term.
         r: coefficients of r_dot by term.
     """
@@ -126,14 +129,13 @@ class AxisCoefficients(Config):
 
 
 class EquationsConfig(AxisCoefficients, FixedBaselineConfig):
-    """Published equations of the accelerations; nothing is identified.
+    """Published equations of the accelerations, whose coefficients are not fitted.
 
     Examples are eqs. (6.24)-(6.32) and (7.2)-(7.7) of document 000.
 
     Attributes:
-        units: units in which the coefficients take channels, where not SI (document 000 has
-            revolutions in rpm).
-        source: where the equations stand.
+        units: units of channels in the equations if not SI (document 000 has revolutions in rpm).
+        source: reference of the equations.
     """
 
     kind: Literal["equations"] = "equations"
@@ -178,7 +180,7 @@ class EquationsConfig(AxisCoefficients, FixedBaselineConfig):
 
 
 class HullEquations(AxisCoefficients):
-    """The accelerations of a hull written out, in SI.
+    """Equations of the accelerations of a hull, in SI units.
 
     The terms are products of u, v, r, tau_x, tau_y and tau_n.
     """
@@ -190,16 +192,16 @@ class HullEquations(AxisCoefficients):
 
 
 class BelievedConfig(FixedBaselineConfig):
-    """The hull of a vessel file with its parameters as they are (document 002 section 4.1.1).
+    """Hull of a vessel file with fixed parameters (document 002 section 4.1.1).
 
-    A factor on its mass, Coriolis and damping matrices makes it wrong on purpose. Needs the
-    channels tau_x, tau_y and tau_n: as inputs, or made by `signals.forces`.
+    A scale factor on the mass, Coriolis and damping matrices introduces a known model error. The
+    model needs the channels tau_x, tau_y and tau_n, as inputs or computed by `signals.forces`.
 
     Attributes:
         vessel: name or file of a vessel whose hull is given by matrices or accelerations (kinds
-            fossen, mass_matrix, odin); a saved model has the hull's equations in its place, without
+            fossen, mass_matrix, odin). A saved model has the equations of the hull instead, without
             the factor.
-        scale: factor on the mass, Coriolis and damping matrices.
+        scale: factor of the mass, Coriolis and damping matrices.
     """
 
     kind: Literal["believed"] = "believed"
@@ -212,10 +214,10 @@ class BelievedConfig(FixedBaselineConfig):
         return self
 
     def hull_equations(self) -> HullEquations:
-        """Return the equations of the vessel, without the factor.
+        """Return the equations of the vessel without the scale factor.
 
         Raises:
-            ValueError: where there is no such vessel, or its hull has no equations of this form.
+            ValueError: if the vessel does not exist, or its hull has no equations of this form.
         """
         if isinstance(self.vessel, HullEquations):
             return self.vessel
@@ -242,7 +244,7 @@ class BelievedConfig(FixedBaselineConfig):
         return HullEquations(u=u, v=v, r=r)
 
     def without_file_references(self) -> Self:
-        """Return the config with the equations in place of the vessel's name."""
+        """Return the config with the equations instead of the name of the vessel."""
         return self.model_copy(update={"vessel": self.hull_equations()})
 
     def build(self, names: Sequence[str]) -> FixedBaseline:

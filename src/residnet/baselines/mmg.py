@@ -1,11 +1,11 @@
-"""The MMG standard model of a ship with one propeller and one rudder, identified from trials.
+"""MMG standard model of a ship with one propeller and one rudder, identified from trials.
 
-Hull, propeller and rudder stand apart, with what each does to the others.
+The model has separate forces of hull, propeller and rudder with their interactions.
 
 Source: Yasukawa and Yoshimura, Introduction of MMG standard method for ship maneuvering
-predictions, J Mar Sci Technol 20 (2015) 37-52. Starting values of the hull's linear derivatives:
-Kijima et al., On the manoeuvring performance of a ship with the parameter of loading condition, J
-SNAJ 168 (1990).
+predictions, J Mar Sci Technol 20 (2015) 37-52. The prior means of the linear hull derivatives are
+those of Kijima et al., On the manoeuvring performance of a ship with the parameter of loading
+condition, J SNAJ 168 (1990).
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.least_squares import minimize_levenberg_marquardt
 
 _WAKE_SLOPE = 2.0
-"""C_1 of the wake in drift: that of the KVLCC2 in the source."""
+"""C_1 of the wake at drift, the value of the KVLCC2 in the source."""
 # keeps the drift angle defined for a ship at rest; (m/s)^2
 _MIN_SPEED_SQUARED = 1e-6
 
 
 class MMGHull(Config):
-    """Particulars of the hull; the body's origin is amidships, where u and v are measured.
+    """Particulars of the hull; the origin of the body frame is midship.
 
     Attributes:
-        length: between perpendiculars.
-        beam: of the hull in m.
-        draught: of the hull in m.
-        mass: of the displaced water.
-        gyration: radius of gyration about the centre of gravity, as a share of the length.
-        x_G: centre of gravity ahead of midship.
-        density: of the water.
+        length: length between perpendiculars.
+        beam: beam of the hull.
+        draught: draught of the hull.
+        mass: mass of the displaced water.
+        gyration: radius of gyration about the centre of gravity, divided by the length.
+        x_G: longitudinal position of the centre of gravity, positive forward of midship.
+        density: density of the water.
     """
 
     length: Metres = Field(gt=0)
@@ -62,17 +62,17 @@ class MMGHull(Config):
 
     @property
     def block_coefficient(self) -> float:
-        """The block coefficient, dimensionless."""
+        """Block coefficient, dimensionless."""
         return self.mass / (self.density * self.length * self.beam * self.draught)
 
 
 class MMGPropeller(Config):
-    """A propeller that turns ahead.
+    """Propeller with ahead revolutions.
 
     Attributes:
-        diameter: of it.
-        x: its place ahead of midship, as a share of the length.
-        thrust: K_T = k_0 + k_1 J + k_2 J^2 in open water.
+        diameter: diameter of the propeller.
+        x: longitudinal position divided by the length, positive forward of midship.
+        thrust: coefficients of the open-water thrust K_T = k_0 + k_1 J + k_2 J^2.
     """
 
     diameter: Metres = Field(gt=0)
@@ -81,13 +81,13 @@ class MMGPropeller(Config):
 
 
 class MMGRudder(Config):
-    """A rudder in the propeller's race.
+    """Rudder in the slipstream of the propeller.
 
     Attributes:
-        area: of the movable part.
-        aspect: span squared over area.
-        x: its place ahead of midship, as a share of the length.
-        race: share of its span that stands in the race, diameter over span.
+        area: area of the movable part.
+        aspect: aspect ratio, span squared divided by area.
+        x: longitudinal position divided by the length, positive forward of midship.
+        race: share of the span in the slipstream, propeller diameter divided by span.
     """
 
     area: SquareMetres = Field(gt=0)
@@ -97,12 +97,12 @@ class MMGRudder(Config):
 
     @property
     def lift_slope(self) -> float:
-        """The slope of the normal force by Fujii's formula, dimensionless."""
+        """Gradient of the rudder normal force by the formula of Fujii, dimensionless."""
         return 6.13 * self.aspect / (2.25 + self.aspect)
 
 
 class ParameterPrior(NamedTuple):
-    """What is believed of a parameter before any trial: mean, standard deviation and meaning."""
+    """Prior of a parameter: mean, standard deviation and description."""
 
     mean: float
     sd: float
@@ -110,10 +110,10 @@ class ParameterPrior(NamedTuple):
 
 
 def default_priors(hull: MMGHull) -> dict[str, ParameterPrior]:
-    """Return the prior of every parameter, as one would expect of a merchant ship of this form.
+    """Return the default prior of every parameter, for a merchant ship with this hull.
 
-    Linear hull derivatives by Kijima's formulas; those of higher order are thought to be near zero,
-    so that the trials speak for themselves.
+    The means of the linear hull derivatives are those of the formulas of Kijima. The means of most
+    higher-order derivatives are zero, so that the trials determine them.
     """
     aspect_ratio = 2.0 * hull.draught / hull.length
     beam_fullness = hull.block_coefficient * hull.beam / hull.length
@@ -124,7 +124,9 @@ def default_priors(hull: MMGHull) -> dict[str, ParameterPrior]:
         "J_z": ParameterPrior(0.011, 0.004, "added moment of inertia in yaw"),
         "R_0": ParameterPrior(0.02, 0.01, "resistance straight ahead"),
         "X_vv": ParameterPrior(0.0, 0.1, "surge force of drift"),
-        "X_vr": ParameterPrior(0.0, 0.1, "surge force of drift in a turn, beyond the added mass's"),
+        "X_vr": ParameterPrior(
+            0.0, 0.1, "surge force of drift in a turn, in addition to that of the added mass"
+        ),
         "X_rr": ParameterPrior(0.0, 0.03, "surge force of turning"),
         "X_vvvv": ParameterPrior(0.5, 0.5, "surge force of large drift"),
         "Y_0": ParameterPrior(0.0, 0.005, "sway force of asymmetry"),
@@ -152,21 +154,23 @@ def default_priors(hull: MMGHull) -> dict[str, ParameterPrior]:
         "C_2p": ParameterPrior(
             1.3,
             0.25,
-            "inflow far aside over inflow straight ahead, drift towards port or turn to starboard",
+            "inflow at large drift over inflow straight ahead, drift to port or turn to starboard",
         ),
-        "C_2n": ParameterPrior(1.1, 0.25, "the same, drift towards starboard or turn to port"),
+        "C_2n": ParameterPrior(1.1, 0.25, "the same, drift to starboard or turn to port"),
         "t_R": ParameterPrior(0.35, 0.15, "steering resistance deduction"),
         "a_H": ParameterPrior(
-            0.3, 0.2, "sway force that the rudder raises on the hull, over its own"
+            0.3, 0.2, "sway force induced on the hull by the rudder, divided by the rudder force"
         ),
-        "x_H": ParameterPrior(-0.45, 0.1, "where that force acts, lengths ahead of midship"),
+        "x_H": ParameterPrior(
+            -0.45, 0.1, "longitudinal position of that force, in lengths forward of midship"
+        ),
         "gamma_p": ParameterPrior(0.5, 0.2, "flow straightening, inflow from port"),
         "gamma_n": ParameterPrior(0.5, 0.2, "flow straightening, inflow from starboard"),
         "l_R": ParameterPrior(
-            -0.8, 0.3, "where the rudder feels the turning, lengths ahead of midship"
+            -0.8, 0.3, "effective longitudinal position of the rudder in a turn, in lengths"
         ),
         "epsilon": ParameterPrior(1.05, 0.2, "wake at the propeller over wake at the rudder"),
-        "kappa": ParameterPrior(0.5, 0.1, "how much of the race's acceleration reaches the rudder"),
+        "kappa": ParameterPrior(0.5, 0.1, "share of the slipstream acceleration at the rudder"),
     }
 
 
@@ -176,13 +180,16 @@ PARAMETER_NAMES = tuple(default_priors(MMGHull(length=1.0, beam=0.2, draught=0.1
 
 @final
 class MMGForces(nn.Module):
-    """The accelerations of the ship.
+    """Accelerations of the ship, valid for forward motion with ahead revolutions.
 
-    Holds ahead, propeller turning ahead. Hull forces are divided by rho/2 L d U^2, moments by rho/2
-    L^2 d U^2, with v' = v/U and r' = r L/U.
+    Hull forces are divided by rho/2 L d U^2, moments by rho/2 L^2 d U^2, with v' = v/U and
+    r' = r L/U.
 
     Args:
-        columns: of u, v, r, propeller revolutions and rudder angle among the channels z.
+        hull: particulars of the hull.
+        propeller: particulars of the propeller.
+        rudder: particulars of the rudder.
+        columns: columns of u, v, r, propeller revolutions and rudder angle in the channels z.
     """
 
     def __init__(
@@ -206,7 +213,7 @@ class MMGForces(nn.Module):
         self.race_share = rudder.race
 
     def forward(self, z: Tensor, theta: Tensor) -> Tensor:
-        """Return nu_dot [..., 3] at channels z [..., nz] with parameters theta [..., 34].
+        """Compute nu_dot [..., 3] at channels z [..., nz] with parameters theta [..., 34].
 
         The order of the parameters is that of `PARAMETER_NAMES`.
         """
@@ -309,18 +316,18 @@ class MMGForces(nn.Module):
 
 
 _MAX_SAMPLES = 4000
-"""Samples that accelerations are fitted to; more are thinned evenly."""
+"""Maximum number of samples in the fit; more samples are thinned evenly."""
 _MAX_STEPS = 20
-"""Most steps of the search."""
+"""Maximum number of Gauss-Newton steps."""
 _MIN_RELATIVE_GAIN = 1e-9
-"""Share of the logarithm of the likelihood that a step must gain for another one."""
-# what can only be seen in the accelerations of one axis is listed under it
+"""Relative decrease of the negative log-posterior below which the iteration ends."""
+# a parameter that affects one acceleration only is listed under its axis
 _AXIS_OF_PREFIX = {"X": "u_dot", "R": "u_dot", "t": "u_dot", "Y": "v_dot", "N": "r_dot"}
 
 
 @final
 class MMGBaseline(ParametricBaseline):
-    """The MMG model, nu_dot [..., 3], with parameters theta [34] as `PARAMETER_NAMES` names them."""
+    """MMG model of nu_dot [..., 3] with parameters theta [34] in the order of `PARAMETER_NAMES`."""
 
     def __init__(self, force_model: MMGForces, priors: Iterable[ParameterPrior]) -> None:
         prior_mean, prior_std, _ = zip(*priors, strict=True)
@@ -334,9 +341,9 @@ class MMGBaseline(ParametricBaseline):
         return nu_dot
 
     def parameter_counts(self) -> list[float]:
-        """Return the number of parameters that are not fixed, by the axis they are listed under.
+        """Return the number of free parameters listed under each axis.
 
-        Those of propeller and rudder count in every axis.
+        Parameters of propeller and rudder are counted for every axis.
         """
         free_parameters = [PARAMETER_NAMES[i] for i in self.free_indices().tolist()]
         return [
@@ -345,20 +352,20 @@ class MMGBaseline(ParametricBaseline):
         ]
 
     def free_indices(self) -> Tensor:
-        """Return the places [P] of the parameters whose prior is not fixed."""
+        """Return the indices [P] of the parameters with a nonzero prior standard deviation."""
         return torch.nonzero(torch.tensor(self.prior_std) > 0).squeeze(1)
 
     def free_parameter_names(self) -> list[tuple[str, str]]:
-        """Return (axis, name) of each parameter whose prior is not fixed [P]."""
+        """Return the P pairs (axis, name) of the free parameters."""
         return [
             (axis_of_parameter(PARAMETER_NAMES[i]), PARAMETER_NAMES[i])
             for i in self.free_indices().tolist()
         ]
 
     def mean_information(self, samples: Samples) -> Tensor:
-        """Return the mean information of a sample [P, P].
+        """Return the Fisher information [P, P] per sample.
 
-        Each axis weighs by the variance that the present parameters leave of it.
+        The variance of each axis is that of the residuals with the current parameters.
         """
         subsample = _subsample(samples)
         with torch.no_grad():
@@ -374,7 +381,7 @@ class MMGBaseline(ParametricBaseline):
         )
 
     def symmetry_precision(self, samples: Samples) -> Tensor:
-        """Return zeros [P, P]: what is asymmetric here has a prior of its own."""
+        """Return zeros [P, P], since the asymmetric parameters have individual priors."""
         n_free = self.free_indices().numel()
         return torch.zeros(n_free, n_free, dtype=torch.float64)
 
@@ -393,7 +400,7 @@ class MMGBaseline(ParametricBaseline):
 
 
 def axis_of_parameter(name: str) -> str:
-    """Return the acceleration that a parameter is listed under, empty where it acts on several."""
+    """Return the acceleration that a parameter affects; empty if it affects several."""
     return _AXIS_OF_PREFIX.get(name.split("_")[0], "") if name != "t_R" else "u_dot"
 
 
@@ -404,22 +411,23 @@ def _subsample(samples: Samples) -> Samples:
 
 
 class MMGConfig(IdentifiedConfig):
-    """The MMG standard model of a ship with one propeller and one rudder.
+    """MMG standard model of a ship with one propeller and one rudder.
 
-    It is that of Yasukawa and Yoshimura (2015). Every parameter has a prior, a mean and a standard
-    deviation; usual values stand in for those that are not given. The trials move the parameters as
-    far as they tell, first through accelerations, then, with a `refit` of this baseline, through
-    free runs, which also gives the standard errors that intervals of predictions come from.
+    The model is that of Yasukawa and Yoshimura (2015). Every parameter has a prior with a mean and
+    a standard deviation, which default to usual values. The fit is the maximum a posteriori
+    estimate from the measured accelerations. A `refit` of this baseline on free runs continues from
+    it and yields the standard errors of the prediction intervals.
 
     Attributes:
         hull: particulars of the hull.
         propeller: particulars of the propeller.
         rudder: particulars of the rudder.
-        beliefs: prior mean and standard deviation by parameter (non-dimensional, as the model has
-            them), where not the usual ones; a standard deviation of 0 fixes it.
-        revolutions: channel of the propeller's revolutions, 1/s.
-        angle: channel of the rudder's angle, rad, positive to starboard.
-        correlation: number of successive samples of accelerations that tell as much as one alone.
+        beliefs: prior mean and standard deviation by non-dimensional parameter, for parameters that
+            differ from the defaults; a standard deviation of 0 fixes the parameter.
+        revolutions: channel of the propeller revolutions, 1/s.
+        angle: channel of the rudder angle, rad, positive to starboard.
+        correlation: number of successive acceleration samples with the information of one
+            independent sample.
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
     """
 
@@ -443,7 +451,7 @@ class MMGConfig(IdentifiedConfig):
         return self
 
     def build(self, names: Sequence[str]) -> MMGBaseline:
-        """Return the module with every parameter at its prior mean, for channels `names`."""
+        """Build the baseline for channels `names`, with every parameter at its prior mean."""
         required_channels = (*VELOCITY_NAMES, self.revolutions, self.angle)
         require_channels(names, required_channels, "the baseline 'mmg'")
         columns = [list(names).index(name) for name in required_channels]
@@ -457,17 +465,17 @@ class MMGConfig(IdentifiedConfig):
         select_manoeuvres(samples, self.manoeuvres)
 
     def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """Return the most likely parameters given accelerations and priors, by Gauss-Newton.
+        """Compute the maximum a posteriori estimate by the Gauss-Newton method.
 
         Raises:
-            FitError: where the accelerations at the prior means are not finite.
+            FitError: if the accelerations at the prior means are not finite.
         """
         assert isinstance(baseline, MMGBaseline)
         selected = select_manoeuvres(samples, self.manoeuvres)
         subsample = _subsample(selected)
         independent_samples = len(selected) / self.correlation
         free_index = baseline.free_indices()
-        (mean, precision) = baseline.prior()
+        mean, precision = baseline.prior()
 
         def acceleration_residual(theta: Tensor) -> Tensor:
             baseline.theta[free_index] = theta

@@ -1,8 +1,8 @@
-"""Baselines that are linear in their coefficients, nu_dot = Theta phi(z), regressors by name.
+"""Baselines that are linear in their coefficients, nu_dot = Theta phi(z), with named regressors.
 
-Single terms such as u r in yaw may have either sign. Where sway and yaw go together in the logs,
-least squares can give such a term a sign that feeds the yaw and let the sway take it out again: the
-fit is good, and the model is not damped.
+Least squares does not ensure a damped model. A term such as u r in yaw may have either sign, and if
+sway and yaw are correlated in the logs, negative damping of this term can be cancelled by terms in
+sway: the fit is good, but the model is unstable. The option `dissipative` removes such terms.
 """
 
 from __future__ import annotations
@@ -41,16 +41,17 @@ from residnet.regression.estimator import Coefficient, Solution, evaluate_regres
 from residnet.regression.least_squares import LeastSquares
 
 _RANGE_MARGIN = 0.5
-"""Share of a channel's training range, on either side, in which a bounded model is as fitted."""
+"""Share of the training range by which a bounded model widens it before clamping."""
 AxisTermNames = dict[Literal["u", "v", "r", "w", "p", "q"], tuple[str, ...]]
 Penalty = Annotated[float, Field(ge=0)]
 
 
 @final
 class RegressorBaseline(ParametricBaseline):
-    """A baseline that is linear in its coefficients, nu_dot [..., n] = theta [n, J] phi(z).
+    """Baseline that is linear in its coefficients, nu_dot [..., n] = theta [n, J] phi(z).
 
-    A term that an axis does not have keeps a zero.
+    All axes share the library of J terms. The coefficient of a term that an axis does not have is
+    zero.
     """
 
     def __init__(
@@ -61,10 +62,15 @@ class RegressorBaseline(ParametricBaseline):
         is_dissipative: bool = False,
         is_bounded: bool = False,
     ) -> None:
-        """From the terms of each axis; `held`: (axis, term) of coefficients that a refit through
-        rollouts must leave as they are; `is_dissipative`: no term may feed energy;
-        `is_bounded`: channels far beyond their training range are taken at its edge, and velocities
-        are pulled back.
+        """Create the baseline with zero coefficients.
+
+        Args:
+            terms_by_axis: terms of each axis.
+            names: channels of the model.
+            fixed_coefficients: (axis, term) of coefficients that a refit does not change.
+            is_dissipative: whether terms with negative damping are excluded.
+            is_bounded: whether channels are clamped outside their widened training range, with a
+                restoring acceleration on the velocities.
         """
         terms = list(dict.fromkeys(term for axis_terms in terms_by_axis for term in axis_terms))
         dof = get_dof(names)
@@ -98,11 +104,11 @@ class RegressorBaseline(ParametricBaseline):
         return acceleration @ weights.T
 
     def parameter_counts(self) -> list[float]:
-        """Return the number of coefficients of each axis that are not zero."""
+        """Return the number of nonzero coefficients per axis."""
         return [float(n_nonzero) for n_nonzero in ((self.theta * self.term_mask) != 0).sum(1)]
 
     def term_columns(self, axis: int) -> list[int]:
-        """Return the places of the terms that an axis has."""
+        """Return the indices of the terms of an axis."""
         return [j for j in range(self.library.n_terms) if bool(self.term_mask[axis, j] > 0)]
 
     def free_indices(self) -> Tensor:
@@ -119,9 +125,9 @@ class RegressorBaseline(ParametricBaseline):
         ]
 
     def mean_information(self, samples: Samples) -> Tensor:
-        """Return the mean information of a sample [P, P].
+        """Return the Fisher information [P, P] per sample.
 
-        Each axis weighs by the variance that least squares leaves of it.
+        The variance of each axis is that of the least-squares residuals.
         """
         phi, variance = self._terms_and_residual_variance(samples)
         mean_gram = phi.T @ phi / len(samples)
@@ -135,13 +141,13 @@ class RegressorBaseline(ParametricBaseline):
         return zeros, zeros
 
     def symmetry_precision(self, samples: Samples) -> Tensor:
-        """Return the mean information of a sample [P, P] about what breaks the mirror symmetry."""
+        """Return the precision matrix [P, P] of a prior for port/starboard symmetry."""
         phi, variance = self._terms_and_residual_variance(samples)
         terms = self.library.terms
         energy = phi.square().mean(0)
         images = mirror_terms(terms, samples.names)
         if images is None:
-            # of single terms some parity may be known where that of all channels is not
+            # some terms have a known parity even if the mirror image of a channel is unknown
             violates = [
                 violates_symmetry(term, i, samples.names)
                 for i in range(self.n_dof)
@@ -155,7 +161,7 @@ class RegressorBaseline(ParametricBaseline):
         )
         for axis, axis_sign in enumerate(get_axis_parities(samples.names)):
             for term_index, (image, sign) in images.items():
-                # a quarter: the image of a term of the wrong parity is the term with minus
+                # weight 1/4: a term of the wrong parity is its own image with opposite sign
                 contrast = torch.zeros(self.n_dof * len(terms), dtype=torch.float64)
                 contrast[axis * len(terms) + term_index] += 0.5
                 contrast[axis * len(terms) + image] -= 0.5 * sign * axis_sign
@@ -165,7 +171,7 @@ class RegressorBaseline(ParametricBaseline):
         return precision[free_index][:, free_index]
 
     def destabilising_terms(self) -> list[int]:
-        """Return the free coefficients, by their number among these, that feed energy."""
+        """Return indices of free coefficients with the sign of negative damping."""
         if not self.is_dissipative:
             return []
         n_terms = self.library.n_terms
@@ -182,7 +188,7 @@ class RegressorBaseline(ParametricBaseline):
         ]
 
     def undamped_terms(self, samples: Samples) -> list[int]:
-        """Return the free coefficients, by their number, that feed an axis most where it is fed."""
+        """Return indices of free coefficients with the most negative damping of an axis."""
         if not self.is_dissipative:
             return []
         free_index = self.free_indices().tolist()
@@ -230,7 +236,7 @@ class RegressorBaseline(ParametricBaseline):
         ]
 
     def _terms_and_residual_variance(self, samples: Samples) -> tuple[Tensor, Tensor]:
-        """Return the terms [N, J], and the variance [n] of what they leave."""
+        """Return the terms [N, J] and the residual variance [n]."""
         phi = self.library(samples.z)
         residuals = samples.target - phi @ (self.theta * self.term_mask).detach().T
         return phi, residuals.square().mean(0)
@@ -238,7 +244,7 @@ class RegressorBaseline(ParametricBaseline):
     def combine_axis_fits(
         self, axis_fits: Mapping[int, Solution], hyperparameters: dict[str, Any]
     ) -> Solution:
-        """Return the solution of all axes from that of each, whose table names its terms."""
+        """Combine the solutions of the axes; their tables give the coefficients by term."""
         theta = torch.zeros_like(self.theta)
         for axis, fit in axis_fits.items():
             for coefficient in fit.table:
@@ -252,9 +258,10 @@ class RegressorBaseline(ParametricBaseline):
 def active_terms(
     terms_by_axis: Sequence[Sequence[str]], names: Sequence[str]
 ) -> list[tuple[str, ...]]:
-    """Return the terms of what moves that are not zero at all times.
+    """Return the terms per dynamic state without terms that are identically zero.
 
-    An axis has none where it is zero itself, is an angle whose rate is known, or is behind `rows`.
+    States without terms are inactive velocities, angles, whose rates are kinematic, and states
+    beyond the axes of `terms_by_axis`.
     """
     dof = get_dof(names)
     all_axes = [*terms_by_axis, *[()] * (dof.n_dynamic - len(terms_by_axis))]
@@ -267,11 +274,11 @@ def active_terms(
 
 
 _SLOPE_SAMPLES = 400
-"""Samples, up to twice as many, that tell slopes; chosen by hand: a median needs few."""
+"""Minimum number of samples after thinning for the median of derivatives; chosen by hand."""
 
 
 def _own_velocity_slopes(library: TermLibrary, samples: Samples) -> Tensor:
-    """Return the slopes [n, K, J] of the terms along what moves at samples spread evenly."""
+    """Return the derivatives [n, K, J] of the terms by each dynamic state at K samples."""
     z = samples.z[:: max(1, len(samples) // _SLOPE_SAMPLES)].double()
     dynamic_states = get_dof(samples.names).dynamic_states
     directions = z.new_zeros(len(dynamic_states), *z.shape)
@@ -281,11 +288,14 @@ def _own_velocity_slopes(library: TermLibrary, samples: Samples) -> Tensor:
 
 
 def _find_undamped_term(theta: Tensor, slopes: Tensor) -> int | None:
-    """Return the term that feeds an axis most where half of the samples feed it; None for none.
+    """Return the term with the most negative damping if the median damping is negative.
 
     Args:
-        theta: coefficients of the axis, [J].
-        slopes: of the terms along the velocity of the axis, [K, J].
+        theta: coefficients of the axis [J].
+        slopes: derivatives of the terms by the velocity of the axis [K, J].
+
+    Returns:
+        The index of the term; None if the axis is damped.
     """
     if not len(slopes) or float((slopes @ theta).median()) <= 0.0:
         return None
@@ -297,7 +307,7 @@ def _find_undamped_term(theta: Tensor, slopes: Tensor) -> int | None:
 def _find_common_undamped_term(
     solutions: Sequence[Solution], terms: Sequence[str], slopes: Tensor
 ) -> set[str]:
-    """Return the term, if any, that turns an axis' damping about in every solution."""
+    """Return the set of the undamped term that all solutions share; empty if none."""
     undamped_terms = []
     for solution in solutions:
         coefficient_values = {coefficient.term: coefficient.value for coefficient in solution.table}
@@ -310,30 +320,30 @@ def _find_common_undamped_term(
 
 
 class RegressorsConfig(IdentifiedConfig):
-    """Least squares (or ridge) of accelerations on named regressors.
+    """Least squares or ridge regression of the accelerations on named regressors.
 
     Attributes:
-        sets: regressors of every axis by the name of a set, written out for the model's channels:
+        sets: named sets of regressors for every axis, expanded for the channels of the model:
             `linear`; `fossen` (linear and quadratic damping, Coriolis products, propeller and
-            rudder); `abkowitz` (third-order Taylor series about straight ahead); `astern` (what
-            tells a propeller that turns astern); `wind`; `polynomial_1`, `polynomial_2` (all
-            products of velocities and inputs, the ridge models of document 001 section 2.2).
-        terms: further regressors of every axis, or of each axis `u`, `v`, `r` (and `p` of a roll,
-            `w`, `p`, `q` of six); with neither sets nor terms: the constant and every channel.
-        drive: channels that the sets take as thrust; empty: n, or tau_x where the model makes
+            rudder); `abkowitz` (third-order Taylor series about straight-ahead motion); `astern`
+            (additional terms for astern revolutions); `wind`; `polynomial_1` and `polynomial_2`
+            (all products of velocities and inputs, the ridge models of document 001 section 2.2).
+        terms: additional regressors of every axis, or per axis `u`, `v`, `r` (with roll also `p`;
+            in six degrees of freedom also `w`, `p`, `q`). Without sets and terms, the regressors
+            are the constant and every channel.
+        drive: channels used as thrust by the sets; if empty n, or tau_x if the model has forces.
+        steer: channels used as steering by the sets; if empty delta, or tau_n if the model has
             forces.
-        steer: channels that the sets take as steering; empty: delta, or tau_n where the model makes
-            forces.
-        ridge: penalty as a share of each regressor's energy, 0 for ordinary least squares; of
-            several the one whose free run is best on validation data.
+        ridge: penalty relative to the energy of each regressor, 0 for ordinary least squares. Of
+            several penalties, the one with the best free run on validation data is selected.
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
-        dissipative: terms along an axis' own velocity, such as u|u| in surge or v|r| in sway, whose
-            sign would feed energy are left out, and the others fitted again; so is, where an axis
-            is not damped at most of the samples, the term that feeds it most, such as u r in yaw.
-            A refit does the same.
-        bounded: terms take velocities and inputs that are far outside their training range (by half
-            its width) at the edge of that, and such velocities are pulled back, so that the model
-            cannot run away.
+        dissipative: whether terms with negative damping are removed and the others fitted again.
+            These are terms proportional to the velocity of their axis, such as u|u| in surge or
+            v|r| in sway, with a positive coefficient; and, if the damping of an axis is negative at
+            most samples, the term that contributes most, such as u r in yaw. A refit does the same.
+        bounded: whether velocities and inputs are clamped if they exceed the training range by more
+            than half its width, with a restoring acceleration on such velocities, so that the model
+            cannot diverge.
     """
 
     kind: Literal["regressors"] = "regressors"
@@ -349,27 +359,26 @@ class RegressorsConfig(IdentifiedConfig):
     @model_validator(mode="after")
     def _validate_terms(self) -> RegressorsConfig:
         if isinstance(self.terms, dict) and not {*VELOCITY_NAMES} <= set(self.terms):
-            raise ValueError(f"terms per axis need all of u, v, r; given {sorted(self.terms)}")
+            raise ValueError(f"terms: expected all of the axes u, v, r, got {sorted(self.terms)}")
         if (self.drive or self.steer) and not self.sets:
             raise ValueError(
-                "drive and steer say what `sets` are written out for; give sets, or leave them out"
+                "drive and steer are channels of the terms of `sets`; give sets, or remove them"
             )
         return self
 
     def axis_terms(self, names: Sequence[str]) -> list[tuple[str, ...]]:
-        """Return the regressors of each axis for channels `channel_names`.
+        """Return the regressors of each axis for channels `names`.
 
-        One that sets and terms both name stands once, as it was named first. Velocities that are
-        zero at all times have none, and no term holds them.
+        Duplicate regressors are removed. Inactive velocities have no regressors and occur in none.
         """
         return active_terms(self._configured_terms(names), names)
 
     def _configured_terms(self, names: Sequence[str]) -> list[tuple[str, ...]]:
-        """Return the regressors of each axis as the settings name them."""
+        """Return the regressors of each axis as configured, including inactive ones."""
         axes = get_dof(names).layout.velocities
         if isinstance(self.terms, dict) and set(self.terms) != set(axes):
             raise ConfigError(
-                f"terms: the axes of the model are {', '.join(axes)}; given {sorted(self.terms)}"
+                f"terms: expected the axes {', '.join(axes)} of the model, got {sorted(self.terms)}"
             )
         terms_by_axis = (
             [
@@ -419,7 +428,7 @@ class RegressorsConfig(IdentifiedConfig):
                 outputs=(baseline.output_names[axis],),
             )
 
-        # an axis that is zero at all times, or whose rate is known, has nothing to fit
+        # inactive velocities and angles, whose rates are kinematic, are not fitted
         learned_axes = get_dof(selected.names).regressed_indices
         axis_fits = {}
         velocity_slopes = (
@@ -444,7 +453,7 @@ class RegressorsConfig(IdentifiedConfig):
                         axis_solutions, terms, velocity_slopes[axis]
                     )
                 ):
-                    # what fed energy beside this term may not without it
+                    # the sign of a removed term may change without the undamped term
                     destabilising = set()
                     undamped = undamped | new_undamped
                 else:
@@ -467,7 +476,7 @@ class RegressorsConfig(IdentifiedConfig):
     def _destabilising_in_all(
         self, solutions: Sequence[Solution], axis: int, names: Sequence[str]
     ) -> set[str]:
-        """Return terms that feed energy in every solution and may not."""
+        """Return the terms with the sign of negative damping in every solution."""
         if not self.dissipative:
             return set()
         destabilising_terms = [

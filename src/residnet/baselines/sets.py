@@ -1,4 +1,4 @@
-"""Named sets of regressors, written out for the channels that a model has."""
+"""Named sets of regressors, expanded for the channels of a model."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _STEER_NAMES = ("delta", "delta_s", "tau_n")
 
 
 class ChannelRoles(NamedTuple):
-    """The roles of a model's channels.
+    """Roles of the channels of a model in the sets of regressors.
 
     Attributes:
-        dynamic_states: velocities, and the angles that forces depend on; in six degrees of freedom those
-            that live.
-        drives: those that push.
-        steers: those that turn.
-        unassigned: inputs of which neither is known.
-        has_wind: whether there is wind.
+        dynamic_states: velocities, and the angles that forces depend on; in six degrees of freedom
+            the active ones.
+        drives: inputs that produce thrust.
+        steers: inputs that produce a steering moment.
+        unassigned: inputs of unknown role.
+        has_wind: whether the model has wind channels.
     """
 
     dynamic_states: tuple[str, ...]
@@ -41,10 +41,10 @@ class ChannelRoles(NamedTuple):
     def from_channels(
         cls, names: Sequence[str], drive: Sequence[str] = (), steer: Sequence[str] = ()
     ) -> ChannelRoles:
-        """Return the roles by name, or as given.
+        """Determine the roles from the channel names, or from `drive` and `steer` if given.
 
         Raises:
-            ConfigError: where a given channel does not exist.
+            ConfigError: if a channel of `drive` or `steer` does not exist.
         """
         for name in (*drive, *steer):
             if name not in names:
@@ -66,26 +66,29 @@ class ChannelRoles(NamedTuple):
         return cls(dynamic_states, drives, steers, unassigned, "wind_u" in names)
 
     def require_assigned(self, subject: str) -> ChannelRoles:
-        """Return the same, where every input has a role.
+        """Check that every input has a role, and return the roles.
+
+        Args:
+            subject: name of the set in the error message.
 
         Raises:
-            ConfigError: where one has none.
+            ConfigError: if an input has no role, or no channel has the role of drive or steer.
         """
         if self.unassigned:
             raise ConfigError(
-                f"set '{subject}' must know whether '{self.unassigned[0]}' pushes or turns; name it in"
+                f"set '{subject}': the role of channel '{self.unassigned[0]}' is unknown; add it to"
                 " `drive` or `steer`"
             )
         if not self.drives or not self.steers:
             raise ConfigError(
-                f"set '{subject}' needs a channel that pushes and one that turns (name them in `drive`"
-                " and `steer`)"
+                f"set '{subject}' needs a channel for thrust and one for steering; add them to"
+                " `drive` and `steer`"
             )
         return self
 
 
 def is_force_channel(name: str) -> bool:
-    """Return whether a channel is a force that acts as it is: tau_x, or a thruster's thrust."""
+    """Return whether a channel is a force, such as tau_x or the thrust of a thruster."""
     base_name = name.removeprefix("cmd_")
     return name in FORCE_CHANNELS or base_name == "thrust" or base_name.startswith("thrust_")
 
@@ -96,19 +99,19 @@ def _linear_terms(roles: ChannelRoles) -> list[str]:
 
 
 def _thrust_terms(drive: str) -> list[str]:
-    """Return a force as it is, or the thrust of a propeller, which falls with the inflow."""
+    """Return the term of a force, or the terms of a propeller, whose thrust depends on speed."""
     return [drive] if is_force_channel(drive) else [drive, f"{drive}|{drive}|", f"|{drive}| u"]
 
 
 def _is_revolutions(drive: str) -> bool:
-    """Return whether a channel counts the revolutions of a propeller, whose thrust is known."""
+    """Return whether a channel is the revolutions of a propeller, such as n or cmd_n_port."""
     return drive.removeprefix("cmd_").partition("_")[0] == "n"
 
 
 def _steering_terms(steer: str, drives: Sequence[str]) -> list[str]:
-    """Return a moment as it is, or the lift of a rudder.
+    """Return the term of a moment, or the terms of the lift of a rudder.
 
-    It grows with the square of the inflow from speed and propellers.
+    The lift is proportional to the square of the inflow, from the speed and the propellers.
     """
     if steer in FORCE_CHANNELS:
         return [steer]
@@ -121,23 +124,21 @@ def _steering_terms(steer: str, drives: Sequence[str]) -> list[str]:
 
 
 HULL_TERMS = ("u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|")
-"""Coriolis products and quadratic damping."""
+"""Coriolis products and quadratic damping of a hull."""
 ROLL_TERMS = ("u p", "p|p|", "u|u| phi", "phi^3")
 WIND_TERMS = (
     "wind_u", "wind_v", "wind_u wind_mag", "wind_v wind_mag",
     "wind_u wind_v", "wind_u wind_v^2 wind_mag^-1", "wind_v wind_u^2 wind_mag^-1",
 )  # fmt: skip
-"""Loads that are quadratic in the relative wind, with coefficients that turn with its direction:
-the first three harmonics.
-"""
+"""Wind loads, quadratic in the relative wind, with the first three harmonics of its direction."""
 
 
 def _fossen_terms(roles: ChannelRoles) -> list[str]:
-    """Return the terms of Fossen's manoeuvring model.
+    """Return the terms of the manoeuvring model of Fossen.
 
-    Coriolis products, linear and quadratic damping (document 002 eq. (2.4), document 003 eqs.
-    (7)-(9)). Of a roll its damping, what speed does to damping and restoring, and a restoring that
-    is not linear (document 004).
+    The terms are Coriolis products, linear and quadratic damping (document 002 eq. (2.4), document
+    003 eqs. (7)-(9)). A model with roll also has roll damping, the effect of speed on damping and
+    restoring, and nonlinear restoring (document 004).
     """
     if "z" in roles.dynamic_states:
         return submerged_terms(roles)
@@ -150,15 +151,15 @@ def _fossen_terms(roles: ChannelRoles) -> list[str]:
 
 
 GRAVITY_TERMS = ("sin(theta)", "cos(theta) sin(phi)", "cos(theta) cos(phi)")
-"""The vertical along the body axes, which weight and buoyancy act along."""
+"""Components of the vertical unit vector in the body frame, for weight and buoyancy."""
 
 
 def submerged_terms(roles: ChannelRoles) -> list[str]:
-    """Return the terms of any axis of a vessel in six degrees of freedom.
+    """Return the terms of every axis of a vessel in six degrees of freedom.
 
-    Linear and quadratic damping, all products of two velocities (Coriolis forces of mass and added
-    mass, lift), weight and buoyancy (Fossen 2021, sections 6.3, 6.4 and 4.1); forces as they are,
-    thrust and torque of propellers, lift and drag of fins.
+    The terms are linear and quadratic damping, all products of two velocities (Coriolis forces of
+    mass and added mass, lift), weight and buoyancy (Fossen 2021, sections 6.3, 6.4 and 4.1),
+    forces, thrust and torque of propellers, and lift and drag of fins.
     """
     velocities = [name for name in roles.dynamic_states if name not in ("z", "phi", "theta")]
     velocity_products = [" ".join(pair) for pair in combinations(velocities, 2)]
@@ -171,13 +172,13 @@ def submerged_terms(roles: ChannelRoles) -> list[str]:
             0 if is_force_channel(thruster) or not _is_revolutions(thruster) else 1 :
         ]
     ]
-    # where no log tells the speed it is that of a usual one
+    # without a measured speed, the speed is assumed constant
     speed_factor = "u^2 " if "u" in velocities else ""
     fin_terms = [
         f"{speed_factor}{fin}{exponent}" for fin in roles.steers for exponent in ("", "^2")
     ]
     damping_terms = [f"{name}|{name}|" for name in velocities]
-    # one that stays upright has weight and buoyancy along heave whatever its pitch
+    # without roll, weight and buoyancy along heave are nearly independent of pitch
     vertical_terms = () if "phi" in roles.dynamic_states else ("sin(theta)", "1")
     return [
         *velocities,
@@ -191,9 +192,9 @@ def submerged_terms(roles: ChannelRoles) -> list[str]:
 
 
 def _abkowitz_terms(roles: ChannelRoles) -> list[str]:
-    """Return a Taylor series to third order about straight ahead.
+    """Return the terms of a third-order Taylor series about straight-ahead motion (Abkowitz).
 
-    Even products act in surge, odd ones in sway and yaw (an asymmetric hull has both).
+    On a symmetric hull even products act in surge, odd ones in sway and yaw.
     """
     lateral_channels = ["v", "r", *roles.require_assigned("abkowitz").steers]
     even_terms = [
@@ -226,14 +227,14 @@ def _wind_terms(roles: ChannelRoles) -> list[str]:
 
 
 def _astern_terms(roles: ChannelRoles) -> list[str]:
-    """Return what tells a propeller that turns astern from one that turns ahead.
+    """Return the terms by which the thrust of astern and ahead revolutions differs.
 
-    The other sets alone take them as mirrored.
+    The terms of the other sets are odd in the revolutions.
     """
     propellers = [name for name in roles.drives if name not in FORCE_CHANNELS]
     if not propellers:
         raise ConfigError(
-            "set 'astern' needs a propeller among the channels that push (name it in `drive`)"
+            "set 'astern' needs a propeller among the channels for thrust; add it to `drive`"
         )
     return [
         term
@@ -275,19 +276,16 @@ _TERM_SETS: dict[str, Callable[[ChannelRoles], list[str]]] = {
 
 
 def expand_sets(set_names: Sequence[SetName], roles: ChannelRoles) -> tuple[str, ...]:
-    """Return the terms of all sets, one after another.
+    """Return the terms of all sets in order.
 
     Raises:
-        ConfigError: where the model lacks a channel that a set needs.
+        ConfigError: if a channel that a set needs is missing.
     """
     return tuple(term for name in set_names for term in _TERM_SETS[name](roles))
 
 
 def drop_equivalent_terms(terms: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
-    """Return the terms without those that repeat one before them.
-
-    Such are `v u` after `u v` or `n^2` after `n n`.
-    """
+    """Return the terms without those that equal a preceding term, such as `v u` after `u v`."""
     term_of_factors: dict[frozenset[tuple[Factor, int, bool]], str] = {}
     for term in terms:
         term_of_factors.setdefault(canonical_factors(term, names, {}), term)

@@ -1,7 +1,8 @@
-"""Speed and steering by lags: Nomoto's models, and the linear model of document 003.
+"""First-order models of speed and steering: Nomoto models and the linear model of document 003.
 
-Nomoto's (document 003 eqs. (12)-(15), document 004 section 5.1.2) are found by least squares on
-derivatives, the linear one (document 003, sections 2.2, 4.2.1, 4.2.2) through steady states.
+Nomoto models (document 003 eqs. (12)-(15), document 004 section 5.1.2) are identified by least
+squares on derivatives, the linear model (document 003 sections 2.2, 4.2.1, 4.2.2) from steady
+states.
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ from residnet.regression.least_squares import LeastSquares
 
 
 class SteeringBaselineConfig(IdentifiedConfig, ABC):
-    """The part that all models of speed and steering share.
+    """Common base of the configurations of models of speed and steering.
 
     Attributes:
-        drive: channel that drives surge.
-        steer: channel that turns the vessel.
+        drive: input channel of surge.
+        steer: input channel of steering.
     """
 
     required_velocities: ClassVar[tuple[str, ...]] = VELOCITY_NAMES
-    """Velocities that must live."""
+    """Velocities that the model must have."""
 
     kind: str
     drive: str
@@ -42,7 +43,7 @@ class SteeringBaselineConfig(IdentifiedConfig, ABC):
 
     @abstractmethod
     def axis_terms(self) -> tuple[tuple[str, ...], ...]:
-        """Return the terms of each axis; sway of `("v",)` alone dies out as the yaw rate does."""
+        """Return the terms per axis; sway with `("v",)` decays with the yaw time constant."""
 
     @final
     def build(self, names: Sequence[str]) -> RegressorBaseline:
@@ -59,7 +60,7 @@ class SteeringBaselineConfig(IdentifiedConfig, ABC):
 
 
 def _sway_decay(yaw_coefficients: Sequence[Coefficient]) -> tuple[Coefficient, ...]:
-    """Return the table of a sway velocity that decays with yaw's time constant."""
+    """Return the coefficient of a sway velocity that decays with the yaw time constant."""
     yaw_coefficient = next(
         coefficient for coefficient in yaw_coefficients if coefficient.term == "r"
     )
@@ -67,9 +68,10 @@ def _sway_decay(yaw_coefficients: Sequence[Coefficient]) -> tuple[Coefficient, .
 
 
 class _NomotoBaselineConfig(SteeringBaselineConfig, ABC):
-    """The part that both Nomoto models share.
+    """Common base of the configurations of both Nomoto models.
 
-    T_u u_dot + u = K_u drive + b_u (eq. (12)) and T r_dot + r = K steer + b (eq. (13)).
+    The equations are T_u u_dot + u = K_u drive + b_u (eq. (12)) and T r_dot + r = K steer + b
+    (eq. (13)).
 
     Attributes:
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
@@ -91,12 +93,10 @@ class _NomotoBaselineConfig(SteeringBaselineConfig, ABC):
 
     @final
     def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """Return the one solution.
-
-        Its table holds the coefficients, then T, K and b of each lag.
+        """Fit each axis; the table has the coefficients, then T, K and b of each axis.
 
         Raises:
-            FitError: where the data do not determine a coefficient, or a lag does not settle.
+            FitError: if the data do not determine a coefficient, or an axis is unstable.
         """
         assert isinstance(baseline, RegressorBaseline)
         ratios = (
@@ -123,10 +123,10 @@ class _NomotoBaselineConfig(SteeringBaselineConfig, ABC):
     def _fit_lag(
         self, baseline: RegressorBaseline, samples: Samples, axis: int, terms: Sequence[str]
     ) -> Solution:
-        """Fit one axis as a first-order lag by least squares.
+        """Fit a first-order lag of one axis by least squares.
 
         Raises:
-            FitError: where the data do not determine it, or it does not settle.
+            FitError: if the data do not determine it, or it is unstable.
         """
         term_columns = [baseline.library.terms.index(term) for term in terms]
         (fit,) = LeastSquares().fit(
@@ -141,15 +141,18 @@ class _NomotoBaselineConfig(SteeringBaselineConfig, ABC):
         name = VELOCITY_NAMES[axis]
         if slope >= 0:
             raise FitError(
-                f"a Nomoto model needs {name} to settle, but {name}_dot rises with {name}"
-                f" ({slope:.2g} +- {standard_error:.1g} 1/s): the vessel is unstable on course or hardly"
-                " excited; take a baseline of kind 'regressors' or fit on other `manoeuvres`"
+                f"a Nomoto model needs a stable {name}, but the coefficient of {name} in"
+                f" {name}_dot is {slope:.2g} +- {standard_error:.1g} 1/s: the vessel is unstable or"
+                " hardly excited; use a baseline of kind 'regressors' or fit on other `manoeuvres`"
             )
         return fit
 
 
 def _lag_ratios(state: str, drive: str, suffix: str) -> dict[str, Ratio]:
-    """Return T, K and b of T x_dot + x = K drive + b, from x_dot = a x + k drive + c."""
+    """Return T, K and b of T x_dot + x = K drive + b as ratios of a, k, c.
+
+    The coefficients are those of x_dot = a x + k drive + c.
+    """
     numerators = {"T": None, "K": drive, "b": "1"}
     return {f"{name}{suffix}": Ratio(-1.0, term, state) for name, term in numerators.items()}
 
@@ -157,7 +160,7 @@ def _lag_ratios(state: str, drive: str, suffix: str) -> dict[str, Ratio]:
 def _ratio_parameters(
     axis: int, terms: Sequence[str], fit: Solution, ratios: Mapping[str, Ratio]
 ) -> list[Coefficient]:
-    """Return parameters that are ratios of the coefficients of an axis, errors to first order."""
+    """Compute parameters that are ratios of coefficients, with first-order error propagation."""
     theta = fit.coefficients[:, 0]
     assert fit.covariance is not None
     parameters = []
@@ -176,10 +179,10 @@ def _ratio_parameters(
 
 
 class NomotoBaselineConfig(_NomotoBaselineConfig):
-    """Nomoto's model of first order, T r_dot + r = K steer + b.
+    """Nomoto model of first order, T r_dot + r = K steer + b.
 
-    Surge is a first-order lag of the drive; sway, of which the model knows nothing, dies out with
-    T. Where only surge or only yaw lives, only its lag is found.
+    Surge is a first-order lag of the drive. Sway, which the model does not describe, decays with T.
+    If the model has only surge or only yaw, only its lag is identified.
     """
 
     required_velocities = ()
@@ -188,9 +191,9 @@ class NomotoBaselineConfig(_NomotoBaselineConfig):
 
 
 class NomotoSideslipBaselineConfig(_NomotoBaselineConfig):
-    """Nomoto's model with side slip (document 003 eqs. (14), (15)).
+    """Nomoto model with sideslip (document 003 eqs. (14), (15)).
 
-    T_beta beta_dot + beta = -K_beta r + b_beta, written for v = u beta.
+    T_beta beta_dot + beta = -K_beta r + b_beta, formulated for v = u beta.
     """
 
     sway_terms = ("v", "u r", "u")
@@ -199,7 +202,7 @@ class NomotoSideslipBaselineConfig(_NomotoBaselineConfig):
 
 
 class _SteadyStateBlock(NamedTuple):
-    """States that one input drives, and the manoeuvres that identify how they settle."""
+    """States with a common input, and the kinds of manoeuvre that identify their dynamics."""
 
     states: tuple[str, ...]
     drive: str
@@ -207,19 +210,20 @@ class _SteadyStateBlock(NamedTuple):
 
 
 class LinearSteadyConfig(SteeringBaselineConfig):
-    """The models u_dot = a u + k tau + c and (v, r)_dot = A (v, r) + B tau + C (eqs. (12), (16)).
+    """Linear models u_dot = a u + k tau + c and (v, r)_dot = A (v, r) + B tau + C.
 
-    First the steady states of constant-input manoeuvres give x_ss = Phi tau + Phi_bias by least
-    squares (eqs. (24), (32)); then x_dot = A (x - Phi tau - Phi_bias) gives A by least squares on
-    derivatives (eq. (29)), and B = -A Phi (eq. (28)). Nomoto's models are identified alike.
+    The equations are (12) and (16) of document 003. Steady states of constant-input manoeuvres give
+    x_ss = Phi tau + Phi_bias by least squares (eqs. (24), (32)). Then x_dot = A (x - Phi tau -
+    Phi_bias) gives A by least squares on derivatives (eq. (29)), and B = -A Phi (eq. (28)). Nomoto
+    models are identified by the same method.
 
     Attributes:
-        steering_model: `linear` is (16). `nomoto` is (13), in which sway velocity decays with
-            yaw's time constant. `nomoto_sideslip` is (15) with side slip written as sway velocity:
-            the yaw rate alone drives sway.
+        steering_model: `linear` is (16). `nomoto` is (13), with a sway velocity that decays with
+            the yaw time constant. `nomoto_sideslip` is (15) with sway velocity instead of sideslip
+            and the yaw rate as the input of sway.
         steady: kinds of manoeuvre with constant input.
-        settled: time after the start of a constant manoeuvre from which its samples count as
-            steady, s.
+        settled: time after the start of a constant-input manoeuvre from which samples count as
+            steady.
         speed: kinds of manoeuvre that identify a.
         steering: kinds of manoeuvre that identify A.
     """
@@ -252,25 +256,26 @@ class LinearSteadyConfig(SteeringBaselineConfig):
         ]
 
     def validate_samples(self, samples: Samples) -> None:
-        """Check that there are constant manoeuvres, and those that identify speed and steering.
+        """Check that the samples contain all required kinds of manoeuvre.
 
         Raises:
-            FitError: where there are not.
+            FitError: if a kind is missing.
         """
         self._steady_means(samples, ())
         for kinds in (self.speed, self.steering):
             select_manoeuvres(samples, kinds)
 
     def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """Return the one solution; its notes hold the steady states and Phi (Table 1).
+        """Fit the model; the notes contain the steady states and Phi (Table 1).
 
         Raises:
-            FitError: where a kind of manoeuvre that a step needs is absent.
+            FitError: if a required kind of manoeuvre is missing.
         """
         assert isinstance(baseline, RegressorBaseline)
         tables: dict[str, tuple[Coefficient, ...]] = {}
         steady_constraints: dict[str, dict[str, Any]] = {}
         for block in self._steady_state_blocks():
+            # static gain and bias from the steady states, then the dynamics
             means = self._steady_means(samples, (*block.states, block.drive))
             design_matrix = torch.stack((means[:, -1], torch.ones_like(means[:, -1])), dim=1)
             (steady_fit,) = LeastSquares().fit(
@@ -305,7 +310,7 @@ class LinearSteadyConfig(SteeringBaselineConfig):
         ]
 
     def _steady_means(self, samples: Samples, names: Sequence[str]) -> Tensor:
-        """Return the means [n, len(names)] of the settled part of every constant manoeuvre."""
+        """Return the mean channels [M, len(names)] of the steady part of M constant manoeuvres."""
         steady_samples = samples.select_manoeuvres(self.steady)
         steady_samples = steady_samples.select(steady_samples.t >= self.settled)
         groups, group_index = torch.unique(steady_samples.group, return_inverse=True)
@@ -324,10 +329,10 @@ class LinearSteadyConfig(SteeringBaselineConfig):
     def _fit_dynamics(
         self, samples: Samples, block: _SteadyStateBlock, steady_fit: Solution
     ) -> dict[str, tuple[Coefficient, ...]]:
-        """Return the coefficients of each state of a block.
+        """Fit the dynamics of a block; return the coefficients of each state.
 
-        First stands A, then B = -A Phi and -A Phi_bias, errors to first order as if those of A and
-        Phi were independent.
+        The order is A, then B = -A Phi and -A Phi_bias. Standard errors are propagated to first
+        order under the assumption that the errors of A and Phi are independent.
         """
         dynamic_samples = select_manoeuvres(samples, block.manoeuvre_kinds)
         states = block.states
