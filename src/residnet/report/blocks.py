@@ -1,4 +1,4 @@
-"""What a report page is made of: sections of text, tables, figures and code.
+"""Building blocks of a report page: sections with text, tables, figures and code.
 
 The same objects serve the page (`residnet.report.page.write_page`) and the terminal
 (`Table.text`).
@@ -20,7 +20,7 @@ CellMark: TypeAlias = Literal["", "bad", "best", "weak", "text"]
 
 
 _PAGE_WIDTH, _LETTER_WIDTH, _CELL_PADDING = 700.0, 5.8, 6.0
-"""Pixels of a sheet of A4 between its margins, of a bold letter of a table, and beside a cell."""
+"""Pixels: text width of an A4 page, width of a bold letter in a table, padding of a cell."""
 
 
 _MIN_WIDE_COLUMNS = 6
@@ -59,7 +59,7 @@ class Bullets:
 
     Attributes:
         items: one string for each entry.
-        is_warning: set off by colour, for what a reader must know before using a result.
+        is_warning: highlighted; for facts that a reader must know before using a result.
     """
 
     kind: ClassVar[str] = "bullets"
@@ -85,7 +85,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Code:
-    """Text in a fixed-width font, exactly as it stands.
+    """Verbatim text in a fixed-width font.
 
     Attributes:
         text: with its line breaks.
@@ -104,8 +104,9 @@ class Cell:
     Attributes:
         text: a formatted number or a few words.
         note: small print below it.
-        mark: `is_flagged`, `best` or `weak` set it off; `to_text` is aligned to the left and may wrap.
-        si: the number in its SI unit where it stands in another, shown under the pointer.
+        mark: `bad`, `best` or `weak` colour the cell; `text` aligns it to the left and lets it
+            wrap.
+        si: the number in SI units, shown as a tooltip if the cell uses another unit.
     """
 
     text: str
@@ -177,7 +178,7 @@ class Table:
         return [True, *(is_text or [False] * (len(self.columns) - 1))]
 
     def select_columns(self, first_column: int, last_column: int) -> Table:
-        """Return the table with the columns from `first_column` up to `last`, those of labels aside."""
+        """Return a table with the data columns `first_column` to `last_column` (exclusive)."""
         groups, column = [], 0
         for title, count in self.groups:
             n_overlap = min(column + count, last_column) - max(column, first_column)
@@ -193,9 +194,9 @@ class Table:
 
     @property
     def split_to_width(self) -> list[Table]:
-        """Return the table in pieces that each fit a sheet of A4, itself where it fits whole.
+        """Split the table into tables that each fit the text width of an A4 page.
 
-        Each piece has the labels of the rows; columns of one group stay together where they fit.
+        Each table repeats the row labels. The columns of a group are kept in one table if they fit.
         """
         lines = [self.columns]
         lines += [[row.label, *(f"{c.text} {c.note}" for c in row.cells)] for row in self.rows]
@@ -248,11 +249,11 @@ class Table:
 
 
 Column: TypeAlias = tuple[Any, ...]
-"""Of a table: its title, what it shows of a row, how, and a factor; all but the first two may lack.
+"""A table column: title, value, format and factor; format and factor are optional.
 
-What it shows is a key, with dots for keys inside, or a function of the row. It is shown by so many
-decimals (an int) or by a function of the value that returns text; without either, a cell stands as
-it is, and anything else is written as words.
+The value is a key of the row (dots separate nested keys) or a function of the row. The format is a
+number of decimals or a function that maps the value to text. Without a format a `Cell` is used
+unchanged and any other value is converted to text.
 """
 
 
@@ -265,18 +266,19 @@ def build_table(
     is_selected: Callable[[Any], bool] = lambda row: False,
     group_key: Callable[[Any], Any] | None = None,
 ) -> Table:
-    """Return a table with a row for each of the given ones.
+    """Build a table with one line for each element of `rows`.
 
     Args:
-        rows: mappings, or anything that the columns' functions take.
-        columns: the first is that of the labels.
+        rows: mappings, or any objects that the functions of the columns accept.
+        columns: the first column holds the row labels.
         groups: titles that span several columns, see `Table`.
         caption: a sentence above the table.
-        is_selected: whether a row is set off as the one that was chosen.
-        group_key: a line is drawn above a row for which this is another than for the row before.
+        is_selected: predicate that highlights a row.
+        group_key: a rule is drawn above each row whose key differs from that of the previous row.
 
     Example:
-        table_of(rows, [("model", "model"), ("time [s]", "time.mean", 2), ("rms", "rms", 1, DEG)])
+        build_table(rows, [("model", "model"), ("time [s]", "time.mean", 2), ("rms", "rms", 1,
+        DEG)])
     """
     table = Table([title for title, *_ in columns], groups=groups, caption=caption)
     previous_group: Any = None
@@ -331,12 +333,12 @@ def _cell_text(cell: Cell) -> str:
 
 @dataclass(frozen=True)
 class Section:
-    """A titled part of a page; it may hold sections itself.
+    """A titled part of a page, which may contain nested sections.
 
     Attributes:
-        title: a few words; empty for the rest of a page's first screen.
-        blocks: what it shows, from top to bottom.
-        is_folded: closed at first, for what most readers skip.
+        title: a few words; empty for the content of the first screen.
+        blocks: content from top to bottom.
+        is_folded: whether the section is collapsed initially.
     """
 
     kind: ClassVar[str] = "section"
@@ -351,7 +353,7 @@ class Section:
 
     @property
     def is_side_by_side(self) -> bool:
-        """Return whether its parts stand beside each other, each in half of the page."""
+        """Return whether the blocks are laid out in two columns."""
         tables = [block for block in self.present_blocks if isinstance(block, Table)]
         return len(self.present_blocks) > 1 and all(
             len(table.columns) < _MIN_WIDE_COLUMNS for table in tables

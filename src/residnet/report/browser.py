@@ -39,7 +39,10 @@ class InteractiveFigures:
 
 
 def render_bokeh(figures: Sequence[Figure]) -> InteractiveFigures | None:
-    """Draw figures; None where there are none. The page's own script lays them out when seen."""
+    """Render interactive figures; the script of the page lays them out when they become visible.
+
+    Returns None if there are no figures.
+    """
     if not figures:
         return None
     from bokeh.resources import Resources
@@ -51,7 +54,7 @@ def render_bokeh(figures: Sequence[Figure]) -> InteractiveFigures | None:
 
 
 def _build_canvases(figure: Figure) -> list[Canvas]:
-    """Return the panels; those of curves share their horizontal axis and a cursor."""
+    """Return the Bokeh panels; panels of kind `curves` share a horizontal axis and a cursor."""
     from bokeh import models
     from bokeh.models.annotations import Span
 

@@ -20,7 +20,7 @@ from residnet.core.stretches import find_runs
 TEXT_COLOR = "ink"
 """The colour of text: black on paper, light on a dark screen."""
 Curve: TypeAlias = tuple[np.ndarray, np.ndarray]
-"""Horizontal and vertical values [T], NaN where there is a gap."""
+"""Horizontal and vertical values [T]; NaN marks a gap."""
 GlyphKind: TypeAlias = Literal["line", "points", "fill", "across", "upright", "strip"]
 
 # Okabe and Ito's palette, which stays distinct under the common colour-vision deficiencies
@@ -39,21 +39,22 @@ DASHES = ("solid", "long", "dashdot", "short", "dense", "dashed", "dotted")
 
 @dataclass(frozen=True)
 class GlyphStyle:
-    """How what bears one name looks in every panel.
+    """Appearance of one named curve in every panel.
 
     Attributes:
-        label: in the legend, and beside its switch.
+        label: text in the legend and at the visibility switch.
         color: as CSS has it, or `TEXT_COLOR`.
         dash: `solid`, `dashed`, `dotted`, `dashdot`, `long`, `short` or `dense`.
         width: of its line in points.
-        kind: a `line`, `points`, a `fill` of outlines that gaps part; lines `across` at vertical
-            values or `upright` at horizontal ones; `strip`s from one horizontal value to another.
-        is_visible: it is switched on at first, and drawn in still pictures.
+        kind: `line`, `points`, `fill` (outlines separated by gaps), `across` (horizontal lines at
+            vertical values), `upright` (vertical lines at horizontal values) or `strip` (vertical
+            bands between two horizontal values).
+        is_visible: whether it is visible initially and drawn in static images.
         alpha: opacity.
         marker: of points: `o`, `s`, `x` or `^`.
         size: of points, in points.
         is_hollow: points are rings.
-        z_order: what has a higher one lies on top.
+        z_order: drawing order; higher values are drawn on top.
     """
 
     label: str
@@ -74,17 +75,17 @@ MAX_PREVIEW_HEIGHT = 280
 MEASURED_STYLE = GlyphStyle("measured", width=0.7, z_order=2)
 SOLID_STYLE = GlyphStyle("", BLUE, width=1.6)
 DASHED_STYLE = GlyphStyle("", ORANGE, "dashed", 1.6, z_order=4)
-"""Two curves of equal rank, told apart by colour and by line."""
+"""Two curves of equal rank, distinguished by colour and line style."""
 MASKED_STYLE = GlyphStyle("masked", "#E0E0E0", kind="strip", alpha=0.8, z_order=0)
 START_STYLE = GlyphStyle("start", kind="points", size=6, is_hollow=True, z_order=6)
 ZERO_LINE_STYLE = GlyphStyle("", "#666666", width=0.8, kind="across", z_order=1)
 
 
 def style_family(names: Iterable[str], **attributes: Any) -> dict[str, GlyphStyle]:
-    """Return looks of equal rank by name, told apart by colour and by line.
+    """Return styles of equal rank by name, distinguished by colour and line style.
 
     Args:
-        attributes: further attributes of all looks.
+        attributes: further attributes of all styles.
     """
     n_colors = len(COLORS)
     return {
@@ -103,15 +104,16 @@ class Panel:
 
     Attributes:
         y_label: of the vertical axis, with its unit.
-        x_label: of the horizontal axis, with its unit; empty where a panel beneath names it.
+        x_label: of the horizontal axis, with its unit; empty if the panel below has the label.
         title: above it.
         kind: a `map` has equal scales; `curves` of one group share their horizontal axis.
         height: in pixels on a page, at 110 to the inch in a still picture.
         x_log, y_log: whether an axis is logarithmic.
         group: of panels that share their horizontal axis.
-        x_names, y_names: what stands at an axis in place of numbers, by place.
-        si_unit: SI unit of the vertical values, and their factor from it; empty where they are in it.
-        x_limits, y_limits: where an axis begins and ends at first; empty for all that is shown.
+        x_names, y_names: tick labels that replace numbers, by position.
+        si_unit: SI unit of the vertical values and the factor from SI; empty if they are in SI
+            units.
+        x_limits, y_limits: initial limits of an axis; empty for the range of the data.
     """
 
     y_label: str = ""
@@ -130,7 +132,7 @@ class Panel:
 
     @property
     def heading(self) -> str:
-        """What stands above the panel on a page."""
+        """Title above the panel."""
         return format_exponents(
             " ".join(": ".join(part for part in (self.title, self.y_label) if part).split())
         )
@@ -138,15 +140,15 @@ class Panel:
 
 @dataclass(frozen=True)
 class Case:
-    """What all panels show at a time.
+    """The curves of all panels for one selectable case.
 
     Attributes:
-        title: in the list to choose from.
+        title: entry in the selection list.
         curves: for each panel, curves by name.
-        note: a sentence on the case, empty where nothing is to be said.
-        still: it has a still picture.
-        texts: number of a panel, place and words of what is written into a still picture; a
-            vertical place of NaN is the upper edge.
+        note: optional sentence about the case.
+        still: whether a static image is written.
+        texts: annotations of the static image: panel number, position and text; a vertical
+            position of NaN is the upper edge.
     """
 
     title: str
@@ -158,18 +160,18 @@ class Case:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure: one case of several, in panels with switches for what they show.
+    """A figure with panels, selectable cases and visibility switches.
 
     Attributes:
-        name: of its files and of its parts on the page.
+        name: stem of its files and of its HTML identifiers.
         title: a few words.
-        caption: whole sentences that say what to look for.
+        caption: sentences that explain what the figure shows.
         styles: by name, in the order of the legend.
-        panels: from top to bottom, line by line where there are columns.
+        panels: from top to bottom; row by row if there are several columns.
         cases: at least one.
-        chooser: what the cases are, beside the list to choose from.
-        columns: of panels beside each other.
-        static_images: pictures that were written of it.
+        chooser: label of the selection list.
+        columns: number of panel columns.
+        static_images: paths of the PNG files.
     """
 
     kind: ClassVar[str] = "figure"
@@ -190,13 +192,13 @@ class Figure:
 
     @property
     def static_cases(self) -> list[Case]:
-        """Cases in the order of the stills."""
+        """Cases with a static image, in the order of the images."""
         return [case for case in self.cases if case.still]
 
     def preview(self, panels: int = 1) -> Figure:
-        """Return the first panels without words: a glance, for the first screen of a page.
+        """Return the first panels without captions, for the first screen of a page.
 
-        It has no stills, since the whole figure stands further down.
+        The preview has no static images because the complete figure follows on the page.
         """
         # panels beneath each other share the name of their horizontal axis
         last = self.panels[-1]
@@ -232,7 +234,7 @@ class Figure:
         return [name for name in self.styles if name in present]
 
     def has_integer_axis(self, panel: int) -> bool:
-        """Return whether the horizontal values of a panel are whole, those of a count."""
+        """Return whether the horizontal values of a panel are integers."""
         x_values = [x for case in self.cases for x, _ in case.curves[panel].values()]
         finite_values = [x[np.isfinite(x)] for x in x_values]
         # values of a file are packed in 16 bits
@@ -264,7 +266,7 @@ def join_with_gaps(xy_pairs: Iterable[tuple[Any, Any]]) -> Curve:
 
 
 def subsample_indices(length: int, max_count: int) -> np.ndarray:
-    """Return the numbers of evenly spaced samples, at most so many, the first and last included."""
+    """Return at most `max_count` evenly spaced sample indices, including the first and the last."""
     if length <= max_count:
         return np.arange(length)
     return np.unique(np.linspace(0, length - 1, max_count).round().astype(int))
@@ -310,5 +312,5 @@ def step_curve(x: Any, y: Any) -> Curve:
 
 
 def tick_labels(texts: Iterable[str]) -> dict[str, str]:
-    """Return what stands at the whole numbers of an axis."""
+    """Return the tick labels at the integers of an axis."""
     return {str(index): text for index, text in enumerate(texts)}

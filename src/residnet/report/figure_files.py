@@ -1,4 +1,4 @@
-"""The figures of a run as files: a picture for each case, and beside it all that a page draws."""
+"""Figures of a run as files: a PNG for each case and a JSON file with the data of the figure."""
 
 from __future__ import annotations
 
@@ -66,10 +66,10 @@ def unpack_column(columns: Mapping[str, Any], name: str) -> np.ndarray:
 
 
 def write_figure(folder: Path, figure: Figure, name: str = "") -> Figure:
-    """Write a figure of a run: a PNG for each case that has one, and the figure itself beside them.
+    """Write a figure: a PNG for each case with a static image, and a JSON file with its data.
 
     Args:
-        name: of the files, that of the figure where empty.
+        name: stem of the files; the name of the figure if empty.
     """
     name = make_file_stem(name or figure.name)
     image_paths, has_several = [], len(figure.static_cases) > 1
@@ -111,9 +111,9 @@ def _pack_curves(panel_curves: Mapping[str, Curve]) -> dict[str, Any]:
 
 
 def write_figures(folder: Path, figures: Iterable[Figure]) -> list[Figure]:
-    """Write figures in the order in which a page shows them; those of an earlier call are replaced.
+    """Write figures in page order and replace the figures of an earlier call.
 
-    Other pictures of the folder stay, and so do figures that somebody edited.
+    Files that residnet did not write, and files edited since, are not touched.
     """
     manifest = find_run_manifest(folder / "figure.json")
     if manifest is not None:
@@ -131,18 +131,18 @@ def write_figures(folder: Path, figures: Iterable[Figure]) -> list[Figure]:
 
 
 def read_figures(folder: Path, names: str = ".*") -> list[Figure]:
-    """Return the figures of a folder in the order of their files; damaged ones are left out.
+    """Read the figures of a folder in file order; unreadable files are skipped.
 
     Args:
-        folder: as `write_figures` left it.
-        names: regular expression of the names of those that are wanted.
+        folder: written by `write_figures`.
+        names: regular expression that the figure name must match.
     """
     read = (_read_figure(path) for path in sorted(folder.glob("*.json")))
     return [figure for figure in read if figure and re.fullmatch(names, figure.name)]
 
 
 def figures_section(folder: Path) -> list[Section]:
-    """Return a section with the figures of a folder, none where there are none."""
+    """Return a section with the figures of a folder; an empty list if there are none."""
     figures = read_figures(folder)
     return [Section("Figures", figures)] if figures else []
 
@@ -175,10 +175,10 @@ def _read_figure(path: Path) -> Figure | None:
 
 
 def _still_path(figure: Path, name: object) -> Path:
-    """Return the picture of a figure: a PNG in the folder of the figure.
+    """Return the path of a static image: a PNG in the folder of the figure.
 
     Raises:
-        UsageError: if the name leads elsewhere, or is that of another file.
+        UsageError: if the name leaves the folder or names another kind of file.
     """
     still = resolve_name(figure.parent, name, figure)
     if still.parent != figure.parent or still.suffix != ".png":

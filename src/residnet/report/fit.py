@@ -15,9 +15,10 @@ from residnet.report.sections import data, free_runs, manoeuvres, models, runs, 
 
 
 def _iterate_fit_sections(run: RunFiles) -> Iterator[Section | None]:
-    """Yield the sections of the page in their order; None is left out.
+    """Yield the sections of the page in order; None entries are skipped.
 
-    A section is added here, and its figures below. What most readers look for stands open.
+    Add a section here and its figures in `write_fit_figures`. Sections that most readers need are
+    not collapsed.
     """
     folder, findings = run.path / "figures", read_sanity_findings(run.path)
     yield verdict.opening_section(run, read_figures(folder, "track"))
@@ -58,10 +59,10 @@ def _iterate_fit_figures(run: RunFiles) -> Iterator[Figure | None]:
 
 
 def write_fit_figures(run: RunFiles) -> list[Figure]:
-    """Write the figures of a fit or an evaluation; what the folder has no data for is left out.
+    """Write the figures of a fit or an evaluation for which the folder holds data.
 
     Raises:
-        UsageError: where the folder holds no metrics.json.
+        UsageError: if the folder holds no metrics.json.
     """
     return write_figures(
         run.path / "figures", (figure for figure in _iterate_fit_figures(run) if figure is not None)
@@ -69,10 +70,10 @@ def write_fit_figures(run: RunFiles) -> list[Figure]:
 
 
 def fit_sections(run: RunFiles) -> list[Section]:
-    """Return the sections of the page of a fit, with the figures that stand in its folder.
+    """Return the sections of the page of a fit with the figures in its folder.
 
     Raises:
-        UsageError: where the folder holds no metrics.json.
-        DataError: where a file in it cannot be read.
+        UsageError: if the folder holds no metrics.json.
+        DataError: if a file in it cannot be read.
     """
     return [section for section in _iterate_fit_sections(run) if section is not None]

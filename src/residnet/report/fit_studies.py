@@ -1,7 +1,7 @@
-"""Published experiments whose figures a fit's report can show, found by name.
+"""Registry of published experiments whose figures the report of a fit can show.
 
-A study is registered like a head or a reader: residnet's own ones in a table, those of other
-packages by the entry points `residnet.fit_studies`. It is imported when a config names it.
+Studies are registered like heads or readers: built-in studies in a table, studies of other
+packages by the entry point group `residnet.fit_studies`. A study is imported on first use.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ FIT_STUDIES = PluginUnion(
 
 
 def find_fit_study(name: str) -> FitStudy:
-    """Return the study of a name.
+    """Return the study with the given name.
 
     Raises:
-        ValueError: if there is none, or the package that offers it is broken.
+        ValueError: if no study has this name or its package cannot be imported.
     """
     if name not in (study_names := FIT_STUDIES.kind_names()):
         raise ValueError(f"unknown value '{name}'{suggest_name(name, study_names)}")

@@ -1,4 +1,4 @@
-"""The one page builder: every task's `report.html` is written here, the field's words linked."""
+"""Page builder: writes `report.html` of every task and links glossary terms."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ _PROVENANCE_TITLES = {
     **{"machine": "machine", "started": "started (UTC)", "seconds": "duration"},
     **{"packages": "packages", "config": "configuration", "overrides": "overrides"},
 }
-"""What is told of provenance.json, and its title."""
+"""Keys of provenance.json that the report shows, with their titles."""
 
 
 _UNIT_SPACE = re.compile(r"(?<=\d) (?=(?:%|m|s|deg|m/s|deg/s|1/s|N|kN)(?![\w/]))")
 """The space between a number and its unit."""
 _MIN_BREAKABLE_LENGTH = 20
-"""Least number of characters of a name that may break in the middle."""
+"""Minimum length of a name that may be broken."""
 
 
 def render_figures(sections: Sequence[Section]) -> InteractiveFigures | None:
-    """Return the interactive figures of a page's sections; None where there are none.
+    """Render the interactive figures of the sections; None if there are none.
 
-    Drawing them takes most of the time of a page: one that is written twice needs them once.
+    Rendering takes most of the time of a page. A page that is written twice renders once.
     """
     return render_bokeh(_collect_figures(sections))
 
@@ -61,28 +61,27 @@ def write_page(
     rendered: InteractiveFigures | None = None,
     level: str = "",
 ) -> Path:
-    """Write `report.html` of a run folder, whole or not at all.
+    """Write `report.html` of a run folder atomically.
 
-    The page stands alone: pictures, styles and scripts are inside, and nothing is loaded. Without
-    JavaScript, and in print, pictures stand where interactive figures would.
-    Words of the glossary are linked to its end, where they are explained.
-    Provenance and configuration are added at its end where the folder holds `provenance.json` and
-    `resolved.yaml`.
+    The page is self-contained: images, styles and scripts are embedded. Without JavaScript, and in
+    print, static images replace the interactive figures. Glossary terms link to their definitions
+    at the end of the page. Provenance and configuration follow if the folder holds
+    `provenance.json` and `resolved.yaml`.
 
     Args:
-        title: of the page, empty for the name of the run in the folder.
-        description: what the page is of, empty for what the run was made for.
-        verdict: sentences that stand first, the first of them in bold.
-        sections: from top to bottom. One without a title is the rest of the first screen: its
-            first block stands beside the others where there is room.
-        rendered: what `render_figures` returned for the sections; None to draw them now.
-        level: of the verdict, a key of `LEVELS`; empty where none was passed.
+        title: title of the page; empty for the name of the run.
+        description: subtitle; empty for the description of the run.
+        verdict: sentences at the top of the page; the first one is bold.
+        sections: from top to bottom. A section without a title belongs to the first screen; its
+            first block is placed next to the others on wide screens.
+        rendered: result of `render_figures` for the sections; None to render them now.
+        level: level of the verdict, a key of `LEVEL_TEXTS`; empty if there is no verdict.
 
     Returns:
         Path of the page.
 
     Raises:
-        OSError: where a figure cannot be read or the page cannot be written.
+        OSError: if a figure cannot be read or the page cannot be written.
     """
     # jinja2 is only needed where a page is written, not where a config is checked
     from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -136,10 +135,10 @@ def _collect_figures(blocks: Sequence[Block]) -> list[Figure]:
 
 
 def exports_section(run: Path) -> Section | None:
-    """Return what a run exported for controllers, and what it could not; None where nothing.
+    """Return the section on exported models and failed exports; None if there are none.
 
     Raises:
-        DataError: where exports.json is not readable.
+        DataError: if exports.json is not readable.
     """
     rows = RunFiles(run).read_json(EXPORTS).get("exports") or []
     if not rows:
@@ -157,7 +156,7 @@ def exports_section(run: Path) -> Section | None:
 
 
 def _provenance_sections(run: Path, record: Mapping[str, Any]) -> list[Section]:
-    """Return the section on provenance and configuration, none where the folder holds neither."""
+    """Return the section on provenance and configuration; empty if the folder holds neither."""
     blocks: list[Block] = []
     if facts := provenance_facts(record):
         blocks.append(Section("How this run was made", [Facts(facts)], is_folded=True))
@@ -173,7 +172,7 @@ def _provenance_sections(run: Path, record: Mapping[str, Any]) -> list[Section]:
 
 
 def provenance_facts(record: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return name and text of each fact of `provenance.json` that a reader may want."""
+    """Return title and text of each entry of `provenance.json` that the report shows."""
     packages = (record.get("packages") or {}).items()
     values = {**record, "overrides": " ".join(record.get("overrides") or ())}
     if (seconds := record.get("seconds")) is not None:
@@ -186,9 +185,10 @@ def provenance_facts(record: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _break_long_names(text: str) -> Markup:
-    """Return escaped text whose long names and paths may break after underscores and slashes.
+    """Return escaped text in which long names and paths may break after underscores and slashes.
 
-    A number and its unit stay in one line, powers are raised, and what stands in backticks is code.
+    A number and its unit are kept on one line, exponents are raised, and text in backticks becomes
+    code.
     """
 
     def add_breaks(match: re.Match[str]) -> str:
@@ -200,7 +200,7 @@ def _break_long_names(text: str) -> Markup:
 
 
 def _image_size_attributes(path: Path) -> Markup:
-    """Return width and height of a picture, so that its place is kept until it is drawn."""
+    """Return the width and height attributes of an image, which reserve its space while loading."""
     from PIL import Image
 
     with Image.open(path) as picture:
@@ -213,7 +213,7 @@ _MARKUP = re.compile(r"`([^`]*)`|\*([^*]*)\*")
 
 
 def read_glossary() -> Mapping[str, str]:
-    """Return terms, several of one meaning with commas between, and what they mean."""
+    """Read the glossary: definitions by term; synonyms are separated by commas."""
     file = resources.files("residnet.report") / "templates" / "glossary.md"
     matches = _GLOSSARY_ENTRY.finditer(file.read_text(encoding="utf-8"))
     return {_strip_markup(entry["terms"]): _strip_markup(entry["text"]) for entry in matches}
@@ -225,7 +225,7 @@ def _strip_markup(text: str) -> str:
 
 @final
 class Glossary:
-    """The words of one page: links to them, and what they mean for its end."""
+    """Glossary links of one page and the definitions for the end of the page."""
 
     def __init__(self) -> None:
         self._meanings = read_glossary()
@@ -243,12 +243,14 @@ class Glossary:
         self._linked_keys: set[str] = set()
 
     def start_section(self) -> str:
-        """Begin a section, whose words are linked anew; returns nothing to print."""
+        """Reset the linked terms at the start of a section; returns an empty string for the
+        template.
+        """
         self._linked_in_section.clear()
         return ""
 
     def link_words(self, text: Markup) -> Markup:
-        """Return escaped text with links at the first use of each word in the section."""
+        """Link the first occurrence of each glossary term in the current section."""
 
         def link_match(match: re.Match[str]) -> str:
             key = self._key_of_word[match[0].lower().replace("\u00a0", " ")]
@@ -273,5 +275,5 @@ class Glossary:
 
 
 def glossary_anchor(key: str) -> str:
-    """Return the name by which a word is linked."""
+    """Return the HTML anchor of a glossary term."""
     return "word-" + re.sub(r"[^a-z0-9]+", "-", key.lower()).strip("-")

@@ -1,4 +1,4 @@
-"""A run folder read back: configuration, metrics, rollouts and what stands beside them."""
+"""Read access to a run folder: configuration, metrics, rollouts and further results."""
 
 from __future__ import annotations
 
@@ -33,27 +33,27 @@ _SPLIT_PRIORITY = ("test", "external", "validation", "train")
 """Splits by how much they say about data that no fit has seen."""
 
 _FINDING_KEYS = ("level", "code", "text", "action")
-"""What the card of an export says of a finding of doctor.json."""
+"""Keys of a finding in doctor.json that the card of an export repeats."""
 
 
 @dataclass(frozen=True)
 class StoredWindow:
-    """A free run of one log over one window under every model.
+    """Free run of every model over one window of one log.
 
     Attributes:
         log: name of the log.
-        manoeuvre: its kind.
+        manoeuvre: kind of manoeuvre.
         protocol: name of the protocol.
-        number: of the window in its log, from 0.
+        number: index of the window within its log, from 0.
         t: [T] in s.
-        usable: [T], whether u, v and the position are scored.
-        measured: [T, 3 + n] of the columns of `columns_of(live)` in SI and rad.
-        predicted: the same by model.
-        diverged: by model.
-        inputs: values [T] by name, SI and rad; empty where the run has stored none.
-        band_lower: lower limits of the band [T, 3 + n] by model; empty where no model has one.
-        band_upper: upper limits likewise.
-        dof: velocities that the logs tell; the others are zero.
+        usable: mask [T] of the samples at which u, v and the position are scored.
+        measured: measured pose and velocities [T, 3 + n] in SI units and rad.
+        predicted: predicted pose and velocities [T, 3 + n] by model.
+        diverged: whether the free run diverged, by model.
+        inputs: inputs [T] by name in SI units and rad; empty if the run stored none.
+        band_lower: lower limits of the prediction band [T, 3 + n] by model; empty without bands.
+        band_upper: upper limits of the prediction band [T, 3 + n] by model.
+        dof: degrees of freedom of the logs; all other velocities are zero.
     """
 
     log: str
@@ -100,22 +100,22 @@ class StoredWindow:
 class RunFiles:
     """The contents of a run folder of any task, or of what `residnet evaluate` writes.
 
-    Parts that a folder does not have are empty. What belongs to a fit (`rows`, `kinds`, `find_row` and
-    so on) needs its metrics.json.
+    Parts that a folder does not have are empty. What belongs to a fit (`rows`, `kinds`, `find_row`
+    and so on) needs its metrics.json.
     """
 
     def __init__(self, path: Path) -> None:
-        """Look at a folder; files are read when they are first needed.
+        """Open a run folder; files are read on first use.
 
         Raises:
-            UsageError: where there is no such folder.
+            UsageError: if the folder does not exist.
         """
         if not path.is_dir():
             raise UsageError(f"{path}: no such folder; give the folder of a run")
         self.path = path
 
     def read_json(self, name: str) -> Any:
-        """Return what a JSON file of the folder holds, an empty object where there is none.
+        """Return the content of a JSON file of the folder; an empty object if it does not exist.
 
         Raises:
             UsageError: if the file cannot be read.
@@ -127,7 +127,7 @@ class RunFiles:
         return read_json_value(path, self.path)
 
     def read_parquet(self, name: str) -> Any:
-        """Return a parquet file of the folder as a pandas table, None where there is none."""
+        """Return a Parquet file of the folder as a data frame; None if it does not exist."""
         path = self.path / name
         if not os.path.lexists(path):
             return None
@@ -135,13 +135,14 @@ class RunFiles:
         return read_table(path)
 
     def assessment(self, judged: tuple[str, Sequence[str]] | None = None) -> Assessment:
-        """Return what the run says of its model and of its logs, for the card of an export.
+        """Return verdict, data findings and log split of the run for the card of an export.
 
         Args:
-            judged: level and sentences of the verdict on the model; None for those of the run.
+            judged: level and sentences of the verdict on the model; None for the verdict of the
+                run.
 
         Raises:
-            DataError: where a file of the run cannot be read.
+            DataError: if a file of the run cannot be read.
         """
         summary, inspection = self.read_json("summary.json"), self.read_json("doctor.json")
         level, verdict = judged or (summary.get("level") or "", summary.get("verdict") or [])
@@ -209,12 +210,12 @@ class RunFiles:
 
     @property
     def title(self) -> str:
-        """The name of the run, else that of its folder."""
+        """Name of the run, or of its folder if the run has no name."""
         return str(self.resolved_config.get("name") or self.path.name)
 
     @property
     def description(self) -> str:
-        """What the run was made for."""
+        """Description of the run."""
         return str(self.resolved_config.get("description") or "")
 
     @cached_property
@@ -238,7 +239,7 @@ class RunFiles:
 
     @cached_property
     def predictor(self) -> str | None:
-        """The model that is reported first; the selected one where no other is named."""
+        """Model that is reported first; the selected model by default."""
         return self.metrics.get("predictor") or self.selected
 
     @cached_property
@@ -274,12 +275,12 @@ class RunFiles:
 
     @cached_property
     def report_split(self) -> str:
-        """The split that the report speaks of: test where there is one."""
+        """Split that the report evaluates; `test` if it exists."""
         return next((split for split in _SPLIT_PRIORITY if split in self.splits), self.splits[0])
 
     @cached_property
     def report_splits(self) -> list[str]:
-        """The splits that stand side by side: train, where there is one, and the focus."""
+        """Splits that the report compares: the training split, if any, and the report split."""
         return [
             split for split in ("train",) if split in self.splits and split != self.report_split
         ] + [self.report_split]
@@ -326,14 +327,14 @@ class RunFiles:
 
     @cached_property
     def dof(self) -> DegreesOfFreedom:
-        """The velocities that the logs tell; models leave the others at zero."""
+        """Degrees of freedom of the logs; models hold all other velocities at zero."""
         return DegreesOfFreedom(
             tuple(name for name in SIX_DOF_LAYOUT.velocities if name in self.channels)
         )
 
     @property
     def position_label(self) -> str:
-        """What an error of the position is called: without a heading it is that of a distance."""
+        """Name of the position error; `distance` for vessels without a measured heading."""
         return "position" if self.dof.has_heading else "distance run"
 
     @cached_property
@@ -354,7 +355,7 @@ class RunFiles:
     def find_row(
         self, model: str | None, split: str, protocol: str, manoeuvre: str = "all"
     ) -> JsonObject | None:
-        """Return a row of metrics.json, None where there is none."""
+        """Return a row of metrics.json; None if it does not exist."""
         key = (model, split, protocol, manoeuvre)
         return next(
             (
@@ -383,9 +384,9 @@ class RunFiles:
         return f"{model} (selected)" if model == self.selected else model
 
     def display_unit(self, channel: str) -> tuple[str, float]:
-        """Return the unit in which a channel is shown and the factor to it from SI.
+        """Return the display unit of a channel and the factor from SI.
 
-        It is that of the log's channel map, and degrees where that has radians.
+        This is the unit in the channel map of the log, with degrees instead of radians.
         """
         reader = (self.resolved_config.get("data") or {}).get("reader") or {}
         channel_map = (reader.get("channels") or {}).get(channel) or {}
@@ -475,7 +476,7 @@ def read_windows(
 def _band_limits(
     tables_by_model: Mapping[str, Any], columns: Sequence[str], suffix: str
 ) -> dict[str, np.ndarray]:
-    """Return one limit of the bands [T, 3 + n] of those models of a stored window that have any."""
+    """Return the lower or upper band limits [T, 3 + n] of a stored window by model."""
     names = [f"{name}_{suffix}" for name in columns]
     return {
         model: model_table[names].to_numpy(float)

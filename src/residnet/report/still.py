@@ -15,7 +15,9 @@ from residnet.report.figure import TEXT_COLOR, Case, Figure, GlyphStyle, split_a
 DPI = 140
 """Dots per inch: pictures are 980 dots wide, nearly as wide as the page."""
 FIGURE_WIDTH = 7.0
-"""Width of every picture in inches: the text block of an A4 page, so that 9 pt stay 9 pt."""
+"""Width of every image in inches: the text width of an A4 page, so that 9 pt text prints at 9
+pt.
+"""
 _MAP_HEIGHT = 4.2
 """Height of a line of maps in inches."""
 _DASHES: dict[str, Any] = {
@@ -55,11 +57,11 @@ RC_PARAMS: Any = {
 def render_matplotlib(
     figure: Figure, case: Case | None = None, panel_numbers: Sequence[int] = ()
 ) -> Any:
-    """Return a matplotlib figure of a case: maps beside each other, other panels below.
+    """Return a matplotlib figure of a case: maps in one row, other panels below.
 
     Args:
-        case: one of the figure's, its first where None.
-        panel_numbers: numbers of the panels that are drawn, all where empty.
+        case: a case of the figure; the first one if None.
+        panel_numbers: numbers of the panels to draw; all if empty.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -163,13 +165,14 @@ def _draw_panel(
             axes.annotate(
                 text, (x_position, 1.0 if is_at_top else y_position), (0 if is_at_top else 3, 2),
                 fontsize=7.5, color="0.25",
-                xycoords=("data", "axes fraction") if is_at_top else "data", textcoords="offset points",
+                xycoords=("data", "axes fraction") if is_at_top else "data", textcoords="offset"
+                                                                                        " points",
                 ha="center" if is_at_top else "left",
             )  # fmt: skip
 
 
 def _draw_curve(axes: Any, style: GlyphStyle, x: np.ndarray, y: np.ndarray) -> Any:
-    """Draw what bears one name, and return what stands for it in the legend."""
+    """Draw one named curve and return its legend handle."""
     color = "black" if style.color == TEXT_COLOR else style.color
     line = {"color": color, "alpha": style.alpha, "zorder": style.z_order}
     stroke = {**line, "linestyle": _DASHES[style.dash], "linewidth": style.width}
@@ -206,7 +209,7 @@ def _draw_curve(axes: Any, style: GlyphStyle, x: np.ndarray, y: np.ndarray) -> A
 
 
 def _legend_above(canvas: Any, handles: dict[str, Any]) -> None:
-    """Put one legend above the panels, in as many columns as the width holds."""
+    """Place one legend above the panels with as many columns as fit."""
     # in points: the sample and its spaces, then the text at 9 pt
     widths = [46.0 + 4.9 * len(text) for text in handles]
     columns = max(len(widths), 1)

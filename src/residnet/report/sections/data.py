@@ -1,4 +1,4 @@
-"""The data: what was fitted on what, what each log holds, and what would mislead a fit."""
+"""Section on the data: split, contents of each log and findings of the data checks."""
 
 from __future__ import annotations
 
@@ -116,7 +116,8 @@ def _data_text(run: RunFiles) -> str:
     noise = data.get("noise") or {}
     if noise:
         text += (
-            f", noise u {format_number(noise.get('u'), 2)} m/s, v {format_number(noise.get('v'), 2)} m/s, r"
+            f", noise u {format_number(noise.get('u'), 2)} m/s, v"
+            f" {format_number(noise.get('v'), 2)} m/s, r"
             f" {format_number(DEGREES_PER_RADIAN * noise.get('r', 0), 2)} deg/s"
         )
     return text + f"; data seed {data.get('seed')}"
@@ -163,7 +164,7 @@ def _protocol_text(protocol: JsonObject) -> str:
 
 
 def quality_tables(run: RunFiles) -> tuple[Table, Table]:
-    """Return what the logs hold: by split and kind of manoeuvre, and log by log."""
+    """Return the contents of the logs by split and kind of manoeuvre, and for each log."""
     groups: dict[tuple[str, str], list[JsonObject]] = {}
     for entry in run.quality:
         groups.setdefault((entry["split"], entry.get("manoeuvre") or DASH), []).append(entry)

@@ -62,7 +62,8 @@ def errors_section(run: RunFiles) -> Section:
         small_print = f"the change against the baseline on the same data, and {small_print}"
     introduction = (
         "The tables give the root mean square error of each free run, averaged over the runs."
-        f" {splits_text} Small print gives {small_print}. A run that diverged counts with the error of held"
+        f" {splits_text} Small print gives {small_print}. A run that diverged counts with the"
+        f" error of held"
         " velocities, and its number stands beside the score."
     )
     blocks: list[Block] = [Text(introduction)]
@@ -155,7 +156,7 @@ def errors_table(run: RunFiles, split: str) -> Table:
 
 
 def errors_by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | None:
-    """Return the errors of one split by kind of manoeuvre, None where there is a single kind."""
+    """Return the errors of one split by kind of manoeuvre; None if there is only one kind."""
     manoeuvre_kinds = distinct_manoeuvres(run, split, protocol)
     if len(manoeuvre_kinds) < 2:
         return None
@@ -279,7 +280,10 @@ def _error_breakdown_table(
             )
     for band in protocol_limits.get("bands") or []:
         if model_band := band["models"].get(main_model):
-            label = f"{band['by']} {format_number(band['low'], 2)} to {format_number(band['high'], 2)} m/s"
+            label = (
+                f"{band['by']} {format_number(band['low'], 2)} to"
+                f" {format_number(band['high'], 2)} m/s"
+            )
             row_fields = {"by": band["by"], "label": label, "windows": band["windows"]}
             difference = model_band["difference"] or {}
             breakdown_rows.append(
@@ -367,7 +371,8 @@ def _repeatability_text(run: RunFiles, repeatability: JsonObject) -> str:
 
     def format_velocities(values: Mapping[str, float], *digits: int) -> str:
         return ", ".join(
-            f"{name} {format_number(run.display_unit(name)[1] * values[name], *digits)} {run.display_unit(name)[0]}"
+            f"{name} {format_number(run.display_unit(name)[1] * values[name], *digits)}"
+            f" {run.display_unit(name)[0]}"
             for name in tolerance["start"]
         )
 
@@ -381,7 +386,8 @@ def _repeatability_text(run: RunFiles, repeatability: JsonObject) -> str:
     )
     if not repeatability["pairs"]:
         return (
-            f"Repeatability: {logs_text} hold no two stretches as long as a window with {criterion}. How"
+            f"Repeatability: {logs_text} hold no two stretches as long as a window with"
+            f" {criterion}. How"
             " well the vessel repeats itself is not known."
         )
     single_run_factor = 1 / math.sqrt(2)
@@ -404,11 +410,14 @@ def _repeatability_text(run: RunFiles, repeatability: JsonObject) -> str:
     exogenous = (run.resolved_config.get("signals") or {}).get("exogenous")
     wind_text = " A model that knows the wind, as these do, can do better." if exogenous else ""
     return (
-        f"Repeatability: {format_count(repeatability['pairs'], 'pair')} of stretches ({pairs_text}) in"
-        f" {repeatability['logs']} of {logs_text} have {criterion}. Their measured motions differ by"
+        f"Repeatability: {format_count(repeatability['pairs'], 'pair')} of stretches"
+        f" ({pairs_text}) in"
+        f" {repeatability['logs']} of {logs_text} have {criterion}. Their measured motions differ"
+        f" by"
         f" {format_velocities(repeatability)} (root"
         f" mean square), and by {pose_error_text} at the end. Each motion is off their mean by"
-        f" 1/√2 of that: an NRMSE of {format_number(single_run_factor * repeatability['nrmse'])}{position_text}."
+        f" 1/√2 of that: an NRMSE of"
+        f" {format_number(single_run_factor * repeatability['nrmse'])}{position_text}."
         " The remaining differences of commands and"
         " starts are part of it. A model that knows only commands and initial velocities is left"
         f" with an error of this order in such runs, whatever its form.{wind_text}"
@@ -416,7 +425,9 @@ def _repeatability_text(run: RunFiles, repeatability: JsonObject) -> str:
 
 
 def bands_section(run: RunFiles) -> Section | None:
-    """Return how wide bands are, what they held and what they do not promise; None without any."""
+    """Return width and coverage of the prediction bands with their limitations; None without
+    bands.
+    """
     models: JsonObject = run.read_json("bands.json").get("models") or {}
     if not models:
         return None
@@ -427,7 +438,8 @@ def bands_section(run: RunFiles) -> Section | None:
         " grows with the horizon, and is wider where the predicted run is livelier or the models"
         " disagree. It was calibrated over logs that its model was not fitted on: training logs,"
         " predicted by models that leave them out, and validation logs that no fit has seen.",
-        f"The tables say what the bands held of the {run.report_split} data. Whole: share of the runs that"
+        f"The tables say what the bands held of the {run.report_split} data. Whole: share of the"
+        f" runs that"
         f" a band holds from beginning to end, each channel for itself, where it is widened to hold"
         f" {level} of them. Score: mean width, and {2 / (1 - band['level']):.0f} times what lies"
         " outside, in units of the error of zero; less is better. Beside it stands a band of one"
@@ -467,7 +479,7 @@ def bands_section(run: RunFiles) -> Section | None:
 
 
 def band_cautions(run: RunFiles, model: str) -> list[str]:
-    """Return whole sentences about what the bands of a model do not promise."""
+    """Return sentences on the limitations of the prediction bands of a model."""
     bands_by_protocol: JsonObject = (run.read_json("bands.json").get("models") or {}).get(
         model
     ) or {}
@@ -479,7 +491,8 @@ def band_cautions(run: RunFiles, model: str) -> list[str]:
         max_duration = max(lengths, default=0.0)
         if max_duration > band["horizon"] + 1e-6:
             sentences.append(
-                f"Runs of protocol {protocol} last up to {format_fixed(max_duration, 0)} s, and the band is"
+                f"Runs of protocol {protocol} last up to {format_fixed(max_duration, 0)} s, and"
+                f" the band is"
                 f" calibrated up to {format_fixed(band['horizon'], 0)} s only; beyond, it grows in"
                 " proportion to time, without any promise."
             )

@@ -56,9 +56,9 @@ from residnet.report.run_reader import JsonObject, RunFiles
 _MAX_SEPARATE_FLIGHTS = 12
 """Most flights that have a table and a picture each; of more, the first of each kind has."""
 _MAX_CASES, _MAX_PANELS, _MAX_ZIGZAGS = 30, 12, 6
-"""Flights and panels of the figure that is looked into, and zigzags of a picture.
+"""Maximum number of manoeuvres and panels in the interactive figure and of zigzags in an image.
 
-Chosen by hand: the page stays a few megabytes, and a picture a page.
+They limit the page to a few megabytes and an image to one page.
 """
 _INDEX_TITLES = {
     "time_90": "time to 90 deg",
@@ -82,7 +82,7 @@ _MAIN_INDICES = (
     "loop_height",
     "largest_cross_track_error",
 )
-"""The index of each kind of manoeuvre that stands on the first screen."""
+"""Index of each kind of manoeuvre shown on the first screen."""
 _CHANNEL_TITLES = {
     "u": "surge velocity\nu", "v": "sway velocity\nv", "r": "yaw rate\nr", "p": "roll rate\np",
     "psi": "heading\n", "phi": "roll angle\n", "w": "heave velocity\nw", "q": "pitch rate\nq",
@@ -99,7 +99,7 @@ def index_title(name: str) -> str:
 
 
 def sections(run: RunFiles) -> list[Section]:
-    """Return the manoeuvring indices and the figures that stand in the folder."""
+    """Return the sections with manoeuvring indices and the figures in the folder."""
     content = run.read_json("indices.json")
     figures = read_figures(run.path / "figures", "manoeuvres")
     sections_written = []
@@ -171,7 +171,7 @@ def indices_text(content: JsonObject) -> str:
 
 
 def _scalar_indices(row: JsonObject) -> dict[str, JsonObject]:
-    """Return the indices of a flight that are one number, with lengths and limits beside them."""
+    """Return the scalar indices of a manoeuvre with non-dimensional lengths and limits."""
     indices: JsonObject = row["indices"]
     return {
         name: {
@@ -187,17 +187,17 @@ def _scalar_indices(row: JsonObject) -> dict[str, JsonObject]:
 def _format_index(
     content: JsonObject, name: str, entry: JsonObject, key: str = "value"
 ) -> tuple[str, str]:
-    """Return a number of an index and its unit, as they are shown."""
+    """Return the displayed value and unit of an index."""
     unit, factor = display_unit(str(content["units"].get(name, "-")))
     value = entry.get(key)
     return format_number(None if value is None else factor * value, 4), unit
 
 
 def index_tables(content: JsonObject) -> list[tuple[str, Table]]:
-    """Return titles and tables of the manoeuvring indices of indices.json.
+    """Return titles and tables of the manoeuvring indices in indices.json.
 
-    Few flights have a table each, with a row for each index; more stand in one table for each kind
-    of manoeuvre, with a row for each flight.
+    With few manoeuvres each has a table with one row per index. With many manoeuvres there is one
+    table per kind with one row per manoeuvre.
     """
     groups: dict[str, list[JsonObject]] = {}
     is_separate = len({row["log"] for row in content["rows"]}) <= _MAX_SEPARATE_FLIGHTS
@@ -216,13 +216,12 @@ def index_tables(content: JsonObject) -> list[tuple[str, Table]]:
 
 
 def _table_by_index(content: JsonObject, crafts: Mapping[str, Mapping[str, JsonObject]]) -> Table:
-    """Return a row for each index of one manoeuvre; of two crafts the second is compared to the
-    first.
+    """Return one row per index of a manoeuvre, with the second craft compared to the first.
 
     Args:
-        content: whose `units` are those of the indices.
-        crafts: of what flew it `value` by index, and what there is of `lengths`, `interval` over
-            draws, `scale_text` at full scale, `limit_cell`, `is_met` and `kept_share` of the draws.
+        content: content of indices.json; its `units` hold the units of the indices.
+        crafts: for each craft `value` by index and optionally `lengths`, `interval` over draws,
+            `scale_text` at full scale, `limit_cell`, `is_met` and `kept_share` of the draws.
     """
     entries = [entry for craft_indices in crafts.values() for entry in craft_indices.values()]
 
@@ -306,13 +305,13 @@ def _table_by_trial(content: JsonObject, rows: Sequence[JsonObject]) -> Table:
 
 
 def trial_figures(trials_by_craft: Mapping[str, Sequence[ManoeuvreRun]]) -> Iterator[Figure]:
-    """Draw track, motion and commands of flights and, of spirals, yaw rate over helm.
+    """Draw track, motion and commands of manoeuvres, and yaw rate against helm for spirals.
 
-    Of many flights, only the first of each kind of manoeuvre has a still picture.
+    With many manoeuvres only the first of each kind has a static image.
 
     Args:
-        trials_by_craft: flights of the same manoeuvres by what flew them; of two, the first is the solid line
-            and the second the dashed one.
+        trials_by_craft: trials of the same manoeuvres by craft; the first craft is drawn solid, the
+            second dashed.
     """
     groups: list[Sequence[ManoeuvreRun]] = list(zip(*trials_by_craft.values(), strict=True))
     first_of_kind: dict[str, Sequence[ManoeuvreRun]] = {}

@@ -1,4 +1,4 @@
-"""What was identified and learned: coefficients, heads, equations, learning, goodness of fit."""
+"""Section on the models: coefficients, heads, equations, training and goodness of fit."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _MIN_WHITE_NOISE_P = 0.05
 
 
 def models_section(run: RunFiles) -> Section | None:
-    """Return the section on what was identified and learned."""
+    """Return the section on identified and learned models."""
     candidate_sections = [_baseline_section(run), _head_section(run)]
     candidate_sections += [
         _equation_section(model, run.fit_notes(model))
@@ -52,7 +52,7 @@ def models_section(run: RunFiles) -> Section | None:
 
 
 def _baseline_section(run: RunFiles) -> Section | None:
-    """Return the tables of coefficients, the first baseline's open; None where there are none."""
+    """Return the coefficient tables, with the first baseline expanded; None if there are none."""
     blocks: list[Block] = [
         Text(
             "u′, v′, r′ are the accelerations du/dt, dv/dt, dr/dt. Each is the sum of its terms. A"
@@ -122,9 +122,10 @@ def _coefficient_table(notes: JsonObject) -> Table:
 
 
 def term_unit(axis: str, term: str) -> str:
-    """Return the unit of a coefficient: that of the acceleration over that of its term.
+    """Return the unit of a coefficient: the unit of the acceleration divided by the unit of its
+    term.
 
-    It is empty where the unit of a factor is not known.
+    Empty if the unit of a factor is unknown.
     """
     units = CHANNEL_UNITS | _EXTRA_UNITS
     try:
@@ -160,9 +161,9 @@ def term_unit(axis: str, term: str) -> str:
 
 
 def _head_section(run: RunFiles) -> Section | None:
-    """Return what was learned: kind, complexity, parameters, time, and the error that selects.
+    """Return the table of learned heads: kind, complexity, parameters, time and selection error.
 
-    None where the folder holds no notes on any fit.
+    None if the folder holds no notes on any fit.
     """
     if not any(run.fit_notes(model) for model in run.heads):
         return None
@@ -226,7 +227,7 @@ _COMPLEXITY_FORMATS = {
     "hidden": "layers of {}",
     "hidden_size": "{} hidden units",
 }
-"""What notes and cards of heads hold, and how it is told."""
+"""Keys of head notes and cards with their display format."""
 
 
 def _complexity_text(run: RunFiles, model: str) -> str:
@@ -243,7 +244,7 @@ def _complexity_text(run: RunFiles, model: str) -> str:
 
 
 def _equation_section(model: str, notes: JsonObject) -> Section:
-    """Return the equations of a model, how sure they are, and what the data cannot tell."""
+    """Return the equations of a model with their uncertainty and non-identifiable terms."""
     delay = notes.get("delay")
     introduction = "SI units. The head adds these accelerations to its baseline." + (
         f" Delayed inputs act {delay['seconds']:g} s after they are given." if delay else ""
@@ -263,7 +264,7 @@ def _equation_section(model: str, notes: JsonObject) -> Section:
 
 
 def equation_remarks(notes: JsonObject) -> list[str]:
-    """Return sentences on what the data do not determine."""
+    """Return sentences on non-identifiable combinations of terms."""
     sentences = []
     equal_terms: dict[str, JsonObject] = {}
     for name, equation in notes["equations"].items():
@@ -483,9 +484,9 @@ def learning_figure(run: RunFiles) -> Figure | None:
 
 
 def goodness_section(run: RunFiles) -> Section | None:
-    """Return the section on goodness of fit, None where the run has no goodness.json.
+    """Return the section on goodness of fit; None if the run has no goodness.json.
 
-    It speaks of the split that the report is on; another one stands in where that has no samples.
+    It uses the split of the report, or another split if that has no samples.
     """
     splits = run.read_json("goodness.json").get("splits") or {}
     split = next((name for name in (run.report_split, *splits) if splits.get(name)), "")
@@ -590,7 +591,9 @@ def _goodness_tables(rows: list[JsonObject], factor: float) -> list[Table]:
 
 
 def _goodness_sentences(rows: list[JsonObject]) -> list[str]:
-    """Return by how much intervals of independent samples are too narrow, and what is white."""
+    """Return the correction of confidence intervals for autocorrelation and the whiteness of
+    residuals.
+    """
     interval_widths = [
         [np.ptp(row[key] or [0.0]) for key in ("mae_ci95", "mae_ci95_independent")] for row in rows
     ]

@@ -39,9 +39,9 @@ from residnet.report.run_reader import RunFiles, StoredWindow
 DisplayUnits: TypeAlias = Mapping[str, tuple[str, str, float]]
 """By channel its SI unit, the unit in which it is shown, and the factor to that."""
 _MAX_CASES, _MAX_STATIC_IMAGES, _MAX_TIME_BINS = 12, 6, 60
-"""Windows to look into, pictures among them, and points of a curve of growing errors.
+"""Maximum number of windows in the interactive figure and in images, and points of an error curve.
 
-Chosen by hand: the page stays a few megabytes, and the curve smooth.
+They limit the page to a few megabytes and keep the curve smooth.
 """
 _TRACK_PANEL = Panel("north [m]", "east [m]", kind="map", height=380)
 _MOTION_TITLES = {
@@ -112,9 +112,9 @@ def short_label(run: RunFiles, model: str) -> str:
 
 
 def free_run_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
-    """Draw track, motion and inputs of the runs with the median, largest and least errors.
+    """Draw track, motion and inputs of the free runs with median, largest and smallest error.
 
-    There are runs of each kind of manoeuvre; those of median error have a still picture.
+    Each kind of manoeuvre is included; the runs with median error have a static image.
     """
     ranked_windows = _select_windows(run, windows)
     if not ranked_windows:
@@ -165,7 +165,8 @@ def free_run_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | 
     return Figure(
         "free_runs",
         "Free runs",
-        f"Each run starts from a measured state and is given the inputs alone ({run.report_split} data)."
+        f"Each run starts from a measured state and is given the inputs alone ({run.report_split}"
+        f" data)."
         + (
             " North is up, and each track begins at its start."
             " Look for a track that turns tighter, wider or later than the measured one, for lag at"
@@ -184,9 +185,10 @@ def free_run_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | 
 
 
 def track_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
-    """Draw the track of the run of median error under the main protocol, for the first screen.
+    """Draw the track of the free run with median error under the main protocol, for the first
+    screen.
 
-    Of a vessel without a track its motion stands in its place.
+    The motion replaces the track for a vessel without a track.
     """
     ranked_windows = _rank_by_error(
         run, [candidate for candidate in windows if candidate.protocol == run.main_protocol]
@@ -391,7 +393,8 @@ def horizon_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | N
     return Figure(
         "horizon",
         "Error against horizon",
-        f"Root mean square over the free runs of the {run.report_split} data, on a logarithmic scale. A"
+        f"Root mean square over the free runs of the {run.report_split} data, on a logarithmic"
+        f" scale. A"
         " model whose curve stays level predicts as well late as early; one whose curve climbs"
         " drifts. The level that no model undercuts is the measurement noise.",
         {name: replace(style, is_visible=True) for name, style in model_styles(run).items()},
@@ -476,7 +479,7 @@ def residual_figure(run: RunFiles) -> Figure | None:
 
 
 def band_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
-    """Draw the half width of the leading model's bands beside the errors that they are to hold."""
+    """Draw the half width of the prediction bands of the main model against the errors."""
     model = run.main_model
     bands_by_protocol = (run.read_json("bands.json").get("models") or {}).get(model) or {}
     cases, coverage_level = [], 0.0
@@ -519,8 +522,10 @@ def band_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None
     return Figure(
         "bands",
         "Band against horizon",
-        f"Half widths of the bands of {model} in the {run.report_split} data, mean over the runs, and the"
-        f" errors that {100 * coverage_level:.0f} % of these runs do not exceed. A curve of errors well"
+        f"Half widths of the bands of {model} in the {run.report_split} data, mean over the runs,"
+        f" and the"
+        f" errors that {100 * coverage_level:.0f} % of these runs do not exceed. A curve of"
+        f" errors well"
         " above the band means that these logs are unlike those that calibrated it; one well"
         " below, that they are easier.",
         {

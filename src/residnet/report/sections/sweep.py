@@ -175,7 +175,7 @@ def _wrap_key(key: str) -> str:
 
 
 def sections(run: RunFiles) -> list[Section]:
-    """Return the best trials, the figures that stand in the folder, and all trials."""
+    """Return the sections with the best trials, the figures in the folder and all trials."""
     content, figures = run.read_json("sweep.json"), []
     if content["best"] is not None:
         figures = [parallel_coordinates(content), _progress_figure(content)]
@@ -234,5 +234,5 @@ def _build_trials_table(content: JsonObject, rows: Sequence[JsonObject]) -> Tabl
 
 
 def objective_text(content: JsonObject) -> str:
-    """Return what is sought, without the sign of a number that has no unit."""
+    """Return the name and unit of the objective; dimensionless objectives have no unit sign."""
     return str(content["objective"]).removesuffix(" [-]")

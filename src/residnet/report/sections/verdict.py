@@ -32,13 +32,14 @@ def verdict_sentences(run: RunFiles) -> list[str]:
     main_model = run.main_model
     if run.find_row(main_model, run.report_split, run.protocols[0]) is None:
         return [
-            f"The run holds no free runs of its selected model on {run.report_split} data; see the tables."
+            f"The run holds no free runs of its selected model on {run.report_split} data; see"
+            f" the tables."
         ]
     return judged(collect_evidence(run, main_model))
 
 
 _MEASUREMENT_ROW = "measurements"
-"""Row of what the measured velocities leave, integrated."""
+"""Row of the position error that remains when the measured velocities are integrated."""
 _NO_POSE_TEXT = (
     "The logs hold no {}: judge the model by its velocities, for errors of position and heading are"
     " those of integrated velocities."
@@ -46,7 +47,7 @@ _NO_POSE_TEXT = (
 
 
 def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
-    """Return what the folder holds that a verdict on its selected model is passed on."""
+    """Read the evidence for the verdict on the selected model from the run folder."""
     protocol, split = run.protocols[0], run.report_split
     rows = {
         model: row for model in run.model_kinds if (row := run.find_row(model, split, protocol))
@@ -96,10 +97,10 @@ def verdict_level(run: RunFiles) -> str:
 
 
 def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
-    """Return the rest of the first screen: a run of median error beside the models' errors.
+    """Return the first screen below the verdict: the median free run and the errors of the models.
 
-    The rows: what predicts, what was selected, the baseline, zero, what the measurements themselves
-    leave, then the others, the nearest first. None where there is no free run.
+    Row order: predictor, selected model, baseline, constant velocity, noise floor of the
+    measurements, then the other models by increasing error. None if there is no free run.
     """
     rows = {
         model_name: row
@@ -152,7 +153,8 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
 
     is_other_protocol = run.main_protocol != run.protocols[0]
     notes = [
-        f"Mean of {format_count(rows[run.main_model]['windows'], 'free run')} on {run.report_split} data"
+        f"Mean of {format_count(rows[run.main_model]['windows'], 'free run')} on"
+        f" {run.report_split} data"
         f" ({run.main_protocol}"
         + f", which start elsewhere than those of {run.protocols[0]} above" * is_other_protocol
         + ")"
@@ -201,7 +203,7 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
 
 
 def cautions_section(run: RunFiles, findings: Sequence[SanityFinding]) -> Section | None:
-    """Return what speaks against using the model reported first, None where nothing does."""
+    """Return the objections to using the main model; None if there are none."""
     sentences = []
     main_model = run.predictor
     for protocol in run.protocols:
@@ -221,16 +223,21 @@ def cautions_section(run: RunFiles, findings: Sequence[SanityFinding]) -> Sectio
         ]
         if worse_channels:
             sentences.append(
-                f"Protocol {protocol}: {main_model} is worse than the baseline in {', '.join(worse_channels)}."
+                f"Protocol {protocol}: {main_model} is worse than the baseline in"
+                f" {', '.join(worse_channels)}."
             )
         if (
             training_row is not None
             and training_row is not row
             and row["nrmse"]["mean"] > 1.5 * training_row["nrmse"]["mean"]
         ):
-            ratio_text = f"{row['nrmse']['mean'] / training_row['nrmse']['mean']:.1f} times its training error"
+            ratio_text = (
+                f"{row['nrmse']['mean'] / training_row['nrmse']['mean']:.1f} times its"
+                f" training error"
+            )
             sentences.append(
-                f"Protocol {protocol}: the {run.report_split} error of {main_model} is {ratio_text}; it may be"
+                f"Protocol {protocol}: the {run.report_split} error of {main_model} is"
+                f" {ratio_text}; it may be"
                 f" overfitted, or the {run.report_split} data differ."
             )
     sentences += [
