@@ -28,14 +28,14 @@ EXPORT_FORMATS = PluginUnion(
     },
     key="name",
 )
-"""All formats, those of other packages included."""
+"""All registered formats, including formats of other packages."""
 
 
 def get_exporter(name: str) -> Exporter:
-    """Return the format of that name.
+    """Return the export format with the given name.
 
     Raises:
-        ConfigError: where there is none, or the package that offers it is broken.
+        ConfigError: if no format has this name or its package cannot be imported.
     """
     if name not in (format_names := EXPORT_FORMATS.kind_names()):
         raise ConfigError(f"no export format '{name}'{suggest_name(name, format_names)}")

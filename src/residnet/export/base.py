@@ -1,24 +1,24 @@
-"""What every export format shares: what is exported, how it is written, how it is checked.
+"""Interfaces shared by all export formats: exported step, card, writer and parity check.
 
-A vessel, a heading policy, a policy along a course and a feed-forward are one kind of thing here:
-a step of fixed arguments, called once per `dt`, with the memory passed in and out. Whatever the
-format, a bad input gives a flag and a finite output, and the next good sample recovers.
+A vessel model, a heading policy, a course policy and a feed-forward are all exported as a step with
+fixed arguments that is called once per `dt` and receives and returns the memory. In every format a
+bad input yields a flag and a finite output, and the next good sample recovers.
 
-A stepped vessel keeps this contract, with batches of rows B in all tensors:
+The methods of an exported vessel model, with batch size B in all tensors:
 
-- `initial_state(batch) -> s`: the memory [B, n_state] without a past, zeros.
-- `warmup(y_history, w_history) -> s`: the memory that a measured past leaves, states [B, T, nx] and
-  inputs [B, T, m], oldest first. A sample that is no measurement is left out.
-- `step(x, w, s) -> (x, s, outside)`: state [B, nx], memory and flag [B] one step of `dt` later.
-- `rollout(x0, w, s) -> (x, s, outside)`: states [B, T+1, nx] from x0 on under inputs w [B, T, m],
-  the memory after the last step, and the flag of each step [B, T].
-- `band(k) -> half widths` of u, v, r, heading and position, then of p and phi where the vessel
-  rolls, k steps after a measured state, where a format has methods; the table that it reads stands
-  in every card as `band`.
+- `initial_state(batch) -> s`: memory [B, n_state] without a measured past (zeros).
+- `warmup(y_history, w_history) -> s`: memory after a measured past with states [B, T, nx] and
+  inputs [B, T, m], oldest first. Invalid samples are skipped.
+- `step(x, w, s) -> (x, s, outside)`: state [B, nx], memory and flag [B] after one step `dt`.
+- `rollout(x0, w, s) -> (x, s, outside)`: states [B, T+1, nx] from x0 under inputs w [B, T, m],
+  memory after the last step, and flag of each step [B, T].
+- `band(k) -> half widths` of the prediction bands of u, v, r, heading and position (and p, phi for
+  a vessel with roll) k steps after a measured state. Formats without methods have the table in the
+  card as `band`.
 
-A controller has `initial_state(y) -> s` at the first measurement y, and `step`, which gives the
-command, the memory and the flag `fault`. A format without methods starts it with a memory that is
-no number: its first answer is the safe command, with the flag.
+A controller has `initial_state(y) -> s` for the first measurement y, and `step`, which returns the
+command, the memory and the flag `fault`. In a format without methods the memory is initialised with
+NaN: the first step then returns the safe command and the flag.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ Attempt = TypeVar("Attempt")
 
 
 class RoundingError(ExportError):
-    """A file that rounds otherwise than what it was made of, and ends elsewhere for that alone."""
+    """The exported file differs from the model only by rounding, which is amplified along the
+    run.
+    """
 
 
 class LoadedExport(ABC):
@@ -85,20 +87,20 @@ class LoadedExport(ABC):
 
 
 class Exportable(ABC):
-    """What is exported: a step, what its card says, and how a file of it is checked.
+    """An exportable step with its card and the parity check of an exported file.
 
     Attributes:
-        name: of the model or policy.
-        label: it is, with its name, for messages.
-        dt: step in s; None where there is none.
-        arguments: names and sizes of what a step takes; the memory stands last where there is any.
-        results: names of what a step gives.
-        flags: those of them that are truth values; they stand last.
-        precisions: that are tried, one after the other.
-        methods: of `build_module`, beside `forward`.
-        objections: sentences on what speaks against its use, for the card; see `require_releasable`.
-        assessment: what its run says of it and of its logs, for the card; None where it is exported
-            without a run folder.
+        name: name of the model or policy.
+        label: kind and name, for messages.
+        dt: time step in s; None for a static map.
+        arguments: names and sizes of the arguments of a step; the memory, if any, is last.
+        results: names of the results of a step.
+        flags: names of the Boolean results, which are last.
+        precisions: precisions to try, in this order.
+        methods: methods of the module of `build_module` in addition to `forward`.
+        objections: reasons against its use, written into the card; see `require_releasable`.
+        assessment: verdict, data findings and log split of its run for the card; None if it is
+            exported without a run folder.
     """
 
     name: str
@@ -139,7 +141,7 @@ class Exportable(ABC):
 
     @abstractmethod
     def card_contents(self) -> dict[str, Any]:
-        """Return what the card says of this kind of thing."""
+        """Return the card entries of this kind of exportable."""
 
     @final
     def build_card(self) -> dict[str, Any]:
@@ -148,7 +150,7 @@ class Exportable(ABC):
 
     @final
     def provenance(self) -> dict[str, Any]:
-        """Return what the card of every format says: build, objections and assessment."""
+        """Return the card entries common to all formats: build, objections and assessment."""
         assessment = Assessment() if self.assessment is None else self.assessment
         return {
             "build": self.build(),
@@ -187,14 +189,14 @@ class Exportable(ABC):
     def check_parity(
         self, loaded: LoadedExport, subject: str, dtype: torch.dtype, tolerance: float | None = None
     ) -> dict[str, Any]:
-        """Return what the card says of the parity, once a file answers as it must.
+        """Check the parity of an exported file and return the card entries on parity.
 
         Args:
-            tolerance: largest difference; None for what the precision allows.
+            tolerance: largest allowed difference; None for the default of the precision.
 
         Raises:
-            RoundingError: where the precision does not determine the answers.
-            ExportError: where the file is wrong otherwise, or what was exported is.
+            RoundingError: if the results depend on rounding in this precision.
+            ExportError: if the file or the exported model is wrong for another reason.
         """
 
 
@@ -219,16 +221,15 @@ class Exporter(ABC):
 
     @abstractmethod
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
-        """Write a model or a policy, after a parity check, and return what its card says.
+        """Write a model or a policy after a parity check and return its card.
 
         Args:
-            exported: for example `residnet.export.vessel.ExportedVessel`, with the attributes
-                `spec`, `model` and `metrics`.
-            file: where to write; its folder may not exist yet.
+            exported: for example a `residnet.export.vessel.ExportedVessel`.
+            file: path of the file; its folder is created if necessary.
 
         Raises:
-            UsageError: where the format cannot hold such a thing.
-            ExportError: where what was written does not reproduce it.
+            UsageError: if the format does not support this kind of exportable.
+            ExportError: if the written file does not reproduce the exportable.
         """
 
 
@@ -238,15 +239,15 @@ Made = TypeVar("Made", bound=Exportable)
 def require_releasable(
     exported: Made, objections: Sequence[str], *, allows_objections: bool
 ) -> Made:
-    """Return what may be exported, with all that speaks against it in its card.
+    """Return the exportable with all objections in its card, if it may be released.
 
     Args:
-        objections: sentences without a full stop on why one should do without it: it is worse than
-            `zero`, than the believed model or than the law that it stands beside.
-        allows_objections: whether it is wanted all the same.
+        objections: reasons against its use, without full stops: it is worse than constant velocity,
+            than the believed model or than the classical law.
+        allows_objections: export despite objections.
 
     Raises:
-        WithheldError: where something speaks against it, and it is not wanted all the same.
+        WithheldError: if there are objections and `allows_objections` is false.
     """
     exported.objections = tuple(objections)
     if objections and not allows_objections:
@@ -287,6 +288,6 @@ def render_template(template: str, **values: Any) -> str:
 
 
 def write_card(file: Path, card: Mapping[str, Any]) -> None:
-    """Write a card beside its file, in a folder that may not exist yet."""
+    """Write the card of an exported file; its folder is created if necessary."""
     file.parent.mkdir(parents=True, exist_ok=True)
     file.with_suffix(".card.json").write_text(json.dumps(card, indent=1) + "\n")

@@ -41,7 +41,7 @@ from residnet.export.base import (
 from residnet.export.vessel import ExportedVessel
 
 _MAX_SCALAR_OPERATIONS: Final = 1100
-"""Most operations of a function that is taken apart into operations on single numbers."""
+"""Maximum number of operations of a function that is expanded into scalar operations."""
 
 
 def expand_if_small(function: ca.Function) -> ca.Function:
@@ -94,10 +94,10 @@ class CFunction:
     """A function of a C file.
 
     Attributes:
-        name: without the file's prefix.
+        name: name without the prefix of the file.
         comment: its comment in the header.
         function: what it does.
-        flags: which of its results are truth values; the first is what the C function returns.
+        flags: Boolean results; the first one is the return value of the C function.
     """
 
     name: str
@@ -154,16 +154,16 @@ def render_c_files(
     is_double_only: bool = False,
     build: str = "",
 ) -> tuple[str, str]:
-    """Return the source and the header of functions.
+    """Return source and header of a C file with the given functions.
 
     Args:
-        prefix: stands before every name of the file.
-        functions: in the order in which they stand there.
-        extra_functions: comment, prototype and body of further functions that call those.
+        prefix: prefix of every name in the file.
+        functions: functions in the order of the file.
+        extra_functions: comment, prototype and body of further functions that call `functions`.
         constants: value and comment of each constant, by name without prefix.
-        header_comment: comment at the top of the header, which tells how to use it.
-        is_double_only: whether single precision is not offered.
-        build: identity of what is exported, which ends in hexadecimal digits; empty for none.
+        header_comment: comment at the top of the header that explains its use.
+        is_double_only: whether only double precision is supported.
+        build: build identity, which ends in hexadecimal digits; empty for none.
     """
     tables = Tables(f"{prefix}_")
     definitions = [function.render_definition(prefix, tables) for function in functions]
@@ -204,7 +204,7 @@ def render_c_files(
 
 
 def _comment(text: str) -> str:
-    """Return a text that cannot end the comment in which it stands."""
+    """Return a text that cannot terminate a C comment."""
     return text.replace("*/", "* /").replace("/*", "/ *")
 
 
@@ -218,8 +218,8 @@ def compile_shared_library(
     """Compile C files to a shared library, without a single warning.
 
     Args:
-        flags: of the compiler, beside its usual ones.
-        compiler_path: the compiler; empty for that of this machine.
+        flags: additional compiler flags.
+        compiler_path: path of the compiler; empty for the default compiler.
 
     Raises:
         ExportError: with the compiler's first complaint.
@@ -252,15 +252,16 @@ CODE_LIMIT: Final = 262_144
 
 
 def measure_footprint(source: Path) -> dict[str, Any]:
-    """Return the stack and the size of a C file on this machine, built for size.
+    """Return stack and code size of a C file compiled for size on this machine.
 
-    Stack is measured by `-fstack-usage`, size by `n_entries`. What the tools here do not measure is
-    estimated from the source: arrays in memory, four bytes for each operation and constant.
+    The stack is measured with `-fstack-usage` and the code with `size`. Without these tools both
+    are
+    estimated from the source: local arrays, and four bytes per operation and constant.
 
     Returns:
-        `machine`; `stack_bytes` of each function without those that it calls; `largest_stack_bytes`
-        of a call with the functions of the file that it calls, those of the C library aside;
-        `code_bytes` of code and constants; `stack_from` and `code_from`, the tool or "estimate".
+        `machine`; `stack_bytes` of each function without its callees; `largest_stack_bytes` of the
+        deepest call chain within the file (without the C library); `code_bytes` of code and
+        constants; `stack_from` and `code_from`, the tool or "estimate".
     """
     text = source.read_text()
     bodies = function_bodies(text)
@@ -371,10 +372,10 @@ _STEP_COMMENTS = {
 
 
 class CSource(NamedTuple):
-    """The two files of what is exported.
+    """Source and header of an exported step.
 
     Attributes:
-        prefix: of all names in them.
+        prefix: prefix of all names.
         source: text of the .c file.
         header: text of the .h file.
     """
@@ -395,13 +396,13 @@ def generate_c_source(
     """Return source and header.
 
     Args:
-        card: stands as a comment in the header.
+        card: card, written as a comment into the header.
         header: name of the header.
-        prefix: of all names, see `file_prefix`.
+        prefix: prefix of all names, see `file_prefix`.
         is_double_only: whether single precision is not offered.
 
     Raises:
-        ExportError: where there is an operation that is not written in C.
+        ExportError: if an operation has no C equivalent.
     """
     label = exported.label
     functions: list[CFunction] = []
@@ -491,7 +492,8 @@ def _render_vessel_functions(prefix: str, exported: ExportedVessel) -> list[tupl
         ),
         (
             "memory that a measured past leaves: count states and inputs, oldest first",
-            f"void {prefix}_warmup(const {real_type} *x, const {real_type} *w, size_t count, {real_type} *s)",
+            f"void {prefix}_warmup(const {real_type} *x, const {real_type} *w, size_t count,"
+            f" {real_type} *s)",
             render_template("c_warmup.c", p=prefix, P=prefix_upper) if has_memory else unused_casts,
         ),
         (
@@ -505,7 +507,7 @@ def _render_vessel_functions(prefix: str, exported: ExportedVessel) -> list[tupl
 
 
 class CompiledModel(LoadedExport):
-    """An exported C file as a library; `prefix` is that of its names."""
+    """An exported C file loaded as a shared library; `prefix` is the prefix of its names."""
 
     def __init__(
         self, library: Path, exported: Exportable, dtype: torch.dtype, prefix: str
@@ -676,13 +678,13 @@ def render_s_function(
 ) -> str:
     """Return the source of the S-function of a vessel or a controller.
 
-    A vessel's output is its state, which it keeps beside the memory, and its flags; a controller's
-    its first result and the flags.
+    The outputs of a vessel are its state and flags; state and memory are kept in the S-function.
+    The outputs of a controller are its first result and the flags.
 
     Args:
-        exported: with its step.
-        prefix: of the functions in the C file.
-        result_sizes: of the step's results.
+        exported: the exportable step.
+        prefix: prefix of the functions in the C file.
+        result_sizes: sizes of the results of the step.
     """
     argument_sizes = dict(exported.arguments)
     is_vessel = isinstance(exported, ExportedVessel)

@@ -76,7 +76,8 @@ class RequiredForce(nn.Module):
     """The force tau [B, 3] = F(nu_dot [B, 3], nu [B, 3]) of a believed model and its correction.
 
     A vessel is the same to port and starboard, while a correction that was fitted to a log is not
-    quite: with `is_mirrored` it is the mean of itself and its mirror image, so that a straight course
+    quite: with `is_mirrored` it is the mean of itself and its mirror image, so that a straight
+        course
     needs neither sway force nor yaw moment.
     """
 
@@ -104,18 +105,18 @@ class RequiredForce(nn.Module):
 
 @final
 class GuardedForce(nn.Module):
-    """A feed-forward that knows where its correction was identified, with a flag.
+    """A feed-forward whose correction is limited to its training range, with a flag.
 
-    Outside the training range the correction fades out over a quarter of the range's width, and no
-    axis commands more than 1.2 times the believed model's force; that limit sets in over the
-    outermost twentieth of the range, so that nothing jumps. The answer is finite whatever it is
-    given: motions are treated as `residnet.export.base` says, not a number becomes the middle of
-    the training range, what is farther off than the accepted range its nearest value. Such a motion
-    commands no more than 1.2 times the believed force of itself either, where that is a number.
+    Outside the training range the correction fades out over a quarter of the range width, and the
+    force of each axis is limited to 1.2 times that of the believed model. This limit is blended in
+    over the outermost twentieth of the range, so that the force is continuous. The result is finite
+    for every input: NaN is replaced by the middle of the training range, and values beyond the
+    accepted range by its nearest limit (see `residnet.export.guard`). The limit of 1.2 times the
+    believed force also applies to such motions if their believed force is finite.
 
     Args:
         model: the believed force and its correction.
-        ranges: of nu_dot and nu in the training data, six.
+        ranges: training ranges of nu_dot and nu (six rows).
     """
 
     def __init__(self, model: RequiredForce, ranges: Sequence[tuple[float, float]]) -> None:
@@ -289,7 +290,8 @@ class ExportedForce(Exportable):
             and are_flags_equal
         ):
             raise ExportError(
-                f"{self.label}: {subject} differs from the model by {max_difference:.1e} of its range; allowed"
+                f"{self.label}: {subject} differs from the model by {max_difference:.1e} of its"
+                f" range; allowed"
                 f" {_TOLERANCE:g}"
             )
         return {"steps": len(motion), "share_of_range": max_difference}
@@ -314,7 +316,8 @@ class ExportedForce(Exportable):
             "accepted": dict(zip(MOTION_CHANNELS, accepted, strict=True)),
             "outside_the_training_range": (
                 f"the correction of the believed model fades out over {FADE_SHARE:g} of the range's"
-                f" width; no axis commands more than {MAX_FORCE_RATIO:g} times the believed model's force,"
+                f" width; no axis commands more than {MAX_FORCE_RATIO:g} times the believed"
+                f" model's force,"
                 " beyond `accepted` neither that of the motion nor that of its nearest value"
             ),
             "mirror": (

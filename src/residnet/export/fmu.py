@@ -1,7 +1,7 @@
 """The formats `fmu` and `fmu2`: co-simulation units of FMI 3.0 and 2.0 around the exported C.
 
-The archive holds the sources, and the unit compiled for this machine and for others whose compilers
-are at hand.
+The archive holds the sources and binaries for this machine and for every other platform whose
+compiler is installed.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class FmuExporter(Exporter):
     suffix: ClassVar[str] = ".fmu"
 
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
-        """Write the unit; its card stands under `resources`."""
+        """Write the FMU with its card under `resources`."""
         if not isinstance(exported, ExportedVessel):
             raise UsageError(f"{exported.label}: an FMU holds a vessel model; export it as c")
         exported.require_finite_numbers()

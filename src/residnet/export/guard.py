@@ -1,23 +1,24 @@
-"""What exported models do with inputs, states and memories that no vessel has.
+"""Input guard of exported models: handling of invalid inputs, states and memories.
 
-Every format keeps to these rules, so that a bad sample never ends in a number that is not finite:
+All formats follow these rules, so that a bad sample never yields a non-finite result:
 
-- An entry is a *measurement* while it lies within its accepted range: the training range, widened
-  on either side by twice the largest magnitude in it (by one SI unit where that is zero, and angles
-  by a turn at least). Positions are accepted up to 100 km from the origin, headings up to 1,000
-  turns: beyond, float32 no longer resolves one step.
-- An entry that is not a number becomes the middle of its training range; position and heading
-  become zero. Any other entry beyond the accepted range, infinities included, becomes the nearest
-  value of its training range (of its accepted range for position and heading).
-- A memory with an entry that is not finite, or beyond what its head can have, is replaced by the
-  memory without a past.
-- A step that would leave the accepted range, or be no number, is not taken as it is: velocities are
-  held at the edge of the accepted range (or where they were, if they are no numbers), and the pose
-  moves on with the velocities before the step.
+- An entry is *valid* within its accepted range: the training range extended on both sides by twice
+  its largest magnitude (by one SI unit if this is zero, and by at least one turn for angles).
+  Positions are accepted up to 100 km from the origin and headings up to 1,000 turns, because
+  float32 does not resolve one step beyond.
+- NaN is replaced by the middle of the training range, and by zero for position and heading. Any
+  other entry beyond the accepted range, including infinity, is replaced by the nearest value of the
+  training range (of the accepted range for position and heading).
+- A memory with a non-finite entry, or an entry beyond the limits of its head, is replaced by the
+  initial memory.
+- If the result of a step is NaN or leaves the accepted range, velocities are clamped to the
+accepted
+  range (NaN is replaced by the previous value), and the pose is integrated with the velocities
+  before the step.
 
-The flag `outside` is true for each row in which any of this happened, and for each row with an
-entry beyond the training range. The rules have no memory of their own: the next good sample is
-answered as if the bad one had not been, from the state and memory that it is given.
+The flag `outside` is true for each row to which one of these rules was applied, and for each row
+with an entry beyond the training range. The rules are stateless: the next good sample is processed
+from the state and memory given to it.
 """
 
 from __future__ import annotations
@@ -86,13 +87,12 @@ class GuardRanges(nn.Module):
 
 @final
 class GuardedDynamics(Dynamics):
-    """A model behind the rules above, whose step is defined and finite whatever it is given.
+    """A model with the input guard, whose step is defined and finite for every input.
 
-    The state is x [B, 3 + n + 1]: that of the model and, behind it, the flag of the step that led
-    there.
+    The state x [B, 3 + n + 1] is the state of the model followed by the flag of the previous step.
 
     Args:
-        model: in the precision that it shall run in, float32 in exports.
+        model: the model in its final precision (float32 in exports).
     """
 
     def __init__(self, model: HybridDynamics, spec: ModelSpec) -> None:
@@ -147,7 +147,7 @@ class GuardedDynamics(Dynamics):
     def replace_bad_inputs(
         self, x: Tensor, w: Tensor, s: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return state [B, 3 + n], inputs [B, m] and memory as they are used, and the flag [B]."""
+        """Return the guarded state [B, 3 + n], inputs [B, m], memory and the flag [B]."""
         measured_values = torch.cat((x, w), dim=-1)
         replaced_values, is_inside = (
             self.ranges.replace_unaccepted(measured_values),
@@ -172,11 +172,11 @@ class GuardedDynamics(Dynamics):
     def replace_bad_result(
         self, x: Tensor, next_state: Tensor, s: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return state and memory after a step as they are given out, and the flag [B].
+        """Return the guarded state and memory after a step, and the flag [B].
 
         Args:
-            x: state before the step [B, 3 + n], accepted.
-            next_state: what the model made of it [B, 3 + n].
+            x: valid state before the step [B, 3 + n].
+            next_state: result of the model [B, 3 + n].
             s: memory after the step [B, n_state].
         """
         is_state_accepted = self.state_ranges.is_accepted(next_state).unsqueeze(-1)
@@ -219,10 +219,10 @@ class GuardedDynamics(Dynamics):
         return torch.cat((next_state, outside.to(x.dtype).unsqueeze(-1)), dim=-1), s
 
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
-        """Return the memory [B, n_state] that a measured past leaves, bad samples left out.
+        """Return the memory [B, n_state] after a measured past.
 
-        In the place of a sample that is no measurement in every entry stands the last one before it
-        that is, or else the first one behind it. Without any the memory is that without a past.
+        A sample with an invalid entry is replaced by the last valid sample before it, or by the
+        first valid sample after it. Without valid samples the initial memory is returned.
 
         Args:
             y_history: states [B, T, 3 + n], oldest first; T may be 0.

@@ -139,7 +139,8 @@ class OnnxExporter(Exporter):
             except (runtime_errors.NotImplemented, runtime_errors.InvalidGraph) as error:
                 error_line = str(error).strip().splitlines()[0]
                 raise ExportError(
-                    f"{'; '.join([*messages, exported.label])}: onnxruntime says: {error_line}; export it as"
+                    f"{'; '.join([*messages, exported.label])}: onnxruntime says: {error_line};"
+                    f" export it as"
                     " c or casadi"
                 ) from None
             card = exported.build_card() | {
@@ -206,10 +207,10 @@ def _translate_scalar(
 
 
 def _translate_arctangent(y: Any, x: Any = None) -> Any:
-    """Return the angle of doubles, whose arctangent onnxruntime has in single precision alone.
+    """Return atan2 in double precision; onnxruntime implements atan in single precision only.
 
-    What is missing then is the angle between the point and the line along which that one leads,
-    about 1e-7: its tangent is it to 1e-21.
+    The single-precision angle is refined by the angle between the point and the direction of that
+    angle. The correction is about 1e-7 and equals its tangent to within 1e-21.
     """
     ir, op = importlib.import_module("onnx_ir"), importlib.import_module("onnxscript").opset18
     double_type = ir.DataType.DOUBLE

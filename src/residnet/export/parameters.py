@@ -1,8 +1,8 @@
 """The format `parameters`: a baseline as M nu_dot + C(nu) nu + D nu + D_n |nu| nu = tau.
 
-It is written as JSON and in the forms of Gazebo, VRX, MSS and PythonVehicleSimulator. C is Fossen's
-skew form of M (Fossen 2011, section 6.3). What the baseline has beyond that form is projected onto
-the damping over the training range, and the share that remains is stated.
+It is written as JSON and for Gazebo, VRX, MSS and PythonVehicleSimulator. C is Fossen's
+skew-symmetric form of M (Fossen 2011, section 6.3). Terms of the baseline beyond this form are
+projected onto the damping over the training range, and the unexplained share is stated.
 """
 
 from __future__ import annotations
@@ -155,11 +155,11 @@ _VRX_NAMES = ("xDotU", "yDotV", "nDotR", "xU", "yV", "nR")
 def render_simulator_files(
     name: str, vessel_coefficients: VesselCoefficients, rigid_body: Mapping[str, float]
 ) -> dict[str, str]:
-    """Return what the simulators read by the ends of file names.
+    """Return the files of the simulators by file name suffix.
 
-    The plugins of Gazebo and VRX as SDF, with the masses of the rigid body: Gazebo's coefficients
-    are forces, and so negative; those of VRX are resistances. A MATLAB function with the six-by-six
-    matrices that MSS' vessels have. A vehicle of PythonVehicleSimulator.
+    SDF for the plugins of Gazebo and VRX with rigid-body masses (Gazebo's coefficients are forces
+    and therefore negative; VRX's are resistances), a MATLAB function with six-by-six matrices as in
+    MSS vessels, and a vehicle of PythonVehicleSimulator.
     """
     matrices = {
         "M": vessel_coefficients.mass,
@@ -216,10 +216,10 @@ class ParametersExporter(Exporter):
     )
 
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
-        """Write the coefficients as JSON, and beside it one file for each simulator.
+        """Write the coefficients as JSON and one file for each simulator.
 
-        The masses of the rigid body, which no acceleration tells, are read from a file of the same
-        name that ends in `.masses.yaml`.
+        Rigid-body masses cannot be identified from accelerations; they are read from a file of the
+        same name with the suffix `.masses.yaml`.
         """
         if not isinstance(exported, ExportedVessel):
             raise UsageError(f"{exported.label}: only vessel models have masses and damping")

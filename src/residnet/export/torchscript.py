@@ -56,7 +56,7 @@ _EXECUTOR_SETTINGS = {
         ),
     },
 }
-"""What the card of this format says besides: the settings that make its first call quick."""
+"""Additional card entry of this format: executor settings for a fast first call."""
 
 
 def get_size(tensor: Tensor, dimensions: int, dimension: int) -> int:
@@ -238,9 +238,9 @@ class AotiExporter(Exporter):
     about: ClassVar[str] = "The model's step compiled for this machine (AOTInductor), one row."
 
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
-        """Compile the step; the card stands beside the package.
+        """Compile the step and write package and card.
 
-        It works in float64 where float32 does not determine the track.
+        Float64 is used if the track depends on rounding in float32.
         """
         exported.require_finite_numbers()
         with tempfile.TemporaryDirectory() as folder:
@@ -261,7 +261,8 @@ class AotiExporter(Exporter):
                     # what torch raises here has no class of its own
                     error_lines = str(error).strip().splitlines() or [type(error).__name__]
                     raise ExportError(
-                        f"{exported.label}: cannot be compiled ahead of time ({error_lines[0]}); export it"
+                        f"{exported.label}: cannot be compiled ahead of time ({error_lines[0]});"
+                        f" export it"
                         " as c or torchscript"
                     ) from None
                 return exported.check_parity(

@@ -1,7 +1,7 @@
-"""A vessel model as it is exported: its guarded step, its card, and what is checked of every file.
+"""Exported vessel model: guarded step, card and parity check of every file.
 
-A format's file is loaded back and driven beside the model itself: 2,000 steps from a warmed-up
-memory, tracks whose inputs jump, then inputs, states and memories that no vessel has.
+The file of a format is loaded and compared with the model: 2,000 steps from a warmed-up memory,
+tracks with step changes of the inputs, and invalid inputs, states and memories.
 """
 
 from __future__ import annotations
@@ -41,9 +41,11 @@ _FRAME_TEXT = (
     " is where the wind comes from"
 )
 _BAD_INPUT_RULES = (
-    "an entry that is no number becomes the one under `substitute`, any other beyond `state_ranges` the"
+    "an entry that is no number becomes the one under `substitute`, any other beyond"
+    " `state_ranges` the"
     " nearest value of its training range; a memory that is not finite or beyond what the head can"
-    " have begins anew; a step that would leave `state_ranges` is held at its edge; `outside` is then"
+    " have begins anew; a step that would leave `state_ranges` is held at its edge; `outside` is"
+    " then"
     " true"
 )
 _BAND_TEXT = (
@@ -118,9 +120,9 @@ class GuardedVesselModule(nn.Module):
 
     @torch.jit.export
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
-        """Return the memory s [B, n_state] that a measured past leaves.
+        """Return the memory s [B, n_state] after a measured past.
 
-        Samples that are no measurements are left out: the last one before them stands for them.
+        Invalid samples are replaced by the last valid sample before them.
 
         Args:
             y_history: states [B, T, 3 + n], oldest first.
@@ -156,10 +158,11 @@ class GuardedVesselModule(nn.Module):
 
     @torch.jit.export
     def rollout(self, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the states [B, T+1, 3 + n] from x0 [B, 3 + n] on under inputs w [B, T, m].
+        """Simulate from x0 [B, 3 + n] under inputs w [B, T, m].
 
-        Behind them stand the memory [B, n_state] after the last step and `outside` [B, T], the flag
-        of each step.
+        Returns:
+            States [B, T+1, 3 + n], memory [B, n_state] after the last step, and the flag `outside`
+            [B, T] of each step.
         """
         n_rows, n_steps = get_size(x0, 2, 0), get_size(w, 3, 1)
         require_shape("x0", x0, [n_rows, self.n_states])
@@ -247,7 +250,8 @@ class ExportedVessel(Exportable):
                 is_invalid &= ~(torch.isinf(value) & (initial_state[name].to(value.dtype) == value))
             if bool(is_invalid.any()):
                 raise ExportError(
-                    f"{self.label}: {name} holds {float(value[is_invalid][0])}, so it is no model; fit it"
+                    f"{self.label}: {name} holds {float(value[is_invalid][0])}, so it is no"
+                    f" model; fit it"
                     " again"
                 )
 
@@ -310,11 +314,12 @@ class ExportedVessel(Exportable):
     def check_parity(
         self, loaded: LoadedExport, subject: str, dtype: torch.dtype, tolerance: float | None = None
     ) -> dict[str, Any]:
-        """Return what the card says of the parity, once a file answers good and bad inputs.
+        """Check the parity of a file for good and bad inputs and return the card entries on parity.
 
         Raises:
-            RoundingError: where the precision does not determine the track.
-            ExportError: where the file is wrong otherwise, or the model leaves what is accepted.
+            RoundingError: if the track depends on rounding in this precision.
+            ExportError: if the file is wrong for another reason or the model leaves the accepted
+                range.
         """
         is_single = dtype == torch.float32
         if tolerance is None:
@@ -331,8 +336,8 @@ class ExportedVessel(Exportable):
     ) -> tuple[Tensor, Tensor]:
         """Return states of the past [1, 50, nx] and inputs [1, 50 + steps, m] of the parity check.
 
-        Inputs sweep a share of the training range about its middle as slow sines, so that the run
-        passes through what the model knows.
+        The inputs are slow sines over a share of the training range about its middle, so that the
+        run stays within the training data.
         """
         spec = self.spec
         lower, upper = torch.tensor(spec.low, dtype=dtype), torch.tensor(spec.high, dtype=dtype)
@@ -348,13 +353,14 @@ class ExportedVessel(Exportable):
         return states, w
 
     def run_reference(self, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what `parity_inputs` returns, and the states [1, steps + 1, nx] of the model's free run.
+        """Return the result of `parity_inputs` and the states [1, steps + 1, nx] of the free run.
 
-        All inputs at once may ask for more than logs that moved some of them at a time: the sweep
-        is the widest of `_SWEEP_SHARES` under which the states stay within what exports accept.
+        Varying all inputs at once may exceed the conditions of logs that varied few at a time.
+        Therefore the widest sweep of `_SWEEP_SHARES` is used that keeps the states within the
+        accepted range.
 
         Raises:
-            ExportError: where it leaves that under each; the first step and channel beyond.
+            ExportError: if every sweep leaves the accepted range; names the first step and channel.
         """
         if dtype in self._reference_runs:
             return self._reference_runs[dtype]
@@ -379,8 +385,10 @@ class ExportedVessel(Exportable):
         raise ExportError(
             f"{self.label}: diverges in the export's free run, though its inputs keep to the middle"
             f" {_SWEEP_SHARES[-1]:.0%} of the training range: {self.state_names[state_index]} is"
-            f" {float(states[0, step_index, state_index]):.3g} after {step_index * self.spec.dt:g} s, accepted"
-            f" {float(accepted_lower[state_index]):.3g} to {float(accepted_upper[state_index]):.3g}; not exported, choose another model"
+            f" {float(states[0, step_index, state_index]):.3g} after"
+            f" {step_index * self.spec.dt:g} s, accepted"
+            f" {float(accepted_lower[state_index]):.3g} to"
+            f" {float(accepted_upper[state_index]):.3g}; not exported, choose another model"
         )
 
     def check_long_run(
@@ -410,16 +418,17 @@ class ExportedVessel(Exportable):
         range_shares = dict(zip(self.state_names, max_shares.tolist(), strict=True))
         if not bool((max_shares <= tolerance).all()):
             raise RoundingError(
-                f"{self.label}: {subject} differs from the model by {range_shares} of each channel's range"
+                f"{self.label}: {subject} differs from the model by {range_shares} of each"
+                f" channel's range"
                 f" over {PARITY_STEPS} steps; allowed {tolerance:g}"
             )
         return range_shares
 
     def warm_up_memory(self, loaded: LoadedExport, y: NumberArray, w: NumberArray) -> NumberArray:
-        """Return the memory that states [T, 3 + n] and inputs [T, m] of a measured past leave.
+        """Return the memory after states [T, 3 + n] and inputs [T, m] of a measured past.
 
-        Where a format has only steps, these are taken. In the place of a sample that is no
-        measurement stands the last one before it that is, or else the first one behind it.
+        Formats without `warmup` use steps. An invalid sample is replaced by the last valid sample
+        before it, or by the first valid sample after it.
         """
         loaded_memory = loaded.initial_memory(y, w)
         if loaded_memory is not None:
@@ -478,7 +487,8 @@ class ExportedVessel(Exportable):
         )
         if not max_share <= tolerance:
             raise RoundingError(
-                f"{self.label}: {subject} differs from the model by {max_share:.2g} of a state's range over"
+                f"{self.label}: {subject} differs from the model by {max_share:.2g} of a state's"
+                f" range over"
                 f" {PARITY_STEPS} steps; allowed {tolerance:g}"
             )
 
@@ -515,7 +525,8 @@ class ExportedVessel(Exportable):
             )
             if not is_equal:
                 raise ExportError(
-                    f"{self.label}: {subject} answers {names[i]} = {value} with {x.tolist()}, outside"
+                    f"{self.label}: {subject} answers {names[i]} = {value} with {x.tolist()},"
+                    f" outside"
                     f" {bool(outside)}; the model with {expected[0][k].tolist()},"
                     f" {bool(expected[2][k])}"
                 )
