@@ -262,7 +262,7 @@ def test_what_single_precision_does_not_determine_is_written_in_double(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Large coefficients that cancel make a model round; here no difference at all is let pass."""
-    monkeypatch.setattr(base, "SINGLE", -1.0)
+    monkeypatch.setattr(base, "SINGLE_TOLERANCE", -1.0)
     made, file = exported("plsr"), tmp_path / f"boat.{name}"
     allowed = {torch.float32: -1.0, torch.float64: 1e-7}
     monkeypatch.setattr("residnet.export.onnx_file._TOLERANCES", allowed)

@@ -431,8 +431,10 @@ def generate_c_source(
         function_comment = "1 where every entry of a state and its inputs is a measurement, else 0"
         functions.append(CFunction("measured", function_comment, measured_function, ["good"]))
         extra_functions = _render_vessel_functions(prefix, exported)
-        unit_texts = {key: ", ".join(f"{entry['name']} {entry['unit']}" for entry in card[key]) for key in
-                 ("states", "inputs")}  # fmt: skip
+        unit_texts = {
+            key: ", ".join(f"{entry['name']} {entry['unit']}" for entry in card[key])
+            for key in ("states", "inputs")
+        }
         argument_sizes = [argument_size for _, argument_size in exported.arguments]
         constants = {
             "STATES": (argument_sizes[0], unit_texts["states"]),

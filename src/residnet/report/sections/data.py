@@ -138,11 +138,9 @@ def _model_facts(run: RunFiles) -> dict[str, str]:
         if name in run.dof.fixed_states:
             continue
         unit, factor = run.display_unit(name)
-        ranges.append(
-            f"{name} {format_number(factor * lower)} to {format_number(factor * upper)} {unit}".removesuffix(
-                " -"
-            )
-        )
+        range_text = f"{name} {format_number(factor * lower)} to {format_number(factor * upper)}"
+        # dimensionless channels have the unit "-"
+        ranges.append(range_text if unit == "-" else f"{range_text} {unit}")
     return {
         "model step": f"{card['dt']:g} s, {card['integrator']}; inputs held over a step",
         "training range": "; ".join(ranges),
