@@ -1,4 +1,1 @@
-"""What is known of a vessel before any data: hull, actuators, environment.
-
-Everything is batched and differentiable.
-"""
+"""Physics of vessels: hull, actuators and environment, batched and differentiable."""

@@ -1,6 +1,6 @@
-"""Abkowitz vessels: Taylor series of the forces about straight motion at service speed.
+"""Abkowitz models: Taylor series of the forces about straight motion at service speed.
 
-A vessel file holds all coefficients (Abkowitz 1964).
+A vessel file contains all hydrodynamic derivatives (Abkowitz 1964).
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from residnet.physics.terms import TermLibrary, parse_axis_terms
 from residnet.physics.vessel_file import VesselFile
 
 SERIES_VARIABLES = ("du", "v", "r", "delta", "dn")
-"""What the terms are made of: u - U0, sway, yaw rate, rudder angle, n - n0."""
+"""Variables of the terms: u - U0, sway, yaw rate, rudder angle, n - n0."""
 
 
 class AbkowitzShaftConfig(ShaftConfig):
-    """The propeller's shaft, for series with terms in dn.
+    """Propeller shaft, for series with terms in dn.
 
     Attributes:
         n_0: revolutions at service speed in 1/s.
@@ -45,9 +45,9 @@ class AbkowitzMassConfig(Config):
     """Rigid body and added mass, in the units of the series.
 
     Attributes:
-        m: mass (kg, or dimensionless in the prime system, as all that follow).
+        m: mass (kg; in the prime system all values are dimensionless).
         I_z: moment of inertia in yaw about the body origin (kg m^2).
-        x_G: centre of gravity ahead of the body origin (m).
+        x_G: longitudinal position of the centre of gravity, forward of the body origin (m).
         X_udot: added mass in surge, negative for a normal hull (kg).
         Y_vdot: added mass in sway (kg).
         Y_rdot: sway force by yaw acceleration (kg m).
@@ -66,7 +66,7 @@ class AbkowitzMassConfig(Config):
 
 
 def _validate_terms(rows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
-    """Return the terms of each axis, after a look at all of them; an empty row where none is."""
+    """Validate the terms of each axis and add empty rows for missing axes."""
     parse_axis_terms(rows, SERIES_VARIABLES)
     return {axis: rows.get(axis, {}) for axis in "XYN"}
 
@@ -77,30 +77,27 @@ HydrodynamicDerivatives = Annotated[
 
 
 class AbkowitzConfig(VesselFile):
-    """A vessel given by its hydrodynamic derivatives.
-
-    M nu_dot = sum of terms in (du, v, r, delta, dn).
+    """Vessel given by hydrodynamic derivatives, M nu_dot = sum of terms in (du, v, r, delta, dn).
 
     Attributes:
-        length: L, between perpendiculars.
-        units: `is_prime_system` for dimensionless coefficients (SNAME's prime system: forces over 0.5 rho L^2
-            U^2, moments over 0.5 rho L^3 U^2, masses over 0.5 rho L^3, with U the present speed
-            through the water; du/U, v/U, r L/U, dn/n_0), `si` for coefficients in SI.
-        speed: U0, the service speed that the series is taken about. In the prime system the present
-            speed counts as at least a tenth of it: the series says nothing about a vessel at rest.
-        density: of the water, for the prime system.
-        coriolis: `included` where the coefficients of v r and u r hold the rigid body's terms (m in
-            X_vr, -m in Y_r), as in most published series; `rigid_body` where they do not, and
-            -C_RB(nu) nu is added.
-        delta_sign: -1 where the coefficients' rudder angle is positive to port (Y_delta > 0), +1
-            where it is positive to starboard; commands and states here are positive to starboard.
+        length: length between perpendiculars L.
+        units: `prime` for dimensionless coefficients (prime system of SNAME: forces divided by 0.5
+            rho L^2 U^2, moments by 0.5 rho L^3 U^2, masses by 0.5 rho L^3, with the current speed
+            through the water U; du/U, v/U, r L/U, dn/n_0); `si` for coefficients in SI.
+        speed: service speed U0 of the expansion. In the prime system U has a lower bound of a tenth
+            of it, because the series is not valid at rest.
+        density: density of the water, for the prime system.
+        coriolis: `included` if the coefficients of v r and u r contain the rigid-body terms (m in
+            X_vr, -m in Y_r), as in most published series; `rigid_body` to add -C_RB(nu) nu.
+        delta_sign: -1 if the rudder angle of the coefficients is positive to port (Y_delta > 0), +1
+            if it is positive to starboard. Commands and states are positive to starboard.
         mass: rigid body and added mass, in the units of the series.
         coefficients: hydrodynamic derivatives of surge and sway force and yaw moment, in the units
             of the series, such as `Y: {v: ..., v^2 r: ...}`.
-        rudder: limits and lag of the steering gear.
-        shaft: limits and lag of the propeller shaft; only where there are terms in dn.
-        wind: coefficients of the hull above water.
-        source: where all coefficients come from.
+        rudder: limits and dynamics of the steering gear.
+        shaft: limits and dynamics of the propeller shaft; only with terms in dn.
+        wind: wind coefficients.
+        source: reference of the coefficients.
     """
 
     kind: Literal["abkowitz"]
@@ -135,18 +132,18 @@ class AbkowitzConfig(VesselFile):
         return self
 
     def build(self) -> HullPlant:
-        """Build the plant of this vessel; trials start straight ahead at service speed.
+        """Build the plant; trials start with straight-ahead motion at service speed.
 
         Raises:
-            ConfigError: where the mass matrix is not positive definite or is singular.
+            ConfigError: if the mass matrix is not positive definite or is singular.
         """
         initial_values = {"u": self.speed, "n": self.shaft.n_0 if self.shaft is not None else 0.0}
         return HullPlant(self.build_hull(), AbkowitzForces(self), self.wind, initial_values)
 
     def build_hull(self) -> Hull:
-        """Build the inertia in SI, with the rigid body's Coriolis force where the series lacks it.
+        """Build the inertia in SI, with rigid-body Coriolis forces if the series excludes them.
 
-        The forces of the water are those of `AbkowitzForces`.
+        The hydrodynamic forces are those of `AbkowitzForces`.
         """
         mass_terms = self.mass
         length = self.length.value
@@ -182,7 +179,7 @@ class AbkowitzConfig(VesselFile):
 
 @final
 class AbkowitzForces(ActuatorSystem):
-    """The whole series as forces of rudder, propeller and motion: tau [..., 3] in N, N, N m."""
+    """Forces tau [..., 3] in N, N, N m of the series, of rudder, propeller and motion."""
 
     def __init__(self, config: AbkowitzConfig) -> None:
         rudder = config.rudder
@@ -219,10 +216,7 @@ class AbkowitzForces(ActuatorSystem):
         self.moment_arms = nn.Buffer(moment_arms, persistent=False)
 
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the rudder angle from steer.
-
-        Revolutions from drive where the series knows them (else it keeps its service power).
-        """
+        """Return the rudder command from steer, and revolutions from drive with terms in dn."""
         return commands_from_demand(self.command_specs, drive, steer)
 
     def force(self, states: Tensor, command: Tensor, nu: Tensor) -> Tensor:

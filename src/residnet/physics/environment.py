@@ -1,6 +1,6 @@
-"""Wind on the hull above water, and waves: spectra, a seaway as a sum of sines, forces on a box.
+"""Wind loads and waves: spectra, irregular waves as a sum of sines, and forces on a box.
 
-Waves follow document 004, eqs. (5.30)-(5.34).
+Waves follow document 004 eqs. (5.30)-(5.34).
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from residnet.physics.parameters import Density, SquareMetres
 
 
 class WindLoadConfig(Config, ABC):
-    """The part of a vessel file that describes the hull above water.
+    """Wind loads of a vessel.
 
     Attributes:
         frontal_area: projected frontal area in m^2.
         lateral_area: projected lateral area in m^2.
-        length: overall, which the yaw coefficient refers to.
-        centre_height: of the lateral area's centre above the body origin, for the heeling moment of
-            vessels that roll.
-        density: of the air.
-        source: where the numbers come from.
+        length: length overall, the reference length of the yaw coefficient.
+        centre_height: height of the centre of the lateral area above the body origin, for the
+            heeling moment of vessels with roll.
+        density: density of the air.
+        source: reference of the coefficients.
         kind: kind of the coefficients.
     """
 
@@ -42,20 +42,20 @@ class WindLoadConfig(Config, ABC):
 
     @abstractmethod
     def wind_forces(self, relative_x: Tensor, relative_y: Tensor) -> Tensor:
-        """Return X, Y [N], K, N [N m], stacked [..., 4], in a relative wind.
+        """Compute the wind loads X, Y [N], K, N [N m], stacked [..., 4].
 
         Args:
             relative_x: velocity of the air relative to the vessel along body x [...] in m/s.
-            relative_y: the same along body y [...] in m/s.
+            relative_y: velocity of the air relative to the vessel along body y [...] in m/s.
         """
 
 
 @final
 class SymmetricWindConfig(WindLoadConfig):
-    """Wind coefficients of ships that are nearly symmetric fore and aft.
+    """Wind coefficients of vessels that are nearly symmetric fore and aft.
 
-    C_X = -c_x cos gamma, C_Y = c_y sin gamma, C_N = c_n sin 2 gamma, with gamma the relative wind's
-    angle; typically c_x is 0.5 to 0.9, c_y 0.7 to 0.95, c_n 0.05 to 0.2. All three are positive.
+    C_X = -c_x cos gamma, C_Y = c_y sin gamma, C_N = c_n sin 2 gamma with the relative wind angle
+    gamma. Typical values are c_x 0.5 to 0.9, c_y 0.7 to 0.95 and c_n 0.05 to 0.2.
 
     Attributes:
         c_x: amplitude of the longitudinal force coefficient, dimensionless.
@@ -69,7 +69,7 @@ class SymmetricWindConfig(WindLoadConfig):
     c_n: float = Field(ge=0, le=1)
 
     def wind_forces(self, relative_x: Tensor, relative_y: Tensor) -> Tensor:
-        """Return the forces [..., 4], in components: no angle, and smooth in a calm."""
+        """Compute the loads [..., 4] without an angle, so that they are smooth at zero wind."""
         frontal_factor = 0.5 * self.density * self.frontal_area
         lateral_factor = 0.5 * self.density * self.lateral_area
         speed = torch.sqrt(relative_x * relative_x + relative_y * relative_y + 1e-12)
@@ -81,13 +81,12 @@ class SymmetricWindConfig(WindLoadConfig):
 
 @final
 class TabulatedWindConfig(WindLoadConfig):
-    """Wind coefficients at angles of the relative wind, as wind tunnels give them.
+    """Table of wind coefficients over the relative wind angle, such as from a wind tunnel.
 
-    Isherwood (1972) and Blendermann (1994) publish such tables.
-
-    `angle` runs from 0 (head wind) to 180 deg for wind from STARBOARD; port follows by symmetry.
-    Signs are those of the body axes: C_X is negative in head wind, C_Y negative (towards port).
-    Linear between the angles.
+    Isherwood (1972) and Blendermann (1994) publish such tables. `angle` increases from 0 (head
+    wind) to 180 deg for wind from STARBOARD; wind from port follows by symmetry. Signs are those of
+    the body axes: C_X is negative in head wind, and C_Y is negative (to port). Interpolation is
+    linear.
 
     Attributes:
         angle: angles of the relative wind in rad, from 0 to pi.
@@ -127,7 +126,7 @@ class TabulatedWindConfig(WindLoadConfig):
 
     @cached_property
     def forces_by_angle(self) -> tuple[Tensor, Tensor]:
-        """Return angles [A] and forces X, Y, N per squared speed [A, 3], float64."""
+        """Return angles [A] and loads X, Y, N per squared speed [A, 3], float64."""
         reference_areas = [self.frontal_area, self.lateral_area, self.lateral_area * self.length]
         coefficients = torch.tensor([self.C_X, self.C_Y, self.C_N], dtype=torch.float64).T
         areas = torch.tensor(reference_areas, dtype=torch.float64)
@@ -135,7 +134,7 @@ class TabulatedWindConfig(WindLoadConfig):
         return angle, coefficients * areas * (0.5 * self.density)
 
     def wind_forces(self, relative_x: Tensor, relative_y: Tensor) -> Tensor:
-        """Return the forces [..., 4], linear between the angles."""
+        """Compute the loads [..., 4] by linear interpolation over the angle."""
         table_angles, table_forces = (
             values.to(relative_x.dtype) for values in self.forces_by_angle
         )
@@ -161,18 +160,18 @@ class TabulatedWindConfig(WindLoadConfig):
 
 
 WindLoadsConfig = Annotated[SymmetricWindConfig | TabulatedWindConfig, Field(discriminator="kind")]
-"""The optional section `wind` of a vessel file."""
+"""Optional section `wind` of a vessel file."""
 
 
 GRAVITY = 9.81
-"""Acceleration of free fall in m/s^2."""
+"""Acceleration of gravity in m/s^2."""
 
 
 class JonswapSpectrumConfig(Config):
-    """The spectrum of a fetch-limited sea (JONSWAP, Hasselmann et al. 1973).
+    """JONSWAP spectrum of a fetch-limited sea (Hasselmann et al. 1973).
 
-    It is the ITTC form with its peak raised by gamma, scaled back to the significant height. With a
-    gamma of 1 it is that of a fully developed sea: modified Pierson-Moskowitz (ITTC 1978).
+    It is the ITTC form with peak enhancement gamma, normalised to the significant wave height. With
+    gamma = 1 it is the modified Pierson-Moskowitz spectrum of a fully developed sea (ITTC 1978).
 
     Attributes:
         kind: kind of the spectrum.
@@ -183,7 +182,7 @@ class JonswapSpectrumConfig(Config):
     gamma: float = Field(default=3.3, ge=1, le=7)
 
     def spectral_density(self, omega: np.ndarray, height: float, period: float) -> np.ndarray:
-        """Return S(omega) [m^2 s] at omega [rad/s], up to the peakedness' own area.
+        """Return S(omega) [m^2 s] at omega [rad/s] without the normalisation of its area.
 
         Args:
             omega: frequencies in rad/s, any shape.
@@ -207,12 +206,12 @@ class JonswapSpectrumConfig(Config):
 
 
 class HullBoxConfig(Config):
-    """The underwater hull as a box, which the wave force is computed for.
+    """Box approximation of the underwater hull for wave forces.
 
     Attributes:
-        length: of the box in m.
-        breadth: of the box in m.
-        draught: of the box in m.
+        length: length of the box in m.
+        breadth: breadth of the box in m.
+        draught: draught of the box in m.
     """
 
     length: Metres = Field(gt=0)
@@ -221,19 +220,19 @@ class HullBoxConfig(Config):
 
 
 class WavesConfig(Config):
-    """A seaway and the hull that it acts on.
+    """Irregular waves and the hull on which they act.
 
     Attributes:
-        spectrum: form.
-        significant_height: 4 sqrt(m0).
-        peak_period: 2 pi / omega_p.
-        direction: where the waves travel TO, clockwise from north (document 004 section 5.2.2.4); 0
-            deg are following seas on a northerly course.
-        hull: dimensions under water.
+        spectrum: wave spectrum.
+        significant_height: significant wave height, 4 sqrt(m0).
+        peak_period: peak period, 2 pi / omega_p.
+        direction: direction TO which the waves travel, clockwise from north (document 004 section
+            5.2.2.4); 0 deg are following seas on a northerly course.
+        hull: dimensions of the underwater hull.
         frequencies: number N of frequency intervals between 0.5 and 4 omega_p.
-        directions: number M of direction intervals; 1 for long-crested waves, else cos^2 over +-90
-            deg.
-        water_density: of the water.
+        directions: number M of direction intervals; 1 for long-crested waves, otherwise cos^2
+            spreading over +-90 deg.
+        water_density: density of the water.
     """
 
     spectrum: JonswapSpectrumConfig = JonswapSpectrumConfig()
@@ -246,22 +245,22 @@ class WavesConfig(Config):
     water_density: Density = Field(default=1025.0, gt=0)
 
     def build(self, n_rows: int, random: np.random.Generator) -> IrregularWaves:
-        """Return one realisation of the seaway for each of several rows."""
+        """Build independent realisations of the waves, one per row."""
         return IrregularWaves(self, n_rows, random)
 
 
 @final
 class IrregularWaves(nn.Module):
-    """A seaway of N x M sines in deep water, a realisation per row, and its force on the hull.
+    """Irregular deep-water waves as a sum of N x M sines, and their force on the hull.
 
-    Frequencies and directions are drawn within their intervals (5.34) and used throughout, also
-    where (5.30) writes the middle of the interval, so that the seaway does not repeat itself; each
-    component has its own random phase (one per frequency, as (5.32) has it, would make a
-    short-crested sea uneven over the place). Amplitudes (5.33) are scaled so that the components
-    carry m0 exactly. The phase follows the vessel's place, omega t - k . (x, y), so that the
-    frequency of encounter (5.31) comes out by itself at any speed and course. The response H_i is
-    the Froude-Krylov force of a box: the undisturbed wave's pressure on its walls and bottom.
-    Diffraction, radiation and drift are left out.
+    Each row is a realisation. Frequencies and directions are drawn within their intervals (5.34)
+    and also replace the centres of the intervals in (5.30), so that the waves are not periodic.
+    Each component has a random phase; one phase per frequency as in (5.32) would make a
+    short-crested sea inhomogeneous. Amplitudes (5.33) are normalised to the exact m0. The phase
+    omega t - k . (x, y) depends on the position of the vessel, which yields the encounter frequency
+    (5.31) at any speed and course. The response H_i is the Froude-Krylov force of a box, from the
+    pressure of the undisturbed wave on its walls and bottom. Diffraction, radiation and drift
+    forces are neglected.
     """
 
     def __init__(self, config: WavesConfig, n_rows: int, random: np.random.Generator) -> None:
@@ -298,11 +297,11 @@ class IrregularWaves(nn.Module):
         self.draught = config.hull.draught
 
     def component_phases(self, north: Tensor, east: Tensor, t: float) -> Tensor:
-        """Return the phase [B, K] in rad of every component at a place and time.
+        """Return the phase [B, K] in rad of every component at a position and time.
 
         Args:
-            north: place [B] in m.
-            east: place [B] in m.
+            north: position north [B] in m.
+            east: position east [B] in m.
             t: time in s.
         """
         distance = north.unsqueeze(-1) * torch.cos(self.direction) + east.unsqueeze(-1) * torch.sin(
@@ -311,12 +310,11 @@ class IrregularWaves(nn.Module):
         return self.omega * t - self.wave_number * distance + self.phase
 
     def force_response(self, psi: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the force per wave amplitude in quadrature [B, K, 3] and in phase [B, K].
+        """Return the forces per wave amplitude: X, Y, K [B, K, 3] and N [B, K].
 
-        In quadrature (factors of sin) are X, Y, K; in phase (factor of cos) is N.
-
-        In N/m and N m/m; K about the waterline, N about midships. chi = direction - psi is 0 in
-        following seas.
+        X, Y and K are in quadrature with the wave (factors of sin), and N is in phase (factor of
+        cos). Units are N/m and N m/m; K is about the waterline and N about midship. The angle
+        chi = direction - psi is 0 in following seas.
         """
         chi = self.direction - psi.unsqueeze(-1)
         cos_chi = torch.cos(chi)
@@ -344,11 +342,11 @@ class IrregularWaves(nn.Module):
         )
 
     def forward(self, north: Tensor, east: Tensor, psi: Tensor, t: float) -> Tensor:
-        """Return the force X, Y [N], K, N [N m], stacked [B, 4], on the hull at a place and time.
+        """Compute the wave loads X, Y [N], K, N [N m], stacked [B, 4], at a position and time.
 
         Args:
-            north: place [B] in m.
-            east: place [B] in m.
+            north: position north [B] in m.
+            east: position east [B] in m.
             psi: heading [B] in rad.
             t: time in s.
         """
@@ -362,7 +360,7 @@ class IrregularWaves(nn.Module):
 def _sine_first_moment(kappa: Tensor, width: float) -> Tensor:
     """Return the integral of x sin(kappa x) over +-width / 2.
 
-    Its series near zero, where the closed form cancels.
+    Near zero a series replaces the closed form, which suffers from cancellation.
     """
     half_width = 0.5 * width
     is_small = kappa.abs() * half_width < 1e-2

@@ -1,4 +1,4 @@
-"""Models in force space: tau = F(nu_dot, nu), a believed hull and corrections to it.
+"""Force models tau = F(nu_dot, nu): a prior hull model and corrections to it.
 
 Source: document 002 eqs. (3.19)-(3.27).
 """
@@ -18,7 +18,7 @@ from residnet.physics.plant import Hull
 from residnet.physics.terms import TermLibrary, parse_term
 
 MOTION_CHANNELS = (*ACCELERATION_NAMES, *VELOCITY_NAMES)
-"""Channels of a force-space model: u_dot, v_dot, r_dot, u, v, r."""
+"""Channels of a force model: u_dot, v_dot, r_dot, u, v, r."""
 
 _CROSS_TERMS = (
     "u v",
@@ -46,26 +46,27 @@ FERRY_TERMS: tuple[str, ...] = (
 
 
 _MAX_CONDITION = 100.0
-"""Of a mass in units of the believed one: beyond it an axis has a hundredth of the mass that
-another has, and none in truth.
+"""Maximum condition number of a mass matrix relative to that of the prior model.
+
+Above this value the mass of some axis is less than a hundredth of another and not physical.
 """
 
 
 def term_order(term: str) -> int:
-    """Return the order of a basis function: how many channels are multiplied in it.
+    """Return the order of a basis function, its number of factors.
 
-    It is called beta in document 002 section 4.3.4.
+    The order is beta in document 002 section 4.3.4.
     """
     return max(sum(abs(factor.power) for factor in parse_term(term, MOTION_CHANNELS)), 1)
 
 
 def weighted_column_std(terms: Sequence[str], x: Tensor) -> Tensor:
-    """Return what the columns x [N, J] of basis functions are divided by: beta std(x) [J].
+    """Return the scales beta std(x) [J] of the columns x [N, J] of basis functions.
 
-    Higher orders weigh less by it; (4.8), (4.9), correction J15.
+    The order beta reduces the weight of high orders (document 002 (4.8), (4.9), correction J15).
 
     Raises:
-        FitError: where a column is constant.
+        FitError: if a column is constant.
     """
     std = x.std(0)
     is_constant = std <= 1e-9 * x.abs().amax(0).clamp(min=1e-300)
@@ -78,7 +79,7 @@ def weighted_column_std(terms: Sequence[str], x: Tensor) -> Tensor:
 
 
 class ForceCorrection(nn.Module):
-    """A force [..., 3] that is linear in basis functions: theta_0 + Theta' phi(nu_dot, nu)."""
+    """Force [..., 3] that is linear in basis functions, theta_0 + Theta' phi(nu_dot, nu)."""
 
     def __init__(self, terms: Sequence[str], coefficients: Tensor, intercept: Tensor) -> None:
         super().__init__()
@@ -95,7 +96,7 @@ class ForceCorrection(nn.Module):
 
 @final
 class ForceCorrectionSum(nn.Module):
-    """The sum of corrections [..., 3] to a believed force."""
+    """Sum of force corrections [..., 3]."""
 
     def __init__(self, corrections: Sequence[nn.Module] | nn.ModuleList) -> None:
         super().__init__()
@@ -111,11 +112,10 @@ class ForceCorrectionSum(nn.Module):
 
 @final
 class ForceModel(nn.Module):
-    """A believed hull with a list of corrections: F_k = F_(k-1) + Theta phi, the chain of (3.26).
+    """Prior hull model with a list of corrections, F_k = F_(k-1) + Theta phi (document 002 (3.26)).
 
     Attributes:
-        earth_force: a force constant in earth axes [2] (north, east) in N that acts on the vessel beside
-            the thrusters.
+        earth_force: constant external force in earth axes [2] (north, east) in N.
     """
 
     def __init__(
@@ -134,27 +134,27 @@ class ForceModel(nn.Module):
     def with_correction(
         self, correction: ForceCorrection, earth_force: Tensor | None = None
     ) -> ForceModel:
-        """Return the next model of the chain."""
+        """Return a model with one more correction."""
         total_earth_force = (
             self.earth_force if earth_force is None else self.earth_force + earth_force
         )
         return ForceModel(self.hull, [*self.corrections, correction], total_earth_force)
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """Return tau [..., 3] in N, N, N m that the motion needs in water at rest."""
+        """Return the force tau [..., 3] in N, N, N m of a motion in calm water."""
         tau: Tensor = self.hull.required_force(nu_dot, nu)
         for correction in self.corrections:
             tau = tau + correction(nu_dot, nu)
         return tau
 
     def split_corrections(self) -> tuple[ForceModel, ForceCorrectionSum]:
-        """Return the believed hull and the sum of its corrections, as modules of their own."""
+        """Return the prior hull model and the sum of its corrections as two modules."""
         return ForceModel(self.hull), ForceCorrectionSum(self.corrections)
 
     def thruster_force(self, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
-        """Return tau [..., 3] that the thrusters have to give at heading psi [...] rad.
+        """Return the thruster force tau [..., 3] at heading psi [...] rad.
 
-        The force that is constant in earth axes acts beside them.
+        It is the force of the motion minus the constant external force.
         """
         earth_force = self.earth_force.to(nu.dtype)
         body_x, body_y = to_body(earth_force[0], earth_force[1], psi)
@@ -164,7 +164,7 @@ class ForceModel(nn.Module):
         return required_force
 
     def force_residual(self, tau: Tensor, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
-        """Return eps = tau - F(nu_dot, nu) [..., 3], which the model leaves unexplained.
+        """Return the force residual eps = tau - F(nu_dot, nu) [..., 3].
 
         Source: document 002 eqs. (3.20), (3.25).
         """
@@ -174,12 +174,12 @@ class ForceModel(nn.Module):
 def find_acceleration_terms(
     terms: Sequence[str], names: Sequence[str] = MOTION_CHANNELS
 ) -> dict[int, int]:
-    """Return the numbers of the terms that are an acceleration, each with its axis.
+    """Return the axis of each term that is an acceleration, by the index of the term.
 
-    The other terms are free of accelerations.
+    The other terms do not depend on accelerations.
 
     Raises:
-        ConfigError: where a term is not affine in nu_dot with a constant factor.
+        ConfigError: if a term is not affine in nu_dot with a constant factor.
     """
     axis_of_term: dict[int, int] = {}
     for j, term in enumerate(terms):
@@ -208,12 +208,12 @@ def augment_mass(
     subject: str,
     names: Sequence[str] = MOTION_CHANNELS,
 ) -> tuple[Tensor, list[int]]:
-    """Return M + A [3, 3] of eps = A nu_dot + b(nu), and the numbers of the terms that make b.
+    """Return M + A [3, 3] of eps = A nu_dot + b(nu), and the indices of the terms of b.
 
     Raises:
-        ConfigError: where a term is not affine in nu_dot with a constant factor.
-        FitError: where M + A has an eigenvalue whose real part is not positive, or is
-            ill-conditioned: the model cannot run forward.
+        ConfigError: if a term is not affine in nu_dot with a constant factor.
+        FitError: if M + A has an eigenvalue without positive real part, or is ill-conditioned, so
+            that the model cannot be solved for nu_dot.
     """
     axis_of_term = find_acceleration_terms(terms, names)
     augmented_mass = mass.clone()

@@ -1,7 +1,7 @@
-"""Vessel files of hulls: rigid body, added mass and terms, as forces or as accelerations.
+"""Vessel files of hulls: rigid body, added mass and terms of forces or accelerations.
 
 Sources: document 003 eqs. (5)-(9), corrections W1, W2; document 002 eqs. (2.3)-(2.6), appendix A;
-document 000 eqs. (6.6)-(6.8), corrections H1 to H5; document 004, section 5.2 with its corrections.
+document 000 eqs. (6.6)-(6.8), corrections H1 to H5; document 004, section 5.2 with corrections.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ from residnet.physics.terms import parse_axis_terms
 from residnet.physics.vessel_file import VesselFile
 
 _METRE_POWER = {"X": 1, "Y": 1, "Z": 1, "K": 2, "M": 2, "N": 2, "u": 1, "v": 1, "r": 0}
-"""Power of metre in the unit of the force or acceleration of each axis."""
+"""Exponent of metre in the unit of the force or acceleration of each axis."""
 
 
 class RigidBody(Config):
-    """The rigid body: mass, yaw inertia and centre of gravity.
+    """Rigid body: mass, yaw inertia and centre of gravity.
 
     Attributes:
         m: mass in kg.
         I_z: moment of inertia in yaw about the body origin in kg m^2.
-        x_G: centre of gravity ahead of the body origin in m.
+        x_G: longitudinal position of the centre of gravity in m, forward of the body origin.
     """
 
     m: Annotated[Mass, Positive]
@@ -60,7 +60,7 @@ class RigidBody(Config):
 
 
 class AddedMass(Config):
-    """The hydrodynamic derivatives of the accelerations (SNAME: negative for a normal hull).
+    """Hydrodynamic derivatives of the accelerations (SNAME notation; negative for most hulls).
 
     Attributes:
         X_udot: surge force by surge acceleration in kg.
@@ -78,18 +78,18 @@ class AddedMass(Config):
 
 
 AxisTerms = dict[str, Parameter]
-"""The terms of one axis by name, each coefficient in the SI unit that its term asks for."""
+"""Coefficients of an axis by term, each in the SI unit determined by its term."""
 
 
 def _axis_terms_validator(
     axes: str, channels: tuple[str, ...], mass_power: int = 1
 ) -> AfterValidator:
-    """Return what checks the units of terms, and gives an axis that has none an empty row.
+    """Return a validator of the units of terms, which also adds empty rows for missing axes.
 
     Args:
-        axes: their names, in the order of the velocities.
-        channels: that terms are made of.
-        mass_power: power of mass in the units, 1 for forces and 0 for accelerations.
+        axes: names of the axes, in the order of the velocities.
+        channels: channels of the terms.
+        mass_power: exponent of mass in the units, 1 for forces and 0 for accelerations.
     """
 
     def validate_units(axis_terms: dict[str, AxisTerms]) -> dict[str, AxisTerms]:
@@ -112,7 +112,7 @@ def _axis_terms_validator(
 PlanarRows = Annotated[
     dict[Literal["X", "Y", "N"], AxisTerms], _axis_terms_validator("XYN", VELOCITY_NAMES)
 ]
-"""Terms of (u, v, r), for example `X: {u: ..., "u|u|": ...}`."""
+"""Forces as terms of (u, v, r), for example `X: {u: ..., "u|u|": ...}`."""
 AccelerationRows = Annotated[
     dict[Literal["u", "v", "r"], AxisTerms], _axis_terms_validator("uvr", VELOCITY_NAMES, 0)
 ]
@@ -132,7 +132,7 @@ SubmergedRows = Annotated[
 def coefficient_rows(
     terms_by_axis: Mapping[Any, AxisTerms], factor: float = 1.0
 ) -> list[dict[str, float]]:
-    """Return the coefficients of each axis, times a factor."""
+    """Return the coefficients of each axis multiplied by a factor."""
     return [
         {term: factor * parameter.value for term, parameter in axis_terms.items()}
         for axis_terms in terms_by_axis.values()
@@ -140,13 +140,13 @@ def coefficient_rows(
 
 
 class HullVessel(VesselFile, ABC):
-    """A hull with actuators in the weather.
+    """Vessel with hull, actuators and wind loads.
 
-    A file may name another one as `base` and give only what differs.
+    A file can refer to another one as `base` and contain the differences only.
 
     Attributes:
-        actuators: what the vessel is driven and steered by.
-        wind: coefficients of the hull above water; without them the vessel feels no wind.
+        actuators: actuators of the vessel.
+        wind: wind coefficients; without them there is no wind load.
     """
 
     actuators: ActuatorConfig
@@ -157,11 +157,11 @@ class HullVessel(VesselFile, ABC):
         """Build the hull.
 
         Raises:
-            ConfigError: where the mass matrix is not positive definite or is singular.
+            ConfigError: if the mass matrix is not positive definite or is singular.
         """
 
     def initial_speeds(self) -> Mapping[str, float]:
-        """Return the states that trials start from, where not at rest."""
+        """Return the nonzero initial states of trials by name."""
         return {}
 
     @final
@@ -172,14 +172,14 @@ class HullVessel(VesselFile, ABC):
 
 
 class HullConfig(HullVessel, ABC):
-    """A 3-DOF vessel M nu_dot + C(nu) nu + D(nu) nu = tau.
+    """3-DOF vessel M nu_dot + C(nu) nu + D(nu) nu = tau.
 
-    A file may name another one as `base` and give only what differs.
+    A file can refer to another one as `base` and contain the differences only.
 
     Attributes:
-        scale: what M, C and D are all multiplied by: a true vessel beside the believed one of its
-            `base` (document 002 eq. (4.2)).
-        damping: terms of D(nu) nu on each axis; positive coefficients brake.
+        scale: common factor of M, C and D, which defines a plant that differs from the prior model
+            of its `base` (document 002 eq. (4.2)).
+        damping: terms of D(nu) nu of each axis; positive coefficients damp.
     """
 
     scale: float = Field(default=1.0, gt=0)
@@ -188,17 +188,17 @@ class HullConfig(HullVessel, ABC):
 
     @abstractmethod
     def mass_matrix(self) -> list[list[float]]:
-        """Return M [3, 3], without the scale."""
+        """Return M [3, 3] without the scale."""
 
     @abstractmethod
     def sway_yaw_coupling(self) -> float:
-        """Return the factor of r in the sway momentum of C(nu), in kg m, without the scale."""
+        """Return the coefficient of r in the sway momentum of C(nu), in kg m, without the scale."""
 
     @final
     def build_hull(self) -> Hull:
-        """Build the hull, with the Coriolis matrix in Fossen's skew form of the mass matrix.
+        """Build the hull with the skew-symmetric Coriolis matrix of the mass matrix (Fossen).
 
-        Inertia does no work where that is symmetric.
+        Coriolis forces of a symmetric mass matrix do no work.
         """
         mass = [
             [self.scale * value for value in axis_coefficients]
@@ -224,7 +224,7 @@ class HullConfig(HullVessel, ABC):
 
 @final
 class FossenConfig(HullConfig):
-    """A 3-DOF vessel in matrix form.
+    """3-DOF vessel with rigid body and added mass.
 
     Attributes:
         rigid_body: mass, inertia and centre of gravity.
@@ -236,7 +236,7 @@ class FossenConfig(HullConfig):
     added_mass: AddedMass
 
     def mass_matrix(self) -> list[list[float]]:
-        """Return rigid body and added mass, [3, 3]."""
+        """Return the mass matrix of rigid body and added mass [3, 3]."""
         rigid_body = self.rigid_body
         added_mass = self.added_mass
         m = rigid_body.m.value
@@ -252,7 +252,7 @@ class FossenConfig(HullConfig):
         ]
 
     def sway_yaw_coupling(self) -> float:
-        """Return the mean of m23 and m32, which makes C that of the symmetric part of M.
+        """Return the mean of m23 and m32, so that C belongs to the symmetric part of M.
 
         Source: Fossen 2011, section 6.3.
         """
@@ -261,7 +261,7 @@ class FossenConfig(HullConfig):
 
 
 class MassEntries(Config):
-    """The mass matrix with added mass; the entries that are not here are zero.
+    """Entries of the mass matrix with added mass; all other entries are zero.
 
     Attributes:
         m11: surge in kg.
@@ -280,7 +280,7 @@ class MassEntries(Config):
 
 @final
 class MassMatrixConfig(HullConfig):
-    """A 3-DOF vessel whose mass matrix was identified as a whole, as that of milliAmpere.
+    """3-DOF vessel with an identified mass matrix, such as milliAmpere.
 
     Attributes:
         mass: entries of the mass matrix.
@@ -292,7 +292,7 @@ class MassMatrixConfig(HullConfig):
     mass: MassEntries
 
     def mass_matrix(self) -> list[list[float]]:
-        """Return the mass matrix [3, 3] of the file; it need not be symmetric."""
+        """Return the mass matrix [3, 3], which need not be symmetric."""
         entries = self.mass
         return [
             [entries.m11.value, 0.0, 0.0],
@@ -301,12 +301,12 @@ class MassMatrixConfig(HullConfig):
         ]
 
     def sway_yaw_coupling(self) -> float:
-        """Return m23 alone, as (2.5) has it (correction J4)."""
+        """Return m23, as in document 002 (2.5) (correction J4)."""
         return self.mass.m23.value
 
 
 class InverseMass(Config):
-    """The acceleration per force or moment on each axis.
+    """Acceleration per force or moment of each axis.
 
     Attributes:
         x: surge in 1/kg.
@@ -321,13 +321,13 @@ class InverseMass(Config):
 
 @final
 class AccelerationHullConfig(HullVessel):
-    """A 3-DOF vessel known by its accelerations, nu_dot = gain tau + terms of the velocities.
+    """3-DOF vessel given by its accelerations, nu_dot = gain tau + terms of the velocities.
 
-    A file may name another one as `base` and give only what differs.
+    A file can refer to another one as `base` and contain the differences only.
 
     Attributes:
         gains: acceleration per force.
-        terms: acceleration without force; terms that brake are negative.
+        terms: acceleration without force; coefficients of damping are negative.
     """
 
     kind: Literal["odin"]
@@ -336,7 +336,7 @@ class AccelerationHullConfig(HullVessel):
     actuators: ActuatorsConfig
 
     def build_hull(self) -> Hull:
-        """Build the hull, whose masses are one over the gains."""
+        """Build the hull, whose masses are the reciprocals of the gains."""
         mass = [1.0 / gain.value for gain in (self.gains.x, self.gains.y, self.gains.n)]
         force_rows = [
             {term: m * value for term, value in acceleration_row.items()}
@@ -351,11 +351,11 @@ class AccelerationHullConfig(HullVessel):
 
 
 class RollingBody(RigidBody):
-    """The rigid body of a vessel that rolls.
+    """Rigid body of a vessel with roll.
 
     Attributes:
         I_x: moment of inertia in roll about the body origin in kg m^2.
-        z_G: centre of gravity below the body origin in m; negative above it.
+        z_G: vertical position of the centre of gravity in m, below the body origin.
     """
 
     I_x: Annotated[Inertia, Positive]
@@ -363,7 +363,7 @@ class RollingBody(RigidBody):
 
 
 class RollingAddedMass(AddedMass):
-    """The hydrodynamic derivatives of the accelerations in surge, sway, roll and yaw (SNAME).
+    """Hydrodynamic derivatives of the accelerations in surge, sway, roll and yaw (SNAME).
 
     Attributes:
         Y_pdot: sway force by roll acceleration in kg m.
@@ -381,11 +381,11 @@ class RollingAddedMass(AddedMass):
 
 
 class Hydrostatics(Config):
-    """Roll restoring K = -rho g V GM phi.
+    """Hydrostatic roll moment K = -rho g V GM phi.
 
     Attributes:
-        density: of the water.
-        volume: displaced.
+        density: density of the water.
+        volume: displaced volume.
         GM: transverse metacentric height.
     """
 
@@ -395,21 +395,21 @@ class Hydrostatics(Config):
 
     @property
     def roll_stiffness(self) -> float:
-        """rho g V GM in N m per rad."""
+        """Roll stiffness rho g V GM in N m per rad."""
         return self.density.value * GRAVITY * self.volume.value * self.GM.value
 
 
 @final
 class RollingHullConfig(HullVessel):
-    """A vessel in surge, sway, roll and yaw, given by its derivatives.
+    """4-DOF vessel in surge, sway, roll and yaw, given by hydrodynamic derivatives.
 
     Attributes:
-        speed: service speed, which trials start from.
-        actuators: rudders as foils in the propellers' race, or linear ones.
+        speed: service speed, the initial speed of trials.
+        actuators: rudders as foils in the slipstream of the propellers, or linear rudders.
         hydrostatics: roll restoring.
         rigid_body: mass, inertia and centre of gravity.
         added_mass: hydrodynamic derivatives of the accelerations.
-        forces: terms of the forces of the water; those that brake are negative.
+        forces: terms of the hydrodynamic forces; coefficients of damping are negative.
     """
 
     kind: Literal["patrol"]
@@ -421,13 +421,13 @@ class RollingHullConfig(HullVessel):
     actuators: RollingActuatorsConfig
 
     def initial_speeds(self) -> Mapping[str, float]:
-        """Return the service speed, at which the source's thrust compensates the resistance."""
+        """Return the service speed, at which the thrust of the source balances the resistance."""
         return {"u": self.speed}
 
     def build_hull(self) -> Hull:
-        """Build the hull, with the inertia of the rigid body about the origin (eq. (5.12)).
+        """Build the hull with the rigid-body inertia about the origin (document 004 eq. (5.12)).
 
-        The water's Coriolis forces are among the terms, as far as the source has them (X_vr).
+        Coriolis forces of the added mass are included only as terms of the source (X_vr).
         """
         rigid_body = self.rigid_body
         added_mass = self.added_mass
@@ -470,7 +470,7 @@ class RollingHullConfig(HullVessel):
 
 
 class SubmergedBody(RollingBody):
-    """The rigid body of a vessel under water, symmetric to port and starboard.
+    """Rigid body of an underwater vessel with port/starboard symmetry.
 
     Attributes:
         I_y: moment of inertia in pitch about the body origin in kg m^2.
@@ -480,7 +480,7 @@ class SubmergedBody(RollingBody):
 
 
 class SubmergedAddedMass(Config):
-    """The hydrodynamic derivatives of the accelerations (SNAME), of a hull with three planes.
+    """Hydrodynamic derivatives of the accelerations (SNAME) of a hull with three symmetry planes.
 
     Attributes:
         X_udot: surge force by surge acceleration in kg.
@@ -500,13 +500,13 @@ class SubmergedAddedMass(Config):
 
 
 class Buoyancy(Config):
-    """The water that the hull displaces.
+    """Buoyancy of a hull.
 
     Attributes:
-        density: of the water.
-        volume: displaced.
-        x_B: centre of buoyancy ahead of the body origin in m.
-        z_B: centre of buoyancy below the body origin in m; negative above it.
+        density: density of the water.
+        volume: displaced volume.
+        x_B: longitudinal position of the centre of buoyancy in m, forward of the body origin.
+        z_B: vertical position of the centre of buoyancy in m, below the body origin.
     """
 
     density: Annotated[MassDensity, Positive]
@@ -517,16 +517,16 @@ class Buoyancy(Config):
 
 @final
 class SubmergedHullConfig(HullVessel):
-    """A vessel under water in six degrees of freedom.
+    """Underwater vessel in six degrees of freedom.
 
     Attributes:
-        actuators: fins and propeller, or thrusters that push in all directions.
-        buoyancy: what carries it.
+        actuators: fins and propeller, or vectored thrusters.
+        buoyancy: buoyancy of the hull.
         rigid_body: mass, inertia and centre of gravity.
         added_mass: hydrodynamic derivatives of the accelerations.
-        forces: terms of the forces of the water; those that brake are negative, and what inertia
-            does is not among them.
-        speed: that trials start from; 0 for at rest.
+        forces: terms of the hydrodynamic forces without inertial forces; coefficients of damping
+            are negative.
+        speed: initial speed of trials.
     """
 
     kind: Literal["submerged"]
@@ -541,11 +541,11 @@ class SubmergedHullConfig(HullVessel):
         return {"u": self.speed}
 
     def build_hull(self) -> Hull:
-        """Build the hull: mass, Coriolis forces of the whole of it, weight and buoyancy.
+        """Build the hull with mass, Coriolis forces, weight and buoyancy.
 
-        With the momenta l of translation and h of rotation the rotating axes make the force -w x l
-        and the moment -v x l - w x h (Kirchhoff; Fossen 2021, section 6.3). Weight and buoyancy
-        act along the vertical in body axes (Fossen 2021, eq. (4.6)).
+        With linear momentum l and angular momentum h, the Coriolis force is -w x l and the moment
+        is -v x l - w x h (Kirchhoff; Fossen 2021, section 6.3). Weight and buoyancy act along the
+        vertical in body axes (Fossen 2021, eq. (4.6)).
         """
         rigid_body = self.rigid_body
         added_mass = self.added_mass
@@ -601,24 +601,29 @@ class SubmergedHullConfig(HullVessel):
 
 
 def _format_velocity_product(a: str, b: str) -> str:
-    """Return the product of two velocities, the same whichever stands first."""
+    """Format the product of two velocities in a fixed order."""
     return f"{a}^2" if a == b else " ".join(sorted((a, b), key=SUBMERGED_LAYOUT.velocities.index))
 
 
 SpeedRegime = Literal["displacement", "semi_displacement", "planing"]
 SPEED_REGIMES: tuple[SpeedRegime, ...] = ("displacement", "semi_displacement", "planing")
 REGIME_BOUNDARIES = (0.4, 1.0)
-"""Froude numbers at which the phases meet (document 000, appendix D).
+"""Froude numbers at the boundaries of the speed regimes (document 000, appendix D).
 
-The document puts the beginning of planing between 1.0 and 1.2.
+In the document, planing begins between 1.0 and 1.2.
 """
 
 
 def compute_froude_number(u: Tensor, v: Tensor, length: float) -> Tensor:
-    """Return the fn = sqrt(u^2 + v^2) / sqrt(g L) (9.10), any shape, for a hull of `length` in m.
+    """Compute the Froude number sqrt(u^2 + v^2) / sqrt(g L) (9.10), any shape.
+
+    Args:
+        u: surge velocity in m/s.
+        v: sway velocity in m/s.
+        length: length of the hull in m.
 
     Raises:
-        ValueError: where the length is not positive.
+        ValueError: if the length is not positive.
     """
     if not length > 0:
         raise ValueError(f"the Froude number needs the length of a hull, given {length:g} m")
@@ -626,9 +631,9 @@ def compute_froude_number(u: Tensor, v: Tensor, length: float) -> Tensor:
 
 
 def classify_speed_regime(froude: Tensor) -> Tensor:
-    """Return the number of the phase in `SPEED_REGIMES` at each Froude number, integers of the same shape.
+    """Return the index in `SPEED_REGIMES` at each Froude number, integers of the same shape.
 
-    A boundary belongs to the phase above it.
+    A boundary belongs to the upper regime.
     """
     edges = torch.tensor(REGIME_BOUNDARIES, dtype=froude.dtype, device=froude.device)
     return torch.bucketize(froude, edges, right=True)

@@ -1,4 +1,4 @@
-"""Nomoto's steering models at constant speed: first and second order, and with sideslip.
+"""Nomoto steering models at constant speed: first and second order, and with sideslip.
 
 Source: document 004, section 5.1.
 """
@@ -28,9 +28,9 @@ SwayGain = Annotated[Parameter, AfterValidator(convert_to_unit("m/s"))]
 
 
 class SteeringStateSpace(NamedTuple):
-    """A state-space model z_dot = A z + b delta with z = (v, r, then `internal_states` internal states).
+    """State-space model z_dot = A z + b delta with z = (v, r, internal states).
 
-    A is [k, k], b [k].
+    A is [k, k], b is [k].
     """
 
     a: np.ndarray
@@ -39,13 +39,14 @@ class SteeringStateSpace(NamedTuple):
 
 
 class NomotoVesselConfig(VesselFile, ABC):
-    """The part that all steering models share.
+    """Common configuration of all steering models.
 
     Attributes:
-        speed: u, which nothing changes.
-        K: yaw rate per rudder angle in a steady turn; K over the product of the time constants must
-            be positive, so that a rudder to starboard turns to starboard at first.
-        rudder: largest angle, rate and lag.
+        speed: constant surge velocity u.
+        K: yaw rate per rudder angle in a steady turn. K divided by the product of the time
+            constants must be positive, so that the initial response to a starboard rudder is to
+            starboard.
+        rudder: limits and dynamics of the rudder.
     """
 
     pole_names: ClassVar[tuple[str, ...]]
@@ -56,7 +57,7 @@ class NomotoVesselConfig(VesselFile, ABC):
 
     @abstractmethod
     def state_space(self) -> SteeringStateSpace:
-        """Return the model in state space."""
+        """Return the state-space model."""
 
     @model_validator(mode="after")
     def _validate_turning_sense(self) -> NomotoVesselConfig:
@@ -79,7 +80,7 @@ class NomotoVesselConfig(VesselFile, ABC):
 
 
 class NomotoConfig(NomotoVesselConfig):
-    """The first-order model T r_dot + r = K delta (document 004 eq. (5.9)); no sideslip.
+    """First-order model T r_dot + r = K delta without sideslip (document 004 eq. (5.9)).
 
     Attributes:
         T: time constant in s.
@@ -90,14 +91,14 @@ class NomotoConfig(NomotoVesselConfig):
     T: TimeConstant
 
     def state_space(self) -> SteeringStateSpace:
-        """Return the model of r alone; v stays as it is."""
+        """Return the state-space model of r with constant v."""
         k = self.K.value
         T = self.T.value
         return SteeringStateSpace(np.diag([0.0, -1.0 / T]), np.array([0.0, k / T]))
 
 
 class SecondOrderSteeringConfig(NomotoVesselConfig, ABC):
-    """The time constants of r/delta = K (1 + T3 s) / ((1 + T1 s)(1 + T2 s)).
+    """Time constants of r/delta = K (1 + T3 s) / ((1 + T1 s)(1 + T2 s)).
 
     Attributes:
         T1: first time constant of the denominator in s.
@@ -113,26 +114,25 @@ class SecondOrderSteeringConfig(NomotoVesselConfig, ABC):
     T3: TimeConstant
 
     def companion_matrix(self) -> np.ndarray:
-        """Return the companion form [2, 2] of the denominator."""
+        """Return the companion matrix [2, 2] of the denominator."""
         time_product = self.T1.value * self.T2.value
         time_sum = self.T1.value + self.T2.value
         return np.array([[0.0, 1.0], [-1.0 / time_product, -time_sum / time_product]])
 
 
 class SecondOrderNomotoConfig(SecondOrderSteeringConfig):
-    """The second-order model of the yaw rate; no sideslip.
+    """Second-order model of the yaw rate without sideslip.
 
-    T1 T2 r_ddot + (T1 + T2) r_dot + r = K (delta + T3 delta_dot): document 004 eq. (5.5) by
+    T1 T2 r_ddot + (T1 + T2) r_dot + r = K (delta + T3 delta_dot): document 004 eq. (5.5) with
     correction G12.
 
-    The internal state is q = r_dot - K T3 / (T1 T2) delta, which needs no derivative of the rudder
-    angle.
+    The internal state q = r_dot - K T3 / (T1 T2) delta avoids the derivative of the rudder angle.
     """
 
     kind: Literal["nomoto_second_order"]
 
     def state_space(self) -> SteeringStateSpace:
-        """Return v, r and q."""
+        """Return the state-space model of v, r and q."""
         k = self.K.value
         companion = self.companion_matrix()
         direct_gain = -k * self.T3.value * companion[1, 0]
@@ -143,12 +143,10 @@ class SecondOrderNomotoConfig(SecondOrderSteeringConfig):
 
 
 class SideslipNomotoConfig(SecondOrderSteeringConfig):
-    """The second-order model in yaw and sway, given by its transfer functions.
+    """Second-order model in yaw and sway, given by its transfer functions.
 
     M nu_dot + N(u) nu = b delta with nu = (v, r) (document 004 eq. (5.1)) has the transfer
-    functions (5.3) and v/delta = K_v (1 + T_v s) / ((1 + T1 s)(1 + T2 s)), (5.4) by correction G12.
-
-    K_v and T_v belong to v, in m/s per rad and s.
+    functions (5.3) and v/delta = K_v (1 + T_v s) / ((1 + T1 s)(1 + T2 s)), (5.4) with correction G12.
 
     Attributes:
         K_v: steady sway velocity per rudder angle in m/s per rad.
@@ -169,7 +167,7 @@ class SideslipNomotoConfig(SecondOrderSteeringConfig):
         return self
 
     def state_space(self) -> SteeringStateSpace:
-        """Return v and r, from the companion form of the common denominator."""
+        """Return the state-space model of v and r."""
         k = self.K.value
         k_v = self.K_v.value
         companion = self.companion_matrix()
@@ -182,10 +180,10 @@ class SideslipNomotoConfig(SecondOrderSteeringConfig):
 
 @final
 class NomotoVessel(Plant):
-    """A vessel that turns as its steering model says and keeps its speed.
+    """Plant of a steering model at constant speed.
 
-    State x [B, 6 + k]: x, y [m], psi [rad], u, v [m/s], r [rad/s], internal states of the model,
-    then the rudder where it has a rate or lag. Input: cmd_delta [rad].
+    The state x [B, 6 + k] is x, y [m], psi [rad], u, v [m/s], r [rad/s], the internal states of the
+    model, then the states of the rudder. The input is cmd_delta [rad].
     """
 
     def __init__(self, config: NomotoVesselConfig) -> None:
@@ -213,10 +211,7 @@ class NomotoVessel(Plant):
         self.b = nn.Buffer(torch.from_numpy(b), persistent=False)
 
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the rudder angle [..., 1] for a steer [...] as a share of the limit.
-
-        The speed is constant whatever the drive.
-        """
+        """Return the rudder command [..., 1] for a normalised steer [...]; drive has no effect."""
         return (steer.clamp(-1.0, 1.0) * self.delta_max).unsqueeze(-1)
 
     def rudder_angle(self, x: Tensor, w: Tensor) -> Tensor:
@@ -241,7 +236,7 @@ class NomotoVessel(Plant):
         return torch.cat((x[:, : self.rudder_columns.start], rudder_states), dim=-1)
 
     def make_initial_state(self, rows: int) -> Tensor:
-        """Return the state straight ahead at the model's speed, [rows, nx]."""
+        """Return the initial state [rows, nx]: straight-ahead motion at the speed of the model."""
         x = super().make_initial_state(rows)
         x[:, SURGE] = self.speed
         return x

@@ -1,4 +1,4 @@
-"""Numbers of vessel files: each with its unit and source, converted to SI once, when read."""
+"""Parameters of vessel files with unit and source, converted to SI on reading."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Density = Annotated[float, Quantity("kg/m^3")]
 
 
 class Parameter(Config):
-    """A number with its unit and source.
+    """Parameter with unit and source.
 
     Attributes:
-        value: the number, in `unit`.
-        unit: its unit; the value is converted to SI when the file is read.
-        source: where it comes from.
+        value: value in `unit`.
+        unit: unit; the value is converted to SI when the file is read.
+        source: reference of the value.
     """
 
     value: float
@@ -40,10 +40,7 @@ class Parameter(Config):
 
 
 def convert_to_unit(unit: str) -> Callable[[Parameter], Parameter]:
-    """Return a validator of a parameter whose unit must measure `unit`.
-
-    The validator converts the value to `unit`.
-    """
+    """Return a validator that converts a parameter to `unit` and rejects other dimensions."""
 
     def convert(parameter: Parameter) -> Parameter:
         try:
@@ -64,7 +61,7 @@ MassDensity = Annotated[Parameter, AfterValidator(convert_to_unit("kg/m^3"))]
 
 
 def require_positive(parameter: Parameter) -> Parameter:
-    """Return a validator of a parameter that must be positive."""
+    """Validate that a parameter is positive."""
     if not parameter.value > 0:
         raise ValueError(f"must be positive, given {parameter.value:g}")
     return parameter
@@ -83,7 +80,7 @@ _BASE_DIMENSIONS = {
 
 
 def parse_dimension(unit: str, mass: int = 1) -> tuple[int, int] | None:
-    """Return the powers of metre and second in an SI unit with `mass` times mass.
+    """Return the exponents of metre and second in an SI unit with `mass` as that of kilogram.
 
     For example (2, -1) for `kg m^2/s` or `N m s/rad`; None for any other unit.
     """
@@ -101,7 +98,7 @@ def parse_dimension(unit: str, mass: int = 1) -> tuple[int, int] | None:
 
 
 def require_dimension(mass: int, metres: int, seconds: int) -> Callable[[Parameter], Parameter]:
-    """Return a validator of a parameter in kilogram, metre and second to these powers."""
+    """Return a validator of a parameter with these exponents of kilogram, metre and second."""
 
     def check(parameter: Parameter) -> Parameter:
         if parse_dimension(parameter.unit, mass) != (metres, seconds):
@@ -114,7 +111,7 @@ def require_dimension(mass: int, metres: int, seconds: int) -> Callable[[Paramet
 
 
 def format_unit(metres: int, seconds: int, mass: int = 1) -> str:
-    """Return SI unit `kg^c m^a s^b` as text."""
+    """Format an SI unit `kg^c m^a s^b`."""
 
     def format_powers(sign: int) -> list[str]:
         dimensions = (("kg", mass), ("m", metres), ("s", seconds))

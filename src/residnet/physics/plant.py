@@ -1,4 +1,4 @@
-"""Plants: a vessel with actuators and environment, as equations that a simulator integrates."""
+"""Plants: equations of motion of a vessel with actuators and environment, for simulation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROLLING_LAYOUT = StateLayout(("x", "y", "phi", "psi"), ("u", "v", "p", "r"))
 SUBMERGED_LAYOUT = StateLayout(
     ("x", "y", "z", "phi", "theta", "psi"), ("u", "v", "w", "p", "q", "r")
 )
-"""All six degrees of freedom, z the depth."""
+"""Six degrees of freedom, z is the depth."""
 _LAYOUT_OF_DOF = {one.n_dof: one for one in (PLANAR_LAYOUT, ROLLING_LAYOUT, SUBMERGED_LAYOUT)}
 _FORCE_AXES_OF_DOF = {
     PLANAR_LAYOUT.n_dof: ("x", "y", "n"),
@@ -32,16 +32,16 @@ _FORCE_AXES_OF_DOF = {
 
 
 class Plant(nn.Module, ABC):
-    """The true vessel of a simulation.
+    """Plant of a simulation, x_dot = f(x, w).
 
     Attributes:
-        state_names: names of the columns of x [B, nx]: pose, velocities, then states of the actuators.
+        state_names: names of the columns of x [B, nx]: pose, velocities, states of the actuators.
         input_names: names of the columns of w [B, m]: commands, then exogenous inputs.
-        n_commands: how many of the inputs are commands.
-        attitude_columns: columns of roll, pitch and heading, where the vessel turns about all axes. The
-            rates that stand there are those about the body axes: whoever integrates them composes
-            rotations. Empty where angles add up.
-        dive_commands: commands [c] that make the vessel dive with all its force; None where it cannot.
+        n_commands: number of commands among the inputs.
+        attitude_columns: columns of roll, pitch and heading of a vessel in six degrees of freedom.
+            The derivatives in these columns are the rates about the body axes, and the integrator
+            composes rotations. Empty if angles are integrated directly.
+        dive_commands: commands [c] of full force downwards; None if the vessel cannot dive.
     """
 
     state_names: tuple[str, ...]
@@ -52,37 +52,37 @@ class Plant(nn.Module, ABC):
 
     @abstractmethod
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
+        """Return commands [..., c] for normalised drive and steer [...] of a manoeuvre."""
 
     @abstractmethod
     def derivative(self, x: Tensor, w: Tensor) -> Tensor:
-        """Return x_dot [B, nx] under inputs w [B, m]."""
+        """Compute x_dot [B, nx] at state x [B, nx] and inputs w [B, m]."""
 
     def prepare(self, x: Tensor, w: Tensor) -> Tensor:
-        """Return what a step holds fixed, p [B, k].
+        """Compute the quantities p [B, k] that are constant over a time step.
 
         Args:
-            x: state [B, nx] at the step's start.
+            x: state [B, nx] at the start of the step.
             w: inputs [B, m].
         """
         return w
 
     def derivative_prepared(self, x: Tensor, p: Tensor) -> Tensor:
-        """Return x_dot [B, nx] within a step that holds p = prepare(x, w).
+        """Compute x_dot [B, nx] within a time step, with p = prepare(x, w).
 
-        It equals `derivative` under the same inputs.
+        The result equals that of `derivative` with the same inputs.
         """
         return self.derivative(x, p)
 
     def make_initial_state(self, n_rows: int) -> Tensor:
-        """Return the state [rows, nx] that trials start from, float64.
+        """Return the initial state of trials [n_rows, nx], float64.
 
-        It is at rest; a model that only holds near its service speed starts there.
+        The vessel is at rest, or at service speed if the model is valid only near it.
         """
         return torch.zeros(n_rows, len(self.state_names), dtype=torch.float64)
 
     def finish_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
-        """Return the state [B, nx] after what moves once per step of dt seconds has moved."""
+        """Apply the updates at the end of a time step of dt seconds to the state [B, nx]."""
         return x
 
 
@@ -90,8 +90,7 @@ def invert_mass(mass: Tensor, vessel: str) -> Tensor:
     """Return the inverse [n, n] of a mass matrix [n, n] in float64.
 
     Raises:
-        ConfigError: where an eigenvalue is zero or has no positive real part, or the matrix is as
-            good as singular.
+        ConfigError: if an eigenvalue has no positive real part, or the matrix is nearly singular.
     """
     if bool((torch.linalg.eigvals(mass).real <= 0).any()):
         raise ConfigError(
@@ -111,18 +110,18 @@ def invert_mass(mass: Tensor, vessel: str) -> Tensor:
 
 @final
 class Hull(nn.Module):
-    """A hull M nu_dot = terms(motion) C + tau, in n degrees of freedom.
+    """Hull M nu_dot = terms(motion) C + tau in n degrees of freedom.
 
-    Buffers are float64; results take the dtype of the input.
+    Buffers are float64; results have the dtype of the input.
 
     Args:
-        mass: M with added mass, [n][n].
-        force_rows: for each axis the coefficients C of its force by term; terms that brake are negative.
-        channels: of the motion: the velocities through the water, then phi where the hull rolls,
-            and theta where it pitches.
+        mass: mass matrix M with added mass, [n][n].
+        force_rows: coefficients C of the force of each axis by term; those of damping are negative.
+        channels: channels of the motion: velocities through the water, then phi with roll and theta
+            with pitch.
 
     Raises:
-        ConfigError: where the mass matrix is not positive definite or is singular.
+        ConfigError: if the mass matrix is not positive definite or is singular.
     """
 
     def __init__(
@@ -153,27 +152,27 @@ class Hull(nn.Module):
         self.inverse_mass = nn.Buffer(invert_mass(self.mass, vessel), persistent=False)
 
     def hydrodynamic_force(self, motion: Tensor) -> Tensor:
-        """Return the forces [..., n] in N and N m of water, weight and rotation."""
+        """Return hydrodynamic, hydrostatic and Coriolis forces [..., n] in N and N m."""
         force: Tensor = self.terms(motion) @ self.coefficients.to(motion.dtype)
         return force
 
     def forward(self, motion: Tensor, tau: Tensor) -> Tensor:
-        """Return the acceleration nu_dot [..., n] under the further forces tau [..., n]."""
+        """Compute the acceleration nu_dot [..., n] under external forces tau [..., n]."""
         if self.terms.n_terms:
             tau = tau + self.hydrodynamic_force(motion)
         return tau @ self.inverse_mass.to(tau.dtype).T
 
     def required_force(self, nu_dot: Tensor, motion: Tensor) -> Tensor:
-        """Return the forces [..., n] that accelerate the vessel by nu_dot [..., n].
+        """Compute the external forces [..., n] for the acceleration nu_dot [..., n].
 
         Source: document 002 eq. (2.10).
         """
         return nu_dot @ self.mass.to(motion.dtype).T - self.hydrodynamic_force(motion)
 
     def acceleration_equations(self) -> tuple[tuple[str, ...], list[list[float]]]:
-        """Return nu_dot as J terms of the motion, and coefficients [n][J + n] on each axis.
+        """Return the J terms of nu_dot and the coefficients [n][J + n] of the axes.
 
-        The coefficients of tau stand behind those of the terms.
+        The last n columns are the coefficients of tau.
         """
         response = torch.cat((self.inverse_mass @ self.coefficients.T, self.inverse_mass), dim=1)
         return self.terms.terms, response.tolist()
@@ -181,21 +180,22 @@ class Hull(nn.Module):
 
 @final
 class HullPlant(Plant):
-    """A hull with actuators in current, wind and external forces.
+    """Plant of a hull with actuators, current, wind and external forces.
 
-    State x [B, 2 n + k]: pose, velocities over ground, then the actuators' states. In 3 degrees of
-    freedom these are x, y, psi and u, v, r; in 4 x, y, phi, psi and u, v, p, r; in 6 those of
-    `SUBMERGED_LAYOUT`.
+    The state x [B, 2 n + k] is pose, velocities over ground and states of the actuators. In 3
+    degrees of freedom pose and velocities are x, y, psi and u, v, r; in 4 they are x, y, phi, psi
+    and u, v, p, r; in 6 they are those of `SUBMERGED_LAYOUT`.
 
-    Inputs: commands; force_x, force_y, (force_z, force_k, force_m,) force_n in body axes [N, N m];
-    current_north, current_east [m/s]; force_north, force_east [N], constant in earth axes; where
-    the vessel file has a section `wind`, the true wind (`WIND_INPUTS`). Hull forces are those of
-    the velocities relative to the water, wind loads those of the velocities relative to the air.
+    The inputs are commands; force_x, force_y, (force_z, force_k, force_m,) force_n in body axes
+    [N, N m]; current_north, current_east [m/s]; force_north, force_east [N], constant in earth
+    axes; and the true wind (`WIND_INPUTS`) if the vessel file has a section `wind`. Hull forces
+    depend on velocities relative to the water, wind loads on velocities relative to the air.
 
     Args:
-        hull: of 3, 4 or 6 degrees of freedom.
-        wind: loads of the air; None where it feels none.
-        initial_values: states that trials start from, where not at rest, by name.
+        hull: hull in 3, 4 or 6 degrees of freedom.
+        actuators: actuators of the vessel.
+        wind: wind loads; None without wind.
+        initial_values: nonzero initial states of trials by name.
     """
 
     def __init__(
@@ -239,10 +239,7 @@ class HullPlant(Plant):
         return self.actuators.commands_for_demand(drive, steer)
 
     def without_environment(self) -> Self:
-        """Return this plant without its exogenous inputs, which is faster.
-
-        There are no body or earth-fixed forces, current, wind or air resistance.
-        """
+        """Return a faster copy of this plant without exogenous inputs and air resistance."""
         self.has_environment = False
         self.input_names = self.actuators.command_names
         return self
@@ -254,10 +251,10 @@ class HullPlant(Plant):
         return x
 
     def prepare(self, x: Tensor, w: Tensor) -> Tensor:
-        """Return the inputs with the actuators' forces added to the body forces.
+        """Return the inputs with the actuator forces added to the body forces.
 
-        This holds where these forces stay the same over a step; elsewhere it returns w itself. A
-        recorded step of wam_v_cal takes 162 us so, 221 us without.
+        If the actuator forces are not constant over a time step, the result is w. This reduces the
+        time of a traced step of wam_v_cal from 221 to 162 us.
         """
         if not self.actuators.is_force_constant_in_step:
             return w
@@ -275,10 +272,13 @@ class HullPlant(Plant):
         return self._compute_derivative(x, w, False)
 
     def _compute_derivative(self, x: Tensor, w: Tensor, is_force_included: bool) -> Tensor:
-        """Return x_dot [B, nx].
+        """Compute x_dot [B, nx].
 
-        `is_force_included`: the actuators' forces are among the body forces already, and their states stand
-        still.
+        Args:
+            x: state [B, nx].
+            w: inputs [B, m].
+            is_force_included: whether the body forces in w include the actuator forces; the
+                derivatives of the actuator states are then zero.
         """
         n = self.n_dof
         c = self.n_commands
@@ -325,7 +325,7 @@ class HullPlant(Plant):
     def _pose_derivative(self, pose: Tensor, nu: Tensor) -> Tensor:
         """Return the derivative [B, n] of the pose (document 003 eq. (1), document 004).
 
-        Where the vessel turns about all axes, what its angles have is p, q and r.
+        In six degrees of freedom the derivatives of the angles are p, q and r.
         """
         u, v = nu[..., 0], nu[..., 1]
         if self.is_submerged:
@@ -343,7 +343,7 @@ class HullPlant(Plant):
         return torch.stack((north, east, nu[..., 2], nu[..., 3] * cos_phi), dim=-1)
 
     def _to_body_axes(self, north: Tensor, east: Tensor, pose: Tensor) -> Tensor:
-        """Return an earth-fixed horizontal vector along the (rolled) body axes, [B, n]."""
+        """Transform a horizontal vector in earth axes to body axes, [B, n]."""
         zero = torch.zeros_like(pose[..., -1])
         if self.is_submerged:
             return torch.stack(
@@ -357,7 +357,7 @@ class HullPlant(Plant):
     def _current_in_body_axes(
         self, north: Tensor, east: Tensor, pose: Tensor, nu: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the current in body axes and its derivative while the body turns, each [B, n]."""
+        """Return the current in body axes and its derivative due to rotation, each [B, n]."""
         if self.is_submerged:
             current = self._to_body_axes(north, east, pose)
             rotation = cross_product(current[..., :3], nu[..., 3:])
@@ -377,7 +377,7 @@ class HullPlant(Plant):
         return current, torch.stack((heading_rate * body_y, sway_derivative, zero, zero), dim=-1)
 
     def _wind_force(self, speed: Tensor, direction: Tensor, pose: Tensor, nu: Tensor) -> Tensor:
-        """Return the forces [B, n] of the true wind on a vessel with velocities over ground nu."""
+        """Return the wind forces [B, n] at a true wind and velocities over ground nu."""
         assert self.wind is not None
         air_velocity = self._to_body_axes(
             -speed * torch.cos(direction), -speed * torch.sin(direction), pose
@@ -386,9 +386,9 @@ class HullPlant(Plant):
         return force if self.has_roll else torch.cat((force[:, :2], force[:, 3:]), dim=-1)
 
     def finish_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
-        """Return the state [B, nx] with the actuators moved on by a step of dt seconds.
+        """Update the actuator states in x [B, nx] at the end of a time step of dt seconds.
 
-        They are held while the hull moves.
+        They are constant during the integration of the hull.
         """
         actuator_states = self.actuators.advance_step(
             x[:, 2 * self.n_dof :], w[:, : self.n_commands], dt

@@ -1,8 +1,7 @@
-"""The channels that baselines and heads may use: velocities, commands, forces, relative wind.
+"""Input channels of baselines and heads: velocities, commands, forces and relative wind.
 
-Position and heading are not offered: a model in body axes must not depend on where the vessel is or
-where it points. True wind enters earth-fixed and is turned into wind relative to the vessel with
-the predicted heading and velocity.
+Position and heading are not channels, because the dynamics in body axes do not depend on them. The
+true wind is transformed to wind relative to the vessel with the predicted heading and velocity.
 """
 
 from __future__ import annotations
@@ -36,24 +35,23 @@ FORCE_CHANNELS = ("tau_x", "tau_y", "tau_n")
 
 
 class SignalsConfig(Config):
-    """The inputs that drive a model.
+    """Inputs and degrees of freedom of a model.
 
     Attributes:
-        inputs: command channels of the log, in order; held over a step.
-        exogenous: channels that are not commanded; `wind_speed` and `wind_dir` (where the true wind
-            comes FROM, earth-fixed) become the channels wind_u, wind_v, wind_mag: velocity of the
-            air relative to the vessel in body axes.
-        forces: a vessel (by name or file) whose thrusters turn the two inputs into tau_x, tau_y,
-            tau_n; or the thrusters themselves.
-        pairs: inputs to port and starboard that change places in the mirror, such as
-            [[left, right]]; those that end in `_port` and `_stbd` are known without. Angles change
-            their sign too.
-        velocities: those of u, v and r that the logs tell and the model moves; the others are zero
-            at all times. A model of surge alone has [u]. With p behind them the model rolls: logs
-            need the roll angle phi, which is a state and a channel of it. [u, v, r, w, p, q] are
-            all six degrees of freedom: logs need depth z, roll and pitch. Those of u, w and q are
-            of a motion in an upright plane, as a float or a vehicle that only dives has: with w or
-            q, and pitch where there is q.
+        inputs: command channels of the log, in order; constant over a time step.
+        exogenous: other input channels. `wind_speed` and `wind_dir` (direction FROM which the true
+            wind blows, in earth axes) are transformed to the channels wind_u, wind_v, wind_mag, the
+            velocity of the air relative to the vessel in body axes.
+        forces: a vessel (by name or file) whose thrusters convert the two inputs to tau_x, tau_y,
+            tau_n; or a configuration of thrusters.
+        pairs: inputs to port and starboard that are exchanged by mirroring, such as
+            [[left, right]]; channels with the suffixes `_port` and `_stbd` are paired
+            automatically. Angles also change sign.
+        velocities: measured velocities of the model; the others are zero. A model of surge only has
+            [u], one in the horizontal plane [u, v, r]. With an additional p the model has roll, and
+            logs need the roll angle phi. [u, v, r, w, p, q] are six degrees of freedom, and logs
+            need depth z, roll and pitch. Subsets of u, w and q are motions in the vertical plane,
+            such as those of a float; logs need depth z, and pitch with q.
     """
 
     inputs: tuple[str, ...]
@@ -127,7 +125,8 @@ class SignalsConfig(Config):
         )
         if conflicting := [name for name in self.inputs if name in computed]:
             raise ValueError(
-                f"input '{conflicting[0]}' is a channel that the model has or makes itself; leave it out"
+                f"input '{conflicting[0]}' is a state or a computed channel of the model;"
+                " remove it"
                 " or rename it in the channel map"
             )
         return self
@@ -139,16 +138,16 @@ class SignalsConfig(Config):
 
     @property
     def dof(self) -> DegreesOfFreedom:
-        """The velocities that live."""
+        """Degrees of freedom of the model."""
         return DegreesOfFreedom(self.velocities)
 
     def with_thrusters(self) -> SignalsConfig:
-        """Return the same config with the vessel's name replaced by its thrusters.
+        """Return the config with the thrusters of the vessel instead of its name.
 
         A saved model then needs no vessel file.
 
         Raises:
-            ValueError: where there is no such vessel.
+            ValueError: if the vessel does not exist.
         """
         if not isinstance(self.forces, str):
             return self
@@ -165,7 +164,7 @@ class SignalsConfig(Config):
         return self.model_copy(update={"forces": actuators})
 
     def channel_units(self) -> dict[str, str]:
-        """Return SI unit of each state and input."""
+        """Return the SI unit of each state and input."""
         return {
             name: get_si_unit(name) or "-" for name in self.dof.state_names + self.input_columns
         }
@@ -176,12 +175,13 @@ class SignalsConfig(Config):
 
 
 class Signals(nn.Module):
-    """The channels z [B, nz] from state x [B, nx] and inputs w [B, m].
+    """Computes the channels z [B, nz] from state x [B, nx] and inputs w [B, m].
 
-    `names` holds the names of the columns of z.
+    `prepare` evaluates the part that depends on the inputs only, once per time step; `forward`
+    evaluates the other part at every stage of the integrator.
 
-    `prepare` does what depends on the inputs alone, once per step; `forward` does the rest at every
-    stage of the integrator.
+    Attributes:
+        names: names of the columns of z.
     """
 
     def __init__(self, config: SignalsConfig) -> None:
@@ -209,9 +209,9 @@ class Signals(nn.Module):
         self.n_channels = len(names)
 
     def prepare(self, w: Tensor) -> Tensor:
-        """Return what a step holds fixed, [..., k], from inputs w [..., m].
+        """Compute the quantities [..., k] that are constant over a time step from w [..., m].
 
-        These are inputs, forces and the air's velocity over ground (north, east).
+        They are inputs, forces and the wind velocity over ground (north, east).
         """
         columns = [w[..., : self.n_inputs]]
         if self.has_forces:
@@ -226,11 +226,11 @@ class Signals(nn.Module):
         return columns[0] if len(columns) == 1 else torch.cat(columns, dim=-1)
 
     def forward(self, x: Tensor, p: Tensor) -> Tensor:
-        """Return the channels z [..., nz].
+        """Compute the channels z [..., nz].
 
         Args:
-            x: state [..., nx] (pose, then what moves).
-            p: what `prepare` returned for the step's inputs.
+            x: state [..., nx]: pose, then dynamic states.
+            p: result of `prepare` for the inputs of the time step.
         """
         if self.is_six_dof:
             # nothing depends on the depth
@@ -256,26 +256,26 @@ class Signals(nn.Module):
 
 
 _MAX_ACCELERATION_STD = 10.0
-"""Accelerations, in standard deviations, that are balanced half a range beyond the edge."""
+"""Acceleration in standard deviations that is balanced half a range outside the range."""
 _MIN_RATE = 0.05
 """Lower limit of the restoring rate of the velocity guard, 1/s."""
 _MAX_RATE = 2.0
 """Upper limit of the restoring rate of the velocity guard, 1/s."""
 _MIN_RANGE = 1e-9
-"""Least width of a range, for channels that do not vary."""
+"""Lower bound of the width of a range, for constant channels."""
 
 
 @final
 class RestoringAcceleration(nn.Module):
-    """An acceleration [..., n] that pulls velocities back which left their range, else zero.
+    """Restoring acceleration [..., n] on velocities outside their training range, otherwise zero.
 
-    Beyond the range of the training data a fitted model knows nothing: with nothing to damp it,
-    what it last said would drive the vessel on for ever.
+    A fitted model is not valid outside the training range. Without damping, the clamped
+    acceleration would be integrated without limit.
 
     Args:
         margin: share of the training range by which it is widened on either side.
-        n_channels: number of channels, the velocities first, that `held` keeps in their range: what
-            an input does far beyond it is as little known.
+        n_channels: number of channels, the velocities first, that are clamped to their ranges.
+        n_dof: number of velocities n.
     """
 
     def __init__(
@@ -293,7 +293,7 @@ class RestoringAcceleration(nn.Module):
         self.restoring_rate = nn.Buffer(torch.zeros(n_dof, dtype=torch.float64))
 
     def calibrate(self, samples: Samples) -> None:
-        """Take the ranges of the channels, and the rate from the accelerations."""
+        """Compute the ranges of the channels, and the restoring rate from the accelerations."""
         channel_moments, target_moments = samples.running_moments()
         lower = channel_moments.minimum[: self.n_channels]
         upper = channel_moments.maximum[: self.n_channels]
@@ -308,7 +308,7 @@ class RestoringAcceleration(nn.Module):
         )
 
     def clamp(self, z: Tensor) -> Tensor:
-        """Return channels z [..., nz], where those that left their range stand at its edge."""
+        """Clamp channels z [..., nz] to their ranges."""
         lower = self.low.to(z.dtype)
         upper = self.high.to(z.dtype)
         clamped = z[..., : self.n_channels]
@@ -317,9 +317,9 @@ class RestoringAcceleration(nn.Module):
         return torch.cat((clamped, z[..., self.n_channels :]), dim=-1)
 
     def restoring_acceleration(self, clamped: Tensor, z: Tensor) -> Tensor:
-        """Return the acceleration at channels z [..., nz] whose held ones are known."""
+        """Return the acceleration at channels z [..., nz], given the clamped channels."""
         return self.restoring_rate.to(z.dtype) * (clamped[..., : self.n_dof] - z[..., : self.n_dof])
 
     def forward(self, z: Tensor) -> Tensor:
-        """Return the acceleration at channels z [..., nz]."""
+        """Return the restoring acceleration at channels z [..., nz]."""
         return self.restoring_acceleration(self.clamp(z), z)

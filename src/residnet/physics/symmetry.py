@@ -1,4 +1,4 @@
-"""Port/starboard symmetry: how channels and terms change when all is mirrored."""
+"""Port/starboard symmetry: mirror images of channels and terms."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ _ANGLE_PREFIXES = ("delta", "rudder", "azimuth")
 
 @final
 class ChannelNames(tuple[str, ...]):
-    """Names of channels, a tuple; `partners` says which change places, as declared or by ending.
+    """Tuple of channel names with port/starboard pairs and degrees of freedom.
 
-    A channel that ends in `_port` has the one that ends in `_stbd` for its partner. `dof` says
-    which velocities among them live; the others are zero.
+    Attributes:
+        partners: partner of each paired channel, declared or by the suffixes `_port` and `_stbd`.
+        dof: degrees of freedom; inactive velocities are zero.
     """
 
     partners: Mapping[str, str]
@@ -33,7 +34,7 @@ class ChannelNames(tuple[str, ...]):
         pairs: Iterable[tuple[str, str]] = (),
         dof: DegreesOfFreedom = SURGE_SWAY_YAW,
     ) -> ChannelNames:
-        """From the names, the pairs that are declared, and the velocities that live."""
+        """Create the tuple from names, declared pairs and degrees of freedom."""
         channel_names = super().__new__(cls, names)
         all_pairs = [*pairs, *port_starboard_pairs(channel_names).items()]
         channel_names.partners = {
@@ -45,44 +46,44 @@ class ChannelNames(tuple[str, ...]):
 
 
 def get_partners(names: Sequence[str]) -> Mapping[str, str]:
-    """Return the partner on the other side of each channel that has one."""
+    """Return the partner of each channel that belongs to a port/starboard pair."""
     return (names if isinstance(names, ChannelNames) else ChannelNames(names)).partners
 
 
 def get_dof(names: Sequence[str]) -> DegreesOfFreedom:
-    """Return which velocities live among channels; all where nobody said."""
+    """Return the degrees of freedom of channels; surge, sway and yaw by default."""
     return names.dof if isinstance(names, ChannelNames) else SURGE_SWAY_YAW
 
 
 def active_channels(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the channels without those that drive nothing."""
+    """Return the channels without inactive velocities."""
     unused = get_dof(names).unmodelled_states
     return tuple(name for name in names if name not in unused)
 
 
 def is_active_term(term: str, names: Sequence[str]) -> bool:
-    """Return whether a product of channels holds none that drives nothing."""
+    """Return whether a term contains no inactive velocity."""
     unused = get_dof(names).unmodelled_states
     return not unused or all(factor.name not in unused for factor in parse_term(term, names))
 
 
 def get_channel_parity(name: str) -> int | None:
-    """Return +1 where a channel keeps its sign in the mirror, -1 where it changes it, else None.
+    """Return +1 if the mirror image of a channel keeps its sign, -1 if it changes, else None.
 
-    None means that the channel's parity is not known.
+    None means that the parity of the channel is unknown.
     """
     return _CHANNEL_PARITY.get(name)
 
 
 def get_pair_parity(name: str) -> int:
-    """Return the sign that a channel of a pair changes places with: -1 for an angle, else +1."""
+    """Return the sign with which paired channels are exchanged: -1 for angles, otherwise +1."""
     return -1 if name.removeprefix("cmd_").startswith(_ANGLE_PREFIXES) else 1
 
 
 def find_heeling_propellers(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the lone propellers among channels of a vessel that rolls.
+    """Return the single propellers among the channels of a vessel with roll.
 
-    Their torque heels it to one side, whichever way it is looked at.
+    The torque of a single propeller heels the vessel to one side, which breaks the symmetry.
     """
     single_propellers = [
         name for name in ("n", "cmd_n") if name in names and name not in get_partners(names)
@@ -91,7 +92,7 @@ def find_heeling_propellers(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _product_parity(factors: Iterable[Factor], parities: Mapping[str, float]) -> int:
-    """Return the sign that a product changes by where its channels change theirs."""
+    """Return the sign of the mirror image of a product, from the parities of its channels."""
     sign = 1
     for factor in factors:
         is_even = factor.magnitude or factor.function in EVEN_FUNCTIONS or factor.power % 2 == 0
@@ -101,17 +102,20 @@ def _product_parity(factors: Iterable[Factor], parities: Mapping[str, float]) ->
 
 
 def compute_term_parity(term: str, names: Sequence[str]) -> int | None:
-    """Return the parity of a product of channels; None where a channel's is not known."""
+    """Return the parity of a term; None if that of a channel is unknown."""
     factors = parse_term(term, names)
     has_known_parity = all(factor.name in _CHANNEL_PARITY for factor in factors)
     return _product_parity(factors, _CHANNEL_PARITY) if has_known_parity else None
 
 
 def violates_symmetry(term: str, axis: int, names: Sequence[str]) -> bool:
-    """Return whether a mirror-symmetric vessel cannot have this term in an axis' acceleration.
+    """Return whether a term of an acceleration violates port/starboard symmetry.
 
-    The axes are those of what moves (`Live.moving`): 0 surge, 1 sway, 2 yaw. A roll may have any
-    term of a lone propeller.
+    Args:
+        term: name of the term.
+        axis: index among the dynamic states: 0 surge, 1 sway, 2 yaw. In roll, terms of a single
+            propeller are allowed.
+        names: channels of the model.
     """
     if get_dof(names).dynamic_states[axis] == "p":
         heeling_propellers = find_heeling_propellers(names)
@@ -122,15 +126,15 @@ def violates_symmetry(term: str, axis: int, names: Sequence[str]) -> bool:
 
 
 def get_axis_parities(names: Sequence[str]) -> list[int]:
-    """Return the sign that each of what moves among channels changes by in the mirror, [n]."""
+    """Return the parity of each dynamic state, [n]."""
     return [_CHANNEL_PARITY[name] for name in get_dof(names).dynamic_states]
 
 
 def mirror_channels(names: Sequence[str]) -> tuple[list[int], list[float]] | None:
-    """Return how channels look in the mirror: the column that each is taken from, and the sign.
+    """Return the mirror image of channels as source column and sign of each channel.
 
-    The result is None where the parity of one is not known, or a propeller heels the vessel.
-    Channels of a port/starboard pair change places.
+    Channels of a port/starboard pair are exchanged. The result is None if the parity of a channel
+    is unknown, or a single propeller heels the vessel.
     """
     if find_heeling_propellers(names):
         return None
@@ -144,9 +148,10 @@ def mirror_channels(names: Sequence[str]) -> tuple[list[int], list[float]] | Non
 
 
 def mirror_terms(terms: Sequence[str], names: Sequence[str]) -> dict[int, tuple[int, int]] | None:
-    """Return the place and the sign of each term's mirror image, by the place of the term.
+    """Return index and sign of the mirror image of each term, by the index of the term.
 
-    Terms whose image is not among them are left out; None where a channel's parity is not known.
+    Terms whose image is not in the list are omitted. The result is None if the parity of a channel
+    is unknown.
     """
     mirror = mirror_channels(names)
     if mirror is None:
@@ -171,10 +176,10 @@ def mirror_terms(terms: Sequence[str], names: Sequence[str]) -> dict[int, tuple[
 def canonical_factors(
     term: str, names: Sequence[str], renamed: Mapping[str, str]
 ) -> frozenset[tuple[Factor, int, bool]]:
-    """Return what a term multiplies, its channels renamed; the same for `v u` and `u v`.
+    """Return a canonical form of a term, which is equal for `v u` and `u v`.
 
-    Each thing stands without its power or magnitude, with its whole power, and with whether the
-    product changes sign with it.
+    The form is a set of (factor without power and magnitude, total power, whether the product is
+    odd in the factor), with channels renamed by `partners`.
     """
     total_power: dict[Factor, int] = {}
     is_odd: dict[Factor, bool] = {}
@@ -191,14 +196,16 @@ def canonical_factors(
 
 
 def acts_along_own_velocity(term: str, axis: int, names: Sequence[str]) -> bool:
-    """Return whether a term acts along its axis' own velocity, whatever the other channels are.
+    """Return whether a term always has the sign of the velocity of its axis.
 
-    Its power is then of one sign: with a positive coefficient it feeds energy at any state. Such
-    are `u` and `u|u|` in surge, `v|r|` in sway, `|n| r` in yaw, and not `u v` in sway, whose sign
-    goes with the speed.
+    Such a term is negative damping in any state if its coefficient is positive. Examples are `u`
+    and `u|u|` in surge, `v|r|` in sway and `|n| r` in yaw, but not `u v` in sway, whose sign
+    depends on the speed.
 
     Args:
-        axis: of what moves (`Live.moving`): 0 surge, 1 sway, 2 yaw.
+        term: name of the term.
+        axis: index among the dynamic states: 0 surge, 1 sway, 2 yaw.
+        names: channels of the model.
     """
     factors = canonical_factors(term, names, {})
     odd_channels = {base_factor.name for base_factor, _, is_odd in factors if is_odd}

@@ -1,8 +1,8 @@
-"""Regressors by name: products of channels and of functions of one channel.
+"""Named regressors: products of channels and of functions of a channel.
 
-Names are such as `u|u|`, `v |r|`, `n^2 sin(delta)` or `1`. One library serves hulls, baselines
-(hydrodynamic derivatives) and closed-form heads (basis functions), so that a name means the same
-number everywhere.
+Examples of names are `u|u|`, `v |r|`, `n^2 sin(delta)` and `1`. Hulls, baselines (hydrodynamic
+derivatives) and closed-form heads (basis functions) use the same library, so that a name has one
+meaning.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY_NAMES, suggest_name
 
 TERM_FUNCTIONS = ("sin", "cos", "sqrt", "ssqrt", "inv")
-"""Functions of one channel: sine, cosine, the protected square root sqrt|x|, the sign-preserving
-one sign(x) sqrt|x|, and the protected inverse, 1/x and 0 at x = 0 (document 001, section 2.4:
-protected division and square root).
+"""Functions of a channel.
+
+`sqrt` is sqrt|x|, `ssqrt` is sign(x) sqrt|x|, and `inv` is 1/x with the value 0 at x = 0 (document
+001 section 2.4: protected division and square root).
 """
 EVEN_FUNCTIONS = ("cos", "sqrt")
-"""Functions that keep their value when their channel changes sign; the others change sign with it.
-"""
+"""Even functions; the others are odd."""
 
 _FACTOR = re.compile(
     r"\s*(?:\|(?P<magnitude>\w+)\||(?P<function>[a-z]+)\((?P<inner>\w+)\)"
@@ -36,7 +36,7 @@ _FACTOR = re.compile(
 
 
 class Factor(NamedTuple):
-    """One factor of a term: a channel, its magnitude or a function of it, to a whole power."""
+    """Factor of a term: a channel, its magnitude or a function of it, with an integer power."""
 
     name: str
     magnitude: bool
@@ -45,27 +45,28 @@ class Factor(NamedTuple):
 
     @property
     def symbol(self) -> str:
-        """The channel, or the function of it, without magnitude and power."""
+        """Channel or function of a channel, without magnitude and power."""
         return f"{self.function}({self.name})" if self.function else self.name
 
     @property
     def term_text(self) -> str:
-        """The factor as a term has it."""
+        """Text of the factor in a term."""
         base = f"|{self.name}|" if self.magnitude else self.symbol
         return base if self.power == 1 else f"{base}^{self.power}"
 
 
 def parse_term(term: str, names: Sequence[str], *, functions: bool = True) -> tuple[Factor, ...]:
-    """Return the factors of a term.
+    """Parse a term to its factors.
 
     Args:
-        term: product of channels; factors stand apart by spaces, `*` or the bars of a magnitude;
-            `^2` is a power; `1` the constant; `^-1` divides, for channels that stay away from zero,
-            such as `wind_mag`; `sin(delta)` is one of `TERM_FUNCTIONS`.
-        functions: whether functions may appear.
+        term: product of channels. Factors are separated by spaces, `*` or the bars of a magnitude;
+            `^2` is a power; `1` is the constant; `^-1` is a division, for channels that are never
+            near zero, such as `wind_mag`; `sin(delta)` is one of `TERM_FUNCTIONS`.
+        names: channels of the model.
+        functions: whether functions are allowed.
 
     Raises:
-        ConfigError: where the text cannot be read or names an unknown channel.
+        ConfigError: if the text is invalid or contains an unknown channel.
     """
     if not term.strip():
         raise ConfigError("a term is empty; write '1' for the constant")
@@ -104,10 +105,10 @@ def parse_term(term: str, names: Sequence[str], *, functions: bool = True) -> tu
 def parse_axis_terms(
     terms_by_axis: Mapping[Any, Iterable[str]], names: Sequence[str], *, functions: bool = True
 ) -> list[tuple[str, str, tuple[Factor, ...]]]:
-    """Return (axis, term, its factors) of all terms of all axes, as a config gives them.
+    """Parse all terms of all axes of a config to (axis, term, factors).
 
     Raises:
-        ValueError: where a term cannot be read, names an unknown channel or divides.
+        ValueError: if a term is invalid, contains an unknown channel or a division.
     """
     parsed_terms = []
     for axis, axis_terms in terms_by_axis.items():
@@ -125,9 +126,9 @@ def parse_axis_terms(
 def make_polynomial_terms(
     names: Sequence[str], degree: int, *, magnitudes: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """Return all products of `names` up to `degree`, without the constant.
+    """Return all products of `names` up to `degree`, then x|x| of the names in `magnitudes`.
 
-    Behind them stands x|x| of every name in `magnitudes`.
+    The constant is not included.
     """
     products = [
         " ".join(factors)
@@ -138,11 +139,11 @@ def make_polynomial_terms(
 
 
 class TermLibrary(nn.Module):
-    """The values [..., J] of J terms from channels [..., nz].
+    """Computes the values [..., J] of J terms from channels [..., nz].
 
     Every term is a product of columns of [1, z, |z|, 1/z, functions of z], gathered by index, so
-    that the number of tensor operations is the largest number of factors and not the number of
-    terms; 1/z and each function are there for the channels that need them.
+    that the number of tensor operations is the maximum number of factors instead of the number of
+    terms. 1/z and functions are computed only for the channels that need them.
     """
 
     def __init__(self, terms: Sequence[str], names: Sequence[str]) -> None:
@@ -188,7 +189,7 @@ class TermLibrary(nn.Module):
         self.is_identity = self.is_linear and channel_index.tolist() == list(range(len(names)))
 
     def forward(self, z: Tensor) -> Tensor:
-        """Return the terms [..., J] of channels z [..., nz]."""
+        """Compute the terms [..., J] at channels z [..., nz]."""
         if self.is_linear:
             return z if self.is_identity else z.index_select(-1, self.channel_index)
         if self.max_factors == 0:
@@ -206,7 +207,7 @@ class TermLibrary(nn.Module):
 
 
 def _evaluate_function(name: str, x: Tensor) -> Tensor:
-    """Return one of `TERM_FUNCTIONS` of x, or 1/x, any shape."""
+    """Evaluate one of `TERM_FUNCTIONS`, or 1/x, any shape."""
     if name == "sin":
         return torch.sin(x)
     if name == "cos":
@@ -225,7 +226,7 @@ def _evaluate_function(name: str, x: Tensor) -> Tensor:
 def _factor_columns(
     factor: Factor, column_of_key: Mapping[tuple[str, bool, str], int]
 ) -> list[int]:
-    """Return the columns whose product is the factor."""
+    """Return the indices of the columns whose product is the factor."""
     if factor.power > 0:
         return [column_of_key[factor.name, factor.magnitude, factor.function]] * factor.power
     inverse_column = column_of_key[factor.name, False, "1/"]
@@ -237,7 +238,7 @@ def _factor_columns(
 
 
 class CandidateTerm(NamedTuple):
-    """A candidate term with its degree and how complicated it is among those of its degree.
+    """Candidate term with its degree and a complexity that sorts terms of equal degree.
 
     A function counts as one degree.
     """
@@ -248,28 +249,28 @@ class CandidateTerm(NamedTuple):
 
 
 class CandidatesConfig(Config):
-    """Which terms an equation may have.
+    """Candidate terms of an equation, given by types.
 
-    The candidates are all products of motions (with any factor as its magnitude), and all products
-    of inputs times products of coupled motions times the sine or cosine of an angle or neither.
-    Document 000 eqs. (6.21)-(6.23): inputs rpm up to degree 2, coupled with u up to degree 2, angle
-    nozzle.
+    The candidates are all products of motions, with magnitudes of any factors, and all products of
+    inputs, multiplied by products of coupled motions and by 1 or the sine or cosine of an angle.
+    The candidates of document 000 eqs. (6.21)-(6.23) are inputs rpm up to degree 2, coupling u up
+    to degree 2, and angle nozzle.
 
     Attributes:
-        motions: channels of the motion that the model has; those that it lacks are left out.
-        motion_degree: highest degree of their products.
-        magnitudes: whether factors also stand as magnitudes, as in `u|u|`.
-        inputs: channels whose products enter; None: all that are neither motions nor angles.
-        input_degree: highest degree of their products, all factors plain; None: 1 where `coupling`
-            is given, otherwise what propellers and rudders need: the first and second degree with
-            magnitudes as in `n|n|`, times u and |u|, those of one input also times u^2 and `u|u|`
-            as in `u^2 delta`, and squares of one times another as in `n|n| delta`. There are ratios
-            too, products of motions over an input and one input over another; a head takes those
-            whose divisor stays `find_nonsingular_terms` of zero in its data.
-        angles: inputs that enter as sine and cosine.
-        coupling: motions that products of inputs are multiplied by.
-        coupling_degree: highest degree of these factors.
-        extra: further terms by name.
+        motions: channels of the motion; those that the model does not have are ignored.
+        motion_degree: maximum degree of the products of motions.
+        magnitudes: whether magnitudes of factors are included, as in `u|u|`.
+        inputs: inputs of the products; null for all that are neither motions nor angles.
+        input_degree: maximum degree of the products of inputs without magnitudes. If null, it is 1
+            with `coupling`; otherwise the products are those of propellers and rudders: degrees one
+            and two with magnitudes as in `n|n|`, times u and |u|; those of one input also times u^2
+            and `u|u|` as in `u^2 delta`; squares of one input times another as in `n|n| delta`; and
+            ratios of products of motions over an input and of one input over another. A head uses
+            the ratios whose divisor is not near zero in its data.
+        angles: inputs whose sine and cosine are used.
+        coupling: motions by which products of inputs are multiplied.
+        coupling_degree: maximum degree of these factors.
+        extra: additional terms by name.
     """
 
     motions: tuple[str, ...] = VELOCITY_NAMES
@@ -283,10 +284,10 @@ class CandidatesConfig(Config):
     extra: tuple[str, ...] = ()
 
     def generate_candidates(self, names: Sequence[str]) -> tuple[CandidateTerm, ...]:
-        """Return the candidates for a model with channels `names`, simplest first in each degree.
+        """Return the candidates for channels `names`, sorted by degree and complexity.
 
         Raises:
-            ConfigError: where a channel is named that the model lacks.
+            ConfigError: if a configured channel does not exist in the model.
         """
         motions = [name for name in self.motions if name in names]
         angles = list(self.angles)
@@ -325,10 +326,10 @@ class CandidatesConfig(Config):
     def find_nonsingular_terms(
         self, terms: Sequence[str], names: Sequence[str], z: Tensor
     ) -> Tensor:
-        """Return which terms [J] divide by nothing near zero, or are named under `extra`.
+        """Return which terms [J] have no divisor near zero in the data, or are in `extra`.
 
         Args:
-            z: channels in the data [N, nz].
+            z: channels of the data [N, nz].
         """
         is_nonzero = z.amin(0) * z.amax(0) > 0
         is_nonzero &= z.abs().amin(0) >= _MIN_DIVISOR_SHARE * z.abs().amax(0)
@@ -348,15 +349,16 @@ class CandidatesConfig(Config):
 
 
 _MIN_DIVISOR_SHARE = 0.1
-"""Least share of a channel's largest value that a divisor keeps: noise of a hundredth of that value
-then changes the quotient by a tenth at most.
+"""Minimum ratio of the magnitude of a divisor to its maximum.
+
+Noise of 1 % of the maximum then changes the quotient by at most 10 %.
 """
 
 
 def _ship_input_products(
     motions: Sequence[str], inputs: Sequence[str], *, magnitudes: bool
 ) -> list[str]:
-    """Return what propellers and rudders add to an equation: thrust, lift in their flow, ratios."""
+    """Return the terms of propellers and rudders: thrust, lift and ratios."""
     surge = [name for name in motions if name == "u"]
     speed_products, speed_squares = (
         _products_up_to(surge, degree, magnitudes=magnitudes) for degree in (1, 2)
@@ -399,15 +401,15 @@ def _ship_input_products(
 
 
 def _combine_products(*choices: Sequence[str]) -> list[str]:
-    """Return the products of one text out of each list."""
+    """Return all products with one factor from each list."""
     return [" ".join(factor for factor in factors if factor) for factors in product(*choices)]
 
 
 def rank_candidates(terms: Iterable[str], names: Sequence[str]) -> tuple[CandidateTerm, ...]:
-    """Return the terms with degree and effort, by degree and then by effort.
+    """Sort terms by degree, then by complexity.
 
     Raises:
-        ConfigError: where a term cannot be read.
+        ConfigError: if a term is invalid.
     """
     ranked = []
     for term in terms:
@@ -424,9 +426,9 @@ def rank_candidates(terms: Iterable[str], names: Sequence[str]) -> tuple[Candida
 
 
 def _products_up_to(names: Sequence[str], degree: int, *, magnitudes: bool = False) -> list[str]:
-    """Return the products up to a degree, the empty one first.
+    """Return the products up to a degree, the empty product first.
 
-    Of one channel's factors at most one stands as a magnitude, since |x|^2 is x^2.
+    At most one factor of a channel is a magnitude, because |x|^2 is x^2.
     """
     symbols = [(name, False) for name in names] + (
         [(name, True) for name in names] if magnitudes else []

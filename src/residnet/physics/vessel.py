@@ -1,4 +1,4 @@
-"""Vessel files (`configs/vessels/*.yaml`): every kind of plant, its SI parameters with sources."""
+"""Reading of vessel files (`configs/vessels/*.yaml`) of all kinds of plants."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def load_vessel(name: str) -> AnyVessel:
     """Read a vessel by the name of a file in `configs/vessels` or by the path of a YAML file.
 
     Raises:
-        ConfigError: where there is no such vessel or its file is wrong.
+        ConfigError: if the vessel does not exist or its file is invalid.
     """
     files = find_vessel_files()
     if name in files:
@@ -66,4 +66,4 @@ def _validate_vessel_name(name: str) -> str:
 
 
 VesselName = Annotated[str, AfterValidator(_validate_vessel_name)]
-"""In a config: name or path of a vessel file, read once to see that it is right."""
+"""Name or path of a vessel file in a config; validation reads the file."""

@@ -1,4 +1,4 @@
-"""The part that every vessel file has, and files that give only what differs from a `base`."""
+"""Common part of all vessel files, and the merging of a file with its `base`."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from residnet.physics.plant import Plant
 
 
 class VesselFile(Config, ABC):
-    """A vessel of any kind.
+    """Configuration of a vessel of any kind.
 
-    A file may name another one of its kind as `base` and give only what differs.
+    A file can refer to another one of its kind as `base` and contain the differences only.
 
     Attributes:
-        name: of the vessel, as its file is called.
+        name: name of the vessel, which equals that of the file.
         description: one line for `residnet list vessels`.
-        length: of the hull, which manoeuvring indices are measured in.
+        length: length of the hull, the unit of manoeuvring indices.
     """
 
     name: str
@@ -41,20 +41,19 @@ class VesselFile(Config, ABC):
         """Build the plant of this vessel.
 
         Raises:
-            ConfigError: where the parameters make no plant, for example a singular mass matrix.
+            ConfigError: if the parameters are invalid, for example a singular mass matrix.
         """
 
 
 def merge_with_base(data: Any, folder: Path | None) -> Any:
-    """Return the content of a vessel file laid over that of its `base`.
+    """Merge the content of a vessel file with that of its `base`.
 
-    Sections are merged key by key; a section of another `kind` takes the place of the base's.
-    `base` is the name of a file in `configs/vessels`, or the path of a YAML file, looked for beside
-    the file first.
+    Sections are merged key by key; a section of another `kind` replaces that of the base. `base` is
+    the name of a file in `configs/vessels`, or the path of a YAML file, which is first searched
+    relative to the folder of the file.
 
     Raises:
-        ValueError: where there is no such file, it cannot be read, or files name each other in a
-            circle.
+        ValueError: if the base does not exist, cannot be read, or bases form a cycle.
     """
     visited: list[Path] = []
     layers = [_lists_to_tuples(data)]
@@ -90,15 +89,15 @@ def _resolve_base_path(name: object, folder: Path | None) -> Path:
         if candidate.suffix in {".yaml", ".yml"} and candidate.is_file():
             return candidate.resolve()
     raise ValueError(
-        f"base: no vessel '{name}'{suggest_name(name, files)}; or give the path of a vessel's yaml file"
+        f"base: no vessel '{name}'{suggest_name(name, files)}; give a name or the"
+        " path of a YAML file"
     )
 
 
 def _lists_to_tuples(data: Any) -> Any:
-    """Return the same content with tuples for lists.
+    """Return the content with tuples instead of lists.
 
-    What a validator of a whole model hands on is taken for Python, not for YAML, and lists are no
-    tuples.
+    pydantic validates the output of a model validator in strict mode, which rejects lists.
     """
     if isinstance(data, dict):
         return {key: _lists_to_tuples(value) for key, value in data.items()}

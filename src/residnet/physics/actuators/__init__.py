@@ -1,4 +1,4 @@
-"""Actuators: what a vessel is driven and steered by, listed once in `ActuatorsConfig`."""
+"""Actuators of vessels; `ActuatorsConfig` lists all kinds."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ ActuatorsConfig = Annotated[
 RollingActuatorsConfig = Annotated[
     FoilRuddersConfig | LinearRuddersConfig, Field(discriminator="kind")
 ]
-"""Of a vessel that rolls: they make a roll moment too."""
+"""Actuators of a vessel with roll, which also produce a roll moment."""
 SubmergedActuatorsConfig = Annotated[
     TorpedoFinsConfig | VectoredThrustersConfig, Field(discriminator="kind")
 ]
-"""Of a vessel under water: they make all six forces and moments."""
+"""Actuators of an underwater vessel, which produce all six forces and moments."""
 
 __all__ = [
     "ActuatorConfig",

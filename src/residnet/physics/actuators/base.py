@@ -1,4 +1,4 @@
-"""What turns commands into forces on the hull, and how each actuator follows its command."""
+"""Interfaces of actuators: dynamics from commands to positions, and forces on the hull."""
 
 from __future__ import annotations
 
@@ -22,36 +22,36 @@ from residnet.core.errors import ConfigError
 
 
 class ResponseConfig(Config, ABC):
-    """The lag between a command and the position.
+    """Dynamic response of an actuator from its target to its position.
 
     Attributes:
-        kind: kind of the lag.
+        kind: kind of the response.
     """
 
     state_suffixes: ClassVar[tuple[str, ...]]
-    """Of the actuator's name, one for each state of the lag."""
+    """Suffixes of the names of the response states, appended to the name of the actuator."""
     kind: str
 
     @abstractmethod
     def derivative(self, states: Tensor, target: Tensor, rate_limit: float) -> Tensor:
-        """Return the derivative of the states a [..., k c], towards target [..., c]."""
+        """Return the derivative of the states [..., k c] for a target [..., c]."""
 
 
 @final
 class ImmediateConfig(ResponseConfig):
-    """A position that follows at once, or as fast as the rate limit allows."""
+    """Response without lag, limited by the rate limit only."""
 
     state_suffixes = ()
     kind: Literal["immediate"] = "immediate"
 
     def derivative(self, states: Tensor, target: Tensor, rate_limit: float) -> Tensor:
-        """Return zeros: the position moves once per step."""
+        """Return zeros, because the position is updated once per time step."""
         return torch.zeros_like(states)
 
 
 @final
 class FirstOrderConfig(ResponseConfig):
-    """A lag of first order, a_dot = (target - a) / T within the rate limit.
+    """First-order response, a_dot = (target - a) / T within the rate limit.
 
     Attributes:
         time: time constant in s.
@@ -67,13 +67,13 @@ class FirstOrderConfig(ResponseConfig):
 
 @final
 class SecondOrderConfig(ResponseConfig):
-    """A lag of second order, a_dotdot = w^2 (target - a) - 2 zeta w a_dot.
+    """Second-order response, a_ddot = w^2 (target - a) - 2 zeta w a_dot.
 
-    At the rate limit it accelerates no further.
+    At the rate limit the acceleration is zero.
 
     Attributes:
         frequency: natural frequency in rad/s.
-        damping: relative damping.
+        damping: damping ratio.
     """
 
     state_suffixes = ("", "_rate")
@@ -82,7 +82,7 @@ class SecondOrderConfig(ResponseConfig):
     damping: float = Field(gt=0)
 
     def derivative(self, states: Tensor, target: Tensor, rate_limit: float) -> Tensor:
-        """Return the derivatives of the positions, then of their rates."""
+        """Return the derivatives of the positions, then those of their rates."""
         position, velocity = states.chunk(2, dim=-1)
         limited_velocity = velocity.clamp(-rate_limit, rate_limit)
         acceleration = (
@@ -100,15 +100,14 @@ class SecondOrderConfig(ResponseConfig):
 
 
 class ServoConfig(Config):
-    """The part that all actuators which follow a command share.
+    """Common settings of actuators that follow a command.
 
-    Limit and rate limit stand, with their units, in the subclass' own keys.
+    The keys of the limits belong to the subclasses, because their units differ.
 
     Attributes:
-        response: lag.
-        dead_time: between a command and its first effect; a whole number of `delay_step`.
-        delay_step: step of the plant that the delay line moves by, once per step; the simulation
-            must step by just this.
+        response: dynamic response.
+        dead_time: time between a command and its first effect, a multiple of `delay_step`.
+        delay_step: time step of the delay line; the simulation must use this step.
     """
 
     response: Annotated[
@@ -134,48 +133,48 @@ class ServoConfig(Config):
         return self
 
     def build_limited_servo(self, limit: float, rate_limit: float | None, *names: str) -> Servo:
-        """Return the servo of actuators that are alike, within their limits."""
+        """Build the servo of equal actuators with a limit and a rate limit."""
         return Servo(self, limit, rate_limit, names)
 
 
 class SteeringGearConfig(ServoConfig):
-    """The steering gear: how far and how fast the rudder turns.
+    """Steering gear of a rudder.
 
     Attributes:
-        limit: largest rudder angle of either side in rad.
-        rate: largest rudder rate in rad/s; None for no limit.
+        limit: maximum rudder angle to either side in rad.
+        rate: maximum rudder rate in rad/s; None for no limit.
     """
 
     limit: Radians = Field(gt=0, lt=1.5707)
     rate: RadiansPerSecond | None = Field(default=None, gt=0)
 
     def build_servo(self, *names: str) -> Servo:
-        """Return the servo of rudders by name."""
+        """Build the servo of rudders with these names."""
         return self.build_limited_servo(self.limit, self.rate, *names)
 
 
 class ShaftConfig(ServoConfig):
-    """A shaft with a propeller or jet.
+    """Shaft of a propeller or a jet.
 
     Attributes:
-        n_max: largest revolutions of either direction in 1/s; commands beyond it saturate.
-        n_rate: largest change of revolutions in 1/s^2; None for at once.
+        n_max: maximum revolutions in either direction in 1/s, at which commands saturate.
+        n_rate: maximum rate of change of the revolutions in 1/s^2; None for no limit.
     """
 
     n_max: RevsPerSecond = Field(gt=0)
     n_rate: RevRate | None = Field(default=None, gt=0)
 
     def build_servo(self, *names: str) -> Servo:
-        """Return the servo of shafts by name."""
+        """Build the servo of shafts with these names."""
         return self.build_limited_servo(self.n_max, self.n_rate, *names)
 
 
 @final
 class Servo(nn.Module):
-    """Actuators alike: each command [..., c] is saturated, waits in a delay line, and is followed.
+    """Servo of c equal actuators: saturation, delay line and dynamic response of commands [..., c].
 
-    States a [..., k c] stand in blocks of c: positions, what else the lag needs, then the delayed
-    commands, newest first. Those that begin with `_` are internal: no sensor measures them.
+    States [..., k c] are blocks of c: positions, other states of the response, then the delayed
+    commands, newest first. Names of states that are not measured begin with `_`.
     """
 
     def __init__(
@@ -197,19 +196,19 @@ class Servo(nn.Module):
         )
 
     def current_target(self, states: Tensor, command: Tensor) -> Tensor:
-        """Return what the actuators follow now, [..., c]."""
+        """Return the current targets [..., c]: saturated, delayed commands."""
         if self.n_delay_steps == 0:
             return command.clamp(-self.limit, self.limit)
         return states[..., -self.n_actuators :]
 
     def position(self, states: Tensor, command: Tensor) -> Tensor:
-        """Return the positions [..., c], within the limit."""
+        """Return the positions [..., c], clamped to the limit."""
         if self.n_lag_states == 0:
             return self.current_target(states, command)
         return states[..., : self.n_actuators].clamp(-self.limit, self.limit)
 
     def derivative(self, states: Tensor, command: Tensor) -> Tensor:
-        """Return the derivative [..., k c] of the states."""
+        """Return the derivative of the states [..., k c]."""
         if not self.has_lag:
             return torch.zeros_like(states)
         lag_derivative = self.response.derivative(
@@ -220,10 +219,10 @@ class Servo(nn.Module):
         )
 
     def advance_step(self, states: Tensor, command: Tensor, dt: float) -> Tensor:
-        """Return the states [..., k c] after a step of dt seconds: rate limits and delay lines.
+        """Apply rate limits and delay lines for a time step of dt seconds to states [..., k c].
 
         Raises:
-            ConfigError: where the delay line does not move by dt.
+            ConfigError: if dt is not the step of the delay line.
         """
         lag_states = states[..., : self.n_lag_states]
         if self.n_lag_states > 0 and not self.has_lag:
@@ -246,20 +245,18 @@ class Servo(nn.Module):
 
 
 class ActuatorSystem(nn.Module, ABC):
-    """All actuators of a vessel: commands move their states, and the states push the hull.
+    """All actuators of a vessel, from commands [..., c] and states [..., k] to forces on the hull.
 
-    Commands are [..., c], states a [..., k].
-
-    A state may move continuously (`rate`, integrated with the hull: lags) or once per step
-    (`advance_step`, after the hull has moved with the states held: rate limits).
+    A state is either integrated together with the hull (`derivative`, for lags) or updated once per
+    time step after the integration (`advance_step`, for rate limits and delay lines).
 
     Attributes:
-        state_names: names of the states; empty where the commands act at once. What no sensor measures
-            begins with `_` and enters no log.
+        state_names: names of the states; empty if the commands act without dynamics. Names of
+            states that are not measured begin with `_` and do not occur in logs.
         command_names: names of the commands.
-        depends_on_speed: whether forces depend on the vessel's speed.
-        is_force_constant_in_step: whether forces stay the same over a step.
-        dive_commands: commands [c] that dive with full force; None where nothing does.
+        depends_on_speed: whether forces depend on the speed of the vessel.
+        is_force_constant_in_step: whether forces are constant over a time step.
+        dive_commands: commands [c] of full force downwards; None if the vessel cannot dive.
     """
 
     command_names: tuple[str, ...] = ()
@@ -278,11 +275,11 @@ class ActuatorSystem(nn.Module, ABC):
 
     @abstractmethod
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the commands [..., c] for a manoeuvre's drive and steer [...], each within +-1."""
+        """Return commands [..., c] for drive and steer [...] of a manoeuvre, each within +-1."""
 
     @abstractmethod
     def force(self, states: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """Return the forces tau [..., n] on the hull in N and N m.
+        """Compute the forces tau [..., n] on the hull in N and N m.
 
         Args:
             states: states [..., k].
@@ -291,7 +288,7 @@ class ActuatorSystem(nn.Module, ABC):
         """
 
     def servo_commands(self, command: Tensor) -> Tensor:
-        """Return the commands [..., c] that servos follow, in their order."""
+        """Return the commands [..., c] of the servos, in their order."""
         return command
 
     def _iterate_servos(
@@ -302,7 +299,7 @@ class ActuatorSystem(nn.Module, ABC):
         yield from zip(self.servos, servo_states, servo_commands, strict=True)
 
     def servo_positions(self, states: Tensor, command: Tensor) -> Tensor:
-        """Return where all servos stand, [..., c]."""
+        """Return the positions of all servos [..., c]."""
         positions = [
             servo.position(servo_state, servo_command)
             for servo, servo_state, servo_command in self._iterate_servos(states, command)
@@ -310,7 +307,7 @@ class ActuatorSystem(nn.Module, ABC):
         return torch.cat(positions, dim=-1)
 
     def derivative(self, states: Tensor, command: Tensor) -> Tensor:
-        """Return the derivative [..., k] of the states."""
+        """Return the derivative of the states [..., k]."""
         derivatives = [
             servo.derivative(servo_state, servo_command)
             for servo, servo_state, servo_command in self._iterate_servos(states, command)
@@ -318,7 +315,7 @@ class ActuatorSystem(nn.Module, ABC):
         return torch.cat(derivatives, dim=-1)
 
     def advance_step(self, states: Tensor, command: Tensor, dt: float) -> Tensor:
-        """Return the states [..., k] after a step of dt seconds, of what moves once per step."""
+        """Apply the updates of a time step of dt seconds to the states [..., k]."""
         next_states = [
             servo.advance_step(servo_state, servo_command, dt)
             for servo, servo_state, servo_command in self._iterate_servos(states, command)
@@ -327,25 +324,25 @@ class ActuatorSystem(nn.Module, ABC):
 
 
 class ForceActuators(ActuatorSystem, ABC):
-    """Actuators that push a hull in surge, sway and yaw, each as asked for, within their limits."""
+    """Actuators that can produce any force in surge, sway and yaw within their limits."""
 
     depends_on_speed = False
 
     @abstractmethod
     def allocate(self, force: Tensor) -> Tensor:
-        """Return the commands [..., c] that ask for forces tau [..., 3] in N, N, N m."""
+        """Return the commands [..., c] that request forces tau [..., 3] in N, N, N m."""
 
     @abstractmethod
     def requested_force(self, command: Tensor) -> Tensor:
-        """Return the forces tau [..., 3] that commands [..., c] ask for, before any lag."""
+        """Return the forces tau [..., 3] that commands [..., c] request, before dynamics."""
 
 
 class ActuatorConfig(Config, ABC):
-    """The part of a vessel file that all kinds of actuators share.
+    """Common part of the section `actuators` of a vessel file.
 
     Attributes:
         kind: kind of the actuators.
-        source: where their numbers come from.
+        source: reference of the parameters.
     """
 
     kind: str
@@ -353,17 +350,17 @@ class ActuatorConfig(Config, ABC):
 
     @abstractmethod
     def build(self) -> ActuatorSystem:
-        """Build the module that turns commands into forces."""
+        """Build the actuators."""
 
 
 class CommandSpec(NamedTuple):
-    """One command of steered actuators.
+    """Specification of a command of steered actuators.
 
     Attributes:
-        name: of the command.
-        demand_axis: what a manoeuvre sets it by.
-        max_value: value of a whole share.
-        min_share: least share; 0 for what pushes one way.
+        name: name of the command.
+        demand_axis: normalised demand of a manoeuvre that sets it, drive or steer.
+        max_value: value at a demand of 1.
+        min_share: minimum demand; 0 for actuators that act in one direction.
     """
 
     name: str
@@ -373,7 +370,7 @@ class CommandSpec(NamedTuple):
 
 
 def commands_from_demand(specs: Sequence[CommandSpec], drive: Tensor, steer: Tensor) -> Tensor:
-    """Return commands [..., c] for drive and steer [...], shares of what is largest."""
+    """Return commands [..., c] for normalised drive and steer [...]."""
     demand = {"drive": drive, "steer": steer, "dive": torch.zeros_like(steer)}
     shares = [
         demand[spec.demand_axis].clamp(spec.min_share, 1.0) * spec.max_value for spec in specs
@@ -382,28 +379,28 @@ def commands_from_demand(specs: Sequence[CommandSpec], drive: Tensor, steer: Ten
 
 
 class SteeredConfig(ActuatorConfig, ABC):
-    """Actuators whose config says what they do."""
+    """Actuators whose forces are computed by their configuration."""
 
     @abstractmethod
     def command_specs(self) -> tuple[CommandSpec, ...]:
-        """Return the commands, those that servos follow first."""
+        """Return the specifications of the commands, those with servos first."""
 
     @abstractmethod
     def build_servos(self) -> tuple[Servo, ...]:
-        """Return the servos, in the order of the commands."""
+        """Build the servos, in the order of the commands."""
 
     @abstractmethod
     def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """Return the forces tau [..., n] on the hull in N and N m.
+        """Compute the forces tau [..., n] on the hull in N and N m.
 
         Args:
-            position: where the servos stand [..., c].
+            position: positions of the servos [..., c].
             command: commands [..., c].
             nu: velocities through the water [..., n].
         """
 
     def servo_commands(self, command: Tensor) -> Tensor:
-        """Return the commands [..., c] that servos follow, in their order."""
+        """Return the commands [..., c] of the servos, in their order."""
         return command
 
     @final
@@ -413,7 +410,7 @@ class SteeredConfig(ActuatorConfig, ABC):
 
 @final
 class SteeredActuators(ActuatorSystem):
-    """Rudders, fins and jets with their propellers, as their config has them."""
+    """Rudders, fins or jets with their propellers, defined by a configuration."""
 
     def __init__(self, config: SteeredConfig) -> None:
         super().__init__(*config.build_servos())
@@ -439,14 +436,14 @@ class SteeredActuators(ActuatorSystem):
 
 Coefficients = tuple[float, float, float]
 CurveRange = tuple[RevsPerSecond, RevsPerSecond]
-"""Revolutions (astern, ahead) between which a curve was measured."""
+"""Range of revolutions (astern, ahead) in which a curve was measured."""
 
 
 def require_curve_covers_range(curve_range: CurveRange | None, n_max: float) -> None:
-    """Stop where a shaft may turn faster than its thrust curve is known.
+    """Check that the measured range of a thrust curve includes +-n_max.
 
     Raises:
-        ValueError: naming both.
+        ValueError: if it does not.
     """
     lower, upper = curve_range or (-n_max, n_max)
     if lower > -n_max or upper < n_max:
@@ -457,14 +454,14 @@ def require_curve_covers_range(curve_range: CurveRange | None, n_max: float) -> 
 
 
 class ThrustConfig(Config):
-    """The thrust curve of a propeller, c0 + c1 n + c2 n^2; it never opposes the rotation.
+    """Thrust curve of a propeller, c0 + c1 n + c2 n^2, clipped to the sign of the rotation.
 
     Attributes:
-        n_max: largest revolutions of either direction in 1/s; commands beyond it saturate.
-        forward: coefficients c0 [N], c1 [N s], c2 [N s^2] for n > 0 [1/s], at standstill.
+        n_max: maximum revolutions in either direction in 1/s, at which commands saturate.
+        forward: coefficients c0 [N], c1 [N s], c2 [N s^2] for n > 0 [1/s], at zero speed.
         reverse: coefficients for n < 0 (signed).
-        curve_range: revolutions (astern, ahead) in 1/s that the curve was measured between; it must
-            include +-n_max.
+        curve_range: range of revolutions (astern, ahead) in 1/s in which the curve was measured; it
+            must include +-n_max.
     """
 
     n_max: RevsPerSecond = Field(gt=0)

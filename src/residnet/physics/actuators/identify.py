@@ -1,4 +1,4 @@
-"""Actuators identified from tests: throttle map, rate limit and dead time, thrust curves.
+"""Identification of actuators from tests: throttle map, rate limit, dead time, thrust curves.
 
 Source: document 003 section 4.1.
 """
@@ -14,7 +14,7 @@ from residnet.core.errors import FitError
 
 
 class IntervalEstimate(NamedTuple):
-    """A number with its 95 % interval, in `unit`."""
+    """Estimate with the half width of its 95 % confidence interval, in `unit`."""
 
     value: float
     low: float
@@ -23,9 +23,9 @@ class IntervalEstimate(NamedTuple):
 
 
 class ThrottleMap(NamedTuple):
-    """The revolutions n = slope * throttle + offset [1/s], bounded by +-n_max.
+    """Map from throttle to revolutions, n = slope * throttle + offset [1/s], within +-n_max.
 
-    n_max is the largest value measured where nothing saturated.
+    n_max is the maximum measured value if the data do not saturate.
     """
 
     slope: IntervalEstimate
@@ -34,7 +34,7 @@ class ThrottleMap(NamedTuple):
     saturated: bool
 
     def __call__(self, throttle: np.ndarray) -> np.ndarray:
-        """Return the revolutions [1/s]."""
+        """Return the revolutions [1/s] at a throttle."""
         return np.clip(
             self.slope.value * throttle + self.offset.value, -self.n_max.value, self.n_max.value
         )
@@ -48,7 +48,7 @@ class StepResponse(NamedTuple):
 
 
 class ThrustFit(NamedTuple):
-    """The thrust curve of one direction: coefficients, range of revolutions and rms residual.
+    """Thrust curve of one direction: coefficients, range of revolutions and RMS residual.
 
     The coefficients are c0 [N], c1 [N s], c2 [N s^2]; the residual is in N.
     """
@@ -59,24 +59,24 @@ class ThrustFit(NamedTuple):
     rms: float
 
     def __call__(self, n: np.ndarray) -> np.ndarray:
-        """Return the thrust [N] per thruster at n [1/s]."""
+        """Return the thrust [N] per thruster at revolutions n [1/s]."""
         coefficients = [estimate.value for estimate in self.coefficients]
         thrust: np.ndarray = coefficients[0] + n * (coefficients[1] + n * coefficients[2])
         return thrust
 
 
 _SATURATION_POINTS = 3
-"""Points at the same revolutions from which a bound is believed."""
+"""Minimum number of points at the same revolutions that count as saturation."""
 
 
 def fit_throttle_map(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:
-    """Fit the steady revolutions n [N] in 1/s over the throttle [N]: a line with a bound.
+    """Fit a line with saturation to steady revolutions n [N] in 1/s over throttle [N].
 
-    Slope, offset and bound are found together by least squares.
+    Slope, offset and saturation are estimated jointly by least squares.
 
     Raises:
-        FitError: with fewer than five points or fewer than three different throttles on the slope,
-            throttle of one direction only, or revolutions that fall with the throttle.
+        FitError: if there are fewer than five points, fewer than three different throttles on the
+            slope or throttles of one direction only, or if revolutions decrease with throttle.
     """
     if throttle.size < 5 or np.unique(throttle).size < 3:
         raise FitError(
@@ -128,13 +128,13 @@ def fit_throttle_map(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:
 def simulate_shaft(
     t: np.ndarray, command: np.ndarray, rate_limit: float, dead_time: float, initial_n: float
 ) -> np.ndarray:
-    """Return the revolutions [T] that follow a command with dead time and rate limit.
+    """Simulate the revolutions [T] of a shaft with dead time and rate limit.
 
     Args:
         t: times [T] in s.
         command: commanded revolutions [T] in 1/s, held between samples.
-        rate_limit: largest change in 1/s^2.
-        dead_time: between a command and its first effect, in s.
+        rate_limit: maximum rate of change in 1/s^2.
+        dead_time: time between a command and its first effect, in s.
         initial_n: revolutions at the first sample in 1/s.
     """
     delayed_t = t - dead_time
@@ -170,11 +170,11 @@ def fit_step_response(
     """Fit rate limit and dead time to step responses.
 
     Args:
-        responses: for each response t [T] in s, command [T] and n [T] in 1/s.
+        responses: time t [T] in s, command [T] and revolutions n [T] in 1/s of each response.
 
     Raises:
-        FitError: where a run is too short, its command does not step, or the revolutions do not
-            follow.
+        FitError: if a response is too short, its command has no step, or the revolutions do not
+            follow it.
     """
     for t, command, n in responses:
         if t.size < 20:
@@ -234,15 +234,15 @@ def fit_step_response(
 def fit_thrust_curves(
     n: np.ndarray, pull: np.ndarray, n_thrusters: int
 ) -> tuple[ThrustFit, ThrustFit]:
-    """Fit the thrust per thruster over revolutions, ahead and astern, to a bollard pull.
+    """Fit the thrust curves ahead and astern of a thruster to a bollard pull test.
 
     Args:
         n: revolutions [N] in 1/s.
-        pull: pull [N] in N of all thrusters together.
+        pull: total pull [N] of all thrusters, in N.
 
     Raises:
-        FitError: where a direction has fewer than five points or four revolutions, or pulls the
-            wrong way.
+        FitError: if a direction has fewer than five points or four different revolutions, or its
+            pull has the wrong sign.
     """
     return _fit_thrust_curve(n[n > 0], pull[n > 0] / n_thrusters, "ahead"), _fit_thrust_curve(
         n[n < 0], pull[n < 0] / n_thrusters, "astern"
@@ -290,9 +290,9 @@ def _fit_with_intervals(
     *,
     is_serial: bool = False,
 ) -> tuple[list[float], list[float]]:
-    """Return the parameters and half widths of their 95 % intervals.
+    """Return the parameters and half widths of their 95 % confidence intervals.
 
-    Widened for residuals that follow each other where they are a series.
+    For time series the intervals are widened for autocorrelated residuals.
     """
     from scipy import stats
     from scipy.optimize import least_squares

@@ -1,4 +1,4 @@
-"""Rudders behind propellers, in the race or not, and water jets.
+"""Rudders with propellers, fins and water jets.
 
 Sources: the MMG standard method (Yasukawa and Yoshimura 2015); document 004, section 5.2.2.3;
 document 000 eqs. (6.12)-(6.16), corrections H10 to H16.
@@ -34,17 +34,17 @@ from residnet.physics.parameters import (
 
 
 class RudderConfig(SteeringGearConfig):
-    """A rudder with its steering gear.
+    """Rudder with its steering gear.
 
     Attributes:
         area: movable area.
-        aspect_ratio: height over mean chord; the slope of the normal force is 6.13 L / (L + 2.25)
-            (Fujii).
-        x: of the rudder stock from the body origin, negative aft.
-        race_share: share of the area in the propeller's race; 0 for a force that grows with u^2
-            alone.
-        straightening: share of the local drift angle that reaches the rudder; 0 for a rudder that
-            sees the flow from ahead only.
+        aspect_ratio: height divided by mean chord L; the gradient of the normal force is
+            6.13 L / (L + 2.25) (Fujii).
+        x: longitudinal position of the rudder stock, negative aft of the body origin.
+        race_share: share of the area in the slipstream of the propeller; with 0 the force is
+            proportional to u^2.
+        straightening: flow-straightening factor, the share of the local drift angle at the rudder;
+            0 for inflow from ahead only.
     """
 
     area: SquareMetres = Field(gt=0)
@@ -55,13 +55,13 @@ class RudderConfig(SteeringGearConfig):
 
 
 class PropellerShaftConfig(ShaftConfig, ThrustConfig):
-    """A propeller on its shaft.
+    """Propeller with its shaft.
 
     Attributes:
-        diameter: of the disc.
-        advance_loss: thrust lost per revolution and speed, T = curve - advance_loss |n| u [N
-            s^2/m], u >= 0; K_T falls linearly.
-        thrust_deduction: share t of the thrust that the hull takes back.
+        diameter: diameter of the propeller disc.
+        advance_loss: decrease of the thrust with speed, T = curve - advance_loss |n| u [N s^2/m]
+            for u >= 0, which is a linear K_T.
+        thrust_deduction: thrust deduction fraction t.
     """
 
     diameter: Metres = Field(gt=0)
@@ -82,21 +82,19 @@ class PropellerShaftConfig(ShaftConfig, ThrustConfig):
 
 @final
 class RudderPropellerConfig(SteeredConfig):
-    """A propeller and a rudder, without hull interaction.
+    """Propeller and rudder without hull interaction.
 
-    Normal force and inflow are those of the MMG standard method (Yasukawa and Yoshimura 2015).
+    Normal force and inflow follow the MMG standard method (Yasukawa and Yoshimura 2015):
+    F_N = 0.5 rho A f sin(delta_e) U_R^2, X = -F_N sin delta, Y = -F_N cos delta, N = x Y, where
+    delta > 0 turns to starboard. The inflow is U_R^2 = u|u| + race_share 2 T / (rho A_p), the fully
+    contracted slipstream of an actuator disc.
 
-    F_N = 0.5 rho A f sin(delta_e) U_R^2, X = -F_N sin delta, Y = -F_N cos delta, N = x Y; delta > 0
-    turns to starboard. The inflow is U_R^2 = u|u| + race_share 2 T / (rho A_p): the race of an
-    actuator disc, fully contracted.
-
-    Commands are cmd_delta [rad] and cmd_n [1/s]; states are delta and n where they do not follow at
-    once.
+    Commands are cmd_delta [rad] and cmd_n [1/s]; delta and n are states if they have dynamics.
 
     Attributes:
         rudder: the rudder.
         propeller: the propeller.
-        density: of the water in kg/m^3.
+        density: density of the water in kg/m^3.
     """
 
     kind: Literal["rudder_propeller"] = "rudder_propeller"
@@ -105,7 +103,7 @@ class RudderPropellerConfig(SteeredConfig):
     density: Density = Field(default=1025.0, gt=0)
 
     def command_specs(self) -> tuple[CommandSpec, ...]:
-        """Return the rudder angle from steer, to starboard, and revolutions from drive."""
+        """Return the commands: rudder angle from steer and revolutions from drive."""
         return (
             CommandSpec("cmd_delta", "steer", self.rudder.limit),
             CommandSpec("cmd_n", "drive", self.propeller.n_max),
@@ -140,19 +138,18 @@ class RudderPropellerConfig(SteeredConfig):
 
 
 class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
-    """Rudders that move together behind propellers whose thrust is commanded.
+    """Coupled stern rudders with propellers whose thrust is commanded.
 
-    Commands are cmd_delta [rad] and cmd_thrust [N]; delta [rad] is a state where the rudder has a
-    rate.
-
-    delta > 0 turns to starboard: Y = -L, K = z L, N = -x L, X = T - D (document 004 eqs.
-    (5.26)-(5.29), signs as in corrections G9, G10).
+    Commands are cmd_delta [rad] and cmd_thrust [N]; delta [rad] is a state if the rudder has
+    dynamics. Y = -L, K = z L, N = -x L, X = T - D, where delta > 0 turns to starboard (document 004
+    eqs. (5.26)-(5.29), signs by corrections G9, G10).
 
     Attributes:
-        x: place of the rudders' centre of pressure ahead of the body origin in m; negative aft.
-        z: the same below the body origin in m.
-        thrust: of all propellers together at full drive; the source knows no astern thrust, so
-            commands hold between zero and this.
+        x: longitudinal position of the centre of pressure of the rudders in m, negative aft of the
+            body origin.
+        z: vertical position of the centre of pressure in m, positive below the body origin.
+        thrust: maximum total thrust of the propellers. Commands are clamped between zero and this
+            value, because the source has no astern thrust.
     """
 
     x: Metres = Field(lt=0)
@@ -169,11 +166,11 @@ class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
             delta: rudder angle [...] in rad.
             u: surge velocity through the water [...] in m/s.
             v: sway velocity through the water [...] in m/s.
-            thrust: of all propellers [...] in N.
+            thrust: total thrust of the propellers [...] in N.
         """
 
     def command_specs(self) -> tuple[CommandSpec, ...]:
-        """Return rudder angle and thrust; there is none astern."""
+        """Return the commands: rudder angle, and thrust without astern thrust."""
         return (
             CommandSpec("cmd_delta", "steer", self.limit),
             CommandSpec("cmd_thrust", "drive", self.thrust, 0.0),
@@ -183,7 +180,7 @@ class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
         return (self.build_servo("delta"),)
 
     def servo_commands(self, command: Tensor) -> Tensor:
-        """Return the rudder's command [..., 1]; thrust acts at once."""
+        """Return the rudder command [..., 1]; thrust has no dynamics."""
         return command[..., :1]
 
     @final
@@ -195,20 +192,20 @@ class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
 
 @final
 class FoilRuddersConfig(SternRuddersConfig):
-    """Rudders as foils in the open water's speed, corrected for the propellers' race.
+    """Rudders modelled as foils, with a correction for the slipstream of the propellers.
 
-    Document 004 eqs. (5.20)-(5.25), corrections G8, G11. The drag at zero angle belongs to the
-    hull's calm-water resistance.
+    Document 004 eqs. (5.20)-(5.25), corrections G8, G11. The drag at zero angle is part of the
+    calm-water resistance of the hull.
 
     Attributes:
-        rudders: how many rudders share the lift evenly.
-        propellers: how many propellers share the thrust evenly.
-        area: of one rudder.
-        aspect_ratio: effective, of the induced drag C_L^2 / (0.9 pi a).
+        rudders: number of rudders with equal lift.
+        propellers: number of propellers with equal thrust.
+        area: area of one rudder.
+        aspect_ratio: effective aspect ratio a of the induced drag C_L^2 / (0.9 pi a).
         lift_slope: dC_L/d alpha per rad.
-        stall: angle of attack beyond which lift and drag grow no more.
-        diameter: of a propeller.
-        density: of the water.
+        stall: angle of attack at which lift and drag saturate.
+        diameter: diameter of a propeller.
+        density: density of the water.
     """
 
     kind: Literal["foil_rudders"] = "foil_rudders"
@@ -247,12 +244,12 @@ class FoilRuddersConfig(SternRuddersConfig):
 
 @final
 class LinearRuddersConfig(SternRuddersConfig):
-    """Rudders whose side force is Y_delta_uu u^2 delta, without drag and race.
+    """Rudders with the side force Y_delta_uu u^2 delta, without drag and slipstream.
 
     Source: document 004, Table 5.3.
 
     Attributes:
-        Y_delta_uu: of all rudders together, in kg/m per rad.
+        Y_delta_uu: coefficient of all rudders in kg/m per rad.
     """
 
     kind: Literal["linear_rudders"] = "linear_rudders"
@@ -273,10 +270,10 @@ PerSquaredRevolutions = Annotated[Parameter, AfterValidator(require_dimension(0,
 
 
 class SpeedCurve(Config):
-    """The thrust at reference revolutions over the speed through the water: a0 + a1 u + a2 u^2.
+    """Thrust at reference revolutions over speed through the water, a0 + a1 u + a2 u^2.
 
     Attributes:
-        a0: thrust at rest in N.
+        a0: thrust at zero speed in N.
         a1: slope in N s/m.
         a2: curvature in N s^2/m^2.
     """
@@ -287,10 +284,10 @@ class SpeedCurve(Config):
 
 
 class RevolutionsCurve(Config):
-    """The share of that thrust at n revolutions per second: (r0 + r1 n + r2 n^2) / reference.
+    """Relative thrust at n revolutions per second, (r0 + r1 n + r2 n^2) / reference.
 
     Attributes:
-        r0: share at rest, dimensionless.
+        r0: value at zero revolutions, dimensionless.
         r1: slope in s.
         r2: curvature in s^2.
         reference: value of the polynomial at the reference revolutions, dimensionless.
@@ -304,18 +301,18 @@ class RevolutionsCurve(Config):
 
 @final
 class WaterJetsConfig(SteeredConfig):
-    """Equal water jets that turn and run together.
+    """Equal water jets with coupled nozzles and revolutions.
 
-    Commands are cmd_n [1/s] and cmd_nozzle [rad], whose thrust pushes to starboard where positive.
+    Commands are cmd_n [1/s] and cmd_nozzle [rad]; at a positive angle the force acts to starboard.
 
     Attributes:
-        jets: how many there are.
-        x: place of the nozzles ahead of the body origin; negative astern.
-        speed: parabola of the thrust of one jet over the speed; its product with `revolutions` is
-            the thrust (6.16), which may be negative below some revolutions (H15).
-        revolutions: parabola of the thrust over the revolutions.
-        motor: limits of the revolutions; it turns in one direction.
-        nozzle: limits of the angle of the nozzles, which direct the jets.
+        jets: number of jets.
+        x: longitudinal position of the nozzles, negative aft of the body origin.
+        speed: quadratic thrust of one jet over speed. Its product with `revolutions` is the thrust
+            (6.16), which can be negative at low revolutions (H15).
+        revolutions: quadratic relative thrust over revolutions.
+        motor: dynamics and limits of the revolutions, which have one direction.
+        nozzle: dynamics and limits of the nozzle angle.
     """
 
     kind: Literal["water_jets"]
@@ -327,7 +324,7 @@ class WaterJetsConfig(SteeredConfig):
     nozzle: SteeringGearConfig
 
     def command_specs(self) -> tuple[CommandSpec, ...]:
-        """Return revolutions, since jets do not push astern, and the yaw moment's sense."""
+        """Return the commands: nonnegative revolutions from drive and nozzle angle from steer."""
         max_nozzle_angle = self.nozzle.limit if self.x > 0 else -self.nozzle.limit
         return (
             CommandSpec("cmd_n", "drive", self.motor.n_max, 0.0),
@@ -342,7 +339,7 @@ class WaterJetsConfig(SteeredConfig):
         return torch.stack((command[..., 0].clamp(min=0.0), command[..., 1]), dim=-1)
 
     def jet_thrust(self, n: Tensor, u: Tensor) -> Tensor:
-        """Return the thrust [N] of one jet at revolutions n [1/s] and speed u [m/s], any shape.
+        """Compute the thrust [N] of one jet at revolutions n [1/s] and speed u [m/s], any shape.
 
         Source: document 000 eq. (6.16).
         """
@@ -368,26 +365,26 @@ class WaterJetsConfig(SteeredConfig):
 
 @final
 class TorpedoFinsConfig(ServoConfig, SteeredConfig):
-    """A propeller, a rudder and stern planes at the tail of a torpedo, each behind the same lag.
+    """Propeller, rudder and stern planes of a torpedo-shaped vehicle, with equal lags.
 
     Commands are cmd_delta [rad] (positive to starboard), cmd_delta_s [rad] (positive to dive) and
-    cmd_n [1/s]. The lift of a fin is across the hull, its drag grows by the square of its angle.
-    Astern the propeller has its thrust at rest.
+    cmd_n [1/s]. The lift of a fin is normal to the hull, and its drag is quadratic in its angle. At
+    astern revolutions the thrust is that at zero speed.
 
     Source: Fossen's model of the REMUS 100 (PythonVehicleSimulator, vehicles/remus100.py).
 
     Attributes:
-        limit: largest angle of rudder and planes.
-        n_max: largest revolutions.
-        density: of the water.
-        x: place of the fins ahead of the body origin; negative aft.
-        rudder: area times slope of the lift coefficient by angle.
-        planes: the same of the stern planes together.
-        diameter: of the propeller.
-        K_T: thrust coefficients at rest and per advance number.
-        K_Q: torque coefficients at rest and per advance number.
-        wake: speed at the propeller by that of the vessel.
-        thrust_deduction: share of the thrust that the hull loses again.
+        limit: maximum angle of rudder and planes.
+        n_max: maximum revolutions.
+        density: density of the water.
+        x: longitudinal position of the fins, negative aft of the body origin.
+        rudder: area of the rudder times its lift-curve slope.
+        planes: area of both stern planes times their lift-curve slope.
+        diameter: diameter of the propeller.
+        K_T: thrust coefficient at zero advance and its slope by advance ratio.
+        K_Q: torque coefficient at zero advance and its slope by advance ratio.
+        wake: ratio of inflow speed of the propeller to speed of the vessel.
+        thrust_deduction: thrust deduction fraction.
     """
 
     kind: Literal["torpedo_fins"] = "torpedo_fins"
@@ -404,7 +401,7 @@ class TorpedoFinsConfig(ServoConfig, SteeredConfig):
     thrust_deduction: float = Field(ge=0, lt=1)
 
     def command_specs(self) -> tuple[CommandSpec, ...]:
-        """Return rudder, planes and revolutions; there are none astern."""
+        """Return the commands: rudder, planes, and revolutions without astern revolutions."""
         return (
             CommandSpec("cmd_delta", "steer", self.limit),
             CommandSpec("cmd_delta_s", "dive", self.limit),

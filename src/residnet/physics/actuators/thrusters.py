@@ -1,4 +1,4 @@
-"""Thrusters: fixed ones, two side by side, azimuths with their allocation, or forces alone."""
+"""Thrusters: fixed, differential, azimuth with allocation, vectored, and commanded forces."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ from residnet.physics.actuators.base import (
 )
 
 _TABLE_POINTS = 401
-"""Points of the thrust curve from which its inverse starts; between them it is known to rise."""
+"""Number of points of the table that initialises the inverse of the thrust curve."""
 _NEWTON_STEPS = 4
-"""Steps of Newton's method; each doubles the digits that a line between two points has."""
+"""Number of Newton steps of the inverse; each doubles the digits of the interpolation."""
 
 
 def _require_unique_names(names: Sequence[str]) -> None:
@@ -47,10 +47,10 @@ def _require_unique_names(names: Sequence[str]) -> None:
 
 
 class ThrusterPositionConfig(Config):
-    """The name and place of one thruster.
+    """Name and position of a thruster.
 
     Attributes:
-        name: what ends the names of its channels, for example `port`.
+        name: suffix of the names of its channels, for example `port`.
         x: distance forward of the body origin in m.
         y: distance to starboard of the body origin in m.
     """
@@ -61,22 +61,22 @@ class ThrusterPositionConfig(Config):
 
 
 class ThrusterConfig(ThrusterPositionConfig, ShaftConfig, ThrustConfig):
-    """One fixed thruster of several.
+    """Fixed thruster.
 
     Attributes:
-        name: ends its channels, n_<name> and cmd_<name>.
-        angle: of its thrust from the bow, clockwise; 90 deg for a bow thruster that pushes to
-            starboard.
+        name: suffix of its channels n_<name> and cmd_<name>.
+        angle: direction of positive thrust, clockwise from the bow; 90 deg for a bow thruster with
+            thrust to starboard.
     """
 
     angle: Radians = 0.0
 
 
 class ThrustersConfig(ActuatorConfig):
-    """Fixed thrusters anywhere on the hull.
+    """Fixed thrusters at any positions of the hull.
 
-    Drive turns all of them ahead as far as they push forward, steer those with a lever about the
-    origin.
+    The share of drive of a thruster is its surge component, and the share of steer is its lever
+    about the origin.
 
     Attributes:
         thrusters: the thrusters, in the order of the commands.
@@ -98,14 +98,14 @@ class ThrustersConfig(ActuatorConfig):
 
 
 class DifferentialThrustConfig(ThrustConfig, ActuatorConfig):
-    """Two fixed thrusters side by side (document 003 section 4.1; revolutions in 1/s).
+    """Two fixed thrusters for differential thrust (document 003 section 4.1).
 
-    The thrust curve is clipped so that thrust never opposes the sense of rotation, which closes the
-    jump that the printed polynomials have at zero (correction W5).
+    The thrust curve is clipped to the sign of the rotation, which removes the discontinuity of the
+    published polynomials at zero (correction W5).
 
     Attributes:
-        spacing: distance between the thrusters in m.
-        n_rate: largest change of revolutions in 1/s^2.
+        spacing: lateral distance between the thrusters in m.
+        n_rate: maximum rate of change of the revolutions in 1/s^2.
     """
 
     kind: Literal["differential_thrust"] = "differential_thrust"
@@ -113,7 +113,7 @@ class DifferentialThrustConfig(ThrustConfig, ActuatorConfig):
     n_rate: RevRate = Field(gt=0)
 
     def build(self) -> Thrusters:
-        """Build the module of a thruster to port and one to starboard, in this order."""
+        """Build the port and the starboard thruster, in this order."""
         thrusters = [
             ThrusterConfig(
                 name=name, y=y, n_max=self.n_max, forward=self.forward, reverse=self.reverse
@@ -128,9 +128,9 @@ class DifferentialThrustConfig(ThrustConfig, ActuatorConfig):
 
 @final
 class ThrusterForces(nn.Module):
-    """Revolutions n [..., c] of fixed thrusters in 1/s make forces tau [..., 3] in N, N, N m.
+    """Forces tau [..., 3] in N, N, N m of fixed thrusters at revolutions n [..., c] in 1/s.
 
-    Source: document 003 eqs. (6), (21), (22), clipped as in correction W5.
+    Source: document 003 eqs. (6), (21), (22), clipped by correction W5.
     """
 
     def __init__(self, thrusters: Sequence[ThrusterConfig]) -> None:
@@ -151,7 +151,7 @@ class ThrusterForces(nn.Module):
         )
 
     def thrust_at(self, n: Tensor) -> Tensor:
-        """Return the thrusts [N] at revolutions n [..., c] in 1/s."""
+        """Return the thrust [..., c] in N at revolutions n [..., c] in 1/s."""
         forward, reverse = self.curve_coefficients.to(n.dtype).unbind(0)
         forward_thrust = (forward[0] + n * (forward[1] + n * forward[2])).clamp(min=0.0)
         reverse_thrust = (reverse[0] + n * (reverse[1] + n * reverse[2])).clamp(max=0.0)
@@ -160,13 +160,13 @@ class ThrusterForces(nn.Module):
         )
 
     def forward(self, n: Tensor) -> Tensor:
-        """Return tau [..., 3] of revolutions n [..., c]."""
+        """Return the forces tau [..., 3] at revolutions n [..., c]."""
         return self.thrust_at(n) @ self.thrust_configuration.to(n.dtype)
 
 
 @final
 class Thrusters(ActuatorSystem):
-    """Fixed thrusters, each on a shaft of its own or on equal ones."""
+    """Fixed thrusters with their shafts."""
 
     depends_on_speed = False
 
@@ -183,9 +183,10 @@ class Thrusters(ActuatorSystem):
         self.n_max = nn.Buffer(n_max, persistent=False)
 
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the revolutions [..., c]: each thruster's share of drive and steer, within +-1.
+        """Return the revolutions [..., c] for drive and steer, limited to n_max.
 
-        Of two side by side these are mean and difference (document 003 eqs. (30), (31)).
+        With differential thrust, drive is the mean and steer the difference of the revolutions
+        (document 003 eqs. (30), (31)).
         """
         shares = torch.stack((drive, steer), dim=-1) @ self.demand_map.to(drive.dtype)
         return shares.clamp(-1.0, 1.0) * self.n_max.to(drive.dtype)
@@ -196,11 +197,11 @@ class Thrusters(ActuatorSystem):
 
 
 class AzimuthConfig(ServoConfig):
-    """The drive that turns a thruster to either side of the bow, not through its limit.
+    """Azimuth drive of a thruster, with a limited angle to either side of the bow.
 
     Attributes:
-        limit: largest angle from the bow in rad.
-        rate: largest rate of turn in rad/s; None for at once.
+        limit: maximum angle from the bow in rad.
+        rate: maximum azimuth rate in rad/s; None for no limit.
     """
 
     limit: Radians = Field(default=math.pi, gt=0)
@@ -208,17 +209,17 @@ class AzimuthConfig(ServoConfig):
 
 
 class AzimuthThrustersConfig(ActuatorConfig):
-    """Equal thrusters that turn, commanded by revolutions and angles.
+    """Equal azimuth thrusters, commanded by revolutions and angles.
 
-    The commands are cmd_n_<name> [1/s], then cmd_alpha_<name> [rad] from the bow, clockwise.
+    The commands are cmd_n_<name> [1/s], then cmd_alpha_<name> [rad] clockwise from the bow.
 
     Attributes:
-        places: of the thrusters.
-        thrust: coefficients c0, c1, ... of the force T = c0 + c1 n + c2 n^2 + ... in N, n in 1/s.
-        curve_range: revolutions (astern, ahead) that the curve was measured between; it must rise
-            between +-n_max.
-        shaft: limits of the revolutions.
-        azimuth: limits of the angles.
+        places: names and positions of the thrusters.
+        thrust: coefficients c0, c1, ... of the thrust T = c0 + c1 n + c2 n^2 + ... in N, n in 1/s.
+        curve_range: range of revolutions (astern, ahead) in which the curve was measured; it must
+            increase between +-n_max.
+        shaft: dynamics and limits of the revolutions.
+        azimuth: dynamics and limits of the angles.
     """
 
     kind: Literal["azimuth_thrusters"]
@@ -255,7 +256,7 @@ class AzimuthThrustersConfig(ActuatorConfig):
 
 @final
 class AzimuthThrusters(ForceActuators):
-    """Revolutions and angles of k thrusters -> tau [..., 3] (document 002 eqs. (5.1), (5.2))."""
+    """Forces tau [..., 3] of k azimuth thrusters (document 002 eqs. (5.1), (5.2))."""
 
     def __init__(self, config: AzimuthThrustersConfig) -> None:
         shaft = config.shaft
@@ -297,13 +298,13 @@ class AzimuthThrusters(ForceActuators):
         self.max_thrust = float(self.thrust_table[1, -1])
 
     def thrust_at(self, n: Tensor) -> Tensor:
-        """Return the force [N] of one thruster along its axis at revolutions n [1/s], any shape."""
+        """Return the thrust [N] of a thruster at revolutions n [1/s], any shape."""
         return _evaluate_polynomial(self.coefficients, n)
 
     def revolutions_for_thrust(self, force: Tensor) -> Tensor:
-        """Return the revolutions n [1/s] within +-n_max that make a force [N], any shape.
+        """Return the revolutions n [1/s] within +-n_max of a thrust [N], any shape.
 
-        Without gradient.
+        The result has no gradient.
         """
         # Newton's method from a table of the curve, which rises, within the table's interval
         thrust_table = self.thrust_table.to(force.dtype)
@@ -321,9 +322,9 @@ class AzimuthThrusters(ForceActuators):
         return n
 
     def allocate(self, tau: Tensor) -> Tensor:
-        """Return the commands [..., 2k] that make forces tau [..., 3] with the least thrust.
+        """Return the commands [..., 2k] for forces tau [..., 3] by the pseudoinverse.
 
-        The sum of squared thrusts is smallest; thrusts beyond the largest saturate.
+        The pseudoinverse minimizes the sum of squared thrusts; thrusts above the maximum saturate.
         """
         thrust_x, thrust_y = (tau @ self.allocation_matrix.to(tau.dtype).T).chunk(2, dim=-1)
         thrust_magnitude = torch.hypot(thrust_x, thrust_y)
@@ -340,8 +341,8 @@ class AzimuthThrusters(ForceActuators):
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the commands [..., 2k] for drive and steer, each within +-1.
 
-        Drive is surge force and steer the yaw moment, as shares of what the thrusters make
-        together; each thruster saturates.
+        Drive is the surge force and steer the yaw moment relative to their maximum values; each
+        thruster saturates.
         """
         lever = self.thrust_configuration[2].abs().sum() / 2.0
         surge_share = drive.clamp(-1, 1) * self.n_thrusters
@@ -362,7 +363,7 @@ class AzimuthThrusters(ForceActuators):
 
 
 def _evaluate_polynomial(coefficients: Sequence[float], x: Tensor) -> Tensor:
-    """Return c0 + c1 x + c2 x^2 + ..., any shape."""
+    """Evaluate c0 + c1 x + c2 x^2 + ..., any shape."""
     value = torch.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         value = coefficient + x * value
@@ -370,13 +371,13 @@ def _evaluate_polynomial(coefficients: Sequence[float], x: Tensor) -> Tensor:
 
 
 class ForceCommandsConfig(ActuatorConfig):
-    """The commands tau_x, tau_y [N], tau_n [N m], each within its limit.
+    """Commanded forces tau_x, tau_y [N] and moment tau_n [N m] with limits.
 
     Attributes:
-        x_max: largest surge force of either direction in N.
-        y_max: largest sway force of either side in N.
-        n_max: largest yaw moment of either side in N m.
-        response: lag of the forces behind the commands; immediate by default.
+        x_max: maximum surge force in either direction in N.
+        y_max: maximum sway force to either side in N.
+        n_max: maximum yaw moment to either side in N m.
+        response: dynamic response of the forces; immediate by default.
     """
 
     kind: Literal["forces"] = "forces"
@@ -393,9 +394,9 @@ class ForceCommandsConfig(ActuatorConfig):
 
 @final
 class ForceCommands(ForceActuators):
-    """The forces tau [..., 3], which follow the saturated commands [..., 3].
+    """Forces tau [..., 3] that follow saturated commands [..., 3].
 
-    With a lag the states are the forces, then what else the response needs.
+    With a lag the states are the forces, then other states of the response.
     """
 
     command_names = ("tau_x", "tau_y", "tau_n")
@@ -412,7 +413,7 @@ class ForceCommands(ForceActuators):
         self.limit = nn.Buffer(limit, persistent=False)
 
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return tau [..., 3] for drive (surge force) and steer (yaw moment), each within +-1."""
+        """Return commands [..., 3] for drive (surge force) and steer (yaw moment) within +-1."""
         shares = torch.stack((drive, torch.zeros_like(drive), steer), dim=-1)
         return shares.clamp(-1.0, 1.0) * self.limit.to(drive.dtype)
 
@@ -431,12 +432,12 @@ class ForceCommands(ForceActuators):
 
 
 class VectoredThrusterConfig(ThrusterPositionConfig):
-    """One of several fixed thrusters that push in any direction, its thrust commanded.
+    """Fixed thruster with any direction of thrust, whose thrust is commanded.
 
     Attributes:
-        name: ends its command, cmd_thrust_<name>, in N.
-        z: place below the body origin in m.
-        push: direction of its force ahead, to starboard and down; made of length one.
+        name: suffix of its command cmd_thrust_<name> in N.
+        z: distance below the body origin in m.
+        push: direction of positive thrust (forward, starboard, down), normalised to length one.
     """
 
     z: Metres = 0.0
@@ -444,13 +445,13 @@ class VectoredThrusterConfig(ThrusterPositionConfig):
 
 
 class VectoredThrustersConfig(ActuatorConfig):
-    """Equal thrusters that push a vessel in all six degrees of freedom.
+    """Equal thrusters of a vessel in six degrees of freedom.
 
-    Their drives follow the demanded thrust: the curve from current to thrust is inverted there.
+    The command is the thrust, because the motor drives invert the thrust curve.
 
     Attributes:
         thrusters: the thrusters, in the order of the commands.
-        limit: largest thrust of each in either direction.
+        limit: maximum thrust of each thruster in either direction.
     """
 
     kind: Literal["vectored_thrusters"] = "vectored_thrusters"
@@ -468,7 +469,7 @@ class VectoredThrustersConfig(ActuatorConfig):
 
 @final
 class VectoredThrusters(ActuatorSystem):
-    """Thrusts T [..., c] in N make forces and moments tau [..., 6] = T map.
+    """Forces and moments tau [..., 6] of vectored thrusters with thrust T [..., c] in N.
 
     Source: Fossen 2021, section 9.4 (thrust configuration matrix).
     """
@@ -500,7 +501,7 @@ class VectoredThrusters(ActuatorSystem):
         self.dive_commands = demand_rows[2]
 
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the thrusts [..., c]: each thruster's share of drive and steer; servos limit."""
+        """Return the commanded thrust [..., c] for drive and steer, before the limits."""
         return torch.stack((drive, steer), dim=-1) @ self.demand_map.to(drive.dtype)
 
     def force(self, states: Tensor, command: Tensor, nu: Tensor) -> Tensor:
