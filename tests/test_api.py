@@ -123,9 +123,9 @@ def test_fifteen_lines(trials: Path) -> None:
 
 def test_tables_and_figures(models: residnet.Models, data: residnet.Dataset) -> None:
     table = residnet.metrics(models, split="test")
-    assert set(table["model"]) == {"zero", "baseline", "ridge", "net"}
+    assert set(table["model"]) == {"constant_velocity", "baseline", "ridge", "net"}
     error = table[table["protocol"] == "T30"].set_index("model")["nrmse_mean"]
-    assert error["ridge"] < error["baseline"] < error["zero"]
+    assert error["ridge"] < error["baseline"] < error["constant_velocity"]
     runs = residnet.free_run(models, data)
     rows = runs.table
     one = rows[(rows["model"] == "ridge") & (rows["protocol"] == "T30") & (rows["window"] == 0)]
@@ -260,7 +260,7 @@ def test_logs_alone_are_fitted_by_the_recipe(logs: list[residnet.Log]) -> None:
     models = residnet.fit(coarse, effort=0.01)
     assert models.settings.recipe == "standard"
     assert models.settings.signals.inputs == ("n_port", "n_stbd")
-    assert {"zero", "baseline", "hull", "hull_network", "mean"} <= set(models)
+    assert {"constant_velocity", "baseline", "hull", "hull_network", "ensemble"} <= set(models)
     assert models.selected_name in models
 
 

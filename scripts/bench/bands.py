@@ -188,7 +188,7 @@ def drawn(found: Found, vessel: str, number: int, logs: dict[str, list[Log]]) ->
     prepared = prepare_splits(logs, settings)
     models = fit_models(prepared, settings)
     judged = models.evaluate({"test": prepared["test"]})["test"]
-    add(found, judged, [name for name in models if name != "zero"], number)
+    add(found, judged, [name for name in models if name != "constant_velocity"], number)
 
 
 def coverage(judged: Sequence[Judged]) -> np.ndarray:
@@ -205,7 +205,7 @@ def coverage(judged: Sequence[Judged]) -> np.ndarray:
 
 
 def score(judged: Sequence[Judged], widths: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the mean interval score of each channel [c], in errors of `zero`."""
+    """Return the mean interval score of each channel [c], in errors of `constant_velocity`."""
     level, unit = judged[0][1].level, judged[0][1].score_unit
     pairs = zip(judged, widths, strict=True)
     each = [interval_score(run.error, width, level) for (run, _), width in pairs]

@@ -6,7 +6,7 @@ For each vessel and seed, two logs of 150 s train and one more is for validation
 rudder and propeller; the same 20/20 zigzag each time, first to port or first to starboard; or three
 unlike zigzags. The models are the document's, kernel ridge on velocities and commands, and nothing
 is believed beforehand. Printed are geometric means of what they miss in free runs of ten seconds
-along manoeuvres that none has seen, over what `zero` misses.
+along manoeuvres that none has seen, over what `constant_velocity` misses.
 """
 
 from __future__ import annotations
@@ -98,7 +98,9 @@ def case(vessel: str, seed: int) -> dict[tuple[str, str, str], float]:
         found = error.set_axis(pd.MultiIndex.from_frame(table[["model", "manoeuvre"]]))
         for model, judged_on in found.index:
             if model in HEADS:
-                out[name, model, judged_on] = found[model, judged_on] / found["zero", judged_on]
+                out[name, model, judged_on] = (
+                    found[model, judged_on] / found["constant_velocity", judged_on]
+                )
     return out
 
 

@@ -210,8 +210,8 @@ def change(plan: dict[str, Any], part: str) -> None:
     if part == "network":
         for key in ("heads", "training"):
             plan[key].setdefault("network", plan[key]["hull_network"])
-        plan["base_of"]["network"] = "zero"
-        plan["means"] = {"mean": ("hull", *plan["heads"])}
+        plan["base_of"]["network"] = "constant_velocity"
+        plan["means"] = {"ensemble": ("hull", *plan["heads"])}
         return
     key, changed = {"mirror": ("training", False), "members": ("heads", 1)}[part]
     plan[key] = {name: {**given, part: changed} for name, given in plan[key].items()}
@@ -275,7 +275,7 @@ class Missed:
 
 def means(models: residnet.Models, first: residnet.Models | None) -> dict[str, float]:
     """Return the test errors of the means of fewer members, and of weighed ones."""
-    names = models["mean"].fitted_model.notes["members"] if "mean" in models else ["hull"]
+    names = models["ensemble"].fitted_model.notes["members"] if "ensemble" in models else ["hull"]
     test, out = Missed(models, names, "test"), {}
     for count in range(1, len(names) + 1):
         for some in combinations(names, count):
@@ -305,7 +305,7 @@ def judged(splits: Splits, given: Namespace) -> dict[str, Any]:
     errors["selected"] = errors[models.selected]
     for part in given.without:
         other = table(fitted(splits, given.effort, [*parts, part]))
-        errors[f"mean without {part}"] = float(other.nrmse_mean["mean"])
+        errors[f"ensemble without {part}"] = float(other.nrmse_mean["ensemble"])
     errors |= means(models, first)
     if given.peer:
         errors["GRU"] = Peer(models.data).error("test")
@@ -324,16 +324,18 @@ def line(record: dict[str, Any]) -> str:
 
 
 def summary(records: list[dict[str, Any]]) -> str:
-    """Return ratios of the mean's errors to those of others: geometric means over the draws."""
-    mean = np.array([record["test"]["mean"] for record in records])
-    out = [f"{len(records)} fits; mean {mean.mean():.3f}; error of others in that of the mean:"]
-    for name in (name for name in records[0]["test"] if name != "mean"):
+    """Return ratios of the ensemble's errors to those of others: geometric means over the draws."""
+    mean = np.array([record["test"]["ensemble"] for record in records])
+    out = [
+        f"{len(records)} fits; ensemble {mean.mean():.3f}; error of others in that of the ensemble:"
+    ]
+    for name in (name for name in records[0]["test"] if name != "ensemble"):
         errors = np.array([record["test"].get(name, np.nan) for record in records])
         ratio = np.log(errors / mean)
         spread = np.nanstd(ratio) / np.sqrt(len(ratio))
         better = int((mean <= errors).sum())
         out.append(
-            f"  {name:40} {np.exp(np.nanmean(ratio)):.3f} +- {spread:.3f}; the mean is no worse in"
+            f"  {name:40} {np.exp(np.nanmean(ratio)):.3f} +- {spread:.3f}; the ensemble is no worse in"
             f" {better}"
         )
     return "\n".join(out)

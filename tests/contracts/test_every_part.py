@@ -250,7 +250,7 @@ def test_baseline_beyond_the_plane(kind: str, signals: SignalsConfig, refusal: s
 @pytest.mark.parametrize("signals", [ROLLING_SIGNALS, SUBMERGED_SIGNALS], ids=["roll", "six"])
 def test_zero_goes_on_level(signals: SignalsConfig) -> None:
     content = make_example_spec(None, signals).model_dump(mode="json", by_alias=True)
-    content |= {"role": "zero", "baseline": {"kind": "still"}}
+    content |= {"role": "constant_velocity", "baseline": {"kind": "still"}}
     model, live = ModelSpec.model_validate(content).build().double(), signals.dof
     x = torch.zeros(1, len(live.state_names), dtype=torch.float64)
     x[0, 3:] = torch.tensor([1.5, *[0.1] * (live.n_dynamic - 1)])

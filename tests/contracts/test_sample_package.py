@@ -100,7 +100,7 @@ def test_its_head_runs_by_name_from_yaml(site: Path, tmp_path: Path) -> None:
     done = python(site, "-m", "residnet.cli", "run", file, "--out", run)
     assert done.returncode == 0, done.stderr
     rows = json.loads((run / "metrics.json").read_text())["rows"]
-    assert {row["model"] for row in rows} >= {"zero", "baseline", "slow"}
+    assert {row["model"] for row in rows} >= {"constant_velocity", "baseline", "slow"}
     assert (run / "report.html").is_file()
     assert (run / "exports" / "slow.pt").is_file()
     words = ("export", run, "--model", "slow", "--format", "numbers")

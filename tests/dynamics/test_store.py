@@ -91,8 +91,13 @@ def test_a_rebuilt_model_is_the_loaded_one_bit_for_bit(tmp_path: Path) -> None:
 
 
 def test_zero_has_no_numbers(tmp_path: Path) -> None:
-    saved(tmp_path / "zero", name="zero", role="zero", baseline=ZeroBaselineConfig().model_dump())
-    _, model = load_model(tmp_path / "zero")
+    saved(
+        tmp_path / "constant_velocity",
+        name="constant_velocity",
+        role="constant_velocity",
+        baseline=ZeroBaselineConfig().model_dump(),
+    )
+    _, model = load_model(tmp_path / "constant_velocity")
     x = torch.tensor([[0.0, 0.0, 0.0, 1.0, 0.2, 0.0]])
     after, _ = model.step(x, torch.ones(1, 2), x[:, :0])
     assert torch.equal(after[:, 3:], x[:, 3:])

@@ -222,7 +222,7 @@ def test_a_mean_is_that_of_the_trajectories_of_its_members() -> None:
 
 
 def test_a_window_beyond_short_training_logs_is_no_divergence() -> None:
-    """A vessel that does more than it did in training exceeds the limit itself, and so does `zero`
+    """A vessel that does more than it did in training exceeds the limit itself, and so does `constant_velocity`
     that holds its velocities.
     """
     log = made(random_states(80, np.random.default_rng(3)), STEP)
@@ -267,7 +267,7 @@ def test_a_memory_is_warmed_up_by_the_measured_past() -> None:
 
 
 def test_the_plant_itself_predicts_its_own_noise_free_trial() -> None:
-    """The candidate `truth`: what the measured state lacks (actuators, phi and p of a vessel that
+    """The candidate `plant`: what the measured state lacks (actuators, phi and p of a vessel that
     rolls) from the log, commands as inputs, no more known.
     """
     plant, count = load_vessel("patrol_p06").build(), 200
@@ -286,15 +286,15 @@ def test_the_plant_itself_predicts_its_own_noise_free_trial() -> None:
     motion, whole = log.stack(("x", "y", "psi", "u", "v", "r")), np.ones(count, dtype=bool)
     trial = prepared(log, motion, np.zeros((count, 2)), whole, np.zeros(count, dtype=int))
     truth = Candidate(
-        "truth",
-        "truth",
+        "plant",
+        "plant",
         model,
         plant.state_names,
         plant.input_names[:2],
         len(plant.input_names) - 2,
     )
     windows = [window(0, s, s + 60, nu=motion[s, 3:]) for s in (0, 70, 130)]
-    found = run_free_runs([truth], windows, [trial], STEP, np.full(3, 1e6))["truth"]
+    found = run_free_runs([truth], windows, [trial], STEP, np.full(3, 1e6))["plant"]
     for one, p in zip(windows, found, strict=True):
         seen = motion[one.start : one.stop]
         np.testing.assert_allclose(p.states[:, 3:], seen[:, 3:], atol=1e-12)

@@ -254,7 +254,7 @@ def test_worst_windows_are_named() -> None:
 
 STEP = 0.5
 CANDIDATES = [
-    candidate("zero", kind="zero"),
+    candidate("constant_velocity", kind="constant_velocity"),
     candidate("baseline", kind="baseline"),
     candidate("mlp"),
 ]
@@ -278,12 +278,16 @@ def run(logs: list[PreparedLog]) -> FreeRun:
         w for i, prepared in enumerate(logs) for w in protocol.make_windows(prepared, i, STEP)
     ]
     out = FreeRun("T20", "test", windows)
-    for name in ("zero", "baseline", "mlp"):
+    for name in ("constant_velocity", "baseline", "mlp"):
         out.predictions[name] = []
         for window in windows:
             states = logs[window.log_index].y[window.start : window.stop].copy()
             age = STEP * np.arange(len(states))
-            error = {"zero": 0.1 + 0 * age, "baseline": 0.09 + 0 * age, "mlp": 0.1 * age / 12.0}
+            error = {
+                "constant_velocity": 0.1 + 0 * age,
+                "baseline": 0.09 + 0 * age,
+                "mlp": 0.1 * age / 12.0,
+            }
             # a little of its own for each log, so that there is a spread
             states[:, 3] += (1.0 + 0.01 * window.log_index) * error[name]
             out.predictions[name].append(Prediction(states, False))
@@ -311,7 +315,7 @@ def test_errors_of_the_pose_are_told_after_the_times_that_matter(
     assert low <= 5.0 <= high
     # velocities were made from the positions
     assert first["floor"]["position"] == pytest.approx(0.0, abs=1e-9)
-    assert first["models"]["zero"]["position"] == pytest.approx(0.0, abs=1e-9)
+    assert first["models"]["constant_velocity"]["position"] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_no_interval_of_a_heading_passes_half_a_turn(run: FreeRun, logs: list[PreparedLog]) -> None:
@@ -326,12 +330,12 @@ def test_every_model_is_compared_with_zero_and_the_first_baseline(
 ) -> None:
     judged = ProtocolEvaluation(run, CANDIDATES, logs, SCALES)
     found = judged.compare_with_references()
-    assert set(found["mlp"]) == {"zero", "baseline"}
-    assert set(found["baseline"]) == {"zero"}
-    apart = found["baseline"]["zero"]["nrmse_mean"]
+    assert set(found["mlp"]) == {"constant_velocity", "baseline"}
+    assert set(found["baseline"]) == {"constant_velocity"}
+    apart = found["baseline"]["constant_velocity"]["nrmse_mean"]
     # u alone is off, by 0.09 and 0.1 m/s, and the more the later the log
     expected = np.array([(1.0 + 0.01 * w.log_index) * -0.01 / 0.5 / 3 for w in run.windows])
-    assert judged.nrmse_by_window["zero"][0] == pytest.approx(0.1 / 0.5 / 3)
+    assert judged.nrmse_by_window["constant_velocity"][0] == pytest.approx(0.1 / 0.5 / 3)
     assert apart == pytest.approx(expected.mean())
 
 

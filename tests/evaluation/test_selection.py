@@ -36,7 +36,7 @@ def contender(
     return SelectionCandidate(name, family, parameters, error, scores, diverged, (*told, *faults))
 
 
-ZERO = contender("zero", "zero", 1.0, parameters=0)
+ZERO = contender("constant_velocity", "constant_velocity", 1.0, parameters=0)
 
 
 def chosen(*models: SelectionCandidate) -> Selection:
@@ -88,9 +88,13 @@ LINE = contender("line", "baseline", 0.4, faults=FAULT)
             WITHIN,
         ),
         ([baseline(0.5, 0.05), contender("mlp", "network", 0.5 * math.exp(-0.05))], "mlp", "errs"),
-        # zero where nothing beats it, or all others diverge
-        ([baseline(1.2), contender("mlp", "network", 1.1)], "zero", "No model beats zero"),
-        ([contender("mlp", "network", 0.1, diverged=1)], "zero", ""),
+        # constant velocity where nothing beats it, or all others diverge
+        (
+            [baseline(1.2), contender("mlp", "network", 1.1)],
+            "constant_velocity",
+            "No model is better than constant velocity",
+        ),
+        ([contender("mlp", "network", 0.1, diverged=1)], "constant_velocity", ""),
     ],
 )
 def test_the_choice(models: list[SelectionCandidate], expected: str, said: str) -> None:
@@ -137,7 +141,7 @@ def test_the_file_says_of_each_model_what_decided() -> None:
     assert rows["mlp"]["ratio"] == pytest.approx(0.7 / 0.5)
     assert rows["mlp"]["standard_error"] == pytest.approx(0.1 * JITTER.std(ddof=1) / np.sqrt(5))
     assert (rows["mlp"]["sound"], rows["mlp"]["diverged"]) == (False, 2)
-    assert rows["zero"]["sound"] is True
+    assert rows["constant_velocity"]["sound"] is True
 
 
 def test_of_stretches_half_a_standard_error_is_taken() -> None:

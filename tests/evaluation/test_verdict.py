@@ -43,7 +43,11 @@ def horizon(
     seconds: float, mlp: dict[str, Any], windows: int = 12, best: dict[str, Any] | None = None
 ) -> dict[str, Any]:
     """One entry of limits.json: 2 m/s are sailed, zero is far off."""
-    models = {"mlp": mlp, "zero": errors(seconds, 40.0), "baseline": best or errors(seconds, 30.0)}
+    models = {
+        "mlp": mlp,
+        "constant_velocity": errors(seconds, 40.0),
+        "baseline": best or errors(seconds, 30.0),
+    }
     about = {"seconds": seconds, "windows": windows, "logs": 4, "slowest": 1.5, "fastest": 2.5}
     return {**about, "sailed": 2.0 * seconds, "floor": errors(0.1, 0.2), "models": models}
 
@@ -57,7 +61,7 @@ def evidence(error: float = 0.2, **change: Any) -> VerdictEvidence:
     given: dict[str, Any] = {
         "selected": "mlp",
         "split": "test",
-        "rows": {"zero": row(0.5), "baseline": row(0.25), "mlp": row(error)},
+        "rows": {"constant_velocity": row(0.5), "baseline": row(0.25), "mlp": row(error)},
         "baseline": "baseline",
         "selection": {
             "reason": "mlp has the least validation error.",
@@ -66,7 +70,10 @@ def evidence(error: float = 0.2, **change: Any) -> VerdictEvidence:
         "limits": under(
             {
                 "compared": {
-                    "mlp": {"zero": difference(-0.3, 0.1), "baseline": difference(-0.05, 0.1)}
+                    "mlp": {
+                        "constant_velocity": difference(-0.3, 0.1),
+                        "baseline": difference(-0.05, 0.1),
+                    }
                 }
             }
         ),
@@ -77,14 +84,22 @@ def evidence(error: float = 0.2, **change: Any) -> VerdictEvidence:
 
 def test_the_first_sentence_compares_with_zero_and_the_baseline() -> None:
     first = write_verdict(evidence())[0]
-    assert first.startswith("On test data model mlp is 60 % better than zero (paired 95 % interval")
+    assert first.startswith(
+        "On test data model mlp is 60 % better than constant velocity (paired 95 % interval"
+    )
     for part in ("-0.4 to -0.2)", "20 % better than the baseline", "zero: the data cannot tell"):
         assert part in first
-    worse = write_verdict(evidence(error=0.608, rows={"zero": row(0.506), "mlp": row(0.608)}))[0]
-    assert worse.startswith("WORSE THAN ZERO: on test data the selected model mlp has an NRMSE of")
+    worse = write_verdict(
+        evidence(error=0.608, rows={"constant_velocity": row(0.506), "mlp": row(0.608)})
+    )[0]
+    assert worse.startswith(
+        "WORSE THAN CONSTANT VELOCITY: on test data the selected model mlp has an NRMSE of"
+    )
     for part in ("0.608", "0.506"):
         assert part in worse
-    assert write_verdict(evidence(selected="zero"))[0].startswith("NOTHING BEATS ZERO")
+    assert write_verdict(evidence(selected="constant_velocity"))[0].startswith(
+        "NOTHING BEATS CONSTANT VELOCITY"
+    )
 
 
 def test_what_is_worse_than_zero_or_the_baseline_is_objected_to() -> None:
@@ -99,7 +114,7 @@ def test_what_is_worse_than_zero_or_the_baseline_is_objected_to() -> None:
 
 def test_unsound_models_and_divergences_are_named() -> None:
     fault = {"models": [{"model": "mlp", "faults": ["its damping has the wrong sign"]}]}
-    rows = {"zero": row(0.5), "mlp": row(0.2, diverged=7)}
+    rows = {"constant_velocity": row(0.5), "mlp": row(0.2, diverged=7)}
     said = write_verdict(evidence(selection=fault, rows=rows))
     assert "7/12 diverged, which count with the error of zero" in said[0]
     assert said[1] == (
@@ -169,17 +184,17 @@ def test_a_model_as_near_as_the_plant_itself_is_good() -> None:
     """Another model is nearer, but within twice what the plant leaves all are alike."""
     entry = horizon(10, errors(0.5, 1.0), best=errors(0.2, 1.0))
     assert rate_model(evidence(limits=under({"horizons": [entry]}))) == "limited"
-    entry["models"]["truth"] = errors(0.4, 0.9)
-    rows = {"zero": row(0.5), "mlp": row(0.2), "truth": row(0.1) | {"kind": "truth"}}
+    entry["models"]["plant"] = errors(0.4, 0.9)
+    rows = {"constant_velocity": row(0.5), "mlp": row(0.2), "plant": row(0.1) | {"kind": "plant"}}
     assert rate_model(evidence(limits=under({"horizons": [entry]}), rows=rows)) == "good"
 
 
 def test_what_diverges_or_is_no_better_than_zero_is_never_good() -> None:
     limits = under({"horizons": [horizon(30, errors(1.0, 1.0))]})
-    rows = {"zero": row(0.5), "baseline": row(0.25), "mlp": row(0.2, diverged=1)}
+    rows = {"constant_velocity": row(0.5), "baseline": row(0.25), "mlp": row(0.2, diverged=1)}
     assert rate_model(evidence(limits=limits, rows=rows)) == "limited"
     assert rate_model(evidence(error=0.6, limits=limits)) == "do not use"
-    assert rate_model(evidence(selected="zero", limits=limits)) == "do not use"
+    assert rate_model(evidence(selected="constant_velocity", limits=limits)) == "do not use"
     assert rate_model(evidence(selected="unknown")) == ""
 
 
@@ -196,12 +211,12 @@ def test_a_horizon_is_judged_by_the_protocol_of_most_windows() -> None:
 
 
 def test_a_model_that_the_data_cannot_tell_from_zero_is_not_to_be_used() -> None:
-    compared = {"mlp": {"zero": difference(-0.01, 0.1)}}
+    compared = {"mlp": {"constant_velocity": difference(-0.01, 0.1)}}
     given = evidence(limits=under({"compared": compared, "horizons": [horizon(30, errors(1, 1))]}))
     assert rate_model(given) == "do not use"
-    assert write_verdict(given)[0].startswith("NO BETTER THAN ZERO")
+    assert write_verdict(given)[0].startswith("NO BETTER THAN CONSTANT VELOCITY")
     # too few logs for an interval tell neither
-    unknown = under({"compared": {"mlp": {"zero": difference(-0.01, None)}}})
+    unknown = under({"compared": {"mlp": {"constant_velocity": difference(-0.01, None)}}})
     assert rate_model(evidence(limits=unknown)) == "limited"
 
 
@@ -218,7 +233,7 @@ def test_data_outside_the_training_range_and_the_doctor_are_told() -> None:
 def test_an_old_run_without_these_files_still_has_a_verdict() -> None:
     said = write_verdict(evidence(selection={}, limits={}))
     assert said == [
-        "On test data model mlp is 60 % better than zero and 20 % better than the baseline; its"
+        "On test data model mlp is 60 % better than constant velocity and 20 % better than the baseline; its"
         " NRMSE is 0.200."
     ]
 

@@ -56,9 +56,9 @@ def test_models_stand_in_order(
     with on_progress(heard.append):
         found = fit_models(logs, settings_of("heads", "ensembles", "training", bands=None))
     assert not list(tmp_path.iterdir())
-    assert list(found) == ["zero", "baseline", "ridge", "lstm", "mean"]
+    assert list(found) == ["constant_velocity", "baseline", "ridge", "lstm", "ensemble"]
     roles = [entry.spec.role for entry in found.values()]
-    assert roles == ["zero", "baseline", "head", "head", "ensemble"]
+    assert roles == ["constant_velocity", "baseline", "head", "head", "ensemble"]
     assert found.velocity_limits.shape == (3,)
     assert np.all(found.velocity_limits > 0)
     epochs = [event.done for event in heard if event.stage == "training lstm"]
@@ -72,7 +72,10 @@ def test_an_optional_head_is_left_out_where_its_package_is_absent(
     bred = {"kind": "genetic", "evolution": {"population": 10, "generations": 1}, "optional": True}
     said: list[str] = []
     with on_progress(lambda event: said.append(str(event))):
-        assert list(fit_models(logs, settings_of(heads={"bred": bred}))) == ["zero", "baseline"]
+        assert list(fit_models(logs, settings_of(heads={"bred": bred}))) == [
+            "constant_velocity",
+            "baseline",
+        ]
     assert "bred is left out" in " ".join(said)
 
 
@@ -116,7 +119,9 @@ def test_side_by_side_gives_the_same_models(
     heard: list[Progress] = []
     with worker_limit(2), on_progress(heard.append):
         found = fit_models(logs, settings)
-    assert list(found) == list(alone) == ["zero", "baseline", "wide", "narrow", "ridge"]
+    assert (
+        list(found) == list(alone) == ["constant_velocity", "baseline", "wide", "narrow", "ridge"]
+    )
     for name, model in alone.items():
         other = found[name].model.state_dict()
         for key, value in model.model.state_dict().items():
@@ -147,36 +152,39 @@ def test_what_ends_soon_stays_in_this_process(
         assert parts.count_parallel_heads(Fitter(logs, gpu, FitStore())) == 1
 
 
-ROLES = {"zero": "zero", **dict.fromkeys(("baseline", "physics", "hull"), "baseline")}
-ROLES |= {"mlp": "head", "ridge": "head", "mean": "ensemble"}
+ROLES = {
+    "constant_velocity": "constant_velocity",
+    **dict.fromkeys(("baseline", "physics", "hull"), "baseline"),
+}
+ROLES |= {"mlp": "head", "ridge": "head", "ensemble": "ensemble"}
 NOTES: dict[str, dict[str, Any]] = {
     "baseline": {"validation": 0.5},
     "physics": {"validation": 0.16},
     "hull": {"validation": 0.18},
     "mlp": {"baseline": "hull", "validation": 0.1},
     "ridge": {"validation": 0.2},
-    "mean": {"validation": 0.1},
+    "ensemble": {"validation": 0.1},
 }
-TO_FIRST = dict.fromkeys(("zero", "physics", "hull", "ridge", "truth"), "baseline")
+TO_FIRST = dict.fromkeys(("constant_velocity", "physics", "hull", "ridge", "plant"), "baseline")
 
 
 @pytest.mark.parametrize(
     ("roles", "notes", "expected"),
     [
-        (ROLES | {"truth": "truth"}, NOTES, {**TO_FIRST, "mlp": "hull", "mean": "physics"}),
+        (ROLES | {"plant": "plant"}, NOTES, {**TO_FIRST, "mlp": "hull", "ensemble": "physics"}),
         # what is not there is no reference
-        ({"mlp": "head", "mean": "ensemble"}, {"mlp": {"baseline": "hull"}}, {}),
+        ({"mlp": "head", "ensemble": "ensemble"}, {"mlp": {"baseline": "hull"}}, {}),
         # baselines without a recorded validation error: the first
         (
-            {"baseline": "baseline", "b": "baseline", "mean": "ensemble"},
+            {"baseline": "baseline", "b": "baseline", "ensemble": "ensemble"},
             {},
-            {"b": "baseline", "mean": "baseline"},
+            {"b": "baseline", "ensemble": "baseline"},
         ),
         # a baseline that diverged is none while a steady one is there
         (
-            {name: ROLES[name] for name in ("baseline", "physics", "hull", "mean")},
+            {name: ROLES[name] for name in ("baseline", "physics", "hull", "ensemble")},
             NOTES | {"physics": {"validation": 0.16, "validation_diverged": 2}},
-            {"physics": "baseline", "hull": "baseline", "mean": "hull"},
+            {"physics": "baseline", "hull": "baseline", "ensemble": "hull"},
         ),
     ],
 )

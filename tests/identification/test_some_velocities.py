@@ -52,7 +52,7 @@ def test_a_fit_is_of_what_the_logs_tell(
     assert ("position_error_end" in table) == live.has_position
     assert ("heading_error_end" in table) == live.has_heading
     error = table.groupby("model")["nrmse_mean"].mean()
-    assert error["baseline"] < 0.2 < error["zero"]
+    assert error["baseline"] < 0.2 < error["constant_velocity"]
     x = np.array([0.0, 0.0, 0.3, 0.5, 0.7, 0.1])
     after, _ = models["baseline"].step(x, np.full(len(data.signals.inputs), 0.5))
     # a velocity that was not recorded is zero, whatever it is given as
@@ -164,7 +164,9 @@ def test_a_vehicle_that_only_dives(made: Callable[..., Log], channels: tuple[str
     ends = {"position": "u" in velocities, "depth": True, "attitude": "q" in velocities}
     assert [f"{name}_error_end" in table for name in ends] == [*ends.values()]
     error = table.groupby("model")["nrmse_mean"].mean()
-    assert error["baseline"] < error["zero"] * (1.0 if velocities == ("w", "q") else 0.3)
+    assert error["baseline"] < error["constant_velocity"] * (
+        1.0 if velocities == ("w", "q") else 0.3
+    )
     x = np.full(len(live.state_names), 0.1)
     after, _ = models["baseline"].step(x, np.full(len(data.signals.inputs), 0.1))
     assert not after[[live.state_names.index(name) for name in live.fixed_states]].any()

@@ -33,7 +33,7 @@ from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import acts_along_own_velocity
 from residnet.preprocessing.prepare import make_samples
 
-NAMES = ("hull", "hull_network", "mean")
+NAMES = ("hull", "hull_network", "ensemble")
 
 
 def content(**changes: Any) -> dict[str, Any]:
@@ -89,17 +89,17 @@ def identified(logs: PreparedSplits) -> Identified:
 def test_the_mean_is_reported_first_and_a_hull_that_does_not_run_away_beside_it(
     identified: Identified, logs: PreparedSplits
 ) -> None:
-    assert list(identified)[:2] == ["zero", "baseline"]
+    assert list(identified)[:2] == ["constant_velocity", "baseline"]
     assert set(NAMES) <= set(identified)
     assert {identified[name].notes["prior"] for name in ("baseline", "hull")} == {1.0}
     assert all(np.isfinite(model.notes.get("validation", 0.0)) for model in identified.values())
     judged = identified.evaluate({split: logs[split] for split in ("train", "validation")})
     chosen = identified.select_models(judged)
     families = {entry.name: entry.family for entry in chosen.candidates}
-    assert chosen.default_model == chosen.selected_ensemble == "mean"
+    assert chosen.default_model == chosen.selected_ensemble == "ensemble"
     assert (chosen.selected, families["hull"]) == ("hull", "refitted baseline")
-    assert families["hull_network"] == families["mean"] == "ensemble"
-    assert identified["mean"].notes["members"] == ["hull", "hull_network"]
+    assert families["hull_network"] == families["ensemble"] == "ensemble"
+    assert identified["ensemble"].notes["members"] == ["hull", "hull_network"]
     found = judged["validation"].free_runs[0].predictions
     found["hull"] = [replace(one, has_diverged=True) for one in found["hull"]]
     assert identified.select_models(judged).selected == "baseline"
@@ -111,8 +111,8 @@ def test_bands_of_short_logs_come_from_fits_without_some_of_them(
 ) -> None:
     found = fit_models(logs, settings(effort=0.01))
     banded = {name: entry.bands["T8"] for name, entry in found.items() if entry.bands}
-    assert list(banded) == ["zero", "baseline", "hull", "mean"]
-    hull, mean = banded["hull"], banded["mean"]
+    assert list(banded) == ["constant_velocity", "baseline", "hull", "ensemble"]
+    hull, mean = banded["hull"], banded["ensemble"]
     assert hull.n_logs == len(logs["train"]) + len(logs["validation"])
     np.testing.assert_array_equal(mean.half_width, hull.half_width)
     assert "hull" in mean.cautions[0]
@@ -124,20 +124,25 @@ def test_members_that_run_away_or_harm_the_mean_are_left_out(
     identified: Identified, logs: PreparedSplits
 ) -> None:
     fitter = Fitter(logs, settings(), FitStore())
-    zero, hull, network = (identified[name] for name in ("zero", "hull", "hull_network"))
+    zero, hull, network = (
+        identified[name] for name in ("constant_velocity", "hull", "hull_network")
+    )
     lost = replace(identified["baseline"], notes={"validation_diverged": 1})
-    assert fitter.build_trajectory_ensemble("mean", [hull, network, lost]).notes["members"] == [
+    assert fitter.build_trajectory_ensemble("ensemble", [hull, network, lost]).notes["members"] == [
         "hull",
         "hull_network",
     ]
     zero = replace(zero, notes={"validation": fitter.score_on_validation(zero.model).error})
-    found = fitter.build_trajectory_ensemble("mean", [hull, network, zero])
-    assert (found.notes["members"], found.notes["left_out"]) == (["hull", "hull_network"], ["zero"])
+    found = fitter.build_trajectory_ensemble("ensemble", [hull, network, zero])
+    assert (found.notes["members"], found.notes["left_out"]) == (
+        ["hull", "hull_network"],
+        ["constant_velocity"],
+    )
     for one in (lost, zero):
         with pytest.raises(FitError, match="no mean errs less"):
-            fitter.build_trajectory_ensemble("mean", [hull, one])
+            fitter.build_trajectory_ensemble("ensemble", [hull, one])
     fitter.validation_in_training = True
-    assert fitter.build_trajectory_ensemble("mean", [hull, zero]).notes["left_out"] == []
+    assert fitter.build_trajectory_ensemble("ensemble", [hull, zero]).notes["left_out"] == []
 
 
 def test_what_harms_a_mean_of_independent_errors() -> None:
@@ -159,7 +164,7 @@ def test_settings_say_the_recipe_and_nothing_of_its_parts() -> None:
     assert written["recipe"] == "standard"
     assert not set(PART_KEYS) & set(written)
     assert validate_config(written, FitSettings, "again") == own
-    assert own.model_names == ("baseline", "hull", "hull_network", "network", "mean")
+    assert own.model_names == ("baseline", "hull", "hull_network", "network", "ensemble")
 
 
 @pytest.mark.parametrize(
@@ -212,10 +217,10 @@ def test_a_yaw_rate_of_noise_alone_tells_no_memory() -> None:
 
 def test_networks_stand_alone_and_horizons_are_long_where_logs_are() -> None:
     facts = TrainingDataSummary.from_channel_names(NAMES_OF_A_BOAT)
-    assert short(NAMES_OF_A_BOAT)["means"] == {"mean": ("hull", "hull_network")}
+    assert short(NAMES_OF_A_BOAT)["means"] == {"ensemble": ("hull", "hull_network")}
     whole = make_portfolio(facts)
-    assert whole["means"] == {"mean": ("hull", "hull_network", "network")}
-    assert whole["base_of"] == {"hull_network": "hull", "network": "zero"}
+    assert whole["means"] == {"ensemble": ("hull", "hull_network", "network")}
+    assert whole["base_of"] == {"hull_network": "hull", "network": "constant_velocity"}
     # no model can run away
     for part in (whole["baseline"], *whole["baselines"].values()):
         assert part["bounded"]

@@ -221,8 +221,8 @@ def test_runs_to_choose_from_are_the_median_worst_and_best_of_each_kind(run: Pat
     pictured = [case.title.split(":")[0] for case in figure.static_cases]
     assert pictured == ["zigzag, whole", "turning, whole"]
     looks = figure.styles
-    assert all(looks[name].is_visible for name in ("measured", "plsr", "baseline", "truth"))
-    assert not looks["zero"].is_visible
+    assert all(looks[name].is_visible for name in ("measured", "plsr", "baseline", "plant"))
+    assert not looks["constant_velocity"].is_visible
     assert (looks["plsr"].color, looks["baseline"].dash) == (BLUE, "dashed")
     track, surge = median.curves[:2]
     assert np.isnan(track["measured"][0]).sum() == 10, "masked samples are a gap"

@@ -80,7 +80,7 @@ def test_the_first_screen_answers_how_far_off_and_which_model(page: str) -> None
     assert table[0] == ["model", "error after 30 s", ""]
     # what is selected, then what it is to be better than, then the others, the nearest first
     labels = [line[0] for line in table[2:]]
-    assert labels == ["plsr (selected)", "baseline", "zero", "truth (plant)", "mlp"]
+    assert labels == ["plsr (selected)", "baseline", "constant_velocity", "plant", "mlp"]
     assert table[2][1:3] == ["0.40", format_number(DEG * LEVEL["plsr"][2], 2)]
     assert "Mean of 6 free runs on test data (T30, which start elsewhere than those of" in first
     # the run holds no errors after single times, so that nothing is known to be good
@@ -346,7 +346,9 @@ def test_a_folder_of_evaluate_has_other_splits_and_no_models(tmp_path: Path) -> 
     folder = made_run(tmp_path / "other", split="external")
     for path in (folder / "models").rglob("*.json"):
         path.unlink()
-    write_json(folder / "metrics.json", metrics(("external",), ("zero", "baseline", "plsr")))
+    write_json(
+        folder / "metrics.json", metrics(("external",), ("constant_velocity", "baseline", "plsr"))
+    )
     text = shown(folder)
     assert Page(text).table("model", "plsr (selected)")["plsr (selected)"][0] == "0.40"
     for absent in ("Baseline parameters", "Residual heads", "simulated plant", "side by side"):

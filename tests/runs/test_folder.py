@@ -61,7 +61,7 @@ def test_a_folder_is_used_again_without_results_or_where_that_is_asked_for(tmp_p
     folder = RunFolder.create(path, "a: 1\n")
     folder.write_json(folder.provenance, {})
     assert RunFolder.create(path, "a: 2\n").resolved_config.read_text() == "a: 2\n"
-    folder.write_json(folder.models / "zero" / "fit.json", {})
+    folder.write_json(folder.models / "constant_velocity" / "fit.json", {})
     refused("exists already", path, "a: 2\n")
     folder = RunFolder.create(path, "a: 3\n", overwrite=True)
     assert {entry.name for entry in path.iterdir()} == {"resolved.yaml", "checksums.jsonl"}

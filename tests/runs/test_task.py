@@ -38,7 +38,7 @@ class SampleTask(ComputingTask):
 
         def wild() -> Path:
             if self.fault == "is withheld":
-                raise WithheldError("model wild is withheld: worse than zero")
+                raise WithheldError("model wild is withheld: worse than constant_velocity")
             raise ExportError("model wild: diverges")
 
         def model() -> Path:
@@ -115,7 +115,7 @@ def test_a_run_that_withholds_or_cannot_export_a_model_is_complete_and_says_so(
     run = tmp_path / "run"
     finished = SampleTask(name="wild", fault="is withheld").run(output_folder=run)
     assert [file.name for file in finished.exports] == ["model.txt"]
-    said = "Not exported: model wild is withheld: worse than zero."
+    said = "Not exported: model wild is withheld: worse than constant_velocity."
     assert finished.folder.read_summary()["verdict"] == ["It works.", said]
     assert "model wild is withheld" in finished.folder.report.read_text()
     with pytest.raises(ExportError, match=r"model wild: diverges; the run itself is complete"):

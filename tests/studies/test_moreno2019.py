@@ -19,7 +19,16 @@ from residnet.studies import moreno2019
 from residnet.studies.moreno2019 import grid_errors, grid_figures
 
 MODELS = (
-    *("zero", "baseline", "rbf_joint", "rbf_each", "p1_joint", "p1_each", "p2_joint", "p2_each"),
+    *(
+        "constant_velocity",
+        "baseline",
+        "rbf_joint",
+        "rbf_each",
+        "p1_joint",
+        "p1_each",
+        "p2_joint",
+        "p2_each",
+    ),
     *("symbolic", "gptips"),
 )
 COLUMNS = ("u", "v", "r", "psi", "x", "y")
@@ -46,7 +55,10 @@ def write(run: Path, split: str, models: tuple[str, ...]) -> None:
 
 
 def made(run: Path, models: tuple[str, ...] = MODELS) -> Path:
-    kinds, rmse = {"zero": "zero", "baseline": "baseline"}, dict.fromkeys("uvr", 1.0)
+    kinds, rmse = (
+        {"constant_velocity": "constant_velocity", "baseline": "baseline"},
+        dict.fromkeys("uvr", 1.0),
+    )
     about = {"split": "test", "protocol": "record", "rmse": rmse}
     rows = [{"model": model, "kind": kinds.get(model, "head"), **about} for model in models]
     (run / "metrics.json").write_text(json.dumps({"rows": rows, "run": "made"}))

@@ -18,7 +18,15 @@ from residnet.report.run_reader import RunFiles
 from residnet.studies import woo2018
 
 KINDS = ("zigzag", "acceleration_deceleration", "three_two_one_one")
-MODELS = ("zero", "nomoto", "nomoto_side_slip", "baseline", "lstm_printed", "lstm_rate", "lstm")
+MODELS = (
+    "constant_velocity",
+    "nomoto",
+    "nomoto_side_slip",
+    "baseline",
+    "lstm_printed",
+    "lstm_rate",
+    "lstm",
+)
 STATES = {"u": [0.5, 1.0, 1.5], "v": [-0.1, 0.0, 0.1], "r": [-0.2, 0.0, 0.2]}
 FORCES = {"tau_x": [100.0, 200.0, 300.0], "tau_n": [-100.0, 0.0, 100.0]}
 STEADY = {
@@ -36,7 +44,11 @@ def row(model: str, split: str, manoeuvre: str) -> dict[str, Any]:
     rmse = {"u": 2 * level, "v": level, "r": 0.5 * level}
     return {
         "model": model,
-        "kind": "zero" if model == "zero" else "head" if "lstm" in model else "baseline",
+        "kind": "constant_velocity"
+        if model == "constant_velocity"
+        else "head"
+        if "lstm" in model
+        else "baseline",
         "split": split,
         "protocol": "manoeuvre",
         "manoeuvre": manoeuvre,

@@ -16,14 +16,20 @@ from residnet.report.run_reader import RunFiles
 from residnet.report.sections import verdict
 
 DEG = 180.0 / math.pi
-MODELS = {"zero": "zero", "baseline": "baseline", "mlp": "head", "plsr": "head", "truth": "truth"}
+MODELS = {
+    "constant_velocity": "constant_velocity",
+    "baseline": "baseline",
+    "mlp": "head",
+    "plsr": "head",
+    "plant": "plant",
+}
 # error of each model: rmse of u [m/s], v [m/s], r [rad/s]
 LEVEL = {
-    "zero": (1.2345, 0.2222, 0.2111),
+    "constant_velocity": (1.2345, 0.2222, 0.2111),
     "baseline": (0.1000, 0.0500, 0.0200),
     "mlp": (0.0700, 0.0510, 0.0150),
     "plsr": (0.0400, 0.0300, 0.0100),
-    "truth": (0.0200, 0.0250, 0.0050),
+    "plant": (0.0200, 0.0250, 0.0050),
 }
 KINDS = {**{f"zigzag_0{number}": "zigzag" for number in (1, 2, 3)}, "turning_01": "turning"}
 SCALES = {"u": 0.5, "v": 0.25, "r": 0.25}

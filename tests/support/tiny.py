@@ -40,7 +40,7 @@ TINY: dict[str, Any] = {
         "ridge": {"kind": "ridge"},
         "lstm": {"kind": "lstm", "hidden_size": 6, "dropout": 0.1},
     },
-    "ensembles": {"mean": ["ridge", "lstm"]},
+    "ensembles": {"ensemble": ["ridge", "lstm"]},
     "training": {
         "lstm": {
             "steps": 3,

@@ -83,7 +83,7 @@ def test_a_fit_to_csv_is_evaluated_and_exported(
     assert command("run", csv, "--out", out, "-s", "export.models=[selected]").code == 0
     content = read_json(out / "metrics.json")
     assert {row["split"] for row in content["rows"]} == {"train", "validation", "test"}
-    assert "truth" not in {row["model"] for row in content["rows"]}
+    assert "plant" not in {row["model"] for row in content["rows"]}
     assert len(read_json(out / "provenance.json")["inputs"]) == 6
     for split, logs in (("train", range(4)), ("test", (5,))):
         shutil.rmtree(external, ignore_errors=True)

@@ -41,7 +41,7 @@ def test_the_folder_holds_models_as_plain_numbers_and_what_was_found(tiny_run: P
     for name in (*made, "data_quality.json", "residuals.parquet"):
         assert (tiny_run / name).stat().st_size > 0, name
     models = {path.name for path in (tiny_run / "models").iterdir()}
-    assert models == {"zero", "baseline", "ridge", "lstm", "mean"}
+    assert models == {"constant_velocity", "baseline", "ridge", "lstm", "ensemble"}
     kinds = {path.suffix for path in (tiny_run / "models").rglob("*") if path.is_file()}
     assert kinds == {".json", ".safetensors"}
 
@@ -72,12 +72,12 @@ def test_an_ensemble_averages_accelerations(tiny_run: Path) -> None:
     y = torch.rand(3, 7, 6, generator=random, dtype=torch.float64)
     w = 20 * torch.rand(3, 7, 2, generator=random, dtype=torch.float64)
     rates = {}
-    for name in ("ridge", "lstm", "mean"):
+    for name in ("ridge", "lstm", "ensemble"):
         model = load_model(tiny_run / "models" / name)[1].double()
         p = model.signals.prepare(w[:, -1])
         rho, _ = model.head(model.signals(y[:, -1], p), model.warmup(y[:, :-1], w[:, :-1]))
         rates[name] = model.rate(y[:, -1], p, rho)[:, 3:]
-    torch.testing.assert_close(rates["mean"], (rates["ridge"] + rates["lstm"]) / 2)
+    torch.testing.assert_close(rates["ensemble"], (rates["ridge"] + rates["lstm"]) / 2)
 
 
 def test_metrics_follow_from_the_stored_free_runs(tiny_run: Path) -> None:
@@ -93,7 +93,7 @@ def test_metrics_follow_from_the_stored_free_runs(tiny_run: Path) -> None:
             each = [np.sqrt(np.mean((g[f"{name}_hat"] - g[name]) ** 2)) for _, g in groups]
             assert row["rmse"][name] == pytest.approx(np.mean(each), rel=1e-9)
     error = {r["model"]: r["nrmse"]["mean"] for r in own_rows if r["protocol"] == "manoeuvre"}
-    assert error["truth"] < error["ridge"] < error["baseline"] < error["zero"]
+    assert error["plant"] < error["ridge"] < error["baseline"] < error["constant_velocity"]
     assert sum(row["diverged"] for row in rows(tiny_run)) == 0
     figures = read_json(tiny_run / "summary.json")["figures"]
     assert figures["nrmse"]["value"] == error[read_json(tiny_run / "metrics.json")["selected"]]
@@ -104,11 +104,11 @@ def test_goodness_of_every_model_and_axis_agrees_with_the_stored_residuals(tiny_
         by = {(row["model"], row["axis"]): row for row in found}
         assert len(by) == len(found) == 3 * 5
         for axis in ("u_dot", "v_dot", "r_dot"):
-            names = ("zero", "baseline", "ridge", "lstm")
+            names = ("constant_velocity", "baseline", "ridge", "lstm")
             counts = [by[name, axis]["parameters"] for name in names]
             assert counts[0] == 0
             assert counts == sorted(set(counts))
-            assert by["zero", axis]["r2"] <= 1e-9 < by["baseline", axis]["r2"]
+            assert by["constant_velocity", axis]["r2"] <= 1e-9 < by["baseline", axis]["r2"]
             assert by["ridge", axis]["difference"]["to"] == "baseline"
             low, high = by["ridge", axis]["mae_ci95"]
             assert low < by["ridge", axis]["mae"] < high
@@ -125,7 +125,10 @@ def test_another_seed_changes_the_networks_alone(
 ) -> None:
     assert command("run", tiny_config, "-s", "seed=1", "--out", tmp_path / "other").code == 0
     pairs = zip(rows(tmp_path / "other"), rows(tiny_run), strict=True)
-    assert {row["model"] for row, old in pairs if row["rmse"] != old["rmse"]} == {"lstm", "mean"}
+    assert {row["model"] for row, old in pairs if row["rmse"] != old["rmse"]} == {
+        "lstm",
+        "ensemble",
+    }
 
 
 @pytest.mark.long

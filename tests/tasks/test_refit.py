@@ -80,7 +80,11 @@ def test_a_refit_leaves_the_old_run_alone_and_can_be_exported(
     assert "IS worth taking" in said.out
     metrics = read_json(out / "metrics.json")
     assert metrics["selected"] == "baseline_refit"
-    assert {row["model"] for row in metrics["rows"]} == {"zero", "baseline", "baseline_refit"}
+    assert {row["model"] for row in metrics["rows"]} == {
+        "constant_velocity",
+        "baseline",
+        "baseline_refit",
+    }
     errors = {
         row["model"]: row["nrmse"]["mean"]
         for row in metrics["rows"]

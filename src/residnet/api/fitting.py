@@ -23,6 +23,7 @@ from residnet.api.values import (
 from residnet.core.config import validate_config
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
+from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.core.names import suggest_name
 from residnet.core.processes import worker_limit
 from residnet.core.progress import ProgressCallback
@@ -107,7 +108,7 @@ class FreeRuns:
 
         Args:
             log: name of the log; the first where None.
-            selection: `models`, their names, all but `zero` if there are none; `protocol`,
+            selection: `models`, their names, all but `constant_velocity` if there are none; `protocol`,
                 `manoeuvre` where there is such a one, else the first; `window`, number of the
                 window in the log, the longest where None.
 
@@ -165,7 +166,9 @@ class FreeRuns:
         model_names = [
             _require_known(model, stored_window.predicted, "model") for model in requested_models
         ]
-        model_names = model_names or [model for model in stored_window.predicted if model != "zero"]
+        model_names = model_names or [
+            model for model in stored_window.predicted if model != CONSTANT_VELOCITY
+        ]
         predicted = {model: stored_window.predicted[model] for model in model_names}
         stored_window = replace(stored_window, predicted=predicted, diverged={})
         window_plot = plot_window(stored_window, f"{log_name}, {protocol_name}")
@@ -246,7 +249,7 @@ def free_run(
 
 @final
 class Models(dict[str, Model]):
-    """Fitted models by name: zero, the baselines, heads and ensembles, in this order.
+    """Fitted models by name: constant_velocity, the baselines, heads and ensembles, in this order.
 
     Attributes:
         identified: what the fit made.

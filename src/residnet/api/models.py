@@ -60,7 +60,7 @@ class Model:
     Attributes:
         fitted_model: the model with the notes of its fit.
         name: of the model.
-        role: what it is: zero, baseline, head or ensemble.
+        role: what it is: constant_velocity, baseline, head or ensemble.
         spec: everything that determines the model but its numbers.
         module: the PyTorch module itself.
         states: names of the columns of a state.
@@ -321,12 +321,13 @@ def export_model(
         model: to export.
         file: to write.
         format: one of `list_available("formats")`.
-        metrics: rows of metrics.json. Those of this model stand in the card; those of `zero` and
+        metrics: rows of metrics.json. Those of this model stand in the card; those of
+            `constant_velocity` and
             of a baseline under the same protocol show whether it is worse than they are.
         allows_objections: whether a model is wanted that is worse, too; its card says so.
 
     Raises:
-        WithheldError: if it is worse than `zero` or the baseline, but for `allows_objections`.
+        WithheldError: if it is worse than `constant_velocity` or the baseline, but for `allows_objections`.
         ConfigError: if there is no such format.
         UsageError: if the format cannot hold such a model.
         ExportError: if what was written does not reproduce the model.

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictStr, TypeAd
 from pydantic import ValidationError as ShapeError
 
 from residnet.core.errors import UsageError
+from residnet.core.model_names import FORMER_NAMES
 
 Number = Annotated[float, Field(strict=True)] | None
 """A number; None stands for one that is not finite."""
@@ -151,3 +152,10 @@ def require_shape(path: Path, content: Any) -> None:
         raise UsageError(
             f"{path}: {where}: {first['msg'].lower()}; restore the folder or run it again"
         ) from None
+    if shape is _FitMetrics:
+        for index, row in enumerate(content["rows"]):
+            if (kind := row.get("kind")) in FORMER_NAMES:
+                raise UsageError(
+                    f"{path}: key 'rows.{index}.kind': an earlier version wrote '{kind}', which is"
+                    f" '{FORMER_NAMES[kind]}' today; run the fit again"
+                )

@@ -120,7 +120,7 @@ class ModelSpec(Stored):
         schema_name: kind and version of the format.
         version: of residnet that wrote it.
         name: of the model in its run.
-        role: zero, baseline, head or ensemble.
+        role: constant_velocity, baseline, head or ensemble.
         signals: what drives it.
         baseline: the known part.
         head: the learned part; None for none.
@@ -139,7 +139,7 @@ class ModelSpec(Stored):
     schema_name: Literal["residnet.model/1"] = Field(default="residnet.model/1", alias="schema")
     version: str = __version__
     name: str
-    role: Literal["zero", "baseline", "head", "ensemble"]
+    role: Literal["constant_velocity", "baseline", "head", "ensemble"]
     signals: SignalsConfig
     baseline: BaselineConfig
     head: HeadConfig | None = None
@@ -181,7 +181,7 @@ class ModelSpec(Stored):
         known = self.baseline.build(signals.names)
         head.set_inertia(known.inertia_matrix())
         model = HybridDynamics(signals, known, head, self.dt, self.integrator)
-        if self.role == "zero":
+        if self.role == "constant_velocity":
             # all is held, angles too
             model.known_rates.zero_()
             if live.is_six_dof:

@@ -209,7 +209,7 @@ class Band:
         unconditional_width: half widths that take every run for the same [G, c].
         simultaneous_factor: factors [c] by which a band grows that is to hold a whole run.
         constant_width: half widths [c] that are the same at all horizons, for comparison.
-        score_unit: root mean square errors of `zero` [c], which scores are given in.
+        score_unit: root mean square errors of `constant_velocity` [c], which scores are given in.
         intensity: measures of liveliness; None where the band knows none.
         slope: logarithm of the factor by each measure [2 n, c].
         n_logs: number of logs that calibrated it.

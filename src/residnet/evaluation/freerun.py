@@ -42,7 +42,7 @@ class Candidate:
 
     Attributes:
         name: unique in a run.
-        model_kind: zero, baseline, head, truth or ensemble.
+        model_kind: constant_velocity, baseline, head, plant or ensemble.
         model: the dynamics; float64 parameters are run in float64.
         state_names: names of the columns of the model's state; those of the prepared logs where empty.
             What is not among these (actuators) starts from the log's channel.
@@ -221,7 +221,7 @@ def run_free_runs(
     """Free-run every candidate over every window.
 
     A window whose prediction is not finite, or whose velocities exceed both `velocity_limits` [n] and twice
-    what the vessel itself did in it, has diverged and holds the prediction of `zero`, velocities
+    what the vessel itself did in it, has diverged and holds the prediction of `constant_velocity`, velocities
     held, instead. Beyond a negative limit everything has diverged.
     """
     names = {candidate.name for candidate in candidates}
@@ -422,7 +422,7 @@ def _to_prediction(
     dt: float,
     velocity_limits: np.ndarray,
 ) -> Prediction:
-    """Return states [L, 3 + n] or what moves [L, n] with its pose; of `zero` if it ran away."""
+    """Return states [L, 3 + n] or what moves [L, n] with its pose; of `constant_velocity` if it ran away."""
     log, window_slice = logs[window.log_index], slice(window.start, window.stop)
     velocities = simulated[:, -log.dof.n_dynamic :]
     measured_speeds = np.abs(log.y[window_slice, log.dof.dynamic_columns][log.usable[window_slice]])

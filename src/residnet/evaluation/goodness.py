@@ -450,7 +450,7 @@ class OneStepResiduals:
 
     Attributes:
         model_name: its name.
-        model_kind: zero, baseline, head or ensemble.
+        model_kind: constant_velocity, baseline, head or ensemble.
         n_parameters: number of fitted parameters of each axis.
         residuals: measured minus predicted acceleration, [T, n] of each piece.
         reference_name: name of the model that it is compared with; None for none.

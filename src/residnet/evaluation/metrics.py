@@ -14,6 +14,7 @@ import scipy
 
 from residnet.core.files import atomic_write, make_file_stem
 from residnet.core.layout import PLANAR_LAYOUT, VELOCITIES, DegreesOfFreedom
+from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.core.names import POSE_ERROR_UNITS
 from residnet.evaluation.band import BandsByModel
 from residnet.evaluation.bands import band_limits, compute_run_errors, count_coverage
@@ -225,7 +226,6 @@ def paired_difference(
 
 SCHEMA = "residnet.metrics/1"
 LIMITS_SCHEMA = "residnet.limits/1"
-CONSTANT_VELOCITY = "zero"
 _N_WORST_WINDOWS, _N_SPEED_CLASSES, _MIN_CLASS_WINDOWS = 3, 3, 3
 """Worst windows that are told, bands of speed, and windows that a band needs; chosen by hand."""
 _WIND_CHANNEL = "wind_speed"
@@ -565,7 +565,7 @@ class ProtocolEvaluation:
         ]
 
     def compare_with_references(self) -> dict[str, dict[str, Any]]:
-        """Return by model its paired differences to `zero` and to the first baseline."""
+        """Return by model its paired differences to `constant_velocity` and to the first baseline."""
         all_windows = np.ones(len(self.log_indices), dtype=bool)
         reference_names = [CONSTANT_VELOCITY] if CONSTANT_VELOCITY in self.errors else []
         reference_names += [
@@ -699,7 +699,7 @@ def build_metrics_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         Columns model, kind, split, protocol, manoeuvre (and selected where the rows have it),
         windows, diverged, n, then rmse_u, rmse_v, rmse_r (m/s, m/s, rad/s), the same for mae and
         nrmse with nrmse_mean, note (such as "2/12 diverged", where such windows count with the
-        error of `zero`), and position_error_end (m), heading_error_end (rad), or depth_error_end
+        error of `constant_velocity`), and position_error_end (m), heading_error_end (rad), or depth_error_end
         (m) and attitude_error_end (rad) where the vessel dives.
     """
     import pandas as pd

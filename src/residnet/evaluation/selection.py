@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 
 from residnet.core.format import format_number
+from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.evaluation.freerun import FreeRun, FreeRunErrors
 from residnet.evaluation.metrics import MIN_LOGS_AS_BLOCKS, TARGET_BLOCKS
 from residnet.preprocessing.prepare import PreparedLog
 
 SCHEMA = "residnet.selection/2"
 MODEL_FAMILIES = (
-    "zero",
+    CONSTANT_VELOCITY,
     "baseline",
     "refitted baseline",
     "closed-form head",
@@ -193,7 +194,7 @@ def select_models(candidates: Iterable[SelectionCandidate], blocks: SelectionBlo
     is chosen: what speaks against a model costs it as much error as the logs can tell, no more.
 
     Args:
-        candidates: `zero` and at least one other.
+        candidates: `constant_velocity` and at least one other.
     """
     all_candidates = tuple(candidates)
     selected_model, reason = _simplest_equivalent(
@@ -230,8 +231,8 @@ def _simplest_equivalent(
         if mean_log_ratio <= (tolerance := blocks.equivalence_standard_errors * standard_error):
             break
     error_text = f"mean validation error {format_number(candidate.mean_nrmse)}"
-    if candidate.family == "zero":
-        reason = f"No model beats zero, which predicts nothing, by more than {tolerance_text}"
+    if candidate.family == CONSTANT_VELOCITY:
+        reason = f"No model is better than constant velocity by more than {tolerance_text}"
     elif candidate is most_accurate:
         reason = f"{candidate.name} errs least ({error_text})"
         if any(model.complexity_rank < most_accurate.complexity_rank for model in bounded_models):

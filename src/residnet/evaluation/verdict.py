@@ -14,12 +14,12 @@ from residnet.core.format import (
     format_number,
     join_list,
 )
+from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.core.names import POSE_ERROR_UNITS
 
 JsonObject = Mapping[str, Any]
 """What a JSON object holds."""
 
-CONSTANT_VELOCITY = "zero"
 UNSEEN_SPLITS = ("test", "external")
 """Splits that no fit has seen."""
 
@@ -175,7 +175,7 @@ def longest_good_horizon(evidence: VerdictEvidence) -> float:
     if row.get("diverged") and evidence.split in UNSEEN_SPLITS:
         return 0.0
     plant_models = {
-        name for name, row in evidence.rows_by_model.items() if row.get("kind") == "truth"
+        name for name, row in evidence.rows_by_model.items() if row.get("kind") == "plant"
     }
     for horizon_entry in known_horizons(evidence):
         if not _has_enough_data(evidence, horizon_entry):
@@ -382,8 +382,8 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
     model_name, split = evidence.selected, evidence.split
     if model_name == CONSTANT_VELOCITY:
         return (
-            "NOTHING BEATS ZERO, which only holds the velocities that a run starts from: no model"
-            " of this run is of use for prediction."
+            "NOTHING BEATS CONSTANT VELOCITY, which holds the initial velocities of each free run: no"
+            " model of this run is of use for prediction."
         )
     selected_row, constant_velocity_row = (
         evidence.rows_by_model.get(model_name),
@@ -399,9 +399,9 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
             else "WORSE"
         )
         return (
-            f"{comparison_text} THAN ZERO: on {split} data the selected model {model_name} has an NRMSE of"
-            f" {format_number(selected_nrmse)}{_diverged_suffix(selected_row)}, and zero, which only holds the velocities that a run"
-            f" starts from, {format_number(_mean_nrmse(constant_velocity_row))}{_format_paired_interval(evidence, CONSTANT_VELOCITY)}. DO NOT USE it for"
+            f"{comparison_text} THAN CONSTANT VELOCITY: on {split} data the selected model {model_name} has an NRMSE of"
+            f" {format_number(selected_nrmse)}{_diverged_suffix(selected_row)}, and the constant-velocity"
+            f" model {format_number(_mean_nrmse(constant_velocity_row))}{_format_paired_interval(evidence, CONSTANT_VELOCITY)}. DO NOT USE it for"
             " prediction."
         )
     comparisons = []
@@ -417,8 +417,8 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
             else 0.0
         )
         comparison = "better" if percent_change >= 0 else "WORSE"
-        reference_label = (
-            f"the {reference_name}" if reference_name == "baseline" else reference_name
+        reference_label = {"baseline": "the baseline", CONSTANT_VELOCITY: "constant velocity"}.get(
+            reference_name, reference_name
         )
         comparisons.append(
             f"{abs(percent_change):.0f} % {comparison} than {reference_label}{_format_paired_interval(evidence, reference_name)}"
@@ -480,7 +480,11 @@ def _mean_nrmse(row: JsonObject) -> float:
 
 def _diverged_suffix(row: JsonObject) -> str:
     divergence_note = describe_divergence(row)
-    return f" ({divergence_note}, which count with the error of zero)" if divergence_note else ""
+    return (
+        f" ({divergence_note}, which count with the constant-velocity error)"
+        if divergence_note
+        else ""
+    )
 
 
 def _difference_to(evidence: VerdictEvidence, reference_name: str) -> JsonObject:

@@ -13,6 +13,7 @@ from torch import nn
 
 from residnet.core.arrays import paged
 from residnet.core.errors import FitError
+from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.core.progress import begin_stage
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
@@ -111,7 +112,7 @@ class LeaveFoldOutModels:
     ) -> list[HybridDynamics]:
         """Return a model without each fold; none where it cannot quickly be fitted again."""
         role = fitted_model.spec.role
-        if role == "zero":
+        if role == CONSTANT_VELOCITY:
             return [copy.deepcopy(fitted_model.model) for _ in range(self.n_folds)]
         if role == "baseline":
             return self._fit_baseline_without_folds(fitted_model)
@@ -301,9 +302,9 @@ class _ProtocolCalibration:
 
     def calibrate_all(self) -> dict[str, Band]:
         """Return the band of each model; none where no log is long enough."""
-        reference_errors = self.cross_validated_errors.get("zero", []) + self.validation_errors.get(
-            "zero", []
-        )
+        reference_errors = self.cross_validated_errors.get(
+            CONSTANT_VELOCITY, []
+        ) + self.validation_errors.get(CONSTANT_VELOCITY, [])
         if not reference_errors:
             return {}
         constant_velocity_errors = np.concatenate([run.error for run in reference_errors])

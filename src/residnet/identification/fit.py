@@ -14,6 +14,7 @@ from torch import Tensor
 
 from residnet.core.arrays import paged
 from residnet.core.errors import DataError, FitError, MissingPackageError
+from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.core.processes import available_cores, process_pool, retain_freed_memory
 from residnet.core.progress import (
     Progress,
@@ -85,7 +86,7 @@ def should_include_validation(settings: FitSettings, train: Sequence[PreparedLog
 def _fit_all_parts(fitter: Fitter, logs: Logs) -> IdentifiedModels:
     """Fit all parts on the training logs."""
     settings = fitter.settings
-    models = {"zero": fitter.build_constant_velocity()}
+    models = {CONSTANT_VELOCITY: fitter.build_constant_velocity()}
     for name in settings.all_baselines:
         with _skip_if_optional(settings, name):
             begin_stage(f"fitting {name}")

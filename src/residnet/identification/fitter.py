@@ -1,4 +1,4 @@
-"""Fitted models, who keeps them, and the single steps of a fit: zero, a baseline, a head on a
+"""Fitted models, who keeps them, and the single steps of a fit: constant velocity, a baseline, a head on a
 baseline, the mean of models.
 """
 
@@ -21,6 +21,7 @@ from residnet.baselines import BaselineConfig
 from residnet.baselines.given import ZeroBaselineConfig
 from residnet.core.arrays import paged
 from residnet.core.errors import FitError
+from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.core.progress import log_message
 from residnet.core.samples import Samples
 from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
@@ -339,7 +340,7 @@ class Fitter:
         """Return the description of a model of this fit.
 
         Args:
-            role: zero, baseline, head or ensemble.
+            role: constant_velocity, baseline, head or ensemble.
         """
         settings = self.settings
         return ModelSpec.model_validate(
@@ -360,7 +361,7 @@ class Fitter:
 
     def build_constant_velocity(self) -> FittedModel:
         """Return the model that holds the velocities."""
-        spec = self.build_spec("zero", "zero", ZeroBaselineConfig())
+        spec = self.build_spec(CONSTANT_VELOCITY, CONSTANT_VELOCITY, ZeroBaselineConfig())
         return self._save_and_reload(FittedModel(spec, spec.build(), {}))
 
     def fit_baseline(self, name: str = "baseline") -> FittedModel:

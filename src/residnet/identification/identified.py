@@ -13,6 +13,7 @@ from torch import Tensor
 
 from residnet.core.arrays import paged
 from residnet.core.errors import UsageError
+from residnet.core.model_names import CONSTANT_VELOCITY, ENSEMBLE, PLANT
 from residnet.core.stretches import find_runs
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
@@ -33,7 +34,7 @@ from residnet.evaluation.selection import (
 from residnet.evaluation.soundness import SanityFinding, TrainingPoints, check_model
 from residnet.heads.base import ClosedFormHead, EquationHead
 from residnet.identification.fitter import FittedModel, find_reference_names
-from residnet.identification.recipe import ENSEMBLE_NAME, SINGLE_MODEL_NAME
+from residnet.identification.recipe import SINGLE_MODEL_NAME
 from residnet.identification.settings import FitSettings
 from residnet.io.sources import MeasuredLogs
 from residnet.manoeuvres.trials import SimulatedTrials, build_plant
@@ -193,7 +194,7 @@ def _make_plant_candidate(data: SimulatedTrials) -> Candidate | None:
     model = RecordedPlantDynamics(plant, data.step, data.substeps)
     n_unknown_inputs = len(plant.input_names) - len(command_names)
     return Candidate(
-        "truth", "truth", model, plant.state_names, command_names, n_unknown_inputs, "baseline"
+        PLANT, PLANT, model, plant.state_names, command_names, n_unknown_inputs, "baseline"
     )
 
 
@@ -225,7 +226,7 @@ def count_parameters(model: HybridDynamics) -> int:
 
 @dataclass(frozen=True)
 class IdentifiedModels(Mapping[str, FittedModel]):
-    """The fitted models by name: zero, baselines, heads and ensembles, in this order.
+    """The fitted models by name: constant_velocity, baselines, heads and ensembles, in this order.
 
     Attributes:
         settings: of the fit.
@@ -263,7 +264,7 @@ class IdentifiedModels(Mapping[str, FittedModel]):
 
     @cached_property
     def sanity_findings(self) -> dict[str, list[SanityFinding]]:
-        """What the checks for physical sanity find, by model; `zero` is left out."""
+        """What the checks for physical sanity find, by model; `constant_velocity` is left out."""
         fitted_models = list(self.values())
         settings = self.settings
         training_points = TrainingPoints.from_logs(self.training_logs, settings.prepare.grid.step)
@@ -275,7 +276,7 @@ class IdentifiedModels(Mapping[str, FittedModel]):
                 settings.evaluation.divergence,
             )
             for fitted_model in fitted_models
-            if fitted_model.spec.role != "zero"
+            if fitted_model.spec.role != CONSTANT_VELOCITY
         }
 
     def select_models(self, evaluations: Mapping[str, SplitEvaluation]) -> Selection:
@@ -351,11 +352,9 @@ class IdentifiedModels(Mapping[str, FittedModel]):
                 )
             )
         selection = select_models(candidates, blocks)
-        if self.settings.recipe is None or ENSEMBLE_NAME not in self.models:
+        if self.settings.recipe is None or ENSEMBLE not in self.models:
             return selection
-        selection = replace(
-            selection, selected_ensemble=ENSEMBLE_NAME, default_ensemble=ENSEMBLE_NAME
-        )
+        selection = replace(selection, selected_ensemble=ENSEMBLE, default_ensemble=ENSEMBLE)
         hull_candidate = next(
             (item for item in selection.candidates if item.name == SINGLE_MODEL_NAME), None
         )

@@ -18,6 +18,7 @@ from residnet.baselines.sets import (
 )
 from residnet.core.layout import SURGE_SWAY_YAW, DegreesOfFreedom
 from residnet.core.log import Log
+from residnet.core.model_names import CONSTANT_VELOCITY, ENSEMBLE
 from residnet.core.names import BOW_WIND_CHANNELS, CHANNEL_UNITS, WIND_INPUTS, azimuth_thrusters
 from residnet.core.samples import Samples
 from residnet.core.stretches import find_runs
@@ -409,10 +410,8 @@ PART_KEYS = (
 """Keys of a fit that the recipe stands in place of."""
 SINGLE_MODEL_NAME = "hull"
 """Name of the model that is taken where one single is needed."""
-_HEAD_BASELINES = {"hull_network": SINGLE_MODEL_NAME, "network": "zero"}
+_HEAD_BASELINES = {"hull_network": SINGLE_MODEL_NAME, "network": CONSTANT_VELOCITY}
 """What the networks stand on."""
-ENSEMBLE_NAME = "mean"
-"""Name of the mean of unlike models, which is reported first."""
 
 
 def make_portfolio(data_summary: TrainingDataSummary, effort: float = 1.0) -> dict[str, Any]:
@@ -458,7 +457,7 @@ def make_portfolio(data_summary: TrainingDataSummary, effort: float = 1.0) -> di
             name: baseline_name for name, baseline_name in _HEAD_BASELINES.items() if name in heads
         },
         "ensembles": {},
-        "means": {ENSEMBLE_NAME: (SINGLE_MODEL_NAME, *heads)},
+        "means": {ENSEMBLE: (SINGLE_MODEL_NAME, *heads)},
         "training": dict.fromkeys(heads, make_training_settings(data_summary, effort)),
     }
 

@@ -13,6 +13,7 @@ from residnet.baselines.given import ZeroBaselineConfig
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.config import Config, validate_config
 from residnet.core.errors import ConfigError
+from residnet.core.model_names import BASELINE, CONSTANT_VELOCITY, PLANT
 from residnet.core.names import suggest_name
 from residnet.dynamics.base import Integrator
 from residnet.evaluation.band import BandsConfig
@@ -25,7 +26,7 @@ from residnet.training.config import TrainingConfig
 from residnet.training.current import CurrentConfig
 from residnet.training.refit import RefitConfig
 
-_RESERVED_NAMES = ("zero", "baseline", "truth")
+_RESERVED_NAMES = (CONSTANT_VELOCITY, BASELINE, PLANT)
 
 
 class ModelPartsConfig(Config):
@@ -39,7 +40,7 @@ class ModelPartsConfig(Config):
             rollouts after least squares.
         heads: residual heads by name.
         base_of: the baseline that a head stands on, by the head's name; `baseline` where absent,
-            `zero` for a head that is the whole model.
+            `constant_velocity` for a head that is the whole model.
         ensembles: models whose mean acceleration makes another model, by its name.
         means: models by name that are the mean of what several others predict, each running by
             itself; members that diverge on a validation window are left out.
@@ -71,7 +72,7 @@ class FitSettings(ModelPartsConfig):
         evaluation: protocols and scales.
         bands: how far free runs may be off, calibrated over logs that were left out; null for none.
         recipe: `standard` stands in place of the parts: a line, a hull, networks on the hull,
-            of long logs networks alone, and the mean of hull and networks, named `mean`, which is
+            of long logs networks alone, and the mean of hull and networks, named `ensemble`, which is
             reported first and exported where no model is named. Terms, sizes and trainings follow
             from the logs. Null for parts of your own.
         effort: how long the recipe trains its networks: 1 for usual, less for a quick look.
@@ -151,7 +152,11 @@ class FitSettings(ModelPartsConfig):
                 )
         check_known_names("training", self.training, self.heads, "head")
         check_known_names("base_of", self.base_of, self.heads, "head")
-        check_known_names("base_of", self.base_of.values(), ("zero", *baseline_configs), "baseline")
+        if "zero" in self.base_of.values() and "zero" not in baseline_configs:
+            raise ValueError("base_of: the model 'zero' is named 'constant_velocity' today")
+        check_known_names(
+            "base_of", self.base_of.values(), (CONSTANT_VELOCITY, *baseline_configs), "baseline"
+        )
         check_known_names("refit", self.refit, baseline_configs, "baseline")
         members = (name for names in self.ensembles.values() for name in names)
         check_known_names("ensembles", members, single_names, "model")
@@ -210,7 +215,7 @@ class FitSettings(ModelPartsConfig):
 
     @property
     def model_names(self) -> tuple[str, ...]:
-        """Names of all models but `zero`: baselines, heads, ensembles."""
+        """Names of all models but `constant_velocity`: baselines, heads, ensembles."""
         return (*self.all_baselines, *self.heads, *self.ensembles, *self.means)
 
     def get_baseline_name(self, head_name: str) -> str:
@@ -220,7 +225,7 @@ class FitSettings(ModelPartsConfig):
     def get_baseline_config(self, head_name: str) -> BaselineConfig:
         """Return the settings of the baseline that a head stands on."""
         name = self.get_baseline_name(head_name)
-        return ZeroBaselineConfig() if name == "zero" else self.all_baselines[name]
+        return ZeroBaselineConfig() if name == CONSTANT_VELOCITY else self.all_baselines[name]
 
 
 def check_known_names(

@@ -17,6 +17,7 @@ from residnet.core.files import make_file_stem, read_table
 from residnet.core.format import DISPLAY_UNITS, display_unit
 from residnet.core.frames import wrap_angle_array
 from residnet.core.layout import SIX_DOF_LAYOUT, SURGE_SWAY_YAW, DegreesOfFreedom
+from residnet.core.model_names import BASELINE, CONSTANT_VELOCITY, PLANT
 from residnet.core.names import CHANNEL_UNITS, POSE_ERROR_UNITS, to_si
 from residnet.core.run_loader import read_json_value, require_listed
 from residnet.core.units import canonical_unit
@@ -220,7 +221,7 @@ class RunFiles:
 
     @cached_property
     def model_kinds(self) -> dict[str, str]:
-        """The kind (zero, baseline, head, truth, ...) of each model, in the order of metrics.json.
+        """The kind (constant_velocity, baseline, head, plant, ...) of each model, in the order of metrics.json.
 
         Reductions refer to the first baseline; the others are `further` models, judged like heads.
         """
@@ -250,15 +251,15 @@ class RunFiles:
     @cached_property
     def plant(self) -> str | None:
         """The plant that made the data, where they are simulated."""
-        return next((model for model, kind in self.model_kinds.items() if kind == "truth"), None)
+        return next((model for model, kind in self.model_kinds.items() if kind == PLANT), None)
 
     @cached_property
     def heads(self) -> list[str]:
-        """The models that are neither zero, baseline nor truth, the predictor first."""
+        """The models that are neither constant_velocity, baseline nor plant, the predictor first."""
         heads = [
             model
             for model, kind in self.model_kinds.items()
-            if kind not in ("zero", "baseline", "truth")
+            if kind not in (CONSTANT_VELOCITY, BASELINE, PLANT)
         ]
         return sorted(heads, key=lambda model: (model != self.predictor, model != self.selected))
 
@@ -377,8 +378,8 @@ class RunFiles:
 
     def model_label(self, model: str) -> str:
         """Return the name of a model in tables, with its role where it has a special one."""
-        if self.model_kinds.get(model) == "truth":
-            return f"{model} (plant)"
+        if self.model_kinds.get(model) == PLANT:
+            return model if model == PLANT else f"{model} (plant)"
         if model == self.predictor != self.selected:
             return f"{model} (predictor)"
         return f"{model} (selected)" if model == self.selected else model

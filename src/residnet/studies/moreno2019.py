@@ -50,7 +50,7 @@ _MODEL_LABELS = {
     "p2_each": "polynomial p = 2, each for itself",
     "symbolic": "symbolic regression, sparse",
     _OPTIONAL_MODEL: "symbolic regression, GPTIPS settings",
-    "zero": "velocities held",
+    "constant_velocity": "velocities held",
 }
 _PLOTTED_MODELS = {"baseline": ORANGE, "rbf_joint": BLUE, "p2_joint": VERMILLION}
 _AXES = {"u": ("u m/s", 1.0, 4), "v": ("v m/s", 1.0, 4), "r": ("r deg/s", DEGREES_PER_RADIAN, 3)}

@@ -330,7 +330,7 @@ def _error_figure(
             if interval_limits
             else (np.empty(0), np.empty(0))
         )
-        noise = files.find_row("truth", "test", PROTOCOL, group)
+        noise = files.find_row("plant", "test", PROTOCOL, group)
         if noise:
             bar_traces["noise"] = (np.zeros(1), np.array([factor * noise["rmse"][channel]]))
         reference = np.array([window.rmse_by_channel("baseline")[column] for window in windows])

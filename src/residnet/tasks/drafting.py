@@ -33,6 +33,12 @@ from residnet.core.progress import log_message
 from residnet.io.drafting.channels import CHANNELS_KEY
 from residnet.io.drafting.questions import AnswerCallback, DraftNotes, dump_commented_yaml
 from residnet.io.drafting.reading import INPUTS_KEY, find_log_files, read_drafted
+from residnet.io.header_vocabulary import (
+    PLANE_PATTERN,
+    match_input_channel,
+    match_state_channel,
+    parse_name,
+)
 from residnet.io.readers.quantities import COSINE_SUFFIX, QUATERNION, SINE_SUFFIX
 from residnet.io.split import (
     SPLITS,
@@ -40,12 +46,6 @@ from residnet.io.split import (
     remove_copies,
     split_logs,
     splits_from_names,
-)
-from residnet.io.header_vocabulary import (
-    PLANE_PATTERN,
-    match_input_channel,
-    match_state_channel,
-    parse_name,
 )
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.quality import inspect_log

@@ -191,7 +191,7 @@ def _summarize_variants(rows: Sequence[dict[str, Any]], reference: str) -> list[
     sentences = []
     for protocol in dict.fromkeys(row["protocol"] for row in rows):
         protocol_rows = [row for row in rows if row["protocol"] == protocol]
-        # the error of runs that diverged is that of zero: a steady variant comes before them
+        # the error of runs that diverged is the constant-velocity error: a steady variant comes before them
         best_row = min(
             protocol_rows, key=lambda row: (int(row["diverged"]) > 0, float(row["nrmse_mean"]))
         )
@@ -203,7 +203,7 @@ def _summarize_variants(rows: Sequence[dict[str, Any]], reference: str) -> list[
         if best_row["diverged"]:
             sentence = (
                 f"{protocol}: EVERY VARIANT DIVERGED in some windows; of the errors, which count"
-                f" those windows as zero does, that of '{best_row['variant']}' is the least,"
+                f" those windows as constant velocity does, that of '{best_row['variant']}' is the least,"
                 f" {best_row['nrmse_mean']:.4f}"
             )
         interval = best_row["difference_ci95"]
@@ -244,7 +244,7 @@ def compute_window_errors(run: Path, model: str, split: str) -> pd.DataFrame:
 
     Returns:
         A row for each window: protocol, log, window, nrmse (mean over what moves; a window that
-        diverged has the error of `zero`) and diverged.
+        diverged has the error of `constant_velocity`) and diverged.
 
     Raises:
         DataError: if the run holds no such model or split.

@@ -23,7 +23,7 @@ class Score:
 
     Attributes:
         diverged: number of windows that diverged.
-        error: mean nrmse over u, v, r; a diverged window counts with the error of `zero`.
+        error: mean nrmse over u, v, r; a diverged window counts with the error of `constant_velocity`.
         axes: nrmse of each axis by name.
         shown: one of the free runs.
     """

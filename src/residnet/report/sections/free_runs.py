@@ -17,6 +17,7 @@ from residnet.core.format import (
     format_signed,
     join_list,
 )
+from residnet.core.model_names import BASELINE, CONSTANT_VELOCITY
 from residnet.evaluation.verdict import describe_divergence, format_pose_error
 from residnet.report.blocks import (
     Block,
@@ -160,7 +161,7 @@ def errors_by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | Non
     manoeuvre_kinds = distinct_manoeuvres(run, split, protocol)
     if len(manoeuvre_kinds) < 2:
         return None
-    models = [model for model, role in run.model_kinds.items() if role != "zero"]
+    models = [model for model, role in run.model_kinds.items() if role != CONSTANT_VELOCITY]
     rows = [
         row
         for manoeuvre_kind in manoeuvre_kinds
@@ -210,7 +211,7 @@ def _quantity_cell(run: RunFiles, key: str, row: JsonObject | None) -> Cell:
         if value is None:
             return Cell(DASH)
         row_key = (row["split"], row["protocol"], row.get("manoeuvre", "all"))
-        is_reference = run.model_kinds[row["model"]] in ("zero", "baseline")
+        is_reference = run.model_kinds[row["model"]] in (CONSTANT_VELOCITY, BASELINE)
         baseline_row = None if is_reference else run.find_row(run.baseline, *row_key)
         is_worse = baseline_row is not None and value > 1.005 * baseline_row["rmse"][key]
         small_print = (
@@ -442,7 +443,7 @@ def bands_section(run: RunFiles) -> Section | None:
         f" runs that"
         f" a band holds from beginning to end, each channel for itself, where it is widened to hold"
         f" {level} of them. Score: mean width, and {2 / (1 - band['level']):.0f} times what lies"
-        " outside, in units of the error of zero; less is better. Beside it stands a band of one"
+        " outside, in units of the error of the constant-velocity model; less is better. Beside it stands a band of one"
         " width at all horizons.",
     ]
     blocks: list[Block] = [Text(introduction)]

@@ -12,6 +12,7 @@ import pandas as pd
 
 from residnet.core.format import DEGREES_PER_RADIAN, display_unit, format_count, format_fixed
 from residnet.core.layout import DegreesOfFreedom
+from residnet.core.model_names import BASELINE, CONSTANT_VELOCITY, PLANT
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.stretches import find_runs
 from residnet.evaluation.metrics import state_column_names
@@ -75,9 +76,9 @@ AXES = {
 """Name of each acceleration's axis, its unit on a page, and the factor to that."""
 # colour, line, order; the plant lies on the head that comes near it and shows it through its gaps
 _ROLE_STYLES = {
-    "zero": (GREY, "dotted", 3),
-    "baseline": (ORANGE, "dashed", 3),
-    "truth": (GREEN, "dashdot", 5),
+    CONSTANT_VELOCITY: (GREY, "dotted", 3),
+    BASELINE: (ORANGE, "dashed", 3),
+    PLANT: (GREEN, "dashdot", 5),
 }
 _HEAD_COLORS = [color for color in COLORS if color not in (GREY, ORANGE, GREEN)]
 _HEAD_DASHES = ("solid", "long", "dense", "short")
@@ -87,7 +88,7 @@ _RANK_NAMES = ("median error", "largest error", "least error")
 def model_styles(run: RunFiles) -> dict[str, GlyphStyle]:
     """Return how each model looks.
 
-    Zero, baseline and truth have their own looks; the selected head is always the solid blue one.
+    Constant velocity, baseline and plant have their own looks; the selected head is always the solid blue one.
     Leading head, baseline and plant alone are switched on at first.
     """
     visible_models = {run.main_model, run.baseline, run.plant, *run.heads[:1]}
@@ -151,7 +152,7 @@ def free_run_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | 
             f"{window.log}: {format_fixed(float(time[-1]), 1)} s under protocol {window.protocol}."
         )
         if diverged := [model for model, state in window.diverged.items() if state]:
-            note += f" Diverged: {', '.join(diverged)}; the curves of zero stand in their place."
+            note += f" Diverged: {', '.join(diverged)}; constant-velocity curves are drawn in their place."
         kind_prefix = "" if manoeuvre_kind == "unknown" else f"{manoeuvre_kind}, "
         title = f"{kind_prefix}{window.protocol}: {rank} ({window.log}{window_text})"
         cases.append(

@@ -12,6 +12,7 @@ from residnet.core.format import (
     format_number,
     format_percent_change,
 )
+from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.evaluation.soundness import CHECKS, SanityFinding
 from residnet.evaluation.verdict import UNSEEN_SPLITS, VerdictEvidence, describe_divergence
 from residnet.evaluation.verdict import rate_model as judged_level
@@ -113,7 +114,7 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         entry["model"]: entry for entry in run.read_json("selection.json").get("models") or []
     }
     limits = (run.limits.get("splits") or {}).get(run.report_split, {}).get(run.main_protocol, {})
-    leading_models = [run.main_model, run.selected, run.baseline, "zero"]
+    leading_models = [run.main_model, run.selected, run.baseline, CONSTANT_VELOCITY]
     table: list[JsonObject] = [
         rows[model_name] for model_name in dict.fromkeys(leading_models) if model_name in rows
     ]
@@ -164,7 +165,7 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
             else "."
         ),
         "" if run.report_split in UNSEEN_SPLITS else "These data are not unseen: read with care.",
-        "Zero: no model at all, the first velocities are held." if "zero" in rows else "",
+        "constant_velocity: the initial velocities are held." if CONSTANT_VELOCITY in rows else "",
         "Measurements: where the measured velocities themselves lead." if measured else "",
         *(
             f"✗ {run.model_label(row['model'])}: {reason}."

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from residnet.core.config import dump_config
 from residnet.core.errors import DataError, UsageError
+from residnet.core.model_names import CONSTANT_VELOCITY, PLANT
 from residnet.core.names import suggest_name
 from residnet.core.progress import begin_stage, log_message
 from residnet.dynamics.store import load_model, model_names
@@ -160,7 +161,7 @@ def evaluate_on_logs(
 ) -> FinishedRun:
     """Free-run every model of a fit on logs that it has never seen.
 
-    Its reader, masks, protocols and scales are used; `zero` comes first, then the config's
+    Its reader, masks, protocols and scales are used; `constant_velocity` comes first, then the config's
     order.
 
     Args:
@@ -187,7 +188,7 @@ def evaluate_on_logs(
         require_apart(folder_path, input_paths)
 
     def evaluate_models(folder: RunFolder) -> TaskOutcome:
-        store, model_order = RunModelStore(run), ["zero", *config.model_names]
+        store, model_order = RunModelStore(run), [CONSTANT_VELOCITY, *config.model_names]
         fitted_models = [store.load(name) for name in store.names()]
         fitted_models.sort(key=lambda model: (*model_order, model.name).index(model.name))
         log_message(f"{config.name}: {len(prepared)} logs, {len(fitted_models)} models")
@@ -198,7 +199,7 @@ def evaluate_on_logs(
         models = [
             candidate
             for candidate in make_candidates(fitted_models, config.data)
-            if candidate.model_kind != "truth" or is_simulated
+            if candidate.model_kind != PLANT or is_simulated
         ]
         limit = divergence_limit(fitted_models[0].spec, config)
         evaluations = evaluate_splits(

@@ -18,6 +18,7 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.files import atomic_write
 from residnet.core.format import format_count, format_fixed, format_number
 from residnet.core.layout import SIX_DOF_LAYOUT
+from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.core.names import suggest_name
 from residnet.core.ownership import record_folder
 from residnet.core.progress import log_message
@@ -368,7 +369,7 @@ def require_refit_folder(run: RunFolder, output_folder: Path, config: FitConfig)
 def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
     """Refit a model on the first two thirds of the new logs, and judge it on the others.
 
-    The new run holds `zero`, the old model under its name, and the new one as `<name>_refit`.
+    The new run holds `constant_velocity`, the old model under its name, and the new one as `<name>_refit`.
 
     Args:
         service: the model, the watch over it and the new logs.
@@ -410,7 +411,7 @@ def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
         store, models = RunModelStore(folder), service.run.models
         reference_names = [
             name
-            for name in dict.fromkeys(("zero", original_model.name))
+            for name in dict.fromkeys((CONSTANT_VELOCITY, original_model.name))
             if (models / name).is_dir()
         ]
         for name in reference_names:
