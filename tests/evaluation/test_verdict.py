@@ -61,13 +61,13 @@ def evidence(error: float = 0.2, **change: Any) -> VerdictEvidence:
     given: dict[str, Any] = {
         "selected": "mlp",
         "split": "test",
-        "rows": {"constant_velocity": row(0.5), "baseline": row(0.25), "mlp": row(error)},
+        "rows_by_model": {"constant_velocity": row(0.5), "baseline": row(0.25), "mlp": row(error)},
         "baseline": "baseline",
         "selection": {
             "reason": "mlp has the least validation error.",
             "models": [{"model": "mlp", "faults": []}],
         },
-        "limits": under(
+        "limits_by_protocol": under(
             {
                 "compared": {
                     "mlp": {
@@ -90,7 +90,7 @@ def test_the_first_sentence_compares_with_zero_and_the_baseline() -> None:
     for part in ("-0.4 to -0.2)", "20 % better than the baseline", "zero: the data cannot tell"):
         assert part in first
     worse = write_verdict(
-        evidence(error=0.608, rows={"constant_velocity": row(0.506), "mlp": row(0.608)})
+        evidence(error=0.608, rows_by_model={"constant_velocity": row(0.506), "mlp": row(0.608)})
     )[0]
     assert worse.startswith(
         "WORSE THAN CONSTANT VELOCITY: on test data the selected model mlp has an NRMSE of"
@@ -115,7 +115,7 @@ def test_what_is_worse_than_zero_or_the_baseline_is_objected_to() -> None:
 def test_unsound_models_and_divergences_are_named() -> None:
     fault = {"models": [{"model": "mlp", "faults": ["its damping has the wrong sign"]}]}
     rows = {"constant_velocity": row(0.5), "mlp": row(0.2, diverged=7)}
-    said = write_verdict(evidence(selection=fault, rows=rows))
+    said = write_verdict(evidence(selection=fault, rows_by_model=rows))
     assert "7/12 diverged, which count with the error of zero" in said[0]
     assert said[1] == (
         "It is UNSOUND: its damping has the wrong sign; 7 of its 12 test windows diverged."
@@ -159,14 +159,14 @@ def test_unsound_models_and_divergences_are_named() -> None:
 def test_a_model_is_good_in_metres_and_degrees(
     entries: list[dict[str, Any]], expected: str, said: str
 ) -> None:
-    given = evidence(limits=under({"horizons": entries}))
+    given = evidence(limits_by_protocol=under({"horizons": entries}))
     assert rate_model(given) == expected
     assert any(said in sentence for sentence in write_verdict(given)[:3])
 
 
 def test_the_verdict_names_what_stands_beside_and_for_what_it_holds() -> None:
     entries = [horizon(10, errors(0.5, 2.0)), horizon(30, errors(3.0, 5.0))]
-    said = write_verdict(evidence(limits=under({"horizons": entries})))
+    said = write_verdict(evidence(limits_by_protocol=under({"horizons": entries})))
     assert said[0].endswith(
         "is off by 3.0 m (2.7 to 3.3, 5.0 % of the 60 m sailed) and 5.0 deg (4.5 to 5.5)."
     )
@@ -176,32 +176,38 @@ def test_the_verdict_names_what_stands_beside_and_for_what_it_holds() -> None:
     assert said[3] == "It holds for 12 free runs (T30) of 4 logs at mean speeds of 1.5 to 2.5 m/s."
     # no number has an exponent that a reader must work out
     limits = under({"horizons": [horizon(100, errors(1234.0, 113.0))]})
-    lost = " ".join(write_verdict(evidence(limits=limits)))
+    lost = " ".join(write_verdict(evidence(limits_by_protocol=limits)))
     assert "off by 1234 m (1111 to 1357, 617 % of the 200 m sailed) and 113 deg" in lost
 
 
 def test_a_model_as_near_as_the_plant_itself_is_good() -> None:
     """Another model is nearer, but within twice what the plant leaves all are alike."""
     entry = horizon(10, errors(0.5, 1.0), best=errors(0.2, 1.0))
-    assert rate_model(evidence(limits=under({"horizons": [entry]}))) == "limited"
+    assert rate_model(evidence(limits_by_protocol=under({"horizons": [entry]}))) == "limited"
     entry["models"]["plant"] = errors(0.4, 0.9)
     rows = {"constant_velocity": row(0.5), "mlp": row(0.2), "plant": row(0.1) | {"kind": "plant"}}
-    assert rate_model(evidence(limits=under({"horizons": [entry]}), rows=rows)) == "good"
+    assert (
+        rate_model(evidence(limits_by_protocol=under({"horizons": [entry]}), rows_by_model=rows))
+        == "good"
+    )
 
 
 def test_what_diverges_or_is_no_better_than_zero_is_never_good() -> None:
     limits = under({"horizons": [horizon(30, errors(1.0, 1.0))]})
     rows = {"constant_velocity": row(0.5), "baseline": row(0.25), "mlp": row(0.2, diverged=1)}
-    assert rate_model(evidence(limits=limits, rows=rows)) == "limited"
-    assert rate_model(evidence(error=0.6, limits=limits)) == "do not use"
-    assert rate_model(evidence(selected="constant_velocity", limits=limits)) == "do not use"
+    assert rate_model(evidence(limits_by_protocol=limits, rows_by_model=rows)) == "limited"
+    assert rate_model(evidence(error=0.6, limits_by_protocol=limits)) == "do not use"
+    assert (
+        rate_model(evidence(selected="constant_velocity", limits_by_protocol=limits))
+        == "do not use"
+    )
     assert rate_model(evidence(selected="unknown")) == ""
 
 
 def test_a_horizon_is_judged_by_the_protocol_of_most_windows() -> None:
     few = {"horizons": [horizon(10, errors(0.5, 2.0), windows=4)]}
     many = {"horizons": [horizon(10, errors(0.6, 2.0), windows=20), horizon(20, errors(1, 3))]}
-    given = evidence(limits={"T10": many, "T30": few})
+    given = evidence(limits_by_protocol={"T10": many, "T30": few})
     assert rate_model(given) == "good"
     said = write_verdict(given)
     assert said[0].startswith("Up to 10 s ahead, where mlp is off by 0.60 m")
@@ -212,18 +218,22 @@ def test_a_horizon_is_judged_by_the_protocol_of_most_windows() -> None:
 
 def test_a_model_that_the_data_cannot_tell_from_zero_is_not_to_be_used() -> None:
     compared = {"mlp": {"constant_velocity": difference(-0.01, 0.1)}}
-    given = evidence(limits=under({"compared": compared, "horizons": [horizon(30, errors(1, 1))]}))
+    given = evidence(
+        limits_by_protocol=under({"compared": compared, "horizons": [horizon(30, errors(1, 1))]})
+    )
     assert rate_model(given) == "do not use"
     assert write_verdict(given)[0].startswith("NO BETTER THAN CONSTANT VELOCITY")
     # too few logs for an interval tell neither
     unknown = under({"compared": {"mlp": {"constant_velocity": difference(-0.01, None)}}})
-    assert rate_model(evidence(limits=unknown)) == "limited"
+    assert rate_model(evidence(limits_by_protocol=unknown)) == "limited"
 
 
 def test_data_outside_the_training_range_and_the_doctor_are_told() -> None:
     limits = under({"outside": {"share": 0.123, "channels": {"u": 0.1, "delta": 0.03}}})
     said = write_verdict(
-        evidence(limits=limits, doctor="Data doctor: nothing would mislead a fit.")
+        evidence(
+            limits_by_protocol=limits, data_quality_text="Data doctor: nothing would mislead a fit."
+        )
     )
     assert any(text.startswith("Of the test data, 12 % lies outside") for text in said)
     assert any("(u 10 %, delta 3.0 %)" in text for text in said)
@@ -231,7 +241,7 @@ def test_data_outside_the_training_range_and_the_doctor_are_told() -> None:
 
 
 def test_an_old_run_without_these_files_still_has_a_verdict() -> None:
-    said = write_verdict(evidence(selection={}, limits={}))
+    said = write_verdict(evidence(selection={}, limits_by_protocol={}))
     assert said == [
         "On test data model mlp is 60 % better than constant velocity and 20 % better than the baseline; its"
         " NRMSE is 0.200."
