@@ -25,7 +25,7 @@ import exported_models
 import numpy as np
 import torch
 
-from residnet.engine.c_code import compiler
+from residnet.engine.c_code import find_compiler
 from residnet.export import get_exporter, vessel
 from residnet.export.c import CasadiModel
 from residnet.export.guard import GuardedDynamics
@@ -55,7 +55,7 @@ def printed(command: list[str]) -> tuple[float, float]:
 
 def c_loop(folder: Path) -> Path:
     """The program that steps the C file in a C loop."""
-    call = [compiler(), "-O3", "-std=c99", "-I.", "boat.c", str(HERE / "export_loop.c")]
+    call = [find_compiler(), "-O3", "-std=c99", "-I.", "boat.c", str(HERE / "export_loop.c")]
     subprocess.run([*call, "-o", "loop", "-lm"], cwd=folder, check=True)
     return folder / "loop"
 

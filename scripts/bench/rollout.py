@@ -45,7 +45,7 @@ from residnet.core.columns import all_but_pose
 from residnet.core.processes import retain_freed_memory
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.engine.compiled import CompiledRollout
-from residnet.engine.rollout import MANY, FreeRun, Rollout, trace_rollout
+from residnet.engine.rollout import TRAINING_STEPS, FreeRun, Rollout, trace_rollout
 from residnet.heads.base import ZeroHead
 from residnet.heads.lstm import LstmConfig
 from residnet.physics.signals import SignalsConfig
@@ -74,7 +74,7 @@ def model_of(head: LstmConfig) -> HybridDynamics:
     baseline.theta.data.copy_(-0.5 * torch.eye(3, 5))
     built = head.build(NAMES)
     model = HybridDynamics(signals, baseline, built, 0.05).to(torch.float32).eval()
-    model.positions = False
+    model.has_position = False
     model.requires_grad_(False).head.requires_grad_(True)
     return model
 
@@ -123,7 +123,7 @@ def rollouts(repeats: int) -> None:
 
 
 WAYS: dict[str, Way] = {
-    "TorchScript": lambda roll, given: trace_rollout(roll, MANY),
+    "TorchScript": lambda roll, given: trace_rollout(roll, TRAINING_STEPS),
     "C": lambda roll, given: CompiledRollout(roll, *(one[:64] for one in given)),
 }
 
@@ -238,7 +238,7 @@ def refits(repeats: int) -> None:
     built = signals.build()
     baseline = RegressorBaseline([_TERMS] * 3, built.names)
     model = HybridDynamics(built, baseline, ZeroHead(built.names), large_data.STEP, "rk4")
-    model.positions = False
+    model.has_position = False
     known = make_samples(logs, built)
     RegressorsConfig(terms=_TERMS).fit_preferred(baseline, known)
     store = WindowStore.from_logs(logs, torch.float64)

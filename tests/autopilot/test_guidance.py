@@ -114,11 +114,11 @@ def test_legs_change_in_the_circle_and_behind_the_point() -> None:
     assert s[:, 0].tolist() == [0, 1, 1], "before the circle, inside, and past the point beside it"
     # now along the second leg, to the east, with the vessel 1.9 m to the south of it
     assert float(heading[1]) == pytest.approx(math.pi / 2 - math.atan(1.9 / 5))
-    assert guidance.finished(x, 0, s).tolist() == [False, False, False]
+    assert guidance.is_finished(x, 0, s).tolist() == [False, False, False]
     # arrived once, arrived for good
     for places in (((7.9, 0.0), (10.0, 18.5), (10.0, 25.0)), ((7.9, 0.0), (0.0, 0.0), (0.0, 0.0))):
         _, s = guidance(at(*places), 1, s)
-        assert guidance.finished(x, 1, s).tolist() == [False, True, True]
+        assert guidance.is_finished(x, 1, s).tolist() == [False, True, True]
 
 
 def test_nonsense_is_refused() -> None:

@@ -200,7 +200,7 @@ def test_sensitivities_are_the_derivatives_of_the_step(scheme: Integrator) -> No
     baseline: Any = model.baseline
     active = baseline.free_indices()
     s = 0.1 * torch.randn(3, 10, len(active), generator=random, dtype=torch.float64)
-    by_state, by_theta = StepJacobian.of(model)(x, w)
+    by_state, by_theta = StepJacobian.of_model(model)(x, w)
     found = by_state @ s + by_theta
     start, size = baseline.theta.detach().flatten()[active].clone(), 1e-6
     for j in range(0, len(active), 17):

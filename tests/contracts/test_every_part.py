@@ -183,7 +183,7 @@ def test_a_model_stored_in_single_precision_keeps_its_answers(kind: str, tmp_pat
 def test_a_head_flies_in_c_as_it_does_in_torch(kind: str) -> None:
     config = head_of(kind)
     model, z = make_example_model(make_example_spec(config)).eval(), make_example_samples().z
-    model.positions = False
+    model.has_position = False
     z = z[torch.arange(3)[:, None] * 100 + torch.arange(100)]
     given = (
         torch.cat((torch.zeros_like(z[:, 0, :3]), z[:, 0, :3]), dim=1),

@@ -152,7 +152,7 @@ def test_heading_and_velocities_do_not_hang_on_positions(
     x0 = torch.randn(5, 6, dtype=torch.float64)
     w = torch.randn(5, 20, 4 if wind else 2, dtype=torch.float64)
     slopes, states = [], []
-    for model.positions in (True, False):
+    for model.has_position in (True, False):
         held = w.clone().requires_grad_(True)
         x, _, _ = Rollout(model)(x0, held, model.initial_state(5).double())
         slopes.append(torch.autograd.grad(x[:, -1, HEADING : MOTION.stop].square().sum(), held)[0])

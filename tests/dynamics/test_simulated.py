@@ -23,7 +23,7 @@ from residnet.autopilot.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError, ExportError
 from residnet.core.frames import to_body
 from residnet.dynamics.base import Dynamics, Integrator
-from residnet.dynamics.simulated import MOST_STEPS, InAmbientCurrent, PlantDynamics, check_steps
+from residnet.dynamics.simulated import MAX_STEPS, InAmbientCurrent, PlantDynamics, check_steps
 from residnet.engine import trace as lowering
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import Rollout
@@ -46,7 +46,7 @@ class Smooth(Stepped):
 
     plant: Plant = load_vessel("wam_v_cal").build()
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+    def state_derivative(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         t = x[:, 6]
         n = torch.stack((25 + 5 * torch.sin(t), 18 + 4 * torch.cos(1.3 * t)), dim=-1)
         full = torch.cat((x[:, :6], n), dim=-1)
@@ -59,7 +59,7 @@ class Smooth(Stepped):
 class Spring(Stepped):
     """v' = -y, y' = v at heading zero."""
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+    def state_derivative(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         zero = torch.zeros_like(x[:, 1])
         return torch.cat((self.kinematics(x), torch.stack((zero, -x[:, 1], zero), dim=-1)), dim=-1)
 
@@ -130,7 +130,7 @@ def test_a_plant_that_cannot_be_recorded_is_stepped_as_it_is(
     wanted = PlantDynamics(plant, 0.1, 5).step(x, w, s)[0]
     recorded = RecordedPlantDynamics(plant, 0.1, 5)
     assert torch.allclose(recorded.step(x, w, s)[0], wanted, rtol=1e-13, atol=1e-15)
-    monkeypatch.setattr(lowering, "lowered", refuse)
+    monkeypatch.setattr(lowering, "lower", refuse)
     assert torch.equal(RecordedPlantDynamics(plant, 0.1, 5).step(x, w, s)[0], wanted)
 
 
@@ -217,7 +217,7 @@ def test_a_rudder_with_a_lag_moves_within_the_step_and_its_effect_is_varied() ->
 
 def test_two_days_at_ten_steps_a_second_are_simulated_and_years_are_not() -> None:
     check_steps(2 * 86_400.0, 0.1)
-    with pytest.raises(ValueError, match=f"at most {MOST_STEPS:,}"):
+    with pytest.raises(ValueError, match=f"at most {MAX_STEPS:,}"):
         check_steps(3.15e7, 0.1)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from residnet.dynamics.base import Dynamics
 from residnet.engine import free_runs
-from residnet.engine.rollout import MANY, Rollout, trace_rollout
+from residnet.engine.rollout import TRAINING_STEPS, Rollout, trace_rollout
 
 DT = 0.1
 
@@ -23,7 +23,7 @@ class Pendulum(Dynamics):
         super().__init__(DT, "rk4")
         self.damping = nn.Parameter(torch.tensor([0.3], dtype=torch.float64))
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+    def state_derivative(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         return torch.stack(
             (x[:, 1], p[:, 0] - torch.sin(x[:, 0]) - (self.damping * x[:, 1:])[:, 0]), dim=-1
         )
@@ -41,7 +41,7 @@ class Forgetful(Dynamics):
         self.damping = nn.Parameter(torch.full((1, 1), 0.3, dtype=torch.float64))
         self.dropout = nn.Dropout(0.5)
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+    def state_derivative(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         drag = self.dropout(self.damping.expand_as(x[:, 1:])) * x[:, 1:]
         return torch.cat((x[:, 1:], p - torch.sin(x[:, :1]) - drag), dim=1)
 
@@ -83,29 +83,29 @@ def test_numbers_and_gradients_are_the_same_after_a_step_of_the_optimiser_too() 
 
 
 def test_models_of_one_structure_are_compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(free_runs, "_KNOWN", {})
+    monkeypatch.setattr(free_runs, "_COMPILED", {})
     loops = [Rollout(Pendulum()) for _ in range(2)]
     with torch.no_grad():
         loops[1].model.damping.add_(0.2)  # type: ignore[operator]
-        runs = [free_runs.compiled(loop, 300) for loop in loops]
+        runs = [free_runs.compile_rollout(loop, 300) for loop in loops]
         for k in (0, 1, 0):
             torch.testing.assert_close(runs[k](*case())[0], loops[k](*case())[0], rtol=0, atol=1e-9)
-        assert [bool(one) for one in free_runs._KNOWN.values()] == [True]
+        assert [bool(one) for one in free_runs._COMPILED.values()] == [True]
         # a number that is neither parameter nor buffer stands in the compiled text
         loops[1].model.apart = torch.ones(1)
-        free_runs.compiled(loops[1], 300)(*case())
-    assert len(free_runs._KNOWN) == 2
+        free_runs.compile_rollout(loops[1], 300)(*case())
+    assert len(free_runs._COMPILED) == 2
 
 
 def test_what_is_drawn_does_not_hang_on_what_ran_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first run tries to compile the step, in vain, for it draws numbers."""
-    monkeypatch.setattr(free_runs, "_KNOWN", {})
+    monkeypatch.setattr(free_runs, "_COMPILED", {})
     x0, w, s = case()
     found = []
     for _ in range(2):
         torch.manual_seed(3)
-        found.append(free_runs.compiled(Rollout(Forgetful()), 600)(x0, w[:, :40], s)[0])
-    assert [*free_runs._KNOWN.values()] == [False]
+        found.append(free_runs.compile_rollout(Rollout(Forgetful()), 600)(x0, w[:, :40], s)[0])
+    assert [*free_runs._COMPILED.values()] == [False]
     assert torch.equal(*found)
 
 
@@ -114,7 +114,7 @@ def test_a_step_that_cannot_be_recorded_runs_as_it_is() -> None:
     for sign in (1.0, -1.0):
         undecided = Rollout(Undecided())
         expected = undecided(sign * x0, w, s)[0]
-        assert torch.equal(trace_rollout(undecided, MANY)(sign * x0, w, s)[0], expected)
+        assert torch.equal(trace_rollout(undecided, TRAINING_STEPS)(sign * x0, w, s)[0], expected)
 
 
 def test_a_short_rollout_is_not_recorded() -> None:

@@ -326,4 +326,4 @@ def test_windows_run_together_as_they_run_alone(
         for one, other, length in zip(ran(model, windows, ready), alone, lengths, strict=True):
             assert one.states.shape == (length, 6)
             np.testing.assert_allclose(one.states, other, rtol=1e-9, atol=1e-9)
-    assert model.positions, "the judged model itself is left as it is"
+    assert model.has_position, "the judged model itself is left as it is"

@@ -276,7 +276,7 @@ def test_what_looks_for_an_unknown_force_is_asked_without_a_past() -> None:
     model = HybridDynamics(plain.signals, plain.baseline, Carried(), STEP, "rk4")
     low, high = spec.low[:3], spec.high[:3]
     for one in (model, MeanOfTrajectories([plain, model], low, high)):
-        assert one.observes
+        assert one.has_innovation
         found = findings(spec, one)
         assert found[DAMPING].ok, found[DAMPING].text
         slopes = re.findall(r"d[uvr] ([-+][.0-9]+)", found[DAMPING].text)

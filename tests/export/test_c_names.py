@@ -19,7 +19,7 @@ from residnet.core.errors import UsageError
 from residnet.core.progress import Progress, on_progress
 from residnet.core.version import __version__
 from residnet.engine import c_code
-from residnet.engine.c_code import compiler
+from residnet.engine.c_code import find_compiler
 from residnet.evaluation.assessment import Assessment
 from residnet.export import c, get_exporter
 from residnet.export.c import STRICT_FLAGS, measure_footprint, to_c_identifier
@@ -70,7 +70,7 @@ def test_two_exports_of_one_model_name_serve_one_program(way: str, tmp_path: Pat
     parts = ("steer.c", "my-boat 2.c", "main.c")
     (tmp_path / "all.c").write_text("".join(f'#include "{part}"\n' for part in parts))
     for command in LINKS[way]:
-        call = [word.format(cc=compiler()) for word in command]
+        call = [word.format(cc=find_compiler()) for word in command]
         flags = STRICT_FLAGS if command[0] == "{cc}" else ()
         subprocess.run([*call, *flags], cwd=tmp_path, check=True)
     printed = subprocess.run([tmp_path / "main"], capture_output=True, text=True).stdout.split()
@@ -91,7 +91,7 @@ def defined_symbols(library: Path) -> set[str]:
 
 def test_every_name_begins_with_that_of_the_file(tmp_path: Path) -> None:
     get_exporter("c").export(vessel(), tmp_path / "2nd Öl.c")
-    subprocess.run([compiler(), "-c", "2nd Öl.c", "-o", "boat.o"], cwd=tmp_path, check=True)
+    subprocess.run([find_compiler(), "-c", "2nd Öl.c", "-o", "boat.o"], cwd=tmp_path, check=True)
     symbols = defined_symbols(tmp_path / "boat.o")
     assert f"{to_c_identifier('2nd Öl')}_step" in symbols
     assert all(name.startswith("m_2nd__l_") for name in symbols)
@@ -118,7 +118,7 @@ def test_the_build_identity_is_of_the_model_and_the_version(tmp_path: Path) -> N
     # a header of another export is refused by the compiler
     header = (tmp_path / "b.h").read_text().replace("B_", "A_").replace("b_", "a_")
     (tmp_path / "a.h").write_text(header)
-    call = [compiler(), "-c", "a.c"]
+    call = [find_compiler(), "-c", "a.c"]
     done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode != 0
     assert "a.h belongs to another export than this file" in done.stderr
@@ -172,7 +172,7 @@ def tools(folder: Path, wanted: Sequence[str]) -> str:
     """A path with a compiler that does not know -fstack-usage, and with `size` where wanted."""
     folder.mkdir()
     check = 'for word; do [ "$word" != -fstack-usage ] || exit 1; done'
-    script = f'#!/bin/sh\n{check}\nexec {compiler()} "$@"\n'
+    script = f'#!/bin/sh\n{check}\nexec {find_compiler()} "$@"\n'
     for name in wanted:
         if name == "cc":
             (folder / "cc").write_text(script)

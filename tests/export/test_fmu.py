@@ -19,7 +19,7 @@ from fmpy.fmi1 import FMICallException
 from fmpy.simulation import instantiate_fmu
 from fmpy.validation import validate_fmu
 
-from residnet.engine.c_code import compiler
+from residnet.engine.c_code import find_compiler
 from residnet.engine.rollout import Rollout
 from residnet.export import fmu, get_exporter
 from residnet.export.vessel import ExportedVessel
@@ -185,7 +185,7 @@ def test_compilers_for_other_machines_are_used(
 ) -> None:
     for name in ("x86_64-w64-mingw32-gcc", "aarch64-linux-gnu-gcc"):
         tool = tmp_path / name
-        tool.write_text(f'#!/bin/sh\nexec {compiler()} "$@"\n')
+        tool.write_text(f'#!/bin/sh\nexec {find_compiler()} "$@"\n')
         tool.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.setattr(fmu.platform, "machine", lambda: "x86_64")

@@ -27,8 +27,8 @@ from residnet.core.errors import ExportError, ResidnetError, WithheldError
 from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import BandTable, ModelSpec
-from residnet.engine.c_code import compiler
-from residnet.engine.trace import lowered
+from residnet.engine.c_code import find_compiler
+from residnet.engine.trace import lower
 from residnet.export import EXPORT_FORMATS as REGISTERED
 from residnet.export import base, get_exporter, torchscript, vessel
 from residnet.export.base import LoadedExport, RoundingError, require_releasable
@@ -240,7 +240,7 @@ def test_c_compiles_without_warnings_and_keeps_nothing(tmp_path: Path) -> None:
     with torch.no_grad():
         after, _ = model.step(x, w, model.initial_state(1))
     for flags in [(), ("-O3", "-Wconversion")]:
-        call = [compiler(), *STRICT_FLAGS, *flags, "boat.c", "main.c", "-o", "main", "-lm"]
+        call = [find_compiler(), *STRICT_FLAGS, *flags, "boat.c", "main.c", "-o", "main", "-lm"]
         subprocess.run(call, cwd=tmp_path, check=True)
         printed = subprocess.run([tmp_path / "main"], capture_output=True, text=True).stdout.split()
         assert printed[0] == "0"
@@ -304,9 +304,9 @@ def test_onnx_has_the_angles_of_doubles(tmp_path: Path) -> None:
 
 def test_an_operation_that_is_not_known_is_refused_by_name() -> None:
     with pytest.raises(ExportError, match="model mine: its step uses torch's operation 'digamma'"):
-        lowered(lambda x: torch.special.digamma(x + 1), [("x", 2)], ["y"], "model mine")
+        lower(lambda x: torch.special.digamma(x + 1), [("x", 2)], ["y"], "model mine")
     with pytest.raises(ExportError, match="cannot be recorded"):
-        lowered(lambda x: x if bool(x.sum() > 1) else -x, [("x", 2)], ["y"], "model mine")
+        lower(lambda x: x if bool(x.sum() > 1) else -x, [("x", 2)], ["y"], "model mine")
 
 
 OPERATIONS: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
@@ -327,7 +327,7 @@ OPERATIONS: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
 def test_operations_are_those_of_torch_in_casadi_and_in_c(name: str, tmp_path: Path) -> None:
     given = torch.tensor([[0.3, -1.7, 2.6, 1.2]], dtype=torch.float64)
     wanted = OPERATIONS[name](given).reshape(-1).numpy()
-    function = lowered(OPERATIONS[name], [("x", 4)], ["y"], "a step")
+    function = lower(OPERATIONS[name], [("x", 4)], ["y"], "a step")
     np.testing.assert_allclose(function(given[0].numpy()).full().ravel(), wanted, rtol=1e-12)
     source, header = render_c_files("f", [CFunction("step", "", function)], [], {}, "", "f.h")
     (tmp_path / "f.c").write_text(source)

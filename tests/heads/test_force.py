@@ -85,7 +85,7 @@ def model() -> Any:
 def test_the_mass_and_the_accelerations_are_the_true_ferrys(model: Any) -> None:
     of = samples()
     with torch.no_grad():
-        torch.testing.assert_close(model.one_step(of.z[None])[0], of.target, rtol=0, atol=1e-5)
+        torch.testing.assert_close(model.one_step_accelerations(of.z[None])[0], of.target, rtol=0, atol=1e-5)
     torch.testing.assert_close(
         torch.linalg.inv(model.head.inverse), hull("milliampere_half").mass, rtol=1e-4, atol=1e-2
     )
@@ -100,7 +100,7 @@ def test_the_thirty_basis_functions_hold_it_too(config: Any) -> None:
     assert model.head.inner.library.n_terms == 30
     of = samples()
     with torch.no_grad():
-        torch.testing.assert_close(model.one_step(of.z[None])[0], of.target, rtol=0, atol=1e-3)
+        torch.testing.assert_close(model.one_step_accelerations(of.z[None])[0], of.target, rtol=0, atol=1e-3)
 
 
 def test_a_free_run_is_the_true_ferrys(model: Any) -> None:
@@ -127,7 +127,7 @@ def test_the_feed_forward_undoes_the_motion(model: Any) -> None:
     with torch.no_grad():
         torch.testing.assert_close(force(of.target, of.z[:, :3]), of.z[:, 3:], rtol=0, atol=1e-2)
         # and exactly the model's own inverse
-        nu_dot = model.one_step(of.z[None])[0]
+        nu_dot = model.one_step_accelerations(of.z[None])[0]
         torch.testing.assert_close(force(nu_dot, of.z[:, :3]), of.z[:, 3:], rtol=0, atol=1e-8)
 
 
@@ -138,8 +138,8 @@ def test_a_mean_is_that_of_its_members(model: Any) -> None:
     with torch.no_grad():
         other = fitted(PlsrConfig(space="force", order=2, choose="one_step"), samples())
         mean = mean_of([model, other])
-        expected = (model.one_step(of.z[None]) + other.one_step(of.z[None])) / 2
-        torch.testing.assert_close(mean.one_step(of.z[None]), expected)
+        expected = (model.one_step_accelerations(of.z[None]) + other.one_step_accelerations(of.z[None])) / 2
+        torch.testing.assert_close(mean.one_step_accelerations(of.z[None]), expected)
         stepped = mean.step(x, w, x[:, :0])[0]
         torch.testing.assert_close(Rollout(mean)(x, w[:, None], x[:, :0])[0][:, 1], stepped)
 

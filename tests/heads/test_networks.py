@@ -19,7 +19,7 @@ from residnet.core.errors import ConfigError
 from residnet.core.samples import Samples
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.engine.rollout import Rollout, record_step
+from residnet.engine.rollout import Rollout, trace_step
 from residnet.heads.base import ResidualHead
 from residnet.heads.lstm import LSTMCell, LstmConfig, LstmHead
 from residnet.heads.mirror import Tanh, fast_tanh
@@ -259,7 +259,7 @@ def test_accelerations_along_measurements_are_those_of_steps(steps: int) -> None
     single: Any = mean_of(members=2).members[0]
     z = 0.2 * torch.randn(1, steps, 5, dtype=torch.float64)
     with torch.no_grad():
-        found = single.one_step(z)
+        found = single.one_step_accelerations(z)
         x = torch.cat((torch.zeros(1, steps, 3), z[..., :3]), dim=-1).repeat(2, 1, 1)
         s, out = torch.zeros(2, single.n_state, dtype=torch.float64), []
         for k in range(steps):
@@ -274,7 +274,7 @@ def test_what_the_recipe_trains_is_recorded() -> None:
     for model in (mean, mean.members[0]):
         x, w = torch.zeros(2, 6), torch.zeros(2, 2)
         model = copy.deepcopy(model).float()
-        assert record_step(model, x, w, model.initial_state(2)) != model.step
+        assert trace_step(model, x, w, model.initial_state(2)) != model.step
 
 
 # channels, where each is found in the mirror, and with which sign

@@ -18,7 +18,7 @@ from residnet.core.errors import ConfigError, FitError
 from residnet.core.layout import SURGE_SWAY_YAW
 from residnet.core.log import Log
 from residnet.core.samples import Samples
-from residnet.dynamics.hybrid import Missed
+from residnet.dynamics.hybrid import InnovationFilter
 from residnet.identification.fit import Identified, fit_models
 from residnet.identification.fitter import FitStore, Fitter, find_harmful_member
 from residnet.identification.prepared import PreparedSplits, prepare_splits
@@ -257,12 +257,12 @@ def test_a_mirror_symmetric_model_has_no_asymmetry(known: Samples) -> None:
 def test_what_was_predicted_wrong_of_the_past_is_told_and_fades() -> None:
     """A constant acceleration that no prediction knows; then a free run, where none is missed."""
     force = torch.tensor([[0.05, -0.02, 0.02]], dtype=torch.float64)
-    missed = Missed(5.0, 0.1, SURGE_SWAY_YAW)
+    missed = InnovationFilter(5.0, 0.1, SURGE_SWAY_YAW)
     x, s = torch.zeros(1, 6, dtype=torch.float64), torch.zeros(1, 7, dtype=torch.float64)
     told = force
     for k in range(2000):
         told = missed(x, s)
-        s = missed.remembered(x, told)
+        s = missed.next_memory(x, told)
         x = x + 0.1 * torch.cat((torch.zeros(1, 3), force), dim=-1) * (k < 1950)
     torch.testing.assert_close(told / force, torch.full_like(force, math.exp(-4.9 / 5.0)))
 

@@ -248,7 +248,7 @@ class Runaway(Dynamics):
     def __init__(self) -> None:
         super().__init__(STEP, "euler")
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+    def state_derivative(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         return torch.zeros_like(x)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:

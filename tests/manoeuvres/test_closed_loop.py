@@ -59,7 +59,7 @@ class Nomoto(Dynamics):
         self.gain, self.time, self.offset = gain, time, offset
         self.steps = 0
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+    def state_derivative(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         return x
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:

@@ -136,17 +136,17 @@ class StagedPlantDynamics(Dynamics):
         super().__init__(dt, "rk4")
         self.plant = plant
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+    def state_derivative(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return x_dot [B, nx] of the plant under the inputs p [B, m] of one stage."""
         return self.plant.derivative(x, p)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state after a step; the memory passes through."""
         start, middle, end = torch.chunk(w, 3, dim=-1)
-        k1 = self.rate(x, start, s)
-        k2 = self.rate(x + 0.5 * self.dt * k1, middle, s)
-        k3 = self.rate(x + 0.5 * self.dt * k2, middle, s)
-        k4 = self.rate(x + self.dt * k3, end, s)
+        k1 = self.state_derivative(x, start, s)
+        k2 = self.state_derivative(x + 0.5 * self.dt * k1, middle, s)
+        k3 = self.state_derivative(x + 0.5 * self.dt * k2, middle, s)
+        k4 = self.state_derivative(x + self.dt * k3, end, s)
         return (
             self.plant.finish_step(
                 x + self.dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4), end, self.dt

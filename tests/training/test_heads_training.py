@@ -111,8 +111,8 @@ def by_euler() -> np.ndarray:
 
 
 def one_step(model: HybridDynamics, nu_dot: torch.Tensor, counted: torch.Tensor) -> torch.Tensor:
-    z = model.channels(Y, W)
-    return one_step_loss(model, z, model.known(z), nu_dot, counted, UNITS)
+    z = model.compute_channels(Y, W)
+    return one_step_loss(model, z, model.baseline_acceleration(z), nu_dot, counted, UNITS)
 
 
 def euler() -> Rollout:

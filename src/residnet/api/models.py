@@ -21,7 +21,7 @@ from residnet.core.run_loader import accept_run, name_damaged_key
 from residnet.core.trust import trusting
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, chosen_model, load_model, save_model
-from residnet.engine.free_runs import compiled
+from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import Rollout
 from residnet.evaluation.band import read_bands
 from residnet.evaluation.verdict import UNSEEN_SPLITS, VerdictEvidence, list_model_objections
@@ -135,7 +135,7 @@ class Model:
         states, inputs = self._parse_arrays(("x0", x0, 1), ("w", w, 2))
         memory = self._parse_memory(s, len(states))
         with torch.no_grad():
-            trajectory, _, _ = compiled(Rollout(self._double_precision_module()), inputs.shape[1])(
+            trajectory, _, _ = compile_rollout(Rollout(self._double_precision_module()), inputs.shape[1])(
                 states, inputs, memory
             )
         return _to_numpy(trajectory, np.ndim(x0) == 1)

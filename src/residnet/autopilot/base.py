@@ -63,7 +63,7 @@ class Reference(StatefulModule):
             s: memory [B, n_state].
         """
 
-    def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
+    def is_finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
         """Return [B] bool: rows that have arrived; asked only where `may_finish`."""
         return torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
 
@@ -91,7 +91,7 @@ class ClosedLoop(Source):
         super().__init__()
         self.policy = policy
         self.reference = reference
-        self.may_stop = reference.may_finish
+        self.can_stop = reference.may_finish
 
     def initial(self, x: Tensor) -> Tensor:
         """Return the memories of guidance and controller side by side."""
@@ -106,9 +106,9 @@ class ClosedLoop(Source):
             (reference_state, s), dim=-1
         )
 
-    def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
+    def is_finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """Return the rows whose guidance has arrived."""
-        return self.reference.finished(x, k, memory[:, : self.reference.n_state])
+        return self.reference.is_finished(x, k, memory[:, : self.reference.n_state])
 
 
 @final
@@ -123,7 +123,7 @@ class ReferenceInInputs(Source):
 
     def __init__(self, policy: Policy, inputs: int) -> None:
         super().__init__()
-        self.policy, self.inputs, self.counts = policy, inputs, False
+        self.policy, self.inputs, self.depends_on_step = policy, inputs, False
 
     def initial(self, x: Tensor) -> Tensor:
         """Return the controller's memory."""

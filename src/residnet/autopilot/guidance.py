@@ -256,7 +256,7 @@ class WaypointGuidance(Reference):
         heading = wrap_angle(direction + angle).unsqueeze(-1)
         return heading, torch.cat((leg_number.to(x.dtype).unsqueeze(-1), s[:, 1:3], memory), dim=-1)
 
-    def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
+    def is_finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
         """Return the rows behind their last way-point."""
         return s[:, 0] >= self.points.shape[0]
 
@@ -561,7 +561,7 @@ class CourseGuidance(Reference):
         reference = torch.stack((heading - torch.atan(slope), yaw_rate, planned[:, 4]), dim=-1)
         return reference, torch.cat((arc_length.unsqueeze(-1), memory), dim=-1)
 
-    def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
+    def is_finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
         """Return the rows behind the end of the course."""
         return s[:, 0] >= self.length
 

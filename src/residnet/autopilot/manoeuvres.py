@@ -91,7 +91,7 @@ class Waypoints(Manoeuvre):
         errors: list[float] = []
         for k in range(len(log)):
             _, s = guidance(x[k : k + 1], k, s)
-            if bool(guidance.finished(x[k : k + 1], k, s)):
+            if bool(guidance.is_finished(x[k : k + 1], k, s)):
                 break
             errors.append(float(guidance.leg_geometry(x[k : k + 1], s[:, 0].long(), s)[2]))
         return {

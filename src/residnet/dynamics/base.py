@@ -1,4 +1,4 @@
-"""The interface of all models, with the explicit Runge-Kutta step that they share."""
+"""The interface of all models, and the explicit Runge-Kutta step that they share."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from residnet.core.layout import PLANAR_LAYOUT
 
 Integrator = Literal["rk4", "heun", "euler", "semi_implicit_euler"]
 
-# nodes and weights of explicit schemes in which every stage starts from the one before it; the
-# first stage is at the state itself
+# Butcher tableaux (nodes, weights) of explicit schemes in which every stage depends on the
+# previous stage alone; the first stage is the state itself
 _TABLEAUX: dict[str, tuple[list[float], list[float]]] = {
     "rk4": ([0.0, 0.5, 0.5, 1.0], [1 / 6, 1 / 3, 1 / 3, 1 / 6]),
     "heun": ([0.0, 1.0], [0.5, 0.5]),
@@ -40,16 +40,17 @@ class Dynamics(nn.Module, ABC):
 
     Inputs are held over the step.
 
-    Subclasses give `step`, and `rate(x, p, rho)`, the derivative of the state at a stage, where
-    they integrate. All is pure tensor code that TorchScript compiles.
+    Subclasses implement `step`, and `state_derivative(x, p, rho)` if they integrate. Both are
+    written with torch operations on batches, without decisions by values: rollouts, gradients,
+    Jacobians and exports are derived from a trace of the step.
 
     Attributes:
-        dof: number of what moves: u, v, r, and p and phi of a vessel that rolls.
-        rolls: whether it does.
-        spatial: whether it turns about all axes, so that rotations are composed.
-        positions: whether x and y move. Velocities and heading do not depend on them: a training
-            that asks for no positions takes 24 to 33 % less time (float32, one thread, batches of
-            64 and 256 rows, with gradients).
+        dof: number of dynamic states: u, v, r, and p and phi of a vessel that rolls.
+        has_roll: whether the roll is among them.
+        spatial: whether the vessel rotates about all three axes.
+        has_position: whether x and y are integrated. Velocities and heading do not depend on them:
+            a training without positions takes 24 to 33 % less time (float32, one thread, batches
+            of 64 and 256 rows, with gradients).
     """
 
     def __init__(self, dt: float, integrator: Integrator) -> None:
@@ -57,29 +58,36 @@ class Dynamics(nn.Module, ABC):
         self.dt = dt
         self.integrator: Integrator = integrator
         self.nodes, self.weights = (list(part) for part in _TABLEAUX[integrator])
-        self.semi_implicit = integrator == "semi_implicit_euler"
+        self.is_semi_implicit = integrator == "semi_implicit_euler"
         self.n_state = 0
-        self.dof, self.rolls = PLANAR_LAYOUT.n_dof, False
-        self.positions = True
-        self.turn_about((), 0)
+        self.dof = PLANAR_LAYOUT.n_dof
+        self.has_roll = False
+        self.has_position = True
+        self.set_attitude_columns((), 0)
 
-    def turn_about(self, attitude: Sequence[int], width: int) -> None:
-        """Take columns of roll, pitch and heading whose rates are those about the body axes.
+    def set_attitude_columns(self, attitude: Sequence[int], n_states: int) -> None:
+        """Declare the columns of roll, pitch and heading in the state.
+
+        Their derivatives are angular velocities about the body axes, and rotations are composed.
 
         Args:
-            attitude: the columns; none where angles add up.
-            width: number of states.
+            attitude: the columns; empty where angles are simply added.
+            n_states: number of states.
         """
         self.spatial = len(attitude) > 0
-        places = torch.arange(width)
-        places[list(attitude)] = width + torch.arange(len(attitude))
+        # columns of a state to which three rotated angles are appended
+        columns = torch.arange(n_states)
+        columns[list(attitude)] = n_states + torch.arange(len(attitude))
         self.attitude = nn.Buffer(torch.tensor(attitude).long(), persistent=False)
-        self.rearranged = nn.Buffer(places, persistent=False)
+        self.columns_with_attitude = nn.Buffer(columns, persistent=False)
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return the derivative of the state [B, nx] at a stage, for models that integrate.
+    def state_derivative(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Return the derivative of the state [B, nx] at a stage.
 
-        A step holds p [B, k] and rho [B, n] fixed.
+        Args:
+            x: state at the stage [B, nx].
+            p: prepared inputs, held over the step [B, k].
+            rho: residual, held over the step [B, n].
         """
         raise NotImplementedError
 
@@ -88,7 +96,7 @@ class Dynamics(nn.Module, ABC):
         """Return the state [B, nx] and the memory [B, n_state] one step later, inputs w [B, m]."""
 
     def initial_state(self, batch: int) -> Tensor:
-        """Return the memory [batch, n_state] without a past: zeros."""
+        """Return the initial memory [batch, n_state]: zeros."""
         return torch.zeros(batch, self.n_state)
 
     def kinematics(self, x: Tensor) -> Tensor:
@@ -97,74 +105,85 @@ class Dynamics(nn.Module, ABC):
         Source: document 003 eq. (1), and document 004 for a vessel that rolls.
         """
         if self.spatial:
-            # the heading has its share of a rotation vector, which is r
+            # the heading is a component of the rotation vector, whose derivative is r
             forward, starboard, _ = level_velocities(dynamic_states(x, self.dof))
             north, east = to_earth(forward, starboard, heading(x))
             return torch.stack((north, east, yaw_rate(x)), dim=-1)
-        across, turned = sway(x), yaw_rate(x)
-        if self.rolls:
-            level = torch.cos(roll_angle(x))
-            across, turned = across * level, turned * level
-        if not self.positions:
-            still = torch.zeros_like(turned)
-            return torch.stack((still, still, turned), dim=-1)
-        north, east = to_earth(surge(x), across, heading(x))
-        return torch.stack((north, east, turned), dim=-1)
+        sway_velocity = sway(x)
+        heading_rate = yaw_rate(x)
+        if self.has_roll:
+            cos_roll = torch.cos(roll_angle(x))
+            sway_velocity = sway_velocity * cos_roll
+            heading_rate = heading_rate * cos_roll
+        if not self.has_position:
+            zero = torch.zeros_like(heading_rate)
+            return torch.stack((zero, zero, heading_rate), dim=-1)
+        north, east = to_earth(surge(x), sway_velocity, heading(x))
+        return torch.stack((north, east, heading_rate), dim=-1)
 
-    def angled(self, x: Tensor, after: Tensor) -> Tensor:
-        """Return states [B, nx] after a step from x whose angles moved with the new velocities.
+    def integrate_angles(self, x: Tensor, next_state: Tensor) -> Tensor:
+        """Return the next states [B, nx] with angles integrated by the new velocities.
 
-        There are none but where a subclass says so.
+        Args:
+            x: states before the step [B, nx].
+            next_state: states after an Euler step [B, nx].
         """
-        return after
+        # models without roll or pitch have no such angles
+        return next_state
 
-    def from_start(self, change: Tensor, k: Tensor) -> Tensor:
-        """Return rates k [B, nx] after a change [B, nx] as those of the change itself."""
-        turn, rate = change.index_select(-1, self.attitude), k.index_select(-1, self.attitude)
-        bent = cross_product(turn, rate)
-        rate = rate + 0.5 * bent + cross_product(turn, bent) / 12.0
-        return torch.cat((k, rate), dim=-1).index_select(-1, self.rearranged)
+    def rotation_vector_derivative(self, rotation: Tensor, derivative: Tensor) -> Tensor:
+        """Return derivatives [B, nx] with angular velocities turned into rotation vector rates.
+
+        This is the inverse of the exponential map's derivative, to the second commutator.
+
+        Args:
+            rotation: change of the state since the start of the step [B, nx]; its attitude columns
+                are a rotation vector.
+            derivative: of the state after that change [B, nx].
+        """
+        vector = rotation.index_select(-1, self.attitude)
+        angular_velocity = derivative.index_select(-1, self.attitude)
+        commutator = cross_product(vector, angular_velocity)
+        vector_rate = angular_velocity + 0.5 * commutator + cross_product(vector, commutator) / 12.0
+        joined = torch.cat((derivative, vector_rate), dim=-1)
+        return joined.index_select(-1, self.columns_with_attitude)
 
     def integrate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return the state one step later, [B, nx]."""
-        return self.integrate_from(self.rate(x, p, rho), x, p, rho)
+        """Return the state one step later [B, nx]; arguments as of `state_derivative`."""
+        return self.integrate_from_derivative(self.state_derivative(x, p, rho), x, p, rho)
 
-    def moved_on(self, x: Tensor, change: Tensor) -> Tensor:
-        """Return states [B, nx] after a change [B, nx], whose angles are a rotation vector."""
-        after = x + change
+    def add_change(self, x: Tensor, change: Tensor) -> Tensor:
+        """Return states [B, nx] after a change [B, nx] whose angles are a rotation vector."""
+        changed = x + change
         if not self.spatial:
-            return after
-        turned = compose_rotation(
+            return changed
+        angles = compose_rotation(
             x.index_select(-1, self.attitude), change.index_select(-1, self.attitude)
         )
-        return torch.cat((after, turned), dim=-1).index_select(-1, self.rearranged)
+        return torch.cat((changed, angles), dim=-1).index_select(-1, self.columns_with_attitude)
 
-    def integrate_from(self, k: Tensor, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return the state one step later [B, nx], where its derivative k [B, nx] is known.
+    def integrate_from_derivative(self, k: Tensor, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Return the state one step later [B, nx], given its derivative k [B, nx] at the start.
 
-        Rotations are integrated as rotation vectors from the step's start (Munthe-Kaas 1998), with
-        the first commutator.
+        Rotations are integrated as rotation vectors from the start of the step, with the first
+        commutator.
+
+        Source: H. Munthe-Kaas, Runge-Kutta methods on Lie groups, BIT 38 (1998).
         """
         total = self.weights[0] * k
         for i in range(1, len(self.nodes)):
             change = (self.dt * self.nodes[i]) * k
-            k = self.rate(self.moved_on(x, change), p, rho)
+            k = self.state_derivative(self.add_change(x, change), p, rho)
             if self.spatial:
-                k = self.from_start(change, k)
+                k = self.rotation_vector_derivative(change, k)
             total = total + self.weights[i] * k
-        after = self.moved_on(x, self.dt * total)
-        if self.semi_implicit and self.spatial:
-            return self.angled(x, after)
-        if self.semi_implicit:
-            after = self.angled(x, after)
-            # the pose moves with the new velocities, which keeps an undamped oscillation bounded;
-            # what stands behind the velocities goes along
-            moved = all_but_pose(after)
-            return torch.cat(
-                (
-                    pose(x) + self.dt * self.kinematics(torch.cat((pose(x), moved), dim=-1)),
-                    moved,
-                ),
-                dim=-1,
-            )
-        return after
+        next_state = self.add_change(x, self.dt * total)
+        if not self.is_semi_implicit:
+            return next_state
+        next_state = self.integrate_angles(x, next_state)
+        if self.spatial:
+            return next_state
+        # integrating the pose with the new velocities keeps an undamped oscillation bounded
+        velocities = all_but_pose(next_state)
+        pose_derivative = self.kinematics(torch.cat((pose(x), velocities), dim=-1))
+        return torch.cat((pose(x) + self.dt * pose_derivative, velocities), dim=-1)

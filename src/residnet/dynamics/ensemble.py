@@ -1,7 +1,8 @@
-"""Several models as one: means of models, and one model with many sets of parameters.
+"""Several models as one: means of models, and one model with many parameter vectors.
 
-`mean_of` averages accelerations inside one free run. `MeanOfTrajectories` lets each member run on
-velocities of its own and averages these. Either steps, warms up and exports like any other model.
+`mean_of` averages accelerations inside one free run. `MeanOfTrajectories` integrates each member
+with its own velocities and averages the trajectories. Both step, warm up and export like any other
+model.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from residnet.baselines.base import Baseline
 from residnet.baselines.given import ZeroBaselineConfig
 from residnet.core.columns import dynamic_states, pose, zero_acceleration
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.hybrid import FARTHEST, HybridDynamics
+from residnet.dynamics.hybrid import MAX_MEMORY, HybridDynamics
 from residnet.heads.base import ResidualHead, ZeroHead
 
 
@@ -27,7 +28,8 @@ class MeanBaseline(Baseline):
 
     def __init__(self, members: Sequence[nn.Module], dof: int) -> None:
         super().__init__()
-        self.members, self.dof = nn.ModuleList(members), dof
+        self.members = nn.ModuleList(members)
+        self.dof = dof
 
     def forward(self, z: Tensor) -> Tensor:
         total = zero_acceleration(z, self.dof)
@@ -36,54 +38,47 @@ class MeanBaseline(Baseline):
         return total / len(self.members)
 
     def parameter_counts(self) -> list[float]:
-        return _parameters(self.members)
+        return _sum_parameter_counts(self.members)
 
 
 @final
 class MeanHead(ResidualHead):
-    """A head that is the mean residual of several; the memory holds theirs side by side."""
+    """A head that is the mean residual of several; its memory joins their memories."""
 
     def __init__(self, members: Sequence[ResidualHead]) -> None:
         super().__init__()
         self.n_dof = members[0].n_dof
         self.members = nn.ModuleList(members)
-        self.widths = [member.n_state for member in members]
-        self.n_state = sum(self.widths)
+        self.memory_sizes = [member.n_state for member in members]
+        self.n_state = sum(self.memory_sizes)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         residuals: list[Tensor] = []
-        memory: list[Tensor] = []
-        begin = 0
-        for i, member in enumerate(self.members):
-            rho, after = member(z, s[..., begin : begin + self.widths[i]])
+        memories: list[Tensor] = []
+        for member, memory in zip(self.members, s.split(self.memory_sizes, dim=-1), strict=True):
+            rho, next_memory = member(z, memory)
             residuals.append(rho)
-            memory.append(after)
-            begin += self.widths[i]
-        return torch.stack(residuals).mean(dim=0), torch.cat(memory, dim=-1)
+            memories.append(next_memory)
+        return torch.stack(residuals).mean(dim=0), torch.cat(memories, dim=-1)
 
     def teacher_forced_residuals(self, z: Tensor) -> Tensor:
-        residuals: list[Tensor] = []
-        for member in self.members:
-            residuals.append(member.sequence(z))  # type: ignore[operator]
+        residuals = [member.teacher_forced_residuals(z) for member in self.members]  # type: ignore[operator]
         return torch.stack(residuals).mean(dim=0)
 
     def warmup(self, z: Tensor) -> Tensor:
-        memory: list[Tensor] = []
-        for member in self.members:
-            memory.append(member.warmup(z))  # type: ignore[operator]
-        return torch.cat(memory, dim=-1)
+        return torch.cat([member.warmup(z) for member in self.members], dim=-1)  # type: ignore[operator]
 
     def memory_bounds(self) -> tuple[Tensor, Tensor]:
-        ranges = [member.memory_range() for member in self.members]  # type: ignore[operator]
-        low, high = zip(*ranges, strict=True)
-        return torch.cat(low), torch.cat(high)
+        bounds = [member.memory_bounds() for member in self.members]  # type: ignore[operator]
+        lower, upper = zip(*bounds, strict=True)
+        return torch.cat(lower), torch.cat(upper)
 
     def parameter_counts(self) -> list[float]:
-        return _parameters(self.members)
+        return _sum_parameter_counts(self.members)
 
 
-def _parameters(members: nn.ModuleList) -> list[float]:
-    counts = [member.parameter_count() for member in members]  # type: ignore[operator]
+def _sum_parameter_counts(members: nn.ModuleList) -> list[float]:
+    counts = [member.parameter_counts() for member in members]  # type: ignore[operator]
     return [sum(axis) for axis in zip(*counts, strict=True)]
 
 
@@ -92,31 +87,32 @@ def mean_of(members: Sequence[HybridDynamics]) -> HybridDynamics:
     first = members[0]
     baselines = [member.head.effective_baseline(member.baseline) for member in members]
     head = MeanHead([member.head for member in members])
-    known = MeanBaseline(baselines, first.dof)
-    return HybridDynamics(first.signals, known, head, first.dt, first.integrator)
+    baseline = MeanBaseline(baselines, first.dof)
+    return HybridDynamics(first.signals, baseline, head, first.dt, first.integrator)
 
 
-_TOLD = 1e-3
+_MEASUREMENT_SHARE = 1e-3
 """Share of a velocity's training range by which a measurement differs from a prediction.
 
-Accelerations change velocities by more in a step, and no rounding of float32 by as much.
+Accelerations change velocities by more in a step, and rounding in float32 by less.
 """
 
 
 @final
 class MeanOfTrajectories(HybridDynamics):
-    """The mean of what several models predict, each on velocities of its own.
+    """The mean trajectory of several models, each of which integrates its own velocities.
 
-    The memory holds what the mean predicted, and for every member how far its own velocities lie
-    from that, with the member's memory. Where the next state is what was predicted, each member
-    goes on from where it was; where it is measured instead, all of them start from it. In between
-    the distances fade with the square of the ratio of what was missed to a small velocity, so that
-    a step has derivatives. Members share the heading and the position that follow from the mean.
+    The memory holds the prediction of the mean, and for every member the deviation of its
+    velocities from the mean and its own memory. If the next state is the prediction, each member
+    continues from its own velocities; if the next state is measured, all members start from it. In
+    between, the deviations decrease with the square of the ratio of the innovation to a small
+    velocity, so that the step is differentiable. Members share heading and position, which are
+    integrated with the mean velocities.
 
     Args:
-        members: with the same signals and step. Each weighs the same, whatever its copies.
-        low: least of what moves in the training data [n].
-        high: their largest [n].
+        members: with the same signals and step; all have the same weight.
+        low: smallest dynamic states in the training data [n].
+        high: largest dynamic states in the training data [n].
     """
 
     def __init__(
@@ -132,115 +128,136 @@ class MeanOfTrajectories(HybridDynamics):
         )
         self.members: Sequence[HybridDynamics] = nn.ModuleList(members)  # type: ignore[assignment]
         for member in self.members:
-            # the pose follows from the mean
-            member.positions = False
+            # the pose is integrated with the mean velocities
+            member.has_position = False
         self.copies = [member.head.batch_ensemble_size for member in members]
-        self.widths = [self.dof + member.n_state for member in members]
-        *self.begins, self.n_state = accumulate(
-            (copies * width for copies, width in zip(self.copies, self.widths, strict=True)),
-            # whether there is a prediction, and it
+        self.memory_sizes = [self.dof + member.n_state for member in members]
+        # the mean's own memory comes first: whether there is a prediction, and the prediction
+        *self.offsets, self.n_state = accumulate(
+            (copies * size for copies, size in zip(self.copies, self.memory_sizes, strict=True)),
             initial=1 + self.dof,
         )
-        small = [_TOLD * max(b - a, 1e-6) for a, b in zip(low, high, strict=True)]
-        self.small = nn.Buffer(torch.tensor(small, dtype=torch.float64), persistent=False)
+        innovation_scale = [
+            _MEASUREMENT_SHARE * max(upper - lower, 1e-6)
+            for lower, upper in zip(low, high, strict=True)
+        ]
+        self.innovation_scale = nn.Buffer(
+            torch.tensor(innovation_scale, dtype=torch.float64), persistent=False
+        )
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        x = self.alive(x)
-        kept = self._kept(x, s)
-        reached: list[Tensor] = []
-        memory: list[Tensor] = []
+        x = self.zero_inactive_velocities(x)
+        continuation = self._continuation(x, s)
+        next_states: list[Tensor] = []
+        memories: list[Tensor] = []
         for i, member in enumerate(self.members):
-            at, part = self._own(x, s, kept, i)
-            given = w.repeat(self.copies[i], 1)
-            after, own = member.step(at, given, part)
-            reached.append(after)
-            memory.append(own)
-        return self._joined(x, reached, memory)
+            member_state, member_memory = self._member_start(x, s, continuation, i)
+            inputs = w.repeat(self.copies[i], 1)
+            next_state, next_memory = member.step(member_state, inputs, member_memory)
+            next_states.append(next_state)
+            memories.append(next_memory)
+        return self._average(x, next_states, memories)
 
-    def _kept(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the share [B, 1] of their distances from the mean that members keep."""
-        missed = (dynamic_states(x, self.dof) - s[:, 1 : 1 + self.dof]) / self.small.to(x.dtype)
-        return s[:, :1] / (1.0 + missed.square().sum(dim=-1, keepdim=True))
+    def _continuation(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return the share [B, 1] of their deviations that members keep.
 
-    def _part(self, s: Tensor, i: int) -> Tensor:
-        """Return a member's share of the memory [K, B, n + n_state]."""
-        copies, width = self.copies[i], self.widths[i]
-        own = s[:, self.begins[i] : self.begins[i] + copies * width]
-        return own.reshape(s.shape[0], copies, width).transpose(0, 1)
+        It is 1 where the state is the prediction, and close to 0 where it is measured.
+        """
+        innovation = dynamic_states(x, self.dof) - s[:, 1 : 1 + self.dof]
+        scaled = innovation / self.innovation_scale.to(x.dtype)
+        return s[:, :1] / (1.0 + scaled.square().sum(dim=-1, keepdim=True))
 
-    def _own(self, x: Tensor, s: Tensor, kept: Tensor, i: int) -> tuple[Tensor, Tensor]:
-        """Return the states and memories [K B, ...] that a member steps from."""
-        copies, rows, part = self.copies[i], x.shape[0], self._part(s, i)
-        moved = dynamic_states(x, self.dof) + kept * part[..., : self.dof]
-        at = torch.cat((pose(x).expand(copies, rows, 3), moved), dim=-1)
-        width = self.widths[i] - self.dof
-        own = part[..., self.dof :].reshape(copies * rows, width)
-        return at.reshape(copies * rows, -1), own
+    def _member_start(
+        self, x: Tensor, s: Tensor, continuation: Tensor, i: int
+    ) -> tuple[Tensor, Tensor]:
+        """Return the states and memories [K B, ...] from which member i steps."""
+        copies = self.copies[i]
+        size = self.memory_sizes[i]
+        n_rows = x.shape[0]
+        begin = self.offsets[i]
+        part = s[:, begin : begin + copies * size].reshape(n_rows, copies, size).transpose(0, 1)
+        deviation = part[..., : self.dof]
+        velocities = dynamic_states(x, self.dof) + continuation * deviation
+        states = torch.cat((pose(x).expand(copies, n_rows, 3), velocities), dim=-1)
+        memory = part[..., self.dof :].reshape(copies * n_rows, size - self.dof)
+        return states.reshape(copies * n_rows, -1), memory
 
-    def _joined(
+    def _average(
         self, x: Tensor, states: list[Tensor], memories: list[Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """Return the mean's state and memory from those of the members, [K B, ...] each."""
-        nu, rows = dynamic_states(x, self.dof), x.shape[0]
+        """Return the state and memory of the mean from those of the members.
+
+        Args:
+            x: state of the mean before the step [B, 3 + n].
+            states: states of each member after the step [K B, 3 + n].
+            memories: memories of each member after the step [K B, n_state].
+        """
+        nu = dynamic_states(x, self.dof)
+        n_rows = x.shape[0]
+        member_velocities = [
+            dynamic_states(state, self.dof).reshape(copies, n_rows, self.dof)
+            for state, copies in zip(states, self.copies, strict=True)
+        ]
         total = torch.zeros_like(nu)
-        own: list[Tensor] = []
-        memory: list[Tensor] = []
-        for i in range(len(states)):
-            reached = dynamic_states(states[i], self.dof).reshape(self.copies[i], rows, self.dof)
-            total = total + reached.mean(dim=0)
-            own.append(reached)
-            memory.append(memories[i].reshape(self.copies[i], rows, self.widths[i] - self.dof))
-        mean = total / len(self.widths)
+        for velocities in member_velocities:
+            total = total + velocities.mean(dim=0)
+        mean = total / len(self.members)
+
         parts = [torch.ones_like(mean[:, :1]), mean]
-        for i in range(len(own)):
-            both = torch.cat((own[i] - mean, memory[i]), dim=-1)
-            parts.append(both.transpose(0, 1).reshape(rows, self.copies[i] * self.widths[i]))
-        # the pose moves with the mean of the velocities at both ends
-        half = 0.5 * (nu + mean)
-        turned = pose(x) + self.dt * self.kinematics(torch.cat((pose(x), half), dim=-1))
-        middle = torch.cat((pose(x)[:, :2], 0.5 * (pose(x) + turned)[:, 2:], half), dim=-1)
-        moved_pose = pose(x) + self.dt * self.kinematics(middle)
-        return torch.cat((moved_pose, mean), dim=-1), torch.cat(parts, dim=-1)
+        for i, velocities in enumerate(member_velocities):
+            size = self.memory_sizes[i]
+            memory = memories[i].reshape(self.copies[i], n_rows, size - self.dof)
+            joined = torch.cat((velocities - mean, memory), dim=-1)
+            parts.append(joined.transpose(0, 1).reshape(n_rows, self.copies[i] * size))
+
+        # midpoint rule: the pose moves with the mean of old and new velocities at half the turn
+        mid_velocities = 0.5 * (nu + mean)
+        end_pose = pose(x) + self.dt * self.kinematics(torch.cat((pose(x), mid_velocities), dim=-1))
+        mid_heading = 0.5 * (pose(x) + end_pose)[:, 2:]
+        midpoint = torch.cat((pose(x)[:, :2], mid_heading, mid_velocities), dim=-1)
+        next_pose = pose(x) + self.dt * self.kinematics(midpoint)
+        return torch.cat((next_pose, mean), dim=-1), torch.cat(parts, dim=-1)
 
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
         s = y_history.new_zeros((y_history.shape[0], self.n_state))
-        # nothing is trained through the mean, and a long past would keep all of its steps
+        # nothing is trained through the mean, and a graph of a long past would fill the memory
         with torch.no_grad():
             for k in range(y_history.shape[1]):
                 s = self.step(y_history[:, k], w_history[:, k], s)[1]
         return s
 
     @property
-    def observes(self) -> bool:
-        return any(member.observes for member in self.members)
+    def has_innovation(self) -> bool:
+        return any(member.has_innovation for member in self.members)
 
-    def known(self, z: Tensor) -> Tensor:
+    def baseline_acceleration(self, z: Tensor) -> Tensor:
         total = zero_acceleration(z, self.dof)
         for member in self.members:
             total = total + member.baseline(z)
-        return total / len(self.widths)
+        return total / len(self.members)
 
-    def one_step(self, z: Tensor) -> Tensor:
+    def one_step_accelerations(self, z: Tensor) -> Tensor:
         total = zero_acceleration(z, self.dof)
         for member in self.members:
-            total = total + member.one_step(z)
-        return total / len(self.widths)
+            total = total + member.one_step_accelerations(z)
+        return total / len(self.members)
 
     def acceleration(self, x: Tensor, w: Tensor, s: Tensor) -> Tensor:
-        """Return the mean change of what moves [B, n] over a step, by its length."""
-        after = dynamic_states(self.step(x, w, s)[0], self.dof)
-        return (after - dynamic_states(x, self.dof)) / self.dt
+        """Return the mean rate of change of the dynamic states [B, n] over a step."""
+        next_nu = dynamic_states(self.step(x, w, s)[0], self.dof)
+        return (next_nu - dynamic_states(x, self.dof)) / self.dt
 
-    def memory_range(self) -> tuple[Tensor, Tensor]:
-        limit = torch.full((1 + self.dof,), FARTHEST, dtype=torch.float64)
+    def memory_bounds(self) -> tuple[Tensor, Tensor]:
+        limit = torch.full((1 + self.dof,), MAX_MEMORY, dtype=torch.float64)
         limit[0] = 1.0
-        low, high = [torch.cat((0.0 * limit[:1], -limit[1:]))], [limit]
+        lower = [torch.cat((0.0 * limit[:1], -limit[1:]))]
+        upper = [limit]
+        deviation = torch.full((self.dof,), MAX_MEMORY, dtype=torch.float64)
         for copies, member in zip(self.copies, self.members, strict=True):
-            least, most = member.memory_range()
-            apart = torch.full((self.dof,), FARTHEST, dtype=torch.float64)
-            low.append(torch.cat((-apart, least.double())).repeat(copies))
-            high.append(torch.cat((apart, most.double())).repeat(copies))
-        return torch.cat(low), torch.cat(high)
+            member_lower, member_upper = member.memory_bounds()
+            lower.append(torch.cat((-deviation, member_lower.double())).repeat(copies))
+            upper.append(torch.cat((deviation, member_upper.double())).repeat(copies))
+        return torch.cat(lower), torch.cat(upper)
 
 
 @final
@@ -251,35 +268,39 @@ class SampledDynamics(Dynamics):
     runs with theta[d] in place of the parameter.
 
     Args:
-        dynamics: the model, memoryless or not.
-        name: of the parameter within `dynamics`.
-        theta: its values by draw, [D, ...].
+        dynamics: the model.
+        name: name of the parameter within `dynamics`.
+        theta: samples of the parameter, [D, ...].
     """
 
     def __init__(self, dynamics: Dynamics, name: str, theta: Tensor) -> None:
         super().__init__(dynamics.dt, dynamics.integrator)
-        self.stepped = _Stepped(dynamics)
-        self.name, self.theta = name, theta
+        self.step_module = _StepModule(dynamics)
+        self.name = name
+        self.theta = theta
         self.n_state = dynamics.n_state
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        draws, parameter = self.theta.shape[0], f"dynamics.{self.name}"
+        n_draws = self.theta.shape[0]
+        parameter = f"dynamics.{self.name}"
 
-        def one(theta: Tensor, *rows: Tensor) -> tuple[Tensor, Tensor]:
-            after: tuple[Tensor, Tensor] = torch.func.functional_call(
-                self.stepped, {parameter: theta}, rows
+        def step_of_draw(theta: Tensor, *rows: Tensor) -> tuple[Tensor, Tensor]:
+            stepped: tuple[Tensor, Tensor] = torch.func.functional_call(
+                self.step_module, {parameter: theta}, rows
             )
-            return after
+            return stepped
 
-        split = [part.unflatten(0, (len(part) // draws, draws)) for part in (x, w)]
-        split.append(s.reshape(x.shape[0] // draws, draws, s.shape[-1]))
-        after, memory = torch.vmap(one, in_dims=(0, 1, 1, 1), out_dims=1)(self.theta, *split)
-        return after.reshape(x.shape), memory.reshape(s.shape)
+        # manoeuvres [M], draws [D]: the draws are the axis that vmap runs over
+        arguments = [part.unflatten(0, (len(part) // n_draws, n_draws)) for part in (x, w)]
+        arguments.append(s.reshape(x.shape[0] // n_draws, n_draws, s.shape[-1]))
+        batched_step = torch.vmap(step_of_draw, in_dims=(0, 1, 1, 1), out_dims=1)
+        next_state, memory = batched_step(self.theta, *arguments)
+        return next_state.reshape(x.shape), memory.reshape(s.shape)
 
 
 @final
-class _Stepped(nn.Module):
-    """The step of a model as the forward of a module, as `functional_call` wants it."""
+class _StepModule(nn.Module):
+    """The step of a model as the `forward` of a module, which `functional_call` requires."""
 
     def __init__(self, dynamics: Dynamics) -> None:
         super().__init__()

@@ -1,9 +1,9 @@
-"""The hybrid model, nu_dot = baseline + residual (document 003 eq. (19)), and what it missed.
+"""The hybrid model, nu_dot = baseline + residual (document 003 eq. (19)), and its innovations.
 
-A residual in force space acts through the head's mass. A head may be shown what was predicted wrong
-of the measured past, where unmeasured wind leaves its trace: each step's velocities are compared
-with those that the step before predicted. In a free run nothing is left over. So one and the same
-step serves both, and nothing has to tell it which is which.
+A residual in force space acts through the head's mass. A head may receive the filtered one-step
+prediction error (innovation) of the measured past, from which it can infer unmeasured wind: the
+velocities at each step are compared with the prediction of the previous step. In a free run the
+state is the prediction, so that the innovation is zero. One step therefore serves both cases.
 """
 
 from __future__ import annotations
@@ -22,68 +22,76 @@ from residnet.heads.base import ResidualHead
 from residnet.physics.signals import Signals
 from residnet.physics.symmetry import get_dof
 
-_PIECE = 20.0
-"""Length in s of pieces of a measurement that run side by side, and of the past of each."""
-FARTHEST = 100.0
+_SEGMENT_DURATION = 20.0
+"""Length in s of the segments into which a measurement is cut, and of the past of each segment."""
+MAX_MEMORY = 100.0
 """Largest velocity or acceleration that a memory may hold, SI."""
 
 
 @final
-class Missed(nn.Module):
-    """An acceleration by which steps were predicted wrong, low-passed and kept in the memory.
+class InnovationFilter(nn.Module):
+    """A first-order low-pass filter of the innovation as an acceleration in body axes.
 
-    It stays in body axes: what settles is forgotten as quickly, before the vessel has turned.
+    The filter does not rotate its value with the vessel: its time constant is short compared with
+    a turn.
 
     Args:
-        settle: time constant in s.
+        time_constant: in s.
         dt: step in s.
-        live: what moves; n numbers. An angle whose rate is known is never predicted wrong.
+        dof: the n dynamic states. An angle whose derivative is known has no innovation.
 
     Attributes:
-        size: entries of the memory: whether there is a prediction, what it is, what was missed.
+        size: entries of the memory: whether there is a prediction, the predicted dynamic states,
+            and the filtered innovation.
     """
 
-    def __init__(self, settle: float, dt: float, live: DegreesOfFreedom) -> None:
+    def __init__(self, time_constant: float, dt: float, dof: DegreesOfFreedom) -> None:
         super().__init__()
-        self.dof, self.size = live.n_dynamic, 1 + 2 * live.n_dynamic
-        self.free = len(live.regressed_indices) == live.n_dynamic
-        self.mask = nn.Buffer(live.equation_mask(), persistent=False)
-        self.keep = math.exp(-dt / settle)
-        self.gain = (1.0 - self.keep) / dt
+        self.dof = dof.n_dynamic
+        self.size = 1 + 2 * dof.n_dynamic
+        self.is_fully_regressed = len(dof.regressed_indices) == dof.n_dynamic
+        self.mask = nn.Buffer(dof.equation_mask(), persistent=False)
+        self.decay = math.exp(-dt / time_constant)
+        self.gain = (1.0 - self.decay) / dt
 
     def forward(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the acceleration in body axes [B, n].
+        """Return the filtered innovation, an acceleration in body axes [B, n].
 
         Args:
-            x: states at the step's start, measured or predicted [B, nx].
-            s: memory of the step before [B, 1 + 2 n].
+            x: states at the start of the step, measured or predicted [B, nx].
+            s: memory of the previous step [B, 1 + 2 n].
         """
-        known, predicted, before = s.split([1, self.dof, self.dof], dim=-1)
-        left = (dynamic_states(x, self.dof) - predicted) * known
-        if not self.free:
-            left = left * self.mask.to(left.dtype)
-        missed: Tensor = self.keep * before + self.gain * left
-        return missed
+        has_prediction, prediction, filtered = s.split([1, self.dof, self.dof], dim=-1)
+        innovation = (dynamic_states(x, self.dof) - prediction) * has_prediction
+        if not self.is_fully_regressed:
+            innovation = innovation * self.mask.to(innovation.dtype)
+        updated: Tensor = self.decay * filtered + self.gain * innovation
+        return updated
 
-    def remembered(self, after: Tensor, missed: Tensor) -> Tensor:
-        """Return the memory [B, 1 + 2 n] from the predicted states [B, nx] and what was missed."""
-        predicted = dynamic_states(after, self.dof)
-        return torch.cat((torch.ones_like(after[:, :1]), predicted, missed), dim=-1)
+    def next_memory(self, next_state: Tensor, filtered: Tensor) -> Tensor:
+        """Return the memory [B, 1 + 2 n] after a step.
 
-    def memory_range(self) -> tuple[Tensor, Tensor]:
-        """Return the least and largest memory [1 + 2 n]."""
-        most = torch.full((self.size,), FARTHEST, dtype=torch.float64)
-        most[0] = 1.0
-        least = -most
-        least[0] = 0.0
-        return least, most
+        Args:
+            next_state: predicted states [B, nx].
+            filtered: filtered innovation [B, n].
+        """
+        prediction = dynamic_states(next_state, self.dof)
+        return torch.cat((torch.ones_like(next_state[:, :1]), prediction, filtered), dim=-1)
+
+    def memory_bounds(self) -> tuple[Tensor, Tensor]:
+        """Return the lower and upper bounds of the memory [1 + 2 n]."""
+        upper = torch.full((self.size,), MAX_MEMORY, dtype=torch.float64)
+        upper[0] = 1.0
+        lower = -upper
+        lower[0] = 0.0
+        return lower, upper
 
 
 class HybridDynamics(Dynamics):
-    """A hybrid model with the state x [B, 3 + n]: x, y, psi, then what moves, u, v, r and so on.
+    """A hybrid model with the state x [B, 3 + n]: x, y, psi, then the dynamic states u, v, r etc.
 
-    The head is evaluated once per step and held over the integrator's stages. A head with a
-    `settle` time is shown what was predicted wrong.
+    The head is evaluated once per step and its residual held over the stages of the integrator. A
+    head with an innovation time constant receives the filtered innovation as further channels.
     """
 
     def __init__(
@@ -98,176 +106,200 @@ class HybridDynamics(Dynamics):
         self.signals = signals
         self.baseline = baseline
         self.head = head
-        live = get_dof(signals.names)
-        self.dof = live.n_dynamic
-        self.whole, self.free = live.is_complete, len(live.regressed_indices) == live.n_dynamic
-        self.rolls, self.level = live.has_roll, not live.has_roll
-        self.turn_about(ATTITUDE if live.is_six_dof else (), len(live.state_names))
-        self.live = nn.Buffer(live.equation_mask(), persistent=False)
-        self.living = nn.Buffer(live.active_mask(), persistent=False)
-        self.known_rates = nn.Buffer(live.angle_rate_matrix(), persistent=False)
+        dof = get_dof(signals.names)
+        self.dof = dof.n_dynamic
+        self.is_complete = dof.is_complete
+        self.is_fully_regressed = len(dof.regressed_indices) == dof.n_dynamic
+        self.has_roll = dof.has_roll
+        self.set_attitude_columns(ATTITUDE if dof.is_six_dof else (), len(dof.state_names))
+        self.equation_mask = nn.Buffer(dof.equation_mask(), persistent=False)
+        self.active_mask = nn.Buffer(dof.active_mask(), persistent=False)
+        self.angle_rate_matrix = nn.Buffer(dof.angle_rate_matrix(), persistent=False)
         head.set_step(dt)
-        self.missed = (
-            Missed(head.innovation_time_constant, dt, live)
-            if head.innovation_time_constant > 0.0
-            else None
-        )
-        self.width = head.n_state
-        self.n_state = head.n_state + (0 if self.missed is None else self.missed.size)
+        self.innovation_filter: InnovationFilter | None = None
+        if head.innovation_time_constant > 0.0:
+            self.innovation_filter = InnovationFilter(head.innovation_time_constant, dt, dof)
+        self.head_memory_size = head.n_state
+        self.n_state = head.n_state
+        if self.innovation_filter is not None:
+            self.n_state += self.innovation_filter.size
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return x_dot [B, 3 + n] from what the step holds fixed.
+    def state_derivative(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Return x_dot [B, 3 + n].
 
-        That is p = signals.prepare(w) and the residual rho [B, n].
+        Args:
+            x: states [B, 3 + n].
+            p: what `signals.prepare` returned for the inputs of the step.
+            rho: residual of the step [B, n].
         """
-        nu_dot = self.found(self.baseline(self.signals(x, p)), rho, dynamic_states(x, self.dof))
+        baseline_acceleration = self.baseline(self.signals(x, p))
+        nu_dot = self.total_acceleration(baseline_acceleration, rho, dynamic_states(x, self.dof))
         return torch.cat((self.kinematics(x), nu_dot), dim=-1)
 
-    def found(self, known: Tensor, rho: Tensor, nu: Tensor) -> Tensor:
-        """Return nu_dot [..., n] from baseline and residual, each [..., n].
+    def total_acceleration(self, baseline: Tensor, rho: Tensor, nu: Tensor) -> Tensor:
+        """Return the derivatives of the dynamic states [..., n].
 
-        A velocity that is dead stays so, and an angle moves by what moves nu [..., n].
+        The derivative of an inactive velocity is zero; those of angles follow from the velocities.
+
+        Args:
+            baseline: accelerations of the baseline [..., n].
+            rho: residual [..., n].
+            nu: dynamic states [..., n].
         """
-        nu_dot: Tensor = self.head.combine_accelerations(known, rho)
-        if self.free:
+        nu_dot: Tensor = self.head.combine_accelerations(baseline, rho)
+        if self.is_fully_regressed:
             return nu_dot
-        nu_dot = nu_dot * self.live.to(nu_dot.dtype)
-        if self.rolls:
-            nu_dot = nu_dot + nu @ self.known_rates.to(nu.dtype)
+        nu_dot = nu_dot * self.equation_mask.to(nu_dot.dtype)
+        if self.has_roll:
+            nu_dot = nu_dot + nu @ self.angle_rate_matrix.to(nu.dtype)
         return with_depth_rate(nu_dot, nu) if self.spatial else nu_dot
 
-    def angled(self, x: Tensor, after: Tensor) -> Tensor:
-        """Return states [B, 3 + n] whose angles moved with the new velocities."""
-        if not self.rolls:
-            return after
-        if self.spatial:
-            # pose, depth and attitude move from where they were, by the new velocities
-            nu = dynamic_states(after, self.dof)
-            nu = torch.where(self.live.to(x.dtype) > 0.0, nu, dynamic_states(x, self.dof))
-            rate = with_depth_rate(nu @ self.known_rates.to(nu.dtype), nu)
-            held = torch.cat((pose(x), nu), dim=-1)
-            moved = torch.cat((self.kinematics(held), rate), dim=-1)
-            return self.moved_on(held, self.dt * moved)
-        nu = self.turned(dynamic_states(x, self.dof), dynamic_states(after, self.dof))
-        return torch.cat((pose(after), nu), dim=-1)
+    def integrate_angles(self, x: Tensor, next_state: Tensor) -> Tensor:
+        if not self.has_roll:
+            return next_state
+        nu = dynamic_states(x, self.dof)
+        next_nu = dynamic_states(next_state, self.dof)
+        has_equation = self.equation_mask.to(x.dtype) > 0.0
+        if not self.spatial:
+            # as with the pose, new velocities keep an undamped oscillation bounded
+            angles = nu + self.dt * (next_nu @ self.angle_rate_matrix.to(x.dtype))
+            return torch.cat((pose(next_state), torch.where(has_equation, next_nu, angles)), dim=-1)
+        # pose, depth and attitude start from their old values and move with the new velocities
+        velocities = torch.where(has_equation, next_nu, nu)
+        angle_rates = with_depth_rate(velocities @ self.angle_rate_matrix.to(x.dtype), velocities)
+        start = torch.cat((pose(x), velocities), dim=-1)
+        derivative = torch.cat((self.kinematics(start), angle_rates), dim=-1)
+        return self.add_change(start, self.dt * derivative)
 
-    def turned(self, nu: Tensor, after: Tensor) -> Tensor:
-        """Return what moves [..., n] after a step from nu, its angles by the new velocities.
-
-        As with a pose, that keeps an undamped oscillation bounded.
-        """
-        angles = nu + self.dt * (after @ self.known_rates.to(after.dtype))
-        return torch.where(self.live.to(after.dtype) > 0.0, after, angles)
-
-    def alive(self, x: Tensor) -> Tensor:
-        """Return states [..., 3 + n] whose dead velocities are zero, whatever somebody gave."""
-        if self.whole:
+    def zero_inactive_velocities(self, x: Tensor) -> Tensor:
+        """Return states [..., 3 + n] whose inactive velocities are zero."""
+        if self.is_complete:
             return x
-        return torch.cat((pose(x), dynamic_states(x, self.dof) * self.living.to(x.dtype)), dim=-1)
+        nu = dynamic_states(x, self.dof) * self.active_mask.to(x.dtype)
+        return torch.cat((pose(x), nu), dim=-1)
 
-    def channels(self, x: Tensor, w: Tensor) -> Tensor:
-        """Return what baseline and head see, z [..., nz].
+    def compute_channels(self, x: Tensor, w: Tensor) -> Tensor:
+        """Return the channels of baseline and head, z [..., nz].
 
         Args:
             x: states [..., 3 + n].
-            w: inputs that belong to each state [..., m].
+            w: inputs at each state [..., m].
         """
         z: Tensor = self.signals(x, self.signals.prepare(w))
         return z
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        return self.stepped(x, self.signals.prepare(w), s)
-
-    def stepped(self, x: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state and the memory one step later, from p = signals.prepare(w) [B, k]."""
-        x = self.alive(x)
+        x = self.zero_inactive_velocities(x)
+        p = self.signals.prepare(w)
         z: Tensor = self.signals(x, p)
-        if self.missed is None:
-            rho, s = self.head(z, s)
-            return self.advanced(x, z, p, rho), s
-        missed = self.missed(x, s[:, self.width :])
-        rho, own = self.head(torch.cat((z, missed), dim=-1), s[:, : self.width])
-        after = self.advanced(x, z, p, rho)
-        return after, torch.cat((own, self.missed.remembered(after, missed)), dim=-1)
+        if self.innovation_filter is None:
+            rho, head_memory = self.head(z, s)
+            return self.advance(x, z, p, rho), head_memory
+        innovation = self.innovation_filter(x, s[:, self.head_memory_size :])
+        head_memory = s[:, : self.head_memory_size]
+        rho, head_memory = self.head(torch.cat((z, innovation), dim=-1), head_memory)
+        next_state = self.advance(x, z, p, rho)
+        filter_memory = self.innovation_filter.next_memory(next_state, innovation)
+        return next_state, torch.cat((head_memory, filter_memory), dim=-1)
 
-    def advanced(self, x: Tensor, z: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+    def advance(self, x: Tensor, z: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return the state [B, 3 + n] one step later.
 
         Args:
             x: states [B, 3 + n].
-            z: their channels [B, nz], which the first stage needs again.
-            p: what `signals.prepare` returned for the step's inputs.
+            z: their channels [B, nz], which the first stage reuses.
+            p: what `signals.prepare` returned for the inputs of the step.
             rho: residual of the step [B, n].
         """
-        nu_dot = self.found(self.baseline(z), rho, dynamic_states(x, self.dof))
-        return self.integrate_from(torch.cat((self.kinematics(x), nu_dot), dim=-1), x, p, rho)
+        nu_dot = self.total_acceleration(self.baseline(z), rho, dynamic_states(x, self.dof))
+        derivative = torch.cat((self.kinematics(x), nu_dot), dim=-1)
+        return self.integrate_from_derivative(derivative, x, p, rho)
 
-    def known(self, z: Tensor) -> Tensor:
-        """Return what the baseline says at channels z [..., nz], accelerations [..., n]."""
-        found: Tensor = self.baseline(z)
-        return found
+    def baseline_acceleration(self, z: Tensor) -> Tensor:
+        """Return the accelerations of the baseline [..., n] at channels z [..., nz]."""
+        nu_dot: Tensor = self.baseline(z)
+        return nu_dot
 
-    def one_step(self, z: Tensor) -> Tensor:
+    def one_step_accelerations(self, z: Tensor) -> Tensor:
         """Return nu_dot [B, T, n] along measured channels [B, T, nz] (teacher forcing).
 
-        The head's memory is empty at first.
+        The head starts with an empty memory.
         """
-        return self.taught(z, self.known(z))
+        return self.teacher_forced_accelerations(z, self.baseline_acceleration(z))
 
-    def taught(self, z: Tensor, known: Tensor) -> Tensor:
-        """Return what `one_step` does where the baseline's share [B, T, n] is known."""
-        if self.missed is not None:
-            return self._observed(z, known)
-        return self.found(known, self.head.teacher_forced_residuals(z), z[..., : self.dof])
+    def teacher_forced_accelerations(self, z: Tensor, baseline: Tensor) -> Tensor:
+        """Return `one_step_accelerations` for known baseline accelerations [B, T, n]."""
+        if self.innovation_filter is not None:
+            return self._accelerations_with_innovation(z, baseline, self.innovation_filter)
+        rho = self.head.teacher_forced_residuals(z)
+        return self.total_acceleration(baseline, rho, z[..., : self.dof])
 
-    def _observed(self, z: Tensor, known: Tensor) -> Tensor:
-        """Return nu_dot [B, T, n] where the head is shown what was predicted wrong.
+    def _accelerations_with_innovation(
+        self, z: Tensor, baseline: Tensor, innovation_filter: InnovationFilter
+    ) -> Tensor:
+        """Return nu_dot [B, T, n] of a head that receives the innovation.
 
-        Long measurements are cut into pieces that run side by side, each behind as long a past.
+        Long measurements are cut into segments that run side by side. Each starts with the previous
+        segment, so that its memory has settled.
+
+        Args:
+            z: channels [B, T, nz].
+            baseline: accelerations of the baseline [B, T, n].
         """
-        rows, steps, copies = z.shape[0], z.shape[1], self.head.batch_ensemble_size
-        piece = max(round(_PIECE / self.dt), 1)
-        first = torch.arange(-piece, steps, piece)
-        at = first[:-1, None] if len(first) > 1 else first[:, None]
-        place = at + torch.arange(2 * piece)
-        inside = ((place >= 0) & (place < steps)).to(z.dtype)
-        place = place.clamp(0, steps - 1)
-        z, known = (part[:, place].repeat(copies, 1, 1, 1).flatten(0, 1) for part in (z, known))
-        inside = inside.repeat(copies * rows, 1)
+        n_rows = z.shape[0]
+        n_steps = z.shape[1]
+        n_copies = self.head.batch_ensemble_size
         n = self.dof
-        x = torch.cat((z.new_zeros(z.shape[:-1] + (3,)), z[..., :n]), dim=-1)  # noqa: RUF005
-        s, out = z.new_zeros((len(z), self.n_state)), []
-        assert self.missed is not None
-        for k in range(2 * piece):
-            missed = self.missed(x[:, k], s[:, self.width :])
-            rho, own = self.head(torch.cat((z[:, k], missed), dim=-1), s[:, : self.width])
-            nu_dot = self.found(known[:, k], rho, z[:, k, :n])
-            after = torch.cat((x[:, k, :3], x[:, k, 3:] + self.dt * nu_dot), dim=-1)
-            s = torch.cat((own, self.missed.remembered(after, missed)), dim=-1)
-            s = s * inside[:, k, None]
-            out.append(nu_dot)
-        each = torch.stack(out[piece:], dim=1).reshape(copies, rows, -1, n)
-        return each.mean(0)[:, :steps]
+        length = max(round(_SEGMENT_DURATION / self.dt), 1)
+
+        # sample indices of the segments [segments, 2 length], each with its past
+        starts = torch.arange(-length, n_steps, length)
+        starts = starts[:-1, None] if len(starts) > 1 else starts[:, None]
+        index = starts + torch.arange(2 * length)
+        is_inside = ((index >= 0) & (index < n_steps)).to(z.dtype)
+        is_inside = is_inside.repeat(n_copies * n_rows, 1)
+        index = index.clamp(0, n_steps - 1)
+        z, baseline = (
+            part[:, index].repeat(n_copies, 1, 1, 1).flatten(0, 1) for part in (z, baseline)
+        )
+
+        # Euler predictions of the velocities stand in for the step; positions do not matter
+        zero_pose = z.new_zeros((*z.shape[:-1], 3))
+        x = torch.cat((zero_pose, z[..., :n]), dim=-1)
+        s = z.new_zeros((len(z), self.n_state))
+        accelerations = []
+        for k in range(2 * length):
+            innovation = innovation_filter(x[:, k], s[:, self.head_memory_size :])
+            head_input = torch.cat((z[:, k], innovation), dim=-1)
+            rho, head_memory = self.head(head_input, s[:, : self.head_memory_size])
+            nu_dot = self.total_acceleration(baseline[:, k], rho, z[:, k, :n])
+            next_state = torch.cat((x[:, k, :3], x[:, k, 3:] + self.dt * nu_dot), dim=-1)
+            filter_memory = innovation_filter.next_memory(next_state, innovation)
+            s = torch.cat((head_memory, filter_memory), dim=-1) * is_inside[:, k, None]
+            accelerations.append(nu_dot)
+        settled = torch.stack(accelerations[length:], dim=1).reshape(n_copies, n_rows, -1, n)
+        return settled.mean(0)[:, :n_steps]
 
     def acceleration(self, x: Tensor, w: Tensor, s: Tensor) -> Tensor:
-        """Return nu_dot [B, n] of baseline and head at states x [B, 3 + n], inputs w and memory."""
-        z = self.channels(x, w)
-        if self.missed is None:
+        """Return nu_dot [B, n] at states x [B, 3 + n], inputs w [B, m] and memory s."""
+        z = self.compute_channels(x, w)
+        if self.innovation_filter is None:
             rho, _ = self.head(z, s)
         else:
-            missed = self.missed(x, s[:, self.width :])
-            rho, _ = self.head(torch.cat((z, missed), dim=-1), s[:, : self.width])
-        return self.found(self.baseline(z), rho, dynamic_states(x, self.dof))
+            innovation = self.innovation_filter(x, s[:, self.head_memory_size :])
+            head_input = torch.cat((z, innovation), dim=-1)
+            rho, _ = self.head(head_input, s[:, : self.head_memory_size])
+        return self.total_acceleration(self.baseline(z), rho, dynamic_states(x, self.dof))
 
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
-        """Return the memory [B, n_state] that a measured past leaves.
+        """Return the memory [B, n_state] after a measured past.
 
         Args:
             y_history: measured states [B, T, 3 + n], oldest first; T may be 0.
             w_history: inputs held over the step that follows each of them [B, T, m].
         """
-        if self.missed is None:
-            s: Tensor = self.head.warmup(self.channels(y_history, w_history))
+        if self.innovation_filter is None:
+            s: Tensor = self.head.warmup(self.compute_channels(y_history, w_history))
             return s
         s = y_history.new_zeros((y_history.shape[0], self.n_state))
         for k in range(y_history.shape[1]):
@@ -275,14 +307,14 @@ class HybridDynamics(Dynamics):
         return s
 
     @property
-    def observes(self) -> bool:
-        """Whether the measured past tells the memory how wrong it was predicted."""
-        return self.missed is not None
+    def has_innovation(self) -> bool:
+        """Whether the memory holds the innovation of the measured past."""
+        return self.innovation_filter is not None
 
-    def memory_range(self) -> tuple[Tensor, Tensor]:
-        """Return the least and largest memory [n_state], of the head and of what was missed."""
-        low, high = self.head.memory_bounds()
-        if self.missed is None:
-            return low, high
-        least, most = self.missed.memory_range()
-        return torch.cat((low.double(), least)), torch.cat((high.double(), most))
+    def memory_bounds(self) -> tuple[Tensor, Tensor]:
+        """Return the lower and upper bounds of the memory [n_state]."""
+        lower, upper = self.head.memory_bounds()
+        if self.innovation_filter is None:
+            return lower, upper
+        filter_lower, filter_upper = self.innovation_filter.memory_bounds()
+        return torch.cat((lower.double(), filter_lower)), torch.cat((upper.double(), filter_upper))

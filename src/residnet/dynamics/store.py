@@ -183,11 +183,11 @@ class ModelSpec(Stored):
         model = HybridDynamics(signals, known, head, self.dt, self.integrator)
         if self.role == "constant_velocity":
             # all is held, angles too
-            model.known_rates.zero_()
+            model.angle_rate_matrix.zero_()
             if live.is_six_dof:
                 # it goes on over the ground, level
-                model.rolls = False
-                model.turn_about((), 0)
+                model.has_roll = False
+                model.set_attitude_columns((), 0)
         return model
 
     @field_validator("name")

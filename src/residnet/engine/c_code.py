@@ -38,17 +38,17 @@ _OPERATORS: Final = {
     ca.OP_DIV: "{0} / {1}", ca.OP_NEG: "-{0}", ca.OP_SQ: "{0} * {0}", ca.OP_TWICE: "{0} + {0}",
     ca.OP_INV: "ONE / {0}", ca.OP_ASSIGN: "{0}",
 }  # fmt: skip
-_COMPARED: Final = {
+_COMPARISONS: Final = {
     ca.OP_LT: "{0} < {1}", ca.OP_LE: "{0} <= {1}", ca.OP_EQ: "{0} == {1}", ca.OP_NE: "{0} != {1}"
 }  # fmt: skip
-_JOINED: Final = {ca.OP_NOT: "!{0}", ca.OP_AND: "{0} && {1}", ca.OP_OR: "{0} || {1}"}
-_UNROLLED: Final = 24
+_LOGICAL: Final = {ca.OP_NOT: "!{0}", ca.OP_AND: "{0} && {1}", ca.OP_OR: "{0} || {1}"}
+_MAX_UNROLLED_LENGTH: Final = 24
 """Longest operation that is written out, where it could be a loop."""
-_WRITTEN_OUT: Final = 256
+_MAX_UNROLLED_PRODUCTS: Final = 256
 """Most products of a small matrix that are written out."""
 
 
-def literal(value: float) -> str:
+def write_literal(value: float) -> str:
     """Return a real number in C; in single precision the compiler rounds it."""
     if np.isnan(value):
         return "(ZERO / ZERO)"
@@ -63,18 +63,18 @@ class Tables:
         self.prefix, self.lines = prefix, dict[str, str]()
         self._names: dict[tuple[str, tuple[str, ...]], str] = {}
 
-    def name(self, texts: Sequence[str], kind: str) -> str:
+    def table_name(self, texts: Sequence[str], c_type: str) -> str:
         """Return the name of a constant array of these numbers."""
-        key = (kind, tuple(texts))
+        key = (c_type, tuple(texts))
         if key not in self._names:
             self._names[key] = name = f"{self.prefix}table_{len(self._names)}"
             rows = ",\n    ".join(", ".join(texts[i : i + 8]) for i in range(0, len(texts), 8))
-            self.lines[name] = f"static const {kind} {name}[{len(texts)}] = {{\n    {rows}\n}};\n"
+            self.lines[name] = f"static const {c_type} {name}[{len(texts)}] = {{\n    {rows}\n}};\n"
         return self._names[key]
 
 
 @dataclass(frozen=True)
-class _Column:
+class _CColumn:
     """Numbers in C.
 
     Attributes:
@@ -86,18 +86,18 @@ class _Column:
 
     cells: Sequence[str]
     array: str | None = None
-    places: Sequence[int] | None = None
-    flag: bool = False
+    indices: Sequence[int] | None = None
+    is_boolean: bool = False
 
-    def taken(self, places: Sequence[int]) -> _Column:
-        cells = [self.cells[i] for i in places]
+    def select(self, indices: Sequence[int]) -> _CColumn:
+        cells = [self.cells[i] for i in indices]
         if self.array is None:
-            return _Column(cells, flag=self.flag)
-        known = places if self.places is None else [self.places[i] for i in places]
-        return _Column(cells, self.array, known, self.flag)
+            return _CColumn(cells, is_boolean=self.is_boolean)
+        selected = indices if self.indices is None else [self.indices[i] for i in indices]
+        return _CColumn(cells, self.array, selected, self.is_boolean)
 
 
-class Body:
+class FunctionWriter:
     """Writes a function as C statements: single numbers where few act, loops where many do.
 
     Args:
@@ -112,247 +112,287 @@ class Body:
 
     REAL: str = "REAL"
     FLAG: str = "int"
-    unrolled: float = _UNROLLED
-    joined: Mapping[int, str] = _JOINED
+    max_unrolled_length: float = _MAX_UNROLLED_LENGTH
+    logical: Mapping[int, str] = _LOGICAL
 
     @property
     def zero(self) -> str:
         """Zero, as constants are written."""
-        return self.literal(0.0)
+        return self.write_literal(0.0)
 
     @property
     def one(self) -> str:
         """One, as constants are written."""
-        return self.literal(1.0)
+        return self.write_literal(1.0)
 
-    def literal(self, value: float) -> str:
+    def write_literal(self, value: float) -> str:
         """Return a constant."""
-        return literal(value)
+        return write_literal(value)
 
     def __init__(self, function: ca.Function, tables: Tables, what: str) -> None:
         self.function, self.tables, self.what = function, tables, what
         self.names = [function.name_in(i) for i in range(function.n_in())]
         self.lines: list[tuple[str, str]] = []
         self.results = [list[str]() for _ in range(function.n_out())]
-        self.chosen: dict[str, tuple[str, bool, str]] = {}
+        self.conditional_halves: dict[str, tuple[str, bool, str]] = {}
         self.negated: dict[str, str] = {}
         self.constants: set[str] = set()
-        self.single = function.is_a("SXFunction")
-        held: dict[int, _Column] = {}
+        self.is_scalar_function = function.is_a("SXFunction")
+        columns: dict[int, _CColumn] = {}
         for k in range(function.n_instructions()):
             op = function.instruction_id(k)
-            given, out = function.instruction_input(k), function.instruction_output(k)
+            inputs, outputs = function.instruction_input(k), function.instruction_output(k)
             if op == ca.OP_CONST:
-                held[out[0]] = self.constant(k)
+                columns[outputs[0]] = self.write_constant(k)
             elif op == ca.OP_INPUT:
-                held[out[0]] = self.taken_in(*given)
+                columns[outputs[0]] = self.copy_argument(*inputs)
             elif op == ca.OP_OUTPUT:
-                self.put(out[0], held[given[0]])
+                self.store_result(outputs[0], columns[inputs[0]])
             else:
-                found = self.instruction(k, op, [held[i] for i in given])
-                held.update(zip(out, found, strict=True))
+                results = self.write_instruction(k, op, [columns[i] for i in inputs])
+                columns.update(zip(outputs, results, strict=True))
 
-    def put(self, result: int, column: _Column) -> None:
+    def store_result(self, result: int, column: _CColumn) -> None:
         """Take numbers as those that come next in a result."""
-        self.results[result] += [self.real(cell, column.flag) for cell in column.cells]
+        self.results[result] += [self.to_real(cell, column.is_boolean) for cell in column.cells]
 
-    def constant(self, k: int) -> _Column:
-        if self.single:
+    def write_constant(self, k: int) -> _CColumn:
+        if self.is_scalar_function:
             values = [self.function.instruction_constant(k)]
         else:
             matrix = ca.densify(self.function.instruction_MX(k).to_DM())
             values = matrix.nonzeros()
-        texts = [*map(self.literal, values)]
+        texts = [*map(self.write_literal, values)]
         self.constants.update(texts)
-        if len(texts) <= self.unrolled:
-            return _Column(texts)
-        return _Column(texts, self.tables.name(texts, "REAL"))
+        if len(texts) <= self.max_unrolled_length:
+            return _CColumn(texts)
+        return _CColumn(texts, self.tables.table_name(texts, "REAL"))
 
-    def argument(self, name: str, place: int) -> str:
+    def argument_expression(self, name: str, place: int) -> str:
         """Return an entry of an argument."""
         return f"{name}[{place}]"
 
-    def taken_in(self, argument: int, place: int | None = None) -> _Column:
+    def copy_argument(self, argument: int, place: int | None = None) -> _CColumn:
         """Return an argument, copied because results may go where arguments came from."""
         name = self.names[argument]
         if place is not None:
-            return _Column([self.number(self.argument(name, place))])
+            return _CColumn([self.write_scalar(self.argument_expression(name, place))])
         size = self.function.numel_in(argument)
-        if size <= self.unrolled:
-            return _Column([self.number(self.argument(name, i)) for i in range(size)])
-        return self.looped(size, f"{name}[i]", False)
+        if size <= self.max_unrolled_length:
+            return _CColumn(
+                [self.write_scalar(self.argument_expression(name, i)) for i in range(size)]
+            )
+        return self.write_loop(size, f"{name}[i]", False)
 
-    def new(self) -> str:
+    def new_name(self) -> str:
         return f"t{len(self.lines)}"
 
-    def number(self, text: str, flag: bool = False) -> str:
+    def write_scalar(self, text: str, is_boolean: bool = False) -> str:
         """Write a single number and return its name."""
-        name = self.new()
-        self.lines.append((name, f"const {self.FLAG if flag else self.REAL} {name} = {text};"))
+        name = self.new_name()
+        self.lines.append(
+            (name, f"const {self.FLAG if is_boolean else self.REAL} {name} = {text};")
+        )
         return name
 
-    def looped(self, size: int, text: str, flag: bool) -> _Column:
+    def write_loop(self, size: int, text: str, is_boolean: bool) -> _CColumn:
         """Write an array whose entry i is what a text says."""
-        name = self.new()
-        kind = self.FLAG if flag else self.REAL
+        name = self.new_name()
+        c_type = self.FLAG if is_boolean else self.REAL
         self.lines.append(
-            (name, f"{kind} {name}[{size}]; for (i = 0; i < {size}; i++) {name}[i] = {text};")
+            (name, f"{c_type} {name}[{size}]; for (i = 0; i < {size}; i++) {name}[i] = {text};")
         )
-        return _Column([f"{name}[{i}]" for i in range(size)], name, flag=flag)
+        return _CColumn([f"{name}[{i}]" for i in range(size)], name, is_boolean=is_boolean)
 
-    def array(self, column: _Column) -> str:
+    def as_array(self, column: _CColumn) -> str:
         """Return the name of an array with the numbers of a column."""
         if column.array is not None:
-            first = column.places[0] if column.places else 0
+            first = column.indices[0] if column.indices else 0
             size = len(column.cells)
-            if column.places is None or list(column.places) == list(range(first, first + size)):
+            if column.indices is None or list(column.indices) == list(range(first, first + size)):
                 return f"({column.array} + {first})" if first else column.array
-            if size > self.unrolled:
-                table = self.tables.name([str(place) for place in column.places], "int")
-                made = self.looped(size, f"{column.array}[{table}[i]]", column.flag)
-                return str(made.array)
+            if size > self.max_unrolled_length:
+                table = self.tables.table_name([str(place) for place in column.indices], "int")
+                selected = self.write_loop(size, f"{column.array}[{table}[i]]", column.is_boolean)
+                return str(selected.array)
         if all(cell in self.constants for cell in column.cells):
-            return self.tables.name(column.cells, "REAL")
-        name = self.new()
-        kind = self.FLAG if column.flag else self.REAL
-        filled = "".join(f" {name}[{i}] = {cell};" for i, cell in enumerate(column.cells))
-        self.lines.append((name, f"{kind} {name}[{len(column.cells)}];{filled}"))
+            return self.tables.table_name(column.cells, "REAL")
+        name = self.new_name()
+        c_type = self.FLAG if column.is_boolean else self.REAL
+        assignments = "".join(f" {name}[{i}] = {cell};" for i, cell in enumerate(column.cells))
+        self.lines.append((name, f"{c_type} {name}[{len(column.cells)}];{assignments}"))
         return name
 
-    def instruction(self, k: int, op: int, given: Sequence[_Column]) -> list[_Column]:
+    def write_instruction(self, k: int, op: int, operands: Sequence[_CColumn]) -> list[_CColumn]:
         """Return what an instruction makes."""
         if op in (ca.OP_VERTCAT, ca.OP_HORZCAT):
-            if any(column.flag for column in given):
-                given = [self.as_real(column) for column in given]
-            return [_Column([cell for column in given for cell in column.cells])]
+            if any(column.is_boolean for column in operands):
+                operands = [self.to_real_column(column) for column in operands]
+            return [_CColumn([cell for column in operands for cell in column.cells])]
         if op == ca.OP_RESHAPE:
-            return [given[0]]
+            return [operands[0]]
         if op in (ca.OP_VERTSPLIT, ca.OP_HORZSPLIT, ca.OP_GETNONZEROS, ca.OP_TRANSPOSE):
-            return [given[0].taken(places) for places in self.places(k, op)]
+            return [operands[0].select(places) for places in self.selected_indices(k, op)]
         if op == ca.OP_MTIMES:
-            start, left, right = given
+            start, left, right = operands
             rows, columns = self.function.instruction_MX(k).shape
-            return [self.product(start, left, right, rows, columns)]
+            return [self.write_product(start, left, right, rows, columns)]
         if op == ca.OP_GETNONZEROS_PARAM:
-            table = self.array(self.as_real(given[0]))
-            return [_Column([self.number(f"{table}[(int){cell}]") for cell in given[1].cells])]
-        return [self.elementwise(op, given)]
+            table = self.as_array(self.to_real_column(operands[0]))
+            return [
+                _CColumn([self.write_scalar(f"{table}[(int){cell}]") for cell in operands[1].cells])
+            ]
+        return [self.write_elementwise(op, operands)]
 
-    def places(self, k: int, op: int) -> list[list[int]]:
+    def selected_indices(self, k: int, op: int) -> list[list[int]]:
         """Return the places of the numbers that each output of an instruction takes."""
         matrix = self.function.instruction_MX(k)
         if op == ca.OP_TRANSPOSE:
             rows, columns = matrix.shape
             return [[i * columns + j for j in range(columns) for i in range(rows)]]
-        info = matrix.info()
-        if "nz" in info:
-            return [list(info["nz"])]
-        if "slice" in info:
-            return [_range(info["slice"])]
-        if "outer" in info:
-            return [[i + j for i in _range(info["outer"]) for j in _range(info["inner"])]]
-        offsets = info["offset"]
+        properties = matrix.info()
+        if "nz" in properties:
+            return [list(properties["nz"])]
+        if "slice" in properties:
+            return [_slice_indices(properties["slice"])]
+        if "outer" in properties:
+            return [
+                [
+                    i + j
+                    for i in _slice_indices(properties["outer"])
+                    for j in _slice_indices(properties["inner"])
+                ]
+            ]
+        offsets = properties["offset"]
         height = matrix.dep(0).shape[0] if op == ca.OP_HORZSPLIT else 1
         return [list(range(a * height, b * height)) for a, b in pairwise(offsets)]
 
-    def real(self, cell: str, flag: bool) -> str:
-        return f"(REAL){cell}" if flag else cell
+    def to_real(self, cell: str, is_boolean: bool) -> str:
+        return f"(REAL){cell}" if is_boolean else cell
 
-    def truth(self, cell: str, flag: bool) -> str:
+    def to_truth(self, cell: str, is_boolean: bool) -> str:
         return cell
 
-    def as_real(self, column: _Column) -> _Column:
-        if not column.flag:
+    def to_real_column(self, column: _CColumn) -> _CColumn:
+        if not column.is_boolean:
             return column
         if column.array is not None:
-            return self.looped(len(column.cells), f"(REAL){self.array(column)}[i]", False)
-        return _Column([self.number(self.real(cell, True)) for cell in column.cells])
+            return self.write_loop(len(column.cells), f"(REAL){self.as_array(column)}[i]", False)
+        return _CColumn([self.write_scalar(self.to_real(cell, True)) for cell in column.cells])
 
-    def elementwise(self, op: int, given: Sequence[_Column]) -> _Column:
+    def write_elementwise(self, op: int, operands: Sequence[_CColumn]) -> _CColumn:
         """Write an operation on each element; single numbers go with each."""
-        size = max(len(column.cells) for column in given)
-        flag = op in _COMPARED or op in _JOINED
-        if size <= self.unrolled:
+        size = max(len(column.cells) for column in operands)
+        is_boolean = op in _COMPARISONS or op in _LOGICAL
+        if size <= self.max_unrolled_length:
             cells = []
             for i in range(size):
-                row = [column.cells[i if len(column.cells) > 1 else 0] for column in given]
-                cells.append(self.applied(op, row, [column.flag for column in given], flag))
-            return _Column(cells, flag=flag)
-        row = [
-            f"{self.array(column)}[i]" if len(column.cells) > 1 else column.cells[0]
-            for column in given
+                expressions = [
+                    column.cells[i if len(column.cells) > 1 else 0] for column in operands
+                ]
+                cells.append(
+                    self.write_scalar_operation(
+                        op, expressions, [column.is_boolean for column in operands], is_boolean
+                    )
+                )
+            return _CColumn(cells, is_boolean=is_boolean)
+        expressions = [
+            f"{self.as_array(column)}[i]" if len(column.cells) > 1 else column.cells[0]
+            for column in operands
         ]
-        flags = [column.flag for column in given]
-        made = self.looped(size, self.expression(op, row, flags), flag)
-        self.note(op, f"{made.array}[i]", row, flags)
-        return made
+        flags = [column.is_boolean for column in operands]
+        result = self.write_loop(
+            size, self.operation_expression(op, expressions, flags), is_boolean
+        )
+        self.note_conditional(op, f"{result.array}[i]", expressions, flags)
+        return result
 
-    def applied(self, op: int, row: Sequence[str], flags: Sequence[bool], flag: bool) -> str:
+    def write_scalar_operation(
+        self, op: int, expressions: Sequence[str], flags: Sequence[bool], is_boolean: bool
+    ) -> str:
         """Write an operation on single numbers; what does nothing is left out."""
-        known = [cell in self.constants for cell in row]
-        if op == ca.OP_ADD and self.zero in row and not any(flags):
-            return row[row[0] == self.zero]
-        if op == ca.OP_MUL and self.one in row and not any(flags) and not all(known):
-            return row[row[0] == self.one]
-        name = self.number(self.expression(op, row, flags), flag)
-        self.note(op, name, row, flags)
+        is_constant = [cell in self.constants for cell in expressions]
+        if op == ca.OP_ADD and self.zero in expressions and not any(flags):
+            return expressions[expressions[0] == self.zero]
+        if op == ca.OP_MUL and self.one in expressions and not any(flags) and not all(is_constant):
+            return expressions[expressions[0] == self.one]
+        name = self.write_scalar(self.operation_expression(op, expressions, flags), is_boolean)
+        self.note_conditional(op, name, expressions, flags)
         return name
 
-    def note(self, op: int, name: str, row: Sequence[str], flags: Sequence[bool]) -> None:
+    def note_conditional(
+        self, op: int, name: str, expressions: Sequence[str], flags: Sequence[bool]
+    ) -> None:
         """Remember halves of a choice, which CasADi has as the sum of two."""
         if op == ca.OP_IF_ELSE_ZERO:
-            self.chosen[name] = row[0], flags[0], self.real(row[1], flags[1])
+            self.conditional_halves[name] = (
+                expressions[0],
+                flags[0],
+                self.to_real(expressions[1], flags[1]),
+            )
         elif op == ca.OP_NOT:
-            self.negated[name] = row[0]
+            self.negated[name] = expressions[0]
 
-    def choice(self, row: Sequence[str]) -> tuple[str, str, str] | None:
+    def find_conditional(self, expressions: Sequence[str]) -> tuple[str, str, str] | None:
         """Return condition, value and alternative where two halves of a choice are added."""
-        for one, other in (row, row[::-1]):
-            if one in self.chosen and other in self.chosen:
-                condition, flag, value = self.chosen[one]
-                against, _, alternative = self.chosen[other]
-                if self.negated.get(against) == condition:
-                    return self.truth(condition, flag), value, alternative
+        for first, second in (expressions, expressions[::-1]):
+            if first in self.conditional_halves and second in self.conditional_halves:
+                condition, is_boolean, value = self.conditional_halves[first]
+                negated_condition, _, alternative = self.conditional_halves[second]
+                if self.negated.get(negated_condition) == condition:
+                    return self.to_truth(condition, is_boolean), value, alternative
         return None
 
-    def expression(self, op: int, row: Sequence[str], flags: Sequence[bool]) -> str:
+    def operation_expression(
+        self, op: int, expressions: Sequence[str], flags: Sequence[bool]
+    ) -> str:
         """Return an operation on numbers in C."""
-        if op == ca.OP_ADD and (choice := self.choice(row)) is not None:
-            return self.pick(*choice)
+        if op == ca.OP_ADD and (conditional := self.find_conditional(expressions)) is not None:
+            return self.conditional_expression(*conditional)
         if op == ca.OP_IF_ELSE_ZERO:
-            return self.pick(self.truth(row[0], flags[0]), self.real(row[1], flags[1]), self.zero)
-        if op in _JOINED:
-            return self.joined[op].format(*map(self.truth, row, flags))
-        row = [*map(self.real, row, flags)]
-        for table in (_OPERATORS, _COMPARED):
+            return self.conditional_expression(
+                self.to_truth(expressions[0], flags[0]),
+                self.to_real(expressions[1], flags[1]),
+                self.zero,
+            )
+        if op in _LOGICAL:
+            return self.logical[op].format(*map(self.to_truth, expressions, flags))
+        expressions = [*map(self.to_real, expressions, flags)]
+        for table in (_OPERATORS, _COMPARISONS):
             if op in table:
-                return table[op].format(*row)
+                return table[op].format(*expressions)
         if op == ca.OP_SIGN:
-            above, below = (self.real(f"({row[0]} {way} ZERO)", True) for way in "><")
-            return f"{above} - {below}"
+            positive, negative = (
+                self.to_real(f"({expressions[0]} {relation} ZERO)", True) for relation in "><"
+            )
+            return f"{positive} - {negative}"
         if op in (ca.OP_FMAX, ca.OP_FMIN):
-            way = ">" if op == ca.OP_FMAX else "<"
-            return self.pick(f"({row[0]} {way} {row[1]})", *row)
+            relation = ">" if op == ca.OP_FMAX else "<"
+            return self.conditional_expression(
+                f"({expressions[0]} {relation} {expressions[1]})", *expressions
+            )
         if op in FUNCTIONS:
-            return self.call(FUNCTIONS[op], row)
+            return self.call_expression(FUNCTIONS[op], expressions)
         name = next(name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == op)
         raise ExportError(
             f"{self.what}: its step uses the operation '{name[3:].lower()}', which is not written"
             " in C; export it as torchscript"
         )
 
-    def pick(self, condition: str, value: str, alternative: str) -> str:
+    def conditional_expression(self, condition: str, value: str, alternative: str) -> str:
         return f"{condition} ? {value} : {alternative}"
 
-    def call(self, name: str, row: Sequence[str]) -> str:
-        return f"R({name})({', '.join(row)})"
+    def call_expression(self, name: str, expressions: Sequence[str]) -> str:
+        return f"R({name})({', '.join(expressions)})"
 
-    def product(
-        self, start: _Column, left: _Column, right: _Column, rows: int, columns: int
-    ) -> _Column:
+    def write_product(
+        self, start: _CColumn, left: _CColumn, right: _CColumn, rows: int, columns: int
+    ) -> _CColumn:
         """Write start + left right; loops run along the results, which compilers vectorise."""
         inner = len(right.cells) // columns
-        if rows * inner * columns <= min(_WRITTEN_OUT, self.unrolled * _WRITTEN_OUT):
+        if rows * inner * columns <= min(
+            _MAX_UNROLLED_PRODUCTS, self.max_unrolled_length * _MAX_UNROLLED_PRODUCTS
+        ):
             cells = []
             for h in range(columns):
                 for j in range(rows):
@@ -364,54 +404,56 @@ class Body:
                         for pair in pairs
                         if self.zero not in pair
                     ]
-                    begin = start.cells[h * rows + j]
-                    terms = terms if terms and begin == self.zero else [begin, *terms]
-                    cells.append(self.number(_sum(terms)))
-            return _Column(cells)
-        a, b = self.array(left), self.array(right)
+                    start_cell = start.cells[h * rows + j]
+                    terms = terms if terms and start_cell == self.zero else [start_cell, *terms]
+                    cells.append(self.write_scalar(_write_sum(terms)))
+            return _CColumn(cells)
+        a, b = self.as_array(left), self.as_array(right)
         if rows == columns == 1:
             # eight sums side by side, which compilers vectorise
-            name, whole = self.new(), inner - inner % 8
+            name, n_unrolled = self.new_name(), inner - inner % 8
             text = (
                 f"REAL {name} = {start.cells[0]}; {{ REAL p[8] = {{ZERO}};"
-                f" for (i = 0; i < {whole}; i += 8) for (j = 0; j < 8; j++)"
+                f" for (i = 0; i < {n_unrolled}; i += 8) for (j = 0; j < 8; j++)"
                 f" p[j] += {a}[i + j] * {b}[i + j];"
-                f" for (i = {whole}; i < {inner}; i++) p[0] += {a}[i] * {b}[i];"
+                f" for (i = {n_unrolled}; i < {inner}; i++) p[0] += {a}[i] * {b}[i];"
                 f" for (j = 0; j < 8; j++) {name} += p[j]; }}"
             )
             self.lines.append((name, text))
-            return _Column([name])
-        made = self.looped(rows * columns, f"{self.array(start)}[i]", False)
+            return _CColumn([name])
+        result = self.write_loop(rows * columns, f"{self.as_array(start)}[i]", False)
         name, text = self.lines.pop()
-        outer = f"for (h = 0; h < {columns}; h++) " if columns > 1 else ""
-        at, into = (f"h * {inner} + i", f"h * {rows} + j") if columns > 1 else ("i", "j")
+        column_loop = f"for (h = 0; h < {columns}; h++) " if columns > 1 else ""
+        right_index, result_index = (
+            (f"h * {inner} + i", f"h * {rows} + j") if columns > 1 else ("i", "j")
+        )
         text += (
-            f" {outer}for (i = 0; i < {inner}; i++) {{ const REAL a = {b}[{at}];"
-            f" for (j = 0; j < {rows}; j++) {name}[{into}] += a * {a}[i * {rows} + j]; }}"
+            f" {column_loop}for (i = 0; i < {inner}; i++) {{ const REAL a = {b}[{right_index}];"
+            f" for (j = 0; j < {rows}; j++) {name}[{result_index}] += a * {a}[i * {rows} + j]; }}"
         )
         self.lines.append((name, text))
-        return made
+        return result
 
-    def read(self, ends: Sequence[str]) -> list[str]:
+    def used_statements(self, results: Sequence[str]) -> list[str]:
         """Return the statements that the last ones need, and those."""
-        used = set(re.findall(r"\w+", " ".join(ends)))
-        kept = []
+        used_names = set(re.findall(r"\w+", " ".join(results)))
+        statements = []
         for name, text in reversed(self.lines):
-            if name in used:
-                kept.append(text)
-                used.update(re.findall(r"\w+", text))
-        return [*kept[::-1], *ends]
+            if name in used_names:
+                statements.append(text)
+                used_names.update(re.findall(r"\w+", text))
+        return [*statements[::-1], *results]
 
 
-def _sum(terms: Sequence[str]) -> str:
+def _write_sum(terms: Sequence[str]) -> str:
     """Return a sum in pairs, whose parts a processor adds side by side."""
     if len(terms) < 3:
         return " + ".join(terms)
     half = len(terms) // 2
-    return f"({_sum(terms[:half])}) + ({_sum(terms[half:])})"
+    return f"({_write_sum(terms[:half])}) + ({_write_sum(terms[half:])})"
 
 
-def _range(slice_: Any) -> list[int]:
+def _slice_indices(slice_: Any) -> list[int]:
     return list(range(slice_["start"], slice_["stop"], slice_["step"]))
 
 
@@ -419,7 +461,7 @@ class CompilerError(ExportError):
     """There is no C compiler, or it fails."""
 
 
-def compiler() -> str:
+def find_compiler() -> str:
     """Return the C compiler: what CC names, or cc, gcc or clang.
 
     Raises:
@@ -443,13 +485,13 @@ _FLAGS = (
     *("-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros"),
     *("-fassociative-math", "-freciprocal-math"),
 )
-_LONGEST_JOURNAL = 1_000_000
+_MAX_JOURNAL_SIZE = 1_000_000
 """Bytes of the cache's journal above which it is merged into the manifest."""
-_KEPT = 64
+_MAX_CACHED_LIBRARIES = 64
 """Libraries that are kept, those used last."""
 
 
-def compiled_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
+def load_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
     """Return a C source as a library compiled for this machine, from the cache where it is there.
 
     The cache is `residnet/compiled` in `XDG_CACHE_HOME`, or in `~/.cache`; `RESIDNET_CACHE` names
@@ -463,70 +505,82 @@ def compiled_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
     Raises:
         ExportError: where there is no compiler, or it fails.
     """
-    tool = compiler()
+    compiler_path = find_compiler()
     flags = ("-O0", *_FLAGS[1:]) if quick else _FLAGS
-    file = _kept(tool, source, flags)
+    path = _cache_path(compiler_path, source, flags)
     try:
-        manifest = Manifest(file.parent)
-        if not manifest.is_owned(file):
+        manifest = Manifest(path.parent)
+        if not manifest.is_owned(path):
             with tempfile.TemporaryDirectory() as folder:
-                out = Path(folder) / "compiled.so"
-                _compile(tool, source, flags, out)
-                with atomic_write(file, manifest) as partial:
-                    shutil.copyfile(out, partial)
-            _forget(manifest)
-        file.touch()
-        return ctypes.CDLL(str(file))
+                library_path = Path(folder) / "compiled.so"
+                _run_compiler(compiler_path, source, flags, library_path)
+                with atomic_write(path, manifest) as partial:
+                    shutil.copyfile(library_path, partial)
+            _evict_old_libraries(manifest)
+        path.touch()
+        return ctypes.CDLL(str(path))
     except (OSError, UsageError):
         with tempfile.TemporaryDirectory() as folder:
-            out = Path(folder) / "compiled.so"
-            _compile(tool, source, flags, out)
-            return ctypes.CDLL(str(out))
+            library_path = Path(folder) / "compiled.so"
+            _run_compiler(compiler_path, source, flags, library_path)
+            return ctypes.CDLL(str(library_path))
 
 
-def _kept(tool: str, source: str, flags: Sequence[str]) -> Path:
+def _cache_path(compiler_path: str, source: str, flags: Sequence[str]) -> Path:
     """Return the file of the cache that is the library of a source."""
-    key = hashlib.sha256("\n".join((source, *flags, *_machine(tool))).encode()).hexdigest()
-    return _folder() / f"{key[:32]}.so"
+    key = hashlib.sha256(
+        "\n".join((source, *flags, *_machine_key(compiler_path))).encode()
+    ).hexdigest()
+    return _cache_folder() / f"{key[:32]}.so"
 
 
-def _folder() -> Path:
+def _cache_folder() -> Path:
     """Return the folder of the cache."""
-    if named := os.environ.get("RESIDNET_CACHE"):
-        return Path(named) / "residnet-cache"
+    if folder := os.environ.get("RESIDNET_CACHE"):
+        return Path(folder) / "residnet-cache"
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "residnet" / "compiled"
 
 
 @cache
-def _machine(tool: str) -> tuple[str, ...]:
+def _machine_key(compiler_path: str) -> tuple[str, ...]:
     """Return what a compiled library depends on beside its source: compiler and processor."""
-    said = subprocess.run([tool, "--version"], capture_output=True, text=True).stdout
-    return tool, said, platform.node(), platform.machine(), platform.processor()
+    version = subprocess.run([compiler_path, "--version"], capture_output=True, text=True).stdout
+    return compiler_path, version, platform.node(), platform.machine(), platform.processor()
 
 
-def _compile(tool: str, source: str, flags: Sequence[str], out: Path) -> None:
+def _run_compiler(
+    compiler_path: str, source: str, flags: Sequence[str], library_path: Path
+) -> None:
     """Compile a C source to a library.
 
     Raises:
         ExportError: with the compiler's first complaint.
     """
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "compiled.c"
-        file.write_text(source)
-        call = [tool, "-std=gnu99", *flags, str(file), "-o", str(out), "-lm"]
-        done = subprocess.run(call, capture_output=True, text=True)
-    if done.returncode:
-        said = done.stderr.strip().splitlines() or ["no message"]
-        raise CompilerError(f"compiled code does not compile ({said[0]})")
+        source_path = Path(folder) / "compiled.c"
+        source_path.write_text(source)
+        command = [
+            compiler_path,
+            "-std=gnu99",
+            *flags,
+            str(source_path),
+            "-o",
+            str(library_path),
+            "-lm",
+        ]
+        process = subprocess.run(command, capture_output=True, text=True)
+    if process.returncode:
+        messages = process.stderr.strip().splitlines() or ["no message"]
+        raise CompilerError(f"compiled code does not compile ({messages[0]})")
 
 
-def _forget(manifest: Manifest) -> None:
+def _evict_old_libraries(manifest: Manifest) -> None:
     """Delete all but the libraries that were used last; files that residnet did not write stay."""
-    files = [file for name in manifest.read() if (file := manifest.folder / name).is_file()]
-    files.sort(key=lambda file: file.stat().st_mtime, reverse=True)
-    for file in files[_KEPT:]:
-        manifest.remove_if_owned(file)
+    paths = [path for name in manifest.read() if (path := manifest.folder / name).is_file()]
+    paths.sort(key=lambda path: path.stat().st_mtime, reverse=True)
+    for path in paths[_MAX_CACHED_LIBRARIES:]:
+        manifest.remove_if_owned(path)
     # another process may append meanwhile, and its entry would be lost: not after each library
-    if manifest.journal.stat().st_size > _LONGEST_JOURNAL:
+    if manifest.journal.stat().st_size > _MAX_JOURNAL_SIZE:
         manifest.compact()

@@ -1,9 +1,9 @@
-"""Rollouts and their gradients as compiled C: many free runs at once, and training through them.
+"""Rollouts and their gradients as compiled C, for many rows at once.
 
-One step of a rollout becomes a CasADi function of single numbers, beside products with the matrices
-that all rows share. It and the product of its Jacobian with a gradient are written for blocks of
-rows by the vector types that gcc and clang know, compiled for this machine and called for all steps
-of a run. Gradients of matrices follow from what the steps leave, in one product each.
+One step of a rollout becomes a CasADi function of scalars, and products with the matrices that all
+rows share. The step and its vector-Jacobian product are written for blocks of rows with the vector
+types of gcc and clang, compiled for this machine and called for all steps of a run. Gradients of
+matrices follow from the stored factors and cotangents of the steps, in one product each.
 """
 
 from __future__ import annotations
@@ -26,95 +26,100 @@ from residnet.core.errors import ExportError
 from residnet.core.processes import available_cores
 from residnet.engine.c_code import (
     FUNCTIONS,
-    Body,
+    FunctionWriter,
     Tables,
-    compiled_library,
-    literal,
+    load_library,
+    write_literal,
 )
 from residnet.engine.rollout import Rollout
-from residnet.engine.trace import Parts, in_numbers, in_parts
+from residnet.engine.trace import StepParts, split_step, to_scalar_function
 
-_VISITED, _ROWS, _STEPS = 40, 16, 3
-"""The compiled rollout is checked over so many steps from every state that some runs visit in their
-first steps: long enough that a step hands all on, too short for rounding to grow in a steep law.
-"""
-_SAME, _ROUNDED = 1e-6, 5e-3
-"""How far it may be off: in double precision, and the median row in the precision of runs."""
-_LONGEST = 20_000
-"""Most operations on single numbers of a step: more take a compiler minutes."""
-_HANDED_ON = ("x", "s", "q")
-"""State, memory of the vessel and memory of the source, which a step hands on."""
-_WHAT = "rollout"
-_TWO = ("atan2", "hypot", "pow", "fmod", "copysign")
+_MAX_INSTRUCTIONS = 20_000
+"""Most scalar operations of a step: a compiler takes minutes for more."""
+_CARRIED = ("x", "s", "q")
+"""Arguments that a step returns updated: state, memory of the model and memory of the source."""
+_LABEL = "rollout"
+_BINARY_FUNCTIONS = ("atan2", "hypot", "pow", "fmod", "copysign")
 
 
-_PRELUDE, FLY, BACK = (
+_PRELUDE, FORWARD_LOOP, BACKWARD_LOOP = (
     resources.files("residnet.engine").joinpath(name).read_text()
     for name in ("lanes.h", "fly.c", "back.c")
 )
-_ONE_BY_ONE = {
+_SCALAR_FUNCTIONS = {
     name: f"static __attribute__((noinline)) V v_{name}"
-    + ("(V a, V b)" if name in _TWO else "(V a)")
-    + f" {{ V o; EACH o[l] = R({name})(a[l]{', b[l]' if name in _TWO else ''}); return o; }}\n"
+    + ("(V a, V b)" if name in _BINARY_FUNCTIONS else "(V a)")
+    + f" {{ V o; EACH o[l] = R({name})(a[l]{', b[l]' if name in _BINARY_FUNCTIONS else ''});"
+    " return o; }\n"
     for name in sorted(set(FUNCTIONS.values()))
 }
-"""Functions of C's library, which takes one number at a time."""
+"""Functions of the C library, which are called for each row."""
 
 
-def _horner(x: str, *parts: float) -> str:
-    """Return a polynomial in C, its coefficients from the constant on."""
-    first, *rest = parts
-    return f"(ALL({first!r}) + {x} * {_horner(x, *rest)})" if rest else f"ALL({first!r})"
+def _write_horner(x: str, *coefficients: float) -> str:
+    """Return Horner's scheme for a polynomial in C; coefficients in ascending order."""
+    constant, *higher = coefficients
+    return (
+        f"(ALL({constant!r}) + {x} * {_write_horner(x, *higher)})"
+        if higher
+        else f"ALL({constant!r})"
+    )
 
 
-def _at_once(terms: int, bits: int, bias: int, most: float, odd: int) -> dict[str, str]:
-    """Return functions of many numbers at once, right but for the last digits, by name.
+def _write_vector_functions(
+    n_exp_terms: int, bits: int, bias: int, overflow: float, n_log_terms: int
+) -> dict[str, str]:
+    """Return vectorised exp, tanh and log1p in C by name, accurate to the last digits.
 
-    They are those that networks call most. With C's library a step of a recurrent network takes six
-    times as long.
+    Networks call these most. With the C library a step of a recurrent network takes six times as
+    long.
 
     Args:
-        terms: of the exponential's series for what is at most half of log 2, behind its one.
-        bits: of a number behind its exponent.
-        bias: of the exponent.
-        most: beyond which the exponential is infinite; below about its opposite it is zero.
-        odd: terms of the logarithm's series for what is at most 0.172, by odd powers.
+        n_exp_terms: terms of the exponential series after the constant, for arguments up to
+            log(2)/2.
+        bits: bits of the mantissa.
+        bias: bias of the exponent.
+        overflow: argument above which the exponential is infinite; below about its negative the
+            exponential is zero.
+        n_log_terms: odd terms of the series of the logarithm for arguments up to 0.172.
     """
-    log = [2.0 / (2 * k + 1) for k in range(odd)]
+    exp_coefficients = [2.0 / math.factorial(k + 1) for k in range(n_exp_terms)]
+    log_coefficients = [2.0 / (2 * k + 1) for k in range(n_log_terms)]
     head = '__attribute__((noinline, optimize("no-associative-math"))) static V '
-    # the same for clang
-    kept = "\n#pragma clang fp reassociate(off)\n"
-    # a sum with so large a number ends in the nearest whole one
-    whole = f"ALL({1.5 * 2.0**bits!r})"
-    # e^a = 2^n e^r, whose rest r is at most half of log 2: `half` of 2^n, which is never beyond
-    # what there is, and twice e^r - 1, `more`. The two parts of log 2 must stay apart: the first
-    # has so few digits that its multiples are exact
-    apart = (
-        f"    V sum = a * ALL({1.0 / math.log(2.0)!r}) + {whole}, n = sum - {whole};\n"
+    # clang has a pragma for what gcc has an attribute for
+    no_reassociation = "\n#pragma clang fp reassociate(off)\n"
+    # adding and subtracting this number rounds to the nearest integer
+    round_constant = f"ALL({1.5 * 2.0**bits!r})"
+    # e^a = 2^n e^r with |r| <= log(2)/2. `half` is 2^(n-1), which cannot overflow, and `more` is
+    # 2 (e^r - 1). log 2 is split into two parts (Cody and Waite): multiples of the first, which has
+    # few digits, are exact
+    range_reduction = (
+        f"    V sum = a * ALL({1.0 / math.log(2.0)!r}) + {round_constant};\n"
+        f"    V n = sum - {round_constant};\n"
         "    V r = a - n * ALL(0.693359375);\n"
         "    r = r - n * ALL(-2.12194440054690583e-4);\n"
         f"    V half = (V)(((I)sum << {bits}) + ((INT){bias - 1} << {bits}));\n"
-        f"    V more = r * {_horner('r', *(2.0 / math.factorial(k + 1) for k in range(terms)))};\n"
+        f"    V more = r * {_write_horner('r', *exp_coefficients)};\n"
     )
     return {
         "exp": (
-            f"{head}v_exp(V a) {{{kept}{apart}"
+            f"{head}v_exp(V a) {{{no_reassociation}{range_reduction}"
             f"    V o = pick(a < ALL({-(bias - 1.5) * math.log(2.0)!r}), ALL(ZERO),"
             " half * (more + ALL(2)));\n"
-            f"    return pick(a > ALL({most!r}), ALL(INFINITY), o);\n}}\n"
+            f"    return pick(a > ALL({overflow!r}), ALL(INFINITY), o);\n}}\n"
         ),
-        # by e^2a - 1, all of whose digits are right where it is small
+        # by e^2a - 1, which is accurate for small arguments
         "tanh": (
-            f"{head}v_tanh(V x) {{{kept}"
+            f"{head}v_tanh(V x) {{{no_reassociation}"
             "    V a = ALL(2) * pick(x < ZERO, -x, x);\n"
-            f"    a = pick(a > ALL(50), ALL(50), a);\n{apart}"
+            f"    a = pick(a > ALL(50), ALL(50), a);\n{range_reduction}"
             "    V e = half * more + (ALL(2) * half - ONE), t = e / (e + ALL(2));\n"
             "    return pick(x < ZERO, -t, t);\n}\n"
         ),
-        # the logarithm of u = 1 + a = 2^n m with m around one, by that of (1 + t) / (1 - t), and
-        # what rounding took from u. A zero, less than that and infinity follow from u itself
+        # log(u) of u = 1 + a = 2^n m with m near 1 by the series of log((1 + t) / (1 - t)), with a
+        # correction `lost` for the rounding of u. Zero, negative and infinite u are special cases
         "log1p": (
-            f"{head}v_log1p(V a) {{{kept}"
+            f"{head}v_log1p(V a) {{{no_reassociation}"
             "    V u = a + ONE, lost = (a - (u - ONE)) / u;\n"
             f"    I n = ((I)u >> {bits}) - {bias};\n"
             f"    V m = (V)((I)u - (n << {bits}));\n"
@@ -122,7 +127,8 @@ def _at_once(terms: int, bits: int, bias: int, most: float, odd: int) -> dict[st
             "    m = pick(high, m * ALL(.5), m);\n"
             "    n = n - high;\n"
             "    V t = (m - ONE) / (m + ONE), s = t * t, whole = __builtin_convertvector(n, V);\n"
-            f"    V low = t * {_horner('s', *log)} + lost + whole * ALL(-2.12194440054690583e-4);\n"
+            f"    V low = t * {_write_horner('s', *log_coefficients)} + lost"
+            " + whole * ALL(-2.12194440054690583e-4);\n"
             "    V o = low + whole * ALL(0.693359375);\n"
             "    o = pick(u < ALL(INFINITY), o, u);\n"
             "    return pick(u > ZERO, o, pick(u < ZERO, ALL(NAN), u - ALL(INFINITY)));\n}\n"
@@ -130,34 +136,34 @@ def _at_once(terms: int, bits: int, bias: int, most: float, odd: int) -> dict[st
     }
 
 
-_AT_ONCE = {
-    torch.float32: _at_once(7, 23, 127, 89.0, 6),
-    torch.float64: _at_once(13, 52, 1023, 710.0, 12),
+_VECTOR_FUNCTIONS = {
+    torch.float32: _write_vector_functions(7, 23, 127, 89.0, 6),
+    torch.float64: _write_vector_functions(13, 52, 1023, 710.0, 12),
 }
-_SIDE_BY_SIDE = 8
-"""Sums of a product that are in registers at once, each an entry of its result."""
+_N_ACCUMULATORS = 8
+"""Accumulators of a matrix product that are kept in registers."""
 
 
-def _sums(count: int, entry: str) -> str:
-    """Return C that adds up so many entries of a product from j on, side by side."""
-    each = range(count)
-    cells = "".join(f" V c{q} = {{0}};" for q in each)
-    added = "".join(f" c{q} += v * {entry.format(q)};" for q in each)
-    stored = "".join(f" *(U *)(to + (j + {q}) * LANES) = c{q};" for q in each)
+def _write_accumulators(count: int, entry: str) -> str:
+    """Return a loop in C that computes this many entries of a product at once."""
+    indices = range(count)
+    declarations = "".join(f" V c{q} = {{0}};" for q in indices)
+    additions = "".join(f" c{q} += v * {entry.format(q)};" for q in indices)
+    stores = "".join(f" *(U *)(to + (j + {q}) * LANES) = c{q};" for q in indices)
     return (
-        f"    for (; j + {count} <= to_count; j += {count}) {{\n       {cells}\n"
+        f"    for (; j + {count} <= to_count; j += {count}) {{\n       {declarations}\n"
         f"        for (long i = 0; i < count; i++) {{\n"
-        f"            V v = *(const U *)(from + i * LANES);{added}\n        }}\n"
-        f"       {stored}\n    }}\n"
+        f"            V v = *(const U *)(from + i * LANES);{additions}\n        }}\n"
+        f"       {stores}\n    }}\n"
     )
 
 
-_CURVES = {
+_ACTIVATION_CODE = {
     "tanh": ("v_tanh(v)", "ONE - v * v"),
     "sigmoid": ("ONE / (ONE + v_exp(-v))", "v * (ONE - v)"),
 }
-"""Curves, and their slopes by the values of the curves."""
-_BEND = "".join(
+"""Activations in C, and their derivatives as functions of their values."""
+_ACTIVATION_LOOPS = "".join(
     f"static void times_{name}(const REAL *from, REAL *to, long count) {{\n"
     "    for (long i = 0; i < count * LANES; i += LANES) {\n"
     f"        V v = *(const U *)(from + i);\n        *(U *)(to + i) = {value};\n    }}\n}}\n"
@@ -165,23 +171,26 @@ _BEND = "".join(
     "    for (long i = 0; i < count * LANES; i += LANES) {\n"
     "        V v = *(const U *)(value + i);\n"
     f"        *(U *)(to + i) = *(const U *)(from + i) * ({slope});\n    }}\n}}\n"
-    for name, (value, slope) in _CURVES.items()
+    for name, (value, slope) in _ACTIVATION_CODE.items()
 )
-"""Curves of many numbers of a row, and the slopes of these numbers."""
-_PRODUCT = "".join(
+"""Loops over the units of a layer for activations and their vector-Jacobian products."""
+_MATRIX_PRODUCT_LOOPS = "".join(
     f"static __attribute__((noinline)) void {name}(const REAL *restrict table, long count,"
     " long to_count, const REAL *restrict from, REAL *restrict to) {\n"
-    "    long j = 0;\n" + _sums(_SIDE_BY_SIDE, entry) + _sums(1, entry) + "}\n"
+    "    long j = 0;\n"
+    + _write_accumulators(_N_ACCUMULATORS, entry)
+    + _write_accumulators(1, entry)
+    + "}\n"
     for name, entry in (
         ("times", "table[i * to_count + j + {0}]"),
         ("back_times", "table[(j + {0}) * count + i]"),
     )
 )
-"""Numbers [count] of a row times a matrix [count, to_count], and times the transposed of one."""
+"""Products of the vectors [count] of rows with a matrix [count, to_count] and its transpose."""
 
 
-def _prelude(dtype: torch.dtype) -> str:
-    """Return what stands at the top of a file in this precision."""
+def _write_prelude(dtype: torch.dtype) -> str:
+    """Return the definitions at the beginning of a C file in this precision."""
     single = dtype == torch.float32
     words = {
         "REAL": "float" if single else "double",
@@ -189,141 +198,157 @@ def _prelude(dtype: torch.dtype) -> str:
         "R(name)": "name##f" if single else "name",
     }
     defined = [f"#define {name} {text}\n" for name, text in words.items()]
-    functions = _ONE_BY_ONE | _AT_ONCE[dtype]
-    return "".join((*defined, _PRELUDE, *functions.values(), _PRODUCT, _BEND))
+    functions = _SCALAR_FUNCTIONS | _VECTOR_FUNCTIONS[dtype]
+    return "".join(
+        (*defined, _PRELUDE, *functions.values(), _MATRIX_PRODUCT_LOOPS, _ACTIVATION_LOOPS)
+    )
 
 
 Calls = Mapping[str, Sequence[tuple[str, str]]]
 
 
-class _Lanes(Body):
-    """Writes a function of single numbers for a block of `LANES` rows.
+class _LaneWriter(FunctionWriter):
+    """Writes a function of scalars in C for a block of `LANES` rows.
 
-    An entry of an argument or result stands so many numbers behind the one before it as `strides`
-    says, and the rows of an entry stand side by side. Numbers `theta` are shared by all rows.
+    The rows of an entry are contiguous; `strides` are the distances between entries. All rows share
+    the argument `theta`.
 
     Args:
-        function: to be written.
-        strides: of arguments and results, by name; `LANES` where not given.
-        calls: which arguments are made from a result once this is complete, and by which
-            statements; by the result's name.
+        function: the function.
+        strides: strides of arguments and results by name; the default is `LANES`.
+        calls: for each result, the arguments that are computed from it as soon as it is complete,
+            and the statements that compute them.
     """
 
     REAL, FLAG = "V", "I"
-    unrolled = math.inf
-    joined: Mapping[int, str] = {
+    max_unrolled_length = math.inf
+    logical: Mapping[int, str] = {
         ca.OP_NOT: "~{0}", ca.OP_AND: "{0} & {1}", ca.OP_OR: "{0} | {1}"
     }  # fmt: skip
 
     def __init__(self, function: ca.Function, strides: Mapping[str, str], calls: Calls) -> None:
         self.strides, self.calls = strides, calls
-        self.given = list(function.name_out())
-        super().__init__(function, Tables(""), _WHAT)
+        self.n_outputs = list(function.name_out())
+        super().__init__(function, Tables(""), _LABEL)
 
-    def literal(self, value: float) -> str:
-        return f"ALL({literal(value)})"
+    def write_literal(self, value: float) -> str:
+        return f"ALL({write_literal(value)})"
 
-    def place(self, name: str, place: int) -> str:
-        """Return where an entry stands."""
+    def matrix_index(self, name: str, place: int) -> str:
+        """Return the address of an entry."""
         return f"(U *)({name} + {place} * {self.strides.get(name, 'LANES')})"
 
-    def argument(self, name: str, place: int) -> str:
-        return f"ALL({name}[{place}])" if name == "theta" else f"(*{self.place(name, place)})"
+    def argument_expression(self, name: str, place: int) -> str:
+        return (
+            f"ALL({name}[{place}])" if name == "theta" else f"(*{self.matrix_index(name, place)})"
+        )
 
-    def put(self, result: int, column: Any) -> None:
-        super().put(result, column)
-        name, cells = self.given[result], self.results[result]
-        if name in self.calls and len(cells) == self.function.numel_out(result):
-            stored = [f"*{self.place(name, i)} = {cell};" for i, cell in enumerate(cells)]
-            for made, text in self.calls[name]:
-                self.lines.append((made, " ".join((*stored, text))))
-                stored = []
+    def store_result(self, result: int, column: Any) -> None:
+        super().store_result(result, column)
+        name, expressions = self.n_outputs[result], self.results[result]
+        if name in self.calls and len(expressions) == self.function.numel_out(result):
+            stores = [
+                f"*{self.matrix_index(name, i)} = {cell};" for i, cell in enumerate(expressions)
+            ]
+            for name_of_call, text in self.calls[name]:
+                self.lines.append((name_of_call, " ".join((*stores, text))))
+                stores = []
 
-    def real(self, cell: str, flag: bool) -> str:
+    def to_real(self, cell: str, flag: bool) -> str:
         return f"pick({cell}, ALL(ONE), ALL(ZERO))" if flag else cell
 
-    def truth(self, cell: str, flag: bool) -> str:
+    def to_truth(self, cell: str, flag: bool) -> str:
         return cell if flag else f"({cell} != ZERO)"
 
-    def pick(self, condition: str, value: str, alternative: str) -> str:
+    def conditional_expression(self, condition: str, value: str, alternative: str) -> str:
         return f"pick({condition}, {value}, {alternative})"
 
-    def call(self, name: str, row: Sequence[str]) -> str:
+    def call_expression(self, name: str, row: Sequence[str]) -> str:
         return f"v_{name}({', '.join(row)})"
 
 
-def _function(
+def _write_function(
     name: str,
     function: ca.Function,
     strides: Mapping[str, str],
     calls: Calls,
-    begun: Mapping[str, str],
-    added: Sequence[str] = (),
+    declarations: Mapping[str, str],
+    accumulated: Sequence[str] = (),
 ) -> str:
-    """Return the C function of a step for a block of rows.
+    """Return a C function of a step for a block of rows.
 
     Args:
-        name: of the function.
-        function: of single numbers.
-        strides, calls: as `_Lanes` has them.
-        begun: arguments and results that stand elsewhere, and the statement that says where.
-        added: results that are added to what stands there.
+        name: name of the C function.
+        function: function of scalars.
+        strides: as of `_LaneWriter`.
+        calls: as of `_LaneWriter`.
+        declarations: statements that declare arguments and results which are no parameters.
+        accumulated: results that are added to the present values.
     """
-    body = _Lanes(function, strides, calls)
-    ends = [f"(void){made};" for made, _ in chain(*calls.values())]
-    for result, cells in zip(function.name_out(), body.results, strict=True):
+    body = _LaneWriter(function, strides, calls)
+    stores = [f"(void){call_result};" for call_result, _ in chain(*calls.values())]
+    for result, expressions in zip(function.name_out(), body.results, strict=True):
         if result not in calls:
-            sign = "+=" if result in added else "="
-            ends += [
-                f"*{body.place(result, i)} {sign} {cell};"
-                for i, cell in enumerate(cells)
-                if result not in added or cell != body.zero
+            sign = "+=" if result in accumulated else "="
+            stores += [
+                f"*{body.matrix_index(result, i)} {sign} {cell};"
+                for i, cell in enumerate(expressions)
+                if result not in accumulated or cell != body.zero
             ]
-    given = [f"const REAL *restrict {one}" for one in body.names if one not in begun]
-    taken = [f"REAL *restrict {one}" for one in function.name_out() if one not in begun]
-    apart = "const REAL *tables, REAL *held, REAL *pulled, const long stride"
-    head = f"static void {name}({', '.join((*given, *taken, apart))})"
-    return head + " {\n" + "\n".join((*begun.values(), *body.read(ends))) + "\n}\n"
+    parameters = [f"const REAL *restrict {name}" for name in body.names if name not in declarations]
+    result_parameters = [
+        f"REAL *restrict {name}" for name in function.name_out() if name not in declarations
+    ]
+    common_parameters = "const REAL *tables, REAL *held, REAL *pulled, const long stride"
+    head = f"static void {name}({', '.join((*parameters, *result_parameters, common_parameters))})"
+    return (
+        head + " {\n" + "\n".join((*declarations.values(), *body.used_statements(stores))) + "\n}\n"
+    )
 
 
-def _source(
-    parts: Parts,
+def _write_source(
+    parts: StepParts,
     sizes: Mapping[str, int],
-    trained: Sequence[int] | None,
+    trained_indices: Sequence[int] | None,
     dtype: torch.dtype,
     *,
-    apart: bool,
+    has_row_gradients: bool,
 ) -> tuple[str, dict[str, slice], dict[str, slice]]:
-    """Return the source file with the functions `fly` and, where there is a gradient, `back`.
-
-    With it come the places of what a step keeps for its gradient, and of slopes of products.
+    """Write the C file with the functions `fly` (forward) and `back` (gradient).
 
     Args:
-        parts: of a step.
-        sizes: number of entries of each of its arguments, and `a` of what acts.
-        trained: places in `theta` that have a gradient; None where nothing has one.
+        parts: the split step.
+        sizes: number of entries of each argument, and `a` of the applied inputs.
+        trained_indices: indices in `theta` that have a gradient; None for no gradient.
         dtype: precision of the file.
-        apart: whether each row has a gradient of matrices for itself.
+        has_row_gradients: whether each row has its own gradient of the matrices.
+
+    Returns:
+        The source, the layout of what a step stores for its gradient, and the layout of the
+        cotangents of products.
     """
-    step = in_numbers(parts.function)
-    if not step.is_a("SXFunction") or step.n_instructions() > _LONGEST:
-        raise ExportError("a step too long, or with tables too long, to be written for many rows")
-    numbers = dict(enumerate(parts.products))
-    matrices = [k for k, one in numbers.items() if not one.curve]
-    tables = [0, *accumulate(one.numbers for one in parts.products)]
-    size = {
-        f"{name}_{k}{end}": one.rows * count
-        for k, one in numbers.items()
-        for name, count in (("product", one.given), ("factor", one.taken))
-        for end in ("", "_slope")
+    step = to_scalar_function(parts.function)
+    if not step.is_a("SXFunction") or step.n_instructions() > _MAX_INSTRUCTIONS:
+        raise ExportError(
+            f"the step has more than {_MAX_INSTRUCTIONS:,} operations or looks up a long table, so"
+            " that it is not compiled for many rows"
+        )
+    products = dict(enumerate(parts.products))
+    matrices = [k for k, product in products.items() if not product.activation]
+    table_offsets = [0, *accumulate(product.matrix_size for product in parts.products)]
+    sizes_by_name = {
+        f"{name}_{k}{suffix}": product.n_repeats * count
+        for k, product in products.items()
+        for name, count in (("product", product.n_outputs), ("factor", product.n_inputs))
+        for suffix in ("", "_slope")
     }
     strides = dict.fromkeys(
         ("x", "w", "s", "q", "own", "x_after", "s_after", "q_after", "a"), "stride"
     )
 
-    def laid(array: str, names: Sequence[str]) -> tuple[dict[str, slice], dict[str, str]]:
-        """Return places in an array of what is kept, and statements that say where it stands."""
-        ends = [0, *accumulate(size[name] for name in names)]
+    def lay_out(array: str, names: Sequence[str]) -> tuple[dict[str, slice], dict[str, str]]:
+        """Return the layout of quantities in an array, and declarations of pointers to them."""
+        ends = [0, *accumulate(sizes_by_name[name] for name in names)]
         return (
             {name: slice(*pair) for name, pair in zip(names, pairwise(ends), strict=True)},
             {
@@ -333,166 +358,212 @@ def _source(
         )
 
     def slope_of(k: int) -> str:
-        return first.get(name := f"product_{k}_slope", name)
+        return shared_slopes.get(name := f"product_{k}_slope", name)
 
     def local(name: str) -> str:
-        return f"REAL {name}[{size[name]} * LANES] __attribute__((aligned(BYTES)));"
+        return f"REAL {name}[{sizes_by_name[name]} * LANES] __attribute__((aligned(BYTES)));"
 
-    def calls(way: str, start: str, end: str) -> Calls:
-        found: dict[str, list[tuple[str, str]]] = {}
-        for k, one in numbers.items():
-            a, b = start.format(k), end.format(k)
-            a = first.get(a, a)
-            here, there = size[a] // one.rows, size[b] // one.rows
-            text = "".join(
-                f"{way}(tables + {tables[k]}, {here}, {there}, {a} + {r * here} * LANES,"
-                f" {b} + {r * there} * LANES);"
-                for r in range(one.rows)
+    def calls(function_name: str, start: str, suffix: str) -> Calls:
+        statements: dict[str, list[tuple[str, str]]] = {}
+        for k, product in products.items():
+            source, target = start.format(k), suffix.format(k)
+            source = shared_slopes.get(source, source)
+            n_source, n_target = (
+                sizes_by_name[source] // product.n_repeats,
+                sizes_by_name[target] // product.n_repeats,
             )
-            if one.curve:
-                value = "" if way == "times" else f"product_{k}, "
-                text = f"{way}_{one.curve}({value}{a}, {b}, {here});"
-            found.setdefault(a, []).append((b, text))
-        return found
+            text = "".join(
+                f"{function_name}(tables + {table_offsets[k]}, {n_source}, {n_target},"
+                f" {source} + {r * n_source} * LANES,"
+                f" {target} + {r * n_target} * LANES);"
+                for r in range(product.n_repeats)
+            )
+            if product.activation:
+                value = "" if function_name == "times" else f"product_{k}, "
+                text = (
+                    f"{function_name}_{product.activation}({value}{source}, {target}, {n_source});"
+                )
+            statements.setdefault(source, []).append((target, text))
+        return statements
 
-    held, pulled = dict[str, slice](), dict[str, slice]()
-    kept, first, back = dict[str, str](), dict[str, str](), list[str]()
-    if trained is not None:
-        alone = [k for k in matrices if numbers[k].rows == 1]
-        slope, first = _slope(step, sizes, len(numbers), trained, alone)
-        given = _symbols(slope)
-        whole = ca.veccat(*slope.call(given))
-        # products that slopes do not hang on, as those of an affine layer, are not kept
-        values = {f"product_{k}": bool(one.curve) for k, one in numbers.items()}
-        values |= {
-            name: values[name] or ca.depends_on(whole, one)
-            for name, one in zip(slope.name_in(), given, strict=True)
-            if name in values
+    forward_storage, backward_storage = dict[str, slice](), dict[str, slice]()
+    stored_pointers, shared_slopes, backward = dict[str, str](), dict[str, str](), list[str]()
+    if trained_indices is not None:
+        single_products = [k for k in matrices if products[k].n_repeats == 1]
+        slope_function, shared_slopes = _vector_jacobian_function(
+            step, sizes, len(products), trained_indices, single_products
+        )
+        symbols = _make_symbols(slope_function)
+        jacobian = ca.veccat(*slope_function.call(symbols))
+        # the gradient does not depend on products of affine layers: these are not stored
+        is_needed = {f"product_{k}": bool(product.activation) for k, product in products.items()}
+        is_needed |= {
+            name: is_needed[name] or ca.depends_on(jacobian, product)
+            for name, product in zip(slope_function.name_in(), symbols, strict=True)
+            if name in is_needed
         }
-        held, kept = laid(
+        forward_storage, stored_pointers = lay_out(
             "held",
-            [name for name, wanted in values.items() if wanted]
+            [name for name, needed in is_needed.items() if needed]
             + [f"factor_{k}" for k in sorted(matrices, key=slope_of)],
         )
-        pulled, begun = laid("pulled", [*dict.fromkeys(map(slope_of, matrices))])
-        pulled |= {f"product_{k}_slope": pulled[slope_of(k)] for k in matrices}
-        begun |= {name: kept.get(name, "") for name in values}
-        begun |= {n: local(n) for n in size if n.endswith("_slope") and n not in begun}
-        back = [
-            _function(
+        backward_storage, declarations = lay_out(
+            "pulled", [*dict.fromkeys(map(slope_of, matrices))]
+        )
+        backward_storage |= {f"product_{k}_slope": backward_storage[slope_of(k)] for k in matrices}
+        declarations |= {name: stored_pointers.get(name, "") for name in is_needed}
+        declarations |= {
+            n: local(n) for n in sizes_by_name if n.endswith("_slope") and n not in declarations
+        }
+        backward = [
+            _write_function(
                 "slope",
-                slope,
+                slope_function,
                 strides | dict.fromkeys(("x_slope", "a_slope", "x_before"), "stride"),
                 calls("back_times", "product_{}_slope", "factor_{}_slope"),
-                begun,
+                declarations,
                 ("x_before", "total"),
             )
         ]
-    forward = kept | {n: local(n) for n in size if n not in kept and not n.endswith("_slope")}
-    fly = _function(
+    forward = stored_pointers | {
+        n: local(n) for n in sizes_by_name if n not in stored_pointers and not n.endswith("_slope")
+    }
+    step_code = _write_function(
         "step",
-        _flowing(step, len(numbers)),
+        _forward_function(step, len(products)),
         strides,
         calls("times", "factor_{}", "product_{}"),
         forward,
     )
-    plain = len(trained or ())
+    n_theta = len(trained_indices or ())
     outer = "".join(
-        f"outer(KEPT(held, N_HELD, k) + {held[f'factor_{k}'].start + r * one.taken} * LANES,"
-        f" {one.taken}, KEPT(pulled, N_PULLED, k)"
-        f" + {pulled[f'product_{k}_slope'].start + r * one.given} * LANES, {one.given},"
-        f" total + at * N_TOTAL + {plain + tables[k]} * LANES);\n"
-        for k, one in numbers.items()
-        for r in range(one.rows)
-        if apart and not one.curve
+        "outer(KEPT(held, N_HELD, k)"
+        f" + {forward_storage[f'factor_{k}'].start + r * product.n_inputs} * LANES,"
+        f" {product.n_inputs}, KEPT(pulled, N_PULLED, k)"
+        f" + {backward_storage[f'product_{k}_slope'].start + r * product.n_outputs} * LANES,"
+        f" {product.n_outputs},"
+        f" total + at * N_TOTAL + {n_theta + table_offsets[k]} * LANES);\n"
+        for k, product in products.items()
+        for r in range(product.n_repeats)
+        if has_row_gradients and not product.activation
     )
     counts = dict(sizes) | {
-        "held": _end(held),
-        "pulled": _end(pulled),
-        "total": plain + apart * tables[-1],
+        "held": _storage_size(forward_storage),
+        "pulled": _storage_size(backward_storage),
+        "total": n_theta + has_row_gradients * table_offsets[-1],
     }
     text = "".join(f"#define N_{name.upper()} {value}L\n" for name, value in counts.items())
-    if trained is not None:
-        back.append(BACK.replace("OUTER\n", outer))
-    return "".join((_prelude(dtype), text, fly, *back[:1], FLY, *back[1:])), held, pulled
+    if trained_indices is not None:
+        backward.append(BACKWARD_LOOP.replace("OUTER\n", outer))
+    return (
+        "".join(
+            (_write_prelude(dtype), text, step_code, *backward[:1], FORWARD_LOOP, *backward[1:])
+        ),
+        forward_storage,
+        backward_storage,
+    )
 
 
-_GIVEN = ("x", "w", "s", "q", "own", "theta")
+_STEP_ARGUMENTS = ("x", "w", "s", "q", "own", "theta")
 
 
-def _symbols(step: ca.Function) -> list[ca.SX]:
+def _make_symbols(step: ca.Function) -> list[ca.SX]:
     return [ca.SX.sym(name, step.numel_in(name)) for name in step.name_in()]
 
 
-def _known(found: ca.SX, apart: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.SX:
-    """Return an expression with what a step detaches put in."""
-    # what is detached may hang on what was detached before it
-    for symbol, value in zip(reversed(apart), reversed(values), strict=True):
-        found = ca.substitute(found, symbol, value)
-    return ca.densify(found)
+def _substitute_detached(
+    expression: ca.SX, symbols: Sequence[ca.SX], values: Sequence[ca.SX]
+) -> ca.SX:
+    """Return an expression with the values that a step detaches."""
+    # a detached value may depend on earlier ones
+    for symbol, value in zip(reversed(symbols), reversed(values), strict=True):
+        expression = ca.substitute(expression, symbol, value)
+    return ca.densify(expression)
 
 
-def _flowing(step: ca.Function, products: int) -> ca.Function:
-    """Return a step that computes what it detaches."""
-    given = _symbols(step)
-    inside = len(_GIVEN) + products
-    names = step.name_out()[: products + len(_HANDED_ON) + 1]
-    found = step.call(given)
-    parts = [_known(one, given[inside:], found[len(names) :]) for one in found[: len(names)]]
-    return ca.Function("step", given[:inside], ca.cse(parts), step.name_in()[:inside], names)
+def _forward_function(step: ca.Function, products: int) -> ca.Function:
+    """Return the step as a function that also computes the values it detaches."""
+    symbols = _make_symbols(step)
+    n_arguments = len(_STEP_ARGUMENTS) + products
+    names = step.name_out()[: products + len(_CARRIED) + 1]
+    outputs = step.call(symbols)
+    parts = [
+        _substitute_detached(output, symbols[n_arguments:], outputs[len(names) :])
+        for output in outputs[: len(names)]
+    ]
+    return ca.Function(
+        "step", symbols[:n_arguments], ca.cse(parts), step.name_in()[:n_arguments], names
+    )
 
 
-def _slope(
+def _vector_jacobian_function(
     step: ca.Function,
     sizes: Mapping[str, int],
-    products: int,
-    trained: Sequence[int],
-    alone: Sequence[int],
+    n_products: int,
+    trained_indices: Sequence[int],
+    single_products: Sequence[int],
 ) -> tuple[ca.Function, dict[str, str]]:
-    """Return the product of a step's Jacobian with the slopes of what it gives.
+    """Return the vector-Jacobian product of a step.
 
-    The slopes of a product need those of the factors of later ones alone, and stand in that order.
-    Products that are added up have their slopes in common: of those in `alone`, slopes that are the
-    same are told once, and the second of what is returned says by the name of which product.
+    The cotangent of a product depends on the cotangents of the factors of later products alone; the
+    results are in this order. Products that are added have equal cotangents, which are computed
+    once.
+
+    Args:
+        step: the step as a function of scalars.
+        sizes: number of entries of each argument.
+        n_products: number of products.
+        trained_indices: indices in `theta` that have a gradient.
+        single_products: products of one vector per row, whose equal cotangents are merged.
+
+    Returns:
+        The function, and for each cotangent of a product the name of the one that represents it.
     """
-    given = _symbols(step)
-    inside = len(_GIVEN) + products
-    x, _, s, q, _, theta, *made = given[:inside]
-    found = step.call(given)
-    factors, results = found[:products], found[products : products + len(_HANDED_ON) + 1]
-    slopes = [ca.SX.sym(f"{name}_slope", sizes[name]) for name in (*_HANDED_ON, "a")]
-    inner = [ca.SX.sym(f"factor_{k}_slope", one.numel()) for k, one in enumerate(factors)]
-    known = [*made, x, s, q, theta[list(trained)]]
-    pulled = ca.jtimes(
-        ca.vertcat(*results, *factors), ca.vertcat(*known), ca.vertcat(*slopes, *inner), True
+    symbols = _make_symbols(step)
+    n_arguments = len(_STEP_ARGUMENTS) + n_products
+    x, _, s, q, _, theta, *product_values = symbols[:n_arguments]
+    outputs = step.call(symbols)
+    factors, results = outputs[:n_products], outputs[n_products : n_products + len(_CARRIED) + 1]
+    slopes = [ca.SX.sym(f"{name}_slope", sizes[name]) for name in (*_CARRIED, "a")]
+    factor_slopes = [ca.SX.sym(f"factor_{k}_slope", part.numel()) for k, part in enumerate(factors)]
+    variables = [*product_values, x, s, q, theta[list(trained_indices)]]
+    pullback = ca.jtimes(
+        ca.vertcat(*results, *factors),
+        ca.vertcat(*variables),
+        ca.vertcat(*slopes, *factor_slopes),
+        True,
     )
-    pulled = _known(pulled, given[inside:], found[products + len(results) :])
-    places = np.cumsum([0, *(one.numel() for one in known)]).tolist()
-    parts = [pulled[a:b] for a, b in pairwise(places)]
-    order = [*range(products)[::-1], *range(products, len(parts))]
-    names = [f"product_{k}_slope" for k in range(products)]
-    names += [*(f"{name}_before" for name in _HANDED_ON), "total"]
-    whole = dict(zip((names[k] for k in order), ca.cse([parts[k] for k in order]), strict=True))
-    first, seen = dict[str, str](), dict[tuple[int, ...], str]()
-    for name in (names[k] for k in order if k in alone):
-        cells = tuple(cell.element_hash() for cell in whole[name].elements())
-        first[name] = seen.setdefault(cells, name)
-    told = [name for name in whole if first.get(name, name) == name]
+    pullback = _substitute_detached(
+        pullback, symbols[n_arguments:], outputs[n_products + len(results) :]
+    )
+    offsets = np.cumsum([0, *(part.numel() for part in variables)]).tolist()
+    parts = [pullback[a:b] for a, b in pairwise(offsets)]
+    order = [*range(n_products)[::-1], *range(n_products, len(parts))]
+    names = [f"product_{k}_slope" for k in range(n_products)]
+    names += [*(f"{name}_before" for name in _CARRIED), "total"]
+    slope_of_name = dict(
+        zip((names[k] for k in order), ca.cse([parts[k] for k in order]), strict=True)
+    )
+    representative, name_of_hash = dict[str, str](), dict[tuple[int, ...], str]()
+    for name in (names[k] for k in order if k in single_products):
+        hashes = tuple(cell.element_hash() for cell in slope_of_name[name].elements())
+        representative[name] = name_of_hash.setdefault(hashes, name)
+    result_names = [name for name in slope_of_name if representative.get(name, name) == name]
     function = ca.Function(
         "slope",
-        [*given[:inside], *slopes, *inner],
-        [whole[name] for name in told],
+        [*symbols[:n_arguments], *slopes, *factor_slopes],
+        [slope_of_name[name] for name in result_names],
         [
-            *step.name_in()[:inside],
-            *(f"{name}_slope" for name in (*_HANDED_ON, "a")),
-            *(f"factor_{k}_slope" for k in range(products)),
+            *step.name_in()[:n_arguments],
+            *(f"{name}_slope" for name in (*_CARRIED, "a")),
+            *(f"factor_{k}_slope" for k in range(n_products)),
         ],
-        told,
+        result_names,
     )
-    return function, first
+    return function, representative
 
 
-class _Step(nn.Module):
+class _RolloutStep(nn.Module):
     """One step of a rollout."""
 
     def __init__(self, rollout: Rollout) -> None:
@@ -500,33 +571,36 @@ class _Step(nn.Module):
         self.rollout = rollout
 
     def forward(self, x: Tensor, w: Tensor, s: Tensor, q: Tensor) -> tuple[Tensor, ...]:
-        """Return state, memory of the vessel, memory of the source, and what acted.
+        """Return state, memory of the model, memory of the source, and applied inputs.
 
-        Inputs that are given are not told again.
+        Applied inputs are left out where they are the given ones.
         """
         acting, q = self.rollout.source(x, w, 0, q)
         x, s = self.rollout.model.step(x, acting, s)
-        return x, s, q, acting[:, :0] if self.rollout.source.given else acting
+        return x, s, q, acting[:, :0] if self.rollout.source.is_playback else acting
 
 
 @final
 class CompiledRollout:
-    """The free runs of a rollout, with a gradient for what is trained, the start and the memory.
+    """A rollout as compiled C, with gradients by parameters, initial states and memory.
 
-    There is none where torch's gradients are switched off while this is made, or nothing is
-    trained.
+    It has no gradient if torch's gradients are disabled when it is made, or no parameter requires
+    one.
 
     Args:
-        rollout: whose source does not count steps. Its numbers may change between runs.
-        x, w, s: examples of its arguments, [B, nx], [B, T, m] and [B, n], in the precision of runs.
-        own: names of parameters and buffers [B, ...] that every row has for itself; there is no
-            gradient for them.
-        most: how much of what is asked of a row reaches its gradient, as a multiple of the median
-            over rows. A loop that is at the edge of swinging has flights whose gradients are
-            millions of times as large as those of others.
+        rollout: its source must not depend on the number of the step. Parameters and buffers may
+            change between runs.
+        x: example of the initial states [B, nx], in the precision of the runs.
+        w: example of the inputs [B, T, m].
+        s: example of the memory [B, n].
+        row_tensors: names of parameters and buffers [B, ...] that differ from row to row; they have
+            no gradient.
+        max_gradient_ratio: largest ratio of a row's gradient to its cotangent, as a multiple of the
+            median over rows; larger gradients are scaled down. Rows of a marginally stable loop
+            can have gradients that are millions of times as large as those of others.
 
     Raises:
-        ExportError: where a step cannot be recorded or written, or no C compiler does its work.
+        ExportError: where a step cannot be traced or written in C, or compilation fails.
     """
 
     def __init__(
@@ -536,365 +610,324 @@ class CompiledRollout:
         w: Tensor,
         s: Tensor,
         *,
-        own: Sequence[str] = (),
-        most: float = math.inf,
+        row_tensors: Sequence[str] = (),
+        max_gradient_ratio: float = math.inf,
     ) -> None:
-        self.rollout, self.dtype, self.own = rollout, x.dtype, tuple(own)
-        self.most = math.inf
-        alone = copy.deepcopy(rollout).double()
-        held = _numbers(alone)
-        self.shared = [
-            name for name, part in held.items() if name not in self.own and part.is_floating_point()
+        self.rollout = rollout
+        self.row_tensor_names = tuple(row_tensors)
+        self.max_gradient_ratio = max_gradient_ratio
+        reference = copy.deepcopy(rollout).double()
+        tensors = _named_tensors(reference)
+        self.shared_names = [
+            name
+            for name, part in tensors.items()
+            if name not in self.row_tensor_names and part.is_floating_point()
         ]
-        trained = torch.is_grad_enabled() and any(held[name].requires_grad for name in self.shared)
-        self.apart = trained and not math.isinf(most)
-        one = _Step(alone)
-        own_shapes = [held[name][:1].shape for name in self.own]
+        is_trained = torch.is_grad_enabled() and any(
+            tensors[name].requires_grad for name in self.shared_names
+        )
+        self.has_row_gradients = is_trained and not math.isinf(max_gradient_ratio)
+        step_module = _RolloutStep(reference)
+        row_shapes = [tensors[name][:1].shape for name in self.row_tensor_names]
 
-        def step(x: Tensor, w: Tensor, s: Tensor, q: Tensor, own: Tensor, *shared: Tensor) -> Any:
-            weights = dict(zip(self.shared, shared, strict=True))
-            pieces = own[0].split([shape.numel() for shape in own_shapes])
-            for name, shape, piece in zip(self.own, own_shapes, pieces, strict=True):
-                weights[name] = piece.reshape(shape)
-            return _called(one, weights, (x, w, s, q))
+        def step(
+            x: Tensor, w: Tensor, s: Tensor, q: Tensor, row_values: Tensor, *shared: Tensor
+        ) -> Any:
+            weights = dict(zip(self.shared_names, shared, strict=True))
+            row_parts = row_values[0].split([shape.numel() for shape in row_shapes])
+            for name, shape, row_part in zip(
+                self.row_tensor_names, row_shapes, row_parts, strict=True
+            ):
+                weights[name] = row_part.reshape(shape)
+            return _call_with_tensors(step_module, weights, (x, w, s, q))
 
         rows = [("x", x[:1].double()), ("w", w[:1, 0].double()), ("s", s[:1].double())]
         with torch.no_grad():
-            # a source whose rows have numbers of their own flies as many rows
-            q = alone.source.initial(x.double())
-            acting = alone.source(x.double(), w[:, 0].double(), 0, q)[0]
-        rows += [("q", q[:1]), ("own", self._own(held, 1).double())]
-        shared = [held[name].detach() for name in self.shared]
-        names = [f"{name}_after" for name in _HANDED_ON]
-        self.parts = in_parts(step, rows, shared, [*names, "a"], _WHAT)
+            # a source with tensors per row accepts only as many rows
+            q = reference.source.initial(x.double())
+            acting = reference.source(x.double(), w[:, 0].double(), 0, q)[0]
+        rows += [("q", q[:1]), ("own", self._row_tensors(tensors, 1).double())]
+        shared = [tensors[name].detach() for name in self.shared_names]
+        names = [f"{name}_after" for name in _CARRIED]
+        self.parts = split_step(step, rows, shared, [*names, "a"], _LABEL)
         self.sizes = {name: example.shape[1] for name, example in rows}
-        self.sizes["a"] = 0 if rollout.source.given else acting.shape[1]
-        self.trained: list[int] | None = None
-        if trained:
-            # what follows from numbers that are not trained has no gradient
-            self.trained, begin = [], 0
+        self.sizes["a"] = 0 if rollout.source.is_playback else acting.shape[1]
+        self.trained_indices: list[int] | None = None
+        if is_trained:
+            # entries of theta that depend on no trained parameter have no gradient
+            self.trained_indices, offset = [], 0
             with torch.enable_grad():
-                found = self.parts.prepare(*(held[name] for name in self.shared))
-            for part in (found[k] for k in self.parts.plain):
-                self.trained += range(begin, begin + part.numel()) if part.requires_grad else ()
-                begin += part.numel()
-        self._made(x.dtype)
-        self._check(alone, x[:_ROWS], w[:_ROWS], s[:_ROWS])
-        self.most = most
+                prepared = self.parts.prepare(*(tensors[name] for name in self.shared_names))
+            for part in (prepared[k] for k in self.parts.theta_indices):
+                self.trained_indices += (
+                    range(offset, offset + part.numel()) if part.requires_grad else ()
+                )
+                offset += part.numel()
 
-    def _made(self, dtype: torch.dtype, *, quick: bool = False) -> None:
-        source, self.held, self.pulled = _source(
-            self.parts, self.sizes, self.trained, dtype, apart=self.apart
+        self.dtype = x.dtype
+        source, self.forward_storage, self.backward_storage = _write_source(
+            self.parts,
+            self.sizes,
+            self.trained_indices,
+            self.dtype,
+            has_row_gradients=self.has_row_gradients,
         )
-        self.dtype, self.library = dtype, compiled_library(source, quick=quick)
-        self.lanes = ctypes.c_long.in_dll(self.library, "lanes").value
+        self.library = load_library(source)
+        self.n_lanes = ctypes.c_long.in_dll(self.library, "lanes").value
 
-    def of(self, rollout: Rollout) -> CompiledRollout:
-        """Return the free runs of a rollout that differs in its numbers alone."""
-        other = copy.copy(self)
-        other.rollout = rollout
-        return other
+    def with_rollout(self, rollout: Rollout) -> CompiledRollout:
+        """Return the compiled rollout for a rollout of equal structure with other parameters."""
+        compiled = copy.copy(self)
+        compiled.rollout = rollout
+        return compiled
 
-    def _own(self, held: Mapping[str, Tensor], count: int) -> Tensor:
-        """Return the numbers [count, n] that every row has for itself."""
-        parts = [held[name].detach()[:count].reshape(count, -1) for name in self.own]
-        return torch.cat([torch.zeros(count, 0), *parts], dim=1)
+    def _row_tensors(self, tensors: Mapping[str, Tensor], n_rows: int) -> Tensor:
+        """Return the tensors that differ from row to row, flattened [n_rows, n]."""
+        parts = [
+            tensors[name].detach()[:n_rows].reshape(n_rows, -1) for name in self.row_tensor_names
+        ]
+        return torch.cat([torch.zeros(n_rows, 0), *parts], dim=1)
 
-    def prepared(self, held: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Return what follows from the shared numbers: `theta`, and the tables of products."""
-        found = self.parts.prepare(*(held[name].double() for name in self.shared))
-        return _flat([found[k] for k in self.parts.plain]).to(self.dtype), _flat(
+    def prepare_tables(self, tensors: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return `theta` and the matrices of products, from parameters and buffers."""
+        prepared = self.parts.prepare(*(tensors[name].double() for name in self.shared_names))
+        return _concatenate([prepared[k] for k in self.parts.theta_indices]).to(
+            self.dtype
+        ), _concatenate(
             [
-                found[one.place].reshape(-1, one.taken, one.given)[one.member]
-                for one in self.parts.products
-                if not one.curve
+                prepared[product.matrix_index].reshape(-1, product.n_inputs, product.n_outputs)[
+                    product.matrix_member
+                ]
+                for product in self.parts.products
+                if not product.activation
             ]
         ).to(self.dtype)
 
     def __call__(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return states, inputs that acted and the last memory, as the rollout does."""
-        held = _numbers(self.rollout)
-        rows = self._own(held, len(x) if self.own else 1).expand(len(x), -1)
+        """Return states, applied inputs and the final memory, as `Rollout.forward`."""
+        tensors = _named_tensors(self.rollout)
+        rows = self._row_tensors(tensors, len(x) if self.row_tensor_names else 1).expand(len(x), -1)
         q = self.rollout.source.initial(x)
-        with torch.set_grad_enabled(self.trained is not None and torch.is_grad_enabled()):
-            theta, tables = self.prepared(held)
-            states, acted, after = self.flown(theta, tables, x, s, rows, w, q)
-        return states, w if self.rollout.source.given else acted, after
+        with torch.set_grad_enabled(self.trained_indices is not None and torch.is_grad_enabled()):
+            theta, tables = self.prepare_tables(tensors)
+            states, applied_inputs, memory = self.simulate(theta, tables, x, s, rows, w, q)
+        return states, w if self.rollout.source.is_playback else applied_inputs, memory
 
-    def flown(self, *given: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return states, inputs and the last memory; the arguments are those of `_Flight`."""
+    def simulate(self, *arguments: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return states, inputs and the final memory; arguments as of `_CompiledRun`."""
         if not torch.is_grad_enabled():
-            return self.fly(*given, keep=False)[0]
-        apply: Any = _Flight.apply
-        found: tuple[Tensor, Tensor, Tensor] = apply(*given, self)
-        return found
+            return self.run_forward(*arguments, keep_history=False)[0]
+        apply: Any = _CompiledRun.apply
+        result: tuple[Tensor, Tensor, Tensor] = apply(*arguments, self)
+        return result
 
-    def fly(
+    def run_forward(
         self,
         theta: Tensor,
         tables: Tensor,
         x: Tensor,
         s: Tensor,
-        own: Tensor,
+        row_values: Tensor,
         w: Tensor,
         q: Tensor,
         *,
-        keep: bool,
+        keep_history: bool,
     ) -> tuple[tuple[Tensor, Tensor, Tensor], list[Tensor]]:
-        """Return states, inputs and the last memory of runs, and all that is known of each step.
+        """Run forward.
 
-        The latter stand with the rows last, padded to whole blocks: `theta`, tables, own numbers,
-        states, inputs and both memories; and, block by block, what a step keeps for its gradient.
+        Returns:
+            States, inputs and final memory; and the arguments of the gradient: `theta`, tables,
+            row tensors, states, inputs and both memories with the rows last, padded to whole
+            blocks, and block by block what a step stores.
         """
-        count, steps = w.shape[:2]
-        blocks = -(-count // self.lanes)
-        width = blocks * self.lanes
-        # rows that fill up the last block repeat the last one
-        places = torch.arange(width).clamp(max=count - 1)
+        n_rows, n_steps = w.shape[:2]
+        n_blocks = -(-n_rows // self.n_lanes)
+        n_padded = n_blocks * self.n_lanes
+        # the last block is padded with copies of the last row
+        row_indices = torch.arange(n_padded).clamp(max=n_rows - 1)
 
-        def filled(part: Tensor) -> Tensor:
+        def pad_rows(part: Tensor) -> Tensor:
             part = part.detach().to(self.dtype)
-            return part if width == count else part[places]
+            return part if n_padded == n_rows else part[row_indices]
 
-        def room(*sizes: int) -> Tensor:
-            return torch.empty(*sizes, width, dtype=self.dtype)
+        def empty(*sizes: int) -> Tensor:
+            return torch.empty(*sizes, n_padded, dtype=self.dtype)
 
-        states = room(steps + 1, self.sizes["x"])
-        memories = [room(steps + 1 if keep else 2, self.sizes[name]) for name in ("s", "q")]
-        for whole, start in zip((states, *memories), (x, s, q), strict=True):
-            whole[0] = filled(start).T
-        inputs = filled(w).permute(1, 2, 0).contiguous()
-        acting = room(steps, self.sizes["a"])
-        held = self.kept(blocks, steps if keep else 0, self.held)
-        rows = filled(own).T.contiguous()
-        known = [theta.detach(), tables.detach(), rows, states, inputs, *memories]
-        self.run("fly", blocks, *known, acting, held, int(keep), steps, width)
-        last = memories[0][steps if keep else steps & 1]
-        found = (
-            states.permute(2, 0, 1)[:count],
-            acting.permute(2, 0, 1)[:count],
-            last.T[:count],
+        states = empty(n_steps + 1, self.sizes["x"])
+        memories = [
+            empty(n_steps + 1 if keep_history else 2, self.sizes[name]) for name in ("s", "q")
+        ]
+        for history, initial in zip((states, *memories), (x, s, q), strict=True):
+            history[0] = pad_rows(initial).T
+        inputs = pad_rows(w).permute(1, 2, 0).contiguous()
+        applied = empty(n_steps, self.sizes["a"])
+        stored = self.allocate(n_blocks, n_steps if keep_history else 0, self.forward_storage)
+        rows = pad_rows(row_values).T.contiguous()
+        tensors = [theta.detach(), tables.detach(), rows, states, inputs, *memories]
+        self.call_library(
+            "fly", n_blocks, *tensors, applied, stored, int(keep_history), n_steps, n_padded
         )
-        return found, [*known, held]
+        final_memory = memories[0][n_steps if keep_history else n_steps & 1]
+        result = (
+            states.permute(2, 0, 1)[:n_rows],
+            applied.permute(2, 0, 1)[:n_rows],
+            final_memory.T[:n_rows],
+        )
+        return result, [*tensors, stored]
 
-    def kept(self, blocks: int, steps: int, places: Mapping[str, slice]) -> Tensor:
-        """Return room for what stands at these places, block by block and step by step."""
-        return torch.empty(blocks * steps, _end(places), self.lanes, dtype=self.dtype)
+    def allocate(self, n_blocks: int, n_steps: int, layout: Mapping[str, slice]) -> Tensor:
+        """Return uninitialised storage of a layout for each block and step."""
+        return torch.empty(
+            n_blocks * n_steps, _storage_size(layout), self.n_lanes, dtype=self.dtype
+        )
 
-    def run(self, name: str, blocks: int, *arguments: Tensor | int) -> None:
-        """Call a function of the library for all blocks of rows, spread over free cores."""
+    def call_library(self, name: str, n_blocks: int, *arguments: Tensor | int) -> None:
+        """Call a function of the library for all blocks, in parallel on idle cores."""
         function = getattr(self.library, name)
-        given = [
+        values = [
             ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else ctypes.c_long(a)
             for a in arguments
         ]
-        parts = min(max(torch.get_num_threads(), available_cores()), blocks)
-        ends = [ctypes.c_long(blocks * k // parts) for k in range(parts + 1)]
-        if parts == 1:
-            function(*given, *ends)
+        n_threads = min(max(torch.get_num_threads(), available_cores()), n_blocks)
+        boundaries = [ctypes.c_long(n_blocks * k // n_threads) for k in range(n_threads + 1)]
+        if n_threads == 1:
+            function(*values, *boundaries)
             return
-        with ThreadPoolExecutor(parts) as pool:
-            list(pool.map(lambda part: function(*given, *part), pairwise(ends)))
-
-    def _check(self, alone: Rollout, x: Tensor, w: Tensor, s: Tensor) -> None:
-        """Compare a few steps from all that runs visit, and their gradient, with the rollout's own.
-
-        Rounding doubles from step to step where a law is steep, and tells nothing then: the text of
-        the library is compared in double precision, from equal states.
-
-        Args:
-            alone: the rollout in double precision.
-            x, w, s: of some runs.
-
-        Raises:
-            ExportError: where they differ by more than the precision explains.
-        """
-        step = _Step(alone)
-        held = {name: part.detach() for name, part in _numbers(alone).items()}
-        for name in self.own:
-            held[name] = held[name][: len(x)]
-
-        def flown(*start: Tensor, taken: Tensor, numbers: dict[str, Tensor]) -> list[Any]:
-            """Return x, s and q at every step, and what acted."""
-            states, acted = [tuple(start)], []
-            for k in range(taken.shape[1]):
-                x, s, q = states[-1]
-                *after, acting = _called(step, numbers, (x, taken[:, k], s, q))
-                states.append(tuple(after))
-                acted.append(acting)
-            return [*zip(*states, strict=True), acted]
-
-        count = min(_VISITED, w.shape[1])
-        w, x, s = w[:, :count].double(), x.double(), s.double()
-        with torch.no_grad():
-            seen = flown(x, s, alone.source.initial(x), taken=w, numbers=held)
-        # the rows of a visited step are one run each, under the inputs that came next
-        last = max(count - _STEPS, 0) + 1
-        starts = [torch.cat(parts[:last]) for parts in seen[:3]]
-        taken = torch.cat([w[:, k : k + _STEPS] for k in range(last)])
-        many = {name: held[name].repeat(last, *[1] * (held[name].dim() - 1)) for name in self.own}
-        wanted = {name: p for name, p in alone.named_parameters() if p.requires_grad}
-        weights = {name: held[name].requires_grad_() for name in self.shared if name in wanted}
-        rows = torch.cat(
-            [torch.zeros(len(taken), 0), *(part.reshape(len(taken), -1) for part in many.values())],
-            dim=1,
-        )
-
-        def offs(fly: Any) -> tuple[list[Tensor], list[Tensor]]:
-            """Return states, inputs and the gradient by the rollout's own steps, and by others."""
-            states, memory, _, acted = flown(*starts, taken=taken, numbers=held | many | weights)
-            pair = []
-            for found in ((torch.stack(states, 1), torch.stack(acted, 1), memory[-1]), fly()):
-                parts = list(found)
-                if self.trained is not None:
-                    cost = sum(part.double().square().mean() for part in parts if part.numel())
-                    slopes = torch.autograd.grad(
-                        torch.as_tensor(cost), list(weights.values()), allow_unused=True
-                    )
-                    parts += [slope for slope in slopes if slope is not None]
-                pair.append([part.detach().double() for part in parts])
-            return pair[0], pair[1]
-
-        def fly(loop: CompiledRollout) -> tuple[Tensor, Tensor, Tensor]:
-            theta, tables = loop.prepared(held | weights)
-            x, s, q, taken_, own = (
-                part.to(loop.dtype) for part in (starts[0], starts[1], starts[2], taken, rows)
+        with ThreadPoolExecutor(n_threads) as pool:
+            list(
+                pool.map(lambda block_range: function(*values, *block_range), pairwise(boundaries))
             )
-            return loop.flown(theta, tables, x, s, own, taken_, q)
-
-        with torch.set_grad_enabled(self.trained is not None):
-            slow, quick = offs(lambda: fly(self))
-            if _off(quick, slow) <= (_SAME if self.dtype == torch.float64 else _CLOSE):
-                return
-            exact = copy.copy(self)
-            exact._made(torch.float64, quick=True)
-            slow, fast = offs(lambda: fly(exact))
-            # rounding moves single rows far, a fault most of them
-            usual = [
-                ((a - b).abs().flatten(1).amax(1).median() / _size(b)).item()
-                for a, b in zip(quick[:2], fast[:2], strict=True)
-                if b.numel()
-            ]
-        off = max(_off(fast, slow), max(usual) * (_SAME / _ROUNDED))
-        if not off <= _SAME:
-            raise ExportError(f"the compiled rollout is off by {off:.2g} of its size")
 
 
-_CLOSE = 1e-4
-"""How far single precision may be off without a look at the same in double precision."""
-
-
-def _size(wanted: Tensor) -> Tensor:
-    return wanted.abs().max().clamp(min=1e-9)
-
-
-def _off(found: Sequence[Tensor], wanted: Sequence[Tensor]) -> float:
-    """Return the largest difference in shares of what is wanted; gradients are one of them."""
-    pairs = [(a, b) for a, b in zip(found[:3], wanted[:3], strict=True) if b.numel()]
-    if found[3:]:
-        pairs.append((_flat(found[3:]), _flat(wanted[3:])))
-    offs = [float((a - b).abs().max() / _size(b)) for a, b in pairs]
-    return max((math.inf if math.isnan(one) else one for one in offs), default=0.0)
-
-
-class _Flight(torch.autograd.Function):
-    """Free runs in C, and their gradient for shared numbers, start and memory."""
+class _CompiledRun(torch.autograd.Function):
+    """The compiled rollout as an operation of torch with a gradient."""
 
     @staticmethod
-    def forward(ctx: Any, *given: Any) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
         """Return states [B, T+1, nx], inputs [B, T, m] and the last memory [B, n].
 
-        The arguments are theta, tables, x, s, own numbers, w, q, and the compiled rollout.
+        The arguments are theta, tables, x, s, row tensors, w, q, and the compiled rollout.
         """
-        *parts, loop = given
-        found: tuple[Tensor, Tensor, Tensor]
-        found, known = loop.fly(*parts, keep=True)
-        ctx.loop, ctx.rows = loop, len(found[0])
-        ctx.save_for_backward(*known)
-        return found
+        *tensors, compiled = arguments
+        result: tuple[Tensor, Tensor, Tensor]
+        result, history = compiled.run_forward(*tensors, keep_history=True)
+        ctx.loop, ctx.n_repeats = compiled, len(result[0])
+        ctx.save_for_backward(*history)
+        return result
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         """Return the gradient of theta, tables, x and s."""
-        known, loop, count = ctx.saved_tensors, ctx.loop, ctx.rows
-        steps, _, width = known[4].shape
-        given = []
+        history, compiled, n_rows = ctx.saved_tensors, ctx.loop, ctx.n_repeats
+        n_steps, _, n_padded = history[4].shape
+        cotangents = []
         for grad in (grads[0], grads[1], grads[2][:, None]):
-            whole = torch.zeros(*grad.shape[1:], width, dtype=loop.dtype)
-            whole[:, :, :count] = grad.permute(1, 2, 0)
-            given.append(whole)
-        # each row adds up for itself, so that the sum does not depend on the number of threads
-        blocks, plain = width // loop.lanes, len(loop.trained)
-        pulled = loop.kept(blocks, steps, loop.pulled)
-        products = [(k, one) for k, one in enumerate(loop.parts.products) if not one.curve]
-        shared = sum(one.numbers for _, one in products) if loop.apart else 0
-        total = torch.zeros(blocks, plain + shared, loop.lanes, dtype=loop.dtype)
-        loop.run("back", blocks, *known, *given, pulled, total, steps, width)
-        rows = total.transpose(1, 2).reshape(width, -1)[:count]
-        if not math.isinf(loop.most):
-            asked = sum(grad.flatten(1).square().sum(1) for grad in grads)
-            rows = _held(rows, torch.as_tensor(asked).sqrt(), loop.most)
-        found, tables = rows.sum(0).split([plain, shared])
-        if not loop.apart:
-            by_table: dict[int, Tensor] = {}
-            places = loop.pulled
-            in_order = sorted(products, key=lambda p: loop.held[f"factor_{p[0]}"].start)
-            for _, group in groupby(in_order, lambda p: places[f"product_{p[0]}_slope"].start):
-                alike = [*group]
-                (k, one), last = alike[0], loop.held[f"factor_{alike[-1][0]}"]
-                ends = slice(loop.held[f"factor_{k}"].start, last.stop)
-                factor = known[-1][:, ends].unflatten(1, (one.rows, -1))
-                slope = pulled[:, places[f"product_{k}_slope"]].unflatten(1, (one.rows, -1))
-                table = torch.zeros(factor.shape[2], one.given, dtype=loop.dtype)
+            padded = torch.zeros(*grad.shape[1:], n_padded, dtype=compiled.dtype)
+            padded[:, :, :n_rows] = grad.permute(1, 2, 0)
+            cotangents.append(padded)
+        # each row is summed by itself, so that the sum does not depend on the number of threads
+        n_blocks, n_theta = n_padded // compiled.n_lanes, len(compiled.trained_indices)
+        backward_storage = compiled.allocate(n_blocks, n_steps, compiled.backward_storage)
+        products = [
+            (k, product)
+            for k, product in enumerate(compiled.parts.products)
+            if not product.activation
+        ]
+        n_matrix_entries = (
+            sum(product.matrix_size for _, product in products) if compiled.has_row_gradients else 0
+        )
+        total = torch.zeros(
+            n_blocks, n_theta + n_matrix_entries, compiled.n_lanes, dtype=compiled.dtype
+        )
+        compiled.call_library(
+            "back", n_blocks, *history, *cotangents, backward_storage, total, n_steps, n_padded
+        )
+        rows = total.transpose(1, 2).reshape(n_padded, -1)[:n_rows]
+        if not math.isinf(compiled.max_gradient_ratio):
+            cotangent_square = sum(grad.flatten(1).square().sum(1) for grad in grads)
+            rows = _clip_row_gradients(
+                rows, torch.as_tensor(cotangent_square).sqrt(), compiled.max_gradient_ratio
+            )
+        theta_gradient, tables = rows.sum(0).split([n_theta, n_matrix_entries])
+        if not compiled.has_row_gradients:
+            gradient_of_product: dict[int, Tensor] = {}
+            layout = compiled.backward_storage
+            ordered_products = sorted(
+                products, key=lambda p: compiled.forward_storage[f"factor_{p[0]}"].start
+            )
+            for _, group in groupby(
+                ordered_products, lambda p: layout[f"product_{p[0]}_slope"].start
+            ):
+                group_products = [*group]
+                (k, product), last_factor = (
+                    group_products[0],
+                    compiled.forward_storage[f"factor_{group_products[-1][0]}"],
+                )
+                factor_range = slice(
+                    compiled.forward_storage[f"factor_{k}"].start, last_factor.stop
+                )
+                factor = history[-1][:, factor_range].unflatten(1, (product.n_repeats, -1))
+                slope = backward_storage[:, layout[f"product_{k}_slope"]].unflatten(
+                    1, (product.n_repeats, -1)
+                )
+                gradient = torch.zeros(factor.shape[2], product.n_outputs, dtype=compiled.dtype)
                 for a, b in zip(factor.unbind(1), slope.unbind(1), strict=True):
-                    table.addbmm_(a, b.transpose(1, 2))
-                split = table.split([each.taken for _, each in alike])
-                by_table |= {k: part for (k, _), part in zip(alike, split, strict=True)}
-            tables = _flat([by_table[k] for k, _ in products])
-        theta = torch.zeros(len(known[0]), dtype=loop.dtype)
-        theta[loop.trained] = found
-        x, s = given[0][0].T[:count], given[2][0].T[:count]
+                    gradient.addbmm_(a, b.transpose(1, 2))
+                parts = gradient.split([member.n_inputs for _, member in group_products])
+                gradient_of_product |= {
+                    k: part for (k, _), part in zip(group_products, parts, strict=True)
+                }
+            tables = _concatenate([gradient_of_product[k] for k, _ in products])
+        theta = torch.zeros(len(history[0]), dtype=compiled.dtype)
+        theta[compiled.trained_indices] = theta_gradient
+        x, s = cotangents[0][0].T[:n_rows], cotangents[2][0].T[:n_rows]
         return theta, tables, x, s, *[None] * 4
 
 
-def _end(places: Mapping[str, slice]) -> int:
-    return max((place.stop for place in places.values()), default=0)
+def _storage_size(layout: Mapping[str, slice]) -> int:
+    return max((entries.stop for entries in layout.values()), default=0)
 
 
-def _held(gradients: Tensor, asked: Tensor, most: float) -> Tensor:
-    """Return gradients [B, n] of rows, none larger than a multiple of what the median row has.
+def _clip_row_gradients(gradients: Tensor, cotangent_norm: Tensor, max_ratio: float) -> Tensor:
+    """Scale down the gradients of rows whose ratio to their cotangents is exceptionally large.
 
     Args:
-        gradients: of each row.
-        asked: size [B] of the gradient that each row was given.
-        most: the multiple; infinity leaves all as they are.
+        gradients: gradient of each row [B, n].
+        cotangent_norm: norm of each row's cotangent [B].
+        max_ratio: largest ratio of gradient and cotangent as a multiple of the median ratio.
     """
     size = gradients.norm(dim=1)
-    share = size / asked.clamp(min=1e-30)
-    usual = share[asked > 0].nanmedian() if bool((asked > 0).any()) else share.new_zeros(())
-    kept = (most * usual * asked / size.clamp(min=1e-30)).clamp(max=1.0)
-    # what is no number says nothing
-    return torch.where(torch.isfinite(size)[:, None], gradients * kept[:, None], 0.0)
+    ratio = size / cotangent_norm.clamp(min=1e-30)
+    median_ratio = (
+        ratio[cotangent_norm > 0].nanmedian()
+        if bool((cotangent_norm > 0).any())
+        else ratio.new_zeros(())
+    )
+    factor = (max_ratio * median_ratio * cotangent_norm / size.clamp(min=1e-30)).clamp(max=1.0)
+    # gradients that are not finite carry no information
+    return torch.where(torch.isfinite(size)[:, None], gradients * factor[:, None], 0.0)
 
 
-def _numbers(rollout: Rollout) -> dict[str, Tensor]:
-    """Return the parameters and buffers of a rollout by name, those of each module once."""
-    # as `named_parameters` and `named_buffers` have them, in half the time of a short run
+def _named_tensors(rollout: Rollout) -> dict[str, Tensor]:
+    """Return the parameters and buffers of a rollout by name."""
+    # `named_parameters` and `named_buffers` take half the time of a short run
     return {
-        f"{place}.{name}" if place else name: part
-        for place, module in rollout.named_modules()
-        for parts in (module._parameters, module._buffers)
-        for name, part in parts.items()
-        if part is not None
+        f"{module_name}.{name}" if module_name else name: tensor
+        for module_name, module in rollout.named_modules()
+        for tensors in (module._parameters, module._buffers)
+        for name, tensor in tensors.items()
+        if tensor is not None
     }
 
 
-def _called(step: nn.Module, numbers: Mapping[str, Tensor], given: tuple[Tensor, ...]) -> Any:
-    """Return what a step makes with these numbers in place of its own."""
-    numbers = {f"rollout.{name}": part for name, part in numbers.items()}
-    # what a module has that stands in two places would be put in twice, and taken out once
-    return torch.func.functional_call(step, numbers, given, tie_weights=False)
+def _call_with_tensors(
+    step: nn.Module, tensors: Mapping[str, Tensor], arguments: tuple[Tensor, ...]
+) -> Any:
+    """Call a step with these parameters and buffers."""
+    tensors = {f"rollout.{name}": tensor for name, tensor in tensors.items()}
+    # a tensor shared by two modules would be replaced twice and restored once
+    return torch.func.functional_call(step, tensors, arguments, tie_weights=False)
 
 
-def _flat(parts: Sequence[Tensor]) -> Tensor:
+def _concatenate(parts: Sequence[Tensor]) -> Tensor:
     return torch.cat([torch.zeros(0), *(part.flatten() for part in parts)])

@@ -1,4 +1,4 @@
-"""How a rollout runs where its numbers are wanted quickly: as C, or with a recorded step."""
+"""Fast rollouts: as compiled C, or with a traced step."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from torch import Tensor
 
 from residnet.core.progress import log_message
 from residnet.engine.rollout import (
-    WORTH_COMPILING,
+    MIN_STEPS_TO_COMPILE,
     FreeRun,
     Rollout,
-    runs_in_python,
+    has_untraceable_part,
     trace_rollout,
 )
 
@@ -24,76 +24,83 @@ if TYPE_CHECKING:
     from residnet.engine.compiled import CompiledRollout
 
 
-class _Structure(pickle.Pickler):
-    """Writes all of a rollout but the numbers of its parameters and buffers."""
+class _StructurePickler(pickle.Pickler):
+    """Pickles a rollout without the values of its parameters and buffers."""
 
-    def __init__(self, out: io.BytesIO, rollout: Rollout) -> None:
-        super().__init__(out)
-        self.known = {id(number) for number in (*rollout.parameters(), *rollout.buffers())}
+    def __init__(self, file: io.BytesIO, rollout: Rollout) -> None:
+        super().__init__(file)
+        self.tensor_ids = {id(tensor) for tensor in (*rollout.parameters(), *rollout.buffers())}
 
     def persistent_id(self, obj: Any) -> Any:
-        """Return what a tensor is known by."""
+        """Return what identifies a tensor: its type and shape, or its values if it is constant."""
         if not isinstance(obj, Tensor):
             return None
-        if obj.is_floating_point() and id(obj) in self.known:
+        if obj.is_floating_point() and id(obj) in self.tensor_ids:
             return str(obj.dtype), tuple(obj.shape), obj.requires_grad and torch.is_grad_enabled()
         return str(obj.dtype), obj.tolist()
 
 
-_KNOWN: dict[bytes, CompiledRollout | Literal[False]] = {}
-"""Rollouts by structure: compiled, or that they cannot be."""
+# compiled rollouts by structure; False where compilation failed
+_COMPILED: dict[bytes, CompiledRollout | Literal[False]] = {}
 
 
-def compiled(rollout: Rollout, steps: int) -> FreeRun:
-    """Return the rollout as compiled C where that pays and can be done.
+def compile_rollout(rollout: Rollout, steps: int) -> FreeRun:
+    """Compile a rollout to C, or trace its step where C is impossible or does not pay.
 
-    Rollouts that differ in their numbers alone are compiled once. Elsewhere the result is that of
-    `trace_rollout`.
+    Rollouts that differ in parameters and buffers alone are compiled once.
 
     Args:
-        rollout: on its device, in its type, in training or in evaluation, as it is run.
-        steps: that will be run with it altogether.
+        rollout: the rollout on its device, in its type and mode (training or evaluation).
+        steps: total number of steps that it will run.
     """
-    chosen: dict[bool, FreeRun] = {}
+    # one for runs with gradients, one for runs without
+    runs: dict[bool, FreeRun] = {}
 
     def run(x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        graded = torch.is_grad_enabled()
-        if graded not in chosen:
-            chosen[graded] = _chosen(rollout, steps, x0, w, s)
-        return chosen[graded](x0, w, s)
+        has_gradient = torch.is_grad_enabled()
+        if has_gradient not in runs:
+            runs[has_gradient] = _select_run(rollout, steps, x0, w, s)
+        return runs[has_gradient](x0, w, s)
 
     return run
 
 
-def _chosen(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> FreeRun:
-    apart = x0.device.type != "cpu" or rollout.source.counts or not w.numel()
-    if steps < WORTH_COMPILING or apart or runs_in_python(rollout):
+def _select_run(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) -> FreeRun:
+    """Return the fastest way to run a rollout with arguments like these."""
+    is_compilable = (
+        steps >= MIN_STEPS_TO_COMPILE
+        and x0.device.type == "cpu"
+        and w.numel() > 0
+        and not rollout.source.depends_on_step
+        and not has_untraceable_part(rollout)
+    )
+    if not is_compilable:
         return trace_rollout(rollout, steps)
-    out = io.BytesIO()
+    file = io.BytesIO()
     try:
-        _Structure(out, rollout).dump((rollout, x0.dtype, torch.is_grad_enabled()))
+        _StructurePickler(file, rollout).dump((rollout, x0.dtype, torch.is_grad_enabled()))
     except Exception:
-        # parts of somebody else's that cannot be pickled
+        # parts of other packages that cannot be pickled
         return trace_rollout(rollout, steps)
-    key = hashlib.sha256(out.getvalue()).digest()
-    if key not in _KNOWN:
+    key = hashlib.sha256(file.getvalue()).digest()
+    if key not in _COMPILED:
         from residnet.engine.c_code import CompilerError
         from residnet.engine.compiled import CompiledRollout
 
         try:
-            # the trial of a step that draws numbers (dropout) must not shift those of the training
+            # tracing a step with dropout must not change the random numbers of the training
             with torch.random.fork_rng(devices=[]):
-                _KNOWN[key] = CompiledRollout(rollout, x0, w, s)
+                _COMPILED[key] = CompiledRollout(rollout, x0, w, s)
         except Exception as error:
-            # no compiler, or a step that C does not hold
-            _KNOWN[key] = False
+            # no compiler, or a step that cannot be written in C
+            _COMPILED[key] = False
             if isinstance(error, CompilerError):
-                _tell(str(error))
-    known = _KNOWN[key]
-    return known.of(rollout) if known else trace_rollout(rollout, steps)
+                _report_missing_compiler(str(error))
+    compiled = _COMPILED[key]
+    return compiled.with_rollout(rollout) if compiled else trace_rollout(rollout, steps)
 
 
 @cache
-def _tell(reason: str) -> None:
-    """Say once why free runs are not compiled."""
-    log_message(f"  free runs are not compiled, and take longer: {reason}")
+def _report_missing_compiler(reason: str) -> None:
+    """Say once per process why free runs are slow."""
+    log_message(f"  free runs are not compiled and take longer: {reason}")

@@ -1,7 +1,7 @@
-"""Exact Jacobians of one model step, for many states at once.
+"""Exact Jacobians of the step of a model, for many states at once.
 
 The step is traced once into a CasADi expression and differentiated there, so that no baseline and
-no integrator has derivatives of its own to keep right.
+no integrator needs derivatives of its own.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from torch import Tensor, nn
 from residnet.baselines.base import ParametricBaseline
 from residnet.core.layout import HEADING
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.engine.c_code import CompilerError, compiled_library
-from residnet.engine.trace import in_numbers, lowered
+from residnet.engine.c_code import CompilerError, load_library
+from residnet.engine.trace import lower, to_scalar_function
 from residnet.heads.base import ZeroHead
 
+# calls the function that CasADi generates for each row
 _LOOP = """
 void jacobians(const double *x, const double *w, const double *theta, double *out, long rows) {{
     casadi_int iwork[{iw}];
@@ -34,8 +35,8 @@ void jacobians(const double *x, const double *w, const double *theta, double *ou
 """
 
 
-class _Step(nn.Module):
-    """One step without a residual, as a function of theta too."""
+class _BaselineStep(nn.Module):
+    """One step of a model without its residual, as a function of the baseline's parameters too."""
 
     def __init__(self, model: HybridDynamics, theta_shape: torch.Size) -> None:
         super().__init__()
@@ -46,73 +47,99 @@ class _Step(nn.Module):
     def forward(self, x: Tensor, w: Tensor) -> Tensor:
         return self.model.step(x, w, x[:, :0])[0]
 
-    def with_theta(self, x: Tensor, w: Tensor, theta: Tensor) -> tuple[Tensor]:
+    def step_with_theta(self, x: Tensor, w: Tensor, theta: Tensor) -> tuple[Tensor]:
+        """Return the state one step later, for flattened parameters theta [1, size]."""
         weights = {"model.baseline.theta": theta.reshape(self.theta_shape)}
-        # baselines share modules with signals, which must not be swapped twice
-        out: Tensor = torch.func.functional_call(self, weights, (x, w), tie_weights=False)
-        return (out,)
+        # baselines share modules with signals, which must not be replaced twice
+        next_state: Tensor = torch.func.functional_call(self, weights, (x, w), tie_weights=False)
+        return (next_state,)
 
 
 @final
 class StepJacobian:
-    """Derivatives of (heading, velocities) one step later, by themselves and the free parameters.
+    """Derivatives of heading and dynamic states after a step by themselves and the parameters.
 
-    The position is left out: nothing in body axes depends on it. float64.
+    The position is left out: nothing in body axes depends on it. All numbers are float64.
 
     Attributes:
-        free: places of the free parameters in the flattened theta.
+        free_indices: indices of the free parameters in the flattened theta.
     """
 
     def __init__(self, model: HybridDynamics, baseline: ParametricBaseline) -> None:
-        self.theta, self.free = baseline.theta, baseline.free_indices().tolist()
-        self.n = 1 + model.dof
-        inputs = model.signals.n_inputs + 2 * model.signals.has_wind
-        sizes = {"x": HEADING + self.n, "w": inputs, "theta": self.theta.numel()}
-        traced = _Step(model, baseline.theta.shape).with_theta
-        step = lowered(traced, [*sizes.items()], ["after"], "step")
+        self.theta = baseline.theta
+        self.free_indices: list[int] = baseline.free_indices().tolist()
+        self.n_rows = 1 + model.dof
+
+        # trace the step and differentiate the expression
+        n_inputs = model.signals.n_inputs + 2 * model.signals.has_wind
+        sizes = {"x": HEADING + self.n_rows, "w": n_inputs, "theta": self.theta.numel()}
+        traced_step = _BaselineStep(model, baseline.theta.shape).step_with_theta
+        step = lower(traced_step, [*sizes.items()], ["next_state"], "step")
         x, w, theta = (ca.SX.sym(name, size) for name, size in sizes.items())
-        after = in_numbers(step)(x, w, theta)
-        jacobian = ca.jacobian(after[HEADING:], ca.vertcat(x[HEADING:], theta[self.free]))
-        # CasADi stores columns, torch rows
+        next_state = to_scalar_function(step)(x, w, theta)
+        variables = ca.vertcat(x[HEADING:], theta[self.free_indices])
+        jacobian = ca.jacobian(next_state[HEADING:], variables)
+
+        # CasADi stores matrices by columns, torch by rows
         transposed = ca.cse([ca.densify(jacobian.T)])
-        self.function = f = ca.Function("jacobian", [x, w, theta], transposed)
+        self.function = ca.Function("jacobian", [x, w, theta], transposed)
+        self._library = self._compile(sizes, jacobian.numel())
+
+    def _compile(self, sizes: dict[str, int], n_entries: int) -> Any:
+        """Return the compiled library; None without a compiler."""
+        function = self.function
         code = ca.CodeGenerator("jacobian.c")
-        code.add(f)
+        code.add(function)
         loop = _LOOP.format(
-            iw=f.sz_iw() + 1, w=f.sz_w() + 1, arg=f.sz_arg(), res=f.sz_res(),
-            nx=sizes["x"], nw=inputs, size=jacobian.numel(),
-        )  # fmt: skip
+            iw=function.sz_iw() + 1,
+            w=function.sz_w() + 1,
+            arg=function.sz_arg(),
+            res=function.sz_res(),
+            nx=sizes["x"],
+            nw=sizes["w"],
+            size=n_entries,
+        )
         try:
-            self._library: Any = compiled_library(code.dump() + loop)
+            return load_library(code.dump() + loop)
         except CompilerError:
-            self._library = None
+            return None
 
     def __call__(self, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
-        """Return d/d state [B, 1 + n, 1 + n] and d/d theta [B, 1 + n, P] at x [B, nx], w [B, m]."""
-        x, w, theta = x.contiguous(), w.contiguous(), self.theta.detach().flatten().contiguous()
+        """Return the Jacobians by state [B, 1 + n, 1 + n] and by parameters [B, 1 + n, P].
+
+        Args:
+            x: states [B, nx].
+            w: inputs [B, m].
+        """
+        x = x.contiguous()
+        w = w.contiguous()
+        theta = self.theta.detach().flatten().contiguous()
         if self._library is None:
-            # without a compiler CasADi's own interpreter takes twenty times as long
+            # CasADi's interpreter takes twenty times as long as the compiled function
             columns = self.function(x.numpy().T, w.numpy().T, theta.numpy()).full()
-            out = torch.from_numpy(columns).reshape(-1, len(x), self.n).permute(1, 2, 0)
+            jacobian = torch.from_numpy(columns).reshape(-1, len(x), self.n_rows).permute(1, 2, 0)
         else:
-            out = torch.empty(len(x), self.n, self.n + len(self.free), dtype=torch.float64)
-            pointers = [ctypes.c_void_p(part.data_ptr()) for part in (x, w, theta, out)]
+            n_columns = self.n_rows + len(self.free_indices)
+            jacobian = torch.empty(len(x), self.n_rows, n_columns, dtype=torch.float64)
+            pointers = [ctypes.c_void_p(part.data_ptr()) for part in (x, w, theta, jacobian)]
             self._library.jacobians(*pointers, ctypes.c_long(len(x)))
-        by_state, by_theta = out.split([self.n, len(self.free)], dim=-1)
+        by_state, by_theta = jacobian.split([self.n_rows, len(self.free_indices)], dim=-1)
         return by_state, by_theta
 
     @classmethod
-    def of(cls, model: HybridDynamics) -> StepJacobian:
-        """Return the Jacobian of a model, traced again only where more than theta has changed."""
+    def of_model(cls, model: HybridDynamics) -> StepJacobian:
+        """Return the Jacobian of a model, traced again only if more than theta has changed."""
         baseline = model.baseline
         assert isinstance(baseline, ParametricBaseline)
-        constants = tuple((b.data_ptr(), b._version) for b in model.buffers())
-        known = _TRACED.get(model)
-        if known is None or known[0] != constants:
-            _TRACED[model] = known = constants, cls(model, baseline)
-        return known[1]
+        constants = tuple((buffer.data_ptr(), buffer._version) for buffer in model.buffers())
+        traced = _TRACED.get(model)
+        if traced is None or traced[0] != constants:
+            traced = (constants, cls(model, baseline))
+            _TRACED[model] = traced
+        return traced[1]
 
 
+# Jacobians by model, with the addresses and versions of the buffers that they were traced with
 _TRACED: WeakKeyDictionary[HybridDynamics, tuple[tuple[Any, ...], StepJacobian]] = (
     WeakKeyDictionary()
 )

@@ -1,4 +1,4 @@
-"""A plant whose step is recorded once and evaluated as a CasADi function."""
+"""A plant whose step is traced once and evaluated as a CasADi function."""
 
 from __future__ import annotations
 
@@ -15,54 +15,56 @@ from residnet.physics.plant import Plant
 
 @final
 class RecordedPlantDynamics(Dynamics):
-    """A `PlantDynamics` whose step is recorded as a CasADi function when it is first taken.
+    """A `PlantDynamics` whose step is traced to a CasADi function at the first call.
 
-    The numbers are the same. For simulation only: it runs without gradients, in float64, at any
-    batch size. A plant whose step cannot be recorded is stepped as it is.
+    For simulation only: it runs without gradients, in float64, for any batch size, with the same
+    numbers. A plant whose step cannot be traced runs in torch.
     """
 
     def __init__(self, plant: Plant, dt: float, substeps: int = 1) -> None:
         super().__init__(dt, "rk4")
-        self.plant, self.substeps = plant, substeps
-        self._plain: PlantDynamics | None = None
-        self._one: Any = None
-        self._rows: dict[int, tuple[Any, Any]] = {}
+        self.plant = plant
+        self.substeps = substeps
+        self._torch_plant: PlantDynamics | None = None
+        self._row_function: Any = None
+        # CasADi buffers and evaluators by number of rows
+        self._evaluators: dict[int, tuple[Any, Any]] = {}
 
-    def _recorded(self) -> Any:
-        """Return the step of one row; its sub-steps are one function, called again and again."""
+    def _trace_row(self) -> Any:
+        """Return the step of one row as a CasADi function, which calls one traced sub-step."""
         import casadi as ca
 
-        from residnet.engine.trace import in_numbers, lowered
+        from residnet.engine.trace import lower, to_scalar_function
 
         sizes = [("x", len(self.plant.state_names)), ("w", len(self.plant.input_names))]
         model = PlantDynamics(self.plant, self.dt / self.substeps).eval()
-        part = in_numbers(
-            lowered(lambda x, w: model.step(x, w, x[:, :0])[0], sizes, ["y"], "plant")
+        substep = to_scalar_function(
+            lower(lambda x, w: model.step(x, w, x[:, :0])[0], sizes, ["y"], "plant")
         )
         x, w = (ca.SX.sym(name, size) for name, size in sizes)
-        after = x
+        next_state = x
         for _ in range(self.substeps):
-            after = part(after, w)
-        return ca.Function("step", [x, w], [after])
+            next_state = substep(next_state, w)
+        return ca.Function("step", [x, w], [next_state])
 
     @torch.no_grad()
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        if self._one is None and self._plain is None:
+        if self._row_function is None and self._torch_plant is None:
             try:
-                self._one = self._recorded()
+                self._row_function = self._trace_row()
             except ExportError:
-                self._plain = PlantDynamics(self.plant, self.dt, self.substeps)
-        if self._plain is not None:
-            return self._plain.step(x, w, s)
-        if len(x) not in self._rows:
-            self._rows[len(x)] = self._one.map(len(x), "serial").buffer()
-        buffer, evaluate = self._rows[len(x)]
-        after = torch.empty_like(x, dtype=torch.float64, memory_format=torch.contiguous_format)
-        # a function of CasADi holds numbers column by column: the rows of a batch are its columns
-        given: list[Any] = [part.detach().double().contiguous().numpy() for part in (x, w)]
-        taken: Any = after.numpy()
-        for place, part in enumerate(given):
-            buffer.set_arg(place, memoryview(part))
-        buffer.set_res(0, memoryview(taken))
+                self._torch_plant = PlantDynamics(self.plant, self.dt, self.substeps)
+        if self._torch_plant is not None:
+            return self._torch_plant.step(x, w, s)
+        if len(x) not in self._evaluators:
+            self._evaluators[len(x)] = self._row_function.map(len(x), "serial").buffer()
+        buffer, evaluate = self._evaluators[len(x)]
+        next_state = torch.empty_like(x, dtype=torch.float64, memory_format=torch.contiguous_format)
+        # CasADi stores matrices by columns: the rows of a batch are columns there
+        arguments: list[Any] = [part.detach().double().contiguous().numpy() for part in (x, w)]
+        result: Any = next_state.numpy()
+        for i, argument in enumerate(arguments):
+            buffer.set_arg(i, memoryview(argument))
+        buffer.set_res(0, memoryview(result))
         evaluate()
-        return after, s
+        return next_state, s

@@ -1,7 +1,7 @@
-"""The only time loop: batched, differentiable, its step recorded where that pays.
+"""The time loop of all simulations: batched and differentiable.
 
-Its inputs come from a `Source`: playback of given inputs, or a manoeuvre that steers by the state
-that it sees. Rows whose source says so stop there: their state is held from that sample on.
+Its inputs come from a `Source`: playback of given inputs, or a manoeuvre that steers by the state.
+A source can stop rows: their state is held from that sample on.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar, final
+from typing import Any, final
 
 import torch
 from torch import Tensor, nn
@@ -19,44 +19,48 @@ from residnet.dynamics.base import Dynamics
 
 
 class Source(nn.Module, ABC):
-    """Where the inputs of a rollout come from.
+    """The source of the inputs of a rollout.
 
     Args:
-        given: whether they are those that the rollout is given, whatever the state.
+        is_playback: whether the inputs are those given to the rollout, independent of the state.
 
     Attributes:
-        counts: whether the number of the step matters.
+        depends_on_step: whether the inputs depend on the number of the step.
+        can_stop: whether rows can stop before the end.
     """
 
-    __constants__: ClassVar = ["given"]
-
-    def __init__(self, *, given: bool = False) -> None:
+    def __init__(self, *, is_playback: bool = False) -> None:
         super().__init__()
-        self.may_stop = False
-        self.given, self.counts = given, not given
+        self.can_stop = False
+        self.is_playback = is_playback
+        self.depends_on_step = not is_playback
 
     def initial(self, x: Tensor) -> Tensor:
-        """Return the source's memory [B, k] at the start, from the initial state x [B, nx]."""
+        """Return the initial memory of the source [B, k] from the initial state x [B, nx]."""
         return x[:, :0]
 
     @abstractmethod
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m] for step k and the new memory.
+        """Return the inputs [B, m] of step k, and the new memory [B, k].
 
-        They follow from the state x [B, nx] and the inputs given for that step, w [B, m].
+        Args:
+            x: states [B, nx].
+            w: inputs given for the step [B, m].
+            k: number of the step.
+            memory: memory of the source [B, k].
         """
 
-    def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Return which rows stop at this state, [B] bool; asked only where `may_stop`."""
+    def is_finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
+        """Return which rows stop at this state, [B] bool; used only if `can_stop`."""
         return torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
 
 
 @final
 class Playback(Source):
-    """A source that gives the inputs back as they are."""
+    """A source that returns the given inputs."""
 
     def __init__(self) -> None:
-        super().__init__(given=True)
+        super().__init__(is_playback=True)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         return w, memory
@@ -79,108 +83,111 @@ class Rollout(nn.Module):
             s: initial memory [B, n_state].
 
         Returns:
-            states [B, T+1, nx] from x0 on, inputs that acted [B, T, m], and the memory after the
+            States [B, T+1, nx] from x0 on, applied inputs [B, T, m], and the memory after the
             last step [B, n_state].
         """
-        return self.run(self.model.step, x0, w, s)
+        return self.run_with_step(self.model.step, x0, w, s)
 
-    def run(self, step: Step, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Run freely by a step that stands in for the model's; see `forward`."""
+    def run_with_step(
+        self, step: Step, x0: Tensor, w: Tensor, s: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Run freely with a replacement of the model's step; see `forward`."""
         x = x0
         states = [x0]
-        if self.source.given:
+        if self.source.is_playback:
             for row in w.unbind(1):
                 x, s = step(x, row, s)
                 states.append(x)
             return torch.stack(states, dim=1), w, s
         memory = self.source.initial(x0)
-        applied: list[Tensor] = []
+        inputs: list[Tensor] = []
         for k in range(w.shape[1]):
-            acting, memory = self.source(x, w[:, k], k, memory)
-            after, s = step(x, acting, s)
-            if self.source.may_stop:
-                finished = self.source.finished(x, k, memory)
-                after = torch.where(finished.unsqueeze(-1), x, after)
-                if bool(finished.all()):
-                    # nothing moves any more
+            step_inputs, memory = self.source(x, w[:, k], k, memory)
+            next_state, s = step(x, step_inputs, s)
+            if self.source.can_stop:
+                is_finished = self.source.is_finished(x, k, memory)
+                next_state = torch.where(is_finished.unsqueeze(-1), x, next_state)
+                if bool(is_finished.all()):
+                    # all rows have stopped: repeat state and inputs up to the end
                     states.extend([x] * (w.shape[1] - k))
-                    applied.extend([acting] * (w.shape[1] - k))
+                    inputs.extend([step_inputs] * (w.shape[1] - k))
                     break
-            x = after
+            x = next_state
             states.append(x)
-            applied.append(acting)
-        inputs = torch.stack(applied, dim=1) if w.shape[1] > 0 else w
-        return torch.stack(states, dim=1), inputs, s
+            inputs.append(step_inputs)
+        applied = torch.stack(inputs, dim=1) if w.shape[1] > 0 else w
+        return torch.stack(states, dim=1), applied, s
 
 
 Step = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 """A step of a model, from x [B, nx], w [B, m] and s [B, n_state] to the next x and s."""
 FreeRun = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
-"""A free run as `Rollout` gives it, from x0 [B, nx], w [B, T, m] and s [B, n_state]."""
-WORTH_COMPILING = 200
-"""Steps of a rollout that take about as long as compiling it does, or recording its step: its own
-steps alone count, so that numbers do not hang on what ran before. C takes .2 s once for all models
-of a structure, a step in torch .15 to 1.3 ms.
+"""A function with the arguments and results of `Rollout.forward`."""
+MIN_STEPS_TO_COMPILE = 200
+"""Number of steps of a rollout that takes about as long as compiling it or tracing its step.
+
+It depends on the rollout's own steps alone, so that numbers do not depend on previous runs. C takes
+.2 s once for all models of a structure, a step in torch .15 to 1.3 ms.
 """
-MANY = 1_000_000
-"""Steps of a training: enough for compiling to pay."""
+TRAINING_STEPS = 1_000_000
+"""Number of steps of a training, large enough for compiling to pay."""
 
 
-def runs_in_python(rollout: Rollout) -> bool:
-    """Return whether a part of the model answers in Python alone, such as scikit-learn's.
+def has_untraceable_part(rollout: Rollout) -> bool:
+    """Return whether a part of the model runs in Python alone, such as one of scikit-learn.
 
-    A recording would hold its answers to the examples as constants.
+    A trace would hold its answers to the examples as constants.
     """
     return any(bool(getattr(part, "refusal", "")) for part in rollout.modules())
 
 
 def trace_rollout(rollout: Rollout, steps: int) -> FreeRun:
-    """Return the rollout with its model's step recorded as a TorchScript graph.
+    """Return the rollout with its model's step traced by TorchScript.
 
-    A recorded step takes half the time of Python's. It shares parameters and buffers with the
-    model as it is now: record anew where the model is moved to another device or type, or changes
-    between training and evaluation. Gradients are those of the rollout.
+    A traced step takes half the time of the step in Python. It shares parameters and buffers with
+    the model as it is now: trace again after the model is moved to another device or type, or
+    changes between training and evaluation.
 
     Args:
-        rollout: on its device, in its type, in training or in evaluation.
-        steps: that will be run with it altogether; the rollout is returned as it is where these are
-            too few to pay for the recording.
+        rollout: the rollout on its device, in its type and mode.
+        steps: total number of steps that it will run. Where these are too few to pay for the trace
+            the rollout itself is returned.
     """
-    if steps < WORTH_COMPILING or runs_in_python(rollout):
+    if steps < MIN_STEPS_TO_COMPILE or has_untraceable_part(rollout):
         return rollout
-    known: dict[tuple[torch.Size, torch.Size], Step] = {}
+    traced_steps: dict[tuple[torch.Size, torch.Size], Step] = {}
 
     def step(x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        # a recording may hold the number of rows as a constant
+        # a trace may hold the number of rows as a constant
         shapes = (x.shape, w.shape)
-        if shapes not in known:
-            known[shapes] = record_step(rollout.model, x, w, s)
-        return known[shapes](x, w, s)
+        if shapes not in traced_steps:
+            traced_steps[shapes] = trace_step(rollout.model, x, w, s)
+        return traced_steps[shapes](x, w, s)
 
     def run(x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        # torch's own optimisation records the first runs, and may round differently afterwards
+        # TorchScript's optimisation changes the rounding after the first runs
         with optimized_execution(False):
-            return rollout.run(step, x0, w, s)
+            return rollout.run_with_step(step, x0, w, s)
 
     return run
 
 
-def record_step(model: Dynamics, x: Tensor, w: Tensor, s: Tensor) -> Step:
-    """Return the step of a model as a TorchScript graph, or as it is where it has none."""
-    from residnet.engine.trace import recorded
+def trace_step(model: Dynamics, x: Tensor, w: Tensor, s: Tensor) -> Step:
+    """Trace the step of a model by TorchScript; return the step itself if it cannot be traced."""
+    from residnet.engine.trace import record_graph
 
-    # the trial of a step that draws numbers (dropout) must not shift those of the training
+    # tracing a step with dropout must not change the random numbers of the training
     with warnings.catch_warnings(), torch.random.fork_rng(devices=[]):
-        # TorchScript still works in torch 2.13 but announces its end
+        # torch 2.13 announces the end of TorchScript, which still works
         warnings.simplefilter("ignore")
         examples = (x.detach(), w.detach(), s.detach())
         try:
-            # a trace would take the branch of the examples always
-            recorded(model.step, examples, "a step")
+            # a trace of a step that decides by values would always take the branch of the examples
+            record_graph(model.step, examples, "a step")
             with torch.no_grad():
-                graph: Any = torch.jit.trace_module(model, {"step": examples}, check_trace=False)
+                module: Any = torch.jit.trace_module(model, {"step": examples}, check_trace=False)
         except Exception:
-            # a part of somebody else's that torch cannot record
+            # parts of other packages that torch cannot trace
             return model.step
-    step: Step = graph.step
-    return step
+    traced_step: Step = module.step
+    return traced_step

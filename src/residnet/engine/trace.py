@@ -1,7 +1,7 @@
-"""A module's step as a CasADi function: every format that is no graph of torch is made from it.
+"""Lower the step of a module to a CasADi function, from which C and other formats are generated.
 
-Torch records the step for one row as a graph of its core operations. A tensor becomes a column of
-its numbers in row order, so that whatever only moves numbers becomes a list of places.
+Torch records the step of one row as a graph of its core operations. A tensor becomes a CasADi
+column of its entries in row order, so that data movements become lists of indices.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from residnet.core.errors import ExportError
 
-_MOVES: Final = {
+_DATA_MOVEMENT: Final = {
     **dict.fromkeys(
         (
             "alias", "clone", "detach", "lift_fresh_copy", "view", "_unsafe_view", "reshape",
@@ -36,26 +36,26 @@ _MOVES: Final = {
     ),
     "slice_scatter": (0, 1), "select_scatter": (0, 1), "index_copy": (0, 3),
 }  # fmt: skip
-"""Operations that only move numbers, with the places of the arguments whose numbers are moved."""
-_LIKE: Final = frozenset(
+"""Operations that only move numbers, with the positions of the arguments that they move."""
+_SHAPE_ONLY: Final = frozenset(
     (
         "full_like", "zeros_like", "ones_like", "empty_like", "new_zeros", "new_ones", "new_full",
         "new_empty",
     )
 )  # fmt: skip
-"""Operations whose result depends on the shape of their argument alone."""
-_SHORT: Final = 64
-"""Rows up to which a look-up is a chain of choices, which has derivatives and can be expanded: the
-commands of a second under way at 50 Hz are so many.
+"""Operations whose result depends on the shape of their argument only."""
+_MAX_TABLE_ROWS: Final = 64
+"""Largest table whose look-up becomes a chain of conditionals, which has derivatives and can be
+expanded to scalars. A delay line of one second at 50 Hz has 50 rows.
 """
 
 
-def _number(a: Any) -> Any:
-    # CasADi takes a == a to be true
+def _is_number(a: Any) -> Any:
+    # CasADi simplifies a == a to true, so that it cannot detect NaN
     return ca.logic_or(a <= 0, a > 0)
 
 
-_ELEMENTWISE: Final[dict[str, Callable[..., Any]]] = {
+_ELEMENTWISE_OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
     **{
         name: getattr(ca, name)
         for name in (
@@ -72,255 +72,298 @@ _ELEMENTWISE: Final[dict[str, Callable[..., Any]]] = {
     "round": lambda a: ca.floor(a + 0.5), "pow": ca.power,
     "exp2": lambda a: ca.power(2.0, a), "log2": lambda a: ca.log(a) / ca.log(2.0),
     "remainder": lambda a, b: a - b * ca.floor(a / b),
-    # comparisons with what is no number are false, so that it stays what it is
+    # comparisons with NaN are false, so that NaN is propagated
     "maximum": lambda a, b: ca.if_else(a < b, b, a),
     "minimum": lambda a, b: ca.if_else(a > b, b, a), "where": lambda c, a, b: ca.if_else(c, a, b),
-    "isnan": lambda a: ca.logic_not(_number(a)),
+    "isnan": lambda a: ca.logic_not(_is_number(a)),
     "isinf": lambda a: ca.eq(ca.fabs(a), ca.inf),
     **dict.fromkeys(("logical_not", "bitwise_not"), ca.logic_not),
     **dict.fromkeys(("logical_and", "bitwise_and"), ca.logic_and),
     **dict.fromkeys(("logical_or", "bitwise_or"), ca.logic_or),
     **dict.fromkeys(("logical_xor", "bitwise_xor"), ca.ne),
 }  # fmt: skip
-"""Operations on each element, on columns of one length or single numbers."""
-_FOLDS: Final = {
+"""Elementwise operations, on columns of one length or scalars."""
+_REDUCTIONS: Final = {
     "sum": "add", "mean": "add", "amax": "maximum", "amin": "minimum", "prod": "mul",
     "any": "logical_or", "all": "logical_and",
 }  # fmt: skip
-"""Reductions, with the operation that joins two numbers."""
+"""Reductions, with the operation that combines two numbers."""
 
 
-def lowered(
+def lower(
     step: Callable[..., Any],
     arguments: Sequence[tuple[str, int]],
     results: Sequence[str],
     what: str,
 ) -> ca.Function:
-    """Return the CasADi function of a step for one row in float64.
+    """Lower a step in torch to a CasADi function of one row in float64.
 
     Args:
-        step: of tensors [1, size], returns as many tensors as there are `results`.
-        arguments: names and sizes.
-        results: names.
-        what: is lowered, for messages.
+        step: function of tensors [1, size] that returns one tensor for each of `results`.
+        arguments: names and sizes of the arguments.
+        results: names of the results.
+        what: name of the model, for messages.
 
     Raises:
-        ExportError: where an operation is not known, by its name, or Python decides by values.
+        ExportError: where an operation is not supported, or Python decides by values.
     """
     examples = [torch.zeros(1, size, dtype=torch.float64) for _, size in arguments]
-    columns = [ca.MX.sym(name, size) for name, size in arguments]
-    graph = recorded(step, examples, what)
-    values = dict(zip(_placeholders(graph), map(_Value, examples, columns), strict=True))
-    found = _columns(graph, values, what)
-    return ca.Function("step", columns, found, [name for name, _ in arguments], list(results))
+    symbols = [ca.MX.sym(name, size) for name, size in arguments]
+    graph = record_graph(step, examples, what)
+    values = dict(zip(_get_placeholders(graph), map(_TracedValue, examples, symbols), strict=True))
+    results_columns = _lower_graph(graph, values, what)
+    return ca.Function(
+        "step", symbols, results_columns, [name for name, _ in arguments], list(results)
+    )
 
 
-def _placeholders(graph: Graph) -> list[Node]:
+def _get_placeholders(graph: Graph) -> list[Node]:
     return [node for node in graph.nodes if node.op == "placeholder"]
 
 
-def _columns(
+def _lower_graph(
     graph: Graph,
     values: dict[Node, Any],
     what: str,
-    instead: Callable[[Node, Any], Any] | None = None,
+    replacement: Callable[[Node, Any], Any] | None = None,
 ) -> list[Any]:
-    """Return the columns of a graph's results.
+    """Return the CasADi columns of the results of a graph.
 
     Args:
-        graph: recorded.
-        values: what is known of nodes already, to which all others are added.
-        what: is lowered, for messages.
-        instead: takes a node and its arguments, and returns its value, None for the usual one.
+        graph: the recorded graph.
+        values: values of some nodes; those of all other nodes are added.
+        what: name of the model, for messages.
+        replacement: returns the value of a node from its arguments, or None for the usual value.
     """
     for node in graph.nodes:
         if node in values:
             continue
         if node.op == "get_attr":
-            values[node] = _Value(
+            values[node] = _TracedValue(
                 operator.attrgetter(str(node.target))(graph.owning_module).detach()
             )
         elif node.op == "output":
             return [values[output].column for output in tree.tree_leaves(node.args[0])]
         else:
-            args, settings = torch.fx.node.map_arg((node.args, node.kwargs), values.__getitem__)
-            value = instead(node, args) if instead else None
-            values[node] = _called(node.target, args, settings, what) if value is None else value
-    raise AssertionError("a graph without results")
+            args, keyword_arguments = torch.fx.node.map_arg(
+                (node.args, node.kwargs), values.__getitem__
+            )
+            value = replacement(node, args) if replacement else None
+            values[node] = (
+                _lower_operation(node.target, args, keyword_arguments, what)
+                if value is None
+                else value
+            )
+    raise AssertionError("the graph has no output node")
 
 
 @dataclass(frozen=True)
-class Product:
-    """A product of numbers of each row with a matrix that all rows share, or a curve of each.
+class RowProduct:
+    """A product of vectors of each row with a matrix that all rows share, or an activation.
 
     Attributes:
-        rows: times that each row is multiplied with the matrix, with other numbers each time.
-        taken, given: numbers of a row, and of the result; the matrix is [taken, given].
-        place: number of what holds the matrix among the results of `Parts.prepare`.
-        member: number of the matrix in there, where several lie side by side.
-        curve: the operation that takes the place of a product, with no matrix.
+        n_repeats: number of vectors of a row that are multiplied with the matrix.
+        n_inputs: length of such a vector.
+        n_outputs: length of its product; the matrix is [n_inputs, n_outputs].
+        matrix_index: index of the tensor with the matrix in the results of `StepParts.prepare`.
+        matrix_member: index of the matrix in this tensor, where it holds several.
+        activation: name of the elementwise function in place of a product; empty for a product.
     """
 
-    rows: int
-    taken: int
-    given: int
-    place: int = -1
-    member: int = 0
-    curve: str = ""
+    n_repeats: int
+    n_inputs: int
+    n_outputs: int
+    matrix_index: int = -1
+    matrix_member: int = 0
+    activation: str = ""
 
     @property
-    def numbers(self) -> int:
-        """Numbers of the matrix."""
-        return 0 if self.curve else self.taken * self.given
+    def matrix_size(self) -> int:
+        """Number of entries of the matrix."""
+        return 0 if self.activation else self.n_inputs * self.n_outputs
 
 
 @dataclass(frozen=True)
-class Parts:
-    """A step, taken apart into what rows share, products with matrices, and all the rest.
+class StepParts:
+    """A step split into computations that rows share, matrix products, and the remainder.
 
     Attributes:
-        function: of the arguments of a row, of `theta`, of `product_<k>`, the results of the
-            products, and of `detached_<k>`, what the step detaches. It gives `factor_<k>`, what is
-            multiplied, then the results of the step, then `detached_<k>_value`. A factor depends on
-            no product but those before it.
-        prepare: takes the shared numbers, and gives what follows from them alone.
-        plain: numbers of what `prepare` gives whose entries make `theta`, one after the other.
-        products: in the order in which they are found.
+        function: the remainder. Its arguments are those of a row, `theta`, the results
+            `product_<k>` of the products, and the values `detached_<k>` that the step detaches. It
+            returns the factors `factor_<k>` of the products, then the results of the step, then
+            `detached_<k>_value`. A factor depends on previous products alone.
+        prepare: computes what depends on shared tensors alone, from these tensors.
+        theta_indices: results of `prepare` whose entries are concatenated to `theta`.
+        products: the products, in order of execution.
     """
 
     function: ca.Function
     prepare: GraphModule
-    plain: Sequence[int]
-    products: Sequence[Product]
+    theta_indices: Sequence[int]
+    products: Sequence[RowProduct]
 
 
-_LEAST: Final = 64
-"""Least numbers of a matrix whose products are loops; smaller ones are written out."""
-CURVES: Final = ("tanh", "sigmoid")
-"""Operations that are loops over a layer's units, and whose slopes follow from their values."""
-_UNITS: Final = 8
-"""Least units of a layer whose curves are loops."""
+_MIN_MATRIX_SIZE: Final = 64
+"""Smallest matrix, in entries, whose products become loops; smaller ones are unrolled."""
+ACTIVATIONS: Final = ("tanh", "sigmoid")
+"""Activation functions that become loops over units; their derivatives follow from their values."""
+_MIN_UNITS: Final = 8
+"""Smallest layer, in units, whose activations become loops."""
 
 
-def in_parts(
+def split_step(
     step: Callable[..., Any],
     rows: Sequence[tuple[str, Tensor]],
     shared: Sequence[Tensor],
     results: Sequence[str],
     what: str,
-) -> Parts:
-    """Return a step in parts; see `Parts`.
+) -> StepParts:
+    """Split a step into the parts of `StepParts`.
 
     Args:
-        step: of the rows' arguments, then of the shared numbers; in float64.
-        rows: names and examples [1, size] of the rows' arguments.
-        shared: numbers of any shape that all rows share.
-        results: names of what the step returns.
-        what: is lowered, for messages.
+        step: function of the arguments of a row, then of the shared tensors; float64.
+        rows: names and examples [1, size] of the arguments of a row.
+        shared: tensors of any shape that all rows share.
+        results: names of the results of the step.
+        what: name of the model, for messages.
 
     Raises:
-        ExportError: as of `lowered`.
+        ExportError: as of `lower`.
     """
-    graph = recorded(step, [*(example for _, example in rows), *shared], what)
-    places = _placeholders(graph)
-    alone: dict[Node, None] = dict.fromkeys(places[len(rows) :])
-    constant: dict[Node, None] = {}
+    graph = record_graph(step, [*(example for _, example in rows), *shared], what)
+    placeholders = _get_placeholders(graph)
+    # nodes that depend on shared tensors alone, and nodes that depend on nothing
+    shared_nodes: dict[Node, None] = dict.fromkeys(placeholders[len(rows) :])
+    constant_nodes: dict[Node, None] = {}
     for node in graph.nodes:
-        given = node.all_input_nodes
-        if node.op == "get_attr" or (node.op == "call_function" and _name(node.target) in _LIKE):
-            constant[node] = None
+        inputs = node.all_input_nodes
+        if node.op == "get_attr" or (
+            node.op == "call_function" and _operation_name(node.target) in _SHAPE_ONLY
+        ):
+            constant_nodes[node] = None
         elif node.op == "call_function":
-            if all(one in constant for one in given):
-                constant[node] = None
-            elif all(one in alone or one in constant for one in given):
-                alone[node] = None
+            if all(source in constant_nodes for source in inputs):
+                constant_nodes[node] = None
+            elif all(source in shared_nodes or source in constant_nodes for source in inputs):
+                shared_nodes[node] = None
 
-    def matrix(node: Node) -> Node | None:
-        """Return the shared matrix that rows are multiplied with."""
-        if node in alone or node.target not in _PRODUCTS or node.kwargs:
+    def shared_matrix_of(node: Node) -> Node | None:
+        """Return the shared matrix that a node multiplies rows with; None for other nodes."""
+        if node in shared_nodes or node.target not in _MATRIX_PRODUCTS or node.kwargs:
             return None
         a, b = node.args[-2:]
-        inside = isinstance(b, Node) and b in alone and a not in alone
-        return b if isinstance(b, Node) and inside and b.meta["size"] >= _LEAST else None
+        is_shared = isinstance(b, Node) and b in shared_nodes and a not in shared_nodes
+        return (
+            b if isinstance(b, Node) and is_shared and b.meta["size"] >= _MIN_MATRIX_SIZE else None
+        )
 
-    edge = [node for node in alone if any(user not in alone for user in node.users)]
-    found_constant = _subgraph(graph, places, list(constant))
+    # shared nodes that other nodes use: these are what `prepare` returns
+    boundary = [
+        node for node in shared_nodes if any(user not in shared_nodes for user in node.users)
+    ]
+    constant_graph = _extract_subgraph(graph, placeholders, list(constant_nodes))
     with torch.no_grad():
-        known = found_constant(*(example for _, example in rows), *shared)
-        prepare = _subgraph(
-            graph, places[len(rows) :], edge, dict(zip(constant, known, strict=True))
+        constants = constant_graph(*(example for _, example in rows), *shared)
+        prepare = _extract_subgraph(
+            graph,
+            placeholders[len(rows) :],
+            boundary,
+            dict(zip(constant_nodes, constants, strict=True)),
         )
         prepared = prepare(*shared)
-    for node, example in zip(edge, prepared, strict=True):
+    for node, example in zip(boundary, prepared, strict=True):
         node.meta["size"] = example.numel()
-    plain = [
+    # matrices of products are stored as tables; all other entries form `theta`
+    theta_indices = [
         k
-        for k, node in enumerate(edge)
-        if any(user not in alone and matrix(user) is not node for user in node.users)
+        for k, node in enumerate(boundary)
+        if any(
+            user not in shared_nodes and shared_matrix_of(user) is not node for user in node.users
+        )
     ]
     columns = [ca.MX.sym(name, example.shape[1]) for name, example in rows]
-    theta = ca.MX.sym("theta", sum(prepared[k].numel() for k in plain))
+    theta = ca.MX.sym("theta", sum(prepared[k].numel() for k in theta_indices))
     values: dict[Node, Any] = {
-        place: _Value(example, column)
-        for place, (_, example), column in zip(places, rows, columns, strict=False)
+        placeholder: _TracedValue(example, column)
+        for placeholder, (_, example), column in zip(placeholders, rows, columns, strict=False)
     }
-    # what shared numbers make of themselves is not evaluated here
-    values.update(dict.fromkeys(alone))
-    begin = 0
-    for k, (node, example) in enumerate(zip(edge, prepared, strict=True)):
-        if k in plain:
-            values[node] = _Value(example, theta[begin : begin + example.numel()])
-            begin += example.numel()
+    # `prepare` computes the shared nodes; they have no value here
+    values.update(dict.fromkeys(shared_nodes))
+    offset = 0
+    for k, (node, example) in enumerate(zip(boundary, prepared, strict=True)):
+        if k in theta_indices:
+            values[node] = _TracedValue(example, theta[offset : offset + example.numel()])
+            offset += example.numel()
         else:
-            values[node] = _Value(example)
+            values[node] = _TracedValue(example)
     symbols: list[Any] = []
     factors: list[Any] = []
-    products: list[Product] = []
-    apart: list[tuple[Any, Any]] = []
+    products: list[RowProduct] = []
+    detached: list[tuple[Any, Any]] = []
 
-    def instead(node: Node, args: Any) -> _Value | None:
-        if (shared_matrix := matrix(node)) is not None:
+    def replace_operation(node: Node, args: Any) -> _TracedValue | None:
+        if (shared_matrix := shared_matrix_of(node)) is not None:
             bias, a, b = (None, *args) if len(args) == 2 else args
             example = a.example @ b.example
-            (times, taken), given = a.example.shape[-2:], b.example.shape[-1]
-            first, count = len(products), b.example.numel() // (taken * given)
+            (n_repeats, n_inputs), n_outputs = a.example.shape[-2:], b.example.shape[-1]
+            first, count = len(products), b.example.numel() // (n_inputs * n_outputs)
             for member in range(count):
-                made = Product(times, taken, given, edge.index(shared_matrix), member)
-                symbols.append(ca.MX.sym(f"product_{len(products)}", times * given))
-                factors.append(a.column[member * times * taken : (member + 1) * times * taken])
-                products.append(made)
-            found = _Value(example, ca.vertcat(*symbols[first:]))
-            return found if bias is None else _each("add", example + bias.example, found, bias)
-        curve = _name(node.target)
-        if curve in CURVES and not args[0].constant and args[0].column.numel() >= _UNITS:
+                product = RowProduct(
+                    n_repeats, n_inputs, n_outputs, boundary.index(shared_matrix), member
+                )
+                symbols.append(ca.MX.sym(f"product_{len(products)}", n_repeats * n_outputs))
+                factors.append(
+                    a.column[member * n_repeats * n_inputs : (member + 1) * n_repeats * n_inputs]
+                )
+                products.append(product)
+            value = _TracedValue(example, ca.vertcat(*symbols[first:]))
+            return (
+                value
+                if bias is None
+                else _lower_elementwise("add", example + bias.example, value, bias)
+            )
+        activation = _operation_name(node.target)
+        if (
+            activation in ACTIVATIONS
+            and not args[0].is_constant
+            and args[0].column.numel() >= _MIN_UNITS
+        ):
             count = args[0].column.numel()
             symbols.append(ca.MX.sym(f"product_{len(products)}", count))
             factors.append(args[0].column)
-            products.append(Product(1, count, count, curve=curve))
-            return _Value(getattr(torch, curve)(args[0].example), symbols[-1])
-        if node.target is torch.ops.aten.detach.default and not args[0].constant:
-            symbol = ca.MX.sym(f"detached_{len(apart)}", args[0].column.numel())
-            apart.append((symbol, args[0].column))
-            return _Value(args[0].example, symbol)
+            products.append(RowProduct(1, count, count, activation=activation))
+            return _TracedValue(getattr(torch, activation)(args[0].example), symbols[-1])
+        if node.target is torch.ops.aten.detach.default and not args[0].is_constant:
+            symbol = ca.MX.sym(f"detached_{len(detached)}", args[0].column.numel())
+            detached.append((symbol, args[0].column))
+            return _TracedValue(args[0].example, symbol)
         return None
 
-    told = _columns(graph, values, what, instead)
-    found = [*factors, *told, *(column for _, column in apart)]
-    for k, one in [(k, one) for k, one in enumerate(products) if one.curve]:
-        used = np.flatnonzero(ca.which_depends(ca.veccat(*found), symbols[k])).tolist()
-        if len(used) < one.taken:
-            # a curve of more than what is looked at, as of all gates of a network at once
-            wanted, whole = ca.MX.sym(symbols[k].name(), len(used)), ca.MX.zeros(one.taken)
-            whole[used] = wanted
-            found = ca.substitute(found, [symbols[k]], [whole])
-            found[k] = found[k][used]
-            symbols[k], products[k] = wanted, Product(1, len(used), len(used), curve=one.curve)
-    names = [f"detached_{k}" for k in range(len(apart))]
-    return Parts(
+    outputs = _lower_graph(graph, values, what, replace_operation)
+    results_columns = [*factors, *outputs, *(column for _, column in detached)]
+    for k, product in enumerate(list(products)):
+        if not product.activation:
+            continue
+        used_units = np.flatnonzero(
+            ca.which_depends(ca.veccat(*results_columns), symbols[k])
+        ).tolist()
+        if len(used_units) < product.n_inputs:
+            # networks evaluate more units than they use, for example all gates at once
+            reduced = ca.MX.sym(symbols[k].name(), len(used_units))
+            expanded = ca.MX.zeros(product.n_inputs)
+            expanded[used_units] = reduced
+            results_columns = ca.substitute(results_columns, [symbols[k]], [expanded])
+            results_columns[k] = results_columns[k][used_units]
+            symbols[k], products[k] = (
+                reduced,
+                RowProduct(1, len(used_units), len(used_units), activation=product.activation),
+            )
+    names = [f"detached_{k}" for k in range(len(detached))]
+    return StepParts(
         ca.Function(
             "step",
-            [*columns, theta, *symbols, *(symbol for symbol, _ in apart)],
-            found,
+            [*columns, theta, *symbols, *(symbol for symbol, _ in detached)],
+            results_columns,
             [
                 *(name for name, _ in rows),
                 "theta",
@@ -334,150 +377,163 @@ def in_parts(
             ],
         ),
         prepare,
-        plain,
+        theta_indices,
         products,
     )
 
 
-_PRODUCTS: Final = tuple(getattr(torch.ops.aten, name).default for name in ("mm", "addmm", "bmm"))
+_MATRIX_PRODUCTS: Final = tuple(
+    getattr(torch.ops.aten, name).default for name in ("mm", "addmm", "bmm")
+)
 
 
-def _name(target: Any) -> str:
-    """Return the name of an operation of torch, as tables here have it."""
+def _operation_name(target: Any) -> str:
+    """Return the name of an operation of torch without its namespace; empty for others."""
     schema = getattr(target, "_schema", None)
     return schema.name.removeprefix("aten::").removesuffix("_copy") if schema else ""
 
 
-def _subgraph(
+def _extract_subgraph(
     graph: Graph,
-    given: Sequence[Node],
+    inputs: Sequence[Node],
     results: Sequence[Node],
     constant: Mapping[Node, Any] = MappingProxyType({}),
 ) -> GraphModule:
-    """Return the part of a graph that makes some of its nodes from others, and constants."""
-    part, owner = Graph(), nn.Module()
+    """Return the subgraph that computes some nodes from others.
+
+    Args:
+        graph: the recorded graph.
+        inputs: nodes that become arguments.
+        results: nodes that become results.
+        constant: values of nodes that become buffers.
+    """
+    subgraph, owner = Graph(), nn.Module()
     copies: dict[Node, Node] = {}
 
-    def copied(node: Node) -> Node:
+    def copy_node(node: Node) -> Node:
         if node not in copies:
             if node in constant:
                 name = f"constant_{len(copies)}"
                 owner.register_buffer(name, constant[node])
-                copies[node] = part.get_attr(name)
+                copies[node] = subgraph.get_attr(name)
             elif node.op == "get_attr":
                 name = f"constant_{len(copies)}"
                 owner.register_buffer(
                     name, operator.attrgetter(str(node.target))(graph.owning_module).detach()
                 )
-                copies[node] = part.get_attr(name)
+                copies[node] = subgraph.get_attr(name)
             else:
-                copies[node] = part.node_copy(node, copied)
+                copies[node] = subgraph.node_copy(node, copy_node)
         return copies[node]
 
-    for node in given:
-        copies[node] = part.placeholder(node.name)
-    part.output(tuple(copied(node) for node in results))
-    return GraphModule(owner, part)
+    for node in inputs:
+        copies[node] = subgraph.placeholder(node.name)
+    subgraph.output(tuple(copy_node(node) for node in results))
+    return GraphModule(owner, subgraph)
 
 
-def in_numbers(function: ca.Function) -> ca.Function:
-    """Return a function of single numbers, where no look-up in a long table keeps it from that."""
-    looks_up = range(function.n_instructions())
-    if any(function.instruction_id(k) == ca.OP_GETNONZEROS_PARAM for k in looks_up):
+def to_scalar_function(function: ca.Function) -> ca.Function:
+    """Expand a CasADi function to scalar operations, unless it looks up a long table."""
+    instructions = range(function.n_instructions())
+    if any(function.instruction_id(k) == ca.OP_GETNONZEROS_PARAM for k in instructions):
         return function
     symbols = [ca.SX.sym(name, function.numel_in(name)) for name in function.name_in()]
-    found = ca.cse([*function.call(symbols)])
-    return ca.Function("step", symbols, found, function.name_in(), function.name_out())
+    results = ca.cse([*function.call(symbols)])
+    return ca.Function("step", symbols, results, function.name_in(), function.name_out())
 
 
-def recorded(step: Callable[..., Any], examples: Sequence[Tensor], what: str) -> Graph:
-    """Return the graph of the operations of torch that a step makes of examples.
+def record_graph(step: Callable[..., Any], examples: Sequence[Tensor], what: str) -> Graph:
+    """Record the operations of a step on examples as a graph.
 
-    Its owning module has its constants.
+    The module that owns the graph holds its constants.
 
     Raises:
         ExportError: where Python decides by values.
     """
     from torch.func import functionalize
 
-    wrapped = functionalize(lambda *given: step(*given), remove="mutations")
+    wrapped = functionalize(lambda *arguments: step(*arguments), remove="mutations")
     try:
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")
-            return _Recorder().graph_of(wrapped, examples)
+            return _Recorder().record(wrapped, examples)
     except (RuntimeError, TypeError, ValueError, NotImplementedError) as error:
-        first = str(error).strip().splitlines()
+        message_lines = str(error).strip().splitlines()
+        reason = message_lines[0] if message_lines else type(error).__name__
         raise ExportError(
-            f"{what}: its step cannot be recorded as a fixed sequence of operations"
-            f" ({first[0] if first else type(error).__name__}); write it with operations on tensors"
-            " alone, torch.where instead of `if`"
+            f"{what}: its step cannot be recorded as a fixed sequence of operations ({reason});"
+            " write it with operations on tensors alone, torch.where instead of `if`"
         ) from error
 
 
 class _Recorder(TorchDispatchMode):
-    """Writes down the core operations that are carried out within it.
+    """Records the core operations of torch that run in its context.
 
-    `make_fx` of torch does so too, and imports torch's compiler, which takes 2 s.
+    `make_fx` does the same, but imports torch's compiler, which takes 2 s.
     """
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        """Return whether torch's compiler is told to leave this alone, and imported for that."""
+        """Return False: otherwise torch imports its compiler to disable it here."""
         return False
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        # `core_aten_decompositions` adds those that each operation has itself, in 60 ms
+        # `core_aten_decompositions` also collects those of each operation, which takes 60 ms
         from torch._decomp import _core_aten_decompositions_post_autograd
 
         self._rules: Any = _core_aten_decompositions_post_autograd()
         self._owner = GraphModule({}, Graph())
         self._graph = Graph(self._owner)
-        # numbers are kept, so that none is taken for another that had its place in memory
+        # tensors are referenced, so that no other tensor gets the same id
         self._nodes: dict[int, tuple[Node, Tensor]] = {}
         self._varying: set[Node] = set()
 
-    def graph_of(self, step: Callable[..., Any], examples: Sequence[Tensor]) -> Graph:
-        """Return the graph of a step."""
+    def record(self, step: Callable[..., Any], examples: Sequence[Tensor]) -> Graph:
+        """Return the graph of a step on examples."""
         for k, example in enumerate(examples):
             self._nodes[id(example)] = self._graph.placeholder(f"given_{k}"), example
         self._varying.update(node for node, _ in self._nodes.values())
         with self:
-            found = step(*examples)
-        self._graph.output(map_aggregate(found, self._node))
+            results = step(*examples)
+        self._graph.output(map_aggregate(results, self._node_of))
         self._graph.eliminate_dead_code()
         return self._graph
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        given = kwargs or {}
-        # what only moves numbers is kept: torch's rules would hide a detach, and import sympy
+        keyword_arguments = kwargs or {}
+        # data movements are not decomposed: torch's rules would hide a detach and import sympy
         rules = (self._rules.get(func), func.decompose)
-        for rule in filter(None, () if _name(func) in _MOVES else rules):
+        for rule in filter(None, () if _operation_name(func) in _DATA_MOVEMENT else rules):
             with self:
-                found = rule(*args, **given)
-            if found is not NotImplemented:
-                return found
-        node = self._graph.call_function(func, *map_aggregate((args, given), self._node))
+                result = rule(*args, **keyword_arguments)
+            if result is not NotImplemented:
+                return result
+        node = self._graph.call_function(
+            func, *map_aggregate((args, keyword_arguments), self._node_of)
+        )
         if not self._varying.isdisjoint(node.all_input_nodes):
             self._varying.add(node)
             if torch.Tag.data_dependent_output in func.tags:
-                raise RuntimeError(f"{_name(func)} takes a number out of what varies")
-        found = func(*args, **given)
-        self._told(node, found)
-        return found
+                raise RuntimeError(
+                    f"{_operation_name(func)} makes a Python number of a tensor that varies"
+                )
+        result = func(*args, **keyword_arguments)
+        self._register(node, result)
+        return result
 
-    def _told(self, node: Node, found: Any) -> None:
-        """Remember what a node has made."""
-        if isinstance(found, Tensor):
-            self._nodes[id(found)] = node, found
-        elif isinstance(found, list | tuple):
-            for k, part in enumerate(found):
-                member = self._graph.call_function(operator.getitem, (node, k))
-                self._varying |= {member} if node in self._varying else set()
-                self._told(member, part)
+    def _register(self, node: Node, result: Any) -> None:
+        """Associate the result of a node with it."""
+        if isinstance(result, Tensor):
+            self._nodes[id(result)] = node, result
+        elif isinstance(result, list | tuple):
+            for k, element in enumerate(result):
+                element_node = self._graph.call_function(operator.getitem, (node, k))
+                self._varying |= {element_node} if node in self._varying else set()
+                self._register(element_node, element)
 
-    def _node(self, value: Any) -> Any:
-        """Return the node of a tensor, anything else as it is."""
+    def _node_of(self, value: Any) -> Any:
+        """Return the node of a tensor; other values are returned unchanged."""
         if not isinstance(value, Tensor):
             return value
         if id(value) not in self._nodes:
@@ -488,268 +544,351 @@ class _Recorder(TorchDispatchMode):
 
 
 @dataclass
-class _Value:
-    """A tensor of the graph: what it is at the examples, and its numbers in row order.
+class _TracedValue:
+    """A tensor of the graph: its value at the examples, and its CasADi column in row order.
 
-    There is no column of what is the same whatever is given.
+    Constants have no expression.
     """
 
     example: Tensor
-    given: Any = None
+    expression: Any = None
 
     @property
-    def constant(self) -> bool:
-        return self.given is None or self.example.numel() == 0
+    def is_constant(self) -> bool:
+        return self.expression is None or self.example.numel() == 0
 
     @property
     def column(self) -> Any:
-        if self.given is None:
-            self.given = ca.MX(ca.DM(self.example.double().reshape(-1).tolist()))
-            return self.given
-        return self.given
+        if self.expression is None:
+            self.expression = ca.MX(ca.DM(self.example.double().reshape(-1).tolist()))
+            return self.expression
+        return self.expression
 
     @property
-    def places(self) -> Tensor:
+    def indices(self) -> Tensor:
         return torch.arange(self.example.numel()).reshape(self.example.shape)
 
 
-def _taken(column: Any, places: Tensor) -> Any:
-    """Return the numbers of a column at known places."""
-    wanted = places.reshape(-1).tolist()
-    if wanted == list(range(column.shape[0])):
+def _select(column: Any, indices: Tensor) -> Any:
+    """Return the entries of a column at constant indices."""
+    order = indices.reshape(-1).tolist()
+    if order == list(range(column.shape[0])):
         return column
-    # a single number that is taken many times makes a row
-    return ca.vec(column[wanted]) if wanted else ca.MX(0, 1)
+    # CasADi returns a row where one entry is selected several times
+    return ca.vec(column[order]) if order else ca.MX(0, 1)
 
 
-def _value(given: Any) -> _Value:
-    if isinstance(given, _Value):
-        return given
-    kind = torch.bool if isinstance(given, bool) else torch.float64
-    return _Value(torch.tensor(given, dtype=kind))
+def _to_traced_value(value: Any) -> _TracedValue:
+    if isinstance(value, _TracedValue):
+        return value
+    dtype = torch.bool if isinstance(value, bool) else torch.float64
+    return _TracedValue(torch.tensor(value, dtype=dtype))
 
 
-def _each(op: str, example: Tensor, *given: Any) -> _Value:
-    """Return an operation on each element of values that are brought to one shape."""
+def _lower_elementwise(operation: str, example: Tensor, *values: Any) -> _TracedValue:
+    """Return an elementwise operation on values broadcast to the shape of the example."""
     columns = []
-    for value in map(_value, given):
-        places = value.places.expand(np.broadcast_shapes(value.example.shape, example.shape))
-        alone = value.example.numel() == 1
-        columns.append(value.column if alone else _taken(value.column, places))
-    out = _ELEMENTWISE[op](*columns)
-    return _Value(
-        example, out if out.shape[0] == example.numel() else ca.repmat(out, example.numel(), 1)
+    for value in map(_to_traced_value, values):
+        indices = value.indices.expand(np.broadcast_shapes(value.example.shape, example.shape))
+        is_scalar = value.example.numel() == 1
+        columns.append(value.column if is_scalar else _select(value.column, indices))
+    result = _ELEMENTWISE_OPERATIONS[operation](*columns)
+    return _TracedValue(
+        example,
+        result if result.shape[0] == example.numel() else ca.repmat(result, example.numel(), 1),
     )
 
 
-def _called(target: Any, args: Any, settings: Any, what: str) -> Any:
+def _lower_operation(target: Any, args: Any, keyword_arguments: Any, what: str) -> Any:
     if target is operator.getitem:
         return args[0][args[1]]
-    name = _name(target)
-    leaves = [leaf for leaf in tree.tree_leaves((args, settings)) if isinstance(leaf, _Value)]
-
-    def plain(part: Any) -> Any:
-        return map_aggregate(part, lambda leaf: leaf.example if isinstance(leaf, _Value) else leaf)
-
-    example = target(*plain(args), **plain(settings))
-    if name in _LIKE or all(leaf.constant for leaf in leaves):
-        return _Value(example) if isinstance(example, Tensor) else [*map(_Value, example)]
-    moved = _MOVES.get(name, ())
-    others = [
-        leaf for i, arg in enumerate(args) if i not in moved for leaf in tree.tree_leaves(arg)
+    name = _operation_name(target)
+    leaves = [
+        leaf
+        for leaf in tree.tree_leaves((args, keyword_arguments))
+        if isinstance(leaf, _TracedValue)
     ]
-    if moved and all(leaf.constant for leaf in others if isinstance(leaf, _Value)):
-        return _moved(target, args, plain, moved, plain(settings), example)
-    if name in _SPECIAL:
-        return _SPECIAL[name](example, *args, **settings)
-    if name in _ELEMENTWISE and not settings:
-        return _each(name, example, *args)
-    if name in _FOLDS:
-        return _folded(name, example, *args, **settings)
+
+    def to_examples(part: Any) -> Any:
+        return map_aggregate(
+            part, lambda leaf: leaf.example if isinstance(leaf, _TracedValue) else leaf
+        )
+
+    example = target(*to_examples(args), **to_examples(keyword_arguments))
+    if name in _SHAPE_ONLY or all(leaf.is_constant for leaf in leaves):
+        return (
+            _TracedValue(example) if isinstance(example, Tensor) else [*map(_TracedValue, example)]
+        )
+    moved_arguments = _DATA_MOVEMENT.get(name, ())
+    other_leaves = [
+        leaf
+        for i, arg in enumerate(args)
+        if i not in moved_arguments
+        for leaf in tree.tree_leaves(arg)
+    ]
+    if moved_arguments and all(
+        leaf.is_constant for leaf in other_leaves if isinstance(leaf, _TracedValue)
+    ):
+        return _lower_data_movement(
+            target, args, to_examples, moved_arguments, to_examples(keyword_arguments), example
+        )
+    if name in _SPECIAL_OPERATIONS:
+        return _SPECIAL_OPERATIONS[name](example, *args, **keyword_arguments)
+    if name in _ELEMENTWISE_OPERATIONS and not keyword_arguments:
+        return _lower_elementwise(name, example, *args)
+    if name in _REDUCTIONS:
+        return _lower_reduction(name, example, *args, **keyword_arguments)
     raise ExportError(
-        f"{what}: its step uses torch's operation '{name}', which this format does not have; export"
-        " it as torchscript"
+        f"{what}: its step uses torch's operation '{name}', which this format does not"
+        " support; export it as torchscript"
     )
 
 
-def _moved(
-    target: Any, args: Any, plain: Any, moved: Sequence[int], settings: Any, example: Any
+def _lower_data_movement(
+    target: Any,
+    args: Any,
+    to_examples: Any,
+    moved_arguments: Sequence[int],
+    keyword_arguments: Any,
+    example: Any,
 ) -> Any:
-    """Return what an operation moves, by letting it move the places of the numbers instead."""
+    """Return the result of a data movement, found by moving the indices of the entries."""
     columns: list[Any] = []
     count = 0
 
-    def placed(leaf: Any) -> Any:
+    def to_indices(leaf: Any) -> Any:
         nonlocal count
-        if not isinstance(leaf, _Value):
+        if not isinstance(leaf, _TracedValue):
             return leaf
         columns.append(leaf.column)
         count += leaf.example.numel()
-        return leaf.places + (count - leaf.example.numel())
+        return leaf.indices + (count - leaf.example.numel())
 
-    given = [map_aggregate(arg, placed) if i in moved else plain(arg) for i, arg in enumerate(args)]
-    places = target(*given, **settings)
-    whole = columns[0] if len(columns) == 1 else ca.vertcat(*columns)
-    if isinstance(example, Tensor):
-        return _Value(example, _taken(whole, places))
-    return [_Value(one, _taken(whole, at)) for one, at in zip(example, places, strict=True)]
-
-
-def _rows(given: _Value, dim: Any) -> tuple[Tensor, int]:
-    """Return the places [rows, n] of the numbers that a reduction over dimensions joins."""
-    places = given.places
-    every = list(range(places.dim()))
-    listed = [dim] if isinstance(dim, int) else dim
-    over = [d % places.dim() for d in listed] if listed else every
-    moved = places.permute(*(d for d in every if d not in over), *over)
-    size = 1
-    for d in over:
-        size *= places.shape[d]
-    return moved.reshape(-1, size), size
-
-
-def _folded(
-    name: str, example: Tensor, given: _Value, dim: Any = None, keepdim: bool = False, **_: Any
-) -> _Value:
-    rows, size = _rows(given, dim)
-    if name in ("sum", "mean"):
-        total = ca.sum2(ca.reshape(_taken(given.column, rows.T), len(rows), size))
-        return _Value(example, total / size if name == "mean" else total)
-    total = _taken(given.column, rows[:, 0])
-    for k in range(1, size):
-        total = _ELEMENTWISE[_FOLDS[name]](total, _taken(given.column, rows[:, k]))
-    return _Value(example, total)
-
-
-def _extreme(name: Literal["max", "min"], example: Any, given: _Value, dim: int) -> list[_Value]:
-    """Return the largest or smallest numbers along a dimension, and their places."""
-    rows, size = _rows(given, dim)
-    best, place = _taken(given.column, rows[:, 0]), ca.MX(ca.DM.zeros(len(rows), 1))
-    for k in range(1, size):
-        other = _taken(given.column, rows[:, k])
-        better = other > best if name == "max" else other < best
-        best, place = ca.if_else(better, other, best), ca.if_else(better, k, place)
-    return [_Value(example[0], best), _Value(example[1], place)]
-
-
-def _scaled(given: Any, factor: float) -> Any:
-    value = _value(given)
-    return given if factor == 1 else _each("mul", value.example * factor, value, float(factor))
-
-
-def _power(example: Tensor, a: Any, b: Any) -> _Value:
-    power = _value(b)
-    known = float(power.example) if power.constant and power.example.numel() == 1 else None
-    if known in (0.5, -1.0, 2.0):
-        return _each({0.5: "sqrt", -1.0: "reciprocal", 2.0: "square"}[known], example, a)
-    if known in (3.0, 4.0):
-        square = _each("square", example, a)
-        return _each("mul", example, square, a if known == 3.0 else square)
-    return _each("pow", example, a, b)
-
-
-def _divided(example: Tensor, a: Any, b: Any, rounding_mode: str | None = None) -> _Value:
-    ratio = _each("div", example, a, b)
-    return ratio if rounding_mode is None else _each(rounding_mode, example, ratio)
-
-
-def _clamped(example: Tensor, given: _Value, min: Any = None, max: Any = None) -> _Value:
-    out = given if min is None else _each("maximum", example, given, min)
-    return out if max is None else _each("minimum", example, out, max)
-
-
-def _cast(example: Tensor, given: _Value, *_: Any, **settings: Any) -> _Value:
-    """Return a value in another type; precisions are not told apart."""
-    before, after = given.example.dtype, example.dtype
-    if after == torch.bool and before != torch.bool:
-        return _each("ne", example, given, 0.0)
-    if before.is_floating_point and not after.is_floating_point:
-        return _each("trunc", example, given)
-    return _Value(example, given.column)
-
-
-def _copied(example: Tensor, given: _Value, source: _Value, *_: Any) -> _Value:
-    return _cast(example, _each("add", source.example.expand(example.shape), source, 0.0))
-
-
-def _product(
-    example: Tensor, a: _Value, b: _Value, start: Any = None, beta: float = 1, alpha: float = 1
-) -> _Value:
-    (m, k), n = a.example.shape, b.example.shape[1]
-    # columns are stored in row order, so that they are the transposed matrices
-    right = (
-        ca.MX(ca.DM(b.example.double().T.tolist())) if b.constant else ca.reshape(b.column, n, k)
-    )
-    out = _Value(example, ca.vec(ca.mtimes(right, ca.reshape(_scaled(a, alpha).column, k, m))))
-    return out if start is None else _each("add", example, out, _scaled(start, beta))
-
-
-def _products(example: Tensor, a: _Value, b: _Value) -> _Value:
-    def part(value: _Value, i: int) -> _Value:
-        column = None if value.given is None else _taken(value.column, value.places[i])
-        return _Value(value.example[i], column)
-
-    parts = [_product(example[i], part(a, i), part(b, i)).column for i in range(len(example))]
-    return _Value(example, ca.vertcat(*parts))
-
-
-def _picked(table: Any, places: Tensor, at: Any) -> Any:
-    """Return the row of a table, whose numbers are at `places` [n, k], that is known at run time.
-
-    What lies beyond the table is held to its ends.
-    """
-    rows, size = places.shape
-    if rows > _SHORT:
-        row = ca.fmin(ca.fmax(at, 0.0), rows - 1.0)
-        return ca.vec(_taken(table, places).get_nz(False, row * size + ca.DM(list(range(size)))))
-    out = _taken(table, places[0])
-    for i in range(1, rows):
-        out = ca.if_else(at >= i, _taken(table, places[i]), out)
-    return out
-
-
-def _looked_up(example: Tensor, given: _Value, dim: int, index: _Value) -> _Value:
-    """Return rows along a dimension; the index is that of torch's `index_select`."""
-    rows = given.places.movedim(dim, 0)
-    flat = rows.reshape(len(rows), -1)
-    parts = [_picked(given.column, flat, index.column[i]) for i in range(index.example.numel())]
-    order = torch.arange(len(parts) * flat.shape[1]).reshape(len(parts), *rows.shape[1:])
-    return _Value(example, _taken(ca.vertcat(*parts), order.movedim(0, dim)))
-
-
-def _indexed(example: Tensor, given: _Value, indices: Sequence[_Value | None]) -> _Value:
-    first = indices[0]
-    if first is None or len(indices) > 1:
-        raise ExportError(
-            "a step looks up a table by several indices at once, which this format does not have;"
-            " export it as torchscript"
-        )
-    return _looked_up(example, given, 0, first)
-
-
-def _gathered(example: Tensor, given: _Value, dim: int, index: _Value, **_: Any) -> _Value:
-    table, at = given.places.movedim(dim, -1), index.places.movedim(dim, -1)
-    table = table[tuple(slice(size) for size in at.shape[:-1])].reshape(-1, table.shape[-1])
-    parts = [
-        _picked(given.column, row[:, None], index.column[place])
-        for row, wanted in zip(table, at.reshape(-1, at.shape[-1]).tolist(), strict=True)
-        for place in wanted
+    arguments = [
+        map_aggregate(arg, to_indices) if i in moved_arguments else to_examples(arg)
+        for i, arg in enumerate(args)
     ]
-    order = torch.arange(len(parts)).reshape(at.shape).movedim(-1, dim)
-    return _Value(example, _taken(ca.vertcat(*parts), order))
+    indices = target(*arguments, **keyword_arguments)
+    joined = columns[0] if len(columns) == 1 else ca.vertcat(*columns)
+    if isinstance(example, Tensor):
+        return _TracedValue(example, _select(joined, indices))
+    return [
+        _TracedValue(element, _select(joined, element_indices))
+        for element, element_indices in zip(example, indices, strict=True)
+    ]
 
 
-_SPECIAL: Final[dict[str, Callable[..., Any]]] = {
-    "add": lambda e, a, b, alpha=1: _each("add", e, a, _scaled(b, alpha)),
-    "sub": lambda e, a, b, alpha=1: _each("sub", e, a, _scaled(b, alpha)),
-    "rsub": lambda e, a, b, alpha=1: _each("sub", e, b, _scaled(a, alpha)),
-    "div": _divided, "pow": _power, "clamp": _clamped, "_to": _cast, "copy": _copied,
-    "mm": _product, "bmm": _products,
-    "addmm": lambda e, start, a, b, beta=1, alpha=1: _product(e, a, b, start, beta, alpha),
-    "max": lambda e, given, dim, keepdim=False: _extreme("max", e, given, dim),
-    "min": lambda e, given, dim, keepdim=False: _extreme("min", e, given, dim),
-    "argmax": lambda e, given, dim=None, keepdim=False: _extreme("max", (e, e), given, dim)[1],
-    "argmin": lambda e, given, dim=None, keepdim=False: _extreme("min", (e, e), given, dim)[1],
-    "index_select": _looked_up, "index": _indexed, "gather": _gathered,
+def _reduction_rows(value: _TracedValue, dim: Any) -> tuple[Tensor, int]:
+    """Return the indices [rows, n] of the entries that a reduction combines, and n."""
+    indices = value.indices
+    dimensions = list(range(indices.dim()))
+    requested = [dim] if isinstance(dim, int) else dim
+    reduced = [d % indices.dim() for d in requested] if requested else dimensions
+    reordered = indices.permute(*(d for d in dimensions if d not in reduced), *reduced)
+    size = 1
+    for d in reduced:
+        size *= indices.shape[d]
+    return reordered.reshape(-1, size), size
+
+
+def _lower_reduction(
+    name: str,
+    example: Tensor,
+    value: _TracedValue,
+    dim: Any = None,
+    keepdim: bool = False,
+    **_: Any,
+) -> _TracedValue:
+    rows, size = _reduction_rows(value, dim)
+    if name in ("sum", "mean"):
+        total = ca.sum2(ca.reshape(_select(value.column, rows.T), len(rows), size))
+        return _TracedValue(example, total / size if name == "mean" else total)
+    total = _select(value.column, rows[:, 0])
+    for k in range(1, size):
+        total = _ELEMENTWISE_OPERATIONS[_REDUCTIONS[name]](total, _select(value.column, rows[:, k]))
+    return _TracedValue(example, total)
+
+
+def _lower_extremum(
+    name: Literal["max", "min"], example: Any, value: _TracedValue, dim: int
+) -> list[_TracedValue]:
+    """Return the largest or smallest entries along a dimension, and their positions."""
+    rows, size = _reduction_rows(value, dim)
+    extremum, position = _select(value.column, rows[:, 0]), ca.MX(ca.DM.zeros(len(rows), 1))
+    for k in range(1, size):
+        candidate = _select(value.column, rows[:, k])
+        is_better = candidate > extremum if name == "max" else candidate < extremum
+        extremum, position = (
+            ca.if_else(is_better, candidate, extremum),
+            ca.if_else(is_better, k, position),
+        )
+    return [_TracedValue(example[0], extremum), _TracedValue(example[1], position)]
+
+
+def _scale(operand: Any, factor: float) -> Any:
+    value = _to_traced_value(operand)
+    return (
+        operand
+        if factor == 1
+        else _lower_elementwise("mul", value.example * factor, value, float(factor))
+    )
+
+
+def _lower_power(example: Tensor, a: Any, b: Any) -> _TracedValue:
+    power = _to_traced_value(b)
+    exponent = float(power.example) if power.is_constant and power.example.numel() == 1 else None
+    if exponent in (0.5, -1.0, 2.0):
+        return _lower_elementwise(
+            {0.5: "sqrt", -1.0: "reciprocal", 2.0: "square"}[exponent], example, a
+        )
+    if exponent in (3.0, 4.0):
+        square = _lower_elementwise("square", example, a)
+        return _lower_elementwise("mul", example, square, a if exponent == 3.0 else square)
+    return _lower_elementwise("pow", example, a, b)
+
+
+def _lower_division(
+    example: Tensor, a: Any, b: Any, rounding_mode: str | None = None
+) -> _TracedValue:
+    ratio = _lower_elementwise("div", example, a, b)
+    return ratio if rounding_mode is None else _lower_elementwise(rounding_mode, example, ratio)
+
+
+def _lower_clamp(
+    example: Tensor, value: _TracedValue, min: Any = None, max: Any = None
+) -> _TracedValue:
+    clamped = value if min is None else _lower_elementwise("maximum", example, value, min)
+    return clamped if max is None else _lower_elementwise("minimum", example, clamped, max)
+
+
+def _lower_cast(example: Tensor, value: _TracedValue, *_: Any, **_settings: Any) -> _TracedValue:
+    """Return a value cast to another type; floating-point precisions are not distinguished."""
+    source_dtype, target_dtype = value.example.dtype, example.dtype
+    if target_dtype == torch.bool and source_dtype != torch.bool:
+        return _lower_elementwise("ne", example, value, 0.0)
+    if source_dtype.is_floating_point and not target_dtype.is_floating_point:
+        return _lower_elementwise("trunc", example, value)
+    return _TracedValue(example, value.column)
+
+
+def _lower_copy(
+    example: Tensor, value: _TracedValue, source: _TracedValue, *_: Any
+) -> _TracedValue:
+    return _lower_cast(
+        example, _lower_elementwise("add", source.example.expand(example.shape), source, 0.0)
+    )
+
+
+def _lower_product(
+    example: Tensor,
+    a: _TracedValue,
+    b: _TracedValue,
+    start: Any = None,
+    beta: float = 1,
+    alpha: float = 1,
+) -> _TracedValue:
+    (m, k), n = a.example.shape, b.example.shape[1]
+    # columns are in row order, and CasADi reshapes by columns: matrices are transposed
+    right = (
+        ca.MX(ca.DM(b.example.double().T.tolist())) if b.is_constant else ca.reshape(b.column, n, k)
+    )
+    product = _TracedValue(
+        example, ca.vec(ca.mtimes(right, ca.reshape(_scale(a, alpha).column, k, m)))
+    )
+    return (
+        product
+        if start is None
+        else _lower_elementwise("add", example, product, _scale(start, beta))
+    )
+
+
+def _lower_batched_products(example: Tensor, a: _TracedValue, b: _TracedValue) -> _TracedValue:
+    def matrix(value: _TracedValue, i: int) -> _TracedValue:
+        column = None if value.expression is None else _select(value.column, value.indices[i])
+        return _TracedValue(value.example[i], column)
+
+    parts = [
+        _lower_product(example[i], matrix(a, i), matrix(b, i)).column for i in range(len(example))
+    ]
+    return _TracedValue(example, ca.vertcat(*parts))
+
+
+def _select_row(table: Any, indices: Tensor, position: Any) -> Any:
+    """Return the row of a table at a position that is known at run time.
+
+    Args:
+        table: column of the entries.
+        indices: indices of the entries of each row [n, k].
+        position: row; clamped to the table.
+    """
+    rows, size = indices.shape
+    if rows > _MAX_TABLE_ROWS:
+        row = ca.fmin(ca.fmax(position, 0.0), rows - 1.0)
+        return ca.vec(_select(table, indices).get_nz(False, row * size + ca.DM(list(range(size)))))
+    selected = _select(table, indices[0])
+    for i in range(1, rows):
+        selected = ca.if_else(position >= i, _select(table, indices[i]), selected)
+    return selected
+
+
+def _lower_index_select(
+    example: Tensor, table: _TracedValue, dim: int, index: _TracedValue
+) -> _TracedValue:
+    """Return rows along a dimension, as `torch.index_select`."""
+    rows = table.indices.movedim(dim, 0)
+    row_indices = rows.reshape(len(rows), -1)
+    parts = [
+        _select_row(table.column, row_indices, index.column[i])
+        for i in range(index.example.numel())
+    ]
+    order = torch.arange(len(parts) * row_indices.shape[1]).reshape(len(parts), *rows.shape[1:])
+    return _TracedValue(example, _select(ca.vertcat(*parts), order.movedim(0, dim)))
+
+
+def _lower_index(
+    example: Tensor, table: _TracedValue, indices: Sequence[_TracedValue | None]
+) -> _TracedValue:
+    index = indices[0]
+    if index is None or len(indices) > 1:
+        raise ExportError(
+            "a step indexes a tensor by several index tensors at once, which this format does not"
+            " support; export it as torchscript"
+        )
+    return _lower_index_select(example, table, 0, index)
+
+
+def _lower_gather(
+    example: Tensor, value: _TracedValue, dim: int, index: _TracedValue, **_: Any
+) -> _TracedValue:
+    table_indices, index_positions = value.indices.movedim(dim, -1), index.indices.movedim(dim, -1)
+    table_indices = table_indices[
+        tuple(slice(size) for size in index_positions.shape[:-1])
+    ].reshape(-1, table_indices.shape[-1])
+    parts = [
+        _select_row(value.column, row[:, None], index.column[position])
+        for row, row_positions in zip(
+            table_indices,
+            index_positions.reshape(-1, index_positions.shape[-1]).tolist(),
+            strict=True,
+        )
+        for position in row_positions
+    ]
+    order = torch.arange(len(parts)).reshape(index_positions.shape).movedim(-1, dim)
+    return _TracedValue(example, _select(ca.vertcat(*parts), order))
+
+
+_SPECIAL_OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
+    "add": lambda e, a, b, alpha=1: _lower_elementwise("add", e, a, _scale(b, alpha)),
+    "sub": lambda e, a, b, alpha=1: _lower_elementwise("sub", e, a, _scale(b, alpha)),
+    "rsub": lambda e, a, b, alpha=1: _lower_elementwise("sub", e, b, _scale(a, alpha)),
+    "div": _lower_division, "pow": _lower_power, "clamp": _lower_clamp, "_to": _lower_cast,
+    "copy": _lower_copy,
+    "mm": _lower_product, "bmm": _lower_batched_products,
+    "addmm": lambda e, start, a, b, beta=1, alpha=1: _lower_product(e, a, b, start, beta, alpha),
+    "max": lambda e, x, dim, keepdim=False: _lower_extremum("max", e, x, dim),
+    "min": lambda e, x, dim, keepdim=False: _lower_extremum("min", e, x, dim),
+    "argmax": lambda e, x, dim=None, keepdim=False: _lower_extremum("max", (e, e), x, dim)[1],
+    "argmin": lambda e, x, dim=None, keepdim=False: _lower_extremum("min", (e, e), x, dim)[1],
+    "index_select": _lower_index_select, "index": _lower_index, "gather": _lower_gather,
 }  # fmt: skip
-"""Operations with settings of their own."""
+"""Operations with arguments that need a rule each."""

@@ -22,7 +22,7 @@ from residnet.core.layout import (
 )
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.engine.free_runs import compiled
+from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import Rollout
 from residnet.evaluation.band import Band, band_channels
 from residnet.evaluation.protocol import Window
@@ -309,7 +309,7 @@ def _run_candidate(
     # a copy: a validation in float32 must not round the model that it validates
     model = copy.deepcopy(candidate.model).to("cpu", dtype).eval()
     # the pose is integrated from the velocities below, or composed of rotations by the model
-    model.positions = model.spatial
+    model.has_position = model.spatial
     dof = logs[0].dof
     state_names = candidate.state_names or dof.state_names
     simulated_states = dof.state_names if model.spatial else dof.dynamic_states
@@ -408,7 +408,7 @@ def _simulate_batch(
                 memory[torch.from_numpy(same_history)] = model.warmup(
                     torch.from_numpy(y_history).to(dtype), torch.from_numpy(w_history).to(dtype)
                 )
-        states, _, _ = compiled(Rollout(model), longest_window)(
+        states, _, _ = compile_rollout(Rollout(model), longest_window)(
             torch.from_numpy(x0).to(dtype), torch.from_numpy(future_inputs).to(dtype), memory
         )
     result: torch.Tensor = states

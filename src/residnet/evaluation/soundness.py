@@ -34,7 +34,7 @@ from residnet.core.stretches import find_runs
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.engine.free_runs import compiled
+from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import Rollout
 from residnet.physics.symmetry import (
     find_heeling_propellers,
@@ -316,7 +316,7 @@ def settled_acceleration(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
     To a model that looks for what was predicted wrong, states that are held would tell of a force
     that holds them: it has no past.
     """
-    memory = model.initial_state(len(x)).to(x) if model.observes else settle_memory(model, x, w)
+    memory = model.initial_state(len(x)).to(x) if model.has_innovation else settle_memory(model, x, w)
     return model.acceleration(x, w, memory)
 
 
@@ -543,7 +543,7 @@ def _final_deviation(model: HybridDynamics, run: SteadyRun) -> float:
     )
     inputs = torch.from_numpy(run.mean_inputs).expand(len(initial_states), -1)
     model_without_pose = copy.deepcopy(model)
-    model_without_pose.positions = False
+    model_without_pose.has_position = False
     n_steps = max(round(run.duration / model.dt), 3)
     with torch.no_grad():
         states, _, _ = Rollout(model_without_pose)(
@@ -666,10 +666,10 @@ def check_boundedness(
     chunk_steps = max(round(_MEMORY_SETTLING_TIME / model.dt), 1)
     # where the vessel is says nothing of how fast it is
     model_without_pose = copy.deepcopy(model)
-    model_without_pose.positions = False
+    model_without_pose.has_position = False
     n_steps = round(max(_LONG_RUN_DURATION, training_points.longest_duration) / model.dt)
     rollout, constant_inputs = (
-        compiled(Rollout(model_without_pose), n_steps),
+        compile_rollout(Rollout(model_without_pose), n_steps),
         w.unsqueeze(1).expand(-1, chunk_steps, -1),
     )
     divergence_time = torch.zeros(len(x))

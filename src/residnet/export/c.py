@@ -26,8 +26,8 @@ import torch
 from residnet.core.errors import ExportError, UsageError
 from residnet.core.progress import log_message
 from residnet.dynamics.store import BandTable
-from residnet.engine.c_code import Body, Tables, compiler, literal
-from residnet.engine.trace import in_numbers, lowered
+from residnet.engine.c_code import FunctionWriter, Tables, find_compiler, write_literal
+from residnet.engine.trace import lower, to_scalar_function
 from residnet.export.base import (
     Exportable,
     Exporter,
@@ -53,7 +53,7 @@ def expand_if_small(function: ca.Function) -> ca.Function:
             n_operations += product.numel() * product.dep(1).shape[1]
     if n_operations > _MAX_SCALAR_OPERATIONS:
         return function
-    expanded = in_numbers(function)
+    expanded = to_scalar_function(function)
     return expanded if expanded.n_instructions() <= _MAX_SCALAR_OPERATIONS else function
 
 
@@ -118,7 +118,7 @@ class CFunction:
 
     def render_definition(self, prefix: str, tables: Tables) -> str:
         """Return the function in C."""
-        statement_writer = Body(expand_if_small(self.function), tables, f"{prefix}_{self.name}")
+        statement_writer = FunctionWriter(expand_if_small(self.function), tables, f"{prefix}_{self.name}")
         names = self.function.name_out()
         store_statements = [
             f"{name}[{i}] = {value};"
@@ -130,7 +130,7 @@ class CFunction:
             store_statements.append(
                 f"return {statement_writer.results[names.index(self.flags[0])][0]} != ZERO;"
             )
-        statements = statement_writer.read(store_statements)
+        statements = statement_writer.used_statements(store_statements)
         used_words = set(re.findall(r"\w+", "\n".join(statements)))
         unused_casts = [
             f"(void){name};"
@@ -227,7 +227,7 @@ def compile_shared_library(
     # all code for Windows is independent of its position, and the flag a warning there
     position_flags = () if library_path.suffix == ".dll" else ("-fPIC",)
     command = [
-        compiler_path or compiler(),
+        compiler_path or find_compiler(),
         "-O2",
         *STRICT_FLAGS,
         "-shared",
@@ -271,7 +271,7 @@ def measure_footprint(source: Path) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         object_file = Path(folder) / "made.o"
         try:
-            size_tool = compiler()
+            size_tool = find_compiler()
         except ExportError:
             size_tool = ""
         command = [size_tool, "-std=c99", "-Os", "-c", str(source), "-o", str(object_file)]
@@ -412,7 +412,7 @@ def generate_c_source(
         for name, n_entries in exported.arguments
     }
     # what is found in double precision is written for both
-    step_function = lowered(
+    step_function = lower(
         exported.build_step_module(torch.float64), exported.arguments, exported.results, label
     )
     description_key, introduction = (
@@ -427,7 +427,7 @@ def generate_c_source(
             " held over the step, s [MEMORY] memory."
         )
         guarded = exported.guard_model(torch.float64)
-        measured_function = lowered(guarded.is_measurement, exported.arguments[:2], ["good"], label)
+        measured_function = lower(guarded.is_measurement, exported.arguments[:2], ["good"], label)
         function_comment = "1 where every entry of a state and its inputs is a measurement, else 0"
         functions.append(CFunction("measured", function_comment, measured_function, ["good"]))
         extra_functions = _render_vessel_functions(prefix, exported)
@@ -446,7 +446,7 @@ def generate_c_source(
             "policy",
             "a policy, written by residnet. All arrays are the caller's.",
         )
-        initial_function = lowered(initial_state, exported.arguments[:1], ["s"], label)
+        initial_function = lower(initial_state, exported.arguments[:1], ["s"], label)
         functions.append(
             CFunction("initial_state", "memory at the first measurement", initial_function)
         )
@@ -652,7 +652,7 @@ class CasadiExporter(Exporter):
 
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
         exported.require_finite_numbers()
-        step_function = lowered(
+        step_function = lower(
             exported.build_step_module(torch.float64),
             exported.arguments,
             exported.results,
@@ -660,7 +660,7 @@ class CasadiExporter(Exporter):
         )
         with tempfile.TemporaryDirectory() as name:
             temporary_path = Path(name) / file.name
-            in_numbers(step_function).save(str(temporary_path))
+            to_scalar_function(step_function).save(str(temporary_path))
             parity = exported.check_parity(
                 CasadiModel(temporary_path), "the CasADi function", torch.float64
             )

@@ -100,8 +100,8 @@ class GuardedDynamics(Dynamics):
         self.model = model
         self.float_max = _FLOAT32_MAX
         self.n_state = model.n_state
-        self.dof, self.rolls = model.dof, model.rolls
-        self.turn_about(ATTITUDE if model.spatial else (), len(spec.signals.dof.state_names) + 1)
+        self.dof, self.has_roll = model.dof, model.has_roll
+        self.set_attitude_columns(ATTITUDE if model.spatial else (), len(spec.signals.dof.state_names) + 1)
         lower, upper, margin = (
             torch.tensor(values, dtype=torch.float64)
             for values in (spec.low, spec.high, _accepted_margins(spec))
@@ -123,18 +123,18 @@ class GuardedDynamics(Dynamics):
         self.state_ranges = GuardRanges(
             lower[:n_states], upper[:n_states], margin[:n_states], torch.float32
         )
-        memory_minimum, memory_maximum = model.memory_range()
+        memory_minimum, memory_maximum = model.memory_bounds()
         # finite, so that comparisons alone tell what is no number
         memory_lower = (memory_minimum - 1e-3 * memory_minimum.abs()).clamp(min=-_FLOAT32_MAX)
         memory_upper = (memory_maximum + 1e-3 * memory_maximum.abs()).clamp(max=_FLOAT32_MAX)
         self.memory_lower = nn.Buffer(memory_lower.to(torch.float32))
         self.memory_upper = nn.Buffer(memory_upper.to(torch.float32))
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+    def state_derivative(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return x_dot [B, nx] of the model at a stage; the flag has none."""
         return torch.cat(
             (
-                self.model.rate(pose_and_dynamic_states(x, self.dof), p, rho),
+                self.model.state_derivative(pose_and_dynamic_states(x, self.dof), p, rho),
                 torch.zeros_like(actuator_states(x, self.dof)),
             ),
             dim=-1,

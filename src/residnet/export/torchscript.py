@@ -97,10 +97,10 @@ def trace_function(function: Callable[..., Any], examples: tuple[Tensor, ...], w
         tuple(torch.cat((part, part[:1])) for part in examples),
     ]
     # CasADi, which the recorder needs, is not imported where nothing is exported
-    from residnet.engine.trace import recorded
+    from residnet.engine.trace import record_graph
 
     # a trace would take the branch of the examples always
-    recorded(function, examples, what)
+    record_graph(function, examples, what)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=DeprecationWarning)
         # sizes that become constants are found by the other batches

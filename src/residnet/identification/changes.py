@@ -154,7 +154,7 @@ class PerturbedDynamics(Dynamics):
     ) -> None:
         super().__init__(model.dt, model.integrator)
         self.model = model
-        self.n_state, self.dof, self.rolls = model.n_state, model.dof, model.rolls
+        self.n_state, self.dof, self.has_roll = model.n_state, model.dof, model.has_roll
         dynamic_states = get_dof(model.signals.names).dynamic_states
 
         def repeat_per_row(values: Sequence[Sequence[float]]) -> Tensor:
@@ -219,7 +219,7 @@ class PerturbedDynamics(Dynamics):
         changed_next_state = nominal_next_state.clone()
         if self.model.spatial:
             changed_velocities = torch.where(
-                self.model.live > 0.0, changed_velocities, nominal_next_state[:, DYNAMIC_STATES]
+                self.model.equation_mask > 0.0, changed_velocities, nominal_next_state[:, DYNAMIC_STATES]
             )
             changed_next_state[:, DYNAMIC_STATES] = changed_velocities
             rotation_vector = torch.zeros_like(nominal_next_state)
@@ -227,14 +227,14 @@ class PerturbedDynamics(Dynamics):
             rotation_vector[:, ATTITUDE] = (
                 0.5 * self.dt * (changed_next_state - nominal_next_state)[:, rate_columns]
             )
-            return self.model.moved_on(changed_next_state, rotation_vector), next_memory
+            return self.model.add_change(changed_next_state, rotation_vector), next_memory
         # angles follow what their rates have gained over the step
         angle_increments = (
             changed_velocities - nominal_next_state[:, DYNAMIC_STATES]
-        ) @ self.model.known_rates
+        ) @ self.model.angle_rate_matrix
         changed_angles = nominal_next_state[:, DYNAMIC_STATES] + 0.5 * self.dt * angle_increments
         changed_next_state[:, DYNAMIC_STATES] = torch.where(
-            self.model.live > 0.0, changed_velocities, changed_angles
+            self.model.equation_mask > 0.0, changed_velocities, changed_angles
         )
         yaw_rate_change = heading_rate(
             changed_next_state[:, DYNAMIC_STATES], self.dof

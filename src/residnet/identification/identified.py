@@ -406,8 +406,8 @@ def run_teacher_forced(model: HybridDynamics, log: PreparedLog) -> TeacherForced
     model = model.to(torch.float64)
     z = compute_channels(log, model.signals)
     with torch.no_grad():
-        baseline_accelerations = model.known(z).numpy()
-        predicted_accelerations = model.one_step(z[None])[0].numpy()
+        baseline_accelerations = model.baseline_acceleration(z).numpy()
+        predicted_accelerations = model.one_step_accelerations(z[None])[0].numpy()
     return TeacherForcedRun(z, baseline_accelerations, predicted_accelerations)
 
 

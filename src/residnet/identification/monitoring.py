@@ -27,7 +27,7 @@ from residnet.core.errors import DataError
 from residnet.core.layout import DYNAMIC_STATES, HEADING, DegreesOfFreedom
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.engine.free_runs import compiled
+from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import Rollout
 from residnet.identification.changes import (
     PerturbedDynamics,
@@ -105,7 +105,7 @@ def compute_innovations(
             ]
         )
         perturbed_model = PerturbedDynamics(model, all_changes, n_windows, w.shape[2])
-        predicted_states, _, _ = compiled(Rollout(perturbed_model), n_steps)(
+        predicted_states, _, _ = compile_rollout(Rollout(perturbed_model), n_steps)(
             x0, w.repeat(n_changes, 1, 1), initial_memory.repeat(n_changes, 1)
         )
     predicted_states = predicted_states.reshape(n_changes, n_windows, n_steps + 1, -1)

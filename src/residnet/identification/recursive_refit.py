@@ -222,7 +222,7 @@ def _parameter_direction(
             short_step_model.dt * change.size
         )
         sensitivities = (
-            parametric(model).parameter_jacobian(model.channels(states, inputs)).flatten(0, 1)
+            parametric(model).parameter_jacobian(model.compute_channels(states, inputs)).flatten(0, 1)
         )
         # axes count alike, though an acceleration in yaw is no acceleration in surge
         axis_weights = added_increment[:, DYNAMIC_STATES].square().mean(0)

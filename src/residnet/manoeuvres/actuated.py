@@ -215,7 +215,7 @@ class ActuatedDynamics(Dynamics):
     ) -> None:
         super().__init__(model.dt, model.integrator)
         self.model, self.actuators = model, actuators
-        self.n_state, self.dof, self.rolls = model.n_state, model.dof, model.rolls
+        self.n_state, self.dof, self.has_roll = model.n_state, model.dof, model.has_roll
         self.hull = get_dof(model.signals.names).state_names
         self.state = (*self.hull, *actuators.state)
         self.mean = hold == "mean"

@@ -162,7 +162,7 @@ class ClosedLoopSource(Source):
         }
         self.demand_commands = helm.commands_for
         self.times = t.tolist()
-        self.may_stop = any(manoeuvre.end_condition is not None for manoeuvre in manoeuvres)
+        self.can_stop = any(manoeuvre.end_condition is not None for manoeuvre in manoeuvres)
 
     def initial(self, x: Tensor) -> Tensor:
         return self.manoeuvre_type.initial_memory(*self._observe(x))
@@ -173,7 +173,7 @@ class ClosedLoopSource(Source):
         *demands, memory = self.manoeuvre_type.step_law(motion, parameters, self.times[k], memory)
         return replace_commands(self.demand_commands(*demands), w), memory
 
-    def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
+    def is_finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """Return the rows [B] whose manoeuvre has come to its end."""
         return self.manoeuvre_type.has_ended(*self._observe(x), self.times[k], memory)
 
@@ -191,7 +191,7 @@ class StackedSource(Source):
         self.sources: Sequence[Source] = torch.nn.ModuleList(sources)  # type: ignore[assignment]
         self.row_counts = list(rows)
         self.widths = [0] * len(self.row_counts)
-        self.may_stop = any(source.may_stop for source in sources)
+        self.can_stop = any(source.can_stop for source in sources)
 
     def initial(self, x: Tensor) -> Tensor:
         """Return the memories of all sources, padded to the widest, [B, k]."""
@@ -215,12 +215,12 @@ class StackedSource(Source):
             memories.append(self._pad_memory(next_memory, memory.shape[1]))
         return torch.cat(inputs), torch.cat(memories)
 
-    def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
+    def is_finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """Return which rows [B] have finished, each block of rows by its source."""
         blocks = zip(
             self.sources, x.split(self.row_counts), self._split_memory(memory), strict=True
         )
-        return torch.cat([source.finished(xs, k, ms) for source, xs, ms in blocks])
+        return torch.cat([source.is_finished(xs, k, ms) for source, xs, ms in blocks])
 
     @staticmethod
     def _pad_memory(memory: Tensor, width: int) -> Tensor:
@@ -241,7 +241,7 @@ class StopRecorder(Source):
     def __init__(self, source: Source, rows: int) -> None:
         super().__init__()
         self.source = source
-        self.may_stop = source.may_stop
+        self.can_stop = source.can_stop
         self.stop_step = torch.full((rows,), -1)
 
     def initial(self, x: Tensor) -> Tensor:
@@ -252,9 +252,9 @@ class StopRecorder(Source):
         inputs_and_memory: tuple[Tensor, Tensor] = self.source(x, w, k, memory)
         return inputs_and_memory
 
-    def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
+    def is_finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """Return the rows that have stopped now or before."""
-        stops_now = self.source.finished(x, k, memory) & (self.stop_step < 0)
+        stops_now = self.source.is_finished(x, k, memory) & (self.stop_step < 0)
         self.stop_step = torch.where(stops_now, k, self.stop_step)
         return self.stop_step >= 0
 

@@ -219,7 +219,7 @@ class WaveForceSource(Source):
         self.source = source
         self.waves = waves
         self.dt = dt
-        self.may_stop = source.may_stop
+        self.can_stop = source.can_stop
         self.pose_columns = [plant.state_names.index(name) for name in ("x", "y", "psi")]
         axis_names = ("force_x", "force_y", "force_k", "force_n")
         available_axes = [name for name in axis_names if name in plant.input_names]
@@ -243,8 +243,8 @@ class WaveForceSource(Source):
         )
         return inputs + (force @ self.force_matrix).to(inputs.dtype), memory
 
-    def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        return self.source.finished(x, k, memory)
+    def is_finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
+        return self.source.is_finished(x, k, memory)
 
 
 def sample_ornstein_uhlenbeck(

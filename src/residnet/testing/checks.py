@@ -359,7 +359,7 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
         w = z[..., n_dynamic : n_dynamic + model.signals.n_inputs]
         s = torch.rand(_N_ROWS, model.n_state).to(z)
         rollout = Rollout(model.double())
-        model.positions = False
+        model.has_position = False
         states, _, memory = rollout(x, w, s)
         for k in range(_N_STEPS):
             x, s = model.step(x, w[:, k], s)

@@ -16,8 +16,8 @@ from residnet.core.columns import all_but_pose, dynamic_states, pose
 from residnet.core.samples import Samples
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.engine.free_runs import compiled
-from residnet.engine.rollout import MANY, FreeRun, Rollout
+from residnet.engine.free_runs import compile_rollout
+from residnet.engine.rollout import TRAINING_STEPS, FreeRun, Rollout
 from residnet.heads.recurrent import GRUEnsembleHead
 from residnet.physics.signals import Signals
 from residnet.physics.symmetry import get_axis_parities, mirror_channels
@@ -58,7 +58,7 @@ def one_step_loss(
         spread: of the residual, [n].
         shared: over the processes of a training, whose mean loss is that of all windows.
     """
-    error = (nu_dot - model.taught(z, known)) / spread
+    error = (nu_dot - model.teacher_forced_accelerations(z, known)) / spread
     weight = good.to(error.dtype).unsqueeze(-1)
     count = float(error.shape[-1])
     return (error.square() * weight).sum() / shared(count * weight.sum()).clamp(min=1.0)
@@ -210,8 +210,8 @@ class HeadTraining(EpochTraining):
         told = paged.allocate_rows(len(store.y), width + 2 * n, dtype=store.y.dtype)
         with torch.no_grad():
             for rows in paged.iterate_row_chunks(len(told)):
-                z = self.model.channels(store.smoothed[rows], store.rate_inputs[rows])
-                told[rows] = torch.cat((z, self.model.known(z), store.nu_dot[rows]), dim=-1)
+                z = self.model.compute_channels(store.smoothed[rows], store.rate_inputs[rows])
+                told[rows] = torch.cat((z, self.model.baseline_acceleration(z), store.nu_dot[rows]), dim=-1)
                 paged.release_pages()
         return told
 
@@ -327,7 +327,7 @@ class HeadTraining(EpochTraining):
         """Return the free run of the model as the training has it now."""
         if self._compiled is None:
             # not before: by now the model is on its device and in training
-            self._compiled = compiled(self.rollout, MANY)
+            self._compiled = compile_rollout(self.rollout, TRAINING_STEPS)
         return self._compiled
 
     def validated(self) -> tuple[nn.Module, float]:
@@ -372,13 +372,13 @@ def train(
         return _train_coarse(name, model, store, config, scales, validate, seed, folder)
     dtype = torch.float64 if config.double else torch.float32
     # losses and scores are those of velocities
-    model.positions = False
+    model.has_position = False
     try:
         module = HeadTraining(model.to(dtype), config, scales.to(dtype), validate, seed)
         return run_epochs(name, module, module.data(store), model, model.head, folder, config)
     finally:
         model.to(torch.float32)
-        model.positions = True
+        model.has_position = True
 
 
 def _train_coarse(
@@ -403,10 +403,10 @@ def _train_coarse(
     # a baseline in steps so long asks for a scheme of second order; a residual alone is held
     alone = isinstance(model.baseline, FixedBaseline) and not model.baseline.library.n_terms
     # an oscillation of the roll grows under Euler's scheme
-    first: Integrator = "semi_implicit_euler" if model.rolls else "euler"
+    first: Integrator = "semi_implicit_euler" if model.has_roll else "euler"
     scheme: Integrator = first if alone else "heun"
     coarse = HybridDynamics(signals, model.baseline, head, steps * model.dt, scheme)
-    coarse.positions = False
+    coarse.has_position = False
 
     def fine(trained: HybridDynamics) -> HybridDynamics:
         return HybridDynamics(

@@ -24,7 +24,7 @@ from residnet.core.config import Config, Seconds
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.engine.free_runs import compiled
+from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import Rollout
 from residnet.preprocessing.channel_values import estimate_noise_std
 from residnet.preprocessing.windows import WindowStore
@@ -251,7 +251,7 @@ def problem_of(
         fixed=torch.zeros(free.numel(), dtype=torch.bool),
         # the mean error is over all channels, of which some may be zero at all times
         independent_errors=max(covered * model.dt / config.correlation, 1.0)
-        * float(model.living.mean()),
+        * float(model.active_mask.mean()),
         robust=config.robust,
         log=store.log_index[starts],
         initial=initial,
@@ -261,7 +261,7 @@ def problem_of(
 @torch.no_grad()
 def simulate(model: HybridDynamics, problem: Problem) -> tuple[Tensor, Tensor]:
     """Return the robust cost of the windows, and their free runs [B, T + 1, 3 + n]."""
-    run = compiled(Rollout(model), _RUNS_PER_FIT * problem.inputs.shape[1])
+    run = compile_rollout(Rollout(model), _RUNS_PER_FIT * problem.inputs.shape[1])
     states, _, _ = run(problem.x0, problem.inputs, problem.x0[:, :0])
     return torch.sqrt(problem.mean_square(states) + problem.robust**2).mean(), states
 
@@ -282,8 +282,8 @@ def sensitivities(
     # CasADi, which it needs, is not imported where nothing is refitted
     from residnet.engine.jacobian import StepJacobian
 
-    jacobian = StepJacobian.of(model)
-    s = torch.zeros(batch, 1 + model.dof, len(jacobian.free), dtype=x.dtype)
+    jacobian = StepJacobian.of_model(model)
+    s = torch.zeros(batch, 1 + model.dof, len(jacobian.free_indices), dtype=x.dtype)
     if to_start:
         s = torch.eye(1 + model.dof, dtype=x.dtype).expand(batch, -1, -1)
     stretch = max(_ROWS_PER_BATCH // max(batch, 1), 1)

@@ -1,4 +1,4 @@
-"""Vessels whose every row steers a little differently, to train and compare controllers on."""
+"""Batches of vessels with random steering properties, to train and compare controllers on."""
 
 from __future__ import annotations
 
@@ -19,15 +19,16 @@ from residnet.physics.symmetry import get_dof
 
 
 class Axis(NamedTuple):
-    """What a controller steers, and by what.
+    """The controlled variable of a steering controller and its actuator.
 
     Attributes:
-        name: of the axis.
-        command: input that steers, an angle in rad.
-        gear: state that follows the command, where the vessel has one.
-        slowed: velocities that the `time` of a variation slows down.
-        value: state that the reference is of; heading [rad] or depth [m].
-        angle, rate: states that the command turns, in rad and rad/s.
+        name: name of the axis.
+        command: name of the input that steers, an angle in rad.
+        gear: name of the state that follows the command, if the vessel has one.
+        slowed: velocities whose time constant a variation scales.
+        value: name of the controlled state: heading [rad] or depth [m].
+        angle: name of the angle that the command changes, rad.
+        rate: name of its angular velocity, rad/s.
         side: sign of the angle under a positive command.
     """
 
@@ -49,17 +50,17 @@ class Axis(NamedTuple):
 HEADING = Axis("heading", "cmd_delta", "delta", ("v", "r"), "psi", "psi", "r", 1.0)
 DEPTH = Axis("depth", "cmd_delta_s", "delta_s", ("w", "q"), "z", "theta", "q", -1.0)
 VARIATION = ("effect", "time", "bias")
-"""Of each row: rudder force as a multiple, time constants of sway and yaw (heave and pitch) as a
-multiple, and an angle [rad] that is added to the rudder's.
+"""Columns of a variation: a factor of the rudder force, a factor of the time constants of sway and
+yaw (heave and pitch), and a constant angle [rad] that is added to the rudder angle.
 """
 
 
 class Vessels(NamedTuple):
-    """The variation of B vessels and the current that each runs in.
+    """The variations of B vessels and their ambient currents.
 
     Attributes:
-        variation: of the steering, [B, 3], see `VARIATION`.
-        current: to the north and to the east, [B, 2] in m/s.
+        variation: variations of the steering [B, 3], see `VARIATION`.
+        current: current to the north and to the east [B, 2] in m/s.
     """
 
     variation: Tensor
@@ -69,25 +70,25 @@ class Vessels(NamedTuple):
 NOMINAL = Vessels(
     torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
 )
-"""The vessel that the course is planned with, in water at rest."""
+"""The nominal vessel, for which courses are planned, without current."""
 
 
 @final
 class VariedPlant(Dynamics):
-    """A plant of which each row has its own rudder effect, time constants and rudder bias.
+    """A plant whose rudder effect, time constants and rudder bias differ from row to row.
 
-    It is stepped by RK4, with held actuators where these stand still within a step.
+    It is integrated with RK4 or Heun's method. Actuators that do not move within a step are held.
 
-    Its memory s [B, 3] is the variation, constant over a rollout: rows of ones and a zero bias are
-    the plant itself. With Nomoto's model of first order, T r_dot + r = K delta, `effect` multiplies
-    K and `time` multiplies T; with other hulls `effect` multiplies the rudder angle that the water
-    feels, and `time` divides the accelerations in sway and yaw.
+    Its memory s [B, 3] is the variation, constant over a rollout; `effect` = `time` = 1 and a zero
+    `bias` are the plant itself. For Nomoto's model of first order, T r_dot + r = K delta, `effect`
+    multiplies K and `time` multiplies T; for other hulls `effect` multiplies the effective rudder
+    angle, and `time` divides the accelerations in sway and yaw.
 
-    On another axis than the heading the rudder is what steers there: for the depth the stern
-    planes. Its command is the first of the inputs, and those of the plant follow in their order.
+    The first input is the command of the axis: the rudder for the heading, the stern planes for the
+    depth. The other inputs of the plant follow in their order.
 
     Raises:
-        ConfigError: where the vessel has no rudder.
+        ConfigError: where the vessel lacks the command of the axis.
     """
 
     def __init__(
@@ -101,91 +102,101 @@ class VariedPlant(Dynamics):
                 f"{axis.name} control needs a vessel with the command {axis.command}, found"
                 f" {', '.join(plant.input_names[: plant.n_commands])}"
             )
-        self.turn_about(plant.attitude_columns, len(plant.state_names))
-        first = plant.input_names.index(axis.command)
-        places = range(len(plant.input_names))
-        self.take = [0 if k == first else k + 1 if k < first else k for k in places]
-        self.rudder = plant.state_names.index(axis.gear) if axis.gear in plant.state_names else -1
-        slowed = torch.tensor([1.0 if name in axis.slowed else 0.0 for name in plant.state_names])
+        names = plant.state_names
+        self.set_attitude_columns(plant.attitude_columns, len(names))
+
+        # columns of w for each input of the plant: the command of the axis is the first of w
+        command = plant.input_names.index(axis.command)
+        n_inputs = len(plant.input_names)
+        others = [k + 1 if k < command else k for k in range(n_inputs)]
+        self.input_columns = [0 if k == command else others[k] for k in range(n_inputs)]
+
+        self.rudder = names.index(axis.gear) if axis.gear in names else -1
+        slowed = torch.tensor([1.0 if name in axis.slowed else 0.0 for name in names])
         self.slowed = nn.Buffer(slowed, persistent=False)
-        gear = torch.tensor([1.0 if "delta" in name else 0.0 for name in plant.state_names])
+        gear = torch.tensor([1.0 if "delta" in name else 0.0 for name in names])
         self.gear = nn.Buffer(gear, persistent=False)
-        x, w = (
-            plant.make_initial_state(1),
-            torch.zeros(1, len(plant.input_names), dtype=torch.float64),
-        )
-        w[:, first] = 0.1
+
         # a rudder with a lag moves within a step
-        self.moving = self.rudder >= 0 and bool(plant.derivative(x, w)[0, self.rudder] != 0)
+        x = plant.make_initial_state(1)
+        w = torch.zeros(1, n_inputs, dtype=torch.float64)
+        w[:, command] = 0.1
+        self.has_moving_rudder = False
+        if self.rudder >= 0:
+            self.has_moving_rudder = bool(plant.derivative(x, w)[0, self.rudder] != 0)
 
     def initial_state(self, batch: int) -> Tensor:
         return torch.tensor([1.0, 1.0, 0.0]).expand(batch, 3)
 
-    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return x_dot [B, nx] of a rudder whose effect is varied.
+    def state_derivative(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Return x_dot [B, nx] of a plant with varied steering.
 
-        rho [B, 3] holds what multiplies the rudder's angle, what is added to it, and 1/time - 1.
+        Args:
+            x: states [B, nx].
+            p: prepared inputs, or raw inputs if the rudder moves within a step.
+            rho: factor of the rudder angle, angle that is added to it, and 1/time - 1 [B, 3].
         """
-        slower = 1.0 + self.slowed.to(x.dtype) * rho[:, 2:]
+        slowing = 1.0 + self.slowed.to(x.dtype) * rho[:, 2:]
         if self.rudder < 0:
-            rate: Tensor = self.plant.derivative_prepared(x, p) * slower
-            return rate
+            derivative: Tensor = self.plant.derivative_prepared(x, p) * slowing
+            return derivative
         angle = x[:, self.rudder : self.rudder + 1] * rho[:, :1] + rho[:, 1:2]
-        felt = self._felt(x, angle)
-        if not self.moving:
-            held: Tensor = self.plant.derivative_prepared(felt, p) * slower
+        effective_state = self._with_rudder_angle(x, angle)
+        if not self.has_moving_rudder:
+            held: Tensor = self.plant.derivative_prepared(effective_state, p) * slowing
             return held
-        hull = self.plant.derivative(felt, p) * slower
-        # the steering gear knows its own angle
-        own = self.plant.derivative(x, p)
+        hull = self.plant.derivative(effective_state, p) * slowing
+        # the steering gear follows its actual angle, not the effective one
+        actuator = self.plant.derivative(x, p)
         gear = self.gear.to(x.dtype)
-        return hull * (1.0 - gear) + own * gear
+        return hull * (1.0 - gear) + actuator * gear
 
-    def _felt(self, x: Tensor, angle: Tensor) -> Tensor:
+    def _with_rudder_angle(self, x: Tensor, angle: Tensor) -> Tensor:
         if self.rudder < 0:
             return x
         return torch.cat((x[:, : self.rudder], angle, x[:, self.rudder + 1 :]), dim=-1)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        varied = torch.cat((s[:, :1], s[:, 2:3], 1.0 / s[:, 1:2] - 1.0), dim=-1)
-        ordered = w[:, self.take]
-        if self.moving:
-            p = self.plant.prepare(x, ordered)
+        effect, time, bias = s.split(1, dim=-1)
+        rho = torch.cat((effect, bias, 1.0 / time - 1.0), dim=-1)
+        inputs = w[:, self.input_columns]
+        if self.has_moving_rudder:
+            p = self.plant.prepare(x, inputs)
         else:
-            angle = (x[:, self.rudder : self.rudder + 1] if self.rudder >= 0 else w[:, :1]) * s[
-                :, :1
-            ] + s[:, 2:]
-            held = torch.cat((angle, w[:, 1:]), dim=-1)[:, self.take]
-            p = self.plant.prepare(self._felt(x, angle), held)
-        return self.plant.finish_step(self.integrate(x, p, varied), ordered, self.dt), s
+            rudder = x[:, self.rudder : self.rudder + 1] if self.rudder >= 0 else w[:, :1]
+            angle = rudder * effect + bias
+            effective_inputs = torch.cat((angle, w[:, 1:]), dim=-1)[:, self.input_columns]
+            p = self.plant.prepare(self._with_rudder_angle(x, angle), effective_inputs)
+        return self.plant.finish_step(self.integrate(x, p, rho), inputs, self.dt), s
 
 
 @final
 class VariedModel(Dynamics):
-    """A learned hull behind a rudder with a rate or a lag, each row with its own variation.
+    """A learned hull with a rudder of limited rate or with a lag, varied from row to row.
 
-    State x [B, 3 + n or one more]: that of the model, and the rudder angle where it has either.
-    Memory s [B, 3 + k]: the variation, then the head's. `effect` multiplies the rudder angle that
-    the model is given, `time` divides what a step changes in the velocities that the axis names.
+    The state x [B, 3 + n (+ 1)] is that of the model, followed by the rudder angle if the rudder
+    has a rate or a lag. The memory s [B, 3 + k] is the variation, followed by that of the model.
+    `effect` multiplies the rudder angle that the model receives, `time` divides the changes of the
+    velocities `axis.slowed` over a step.
 
     Args:
-        model: of the hull.
+        model: the hull.
         dt: step in s.
-        take: for each input of the model its column of w; the rudder's command is the first of w.
-        mean: whether the model's inputs are means over the step.
-        rate: of the rudder in rad/s; None where it has none.
-        lag: time constant in s with which the rudder follows; None where it has none.
-        axis: that is steered.
+        input_columns: column of w for each input of the model; the rudder's command is the first.
+        mean: whether the inputs of the model are means over the step.
+        rate: largest rate of the rudder in rad/s; None for no limit.
+        lag: time constant of the rudder in s; None for none.
+        axis: the controlled axis.
 
     Raises:
-        ConfigError: where the model has a memory and steps of another length.
+        ConfigError: where the model has a memory and another step.
     """
 
     def __init__(
         self,
         model: HybridDynamics,
         dt: float,
-        take: Sequence[int],
+        input_columns: Sequence[int],
         mean: bool,
         rate: float | None,
         lag: float | None = None,
@@ -197,10 +208,10 @@ class VariedModel(Dynamics):
         self.slowed = nn.Buffer(slowed, persistent=False)
         if model.n_state > 0 and not math.isclose(model.dt, dt, rel_tol=1e-9):
             raise ConfigError(
-                f"the learned model has a memory and steps of {model.dt:g} s; give the policy's"
-                f" training this dt, not {dt:g} s"
+                f"the learned model has a memory and steps of {model.dt:g} s; set dt of the policy's"
+                f" training to this value instead of {dt:g} s"
             )
-        # one for each precision: policies are trained in single and flown in double
+        # one for each precision: policies are trained in single and simulated in double precision
         self.models = tuple(
             copy.deepcopy(model).to(dtype).eval().requires_grad_(False)
             for dtype in (torch.float32, torch.float64)
@@ -208,57 +219,66 @@ class VariedModel(Dynamics):
         for model_at_precision in self.models:
             model_at_precision.dt = dt
         self.n_state = len(VARIATION) + model.n_state
-        self.dof, self.rolls = model.dof, model.rolls
-        self.take, self.mean = list(take), mean
-        self.travel = None if rate is None else rate * dt
-        self.share = None if lag is None else 1.0 - math.exp(-dt / lag)
-        self.geared = rate is not None or lag is not None
+        self.dof = model.dof
+        self.has_roll = model.has_roll
+        self.input_columns = list(input_columns)
+        self.has_mean_inputs = mean
+        self.max_rudder_change = None if rate is None else rate * dt
+        self.lag_gain = None if lag is None else 1.0 - math.exp(-dt / lag)
+        self.has_rudder_state = rate is not None or lag is not None
 
     def initial_state(self, batch: int) -> Tensor:
         return torch.tensor([1.0, 1.0] + [0.0] * (self.n_state - 2)).expand(batch, -1)
 
-    def _of(self, x: Tensor) -> HybridDynamics:
-        return self.models[1 if x.dtype == torch.float64 else 0]
-
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        command, angle = w[:, :1], actuator_states(x, self.dof)
-        angle_before, angle_after = (angle, angle) if self.geared else (command, command)
-        if self.travel is not None:
-            angle_after = angle + (command - angle).clamp(-self.travel, self.travel)
-        elif self.share is not None:
-            angle_after = angle + self.share * (command - angle)
-        held = 0.5 * (angle_before + angle_after) if self.mean else angle_before
-        effect, time_share, bias = s[:, : len(VARIATION)].split(1, dim=1)
-        effective = effect * held + bias
-        given = torch.cat((effective, w[:, 1:]), dim=1)[:, self.take]
-        own = pose_and_dynamic_states(x, self.dof)
-        moved, memory = self._of(x).step(own, given, s[:, len(VARIATION) :])
-        parts = [torch.where(self.slowed, own + (moved - own) / time_share, moved)]
-        parts += [angle_after] if self.geared else []
-        return torch.cat(parts, dim=1), torch.cat((s[:, : len(VARIATION)], memory), dim=1)
+        command = w[:, :1]
+        # without a rate or a lag the rudder follows its command at once
+        angle = actuator_states(x, self.dof) if self.has_rudder_state else command
+        next_angle = angle
+        if self.max_rudder_change is not None:
+            change = (command - angle).clamp(-self.max_rudder_change, self.max_rudder_change)
+            next_angle = angle + change
+        elif self.lag_gain is not None:
+            next_angle = angle + self.lag_gain * (command - angle)
+        held_angle = 0.5 * (angle + next_angle) if self.has_mean_inputs else angle
+
+        variation = s[:, : len(VARIATION)]
+        effect, time, bias = variation.split(1, dim=1)
+        effective_angle = effect * held_angle + bias
+        inputs = torch.cat((effective_angle, w[:, 1:]), dim=1)[:, self.input_columns]
+        hull_state = pose_and_dynamic_states(x, self.dof)
+        model = self.models[1 if x.dtype == torch.float64 else 0]
+        next_hull, memory = model.step(hull_state, inputs, s[:, len(VARIATION) :])
+        slowed_hull = hull_state + (next_hull - hull_state) / time
+        parts = [torch.where(self.slowed, slowed_hull, next_hull)]
+        if self.has_rudder_state:
+            parts.append(next_angle)
+        return torch.cat(parts, dim=1), torch.cat((variation, memory), dim=1)
 
 
 @final
 class PushedSteering(Dynamics):
     """A varied vessel whose rudder bias changes from step to step.
 
-    Its inputs [B, m + k] are those of the vessel, then the push, an angle [rad] that is added to
-    the rudder's beside the constant bias; further columns are left alone.
+    Its inputs [B, m + k] are those of the vessel, followed by the push: an angle [rad] that is
+    added to the constant rudder bias. Further columns are ignored.
 
     Args:
         inner: a varied vessel, whose memory begins with the variation.
-        inputs: number m of the vessel's own inputs.
+        n_inputs: number m of the vessel's inputs.
     """
 
-    def __init__(self, inner: Dynamics, inputs: int) -> None:
+    def __init__(self, inner: Dynamics, n_inputs: int) -> None:
         super().__init__(inner.dt, inner.integrator)
         self.inner = inner
-        self.n_state, self.inputs = inner.n_state, inputs
+        self.n_state = inner.n_state
+        self.n_inputs = n_inputs
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         bias = len(VARIATION) - 1
-        push = w[:, self.inputs : self.inputs + 1]
+        push = w[:, self.n_inputs : self.n_inputs + 1]
         pushed = torch.cat((s[:, :bias], s[:, bias : bias + 1] + push, s[:, bias + 1 :]), dim=1)
-        moved, after = self.inner.step(x, w[:, : self.inputs], pushed)
-        kept = torch.cat((s[:, : bias + 1], after[:, bias + 1 :]), dim=1)
-        return moved, kept
+        next_state, next_memory = self.inner.step(x, w[:, : self.n_inputs], pushed)
+        # the push acts for one step: the constant bias stays in the memory
+        memory = torch.cat((s[:, : bias + 1], next_memory[:, bias + 1 :]), dim=1)
+        return next_state, memory

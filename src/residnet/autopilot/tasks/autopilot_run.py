@@ -249,7 +249,7 @@ def _train_policy_or_resume(
     notes, start_times = store.restore_module(name, policy), (time.time(), time.process_time())
     if notes is None:
         begin_stage(f"training {name}")
-        compiler = partial(CompiledRollout, most=policy_config.training.outlying)
+        compiler = partial(CompiledRollout, max_gradient_ratio=policy_config.training.outlying)
         notes = train_policy(
             name,
             policy,

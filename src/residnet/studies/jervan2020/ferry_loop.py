@@ -149,7 +149,7 @@ class NoisyLoop(Source):
 
     def __init__(self, loop: Source) -> None:
         super().__init__()
-        self.loop, self.counts = loop, loop.counts
+        self.loop, self.depends_on_step = loop, loop.depends_on_step
 
     def initial(self, x: Tensor) -> Tensor:
         return self.loop.initial(x)
@@ -292,7 +292,7 @@ class FerrySimulation:
                         f"source.loop.policy.policy.{name}" for name in ("lag", "step")
                     ]
                     model = compile_or_fallback(
-                        model, partial(CompiledRollout, own=per_row_names), rollout_arguments
+                        model, partial(CompiledRollout, row_tensors=per_row_names), rollout_arguments
                     )
             states, applied_inputs, _ = model(*rollout_arguments)
             states = states[:, :-1]
