@@ -190,7 +190,7 @@ def test_the_same_source_is_compiled_once(tmp_path: Path, monkeypatch: pytest.Mo
         calls.append(out)
         compile_one(tool, source, flags, out)
 
-    monkeypatch.setattr(c_code, "_compile", counted)
+    monkeypatch.setattr(c_code, "_run_compiler", counted)
     assert [called(c_code.load_library(SOURCE)) for _ in range(2)] == [3.0, 3.0]
     assert len(calls) == 1
     c_code.load_library(SOURCE.replace("2.0", "4.0"))
@@ -215,7 +215,7 @@ def test_the_cache_deletes_no_file_of_the_user(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RESIDNET_CACHE", str(tmp_path))
-    monkeypatch.setattr(c_code, "_KEPT", 1)
+    monkeypatch.setattr(c_code, "_MAX_CACHED_LIBRARIES", 1)
     cache = tmp_path / "residnet-cache"
     cache.mkdir()
     mine = [folder / f"{n}.so" for folder in (tmp_path, cache) for n in range(5)]

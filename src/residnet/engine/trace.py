@@ -110,11 +110,23 @@ def lower(
     examples = [torch.zeros(1, size, dtype=torch.float64) for _, size in arguments]
     symbols = [ca.MX.sym(name, size) for name, size in arguments]
     graph = record_graph(step, examples, what)
+    _require_deterministic(graph, what)
     values = dict(zip(_get_placeholders(graph), map(_TracedValue, examples, symbols), strict=True))
     results_columns = _lower_graph(graph, values, what)
     return ca.Function(
         "step", symbols, results_columns, [name for name, _ in arguments], list(results)
     )
+
+
+def _require_deterministic(graph: Graph, what: str) -> None:
+    """Refuse a step that draws random numbers, such as dropout in training.
+
+    Raises:
+        ExportError: where there is such an operation.
+    """
+    for node in graph.nodes:
+        if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
+            raise ExportError(f"{what}: its step draws random numbers ({node.target})")
 
 
 def _get_placeholders(graph: Graph) -> list[Node]:
@@ -231,6 +243,7 @@ def split_step(
         ExportError: as of `lower`.
     """
     graph = record_graph(step, [*(example for _, example in rows), *shared], what)
+    _require_deterministic(graph, what)
     placeholders = _get_placeholders(graph)
     # nodes that depend on shared tensors alone, and nodes that depend on nothing
     shared_nodes: dict[Node, None] = dict.fromkeys(placeholders[len(rows) :])
