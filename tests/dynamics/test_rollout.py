@@ -148,7 +148,7 @@ def test_heading_and_velocities_do_not_hang_on_positions(
     kind = GRUEnsembleConfig(members=1, hidden_size=6, step=STEP) if told else LstmConfig()
     head = kind.build(signals.names)
     model = HybridDynamics(signals, baseline, head, STEP, integrator).double().eval()
-    assert (model.missed is not None) == told
+    assert (model.innovation_filter is not None) == told
     x0 = torch.randn(5, 6, dtype=torch.float64)
     w = torch.randn(5, 20, 4 if wind else 2, dtype=torch.float64)
     slopes, states = [], []

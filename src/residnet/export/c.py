@@ -484,7 +484,7 @@ def _render_vessel_functions(prefix: str, exported: ExportedVessel) -> list[tupl
         if band_table is None
         else list(zip(*band_table.columns, strict=True))
     )
-    widths = ["{" + ", ".join(map(literal, half_widths)) + "}" for half_widths in width_rows]
+    widths = ["{" + ", ".join(map(write_literal, half_widths)) + "}" for half_widths in width_rows]
     band_body = render_template("c_band.c", steps=steps, widths=widths, channels=len(band_channels))
     return [
         (
