@@ -1,7 +1,7 @@
 """Registry of published experiments whose figures the report of a fit can show.
 
-Studies are registered like heads or readers: built-in studies in a table, studies of other
-packages by the entry point group `residnet.fit_studies`. A study is imported on first use.
+A study is registered by the entry point group `residnet.fit_studies` of a wing or of another package.
+It is imported on first use.
 """
 
 from __future__ import annotations
@@ -41,10 +41,7 @@ class FitStudy(ABC):
 FIT_STUDIES = PluginUnion(
     "residnet.fit_studies",
     "residnet.report.fit_studies:FitStudy",
-    {
-        "moreno2019": "residnet.studies.moreno2019:Moreno2019Study",
-        "woo2018": "residnet.studies.woo2018:Woo2018Study",
-    },
+    {},
     key="name",
 )
 

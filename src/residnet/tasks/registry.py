@@ -41,19 +41,15 @@ from residnet.report.blocks import build_table
 from residnet.runs.folder import RunFolder, require_recorded, write_checksums
 from residnet.runs.task import Task
 
-_TASK_BASE, _DOCUMENTS = "residnet.runs.task:Task", "residnet.studies"
+_TASK_BASE = "residnet.runs.task:Task"
 SINGLE_TASKS = {
     "fit": "residnet.tasks.fit.config:FitConfig",
     "import": "residnet.tasks.import_logs:ImportConfig",
     "simulate": "residnet.tasks.simulate:SimulateConfig",
     "study": "residnet.tasks.study:StudyConfig",
     "actuators": "residnet.tasks.actuators:ActuatorsTaskConfig",
-    "ferry_study": f"{_DOCUMENTS}.jervan2020.ferry:FerryStudyConfig",
-    "force_residual": f"{_DOCUMENTS}.jervan2020.measured:ForceResidualConfig",
-    "breeding": f"{_DOCUMENTS}.halvorsen2019.breeding:BreedingTaskConfig",
-    "sea_trial": f"{_DOCUMENTS}.halvorsen2019.sea_trial:SeaTrialTaskConfig",
 }
-"""All tasks but the sweep, which varies any of these."""
+"""Tasks of the core but the sweep, which varies any task; wings add their own."""
 _ALL_TASKS = {**SINGLE_TASKS, "sweep": "residnet.tasks.sweep:SweepConfig"}
 TaskConfig = Annotated[Task, PluginUnion("residnet.tasks", _TASK_BASE, _ALL_TASKS, key="task")]
 SweepableConfig = Annotated[
