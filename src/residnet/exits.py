@@ -1,6 +1,6 @@
-"""How a command ends: in one line and an exit code, with a crash file where residnet is at fault.
+"""The end of a command: a one-line message, an exit code, and a crash file for a defect of residnet.
 
-Nothing heavy is imported here, so that an interruption is heard from the first moment on.
+This module imports nothing heavy, so that signals are handled from the start.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ _SYSTEM_ERRNOS = {
     errno.EPERM,
     errno.EROFS,
 }
-"""Faults that are the machine's: nothing in residnet could be repaired to avoid them."""
+"""Errors of the machine, such as a full disk, which are no defects of residnet."""
 
 
 class _SignalHandler:
-    """Remembers that the user asked for the end, whatever a library makes of the exception."""
+    """Signal handlers that remember an interruption, even if a library swallows the exception."""
 
     def __init__(self) -> None:
         self.is_interrupted = False
@@ -54,7 +54,7 @@ class _SignalHandler:
 
     @contextmanager
     def handle_signals(self) -> Iterator[None]:
-        """Hear the signals within the context; only a main thread can."""
+        """Install the handlers within the context; only the main thread can."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
@@ -70,10 +70,10 @@ class _SignalHandler:
 
 
 def run_cli(command: Callable[[], object]) -> None:
-    """Carry out a command; whatever goes wrong is told in one line on standard error.
+    """Run a command; an error is reported in one line on standard error.
 
     Args:
-        command: what parses the arguments and does the work.
+        command: parses the arguments and does the work.
 
     Raises:
         SystemExit: with the exit code, if it is not 0.
@@ -98,11 +98,11 @@ def run_cli(command: Callable[[], object]) -> None:
     except Terminated as exception:
         _exit(_interruption_message("terminated"), EXIT_TERMINATED, exception)
     except BrokenPipeError:
-        # whoever read the output has seen enough
+        # the reader of the output, such as `head`, has closed it
         sys.exit(0)
     except Exception as error:
         if signals.is_interrupted:
-            # a library has turned the interruption into an error of its own
+            # a library has converted the interruption into another exception
             _exit(_interruption_message("interrupted"), EXIT_INTERRUPTED, error)
         _exit(*_error_message(error), error)
 
@@ -116,22 +116,22 @@ def _report_skipped_packages() -> None:
 
 
 def _error_message(error: Exception) -> tuple[str, int]:
-    """Return the line about an error and the exit code."""
+    """Return the message of an error and the exit code."""
     if isinstance(error, ResidnetError):
         return str(error), error.exit_code
-    # PyTorch has no error of its own for memory
+    # PyTorch raises a plain RuntimeError if memory is exhausted
     if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
-        return "the memory of this machine is used up; take fewer or shorter logs", 1
+        return "the memory of this machine is exhausted; use fewer or shorter logs", 1
     if isinstance(error, OSError) and error.errno in _SYSTEM_ERRNOS:
         location = "" if error.filename is None else f"{error.filename}: "
-        return f"{location}{error.strerror}; make room or give another place", 2
+        return f"{location}{error.strerror}; free space or choose another place", 2
     if isinstance(error, ModuleNotFoundError) and "residnet" not in str(error.name):
         problem = f"{sys.executable} has no package '{error.name}'"
-        return f"{problem}; install residnet for this Python, or take that of its .venv", 2
+        return f"{problem}; install residnet for this Python, or use the Python of its .venv", 2
     file = write_crash_file(error)
     first_line = next(iter(str(error).splitlines()), "")
     location = (
-        "it could not be described in a file" if file is None else f"attach {file} to an issue"
+        "the crash file could not be written" if file is None else f"attach {file} to an issue"
     )
     return (
         f"this is a defect of residnet, {type(error).__name__}: {first_line[:200]}; {location}",
@@ -140,20 +140,20 @@ def _error_message(error: Exception) -> tuple[str, int]:
 
 
 def _interruption_message(event: str) -> str:
-    """Return the line of a command that was stopped from outside."""
+    """Return the message of a command that was stopped by a signal."""
     if "run" in sys.argv[1:2]:
         return f"{event}; continue the run with the same command and --resume"
-    return f"{event}; nothing is left half written, give the same command again"
+    return f"{event}; no file is incomplete; repeat the same command"
 
 
 def _exit(message: str, code: int, original_error: BaseException) -> None:
-    # whatever the line quotes, it stays one line
+    # ResidnetError replaces line breaks of quoted text
     print(f"residnet: {ResidnetError(message)}", file=sys.stderr)
     raise SystemExit(code) from original_error
 
 
 _MAX_CONFIG_LENGTH = 100_000
-"""Letters of each config in a report of a defect; chosen by hand, above those of any config."""
+"""Number of characters of a config in a crash file; larger than any usual config."""
 _SECRET_PATTERN = re.compile(
     r"(?i)((?:[\w.-]*(?:password|passwd|secret|token|api[_-]?key|credential)[\w.-]*)"
     r"[\"']?\s*[:=]\s*)\S.*"
@@ -162,11 +162,11 @@ _ACCOUNT_PATTERN = re.compile(r"://[^/\s@]+@")
 
 
 def write_crash_file(error: BaseException) -> Path | None:
-    """Write versions, command, config and traceback to a file, and return the file.
+    """Write versions, command, config and traceback to a crash file; returns the file.
 
-    It stands in the current folder, or where that cannot be written in the folder for temporary
-    files; None if neither can be. Passwords, tokens and the name of the user are left out, and
-    the environment is not looked at.
+    The file is written to the current folder, or to the folder for temporary files if that fails.
+    Returns None if both fail. Passwords, tokens and the name of the user are removed, and
+    environment variables are not included.
     """
     import platform
     import tempfile
@@ -196,7 +196,7 @@ def write_crash_file(error: BaseException) -> Path | None:
                 text = file.read_text(encoding="utf-8", errors="backslashreplace")
                 config_texts.append(f"{file}:\n{text[:_MAX_CONFIG_LENGTH]}")
         except (OSError, ValueError):
-            # a word that is no path, or a file that cannot be read
+            # the argument is not a path, or the file cannot be read
             continue
     text = remove_secrets("\n\n".join([*parts, *config_texts]) + "\n")
     name = f"residnet-crash-{time.strftime('%Y%m%dT%H%M%S')}-{os.getpid()}.txt"
@@ -211,7 +211,7 @@ def write_crash_file(error: BaseException) -> Path | None:
 
 
 def remove_secrets(text: str) -> str:
-    """Return text without passwords, tokens and the home folder's name."""
+    """Return text without passwords, tokens and the name of the home folder."""
     try:
         home = str(Path.home())
     except RuntimeError:

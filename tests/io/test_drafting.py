@@ -220,7 +220,7 @@ def _told(work: Callable[..., object], files: Sequence[Path]) -> dict[str, Any]:
     """The map that a function of Python reports to whoever listens."""
     lines: list[str] = []
     work(files, lambda told: lines.append(told.message))
-    begun = next(i for i, line in enumerate(lines) if "channel map as guessed" in line)
+    begun = next(i for i, line in enumerate(lines) if "guessed channel map" in line)
     drafted = takewhile(lambda line: line.startswith("  "), lines[begun + 1 :])
     text = "\n".join(line.removeprefix("  ") for line in drafted)
     return dict(yaml.safe_load(text)["data"]["reader"])

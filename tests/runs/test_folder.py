@@ -48,7 +48,7 @@ def test_a_folder_is_taken_up_only_by_its_own_configuration(tmp_path: Path) -> N
     (path / "kept.txt").write_text("mine")
     folder.write_summary("fit", [], {}, is_finished=True)
     refused("exists already; give another --out", path)
-    refused("was made with another configuration", path, "a: 2\n", resume=True)
+    refused("has another configuration", path, "a: 2\n", resume=True)
     assert RunFolder(path).is_finished
     assert RunFolder.create(path, "a: 1\n", resume=True).path == path
     assert (path / "kept.txt").read_text() == "mine"

@@ -262,7 +262,7 @@ def test_evaluate_has_the_options_that_it_recommends(
     shutil.copy(next((flown / "logs").glob("*.parquet")), other)
     said = command("evaluate", run, other, "--out", out, "--resume", "--quiet")
     assert said.code == 2
-    assert "began with" in said.err
+    assert "has changed since" in said.err
     said = command("evaluate", run, other, "--out", run, "--overwrite", "--quiet")
     assert said.code == 2
     assert "resolved.yaml: lies in" in said.err

@@ -60,17 +60,17 @@ def read_logs(
 ) -> list[Log]:
     """Read logs from files, patterns or folders.
 
-    A table (csv, foreign Parquet) needs to be told what its columns are: by `channels`, or by a
-    `reader` as YAML has it. Without either the reader is drafted as `draft` does it, by names,
-    headers, values and physics; it is reported to `progress`, with a comment at each guess.
+    The columns of a table (csv, foreign Parquet) are described by `channels`, or by a `reader` as
+    in YAML. Without either, the reader is drafted from names, headers, values and physics, as
+    `draft_config` does it, and reported to `progress` with a comment on each guess.
 
     Args:
         source: a path, a pattern such as `trials/*.csv`, a folder, or a list of these.
         channels: channel -> (column, unit), for example `{"u": ("speed", "kn")}`, or a mapping with
-            column, unit, sign and frame as YAML has it.
-        time: column that holds time, in s, or (column, unit).
-        manoeuvre: kind of manoeuvre of every file; `folder` takes the name of each file's folder.
-        reader: kind or settings of a reader, in place of `channels`.
+            column, unit, sign and frame as in YAML.
+        time: name of the time column in s, or (column, unit).
+        manoeuvre: kind of manoeuvre of all files; `folder` for the name of each file's folder.
+        reader: kind or settings of a reader, instead of `channels`.
         progress: called with the progress of the reading.
 
     Returns:
@@ -115,7 +115,7 @@ def read_logs(
                     raise error
                 if {"channels", "parts"} & set(draft_result.reader):
                     log_message(
-                        f"{next(iter(draft_result.logs))}: channel map as guessed, to be checked"
+                        f"{next(iter(draft_result.logs))}: guessed channel map, please check"
                     )
                     content = {"data": {"reader": draft_result.reader}}
                     for line in dump_commented_yaml(
@@ -165,18 +165,17 @@ def _parse_column(entry: Any, name: str, default_unit: str | None = None) -> Any
 def inspect(
     logs: LogsLike, *, inputs: Sequence[str] | None = None, masks: Sequence[Any] = ()
 ) -> pd.DataFrame:
-    """Look at logs as a doctor would: clocks, gaps, jumps, frames, lags, copies, excitation.
+    """Check logs for errors: clocks, gaps, jumps, frames, lags, copies, excitation.
 
     Args:
-        logs: from `read_logs`, or what it takes.
-        inputs: channels that drive the vessel; all that no sensor of the motion measures where
-            None.
-        masks: rules that will leave samples out, as YAML has them.
+        logs: logs from `read_logs`, or any argument that it accepts.
+        inputs: channels that drive the vessel; None for all channels that do not measure motion.
+        masks: rules that will exclude samples, as in YAML.
 
     Returns:
-        One row for each finding, with the columns log (`together` for what concerns several), level
-        (`note`, `will mislead`, `fatal`), code, text and action. A fit would be misled where any
-        level is above `note`.
+        One row for each finding, with the columns log (`together` for findings between logs), level
+        (`note`, `will mislead`, `fatal`), code, text and action. A level above `note` means that
+        the data would mislead a fit.
 
     Raises:
         UsageError: if a log lacks an input, or a path is wrong.
@@ -213,16 +212,16 @@ def draft_config(
 ) -> ConfigDraft:
     """Draft a complete config of a fit from logs of any format.
 
-    Channels, units, frames, inputs, splits, protocols and scales are proposed by names, headers,
-    values and physics, models by the standard recipe. What the logs do not tell is a guess, and
-    marked as one.
+    Channels, units, frames, inputs, splits, protocols and scales are proposed from names, headers,
+    values and physics, models from the standard recipe. Values that cannot be derived from the
+    logs are guesses and marked in the config.
 
     Args:
-        logs: files, folders and bags: one, or a list of these.
-        name: of the run.
-        folder: where the config will lie; its paths start from there.
-        answer: is given each question that the logs leave open, and returns its answer; None takes
-            the defaults.
+        logs: a file, folder or bag, or a list of these.
+        name: name of the run.
+        folder: folder of the config; its paths are relative to this folder.
+        answer: called with each question that the logs do not answer; returns the answer. None
+            for the default answers.
         progress: called with the progress of the reading.
 
     Returns:
@@ -230,30 +229,30 @@ def draft_config(
         YAML with comments, and `save(file)`.
 
     Raises:
-        UsageError: if a path does not exist, or nothing in the logs drives the vessel.
+        UsageError: if a path does not exist, or the logs have no channel of a command.
         DataError: if no log can be used.
 
     Example:
-        draft = residnet.draft_config("trials/"); draft.save("my_boat.yaml"); residnet.run("my_boat.yaml")
+        draft = residnet.draft_config("trials/"); draft.save("my_boat.yaml")
     """
     sources = list(logs) if isinstance(logs, list | tuple) else [logs]
     if not sources:
-        raise UsageError("draft: no log is given; name files, folders or bags")
+        raise UsageError("draft_config: no log is given; name files, folders or bags")
     with forward_progress(progress):
-        paths = [parse_path(log_source, "draft") for log_source in sources]
+        paths = [parse_path(log_source, "draft_config") for log_source in sources]
         return draft_fit_config(paths, Path(folder), name, answer)
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """Logs that are ready for a fit, with what models are judged by.
+    """Logs prepared for a fit, with the settings of the evaluation.
 
     Attributes:
-        splits: prepared logs by split: train, validation, test; external for further ones.
-        signals: what drives the models.
+        splits: prepared logs by split: train, validation, test; external for other logs.
+        signals: inputs and velocities of the models.
         prepare: grid, masks and derivatives.
         evaluation: protocols, scales and selection.
-        source: the `data` section of a config that the logs came from; None for others.
+        source: the `data` section of the config that the logs came from; None without a config.
     """
 
     splits: Mapping[str, list[PreparedLog]]
@@ -291,29 +290,30 @@ def prepare(
     progress: ProgressCallback | None = None,
     **settings: Any,
 ) -> Dataset:
-    """Bring logs to a grid, smooth and differentiate them, and say what models are judged by.
+    """Resample, smooth and differentiate logs, and choose the settings of the evaluation.
 
-    What is left out follows from the logs, as in a config that `draft` writes: inputs by names and
-    values; step and derivative by the sampling interval and by how long the yaw rate stays alike;
-    models are judged over back-to-back windows of the length that most of the logs for judging
-    hold, and of about a third of it; scales are the standard deviations of u, v and r over training
-    and validation logs. Where logs tell some of u, v and r alone, models are of these; where all
-    tell a roll angle, models roll.
+    Settings that are not given are derived from the logs, as `draft_config` does it: inputs from
+    names and values; step and derivative from the sampling interval and the correlation time of the
+    yaw rate; evaluation windows back to back, of the length that most validation and test logs
+    contain and of about a third of it; scales as the standard deviations of u, v and r over the
+    training and validation logs. If the logs measure only some of u, v and r, the models have these
+    velocities; if all logs measure the roll angle, the models include roll.
 
     Args:
-        logs: a list of logs (of each five, in the order of their manoeuvres, the third is for
-            validation and the fifth for the test; fewer are cut in time), a mapping from `train`,
+        logs: a list of logs (of each five, sorted by manoeuvre, the third is used for validation
+            and the fifth for testing; fewer than five are cut in time), a mapping from `train`,
             `validation` and `test` to logs, or the `data` section of a config.
         inputs: command channels that drive the model, in order; an empty list for a model without
-            any.
-        step: of the grid in s.
-        held_channels: channels whose last value holds until the next; others are interpolated.
-        settings_from: data whose settings are taken over; all logs then form the split `external`.
+            inputs.
+        step: step of the grid in s.
+        held_channels: channels that keep their last value between samples; other channels are
+            interpolated.
+        settings_from: dataset whose settings are used; all logs then form the split `external`.
         progress: called with the progress of the work.
         settings: further keys of the sections `signals` (exogenous, forces, velocities),
             `prepare` (masks, derivative, motion, trim, hold, beside) and `evaluation` (protocols,
-            selection, scales, groups, divergence) of a config, as YAML has them; without
-            `selection` the first of `protocols` chooses between models.
+            selection, scales, groups, divergence) of a config, as in YAML; without `selection` the
+            first of `protocols` is used for model selection.
 
     Returns:
         The data: y, smooth [T, 3 + n], nu_dot [T, n], w [T, m] of each log, float64, SI.
@@ -321,7 +321,7 @@ def prepare(
     Raises:
         ConfigError: if a setting is wrong.
         UsageError: if a channel is missing, or no inputs are named.
-        DataError: if a log holds nothing to learn from or to predict, or splits share data.
+        DataError: if a log has no usable stretch, or splits share measurements.
 
     Example:
         data = residnet.prepare(logs, ["n_port", "n_stbd"])
@@ -356,8 +356,8 @@ def prepare(
         if inputs is None and not input_names:
             raise UsageError(
                 "prepare: inputs: no channel of the logs is a rudder, a propeller or another"
-                " command; name those that drive the vessel; the first log has"
-                f" {', '.join(all_logs[0].channels)} (an empty list makes a model without commands)"
+                " command; pass the inputs of the vessel; the first log has"
+                f" {', '.join(all_logs[0].channels)} (an empty list: a model without commands)"
             )
         common_inputs = [
             name for name in input_names if all(name in log.channels for log in all_logs)
@@ -384,7 +384,7 @@ def prepare(
             "exogenous": preparation_recipe.wind_channels,
             "velocities": dof.velocities,
         }
-        # what no section knows is refused as an unknown key of `prepare`
+        # a key of no section is reported as an unknown key of `prepare`
         sections: Any = (
             (SignalsConfig, signals),
             (EvaluationConfig, evaluation_settings),
@@ -432,8 +432,8 @@ def _prepare_splits(
             )
             if not prepared[split][-1].trainable.any():
                 raise DataError(
-                    f"log {log.name}: no stretch is as long as the derivative's window; leave the"
-                    " log out or give a shorter derivative window"
+                    f"log {log.name}: no stretch is as long as the window of the derivative; leave the"
+                    " log out or use a shorter window"
                 )
             n_done += 1
     report_progress("preparing logs", total, total)

@@ -1,4 +1,4 @@
-"""The fit in Python: baselines, heads and ensembles by name, judged in free run along logs."""
+"""Fit in Python: baselines, heads and ensembles by name, evaluated in free run along logs."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ if TYPE_CHECKING:
 
 @final
 class FreeRuns:
-    """Models run freely along logs: every window of every protocol, measured beside predicted.
+    """Free runs of models along logs: measured and predicted states of every window.
 
     Attributes:
         rows: errors as rows of metrics.json.
         logs: names of the logs.
-        protocols: names of the protocols that have a window.
+        protocols: names of the protocols with at least one window.
 
     Example:
         runs.plot_track("zigzag_01").savefig("track.png")
@@ -74,12 +74,12 @@ class FreeRuns:
 
     @property
     def metrics(self) -> pd.DataFrame:
-        """Errors as a table, see `residnet.metrics`."""
+        """The errors as a table, see `residnet.metrics`."""
         return build_metrics_table(self.rows)
 
     @cached_property
     def windows(self) -> list[StoredWindow]:
-        """Every window, as `residnet.report.run_reader.RunFiles` reads them of a run."""
+        """All windows, in the form that `RunFiles` reads from a run folder."""
         logs, tables = self.evaluation.logs, self.table.groupby("log", sort=False)
         kinds = {log.log.name: log.log.manoeuvre for log in logs}
         return [
@@ -92,8 +92,8 @@ class FreeRuns:
     def table(self) -> pd.DataFrame:
         """One row for each log, protocol, model, window and time step.
 
-        Columns log, protocol, model, window, t (s, the log's clock), usable, diverged, then u, v
-        (m/s), r (rad/s), psi (rad), x, y (m) as measured, and with `_hat` as predicted.
+        Columns: log, protocol, model, window, t (s, clock of the log), usable, diverged; measured u,
+        v (m/s), r (rad/s), psi (rad), x, y (m); predicted states with the suffix `_hat`.
         """
         import pandas as pd
 
@@ -104,13 +104,13 @@ class FreeRuns:
         return pd.concat(tables, ignore_index=True)
 
     def plot_track(self, log: str | None = None, **selection: Any) -> Figure:
-        """Draw the measured track and those of models; north up, equal scales.
+        """Plot the measured and predicted tracks; north up, equal scales.
 
         Args:
-            log: name of the log; the first where None.
-            selection: `models`, their names, all but `constant_velocity` if there are none; `protocol`,
-                `manoeuvre` where there is such a one, else the first; `window`, number of the
-                window in the log, the longest where None.
+            log: name of the log; None for the first.
+            selection: `models`, names of models, by default all but `zero`; `protocol`, by default
+                `manoeuvre` if it exists, else the first; `window`, number of the window in the
+                log, by default the longest.
 
         Raises:
             UsageError: if there is no such log, model, protocol or window.
@@ -118,11 +118,11 @@ class FreeRuns:
         return self._plot(log, True, **selection)
 
     def plot_history(self, log: str | None = None, **selection: Any) -> Figure:
-        """Draw velocities and heading against time, measured and predicted.
+        """Plot measured and predicted velocities and heading against time.
 
         Args:
-            log: name of the log; the first where None.
-            selection: as of `plot_track`.
+            log: name of the log; None for the first.
+            selection: see `plot_track`.
 
         Raises:
             UsageError: if there is no such log, model, protocol or window.

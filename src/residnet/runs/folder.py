@@ -1,4 +1,4 @@
-"""The run folder: what a run leaves behind, and what other programs may rely on; provenance."""
+"""The run folder: paths and writers of result files, checksums, locks and provenance."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ SUMMARY_SCHEMA = "residnet.summary/1"
 """Schema of summary.json."""
 
 LOG_FILE = "log.txt"
-"""File that holds the progress of a run, where that is kept."""
+"""File with the progress messages of a run with --verbose."""
 CHECKSUMS_FILE = RUN_MANIFEST
 _RESULT_SUFFIXES = {".json", ".yaml", ".parquet", ".safetensors"}
 _UNCHECKED_FOLDERS = {"figures", "exports", "tensorboard", "checkpoints"}
-"""Folders that have no checksums: nothing reads them back as a result."""
+"""Folders without checksums: their files are never read as results."""
 _PRE_RESULT_FILES = {
     "resolved.yaml",
     "provenance.json",
@@ -42,16 +42,15 @@ _PRE_RESULT_FILES = {
     "data_quality.json",
     LOG_FILE,
 }
-"""Files that a run writes before its first result; a folder of these alone may be used again."""
+"""Files written before the first result; a folder with only these may be reused."""
 
 
 _LOCK_RETRIES = 20
-"""Tenths of a second that the workers of a killed run have to end."""
+"""Tenths of a second to wait for the workers of a killed run to end."""
 
 
 class RunFolder:
-    """The folder of one run: its paths, and writers that put a file in its place whole or not at
-    all.
+    """The folder of one run: paths of its files, and writers that replace files atomically.
 
     Attributes:
         path: the folder itself.
@@ -59,20 +58,20 @@ class RunFolder:
         resolved_config: the complete configuration, with every default and in SI units.
         provenance: versions, seed, revision and the SHA-256 of every input file.
         summary: task, finished mark, verdict and main figures.
-        report: the page for people.
-        metrics: free-run errors of a fit, or what the task compares.
+        report: the HTML page.
+        metrics: free-run errors of a fit, or the comparison of another task.
         models: one folder for each model.
         figures: pictures of the report.
         rollouts: stored free runs by split.
         exported_models: models for controllers.
-        data_quality: what each log contributes.
+        data_quality: samples, masks and ranges of each log.
         residuals: residual targets and predictions.
-        limits: where models fail, and what limits them.
+        limits: horizons and conditions at which models fail.
         goodness: goodness of fit of the regressions.
         booklet: standard manoeuvres of the identified model.
         selection: which model was selected, and why.
-        sanity: whether each model behaves like a vessel.
-        bands: how far free runs may be off.
+        sanity: findings of the physical checks of each model.
+        bands: prediction intervals of free runs.
     """
 
     def __init__(self, path: Path) -> None:
@@ -100,26 +99,28 @@ class RunFolder:
     def create(
         cls, path: Path, resolved: str, *, resume: bool = False, overwrite: bool = False
     ) -> RunFolder:
-        """Make the folder of a run, or take up one that is there.
+        """Create the folder of a run, or reuse an existing one.
 
-        A folder that an earlier run left without any result is used again.
+        A folder of an earlier run without any result is reused.
 
         Args:
+            path: the folder.
             resolved: text of the complete configuration.
             resume: continue a run of the same configuration.
+            overwrite: replace the files of an earlier run.
 
         Raises:
-            UsageError: if the folder exists and may not be used, or holds a run of another
+            UsageError: if the folder exists and may not be used, or contains a run of another
                 configuration.
         """
         folder = cls(path)
         folder.require_usable(resolved, resume=resume, overwrite=overwrite)
         if resume and folder.resolved_config.is_file() and folder._has_results():
-            # what is done again must not look finished meanwhile
+            # the run must not appear finished while it is repeated
             folder.summary.unlink(missing_ok=True)
             return folder
         if folder._has_results():
-            # the folder itself stays, since it is locked
+            # the folder itself is locked, so only its files are removed
             folder.manifest.remove_owned()
         folder.manifest.start_recording()
         folder.write(folder.resolved_config, resolved)
@@ -128,10 +129,10 @@ class RunFolder:
     def require_usable(
         self, resolved: str, *, resume: bool = False, overwrite: bool = False
     ) -> None:
-        """Check that `create` will do what it is asked for; nothing is changed.
+        """Check that `create` with the same arguments will succeed, without changing anything.
 
         Raises:
-            UsageError: as `create`.
+            UsageError: if the folder may not be used, see `create`.
         """
         if resume and overwrite:
             raise UsageError(f"{self.path}: give --resume or --overwrite, not both")
@@ -146,18 +147,18 @@ class RunFolder:
             self._require_replaceable(overwrite)
         elif _read_text(self.resolved_config) != resolved:
             raise UsageError(
-                f"{self.path}: was made with another configuration ({self.resolved_config} differs);"
-                " resume with the same one or give another --out"
+                f"{self.path}: the run has another configuration ({self.resolved_config} differs);"
+                " resume with the same configuration, or choose another --out"
             )
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Keep other processes from running into this folder within the context.
+        """Lock the folder against runs of other processes within the context.
 
-        Where the system or its disk knows no locks, nothing is held.
+        If the system or the file system does not support locks, the folder is not locked.
 
         Raises:
-            UsageError: if another process runs into it.
+            UsageError: if another process writes a run into the folder.
         """
         self.path.mkdir(parents=True, exist_ok=True)
         try:
@@ -176,7 +177,7 @@ class RunFolder:
                         time.sleep(0.1)
                         continue
                     raise UsageError(
-                        f"{self.path}: another run is being written here; wait for it, or give"
+                        f"{self.path}: another run is being written here; wait for it, or choose"
                         " another --out"
                     ) from None
                 except OSError:
@@ -190,15 +191,15 @@ class RunFolder:
         """Open the folder of a finished run.
 
         Raises:
-            UsageError: if there is no run, it is not finished, or a result is not as it was
-                written.
+            UsageError: if there is no run, the run is not finished, or a result has changed since
+                it was written.
         """
         folder = cls(path)
         if not stat.S_ISREG(
             folder.resolved_config.lstat().st_mode if folder.resolved_config.exists() else 0
         ):
             problem = "not a run folder (no resolved.yaml)" if path.exists() else "no such folder"
-            raise UsageError(f"{path}: {problem}; `residnet runs` lists what there is")
+            raise UsageError(f"{path}: {problem}; `residnet runs` lists the runs")
         if not folder.is_finished:
             raise UsageError(
                 f"{path}: the run is not finished (summary.json does not say so); continue it with"
@@ -209,16 +210,16 @@ class RunFolder:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the run came to its end."""
+        """Whether the run is complete."""
         return self.summary.is_file() and bool(self.read_summary().get("finished"))
 
     def write(self, path: Path, text: str) -> None:
-        """Write a text file, whole or not at all."""
+        """Write a text file atomically."""
         with atomic_write(path) as file:
             file.write_text(text, encoding="utf-8")
 
     def write_json(self, path: Path, content: Any) -> None:
-        """Write JSON that every reader takes (no NaN)."""
+        """Write a file of standard JSON, without NaN and infinity."""
         self.write(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
     def write_table(self, path: Path, table: pd.DataFrame) -> None:
@@ -235,7 +236,7 @@ class RunFolder:
         level: str = "",
         is_finished: bool,
     ) -> None:
-        """Write summary.json; its `is_finished` is the mark that the run came to its end."""
+        """Write summary.json; `is_finished` marks the run as complete."""
         content = {
             "schema": SUMMARY_SCHEMA,
             "task": task,
@@ -255,7 +256,7 @@ class RunFolder:
         content = read_json(self.summary)
         sentences = content.get("verdict")
         if not isinstance(sentences, list) or not all(isinstance(text, str) for text in sentences):
-            raise UsageError(f"{self.summary}: holds no verdict; restore the file or run it again")
+            raise UsageError(f"{self.summary}: has no verdict; restore the file, or repeat the run")
         return content
 
     def read_metrics(self) -> Mapping[str, Any]:
@@ -267,14 +268,14 @@ class RunFolder:
         return read_json(self.metrics)
 
     def read_fit_notes(self, model: str) -> dict[str, Any]:
-        """Return what models/<model>/fit.json tells of a model's fit; empty if there is none."""
+        """Return the content of models/<model>/fit.json; empty if the file does not exist."""
         path = self.models / model / "fit.json"
         return read_json(path) if path.is_file() else {}
 
     def _has_results(self) -> bool:
         entry_names = {entry.name for entry in self.path.iterdir()} if self.path.is_dir() else set()
         entry_names -= {self.manifest.path.name, self.manifest.journal.name}
-        # without a configuration the files are somebody else's
+        # files without a configuration belong to the user
         return bool(entry_names - _PRE_RESULT_FILES) or (
             bool(entry_names) and not self.resolved_config.is_file()
         )
@@ -282,18 +283,18 @@ class RunFolder:
     def _require_replaceable(self, overwrite: bool) -> None:
         if not self.resolved_config.is_file():
             raise UsageError(
-                f"{self.path}: exists already and is not the folder of a run; give another --out"
+                f"{self.path}: exists already and is not a run folder; choose another --out"
             )
         if not overwrite:
             raise UsageError(
-                f"{self.path}: exists already; give another --out (in Python `folder`), continue it"
+                f"{self.path}: exists already; choose another --out (in Python `folder`), continue it"
                 " with --resume (`resume=True`), or replace it with --overwrite (`overwrite=True`)"
             )
         self.manifest.require_all_owned()
 
 
 def _read_text(path: Path) -> str:
-    """Return the text of a file; what is no text in it shows as escapes."""
+    """Return the text of a file; bytes that are not UTF-8 are shown as escapes."""
     try:
         return path.read_text(encoding="utf-8", errors="backslashreplace")
     except OSError as error:
@@ -301,38 +302,38 @@ def _read_text(path: Path) -> str:
 
 
 def require_recorded(run: Path) -> None:
-    """Check that the files of a run folder are recorded, before more are written into it.
+    """Check that a run folder has a manifest, before further files are written into it.
 
     Raises:
-        UsageError: if there is no manifest, as in the run of an earlier version.
+        UsageError: if there is no manifest, as in runs of early versions.
     """
     if not Manifest(run).is_recorded:
         raise UsageError(
-            f"{run}: has no {CHECKSUMS_FILE}, so nothing says which of its files residnet wrote; give"
-            " another --out"
+            f"{run}: has no {CHECKSUMS_FILE}, which lists the files that residnet wrote;"
+            " choose another --out"
         )
 
 
 def require_apart(folder: Path, inputs: Iterable[Path]) -> None:
-    """Check that a folder that is replaced holds none of the files that the work reads.
+    """Check that a folder to be replaced contains none of the input files.
 
     Raises:
-        UsageError: if it holds one.
+        UsageError: if it contains one.
     """
     place = folder.resolve()
     for file in inputs:
         if file.resolve().is_relative_to(place):
             raise UsageError(
-                f"{file}: lies in {folder}, which --overwrite would empty; move it, or give another"
+                f"{file}: lies in {folder}, which --overwrite would empty; move it, or choose another"
                 " --out"
             )
 
 
 def write_checksums(run: Path) -> None:
-    """Bring checksums.json up to date: the SHA-256 of every file that residnet wrote there.
+    """Update checksums.json: the SHA-256 of every file that residnet wrote into the folder.
 
-    In a folder without a manifest, such as that of a single model, the results that stand there are
-    recorded. A run within the folder, such as an evaluation, has checksums of its own.
+    In a folder without a manifest, such as the folder of a single model, all result files are
+    recorded. A run inside the folder, such as an evaluation, has its own checksums.
     """
     manifest = Manifest(run)
     if not manifest.is_recorded:
@@ -342,11 +343,11 @@ def write_checksums(run: Path) -> None:
 
 
 def verify_checksums(run: Path) -> None:
-    """Check that the results of a finished run are those that it wrote.
+    """Check that the result files of a finished run are unchanged.
 
     Raises:
-        UsageError: if the manifest is missing or does not list a file, or if a file is missing, cut
-            off, edited, from elsewhere, or no regular file.
+        UsageError: if the manifest is missing or does not list a file, or if a file is missing,
+            truncated, edited, replaced, or not a regular file.
     """
     require_trustworthy(run)
 
@@ -375,14 +376,14 @@ _RECORDED_PACKAGES = (
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a run is made from.
+    """Inputs and settings that a run was made from.
 
     Attributes:
-        config_path: the file that describes it; None if Python called.
-        overrides: of the config's keys.
-        seed: of everything random.
-        input_paths: inputs whose contents the run depends on.
-        start_time: seconds since the epoch.
+        config_path: file of the config; None for a config made in Python.
+        overrides: overrides of keys of the config.
+        seed: seed of all random numbers.
+        input_paths: input files that determine the results.
+        start_time: time of the start in s since the epoch.
     """
 
     config_path: Path | None
@@ -395,7 +396,7 @@ class Provenance:
         """Check that no input file has changed since an interrupted run in the folder began.
 
         Raises:
-            UsageError: if one has.
+            UsageError: if a file has changed, or is no longer an input.
         """
         if not folder.provenance.is_file():
             return
@@ -404,17 +405,17 @@ class Provenance:
         for path in self.input_paths:
             if recorded_checksums.get(str(path), "") != sha256(path):
                 raise UsageError(
-                    f"{path}: is not the file that the run in {folder.path} began with; bring it"
-                    " back, or begin anew with --overwrite"
+                    f"{path}: has changed since the run in {folder.path} was started; restore"
+                    " it, or restart with --overwrite"
                 )
         for name in sorted(recorded_checksums.keys() - {str(path) for path in self.input_paths}):
             raise UsageError(
-                f"{name}: the run in {folder.path} began with this file, which is not among the"
-                " inputs now; name it, too, or begin anew with --overwrite"
+                f"{name}: the run in {folder.path} was started with this file, which is no longer"
+                " an input; add it again, or restart with --overwrite"
             )
 
     def write(self, folder: RunFolder) -> None:
-        """Write provenance.json, with the seconds since the start."""
+        """Write provenance.json, including the time since the start."""
         content = {
             "residnet": __version__,
             "command": sys.argv,
@@ -433,9 +434,9 @@ class Provenance:
 
 
 def read_git_revision() -> str | None:
-    """Return the revision of the checkout that residnet runs from; None outside a checkout.
+    """Return the Git revision of residnet's source; None if it is not a checkout.
 
-    It ends in `+changes` where the checkout is not clean.
+    The revision has the suffix `+changes` if the checkout has uncommitted changes.
     """
     package_folder = Path(__file__).parent
     try:

@@ -1,4 +1,4 @@
-"""Trained models in their run folder, each kept as it is done, so that a broken run can go on."""
+"""Storage of trained models in a run folder, so that an interrupted run can be resumed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class RunModelStore(FitStore):
     """Vessel models and policies in `models/<name>` of a run folder.
 
     Attributes:
-        training_folder: the run folder, where checkpoints and the TensorBoard log stand.
+        training_folder: the run folder, for checkpoints and the TensorBoard log.
     """
 
     def __init__(self, folder: RunFolder) -> None:
@@ -26,18 +26,18 @@ class RunModelStore(FitStore):
         self.folder = folder
 
     def names(self) -> list[str]:
-        """Return the names of the models that are there."""
+        """Return the names of the stored models."""
         return list(model_names(self.folder.models))
 
     def load_finished(self, name: str) -> FittedModel | None:
-        """Return a model that is there whole; None if it is not."""
+        """Return a completely stored model; None if it is absent or incomplete."""
         return self.load(name) if (self.folder.models / name / "model.json").is_file() else None
 
     def load(self, name: str) -> FittedModel:
         """Return a model with its notes.
 
         Raises:
-            UsageError: if there is none of that name, or a file of it has changed since.
+            UsageError: if there is no such model, or one of its files has changed.
         """
         verify_checksums(self.folder.models / name)
         content = read_json(self.folder.bands) if self.folder.bands.is_file() else {}
@@ -57,13 +57,13 @@ class RunModelStore(FitStore):
         write_checksums(folder)
 
     def restore_module(self, name: str, module: nn.Module) -> dict[str, Any] | None:
-        """Fill a module with the weights that an interrupted run had trained, and freeze it.
+        """Load the weights trained by an interrupted run into a module, and freeze it.
 
         Returns:
-            The notes of its training; None if it had not ended.
+            The notes of the training; None if it was not complete.
 
         Raises:
-            UsageError: if the weights or the notes are not as they were written.
+            UsageError: if the weights or the notes have changed since they were written.
         """
         folder = self.folder.models / name
         if not (folder / "model.json").is_file():
@@ -74,7 +74,7 @@ class RunModelStore(FitStore):
         return self.folder.read_fit_notes(name)
 
     def save(self, fitted_model: FittedModel) -> None:
-        """Write a model and its notes; the model's description comes last and marks it whole."""
+        """Write a model and its notes; the description is written last and marks it as complete."""
         self.save_module(
             fitted_model.name, fitted_model.spec, fitted_model.model, fitted_model.notes
         )
