@@ -188,7 +188,7 @@ def test_save_load_export(
     np.testing.assert_allclose(one["nrmse_mean"], many["nrmse_mean"], rtol=1e-12)
     card = residnet.export_model(again, tmp_path / "net.pt")
     assert card["model"] == "net"
-    with pytest.raises(ResidnetError, match="stands there already"):
+    with pytest.raises(ResidnetError, match="already contains a model"):
         residnet.save(models["net"], tmp_path / "net")
 
 
@@ -295,7 +295,7 @@ WRONG = [
     ),
     ("ridge.rollout(x, np.zeros((10, 5)))", r"w has the shape \[10, 5\], expected \[B, T, 2\]"),
     ("ridge.step(np.zeros(3), w)", r"x has the shape \[3\]"),
-    ("ridge.step(x, [np.nan, 1.0])", "w holds a value that is not finite"),
+    ("ridge.step(x, [np.nan, 1.0])", "w contains a value that is not finite"),
     ("ridge.step('here', w)", "x: expected numbers"),
     ("ridge.step(np.zeros((2, 6)), np.zeros((3, 2)))", "2 states, but inputs for 3"),
     (

@@ -108,9 +108,9 @@ class FreeRuns:
 
         Args:
             log: name of the log; None for the first.
-            selection: `models`, names of models, by default all but `zero`; `protocol`, by default
-                `manoeuvre` if it exists, else the first; `window`, number of the window in the
-                log, by default the longest.
+            selection: `models`, names of models, by default all but `constant_velocity`;
+                `protocol`, by default `manoeuvre` if it exists, else the first; `window`, number of
+                the window in the log, by default the longest.
 
         Raises:
             UsageError: if there is no such log, model, protocol or window.
@@ -196,16 +196,16 @@ def free_run(
     *,
     progress: ProgressCallback | None = None,
 ) -> FreeRuns:
-    """Run models freely along logs: from a measured state on, with the inputs alone.
+    """Predict logs in free run: from a measured state on, with the measured inputs only.
 
-    A window whose prediction is not finite, or leaves the training envelope by far, has diverged
-    and counts with the prediction that holds the initial velocities.
+    A prediction that is not finite, or far outside of the training envelope, has diverged. Its
+    errors are replaced by those of the constant-velocity prediction.
 
     Args:
-        models: from `fit` or `load`; one or several.
-        data: from `prepare`.
-        split: of the data; `test` if there is one, else the first.
-        progress: is told how far the free runs are.
+        models: one or several models from `fit` or `load`.
+        data: dataset from `prepare`.
+        split: split of the data; None for `test` if it exists, else the first.
+        progress: called with the progress of the free runs.
 
     Raises:
         UsageError: if the data have no such split, or a model has other inputs or another step.
@@ -252,9 +252,9 @@ class Models(dict[str, Model]):
     """Fitted models by name: constant_velocity, the baselines, heads and ensembles, in this order.
 
     Attributes:
-        identified: what the fit made.
-        data: what they were fitted on and are judged on.
-        settings: of the fit, as YAML would have them.
+        identified: results of the identification.
+        data: dataset of the fit and of the evaluation.
+        settings: settings of the fit.
 
     Example:
         models["lstm"].step(x, w)
@@ -273,31 +273,31 @@ class Models(dict[str, Model]):
 
     @cached_property
     def selection(self) -> Selection:
-        """Which single model and which ensemble the validation logs choose, and why."""
+        """Selected single model and ensemble, with the reason; selected on the validation logs."""
         return self.identified.select_models(
             {name: runs.evaluation for name, runs in self.runs.items()}
         )
 
     @property
     def selected_name(self) -> str:
-        """Name of the single model: the recipe's hull, else the simplest that is alike the best."""
+        """Name of the selected single model: the hull of the recipe, else see `select_model`."""
         return self.selection.selected
 
     @property
     def predictor_name(self) -> str:
-        """Name of the model that is reported first: the recipe's mean, else the selected one."""
+        """Name of the model reported first: the mean of the recipe, else the selected model."""
         return self.selection.default_model
 
     @property
     def verdict(self) -> list[str]:
-        """The verdict on the predictor in whole sentences, the most important first."""
+        """The verdict on the predictor in complete sentences, the most important first."""
         return write_verdict(self.evidence)
 
     @cached_property
     def evidence(self) -> VerdictEvidence:
-        """What the verdict is passed on.
+        """Errors and findings on which the verdict is based.
 
-        It is of the test logs where they are judged, else of the validation logs.
+        They are those of the test logs if these are evaluated, else of the validation logs.
         """
         split = "test" if "test" in self.runs else "validation"
         evaluation = self.runs[split].evaluation
@@ -346,35 +346,34 @@ def fit(
     progress: ProgressCallback | None = None,
     **settings: Any,
 ) -> Models:
-    """Fit baselines, then heads on what each leaves, then ensembles.
+    """Fit baselines, residual heads on the baselines, and ensembles.
 
-    The arguments are the keys of a config of the task `fit`, and give the same numbers. Without a
-    baseline, heads or other parts the standard recipe fits its portfolio of models.
+    The arguments are the keys of a config of the task `fit`, with the same numerical results.
+    Without a baseline, heads or other parts, the standard recipe fits its portfolio of models.
 
     Args:
-        data: from `prepare`; or logs, whose inputs, split, step, protocols and scales then follow
-            from what they hold.
-        baseline: the known part: its kind, a mapping or a config object. `regressors` alone is a
-            line in every channel, and is taken where there are heads but no baseline.
-        heads: what is learned on top: kinds such as `["plsr", "lstm"]`, or a mapping from names to
+        data: dataset from `prepare`; or logs, for which `prepare` is called without further
+            arguments.
+        baseline: baseline model: a kind, a mapping or a config object. `regressors` without
+            settings is linear in every channel, and the default if heads are given.
+        heads: learned residual models: kinds such as `["plsr", "lstm"]`, or a mapping from names to
             kinds, mappings or config objects.
         baselines: further baselines by name.
-        threads: of PyTorch; one is fastest for these small products, and part of what makes a fit
-            repeatable.
-        workers: models that may be fitted in parallel, each in a process of its own, where they
-            take long; the numbers stay the same. With more than one, a script has to keep its calls
-            under `if __name__ == "__main__":`, since each process imports it again.
+        threads: number of PyTorch threads; one is fastest for the small matrix products.
+        workers: number of models fitted in parallel processes; the results do not change. With more
+            than one worker, a script must call `fit` under `if __name__ == "__main__":`, since each
+            process imports it.
         trust: allow classes of scikit-learn whose fitted state is not stored as data; they can run
             code, so only for sources that you trust.
-        progress: is told what is being fitted, and how far it is.
-        settings: further keys of a fit, as YAML has them: recipe, effort, base_of, forces,
-            ensembles, means, training, refit, current, bands, seed, and integrator, which is
-            that of `residnet new` for the recipe if it is not given.
+        progress: called with the progress of the fit.
+        settings: further keys of a fit, as in YAML: recipe, effort, base_of, forces, ensembles,
+            means, training, refit, current, bands, seed, and integrator (default for the recipe:
+            as `residnet new` chooses it).
 
     Raises:
         ConfigError: if a setting is wrong.
-        FitError: if the data do not determine a part.
-        DataError: if a split holds no sample or no window.
+        FitError: if the data do not determine the coefficients of a model.
+        DataError: if a split contains no sample or no window.
 
     Example:
         models = residnet.fit(logs); models.selected, models.metrics
@@ -426,11 +425,12 @@ def metrics(
     """Return the free-run errors of models, one row for each model, split and protocol.
 
     Args:
-        models: from `fit`.
-        data: other logs, from `prepare(logs, like=data)`; those of the fit where None.
-        split: train, validation, test or external; all where None.
-        manoeuvre: a kind of manoeuvre or a group; `all` for all together, None for a row of each.
-        progress: is told how far the free runs are.
+        models: models from `fit`.
+        data: other logs, from `prepare(logs, settings_from=data)`; None for the logs of the fit.
+        split: train, validation, test or external; None for all splits.
+        manoeuvre: a kind of manoeuvre or a group; `all` for the errors over all manoeuvres, None
+            for one row for each manoeuvre.
+        progress: called with the progress of the free runs.
 
     Returns:
         Columns model, kind, split, protocol, manoeuvre, selected, windows, diverged, n, rmse_u,
@@ -457,12 +457,14 @@ def metrics(
 
 
 def select_model(models: Models) -> Model:
-    """Return the recipe's hull, else the simplest sound model that is alike the best.
+    """Return the selected single model.
 
-    Free runs over the validation logs decide; `models.selection.reason` says why.
+    For the standard recipe it is the model `hull`. Otherwise it is the simplest physically
+    plausible model whose validation error in free run is within one standard error of the lowest
+    one; `models.selection.reason` explains the selection.
 
     Example:
         residnet.select_model(models).name
     """
-    require_instance(models, Models, "select: expected models from residnet.fit")
+    require_instance(models, Models, "select_model: expected models from residnet.fit")
     return models[models.selected_name]

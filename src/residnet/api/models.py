@@ -1,4 +1,4 @@
-"""Models in Python: stepped and rolled out with arrays, kept, loaded, exported and watched."""
+"""Models in Python: simulation with arrays, saving, loading, export and monitoring."""
 
 from __future__ import annotations
 
@@ -48,26 +48,26 @@ if TYPE_CHECKING:
 
 @final
 class Model:
-    """A fitted model of a vessel: what it is, how it was fitted, and how it moves.
+    """A fitted model of a vessel with the notes of its fit.
 
-    States are x, y [m], psi [rad], u, v [m/s], r [rad/s], and of a vessel that rolls p [rad/s] and
-    phi [rad]; inputs are named by `inputs`. Arrays may
-    be of one vessel (no batch axis) or of B; results have the axes that were given.
+    States are x, y [m], psi [rad], u, v [m/s], r [rad/s], and for a vessel that rolls p [rad/s] and
+    phi [rad]; `inputs` names the inputs. Arrays have no batch axis (one vessel) or a batch axis of
+    B vessels; results have the same axes as the arguments.
 
     Example:
         x, s = model.step([0, 0, 0, 1.2, 0, 0], [20.0, 18.0])
 
     Attributes:
         fitted_model: the model with the notes of its fit.
-        name: of the model.
-        role: what it is: constant_velocity, baseline, head or ensemble.
-        spec: everything that determines the model but its numbers.
-        module: the PyTorch module itself.
+        name: name of the model.
+        role: constant_velocity, baseline, head or ensemble.
+        spec: settings and structure of the model, without its numerical parameters.
+        module: the PyTorch module.
         states: names of the columns of a state.
         inputs: names of the columns of the inputs: commands, then exogenous channels.
         units: SI unit of each state and input.
         dt: time step of the model in s.
-        notes: what there is to say about the fit; empty for a model that was saved without a run.
+        notes: notes of the fit; empty for a model that was saved without a run.
     """
 
     def __init__(self, fitted_model: FittedModel) -> None:
@@ -87,9 +87,9 @@ class Model:
 
     @property
     def coefficients(self) -> pd.DataFrame:
-        """Identified coefficients: axis, term, value, standard_error; no row if there are none.
+        """Identified coefficients in SI units: axis, term, value, standard_error.
 
-        The coefficients are SI.
+        The table is empty for a model without coefficients.
         """
         import pandas as pd
 
@@ -97,12 +97,12 @@ class Model:
         return pd.DataFrame(self.notes.get("coefficients", []), columns=columns)
 
     def step(self, x: Any, w: Any, s: Any = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return the state and the memory one step later.
+        """Return state and memory after one time step.
 
         Args:
             x: states [B, 6] or [6].
             w: inputs [B, m] or [m], held over the step.
-            s: memory [B, n_state] from the step before or from `warmup`; empty if None.
+            s: memory [B, n_state] of the previous step or from `warmup`; None for zero memory.
 
         Raises:
             UsageError: if a shape does not fit or a number is not finite.
@@ -119,12 +119,12 @@ class Model:
         return next_states, memory
 
     def rollout(self, x0: Any, w: Any, s: Any = None) -> np.ndarray:
-        """Return the states of a free run from x0 on, [B, T+1, 6] or [T+1, 6].
+        """Simulate a free run; returns the states [B, T+1, 6] or [T+1, 6].
 
         Args:
             x0: initial states [B, 6] or [6].
             w: inputs [B, T, m] or [T, m], each held over its step.
-            s: memory [B, n_state] from `warmup`; empty if None.
+            s: memory [B, n_state] from `warmup`; None for zero memory.
 
         Raises:
             UsageError: if a shape does not fit or a number is not finite.
@@ -141,7 +141,7 @@ class Model:
         return _to_numpy(trajectory, np.ndim(x0) == 1)
 
     def warmup(self, y_history: Any, w_history: Any) -> np.ndarray:
-        """Return the memory that a measured past leaves, [B, n_state] or [n_state].
+        """Return the memory after a measured past, [B, n_state] or [n_state].
 
         Args:
             y_history: measured states [B, T, 6] or [T, 6], oldest first.
@@ -176,7 +176,7 @@ class Model:
         return copy.deepcopy(self.module).to(torch.float64).eval()
 
     def _parse_arrays(self, *named_arrays: tuple[str, Any, int]) -> tuple[Tensor, Tensor]:
-        """Rows [B, (T,) width] of states and inputs, each by its name, value and axes; float64."""
+        """Check states and inputs, given as (name, value, axes); returns float64 [B, (T,) width]."""
         tensors = []
         for (name, value, axes), array_kind in zip(named_arrays, ("states", "inputs"), strict=True):
             columns = self.states if array_kind == "states" else self.inputs
@@ -194,7 +194,7 @@ class Model:
                     f" [B, {expected_shape}] or [{expected_shape}] ({array_kind} {', '.join(columns)})"
                 )
             if not np.isfinite(values).all():
-                raise UsageError(f"model {self.name}: {name} holds a value that is not finite")
+                raise UsageError(f"model {self.name}: {name} contains a value that is not finite")
             tensors.append(
                 torch.from_numpy(values if values.ndim == axes + 1 else values[None].copy())
             )
@@ -223,15 +223,17 @@ def _to_numpy(values: Tensor, is_single: bool) -> np.ndarray:
 
 
 def save(model: Model, folder: PathLikeArg, *, overwrite: bool = False) -> Path:
-    """Write a model to a folder and return it; nothing in it runs when it is loaded.
+    """Save a model to a folder; returns the folder.
+
+    The files contain data only: no code runs when the model is loaded.
 
     Args:
-        model: to keep.
-        folder: `model.json` and `model.safetensors` are written into it.
-        overwrite: replace a model that stands there.
+        model: the model.
+        folder: folder for `model.json` and `model.safetensors`.
+        overwrite: replace an existing model.
 
     Raises:
-        UsageError: if a model stands there already.
+        UsageError: if the folder already contains a model.
 
     Example:
         residnet.save(models["lstm"], "models/lstm")
@@ -239,7 +241,7 @@ def save(model: Model, folder: PathLikeArg, *, overwrite: bool = False) -> Path:
     require_instance(model, Model, "save: expected a model")
     model_folder = parse_path(folder, "save")
     if (model_folder / "model.json").exists() and not overwrite:
-        raise UsageError(f"{model_folder}: a model stands there already; give overwrite=True")
+        raise UsageError(f"{model_folder}: already contains a model; give overwrite=True")
     if model_folder.exists() and not model_folder.is_dir():
         raise UsageError(f"{model_folder}: is a file, expected a folder")
     manifest = Manifest(model_folder)
@@ -251,12 +253,12 @@ def save(model: Model, folder: PathLikeArg, *, overwrite: bool = False) -> Path:
 
 
 def load(folder: PathLikeArg, name: str | None = None, *, trust: bool = False) -> Model:
-    """Read a model from its folder, or by its name from the folder of a run.
+    """Load a model from its folder, or by its name from the folder of a run.
 
     Args:
-        folder: of a model, or of a finished run.
-        name: of the model in the run; `selected` is the single one that validation data chose;
-            if not given, the one that is reported first.
+        folder: folder of a model, or of a finished run.
+        name: name of the model in the run; `selected` is the single model chosen on validation
+            data; None for the model reported first.
         trust: allow classes of scikit-learn whose fitted state is not stored as data; they can run
             code, so only for sources that you trust.
 
@@ -273,7 +275,7 @@ def load(folder: PathLikeArg, name: str | None = None, *, trust: bool = False) -
             model_folder = model_folder / "models" / chosen_model(model_folder, name or "predictor")
         verify_checksums(model_folder)
         spec, module = load_model(model_folder)
-        # outside of a run there are neither notes nor bands
+        # a model saved outside of a run has neither notes nor bands
         notes, bands = model_folder / "fit.json", model_folder.parent.parent / "bands.json"
         return Model(
             FittedModel(
@@ -288,18 +290,20 @@ def load(folder: PathLikeArg, name: str | None = None, *, trust: bool = False) -
 
 
 def trust(folder: PathLikeArg) -> list[str]:
-    """Accept the folder of a run or model as it stands, as `residnet trust` does.
+    """Accept the present files of a run or model folder, as `residnet trust` does.
 
-    Do this only if you trust where it comes from. Its manifest (`checksums.json`) is written anew.
+    Do this only if you trust the source of the folder. Its manifest (`checksums.json`) is
+    rewritten.
 
     Args:
-        folder: of a run or a single model.
+        folder: folder of a run or of a single model.
 
     Returns:
         One line for each file that was new or changed.
 
     Raises:
-        UsageError: if it is no such folder, or holds a link, a device or a file that is too large.
+        UsageError: if it is not such a folder, or contains a link, a device or a file that is too
+            large.
 
     Example:
         residnet.trust("runs/of_an_earlier_version")
@@ -315,22 +319,23 @@ def export_model(
     metrics: Sequence[Mapping[str, Any]] = (),
     allows_objections: bool = False,
 ) -> Mapping[str, Any]:
-    """Write a model for controllers, after a parity check, and return what its card says.
+    """Export a model for controllers after a parity check; returns the model card.
 
     Args:
-        model: to export.
-        file: to write.
+        model: the model.
+        file: file to write.
         format: one of `list_available("formats")`.
-        metrics: rows of metrics.json. Those of this model stand in the card; those of
-            `constant_velocity` and
-            of a baseline under the same protocol show whether it is worse than they are.
-        allows_objections: whether a model is wanted that is worse, too; its card says so.
+        metrics: rows of metrics.json. The rows of this model are copied to the card; the rows of
+            `constant_velocity` and of a baseline under the same protocol are its reference.
+        allows_objections: export the model even if it is worse than its reference; the card
+            states this.
 
     Raises:
-        WithheldError: if it is worse than `constant_velocity` or the baseline, but for `allows_objections`.
+        WithheldError: if the model is worse than `constant_velocity` or the baseline, and
+            `allows_objections` is False.
         ConfigError: if there is no such format.
-        UsageError: if the format cannot hold such a model.
-        ExportError: if what was written does not reproduce the model.
+        UsageError: if the format does not support the model.
+        ExportError: if the written file does not reproduce the model.
 
     Example:
         card = residnet.export_model(models["lstm"], "lstm.pt")
@@ -349,7 +354,7 @@ def export_model(
 
 
 def _find_objections(name: str, metrics: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return what rows of metrics.json say against a model, on the data that tell most."""
+    """Return the objections against a model from rows of metrics.json, on unseen data if any."""
     all_manoeuvre_rows = [row for row in metrics if row.get("manoeuvre") == "all"]
     splits = [row["split"] for row in all_manoeuvre_rows if row["model"] == name]
     if not splits:
@@ -367,10 +372,15 @@ def _find_objections(name: str, metrics: Sequence[Mapping[str, Any]]) -> list[st
 def require_instance(
     value: Any, expected_type: type[Any] | tuple[type[Any], ...], expected: str
 ) -> None:
-    """Stop where an argument is of another kind.
+    """Check the type of an argument.
+
+    Args:
+        value: the argument.
+        expected_type: its expected type or types.
+        expected: begin of the error message.
 
     Raises:
-        UsageError: with what it is instead.
+        UsageError: if the argument has another type.
     """
     if not isinstance(value, expected_type):
         raise UsageError(f"{expected}, given {describe_type(value)}")
@@ -378,21 +388,21 @@ def require_instance(
 
 @final
 class Monitor:
-    """A watch over a model in service.
+    """Online change detection for a model in service.
 
-    Short free runs of the model are compared with what is measured. Score tests say whether a
-    change of mass, damping, thrust, rudder or of a sensor explains the last minutes better than
-    clean logs ever asked for; wind and current have their part taken out first.
+    Short free runs of the model are compared with measurements. Score tests decide whether a change
+    of mass, damping, thrust, rudder or a sensor explains the innovations of the last minutes; the
+    threshold is calibrated on reference data. The effects of wind and current are removed first.
 
     Args:
-        model: of the vessel as it was.
-        reference_data: data of the unchanged vessel, as they were fitted.
-        settings: of `residnet.identification.monitoring.MonitorConfig`: `window`,
+        model: model of the unchanged vessel.
+        reference_data: data of the unchanged vessel, such as those of the fit.
+        settings: keys of `residnet.identification.monitoring.MonitorConfig`: `window`,
             `stretch`, `false_alarm`, `group` in s.
 
     Raises:
-        UsageError: if an argument is of another kind.
-        DataError: if the clean data are too few.
+        UsageError: if an argument has a wrong type.
+        DataError: if there are too few reference data.
 
     Example:
         monitor = residnet.Monitor(models["baseline"], data); verdict = monitor.step(y, w)
@@ -413,38 +423,37 @@ class Monitor:
 
     @property
     def threshold(self) -> float:
-        """The score at which a cause raises an alarm."""
+        """Score above which a change raises an alarm."""
         return self._detector.detector.threshold
 
     def step(self, y: Sequence[float], w: Sequence[float]) -> MonitorVerdict | None:
-        """Take one sample, and return the verdict where a window is complete, else None.
+        """Process one sample; returns the verdict if it completes a window, else None.
 
         Args:
-            y: measured x, y, psi, u, v, r, then p and phi of a model that rolls; psi without jumps.
-            w: inputs held over the step after it, in the model's order.
+            y: measured x, y, psi, u, v, r, then p and phi for a model with roll; psi unwrapped.
+            w: inputs held over the following step, in the order of the model.
         """
         new_verdict = self._detector.update(np.asarray(y, dtype=float), np.asarray(w, dtype=float))
         self.verdict = new_verdict or self.verdict
         return new_verdict
 
     def refit(self, new_data: Dataset) -> tuple[Model, RecursiveRefit]:
-        """Put the changes that the monitor names into a copy of the model, log by log.
+        """Apply the detected changes to a copy of the model, estimated recursively log by log.
 
-        The old model stays as it is. Judge both on logs that were not given here, for example by
+        The original model is not changed. Evaluate both models on other logs, for example with
         `residnet.free_run`, before the new one goes into service.
 
         Args:
-            new_data: logs of the changed vessel in the order of time, as
-                `residnet.prepare(logs, like=data)` gives them.
+            new_data: logs of the changed vessel in the order of time, from
+                `residnet.prepare(logs, settings_from=data)`.
 
         Returns:
-            The new model, named `<name>_refit`, and what was found: `moved` holds each change with
-            size and standard error, `ended` says why no further one was taken. Where `moved` is
-            empty the model is as it was.
+            The new model, named `<name>_refit`, and the result of the refit with each identified
+            change, its size and standard error. Without a change the model equals the original.
 
         Raises:
-            UsageError: if the data are of another kind, or the model has no parameters to move.
-            DataError: if a log holds no window.
+            UsageError: if the data have a wrong type, or the model has no parameters to change.
+            DataError: if a log contains no window.
         """
         require_instance(new_data, Dataset, "Monitor.refit: expected data from residnet.prepare")
         change_detector = self._detector.detector
@@ -459,5 +468,5 @@ class Monitor:
         ), recursive_result
 
     def restart(self) -> None:
-        """Say that the next sample does not follow the last one."""
+        """Start a new log: the next sample does not follow the previous one."""
         self._detector.start_new_log()

@@ -1,4 +1,4 @@
-"""Any task from Python, what there is to choose from, and sea trials of vessels by name."""
+"""Tasks in Python, configs of parts by name, and simulated sea trials."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ PartKind = Literal["vessels", "heads", "baselines", "manoeuvres", "readers", "ta
 
 
 def list_available(part_kind: PartKind) -> pd.DataFrame:
-    """Return what there is to choose from, parts of other packages included: name and about.
+    """Return a table of the available parts of a kind, with columns name and about.
 
     Args:
         part_kind: vessels, heads, baselines, manoeuvres, readers, tasks or formats (of exports).
 
     Raises:
-        UsageError: if it is none of these.
+        UsageError: if there is no such kind of part.
 
     Example:
         residnet.list_available("heads")
@@ -66,7 +66,7 @@ def list_available(part_kind: PartKind) -> pd.DataFrame:
 
     if part_kind not in get_args(PartKind):
         raise UsageError(
-            f"available: there are no '{part_kind}'{suggest_name(str(part_kind), get_args(PartKind))}"
+            f"list_available: there are no '{part_kind}'{suggest_name(str(part_kind), get_args(PartKind))}"
         )
     return pd.DataFrame(list_catalogue(part_kind), columns=["name", "about"])
 
@@ -78,7 +78,7 @@ def head(kind: PartLike, *, trust: bool = False, **settings: Any) -> FeatureConf
         kind: one of `list_available("heads")`.
         trust: allow classes of scikit-learn whose fitted state is not stored as data; they can run
             code, so only for sources that you trust.
-        settings: of the head, as YAML has them.
+        settings: settings of the head, as in YAML.
 
     Raises:
         ConfigError: if there is no such kind, or a setting is wrong.
@@ -98,7 +98,7 @@ def baseline(kind: PartLike, **settings: Any) -> IdentifiedConfig:
 
     Args:
         kind: one of `list_available("baselines")`.
-        settings: of the baseline, as YAML has them.
+        settings: settings of the baseline, as in YAML.
 
     Raises:
         ConfigError: if there is no such kind, or a setting is wrong.
@@ -116,7 +116,7 @@ def manoeuvre(kind: PartLike, **settings: Any) -> Manoeuvre:
 
     Args:
         kind: one of `list_available("manoeuvres")`.
-        settings: of the manoeuvre; SI numbers, or texts with a unit such as "20 deg".
+        settings: settings of the manoeuvre; numbers in SI, or texts with a unit such as "20 deg".
 
     Raises:
         ConfigError: if there is no such kind, or a setting is wrong.
@@ -131,7 +131,7 @@ def manoeuvre(kind: PartLike, **settings: Any) -> Manoeuvre:
 
 
 def vessel(name: str) -> VesselFile:
-    """Return a vessel by its name or file: particulars in SI, each with its source.
+    """Return the parameters of a vessel in SI units, each with its source.
 
     Args:
         name: one of `list_available("vessels")`, or the path of a YAML file.
@@ -149,14 +149,14 @@ def vessel(name: str) -> VesselFile:
 
 @final
 class SimulationResult:
-    """Sea trials that were flown.
+    """Simulated sea trials.
 
     Attributes:
-        logs: what sensors measured, one log for each manoeuvre; those of a learned model follow
-            those of a vessel.
-        motions: the motions themselves, without noise.
-        indices: one row for each flight: log, manoeuvre, craft, fault, then manoeuvring indices in
-            SI and rad; those that a flight is too short for are missing.
+        logs: simulated measurements, one log for each manoeuvre; the logs of a learned model follow
+            those of the vessel.
+        motions: the simulated motions without noise.
+        indices: one row for each simulated run: log, manoeuvre, craft, fault, then manoeuvring
+            indices in SI and rad; an index is missing if the run is too short for it.
 
     Example:
         trials.indices[["log", "first_overshoot"]]
@@ -168,7 +168,7 @@ class SimulationResult:
         self.indices = indices
 
     def __repr__(self) -> str:
-        return f"Trials({len(self.logs)} logs)"
+        return f"SimulationResult({len(self.logs)} logs)"
 
 
 def simulate(
@@ -179,22 +179,22 @@ def simulate(
     progress: ProgressCallback | None = None,
     **settings: Any,
 ) -> SimulationResult:
-    """Fly manoeuvres with a vessel, a learned model, or both.
+    """Simulate manoeuvres of a vessel, a learned model, or both.
 
-    The arguments are the keys of `programme` in a config of the task `simulate`, and give the same
-    logs.
+    The arguments are the keys of `programme` in a config of the task `simulate`, with the same
+    numerical results.
 
     Args:
         vessel: name of a vessel, or path of its file.
-        manoeuvres: each a kind with settings, or a config object.
-        families: further ones drawn at random by `seed`.
-        progress: is told about the work.
-        settings: further keys of `programme`, as YAML has them: model, duration, step, substeps,
+        manoeuvres: manoeuvres, each a kind with settings, or a config object.
+        families: families from which further manoeuvres are drawn at random by `seed`.
+        progress: called with the progress of the simulation.
+        settings: further keys of `programme`, as in YAML: model, duration, step, substeps,
             noise, disturbance, initial, length, reader, seed.
 
     Raises:
-        ConfigError: if a setting is wrong, or the vessel cannot fly a manoeuvre.
-        DataError: if a motion is not finite from its first step on.
+        ConfigError: if a setting is wrong, or the vessel cannot perform a manoeuvre.
+        DataError: if a motion is not finite after its first step.
 
     Example:
         trials = residnet.simulate("wam_v_cal", {"kind": "zigzag", "drive": 0.6, "steer": 0.4,
@@ -224,12 +224,12 @@ def simulate(
 
 @final
 class RunResult:
-    """What a run found, of whatever task.
+    """The results of a run of any task.
 
-    Where the run was given no folder, its files are kept as long as this object is.
+    If the run had no folder, its files are deleted together with this object.
 
     Attributes:
-        folder: where everything stands.
+        folder: the run folder.
     """
 
     def __init__(
@@ -239,12 +239,12 @@ class RunResult:
 
     @cached_property
     def summary(self) -> dict[str, Any]:
-        """Task, verdict in whole sentences, and main figures with their units."""
+        """Task, verdict, and main figures with their units."""
         return dict(RunFolder(self.folder).read_summary())
 
     @property
     def verdict(self) -> list[str]:
-        """The verdict in whole sentences."""
+        """The verdict in complete sentences."""
         return list(self.summary["verdict"])
 
     @cached_property
@@ -252,12 +252,12 @@ class RunResult:
         """Rows of metrics.json as a table.
 
         Raises:
-            UsageError: if the task has none.
+            UsageError: if the task has no metrics.
         """
         import pandas as pd
 
         rows = list(RunFolder(self.folder).read_metrics()["rows"])
-        # a fit counts errors of velocities; other tasks have columns of their own
+        # rows of a fit contain errors of velocities; other tasks have other columns
         return build_metrics_table(rows) if "rmse" in rows[0] else pd.json_normalize(rows)
 
     @property
@@ -270,13 +270,13 @@ class RunResult:
         """Return the contents of a file: a table for Parquet, values for JSON, else text.
 
         Args:
-            name: of the file, as `file_names` has it.
+            name: name of the file, one of `file_names`.
 
         Raises:
-            UsageError: if there is no such file, or it is no text, JSON or Parquet.
+            UsageError: if there is no such file, or it is not text, JSON or Parquet.
 
         Example:
-            result.read("indices.json")["rows"]
+            result.read_file("indices.json")["rows"]
         """
         file = resolve_name(self.folder, name)
         if not file.is_file():
@@ -291,15 +291,15 @@ class RunResult:
             return json.loads(text) if file.suffix == ".json" else text
         except (OSError, ValueError, RecursionError) as error:
             raise UsageError(
-                f"{file}: not readable ({error}); restore it or run it again"
+                f"{file}: not readable ({error}); restore it, or repeat the run"
             ) from error
 
     def load_model(self, name: str = "predictor", *, trust: bool = False) -> Model:
-        """Return a model of a fit, the one that is reported first if none is named.
+        """Load a model of a fit.
 
         Args:
-            name: of the model.
-            trust: as of `load`.
+            name: name of the model; `predictor` is the model reported first.
+            trust: see `load`.
 
         Raises:
             UsageError: if the run has no such model.
@@ -307,7 +307,7 @@ class RunResult:
         return load(self.folder, name, trust=trust)
 
     def __repr__(self) -> str:
-        return f"Result({self.summary['task']}, {self.folder})"
+        return f"RunResult({self.summary['task']}, {self.folder})"
 
 
 def run(
@@ -321,21 +321,22 @@ def run(
     trust: bool = False,
     progress: ProgressCallback | None = None,
 ) -> RunResult:
-    """Carry out any task, with the numbers of the command line.
+    """Run any task, with the same numerical results as the command line.
 
     Args:
-        config: path of a YAML file, the same as a mapping, or a task's config object. Relative
-            paths in a file start from its folder, those in a mapping from the current one.
-        overrides: of single keys: texts such as `heads.lstm.hidden_size=16` (or `~key`, which takes
-            one away), or a mapping from dotted keys to values; for a file.
-        folder: where the run is kept; without one it is carried out in a folder of its own, which
-            vanishes with the result.
+        config: path of a YAML file, its content as a mapping, or the config object of a task.
+            Relative paths in a file are relative to its folder, paths in a mapping to the current
+            folder.
+        overrides: overrides of single keys of a file: texts such as `heads.lstm.hidden_size=16` (or
+            `~key`, which removes a key), or a mapping from dotted keys to values.
+        folder: run folder; None for a temporary folder, which is deleted together with the
+            result.
         resume: continue an interrupted run in its folder.
         overwrite: replace an earlier run in its folder.
-        report: draw the report and export; without them a run ends after its results.
+        report: write report and exports; if False, the run ends after its results.
         trust: allow classes of scikit-learn whose fitted state is not stored as data; they can run
             code, so only for sources that you trust.
-        progress: is told what is being done, and how far it is.
+        progress: called with the progress of the run.
 
     Raises:
         ConfigError: if the config is wrong.

@@ -1,4 +1,4 @@
-"""Plain Python values turned into what a config holds, with the errors of the command line."""
+"""Conversion of Python arguments to values of a config, with one-line errors."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ PathLikeArg = str | PathLike[str]
 """A path, as text or as an object."""
 
 PartLike = str | Mapping[str, Any] | BaseModel
-"""A part by its kind, by a mapping as YAML has it, or by its config object."""
+"""A part, given as its kind, as a mapping like in YAML, or as a config object."""
 
 
 def to_builtin(value: Any) -> Any:
-    """Return a value as YAML would hold it: configs, tuples, paths and arrays become plain."""
+    """Convert configs, tuples, paths and arrays to the types that YAML has."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", by_alias=True)
     if isinstance(value, Mapping):
@@ -38,12 +38,12 @@ def parse_part(value: PartLike, description: str, **settings: Any) -> dict[str, 
     """Return the config of a part as a mapping with its kind.
 
     Args:
-        value: the kind alone, a mapping, or a config object.
-        description: the part, in words, for the error.
+        value: a kind, a mapping, or a config object.
+        description: name of the argument for the error message.
         settings: further keys.
 
     Raises:
-        UsageError: if it is none of these.
+        UsageError: if the value has another type.
     """
     if isinstance(value, str):
         return {"kind": value, **to_builtin(settings)}
@@ -58,7 +58,7 @@ def parse_named_parts(value: Any, description: str) -> dict[str, Any]:
     """Return parts by name, from a list of kinds or a mapping from names to parts.
 
     Raises:
-        UsageError: if it is neither.
+        UsageError: if the value has another type.
     """
     if isinstance(value, str):
         return {value: parse_part(value, description)}
@@ -75,10 +75,10 @@ def parse_named_parts(value: Any, description: str) -> dict[str, Any]:
 
 
 def parse_path(value: Any, description: str) -> Path:
-    """Return the given value as a path, ~ expanded.
+    """Convert an argument to a path and expand `~`.
 
     Raises:
-        UsageError: if it is none.
+        UsageError: if it is not a path.
     """
     if isinstance(value, str | PathLike) and str(value):
         return Path(value).expanduser()
@@ -86,7 +86,7 @@ def parse_path(value: Any, description: str) -> Path:
 
 
 def describe_type(value: Any) -> str:
-    """Return what a wrong argument is, in a few words."""
+    """Describe the type or value of a wrong argument for an error message."""
     if value is None or isinstance(value, str | int | float | bool):
         return repr(value)
     if isinstance(value, Sequence) and not value:
@@ -96,10 +96,10 @@ def describe_type(value: Any) -> str:
 
 
 def forward_progress(progress: ProgressCallback | None) -> AbstractContextManager[None]:
-    """Return a context that sends progress to a callback; without one, whoever listens goes on.
+    """Return a context that sends progress to a callback; None keeps the present callback.
 
     Raises:
-        UsageError: if it cannot be called.
+        UsageError: if the callback is not callable.
     """
     if progress is None:
         return nullcontext()
