@@ -19,7 +19,7 @@ DEAR = (
     "contracts/test_beyond_the_plane.py",
     "physics/test_every_vessel.py",
     "identification/monitoring/test_monitor.py",
-    "data/test_others.py",
+    "io/test_consensus.py",
     "tasks/test_fit.py",
     "export/test_formats.py",
     "control/test_courses.py",

@@ -1,4 +1,4 @@
-"""Whatever ends a command, it is told in one line with the exit code that belongs to it."""
+"""Every outcome of a command is one line on standard error with its exit code."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import NoReturn
 import pytest
 
 from residnet.core.errors import DataError, UsageError
-from residnet.exits import remove_secrets, run_cli
+from residnet.exits import run_cli
 
 
 def ended(
@@ -34,7 +34,7 @@ def raising(error: BaseException) -> Callable[[], NoReturn]:
 
 
 @pytest.mark.parametrize(
-    ("error", "code", "told"),
+    ("error", "code", "message"),
     [
         (UsageError("a.yaml: no such file"), 2, "residnet: a.yaml: no such file"),
         (DataError("two\nlines"), 1, "residnet: two lines"),
@@ -44,31 +44,31 @@ def raising(error: BaseException) -> Callable[[], NoReturn]:
         (KeyboardInterrupt(), 130, "interrupted"),
     ],
 )
-def test_errors_are_one_line(
-    error: BaseException, code: int, told: str, capsys: pytest.CaptureFixture[str]
+def test_run_cli_reports_errors_in_one_line(
+    error: BaseException, code: int, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found, lines = ended(raising(error), capsys)
-    assert found == code
+    exit_code, lines = ended(raising(error), capsys)
+    assert exit_code == code
     assert len(lines) == 1
-    assert told in lines[0]
+    assert message in lines[0]
 
 
 @pytest.mark.parametrize(
-    ("number", "code", "made_of_it"),
+    ("number", "code", "replacement"),
     [
         (signal.SIGINT, 130, SystemExit),
         (signal.SIGINT, 130, ImportError),
         (signal.SIGTERM, 143, KeyboardInterrupt),
     ],
 )
-def test_signals_are_told_with_the_hint(
+def test_run_cli_on_a_signal_hints_at_resume(
     number: signal.Signals,
     code: int,
-    made_of_it: type[BaseException],
+    replacement: type[BaseException],
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Lightning makes an exit of an interruption, and an import an error of its own."""
+    """Lightning replaces an interruption by SystemExit, and an import by ImportError."""
     monkeypatch.setattr(sys, "argv", ["residnet", "run", "x.yaml"])
     before = signal.getsignal(number)
 
@@ -76,62 +76,37 @@ def test_signals_are_told_with_the_hint(
         try:
             os.kill(os.getpid(), number)
         except KeyboardInterrupt as interruption:
-            raise made_of_it from interruption
+            raise replacement from interruption
 
-    found, lines = ended(command, capsys)
-    assert found == code
+    exit_code, lines = ended(command, capsys)
+    assert exit_code == code
     assert len(lines) == 1
     assert "--resume" in lines[0]
     assert signal.getsignal(number) == before
 
 
-def test_a_defect_leaves_a_crash_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("is_traceback_wanted", [False, True])
+def test_defect_prints_its_traceback_on_demand(
+    is_traceback_wanted: bool,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    config = tmp_path / "mine.yaml"
-    config.write_text("name: mine\nstorage: postgres://me:hidden@host/db\napi_key: sesame\n")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    monkeypatch.setattr(sys, "argv", ["residnet", "run", str(config)])
-    found, lines = ended(raising(IndexError("list index\nout of range")), capsys)
-    assert found == 1
-    assert len(lines) == 1
-    (file,) = tmp_path.glob("residnet-crash-*.txt")
-    assert str(file) in lines[0]
-    text = file.read_text()
-    for wanted in ("torch 2.", "Python 3.", f"residnet run {config}", "Traceback", "IndexError"):
-        assert wanted in text
-    assert "name: mine" in text
-    assert "hidden" not in text
-    assert "sesame" not in text
-
-
-def test_a_crash_file_finds_another_place(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def nowhere() -> Path:
-        raise FileNotFoundError(2, "No such file or directory")
-
-    monkeypatch.setattr(Path, "cwd", nowhere)
-    monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
-    _, lines = ended(raising(ZeroDivisionError()), capsys)
-    (file,) = tmp_path.glob("residnet-crash-*.txt")
-    assert str(file) in lines[0]
-    monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path / "missing"))
-    _, lines = ended(raising(ZeroDivisionError()), capsys)
-    said = "it could not be described in a file"
-    assert lines == [f"residnet: this is a defect of residnet, ZeroDivisionError: ; {said}"]
-
-
-def test_secrets_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", "/home/eve")
-    text = "at /home/eve/x.py\nAPI_TOKEN = 'abc'\npassword: def\nmqtt://u:p@host/x\nn: 3\n"
-    left = "at ~/x.py\nAPI_TOKEN = ***\npassword: ***\nmqtt://***@host/x\nn: 3\n"
-    assert remove_secrets(text) == left
+    monkeypatch.setenv("RESIDNET_TRACEBACK", "1" if is_traceback_wanted else "")
+    code, lines = ended(raising(IndexError("list index\nout of range")), capsys)
+    assert code == 1
+    assert lines[-1].startswith("residnet: this is a defect of residnet, IndexError: list index;")
+    assert any(line.startswith("Traceback") for line in lines) == is_traceback_wanted
+    assert (len(lines) == 1) != is_traceback_wanted
+    assert ("RESIDNET_TRACEBACK=1" in lines[-1]) != is_traceback_wanted
+    assert [*tmp_path.iterdir()] == []
 
 
 @pytest.mark.parametrize("closed", ["1>&-", "2>&-"])
-def test_closed_streams_do_not_end_a_command(closed: str, tmp_path: Path) -> None:
-    told = "import sys; from residnet.exits import run_cli; run_cli(lambda: sys.stderr.write('x'))"
-    command = f'{sys.executable} -c "{told}" {closed}'
+def test_run_cli_with_closed_streams_succeeds(closed: str, tmp_path: Path) -> None:
+    program = (
+        "import sys; from residnet.exits import run_cli; run_cli(lambda: sys.stderr.write('x'))"
+    )
+    command = f'{sys.executable} -c "{program}" {closed}'
     assert subprocess.run(command, shell=True, check=False, cwd=tmp_path).returncode == 0

@@ -14,6 +14,7 @@ import pytest
 from pydantic import Field, TypeAdapter, ValidationError, field_validator, model_validator
 
 from residnet.core.config import (
+    RENAMED_KEYS,
     BaseConfig,
     Config,
     ConfigPath,
@@ -279,7 +280,7 @@ def test_a_base_is_a_file_or_a_shipped_config(tmp_path: Path) -> None:
     own.write_text("task: fit\n")
     assert Swept.model_validate({"base": str(own)}).base == own
     assert Swept.model_validate({"base": "quickstart"}).base.name == "quickstart.yaml"
-    with pytest.raises(ValidationError, match=r"no config 'quickstrat' either.*quickstart"):
+    with pytest.raises(ValidationError, match=r"no config named 'quickstrat'.*quickstart"):
         Swept.model_validate({"base": "quickstrat"})
     with pytest.raises(ValidationError, match="no such file or folder"):
         Swept.model_validate({"base": "absent.yaml"})
@@ -346,7 +347,7 @@ def test_a_base_is_a_file_or_a_shipped_config(tmp_path: Path) -> None:
         ("out: ''", "2: out: expected a path (given '')"),
         (
             "out: ~no-such-user/a",
-            "2: out: no home folder is known for '~' (given '~no-such-user/a')",
+            "2: out: the home folder for '~' is unknown (given '~no-such-user/a')",
         ),
         # plain unions name what any member takes, or go with the member that got furthest
         ("threshold: x", "2: threshold: expected a number or a list (given 'x')"),
@@ -483,8 +484,8 @@ OVERRIDDEN = (
         ("stages.last.kind=mlp", "stages: a list of 1 items has no item 'last'; the first is 0"),
         ("epochs=[1", "not YAML: expected ',' or ']', but got '<stream end>'"),
         ("heads={a: 1, a: 2}", "duplicate key 'a', first on line 1"),
-        ("~heads.aa", "there is no 'heads.aa' to take away; did you mean 'a'?"),
-        ("~name.x", "there is no 'name.x' to take away"),
+        ("~heads.aa", "there is no 'heads.aa' to remove; did you mean 'a'?"),
+        ("~name.x", "there is no 'name.x' to remove"),
     ],
 )
 def test_faults_are_attributed_to_an_override(failure: Failure, override: str, told: str) -> None:
@@ -511,13 +512,31 @@ def test_a_fault_is_of_what_set_the_value(
     assert failure("epochs: x\n", "dt=3").startswith("run.yaml:2: epochs: expected")
 
 
-def test_keys_that_are_gone_may_stand_where_they_did_nothing(failure: Failure) -> None:
-    lstm = {"kind": "lstm", "hidden_size": 3}
-    given = {"task": "fit", "heads": {"a": lstm | {"encoder": False}}, "policy": lstm}
-    assert validate_config(given, Fit, "run").heads["a"] == Lstm(hidden_size=3)
-    assert failure("heads: {a: {kind: lstm, hidden_size: 3, encoder: true}}\n").startswith(
-        "run.yaml:2: heads.a.encoder: unknown key; it is gone: the memory"
+def test_renamed_key_error_names_the_new_key(
+    failure: Failure, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(RENAMED_KEYS, "heads.*.units", "hidden_size")
+    assert failure("heads: {a: {kind: lstm, units: 3}}\n").startswith(
+        "run.yaml:2: heads.a.units: unknown key; it was renamed to 'hidden_size'"
     )
+
+
+@pytest.mark.parametrize(
+    ("data", "code"),
+    [
+        ({"dt": "x"}, "config.invalid"),
+        ({"dt": -1.0}, "config.out_of_range"),
+        ({"epoch": 3}, "config.unknown_key"),
+        ({"epochs": "x"}, "config.wrong_type"),
+        ({"method": "rk5"}, "config.unknown_value"),
+        ({"task": None}, "config.unknown_value"),
+        ({"dt": 1e31}, "config.out_of_range"),
+    ],
+)
+def test_config_error_has_a_code(data: dict[str, Any], code: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        validate_config({"task": "fit", **data}, Fit, "run.yaml")
+    assert caught.value.code == code
 
 
 def test_scalars_follow_yaml_1_2(tmp_path: Path) -> None:

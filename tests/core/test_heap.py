@@ -10,9 +10,9 @@ import pytest
 
 _FAULTS = """
 import resource, sys
-from residnet.core.processes import keep_freed_memory
+from residnet.core.processes import retain_freed_memory
 if sys.argv[1] == "keep":
-    keep_freed_memory()
+    retain_freed_memory()
 def fill():
     number = 48 << 20
     b"1" * number

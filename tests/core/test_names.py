@@ -7,7 +7,7 @@ import math
 import pytest
 
 from residnet.core.errors import UsageError
-from residnet.core.names import CHANNEL_UNITS, si_unit, suggest_name, to_si, units
+from residnet.core.names import CHANNEL_UNITS, si_unit, suggest_name, to_si, unit_names
 
 
 @pytest.mark.parametrize(
@@ -25,7 +25,7 @@ def test_factor(unit: str, si: str, factor: float) -> None:
 
 
 def test_si_units_and_those_of_channels_convert_to_themselves() -> None:
-    for unit in (*map(si_unit, units()), *CHANNEL_UNITS.values()):
+    for unit in (*map(si_unit, unit_names()), *CHANNEL_UNITS.values()):
         assert si_unit(unit) == unit
         assert to_si(unit) == 1.0
 

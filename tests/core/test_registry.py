@@ -73,8 +73,8 @@ def test_a_broken_part_says_so_where_it_is_used_and_disturbs_nothing_else() -> N
 @pytest.mark.parametrize(
     ("target", "fault"),
     [
-        ("residnet.heads.linear:PlsrConfig", "no subclass of residnet.heads.base.HeadKind"),
-        ("residnet.heads.base:BaseHeadConfig", "HeadKind lacks build"),
+        ("residnet.heads.linear:PlsrConfig", "no subclass of residnet.heads.base.BaseHeadConfig"),
+        ("residnet.heads.base:BaseHeadConfig", "BaseHeadConfig lacks build"),
         ("residnet_sample.slow_water:SlowWaterConfig", "has no field `kind: Literal['odd']`"),
         ("residnet_sample.slow_water:Nothing", "AttributeError"),
         ("os", "no subclass"),

@@ -214,7 +214,7 @@ def test_copies_across_splits_are_found(monkeypatch: pytest.MonkeyPatch) -> None
     words = r"logs wavy \(train\) and copy \(test\) share 500 identical rows, at most 100 are"
     for most in (10**9, 600):
         # of very many rows a sample is compared
-        monkeypatch.setattr("residnet.io.split.LARGE", most)
+        monkeypatch.setattr("residnet.io.split.MAX_SAMPLES_IN_MEMORY", most)
         with pytest.raises(DataError, match=words):
             check_leaks(logs)
         assert inspect_log_set([log, copied(log, 700, 1200)]).find_by_code("copied_part")

@@ -1,18 +1,17 @@
-"""Configs: frozen pydantic models that are read from YAML files and overrides.
+"""Read configs (frozen pydantic models) from YAML files and overrides.
 
-A run is one YAML file plus overrides (`heads.lstm.hidden_size=64`). Values are taken strictly: text
-is no number, a boolean is no number, `64.0` is no count. Dimensional values are SI numbers or text
-with a unit (`20 deg`). Every error is one line.
+A run is one YAML file plus overrides (`heads.lstm.hidden_size=64`). Validation is strict: neither
+text nor a boolean is accepted as a number, and `64.0` is not accepted as an integer. Dimensional
+values are SI numbers or text with a unit (`20 deg`). Every error is one line.
 """
 
 from __future__ import annotations
 
-import copy
 import math
 import os
 import re
 import types
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -30,73 +29,35 @@ from residnet.core.names import suggest_name, truncate
 from residnet.core.registry import PluginUnion, type_adapter
 from residnet.core.units import si_unit, to_si, unit_names
 
-# Keys of the tables are ends of dotted key paths, `*` for any one key; a kind that was renamed has
-# `=<old kind>` behind the path of its discriminator. Values are what to write instead.
-RENAMED_KEYS: dict[str, str] = {
-    "recurrent": "policies",
-    "policies.*.hidden": "units",
-    "policies.*.observer": "start",
-    "policies.*.imitate": "start",
-    "policies.*.training.horizon": "duration",
-    "policies.*.training.margin": "steady.overshoot",
-    "policies.*.training.overshoot": "exact",
-    "policies.*.training.sharp": "conditions.stated.band",
-    "policies.*.training.slowest": "conditions.stated.time",
-    "policies.*.training.smoothness": "calm",
-    "spread": "conditions.stated",
-    "test.bias_error": "conditions.stated",
-    "test.overshoot": "conditions.stated.overshoot_weight",
-    "tuning_points": "conditions.evolution",
-}
-"""For example `"free_run.lead": "warmup"`, `"baseline.kind=fossen": "hull"`."""
+RENAMED_KEYS: dict[str, str] = {}
+"""Keys that this release renames -> what to write instead; emptied with the next release.
+
+A key is the end of a dotted key path, `*` stands for any one key, and a renamed value follows the
+path of its key with `=`: `"free_run.lead": "warmup"`, `"baseline.kind=fossen": "hull"`.
+"""
 
 
-REMOVED_KEYS: dict[str, str] = {
-    "training.*.average": "learning rates that fall to a few percent average by themselves",
-    "refit.*.folds": "the prior is fixed by the length of the logs",
-    "refit_baseline": "refit the baseline before its networks, by `refit`",
-    "begin_with": "a network begins from its baseline alone",
-    "swaps": "the search keeps a beam of sets and trims them",
-    "separate": "models of single phases are always fitted besides",
-    "standard.bounds": "parameters are free, as in the document",
-    "identify": "the first half identifies, as in the document",
-    "spectrum.kind=ittc": "jonswap with gamma: 1 is the same",
-    "encoder": "the memory of a measured past is that of the steps along it",
-    "acceleration": "the derivative of the measured velocity is taken",
-    "published_absolute": "its numbers are the last three of `published`",
-}
-"""Keys that nothing took the place of, and what holds instead."""
-IGNORED_KEYS: dict[str, Any] = {
-    **{"disturbance": None, "encoder": False, "intercept": False, "one": False},
-    **{"always": False, "longest_gap": 1.0},
-}
-"""Keys that are gone, and the value with which they did nothing: runs of before hold them so."""
-
-
-def renamed_hint(path: tuple[str | int, ...], value: str | None = None) -> str:
-    """Return `; it is 'new' now` for an old key or value, `; it is gone: ...`, or nothing."""
+def format_renaming_hint(path: tuple[str | int, ...], value: str | None = None) -> str:
+    """Return `; it was renamed to 'new'` for a renamed key or value, else an empty text."""
     key_text = ".".join(map(str, path)) + ("" if value is None else f"={value}")
     for old_key, new_key in RENAMED_KEYS.items():
         if fnmatchcase(f".{key_text}", f"*.{old_key}"):
-            return f"; it is '{new_key}' now"
-    for old_key, replacement in REMOVED_KEYS.items():
-        if fnmatchcase(f".{key_text}", f"*.{old_key}"):
-            return f"; it is gone: {replacement}"
+            return f"; it was renamed to '{new_key}'"
     return ""
 
 
 T = TypeVar("T")
 
 _MAX_FILE_BYTES = 2_000_000
-"""Bytes; chosen by hand, far above any config."""
+"""Largest size of a config file in bytes; chosen by hand, far above any real config."""
 _MAX_NUMBER = 1e30
-"""Largest size of a number, its inverse the least; no vessel has it, and float32 ends at 3e38."""
+"""Largest accepted absolute value, and inverse of the smallest: float32 overflows at 3e38."""
 
 
 class Config(BaseModel):
-    """The base of all configs: frozen, without unknown keys, finite numbers only.
+    """Base class of all configs: immutable, without unknown keys, finite numbers only.
 
-    Defaults are checked as given values are.
+    Default values are validated like the values of a file.
     """
 
     model_config = ConfigDict(
@@ -106,17 +67,17 @@ class Config(BaseModel):
 
 @dataclass(frozen=True)
 class _ConfigOrigin:
-    """The file and the overrides that a config's values come from, for error messages."""
+    """File and overrides that set the values of a config, for error messages."""
 
     name: str
     root: Node | None = None
     overrides: tuple[Override, ...] = ()
 
     def locate_value(self, path: KeyPath) -> str:
-        """Return where the value at `path` was set: an override, or a line of the file.
+        """Return which override or which line of the file set the value at `path`.
 
-        The last override that set the whole value counts; one that changed a part of it is named
-        too.
+        The last override that set the complete value wins; the text also names an override that
+        changed a part of it.
         """
         partial_override = ""
         for override in reversed(self.overrides):
@@ -130,38 +91,43 @@ class _ConfigOrigin:
 
 def _read_mapping(path: Path) -> tuple[dict[str, Any], Node]:
     try:
-        # a device has no end
+        # a bounded read, because a device such as /dev/zero never ends
         with path.open("rb") as file:
             content = file.read(_MAX_FILE_BYTES + 1)
         if len(content) > _MAX_FILE_BYTES:
             raise ConfigError(
-                f"{path}: is longer than {_MAX_FILE_BYTES / 1e6:.0f} MB; no config is"
+                f"{path}: is longer than {_MAX_FILE_BYTES / 1e6:.0f} MB; no config is so long",
+                "config.file",
             )
         text = content.decode("utf-8-sig")
     except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file") from error
+        raise ConfigError(f"{path}: no such file", "config.file") from error
     except IsADirectoryError as error:
-        raise ConfigError(f"{path}: is a folder; give a YAML file") from error
+        raise ConfigError(f"{path}: is a folder; give a YAML file", "config.file") from error
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not UTF-8 text (byte {error.start})") from error
+        raise ConfigError(
+            f"{path}: not UTF-8 text (byte {error.start})", "config.not_yaml"
+        ) from error
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})", "config.file") from error
     except ValueError as error:
-        raise ConfigError(f"{str(path)!r}: is no path ({error})") from error
+        raise ConfigError(f"{str(path)!r}: is no path ({error})", "config.file") from error
     data, root = parse_yaml(text, str(path))
     if root is None or data is None:
-        raise ConfigError(f"{path}: empty; expected a mapping of keys to values")
+        raise ConfigError(f"{path}: empty; expected a mapping of keys to values", "config.not_yaml")
     if not isinstance(data, dict):
         found_type = "a list" if isinstance(data, list) else f"the value {data!r}"
-        raise ConfigError(f"{path}: expected a mapping of keys to values, found {found_type}")
+        raise ConfigError(
+            f"{path}: expected a mapping of keys to values, found {found_type}", "config.not_yaml"
+        )
     return data, root
 
 
 def load_mapping(path: Path) -> dict[str, Any]:
-    """Read a YAML file as plain values, without validation; all keys are text.
+    """Read a YAML file as plain values without validation; all keys are text.
 
     Raises:
-        ConfigError: where the file is missing, a folder, not YAML, empty or not a mapping, or
+        ConfigError: if the file is missing, a folder, not YAML, empty or not a mapping, or
             repeats a key.
     """
     return _read_mapping(Path(path))[0]
@@ -181,13 +147,14 @@ def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any:
     """Build a config of type `model` from a YAML file and overrides.
 
     Args:
-        overrides: `dotted.key=value`, value in YAML, in order; an element of a list is addressed by
-            its index. `~dotted.key` takes a key away.
+        path: YAML file; relative paths in the config are relative to its folder.
+        overrides: applied in order. `dotted.key=value` sets a YAML value, an index addresses an
+            item of a list, and `~dotted.key` removes a key.
         model: config class, or a union of them (`Annotated[A | B, Field(discriminator="kind")]`).
 
     Raises:
-        ConfigError: one line: file (with line) or override, key path, what is wrong, what was
-            given, the nearest valid name.
+        ConfigError: with the file (and line) or override, the key path, the fault, the value and
+            the nearest valid name.
     """
     path = Path(path)
     data, root = _read_mapping(path)
@@ -211,9 +178,10 @@ def validate_config(data: Any, model: Any, where: str, folder: Path | None = Non
     """Build a config of type `model` from plain values, under the rules of `load_config`.
 
     Args:
-        data: what JSON can hold, for example a mapping from `load_mapping`.
-        where: what errors name as the source.
-        folder: folder that relative paths are looked for in first.
+        data: values that JSON can represent, for example a mapping from `load_mapping`.
+        model: config class, or a union of them.
+        where: source of the data in error messages.
+        folder: folder in which relative paths are searched first.
 
     Raises:
         ConfigError: as `load_config`.
@@ -222,43 +190,27 @@ def validate_config(data: Any, model: Any, where: str, folder: Path | None = Non
 
 
 def _validate_data(data: Any, model: Any, origin: _ConfigOrigin, folder: Path | None) -> Any:
-    # what is computed, as in a model's description, may be as good as zero
+    # values that residnet computed itself (no YAML root) may be arbitrarily close to zero
     _require_plausible_numbers(data, origin, 0.0 if origin.root is None else 1.0 / _MAX_NUMBER)
-    # pydantic is strict without refusing lists for tuples or text for enums and paths only when it
-    # reads JSON
+    # only the JSON mode of pydantic is strict and still accepts lists for tuples and text for enums
+    # and paths
     try:
         return type_adapter(model).validate_json(
             to_json(data), strict=True, context={"folder": folder}
         )
     except ValidationError as error:
-        ignored_paths = {
-            _locate_key(details["loc"], model)[0]
-            for details in error.errors(include_url=False)
-            if details["type"] == "extra_forbidden"
-            and (details["loc"][-1], details["input"]) in IGNORED_KEYS.items()
-        }
-        if not ignored_paths:
-            raise ConfigError(describe_error(error, model, origin.locate_value)) from error
-        return _validate_data(_remove_paths(data, ignored_paths), model, origin, folder)
+        fault = describe_error(error, model, origin.locate_value)
+        raise ConfigError(fault.text, fault.code) from error
     except PydanticSerializationError as error:
-        raise ConfigError(f"{origin.name}: holds a value that YAML cannot ({error})") from error
-
-
-def _remove_paths(data: Any, paths: Iterable[KeyPath]) -> Any:
-    """Return plain values without the entries at some key paths."""
-    remaining = copy.deepcopy(data)
-    for *parents, key in paths:
-        mapping = remaining
-        for parent in parents:
-            mapping = mapping[parent]
-        del mapping[key]
-    return remaining
+        raise ConfigError(
+            f"{origin.name}: holds a value that YAML cannot represent ({error})", "config.not_yaml"
+        ) from error
 
 
 def _require_plausible_numbers(
     data: Any, origin: _ConfigOrigin, min_size: float, path: KeyPath = ()
 ) -> None:
-    """Stop at numbers that no vessel has: they would overflow wherever they are first used.
+    """Reject numbers that are so large or small that later arithmetic would overflow.
 
     Raises:
         ConfigError: with the key of the number.
@@ -271,48 +223,56 @@ def _require_plausible_numbers(
         key = ".".join(map(str, path))
         raise ConfigError(
             f"{origin.locate_value(path)}: {key}: expected a number of usual size (given"
-            f" {f'one of {data.bit_length()} bits' if isinstance(data, int) else data})"
+            f" {f'one of {data.bit_length()} bits' if isinstance(data, int) else data})",
+            "config.out_of_range",
         )
 
 
 def _is_plausible_number(number: float, min_size: float) -> bool:
     if isinstance(number, int):
         return abs(number) < 2**63
-    # that it is no number is said with what was expected
+    # infinity and NaN pass: the validation reports them with the expected type
     return number == 0 or not math.isfinite(number) or min_size <= abs(number) <= _MAX_NUMBER
 
 
 def dump_config(config: BaseModel) -> str:
-    """Write a config as YAML text that loads back to an equal config.
+    """Return a config as YAML text that loads back to an equal config.
 
-    Every key is there, numbers are SI and paths absolute.
+    The text holds every key, numbers in SI units and absolute paths.
     """
     return dump_yaml(config.model_dump(mode="json", by_alias=True))
 
 
-# overrides: `dotted.key=value` sets a value, `~dotted.key` takes a key away
+# overrides: `dotted.key=value` sets a value, `~dotted.key` removes a key
 
 
 @dataclass(frozen=True)
 class Override:
-    """An override as the user wrote it, and the key path that it set."""
+    """One override: the text of the user and the key path that it set."""
 
     text: str
     path: KeyPath
 
     @property
     def label(self) -> str:
-        """The override as error messages name it."""
+        """Name of the override in error messages."""
         return f"override '{self.text}'"
 
 
 def apply_override(data: dict[str, Any], text: str) -> Override:
-    """Change `data` in place as one override says and return what was changed.
+    """Apply one override to `data` in place.
 
-    Keys on the way that the file leaves out are made; `~key` takes a key away.
+    Missing mappings along the key path are created.
+
+    Args:
+        data: plain values of a config.
+        text: `dotted.key=value`, or `~dotted.key` to remove a key.
+
+    Returns:
+        The override with the key path that it set.
 
     Raises:
-        ConfigError: where the text is no override, or names a key or item that cannot be there.
+        ConfigError: if the text is not an override, or its key path does not fit the data.
     """
     if text.startswith("~"):
         return _apply_removal(data, text)
@@ -320,7 +280,8 @@ def apply_override(data: dict[str, Any], text: str) -> Override:
     keys = key.strip().split(".")
     if not equals or not all(keys):
         raise ConfigError(
-            f"override '{text}': expected key=value, for example heads.lstm.hidden_size=64"
+            f"override '{text}': expected key=value, for example heads.lstm.hidden_size=64",
+            "config.override",
         )
     label = f"override '{text}'"
     value, _ = parse_yaml(value_text, label, show_location=False)
@@ -346,8 +307,9 @@ def _apply_removal(data: dict[str, Any], text: str) -> Override:
         if not isinstance(container, dict) or name not in container:
             key_path = ".".join(keys[: i + 1])
             raise ConfigError(
-                f"{label}: there is no '{key_path}' to take"
-                f" away{suggest_name(name, container) if isinstance(container, dict) and container else ''}"
+                f"{label}: there is no '{key_path}' to remove"
+                f"{suggest_name(name, container) if isinstance(container, dict) and container else ''}",
+                "config.override",
             )
         path += (name,)
         if i == len(keys) - 1:
@@ -358,30 +320,34 @@ def _apply_removal(data: dict[str, Any], text: str) -> Override:
 
 
 def _resolve_element(container: Any, name: str, label: str, path: KeyPath) -> str | int:
-    """Return `name` as a key or an index of `here`."""
+    """Return `name` as a key of a mapping or as an index of a list."""
     key_path = ".".join(str(path_element) for path_element in path)
     if isinstance(container, dict):
         return name
     if not isinstance(container, list):
-        raise ConfigError(f"{label}: {key_path}: has no key '{name}' {format_given(container)}")
+        raise ConfigError(
+            f"{label}: {key_path}: has no key '{name}' {format_given(container)}", "config.override"
+        )
     if not name.isdecimal() or int(name) >= len(container):
         raise ConfigError(
-            f"{label}: {key_path}: a list of {len(container)} items has no item '{name}'; the first is 0"
+            f"{label}: {key_path}: a list of {len(container)} items has no item '{name}'; the first"
+            " is 0",
+            "config.override",
         )
     return int(name)
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """The mark of a float that a config gives in SI or as text with a unit.
+    """Marker of a float field that accepts an SI number or text with a unit.
 
     Used in an annotation: `Annotated[float, Quantity("kg")]`.
 
     Attributes:
-        si: SI unit of the dimension; the value that the config holds is in this unit.
+        si: SI unit of the dimension; the validated value is in this unit.
 
     Raises:
-        UsageError: where `si_value` is not the SI unit of a known dimension.
+        UsageError: if `si` is not the SI unit of a known dimension.
     """
 
     si: str
@@ -393,15 +359,15 @@ class Quantity:
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        """Return the float's own schema, constraints included, behind the conversion."""
+        """Return the schema of the float with its constraints, preceded by the conversion."""
         return core_schema.no_info_before_validator_function(self.convert, handler(source))
 
     def convert(self, value: object) -> float:
         """Convert a number, or text such as `20 deg`, to SI.
 
         Raises:
-            ValueError: where the value is not a finite number or `<number> <unit>`, or the unit is
-                unknown or of another dimension.
+            ValueError: if the value is not a finite number or `<number> <unit>`, or the unit is
+                unknown or has another dimension.
         """
         try:
             si_value = self._parse_value(value)
@@ -418,7 +384,8 @@ class Quantity:
         if match is None:
             example = next((unit for unit in self._compatible_units() if unit != self.si), self.si)
             raise ValueError(
-                f"expected a number in {self.si} or text such as '1.5 {example}' {format_given(value)}"
+                f"expected a number in {self.si} or text such as '1.5 {example}'"
+                f" {format_given(value)}"
             )
         number, unit = match.groups()
         try:
@@ -434,12 +401,12 @@ _QUANTITY_PATTERN = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\
 
 
 def quantity_type(si: str) -> Any:
-    """Return the type of a float in `si_value`, for types that are put together at run time.
+    """Return the type of a float with unit `si`, for types that are created at run time.
 
     In annotations write `Annotated[float, Quantity(si)]`.
 
     Raises:
-        UsageError: where `si_value` is not the SI unit of a known dimension.
+        UsageError: if `si` is not the SI unit of a known dimension.
     """
     return Annotated[float, Quantity(si)]
 
@@ -484,7 +451,7 @@ class _PathRule:
             if path.as_posix() in shipped:
                 return shipped[path.as_posix()].absolute()
             searched = " or ".join(str(candidate) for candidate in dict.fromkeys(candidates))
-            hint = f"; residnet has no config '{path}' either{suggest_name(str(path), shipped)}"
+            hint = f"; residnet has no config named '{path}'{suggest_name(str(path), shipped)}"
             raise ValueError(f"no such file or folder: {searched}{hint if shipped else ''}")
         return (existing or candidates[-1]).absolute()
 
@@ -502,7 +469,7 @@ def _expand_path(text: str) -> Path:
     try:
         return Path(re.sub(r"\$\{([^}]*)\}", expand_variable, text)).expanduser()
     except RuntimeError as error:
-        raise ValueError(f"no home folder is known for '~' {format_given(text)}") from error
+        raise ValueError(f"the home folder for '~' is unknown {format_given(text)}") from error
 
 
 def _path_exists(path: Path) -> bool:
@@ -513,18 +480,19 @@ def _path_exists(path: Path) -> bool:
 
 
 ConfigPath = Annotated[Path, _PathRule(must_exist=False)]
-"""Absolute path; `${NAME}` and `~` expanded, a relative one taken from the config's folder if it
-exists there, else from the current folder.
+"""Absolute path with `${NAME}` and `~` expanded.
+
+A relative path is searched in the folder of the config first, then in the current folder.
 """
 
 ExistingPath = Annotated[Path, _PathRule(must_exist=True)]
-"""As `ConfigPath`, and the file or folder exists."""
+"""`ConfigPath` of an existing file or folder."""
 
 BaseConfig = Annotated[Path, _PathRule(must_exist=True, allows_shipped=True)]
-"""As `ExistingPath`; without an ending it may name a config that comes with residnet."""
+"""`ExistingPath`; without a suffix it may name a config that is shipped with residnet."""
 
 
-# one line out of pydantic's validation errors
+# conversion of pydantic's validation errors to one line
 
 _EXPECTED_TYPES = {
     **dict.fromkeys(("int_type", "int_from_float", "int_parsing"), "a whole number"),
@@ -537,22 +505,48 @@ _EXPECTED_TYPES = {
 
 
 @dataclass(frozen=True)
-class _ConfigFault:
-    kind: str
+class ConfigFault:
+    """One fault of a config.
+
+    Attributes:
+        code: code of the `ConfigError`.
+        path: key path of the value.
+        text: description in one line.
+    """
+
+    code: str
     path: KeyPath
     text: str
 
 
-def describe_error(error: ValidationError, model: Any, locate: Callable[[KeyPath], str]) -> str:
-    """Return the first fault of a validation error as one line.
+_FAULT_CODES = {
+    "missing": "config.missing_key",
+    "extra_forbidden": "config.unknown_key",
+    "union_tag_invalid": "config.unknown_value",
+    "union_tag_not_found": "config.missing_key",
+    "literal_error": "config.unknown_value",
+    "enum": "config.unknown_value",
+    "value_error": "config.invalid",
+    "assertion_error": "config.invalid",
+    **dict.fromkeys(_EXPECTED_TYPES, "config.wrong_type"),
+}
+"""Kind of pydantic's error -> code of the fault; any other kind is a violated bound."""
+
+
+def describe_error(
+    error: ValidationError, model: Any, locate: Callable[[KeyPath], str]
+) -> ConfigFault:
+    """Return the most specific fault of a validation error as one line.
 
     Args:
-        locate: file (with line) or override in which the value at a key path was set.
+        error: of pydantic.
+        model: config class, or a union of them, that was validated.
+        locate: returns the file (with line) or override that set the value at a key path.
     """
     faults = [_parse_fault(details, model) for details in error.errors(include_url=False)]
-    # a mistyped key is also a missing one; the typo is what the user has to see
-    main_fault = next((fault for fault in faults if fault.kind == "extra_forbidden"), faults[0])
-    # below a plain union, the member that got furthest into the value is the one that was meant
+    # a mistyped key is reported as unknown and as missing; the user needs the first
+    main_fault = next((fault for fault in faults if fault.code == "config.unknown_key"), faults[0])
+    # in a union without discriminator the member with the deepest fault fits the value best
     main_fault = max(
         (fault for fault in faults if fault.path[: len(main_fault.path)] == main_fault.path),
         key=lambda fault: len(fault.path),
@@ -563,13 +557,12 @@ def describe_error(error: ValidationError, model: Any, locate: Callable[[KeyPath
     }
     more_text = f" (and {len(other_paths)} more)" if other_paths else ""
     key = ".".join(str(element) for element in main_fault.path)
-    return " ".join(
-        f"{locate(main_fault.path)}: {key + ': ' if key else ''}{text}{more_text}".split()
-    )
+    line = f"{locate(main_fault.path)}: {key + ': ' if key else ''}{text}{more_text}"
+    return ConfigFault(main_fault.code, main_fault.path, " ".join(line.split()))
 
 
 def _join_alternatives(texts: list[str]) -> str:
-    """Join what the members of a union say about one value into one phrase."""
+    """Join the faults that the members of a union report on one value into one phrase."""
     texts = list(dict.fromkeys(texts))
     matches = [re.fullmatch(r"expected (.*?)( \(given .*\))", text) for text in texts]
     if all(matches):
@@ -582,14 +575,14 @@ def _join_alternatives(texts: list[str]) -> str:
     return "; or ".join(texts)
 
 
-def _parse_fault(details: ErrorDetails, model: Any) -> _ConfigFault:
+def _parse_fault(details: ErrorDetails, model: Any) -> ConfigFault:
+    """Convert one error of pydantic to a fault with the key path of the user."""
     path, parents, value_types = _locate_key(details["loc"], model)
     error_type, error_context, value = details["type"], details.get("ctx", {}), details["input"]
     match error_type:
         case "missing" if path and isinstance(path[-1], int):
-            return _ConfigFault(
-                error_type, path[:-1], f"item {path[-1]} is missing {format_given(value)}"
-            )
+            fault_text = f"item {path[-1]} is missing {format_given(value)}"
+            return ConfigFault(_FAULT_CODES["missing"], path[:-1], fault_text)
         case "missing":
             fault_text = f"missing{_kind_suffix(parents)}"
         case "extra_forbidden":
@@ -599,12 +592,12 @@ def _parse_fault(details: ErrorDetails, model: Any) -> _ConfigFault:
                 if _is_model_class(error_type)
                 for key in _annotations_by_key(error_type)
             ]
-            hint = renamed_hint(path) or suggest_name(str(path[-1]), valid_names)
+            hint = format_renaming_hint(path) or suggest_name(str(path[-1]), valid_names)
             fault_text = f"unknown key{hint}{_kind_suffix(parents)}"
         case "union_tag_invalid":
             path += _discriminator_path(error_context)
             tag = str(error_context["tag"])
-            hint = renamed_hint(path, tag) or suggest_name(
+            hint = format_renaming_hint(path, tag) or suggest_name(
                 tag, _find_quoted(error_context["expected_tags"])
             )
             fault_text = f"unknown value '{truncate(tag)}'{hint}"
@@ -615,20 +608,20 @@ def _parse_fault(details: ErrorDetails, model: Any) -> _ConfigFault:
             valid_names = _find_quoted(error_context["expected"])
             is_unknown_value = isinstance(value, str) and bool(valid_names)
             fault_text = (
-                f"unknown value '{truncate(value)}'{renamed_hint(path, value) or suggest_name(value, valid_names)}"
+                "unknown value"
+                f" '{truncate(value)}'{format_renaming_hint(path, value) or suggest_name(value, valid_names)}"
                 if is_unknown_value
                 else f"expected {error_context['expected']} {format_given(value)}"
             )
         case "value_error" | "assertion_error":
             fault_text = str(error_context["error"])
-            # a validator of a whole section has said which of its keys it means; the section
-            # itself would only fill the line
+            # the validator of a section names the key itself, so the section's value is omitted
             is_scalar = isinstance(value, (str, int, float)) and "(given " not in fault_text
             fault_text = f"{fault_text} {format_given(value)}" if is_scalar else fault_text
         case _ if error_type in _EXPECTED_TYPES:
             fault_text = f"expected {_EXPECTED_TYPES[error_type]} {format_given(value)}"
         case _:
-            # a bound is told in the unit that it counts in, however deep it stands in the type
+            # a violated bound: its unit is in the metadata of the field, at any depth of the type
             model_fields = [
                 error_type.model_fields for error_type in parents if _is_model_class(error_type)
             ]
@@ -644,11 +637,12 @@ def _parse_fault(details: ErrorDetails, model: Any) -> _ConfigFault:
                 f" {unit[1]}" if unit else ""
             )
             fault_text = f"{bound_text} {format_given(value)}"
-    return _ConfigFault(error_type, path, fault_text)
+    code = _FAULT_CODES.get(error_type, "config.out_of_range")
+    return ConfigFault(code, path, fault_text)
 
 
 def format_given(value: Any) -> str:
-    """Return `(given 'x')` for error messages: the value as YAML writes it, cut where long."""
+    """Return `(given 'x')` for error messages: the value in YAML notation, truncated."""
     names = {None: "null", True: "true", False: "false"}
     text = names[value] if value is None or isinstance(value, bool) else repr(value)
     return f"(given {truncate(text)})"
@@ -659,17 +653,20 @@ def _find_quoted(text: str) -> list[str]:
 
 
 def _discriminator_path(context: dict[str, Any]) -> KeyPath:
-    # pydantic quotes the name of a key; a callable discriminator has none
+    # pydantic quotes the key of a discriminator; a callable discriminator has no key
     return tuple(_find_quoted(context["discriminator"])[:1])
 
 
 def _locate_key(
     loc: tuple[str | int, ...], model: Any
 ) -> tuple[KeyPath, tuple[Any, ...], tuple[Any, ...]]:
-    """Return the key path that the user wrote, the types around its last key, and of its value.
+    """Translate a location of pydantic to the key path of the user.
 
-    pydantic puts the chosen member of a union between the keys; only the types tell such a label
-    from a key.
+    pydantic inserts the chosen member of a union between the keys; only the types distinguish such
+    a label from a key.
+
+    Returns:
+        The key path, the types that hold its last key, and the types of its value.
     """
     path: list[str | int] = []
     parents: tuple[Any, ...] = ()
@@ -691,7 +688,7 @@ def _locate_key(
 
 
 def _unwrap_type(annotation: Any) -> Any:
-    """Return the type without wrappers that leave an error's location alone (Annotated, None)."""
+    """Return the type without wrappers that do not appear in a location (Annotated, None)."""
     while True:
         if get_origin(annotation) is Annotated:
             wrapped_type, *metadata = get_args(annotation)
@@ -716,9 +713,9 @@ def _union_members(union: Any) -> list[Any]:
 
 
 def _select_union_members(kinds: tuple[Any, ...], label: str) -> tuple[Any, ...]:
-    """Return the members of unions that pydantic's label stands for; all where none fits.
+    """Return the members of unions that a label of pydantic denotes; all if none matches.
 
-    A label is a discriminator's value or the name of a type.
+    A label is the value of a discriminator or the name of a type.
     """
     named_kinds = [
         union_type.find_kind(label)
@@ -748,7 +745,7 @@ def _select_union_members(kinds: tuple[Any, ...], label: str) -> tuple[Any, ...]
 
 
 def _element_types(container_type: Any, element: str | int) -> list[Any]:
-    """Return the types of what stands under `element` in a value of type `kind`."""
+    """Return the possible types of the value under a key or index of a container type."""
     if _is_model_class(container_type):
         return [
             _unwrap_type(annotation)
@@ -762,7 +759,7 @@ def _element_types(container_type: Any, element: str | int) -> list[Any]:
         and Ellipsis not in arguments
     ):
         return [_unwrap_type(argument) for argument in arguments[element : element + 1]]
-    # a mapping's values come last, a list's items first and last
+    # the last type argument is that of the values of a mapping and of the items of a list
     return [_unwrap_type(argument) for argument in arguments if argument is not Ellipsis][-1:]
 
 
@@ -778,7 +775,7 @@ def _annotations_by_key(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def _annotation_with_marker(field: FieldInfo) -> Any:
-    """Return a field's annotation with the marker that pydantic has moved into its metadata."""
+    """Return the annotation of a field with the marker that pydantic moved to the metadata."""
     plugin_union = next(
         (marker for marker in field.metadata if isinstance(marker, PluginUnion)), None
     )
@@ -786,7 +783,7 @@ def _annotation_with_marker(field: FieldInfo) -> Any:
 
 
 def _literal_fields(model: Any) -> dict[str, tuple[Any, ...]]:
-    """Return the fields of a model that take only fixed values, with these values."""
+    """Return the fields of a model whose type is a literal, with the allowed values."""
     if not _is_model_class(model):
         return {}
     unwrapped = {
@@ -800,7 +797,7 @@ def _literal_fields(model: Any) -> dict[str, tuple[Any, ...]]:
 
 
 def _kind_suffix(kinds: tuple[Any, ...]) -> str:
-    # which keys a section has follows from its kind, and an override may have changed that
+    # the valid keys of a section depend on its kind, which an override may have changed
     single_literals = [
         (key, values[0])
         for section_type in kinds

@@ -1,7 +1,7 @@
-"""YAML as configs use it: YAML 1.2 scalars, no duplicate keys, and the line of every key.
+"""Read and write YAML with the scalars of YAML 1.2, without duplicate keys, with line numbers.
 
 PyYAML follows YAML 1.1, where `1e-3` is text, `off` is a boolean, `12:30` is 750 and `010` is 8.
-Each of these would silently put a wrong value into a run, so scalars are read by the YAML 1.2 core
+Each of these would silently change a value of a run. Therefore scalars follow the YAML 1.2 core
 schema, and keys are always text.
 """
 
@@ -17,12 +17,12 @@ from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from residnet.core.errors import ConfigError
 
 KeyPath = tuple[str | int, ...]
-"""Where a value stands in a config: keys of mappings and indices of lists."""
+"""Path to a value of a config: keys of mappings and indices of lists."""
 
 _MAX_VALUES, _MAX_DEPTH, _MAX_DIGITS = 200_000, 60, 400
-"""Values, levels and digits, chosen by hand: no config has so many, and far more take minutes."""
+"""Limits on values, nesting levels and digits, chosen by hand: far more take minutes to parse."""
 _TAG_PREFIX = "tag:yaml.org,2002:"
-# in the order in which they are tried: a whole number is also a valid float
+# the first match counts: a whole number is also a valid float
 _SCALAR_TAGS: tuple[tuple[str, str, str], ...] = (
     ("null", r"^(?:~|null|Null|NULL|)$", "~nN\0"),
     ("bool", r"^(?:true|True|TRUE|false|False|FALSE)$", "tTfF"),
@@ -55,7 +55,7 @@ class _ConfigLoader(yaml.SafeLoader):
             raise yaml.constructor.ConstructorError(
                 None, None, "expected a mapping", node.start_mark
             )
-        # before merge keys are resolved: a key that overrides a merged one is what merging is for
+        # checked before merge keys are resolved, because a key may override a merged key
         lines: dict[str, int] = {}
         for key, _ in node.value:
             if not isinstance(key, ScalarNode):
@@ -85,7 +85,7 @@ class _ConfigLoader(yaml.SafeLoader):
         return bool(super().add_indent(column))
 
     def _require_max_depth(self, depth: int) -> None:
-        # the scanner would first look to the end of thousands of brackets, which takes minutes
+        # without the limit the scanner reads thousands of brackets, which takes minutes
         if depth > _MAX_DEPTH:
             raise yaml.scanner.ScannerError(
                 None, None, f"nested more than {_MAX_DEPTH} levels deep", self.get_mark()
@@ -100,8 +100,8 @@ class _ConfigLoader(yaml.SafeLoader):
         return int(text, 0) if text.startswith(("0x", "0o")) else int(text)
 
 
-# other tags of YAML 1.1 (dates, sets, binary) are refused rather than turned into objects that no
-# config has; None refuses the unknown ones
+# other tags of YAML 1.1 (dates, sets, binary) are rejected, because no config field has such a
+# type; the constructor under None rejects unknown tags
 _ALLOWED_TAGS = (
     None,
     *(_TAG_PREFIX + name for name in ("null", "bool", "float", "str", "seq", "map")),
@@ -115,7 +115,7 @@ _ConfigLoader.add_constructor(_TAG_PREFIX + "int", _ConfigLoader.construct_whole
 
 
 class _ConfigDumper(yaml.SafeDumper):
-    # the loader's resolvers, so that text such as '1e-3' is quoted and comes back as text
+    # the resolvers of the loader, so that text such as '1e-3' is quoted and loads as text
     yaml_implicit_resolvers = _RESOLVERS
 
     def ignore_aliases(self, data: Any) -> bool:
@@ -130,20 +130,22 @@ _ConfigDumper.add_representer(list, _ConfigDumper.represent_short_list)
 
 
 def parse_yaml(text: str, source: str, *, show_location: bool = True) -> tuple[Any, Node | None]:
-    """Return the plain value and the node tree of one YAML document.
-
-    The value consists of dicts with text keys, lists and scalars; both are None where the text
-    holds no document.
+    """Parse one YAML document.
 
     Args:
-        source: file or override that errors name.
+        text: the document.
+        source: file or override for error messages.
         show_location: whether errors give the line and column.
 
+    Returns:
+        The value, which consists of dicts with text keys, lists and scalars, and the tree of
+        nodes. Both are None if the text holds no document.
+
     Raises:
-        ConfigError: where the text is not YAML, repeats a key or refers to itself.
+        ConfigError: if the text is not YAML, repeats a key or refers to itself.
     """
     try:
-        # inside try: the constructor already rejects characters that YAML does not allow
+        # inside the try block, because the constructor rejects characters that YAML forbids
         loader = _ConfigLoader(text)
         node = loader.get_single_node()
         if node is None:
@@ -152,9 +154,8 @@ def parse_yaml(text: str, source: str, *, show_location: bool = True) -> tuple[A
 
         def count_values(node: Node) -> int:
             if id(node) not in value_counts:
-                value_counts[id(node)] = (
-                    _MAX_VALUES + 1
-                )  # met again meanwhile: it stands within itself
+                # a node that is visited again before its count is known contains itself
+                value_counts[id(node)] = _MAX_VALUES + 1
                 children = (
                     [child for pair in node.value for child in pair]
                     if isinstance(node, MappingNode)
@@ -168,7 +169,8 @@ def parse_yaml(text: str, source: str, *, show_location: bool = True) -> tuple[A
         if count_values(node) > _MAX_VALUES:
             raise ConfigError(
                 f"{source}: stands for more than {_MAX_VALUES} values, or refers to itself; write"
-                " out what its aliases mean"
+                " its aliases out",
+                "config.too_large",
             )
         return _copy_without_aliases(loader.construct_document(node)), node
     except yaml.MarkedYAMLError as error:
@@ -176,20 +178,27 @@ def parse_yaml(text: str, source: str, *, show_location: bool = True) -> tuple[A
         problem = error.problem or error.context or "cannot be read"
         if isinstance(error, _DuplicateKeyError) and mark is not None:
             raise ConfigError(
-                f"{source}{f':{mark.line + 1}' if show_location else ''}: {problem}"
+                f"{source}{f':{mark.line + 1}' if show_location else ''}: {problem}",
+                "config.duplicate_key",
             ) from error
         location = (
             "" if mark is None or not show_location else f":{mark.line + 1}:{mark.column + 1}"
         )
-        raise ConfigError(f"{source}{location}: not YAML: {' '.join(problem.split())}") from error
+        raise ConfigError(
+            f"{source}{location}: not YAML: {' '.join(problem.split())}", "config.not_yaml"
+        ) from error
     except (yaml.YAMLError, ValueError) as error:
-        raise ConfigError(f"{source}: not YAML: {' '.join(str(error).split())}") from error
+        raise ConfigError(
+            f"{source}: not YAML: {' '.join(str(error).split())}", "config.not_yaml"
+        ) from error
     except RecursionError as error:
-        raise ConfigError(f"{source}: nested too deeply, or refers to itself") from error
+        raise ConfigError(
+            f"{source}: nested too deeply, or refers to itself", "config.too_large"
+        ) from error
 
 
 def _copy_without_aliases(value: Any) -> Any:
-    # an alias makes two keys share one object; an override of one of them must not change the other
+    # with an alias two keys share one object; an override of one key must not change the other
     if isinstance(value, dict):
         return {key: _copy_without_aliases(item) for key, item in value.items()}
     return [_copy_without_aliases(item) for item in value] if isinstance(value, list) else value
@@ -218,5 +227,5 @@ def find_line(root: Node, path: KeyPath) -> int:
 
 
 def dump_yaml(data: Any) -> str:
-    """Write plain values as YAML text; keys keep their order, lists of scalars take one line."""
+    """Return plain values as YAML text with keys in order and lists of scalars on one line."""
     return yaml.dump(data, Dumper=_ConfigDumper, sort_keys=False, allow_unicode=True, width=120)

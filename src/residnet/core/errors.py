@@ -1,4 +1,4 @@
-"""The errors that a user can cause: every one is a `ResidnetError` and reads as one line.
+"""Errors that a user can cause; each is a `ResidnetError` with a message of one line.
 
 A message says what is wrong, where (file, row, column, key), what was expected and what to do about
 it. The command line prints the message without a traceback and exits with the class's `exit_code`.
@@ -10,71 +10,99 @@ import importlib.util
 
 
 class ResidnetError(Exception):
-    """The base of all errors that residnet raises on purpose.
+    """Base class of all errors that residnet raises on purpose.
 
-    Whatever a message quotes from a file, it stays one printable line.
+    Line breaks and control characters in a message are escaped, because a message may quote a file.
+
+    Args:
+        message: one line for the user.
+        code: overrides the default code of the class.
 
     Attributes:
         exit_code: exit status of the command line.
+        code: dotted identifier of the kind of error, for tests and programs; never shown.
     """
 
     exit_code: int = 1
+    code: str = "error"
 
-    def __init__(self, message: str = "") -> None:
+    def __init__(self, message: str = "", code: str | None = None) -> None:
+        if code is not None:
+            self.code = code
         super().__init__(
             "".join(
-                character
-                if character.isprintable()
-                else " "
-                if character.isspace()
-                else f"\\x{ord(character):02x}"
+                (
+                    character
+                    if character.isprintable()
+                    else " "
+                    if character.isspace()
+                    else f"\\x{ord(character):02x}"
+                )
                 for character in message
             )
         )
 
 
 class Terminated(BaseException):
-    """The signal SIGTERM, which asks a process to end; no `except Exception` holds it up."""
+    """Request to end the process (signal SIGTERM); no `except Exception` catches it."""
 
 
 class UsageError(ResidnetError):
-    """The error of a wrong call, path or unit (exit code 2)."""
+    """Wrong call, path or unit (exit code 2)."""
 
     exit_code = 2
+    code = "usage"
 
 
 class MissingPackageError(UsageError):
-    """The error of an optional package that is not installed (exit code 2)."""
+    """Optional package that is not installed (exit code 2)."""
+
+    code = "package.missing"
 
 
 class ConfigError(UsageError):
-    """The error of a wrong configuration key, value or combination (exit code 2)."""
+    """Wrong key, value or combination in a config (exit code 2)."""
+
+    code = "config.invalid"
 
 
 class DataError(ResidnetError):
-    """The error of a log whose contents cannot be used (exit code 1)."""
+    """Log whose contents cannot be used (exit code 1)."""
+
+    code = "data.unusable"
 
 
 class FitError(ResidnetError):
-    """The error of data that do not determine a model, or of an unusable model (exit code 1)."""
+    """Data that do not determine a model, or an unusable model (exit code 1)."""
+
+    code = "fit.failed"
 
 
 class ExportError(ResidnetError):
-    """The error of an exported model that does not reproduce the original (exit code 1)."""
+    """Exported model that does not reproduce the original (exit code 1)."""
+
+    code = "export.mismatch"
 
 
 class WithheldError(ExportError):
-    """The error of a model that is worse than doing without it (exit code 1).
+    """Export refused because the model is worse than the reference model (exit code 1).
 
-    A run whose own exports meet it is complete.
+    A run is complete even if its own exports are refused.
     """
+
+    code = "export.withheld"
 
 
 def require_package(package: str, feature: str, extra: str) -> None:
-    """Refuse to go on without an optional package.
+    """Raise an error if an optional package is not installed.
+
+    Args:
+        package: name of the package to import.
+        feature: what needs the package, as the subject of the message.
+        extra: extra of residnet that installs the package.
 
     Raises:
-        MissingPackageError: where it is not installed.
+        MissingPackageError: if it is not installed.
     """
     if importlib.util.find_spec(package) is None:
         raise MissingPackageError(

@@ -39,7 +39,7 @@ def prepare_splits(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -
     if settings.prepare.dead_commands == "mask":
         # what explains motion is learned from training and validation logs
         # a config is checked without what only data need
-        from residnet.quality.others import dead_commands
+        from residnet.quality.consensus import find_unexplained_idle
         from residnet.quality.statistics import LogStatistics
 
         statistics_by_split = {
@@ -54,7 +54,9 @@ def prepare_splits(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -
             for split in statistics_by_split.keys() - {"train", "validation"}
             for log in statistics_by_split[split]
         ]
-        idle_segments = dead_commands(training_statistics, other_statistics, signals.input_columns)
+        idle_segments = find_unexplained_idle(
+            training_statistics, other_statistics, signals.input_columns
+        )
 
         def masked(log: Log) -> Log:
             is_idle = np.zeros(len(log), dtype=bool)

@@ -168,7 +168,7 @@ class WindowsDataModule(EpochDataModule):
     ) -> WindowBatch:
         """Return the windows of `length` samples from rows [B] of the store on."""
         store = self.store
-        window_columns = dict.fromkeys((*WINDOW_COLUMNS, "told"), store.y[:0]) | {
+        window_columns = dict.fromkeys((*WINDOW_COLUMNS, "precomputed"), store.y[:0]) | {
             name: store.take_windows(getattr(store, name), starts, length) for name in columns
         }
         past_y, past_w = store.take_history(starts, history)

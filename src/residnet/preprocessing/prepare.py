@@ -126,7 +126,7 @@ class PreparedLog:
         paged_arrays: dict[str, Any] = {
             field_.name: paged.copy_to_disk(getattr(self, field_.name))
             for field_ in fields(self)
-            if field_.name not in ("log", "split", "live")
+            if field_.name not in ("log", "split", "dof")
         }
         return replace(self, log=self.log.move_to_disk(), **paged_arrays)
 

@@ -21,8 +21,8 @@ class WindowStore:
     """All logs end to end, N samples.
 
     Attributes are those of `Prepared`, positions from the start of each log, and:
-        n_remaining: samples from here to the end of the stretch, itself included, [N]; 0 where there is
-            none.
+        n_remaining: samples from here to the end of the stretch, itself included, [N]; 0 where
+            there is none.
         n_elapsed: samples since the stretch began, [N].
         log_index: number of the log, in the order gathered, [N].
         precomputed: what a training adds of each sample [N, k]; None where it adds nothing.
@@ -65,7 +65,7 @@ class WindowStore:
             origin[POSITION] = log.y[0, POSITION]
             for name, values in columns.items():
                 values_of_log = (
-                    getattr(log, name) - origin if name in ("y", "smooth") else getattr(log, name)
+                    getattr(log, name) - origin if name in ("y", "smoothed") else getattr(log, name)
                 )
                 values[row_slice] = torch.from_numpy(np.nan_to_num(values_of_log)).to(values.dtype)
             segment_labels[row_slice] = np.where(
@@ -74,13 +74,11 @@ class WindowStore:
             row_start += length
             paged.release_pages()
         segment_starts, segment_ends = find_run_bounds(segment_labels)
-        index_columns = {
-            "reach": segment_ends - np.arange(n_samples),
-            "depth": np.arange(n_samples) - segment_starts,
-        }
-        index_columns |= {"log": np.repeat(np.arange(len(logs)), lengths)}
         return cls(
-            **columns, **{name: torch.from_numpy(values) for name, values in index_columns.items()}
+            **columns,
+            n_remaining=torch.from_numpy(segment_ends - np.arange(n_samples)),
+            n_elapsed=torch.from_numpy(np.arange(n_samples) - segment_starts),
+            log_index=torch.from_numpy(np.repeat(np.arange(len(logs)), lengths)),
         )
 
     def coarsen(self, stride: int, angle_columns: Sequence[int] = ()) -> WindowStore:
@@ -110,24 +108,24 @@ class WindowStore:
         sampled_columns = {
             field_.name: getattr(self, field_.name)[row_order]
             for field_ in fields(self)
-            if field_.name != "told"
+            if field_.name != "precomputed"
         }
         return replace(
             self,
             **sampled_columns
             | {
                 "w": average_over_step(self.w),
-                "recorded": average_over_step(self.rate_inputs),
-                "reach": (self.n_remaining[row_order] + stride - 1) // stride,
-                "depth": self.n_elapsed[row_order] // stride,
+                "rate_inputs": average_over_step(self.rate_inputs),
+                "n_remaining": (self.n_remaining[row_order] + stride - 1) // stride,
+                "n_elapsed": self.n_elapsed[row_order] // stride,
             },
         )
 
     def find_starts(self, length: int, min_usable_share: float = 0.5) -> Tensor:
         """Return the rows at which a window of `n_window_samples` samples may start.
 
-        It lies within one stretch, its first sample is good, and at least `min_usable_share` of all are
-        usable.
+        It lies within one stretch, its first sample is good, and at least `min_usable_share` of all
+        are usable.
         """
         cumulative_usable = torch.nn.functional.pad(self.usable.cumsum(0), (1, 0))
         is_long_enough = self.trainable & (self.n_remaining >= length)
@@ -149,8 +147,8 @@ class WindowStore:
         start_rows = start_rows[self.n_elapsed[start_rows] == n_lead]
         if start_rows.numel() == 0:
             raise DataError(
-                f"no training log holds a window of {length} samples from {n_lead} samples after its"
-                " beginning on; shorten it or leave out `find_segment_starts`"
+                f"no training log holds a window of {length} samples from {n_lead} samples after"
+                " its beginning on; shorten it or leave out `find_segment_starts`"
             )
         return start_rows
 
@@ -199,7 +197,7 @@ class WindowSampler:
         return self.starts[shuffled_indices].reshape(self.n_batches, self.batch_size)
 
 
-WINDOW_COLUMNS = ("y", "smooth", "nu_dot", "w", "recorded", "usable", "good")
+WINDOW_COLUMNS = ("y", "smoothed", "nu_dot", "w", "rate_inputs", "usable", "trainable")
 """What the windows of a log hold of each sample."""
 
 
@@ -210,9 +208,10 @@ class WindowStage:
     Attributes:
         n_window_samples: samples in a window.
         batch_size: windows in a batch.
-        n_history: samples before a window that come with it; where the stretch is shorter, its first
-            is repeated.
-        n_segment_start_windows: how many of the batch begin near the start of a stretch, as a free run does.
+        n_history: samples before a window that come with it; where the stretch is shorter, its
+            first is repeated.
+        n_segment_start_windows: how many of the batch begin near the start of a stretch, as a free
+            run does.
         n_lead: how many samples after it these begin; their history is as long, and at least one.
         columns: of the store that its windows hold, the others are left empty.
     """

@@ -1,7 +1,7 @@
-"""The data doctor: what logs hold, what is wrong with them, and whether a fit would be misled.
+"""Inspect logs for faults that would mislead a fit (the data doctor).
 
-A check is a function with `@check` above it, in the module of its subject; it reads a `Record` and
-yields findings. `STAGE_DESCRIPTIONS` says when it looks, and at what state of the log.
+A check is a function with the decorator `@check` in the module of its subject. It reads
+`LogStatistics` and yields findings. `STAGE_DESCRIPTIONS` lists the stages of the inspection.
 """
 
 from __future__ import annotations
@@ -52,40 +52,40 @@ __all__ = [
 
 STAGE_DESCRIPTIONS = {
     "header": "as recorded",
-    "order": "as recorded; a finding here ends the examination",
+    "order": "as recorded; a finding here ends the inspection",
     "clock": "as recorded, with an increasing clock",
-    "values": "with its headings continuous",
-    "grid": "on a uniform grid, without what a finding about values says is wrong",
-    "inputs": "with its headings continuous",
-    "actuators": "without what a finding about values says is wrong",
-    "excitation": "with its headings continuous",
-    "between": "several logs (`Together`)",
+    "values": "with continuous headings",
+    "grid": "on a uniform grid, without samples that the stage values found invalid",
+    "inputs": "with continuous headings",
+    "actuators": "without samples that the stage values found invalid",
+    "excitation": "with continuous headings",
+    "between": "a set of logs (`LogSet`)",
 }
-"""Stage -> the state of the log that its checks see, in the order of the stages."""
+"""Stage -> state of the log that its checks receive, in the order of execution."""
 
 
 def inspect_log(
     log: Log, inputs: Sequence[str] | None = None, masks: Sequence[MaskRule] = ()
 ) -> InspectionReport:
-    """Examine one log as recorded (before the grid, whose effect it cannot see).
+    """Inspect one log as recorded, before it is resampled to the grid of a fit.
 
     Args:
-        log: any log.
-        inputs: channels that drive the vessel; None takes all that no sensor of the motion
-            measures.
-        masks: rules that will leave samples out of a fit; a finding about such samples only is a
+        log: log in canonical channels.
+        inputs: channels that drive the vessel; None takes all channels except states and
+            accelerations.
+        masks: rules that exclude samples from a fit; a finding about excluded samples only is a
             note.
 
     Raises:
-        UsageError: where the log lacks an input that was named.
-        DataError: where the log has fewer than two samples, or a channel holds no number.
+        UsageError: if the log lacks an input.
+        DataError: if the log has fewer than two samples, or a channel without a number.
     """
     if len(log) < 2:
-        raise DataError(f"log {log.name}: {len(log)} samples, at least 2 are needed; leave it out")
+        raise DataError(f"log {log.name}: {len(log)} samples, at least 2 are needed; exclude it")
     for name, channel in log.channels.items():
         if not np.isfinite(channel).any():
             raise DataError(
-                f"log {log.name}: channel {name} holds no number; take it out of the channel map"
+                f"log {log.name}: channel {name} holds no number; remove it from the channel map"
             )
     driving_inputs = [name for name in log.channels if name not in MOTION_CHANNELS]
     driving_inputs = driving_inputs if inputs is None else original_input_names(log, inputs)
@@ -124,9 +124,9 @@ def inspect_log(
 
 
 def _check_on_grid(log: LogStatistics) -> list[Finding]:
-    """Return the findings of the checks that need a uniform grid, told at the log's own samples."""
+    """Run the checks that need a uniform grid; sample masks refer to the samples of the log."""
     subsample = log.subsample
-    # from one stretch to the next a heading may have turned round many times
+    # between two stretches of a subsample the heading may turn by several circles
     unwrapped_log = subsample.log if subsample is log else values.unwrap_headings(subsample.log)
     try:
         gridded = subsample.on_grid(
@@ -137,15 +137,17 @@ def _check_on_grid(log: LogStatistics) -> list[Finding]:
     except DataError as error:
         return [Finding("fatal", "clock_span", f"frames not checked: {error}")]
     if subsample is not log:
-        # what single samples of a long log do is seen as they were recorded
+        # statistics of a long log use the gridded subsample, single samples the recorded log
         return [*run_checks("grid", log.with_subsample(gridded, values.horizontal_motion(log.log)))]
     findings = [*run_checks("grid", gridded)]
     nearest_grid_points = np.searchsorted(gridded.t - gridded.t[0], log.t - log.t[0] - 1e-9)
     nearest_grid_points = np.minimum(nearest_grid_points, len(gridded) - 1)
     return [
-        finding
-        if finding.sample_mask is None
-        else dataclasses.replace(finding, sample_mask=finding.sample_mask[nearest_grid_points])
+        (
+            finding
+            if finding.sample_mask is None
+            else dataclasses.replace(finding, sample_mask=finding.sample_mask[nearest_grid_points])
+        )
         for finding in findings
     ]
 
@@ -155,15 +157,13 @@ def inspect_log_set(
     inputs: Sequence[str] | None = None,
     splits: Mapping[str, str] | None = None,
 ) -> InspectionReport:
-    """Examine logs beside each other: copies, runs cut into files, ranges, excitation.
-
-    The last is whether a fit to all of them has something to learn from.
+    """Inspect a set of logs: copies, split runs, ranges, excitation, contradicting logs.
 
     Args:
-        logs: at least one, each with an increasing clock.
-        inputs: channels that drive the vessel; None takes all that no sensor of the motion
-            measures.
-        splits: log's name -> train, validation or test, where a config says.
+        logs: at least one log; those without an increasing clock are ignored.
+        inputs: channels that drive the vessel; None takes all channels except states and
+            accelerations.
+        splits: name of a log -> train, validation or test, as far as a config defines it.
     """
     ordered_logs = [
         log for log in logs if len(log) > 1 and not [*run_checks("order", LogStatistics(log))]

@@ -327,8 +327,9 @@ def check_rudder_clipping(log: LogStatistics, make_finding: Check) -> Iterator[F
     )
     if excess_statistic > 0.0:
         text = (
-            f"at {math.degrees(rudder_limit):.1f} deg of delta the vessel turns harder than smaller angles"
-            f" explain ({excess_statistic:.1f} times what they leave open): its record is cut off there"
+            f"at {math.degrees(rudder_limit):.1f} deg of delta the vessel turns harder than smaller"
+            f" angles explain ({excess_statistic:.1f} times what they leave open): its record is"
+            " cut off there"
         )
         yield make_finding(text, {"limit": rudder_limit, "harder": excess_statistic})
 
@@ -563,8 +564,10 @@ class ResponseDelay:
     Attributes:
         delay: how late the answer comes; negative where it comes before the input.
         standard_error: standard error of that, s.
-        improvement: what a fit leaves without the shift, over what it leaves with it (sums of squares).
-        late_answer_ratio: what the best shift leaves that is no early answer, over the least that any leaves.
+        improvement: what a fit leaves without the shift, over what it leaves with it (sums of
+            squares).
+        late_answer_ratio: what the best shift leaves that is no early answer, over the least that
+            any leaves.
     """
 
     delay: float
@@ -774,8 +777,9 @@ def check_acausal_response(log: LogStatistics, make_finding: Check) -> Iterator[
             MIN_LEAD_TIME, 1.5 * log.sampling_interval, 3.0 * delay.standard_error
         ):
             text = (
-                f"{answer} answers {channels} {lead_time:.2f} +- {2.0 * delay.standard_error:.2f} s before it is"
-                f" given (a fit leaves {delay.improvement:.1f} times less with it shifted)"
+                f"{answer} answers {channels} {lead_time:.2f} +- {2.0 * delay.standard_error:.2f} s"
+                f" before it is given (a fit leaves {delay.improvement:.1f} times less with it"
+                " shifted)"
             )
             figures = {
                 "lag": delay.delay,

@@ -1,4 +1,4 @@
-"""Findings between logs: copies, one run in several files, ranges, excitation, logs apart."""
+"""Checks of a set of logs: copies, split runs, ranges, excitation, contradicting logs."""
 
 from __future__ import annotations
 
@@ -18,6 +18,12 @@ from residnet.io.split import hash_rows, row_sampling_interval
 from residnet.preprocessing.channel_values import estimate_noise_std, nan_median, nan_std
 from residnet.preprocessing.statistics import MIN_SAMPLES
 from residnet.quality.clock import MIN_UNIX_TIME
+from residnet.quality.consensus import (
+    Consensus,
+    find_consensus,
+    find_dead_steering,
+    rank_hypotheses,
+)
 from residnet.quality.excitation import compute_condition_number, format_names
 from residnet.quality.findings import (
     Check,
@@ -27,7 +33,6 @@ from residnet.quality.findings import (
     format_quantity,
     format_share,
 )
-from residnet.quality.others import Fleet, causes, nothing_steers
 from residnet.quality.statistics import (
     MOTION_CHANNELS,
     LogStatistics,
@@ -35,18 +40,18 @@ from residnet.quality.statistics import (
     moving_average,
 )
 
-# so many rows in a row that two logs share are no chance
+# smallest number of consecutive equal rows that is no coincidence
 _MIN_COPIED_ROWS = 20
 
 
 class LogSet:
-    """Logs that are examined beside each other; it contains the channels that all of them have.
+    """Set of logs with the channels that all logs have in common.
 
     Args:
         logs: each with an increasing clock.
-        inputs: channels that drive the vessel; None takes all that no sensor of the motion
-            measures.
-        splits: log's name -> train, validation or test, where a config says.
+        inputs: channels that drive the vessel; None takes all channels except states and
+            accelerations.
+        splits: name of a log -> train, validation or test, as far as a config defines it.
     """
 
     def __init__(
@@ -62,27 +67,27 @@ class LogSet:
         self.splits = splits
 
     @cached_property
-    def fleet(self) -> Fleet | None:
-        """The logs, each predicted by a model of the others; None where that cannot be."""
+    def consensus(self) -> Consensus | None:
+        """Inliers and outliers of leave-one-log-out prediction; None without inputs or velocity."""
         if len(self.logs) < 2 or not self.inputs:
             return None
         logs = [with_derived_velocities(log) for log in self.logs]
         has_velocity = any(all(name in log for log in logs) for name in VELOCITY_NAMES)
-        return Fleet(logs, self.inputs) if has_velocity else None
+        return find_consensus(logs, self.inputs) if has_velocity else None
 
     def __contains__(self, name: object) -> bool:
         return name in self.channels
 
     def split_conflict(self, *logs: LogStatistics) -> str:
-        """Return the splits of logs where these are known and differ."""
+        """Return the splits of logs joined by `and` if they are known and differ; else empty."""
         split_names = [self.splits.get(log.name, "") for log in logs]
         return " and ".join(split_names) if all(split_names) and len(set(split_names)) > 1 else ""
 
 
 def with_derived_velocities(log: LogStatistics) -> LogStatistics:
-    """Return a log with the velocities that its position and heading tell; others as they are.
+    """Return a log with u and v derived from position and heading, unless it has u.
 
-    A yaw rate is none of them: differences of smoothed headings accused 3 of 12 good logs.
+    The yaw rate is not derived: differences of smoothed headings flagged 3 of 12 good logs.
     """
     if "u" in log or len(log) < MIN_SAMPLES or not all(name in log for name in POSE_NAMES):
         return log
@@ -97,15 +102,16 @@ def with_derived_velocities(log: LogStatistics) -> LogStatistics:
     return LogStatistics(completed_log, log.inputs)
 
 
-@check("between", "copied_part", fix="leave it out, or keep both in one split")
+@check("between", "copied_part", fix="exclude it, or put both into one split")
 def check_copies(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
-    """Report stretches that two logs, or two places of one log, have in common."""
+    """Report rows that occur in two logs, or at two places of one log."""
     velocities = [name for name in VELOCITY_NAMES if name in logs]
     names = velocities if len(velocities) > 1 else sorted(logs.channels)
     candidate_logs = [log.log for log in logs.logs]
     if names and (sampling_interval := row_sampling_interval(candidate_logs)) > 1:
-        # of very many rows a sample tells which logs have some in common
-        # of equal rows all are in it, or none
+        # for very many rows, a sample by hash value selects the logs that may share rows: equal
+        # rows
+        # have equal hashes, so all copies of a row are sampled or none
         hashes_by_log = (hash_rows(log, names) for log in candidate_logs)
         sampled_hashes = [
             hashes[hashes % np.uint64(sampling_interval) == 0] for hashes in hashes_by_log
@@ -119,7 +125,7 @@ def check_copies(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
         candidate_logs = list(itertools.compress(candidate_logs, may_share_rows))
     if not names or not candidate_logs:
         return
-    # rows are hashed one by one, so that all logs are hashed at once
+    # each row is hashed independently, so all logs can be hashed in one call
     joined_log = Log(
         "together",
         np.concatenate([log.t for log in candidate_logs]),
@@ -136,7 +142,7 @@ def check_copies(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     _, hash_indices, n_occurrences = np.unique(
         np.concatenate(hashes), return_inverse=True, return_counts=True
     )
-    # rows that stand in many places are those of a vessel at rest
+    # rows with many occurrences belong to a vessel at rest
     shared_rows = np.flatnonzero(
         (n_occurrences[hash_indices] > 1) & (n_occurrences[hash_indices] <= 2 * len(candidate_logs))
     )
@@ -164,7 +170,7 @@ def check_copies(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
         a, b = candidate_logs[i], candidate_logs[j]
         if i == j:
             text = (
-                f"{a.name}: rows {start} to {start + n_copied - 1} stand again from row"
+                f"{a.name}: rows {start} to {start + n_copied - 1} are repeated from row"
                 f" {start + offset} on"
             )
             yield make_finding(text, figures, code="repeated_block", fix="delete one of the copies")
@@ -172,13 +178,13 @@ def check_copies(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
         split_conflict = logs.split_conflict(records[a.name], records[b.name])
         level: Level = "fatal" if split_conflict else "will mislead"
         if logs.splits and not {a.name, b.name} <= logs.splits.keys():
-            # the config leaves one of them out already
+            # the config already excludes one of the logs
             level = "note"
         conflict_text = f" ({split_conflict})" if split_conflict else ""
         if n_copied >= max(len(a), len(b)) - 1:
             text, fix = (
                 f"{a.name} and {b.name} are the same{conflict_text}",
-                "leave one of them out",
+                "exclude one of them",
             )
             yield make_finding(text, figures, code="duplicate_log", level=level, fix=fix)
             continue
@@ -197,7 +203,7 @@ _COMPARED_STATES = ("x", "y", "u", "v", "r")
 
 @check("between", "continued", "note")
 def check_continued_logs(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
-    """Report a log that goes on where another ended: one run, cut into files."""
+    """Report a log that continues another one: a run that was split into files."""
     is_comparable = [
         len(log) >= 20 and sum(n in log for n in _COMPARED_STATES) >= 4 for log in logs.logs
     ]
@@ -205,7 +211,7 @@ def check_continued_logs(logs: LogSet, make_finding: Check) -> Iterator[Finding]
         return
 
     def compute_per_log(statistic: Callable[[np.ndarray], float]) -> np.ndarray:
-        """Return a figure of each log and state [L, 5], NaN where it is not measured."""
+        """Return a statistic per log and state [L, 5]; NaN for missing states."""
         return np.array(
             [
                 [statistic(log[n]) if n in log else np.nan for n in _COMPARED_STATES]
@@ -238,7 +244,7 @@ def check_continued_logs(logs: LogSet, make_finding: Check) -> Iterator[Finding]
                 min(abs(a.t[-1]), start_offset) > 2.0 * a.sampling_interval
                 and 0.0 < pause_duration < 3.0 * a.sampling_interval
             )
-            # where both are at rest nothing tells one quay from another
+            # two runs may begin and end at rest at the same berth
             is_at_rest = math.hypot(*final_states[i, 2:4]) < 0.2 * math.hypot(*high_levels[i, 2:4])
             has_restarted_clock = (
                 abs(b.t[0] - a.t[0]) <= 1e-9 or b.t[0] <= 2.0 * a.sampling_interval
@@ -248,12 +254,14 @@ def check_continued_logs(logs: LogSet, make_finding: Check) -> Iterator[Finding]
             ):
                 continue
             split_conflict = logs.split_conflict(a, b)
-            text = f"{b.name} goes on where {a.name} ends"
+            text = f"{b.name} continues where {a.name} ends"
             text += (
-                f", {pause_duration:.2f} s later: one run, cut into files" if is_contiguous else ""
+                f", {pause_duration:.2f} s later: a run that was split into files"
+                if is_contiguous
+                else ""
             )
-            text += f"; they stand in {split_conflict}" if split_conflict else ""
-            fix = "keep them in one split" if split_conflict or not logs.splits else ""
+            text += f"; they belong to {split_conflict}" if split_conflict else ""
+            fix = "put them into one split" if split_conflict or not logs.splits else ""
             yield make_finding(text, {"pause": pause_duration}, fix=fix)
 
 
@@ -261,10 +269,10 @@ def check_continued_logs(logs: LogSet, make_finding: Check) -> Iterator[Finding]
     "between",
     "overlapping",
     "note",
-    "two vessels, or two recordings of one run? keep them in one split",
+    "two vessels, or two recordings of one run? put them into one split",
 )
 def check_overlapping_logs(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
-    """Report logs of the same time."""
+    """Report logs that overlap in time."""
     start_times, end_times = np.array([(log.t[0], log.t[-1]) for log in logs.logs]).T
     for i, a in enumerate(logs.logs if float(end_times.max()) > MIN_UNIX_TIME else ()):
         overlap_durations = np.minimum(a.t[-1], end_times[i + 1 :]) - np.maximum(
@@ -280,17 +288,17 @@ def check_overlapping_logs(logs: LogSet, make_finding: Check) -> Iterator[Findin
 
 
 _COMPARED_ROWS = 50 * 4 ** np.arange(12) - 1
-"""Rows whose commands tell most logs apart: a manoeuvre may begin with a rest."""
+"""Rows at which commands are compared first; late ones too, as manoeuvres may begin alike."""
 
 
 @check(
     "between",
     "same_commands",
     "note",
-    "repeats show how far the vessel repeats itself; keep them in one split",
+    "repeated runs show the repeatability of the vessel; put them into one split",
 )
 def check_same_commands(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
-    """Report logs with the same commands."""
+    """Report logs with identical commands."""
     names = [name for name in logs.inputs if not name.startswith(("wind", "current"))]
     sampled_commands = np.full((len(logs.logs), len(names), _COMPARED_ROWS.size), np.nan)
     for i, log in enumerate(logs.logs if names else ()):
@@ -299,7 +307,7 @@ def check_same_commands(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     is_close = functools.partial(np.isclose, rtol=1e-6, atol=1e-9)
     for i, a in enumerate(logs.logs if names else ()):
         later_commands = sampled_commands[i + 1 :]
-        # what rests while both last tells nothing
+        # a command that is constant in the compared rows does not distinguish logs
         is_changing = (np.abs(np.diff(sampled_commands[i])) > 0.0) & np.isfinite(
             later_commands[..., 1:]
         )
@@ -322,20 +330,20 @@ def check_same_commands(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
                 continue
             split_conflict = logs.split_conflict(a, b)
             text = (
-                f"{a.name} and {b.name} have the same commands ({', '.join(moving_inputs)}) over {n_common}"
-                " samples"
+                f"{a.name} and {b.name} have the same commands ({', '.join(moving_inputs)}) over"
+                f" {n_common} samples"
             )
-            text += f" and stand in {split_conflict}" if split_conflict else ""
+            text += f" and belong to {split_conflict}" if split_conflict else ""
             yield make_finding(text, {"samples": n_common})
 
 
 @check(
     "between",
     "extrapolation",
-    fix="add training logs that go there, or do not trust the model there",
+    fix="add training logs in this range, or do not use the model there",
 )
 def check_extrapolation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
-    """Report how much of the other logs lies outside what the training logs cover."""
+    """Report validation and test samples outside the range of the training logs."""
     training_logs = [log for log in logs.logs if logs.splits.get(log.name) == "train"]
     other_logs = [log for log in logs.logs if logs.splits.get(log.name) in ("validation", "test")]
     for name in logs.channels if training_logs and other_logs else ():
@@ -351,15 +359,15 @@ def check_extrapolation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
             if share_outside > 0.01:
                 text = (
                     f"{name} of {log.name} ({logs.splits[log.name]}) lies outside the training"
-                    f" range {format_quantity(lower, unit)} to {format_quantity(upper, unit)} for {format_share(share_outside)} of the"
-                    " time"
+                    f" range {format_quantity(lower, unit)} to {format_quantity(upper, unit)} for"
+                    f" {format_share(share_outside)} of the time"
                 )
                 level: Level = "will mislead" if share_outside > 0.25 else "note"
                 yield make_finding(text, {"share": share_outside}, level=level)
 
 
 def _relative_spread(*value_arrays: np.ndarray) -> float:
-    """Return the spread of a channel over its size, beyond its noise."""
+    """Return the standard deviation of a channel beyond its noise, over its largest value."""
     finite_values = np.concatenate(value_arrays)
     finite_values = finite_values[np.isfinite(finite_values)]
     max_abs = float(np.abs(finite_values).max(initial=0.0))
@@ -371,14 +379,17 @@ def _relative_spread(*value_arrays: np.ndarray) -> float:
 
 
 _MIN_TURN_SHARE = 0.05
-"""Share of turning below which only noise and overshoots turn to a side: .0001 in circles behind
-a straight run, .3 and more in zigzags and random steps of five vessels."""
+"""Smallest share of yaw motion to one side that counts as turning to that side.
+
+Noise and overshoots reach .0001 in circles after a straight run; zigzags and random steps of five
+vessels reach .3 and more.
+"""
 
 
 def _excitation_ratio(log: LogStatistics, name: str) -> float:
-    """Return the spread of a velocity over the least that counts; below 1 it does not vary.
+    """Return the standard deviation of a smoothed velocity over the smallest one that counts.
 
-    Only what its averaged noise does not explain counts.
+    Below 1 the velocity does not vary beyond its averaged noise.
     """
     n_samples = max(round(2.0 / log.sampling_interval), 5)
     smoothed_values = moving_average(log[name], n_samples)
@@ -391,7 +402,7 @@ def _excitation_ratio(log: LogStatistics, name: str) -> float:
 
 @check("between", "no_excitation", fix="record manoeuvres: zigzag, 3-2-1-1")
 def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
-    """Report whether a fit to all logs together has something to learn from."""
+    """Report missing or collinear excitation in the set of logs."""
     n_logs, velocities = len(logs.logs), [name for name in VELOCITY_NAMES if name in logs]
     subsamples = [log.subsample for log in logs.logs]
     excitation_by_velocity = {
@@ -399,8 +410,8 @@ def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     }
     if excitation_by_velocity and max(excitation_by_velocity.values()) < 1.0:
         text = (
-            f"no velocity varies beyond its noise in any of {n_logs} logs: a fit would find nothing"
-            " but noise"
+            f"no velocity varies beyond its noise in any of {n_logs} logs: a fit would learn"
+            " only noise"
         )
         yield make_finding(
             text,
@@ -418,10 +429,10 @@ def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
         )
         text, turning_side = "", "port" if port_share > 0.5 else "starboard"
         if excitation_by_velocity["r"] < 1.0:
-            text = f"none of {n_logs} logs turns beyond its noise: nothing is learned of steering"
+            text = f"none of {n_logs} logs turns beyond its noise: steering cannot be learned"
         elif min(port_share, 1.0 - port_share) < _MIN_TURN_SHARE:
             text = (
-                f"all of {n_logs} logs turn to {turning_side}: how it turns to the other is unknown"
+                f"all of {n_logs} logs turn to {turning_side}: turns to the other side are unknown"
             )
         if text:
             level: Level = "will mislead" if n_logs > 1 else "note"
@@ -434,14 +445,14 @@ def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     spread_among_logs = {
         name: _relative_spread(*(log[name] for log in subsamples)) for name in driving_inputs
     }
-    # constant in each, but not the same in all, tells something
+    # inputs that are constant in each log but differ among logs carry information
     if (
         driving_inputs
         and max(max_spread_within_logs.values()) < 1e-3
         and max(spread_among_logs.values()) <= 1e-2
     ):
         text = f"no input ({', '.join(driving_inputs)}) varies within any of {n_logs} logs"
-        text += ": what they do cannot be identified"
+        text += ": their effects cannot be identified"
         yield make_finding(text, {"spread": max(max_spread_within_logs.values())})
     constant_inputs = [
         name
@@ -449,14 +460,17 @@ def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
         if max(max_spread_within_logs[name], spread_among_logs[name]) < 1e-3
     ]
     if constant_inputs:
-        text = f"{', '.join(constant_inputs)} never varies: its effect cannot be separated from a constant"
+        text = (
+            f"{', '.join(constant_inputs)} never varies: its effect cannot be separated from a"
+            " constant"
+        )
         yield make_finding(
             text, {"count": len(constant_inputs)}, code="constant_inputs", level="note", fix=""
         )
     varying_channels = [
         name for name in (*velocities, *driving_inputs) if name not in constant_inputs
     ]
-    # of very many samples evenly spread ones tell the same
+    # evenly spread samples suffice for the condition number
     sample_stride = -(-sum(len(log) for log in subsamples) // MAX_SAMPLES_IN_MEMORY)
     columns = np.concatenate(
         [log.log.stack(varying_channels)[::sample_stride] for log in subsamples]
@@ -468,11 +482,14 @@ def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
         and columns.shape[0] >= 10 * len(varying_channels)
     ):
         condition_number, collinear_names = compute_condition_number(columns, varying_channels)
-        text = f"{n_logs} logs together: condition number of {format_names(varying_channels)} {condition_number:.3g}"
+        text = (
+            f"{n_logs} logs together: condition number of {format_names(varying_channels)}"
+            f" {condition_number:.3g}"
+        )
         if condition_number > 30.0:
             text += (
-                f"; {', '.join(collinear_names)} move together: give one of them, or add manoeuvres that move"
-                " them apart"
+                f"; {', '.join(collinear_names)} are collinear: use one of them, or add manoeuvres"
+                " that vary them separately"
             )
         yield make_finding(
             text, {"condition": condition_number}, code="condition", level="note", fix=""
@@ -481,84 +498,92 @@ def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
 
 @check("between", "contradicts", fix="")
 def check_contradicting_logs(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
-    """Report logs that a model of the others does not explain, and what would explain them."""
-    fleet = logs.fleet
-    if fleet is None:
+    """Report logs that a model of the other logs does not explain, with the likeliest cause."""
+    consensus = logs.consensus
+    if consensus is None:
         return
-    for name in (dead_steering := nothing_steers(fleet))[0]:
+    dead_steering, unexplained_share = find_dead_steering(consensus)
+    for name in dead_steering:
         text = (
-            f"{name} rests in every log, and {format_share(dead_steering[1])} of how the yaw rate changes is"
-            " explained by nothing that was recorded: its record is dead"
+            f"{name} is constant in every log, and no recorded channel explains"
+            f" {format_share(unexplained_share)} of the changes of the yaw rate: its record is dead"
         )
         fix = "find the channel that holds the steering"
         yield make_finding(
-            text, {"unexplained": dead_steering[1]}, code="contradicts_dead", fix=fix
+            text, {"unexplained": unexplained_share}, code="contradicts_dead", fix=fix
         )
-    if dead_steering[0]:
+    if dead_steering:
         # without the steering no log explains another
         return
-    n_inliers = len(fleet.core)
-    for i in fleet.apart:
-        log, likeliest_hypothesis = fleet.logs[i], causes(fleet, i)[0]
+    fleet = consensus.fleet
+    n_inliers = len(consensus.inliers)
+    for i in consensus.outliers:
+        log = fleet.logs[i]
+        hypothesis = rank_hypotheses(consensus, i)[0]
         split = logs.splits.get(log.name, "")
-        if likeliest_hypothesis.kind == "vessel" and fleet.agreed and fleet.goes_beyond(i):
+        # new inputs are no contradiction: the polynomial does not extrapolate
+        if (
+            hypothesis.kind == "vessel"
+            and consensus.has_majority
+            and consensus.is_only_extrapolating(i)
+        ):
             text = (
-                f"{log.name} goes beyond the inputs of the {n_inliers} other logs that agree: they"
-                " cannot tell whether it is right"
+                f"{log.name} has inputs outside the range of the {n_inliers} other logs that agree:"
+                " they cannot confirm or contradict it"
             )
             yield make_finding(text, code="beyond_others", level="note")
             continue
-        residual_ratio = float(np.nanmax(fleet.scores(fleet.core, [i])[i].left))
+        residual_ratio = consensus.compute_rmse_ratio(i)
         text = (
-            f"{log.name}{f' ({split})' if split else ''}: a model of {n_inliers} other logs does not"
-            f" explain its motion ({residual_ratio:.2g} times what it leaves of them); {likeliest_hypothesis.text}"
+            f"{log.name}{f' ({split})' if split else ''}: a model of {n_inliers} other logs does"
+            f" not explain its motion (RMSE {residual_ratio:.2g} times the usual one);"
+            f" {hypothesis.text}"
         )
-        if not fleet.agreed:
-            text += "; no more than half of the logs agree, so that it may be the others"
+        if not consensus.has_majority:
+            text += "; no more than half of the logs agree, so the other logs may be wrong"
         figures = {
             "left": residual_ratio,
-            "size": likeliest_hypothesis.size,
-            "effect": fleet.harm(i),
+            "size": hypothesis.size,
+            "effect": consensus.compute_influence(i),
         }
         yield make_finding(
             text,
             figures,
-            code=f"contradicts_{likeliest_hypothesis.kind}",
-            fix=_ACTIONS[likeliest_hypothesis.kind],
+            code=f"contradicts_{hypothesis.kind}",
+            fix=_ACTIONS[hypothesis.kind],
         )
 
 
 _ACTIONS = {
-    "dead": "leave this log out, or restore the record",
-    "scale": "correct its unit or scale in this log, or leave it out if an actuator had failed",
+    "dead": "exclude this log, or restore the record",
+    "scale": "correct its unit or scale in this log, or exclude it if an actuator had failed",
     "sign": "correct its sign in this log",
-    "offset": "take the offset off in this log",
+    "offset": "subtract the offset in this log",
     "late": "shift the clock of the inputs in this log",
     "exchanged": "exchange both columns in this log",
     "heading": "correct the heading, or the axes of the velocities, of this log",
-    "current": "leave it out, give the current as an input, or let the fit estimate it",
-    "vessel": "leave it out, or fit it alone",
+    "current": "exclude it, provide the current as an input, or let the fit estimate it",
+    "vessel": "exclude it, or fit it separately",
 }
-"""What explains a log -> what to do."""
+"""Kind of hypothesis -> recommended action."""
 
 
 @check(
     "between",
     "dead_commands",
     "note",
-    fix="a fit leaves these stretches out (prepare.dead_commands: keep would keep them)",
+    fix="a fit excludes these stretches (prepare.dead_commands: keep would include them)",
 )
 def check_unexplained_idle(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
-    """Report motion that no recorded input explains while all of them rest."""
-    fleet = logs.fleet
-    idle_segments = (
-        [(i, *segment) for i in fleet.told for segment in fleet.rests(i)] if fleet else []
-    )
-    for i, start, stop in idle_segments:
+    """Report motion that no recorded input explains while all inputs are constant."""
+    consensus = logs.consensus
+    for i in consensus.fleet.usable if consensus else ():
         log = logs.logs[i]
-        text = (
-            f"{log.name}: from t = {log.t[start]:.1f} to {log.t[stop]:.1f} s all inputs rest and"
-            " the vessel moves as none of the other logs explains: a hand on the wheel, or a dead"
-            " record"
-        )
-        yield make_finding(text, {"t": log.t[start], "seconds": log.t[stop] - log.t[start]})
+        for start, stop in consensus.find_unexplained_idle(i) if consensus else ():
+            text = (
+                f"{log.name}: from t = {log.t[start]:.1f} to {log.t[stop]:.1f} s all inputs are"
+                " constant and the vessel moves as no other log explains: manual control, or a"
+                " dead record"
+            )
+            seconds = log.t[stop] - log.t[start]
+            yield make_finding(text, {"t": log.t[start], "seconds": seconds})

@@ -1,4 +1,4 @@
-"""What is wrong with a log's clock: order, rate, jitter, gaps, start, dates beside it."""
+"""Checks of the clock of a log: order, rate, jitter, gaps, start, and columns of dates."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from residnet.quality.statistics import SMOOTHING_SAMPLES, LogStatistics
 if TYPE_CHECKING:
     import pandas as pd
 
-# stamps that scatter move a velocity by this share of its spread before a fit suffers
+# largest velocity error due to timestamp jitter, as a share of the velocity's standard deviation
 _MAX_JITTER_SHARE = 0.05
-# longest time step, in usual ones, that the grid interpolates across, and rounding
+# longest time step across which the grid interpolates, in sampling intervals, with rounding
 _MAX_BRIDGED_STEPS = 3.0 * (1.0 + 1e-6)
-# stamps beyond this count from 1970
+# time stamps from this value on are seconds since 1970
 MIN_UNIX_TIME = 1e8
 
 
@@ -33,7 +33,7 @@ _CLOCK_RESTART_FIX = "sort the rows, or split the log where its clock restarts"
 
 @check("order", "time_missing", "fatal", "delete them or restore their time")
 def check_time_order(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report samples without a time, and times that run backwards or repeat."""
+    """Report samples without a time, and times that decrease or repeat."""
     n_missing, increments = int((~np.isfinite(log.t)).sum()), np.diff(log.t)
     if n_missing:
         yield make_finding(f"{n_missing} of {len(log)} samples have no time", {"count": n_missing})
@@ -60,9 +60,10 @@ def check_time_order(log: LogStatistics, make_finding: Check) -> Iterator[Findin
 
 @check("clock", "clock")
 def check_sampling_rate(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report the rate of the samples, and how much their times scatter.
+    """Report the sampling rate and the jitter of the time stamps.
 
-    Stamps that scatter mislead by what the vessel does meanwhile, not by their share of a step.
+    Jitter matters only as far as the vessel's velocity changes during it, therefore the level
+    depends on the resulting velocity error.
     """
     dt, step, duration = np.diff(log.t), log.sampling_interval, float(log.t[-1] - log.t[0])
     jitter = float(dt[dt <= 1.5 * step].std() / step)
@@ -88,19 +89,22 @@ def check_sampling_rate(log: LogStatistics, make_finding: Check) -> Iterator[Fin
 
 @check("clock", "dropped_samples", "note", "the grid interpolates across them")
 def check_dropped_samples(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report single samples that are missing."""
+    """Report single missing samples, which the grid interpolates."""
     dt = np.diff(log.t)
     short_gaps = dt[
         (dt > 1.5 * log.sampling_interval) & (dt <= _MAX_BRIDGED_STEPS * log.sampling_interval)
     ]
     if short_gaps.size:
-        text = f"{short_gaps.size} single samples or pairs are missing (steps up to {short_gaps.max():.3g} s)"
+        text = (
+            f"{short_gaps.size} single samples or pairs are missing (steps up to"
+            f" {short_gaps.max():.3g} s)"
+        )
         yield make_finding(text, {"count": short_gaps.size, "longest": short_gaps.max()})
 
 
 @check("clock", "gaps", fix="split the log there (mask kind: gap)")
 def check_gaps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report time steps that are too long to be bridged."""
+    """Report time steps that are too long for interpolation."""
     dt = np.diff(log.t)
     is_gap = np.append(False, dt > _MAX_BRIDGED_STEPS * log.sampling_interval)
     if not is_gap.any():
@@ -108,8 +112,8 @@ def check_gaps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     lost_time = float((dt[is_gap[1:]] - log.sampling_interval).sum())
     longest_index = int(np.argmax(dt))
     text = (
-        f"{int(is_gap.sum())} gaps, {lost_time:.2f} s in all, the longest {dt[longest_index]:.2f} s after t ="
-        f" {log.t[longest_index]:.2f} s"
+        f"{int(is_gap.sum())} gaps, {lost_time:.2f} s in all, the longest {dt[longest_index]:.2f} s"
+        f" after t = {log.t[longest_index]:.2f} s"
     )
     level: Level = "fatal" if lost_time > 0.5 * (log.t[-1] - log.t[0]) else "will mislead"
     figures = {
@@ -121,7 +125,12 @@ def check_gaps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     yield make_finding(text, figures, level=level, sample_mask=is_gap)
 
 
-@check("clock", "clock_start", "note", "times count from the log's own clock, nothing to do")
+@check(
+    "clock",
+    "clock_start",
+    "note",
+    "times count from the start of the log's clock; no action is needed",
+)
 def check_clock_start(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report a clock that does not start at 0."""
     if abs(log.t[0]) > log.sampling_interval:
@@ -133,22 +142,25 @@ def check_clock_start(log: LogStatistics, make_finding: Check) -> Iterator[Findi
 
 _DATE_COLUMN_PATTERN = re.compile(r"date|time|stamp|utc|gps|clock|epoch", re.IGNORECASE)
 _MAX_DATE_ROWS = 50_000
-"""Rows of a table whose dates are read; chosen by hand: more tell no better how fast it goes."""
+"""Rows of a table whose dates are read; chosen by hand, enough to estimate the clock rate."""
 _MAX_HEADER_LENGTH = 1 << 16
-"""Characters of a line of names."""
-# a clock that is off by more than this share misleads
+"""Largest length of the header line in characters."""
+# smallest relative error of the clock rate that is reported
 _MIN_RATE_ERROR = 0.005
 _MIN_DATES = 20
-"""Dates below which no rate is told; chosen by hand."""
+"""Smallest number of dates for an estimate of the clock rate; chosen by hand."""
 
 
 def find_clock_rate_errors(log: Log, path: Path) -> list[Finding]:
-    """Return the columns of dates that go faster or slower than the log's time.
+    """Compare the time of a log with the columns of dates in its table.
 
     Args:
-        log: as read from the table, row by row; where rows were dropped, a row of the table is none
-            of the log's, and nothing is told.
-        path: the table; anything that is no csv or Parquet file has no such columns.
+        log: log as read from the table, row by row. If the reader dropped rows, the rows do not
+            correspond and the result is empty.
+        path: CSV or Parquet file; for other files the result is empty.
+
+    Returns:
+        One finding for each column of dates that runs faster or slower than the log's time.
     """
     has_dropped_rows = log.meta.get("rows_dropped", 0) > _MIN_RATE_ERROR * len(log)
     date_columns, findings = None if has_dropped_rows else _read_date_columns(path), []
@@ -169,7 +181,7 @@ def find_clock_rate_errors(log: Log, path: Path) -> list[Finding]:
             and 0.05 < clock_rate < 20.0
         ):
             text = (
-                f"'{name}' goes on by {clock_rate:.4g} s for every second of the log's time: the time"
+                f"'{name}' advances by {clock_rate:.4g} s per second of the log's time: the time"
                 " column is nominal, or its unit is wrong"
             )
             action = f"take the time from '{name}'"
@@ -180,7 +192,7 @@ def find_clock_rate_errors(log: Log, path: Path) -> list[Finding]:
 
 
 def _read_date_columns(path: Path) -> pd.DataFrame | None:
-    """Return the columns that may hold dates; None where the file is no table that can be read."""
+    """Return the columns that may hold dates; None if the file is not a readable table."""
     import pandas as pd
 
     try:
@@ -207,12 +219,12 @@ def _read_date_columns(path: Path) -> pd.DataFrame | None:
                 encoding="utf-8-sig",
             )
     except (DataError, OSError, ValueError, LookupError, csv.Error):
-        # a file that cannot be read again has no date to tell
+        # the check is optional: without a readable table it reports nothing
         return None
 
 
 def _to_seconds(column: pd.Series) -> np.ndarray:
-    """Return a column of dates as seconds [T], NaN where empty; no samples where it holds none."""
+    """Convert a column of dates to seconds [T] with NaN for empty cells; empty if not dates."""
     import pandas as pd
 
     try:

@@ -1,7 +1,8 @@
-"""What a finding does to a fit, measured: findings that change next to nothing become notes.
+"""Measure the effect of findings on a fit; findings with a small effect become notes.
 
-The fit is a cheap one of one step: the change of the velocities over a few seconds, by least
-squares. Dead reckoning tells how far the velocities of a log lead from its positions and headings.
+Two quantities are compared with and without the fault: the predictions of a one-step least-squares
+fit (the change of the velocities over a few seconds), and the error of dead reckoning, that is of
+positions and headings integrated from the velocities.
 """
 
 from __future__ import annotations
@@ -22,37 +23,38 @@ from residnet.quality.statistics import (
 )
 
 MIN_EFFECT = 0.04
-"""Change of a fit's predictions, as a share of what they predict, below which none is misled."""
+"""Relative change of a fit's predictions below which a finding is only a note."""
 _RIDGE = 1e-6
-"""Of columns of size 1: solves those that move together, and changes others by a millionth."""
-# the predictions must change by so many times what no fit explains
+"""Ridge penalty for columns of unit RMS, which makes collinear columns solvable."""
+# smallest change of the predictions that counts, in RMS residuals of the fit
 _MIN_CHANGE_TO_RESIDUAL = 1.3
-# dead reckoning must change by this share of the way sailed
+# smallest change of the dead-reckoning error that counts, as a share of the distance travelled
 _MIN_RECKONING_CHANGE = 0.06
-# a stretch is compared with so many others of its length, because every fit depends on its data
+# number of stretches of equal length that are omitted for comparison: omitting any data changes
+# a fit
 _N_COMPARISON_SEGMENTS = 6
 _MIN_ROWS_PER_COLUMN = 4
-"""Rows for each coefficient; a fit to fewer follows their noise. Chosen by hand."""
+"""Smallest number of rows per coefficient, to avoid overfitting. Chosen by hand."""
 _CERTAIN_T_STATISTIC = 20.0
-"""Standard errors from which on a size is certain."""
+"""t statistic from which the estimated size of a fault is certain."""
 _MIN_VELOCITY_CHANGE = 0.1
-"""Share of its spread by which a velocity has to be wrong to count by itself."""
+"""RMS error of a velocity that counts by itself, in standard deviations of the velocity."""
 _RECKONING_DURATION = 60.0
-"""Length of a free run by dead reckoning in s; a short log has at least three of them."""
+"""Duration of a dead-reckoning run in s; shorter in a log with less than three of them."""
 
 
 class OneStepRegression:
-    """The rows of a one-step fit to one log.
+    """Regression of the velocity changes over blocks of one log on polynomial terms.
 
     Args:
-        log: with the inputs that drive the vessel.
-        reference: rows whose block length is taken; None takes what the noise asks for.
+        log: statistics of a log with its inputs.
+        reference: regression whose block length is used; None selects the length by the noise.
 
     Attributes:
-        blocks: over which the equations are integrated, K of them.
-        regressors: regressors [K, k], integrated over the blocks.
-        responses: of the velocities over the blocks [K, n].
-        response_std: standard deviation of the changes [n].
+        blocks: K overlapping blocks of samples.
+        regressors: terms integrated over the blocks [K, k].
+        responses: changes of the velocities over the blocks [K, n].
+        response_std: standard deviation of the responses [n].
     """
 
     def __init__(self, log: LogStatistics, reference: OneStepRegression | None = None) -> None:
@@ -63,7 +65,8 @@ class OneStepRegression:
             blocks = dataclasses.replace(blocks, starts=block_starts, length=block_length)
         velocities = {name: log[name] for name in log.velocities}
         input_values = [log[name] for name in log.inputs if log.std(name) > 0.0]
-        # a polynomial that knows no vessel; beyond four inputs each enters linearly only
+        # a polynomial without vessel parameters; more than four inputs enter linearly, so that the
+        # terms do not outnumber the blocks
         regressor_columns = [np.ones(len(log)), *make_velocity_terms(velocities)]
         regressor_columns += make_input_terms(
             input_values, velocities.get("u"), is_linear=len(input_values) > 4
@@ -86,7 +89,7 @@ class OneStepRegression:
         return int(self.blocks.starts.size)
 
     def fit_ridge(self, row_mask: np.ndarray | None = None) -> np.ndarray:
-        """Return the coefficients [k, n] of a ridge fit, to rows [K] bool or to all."""
+        """Return the coefficients [k, n] of a ridge fit to the rows in a mask [K], or to all."""
         x, y = (
             (self.regressors, self.responses)
             if row_mask is None
@@ -101,16 +104,20 @@ class OneStepRegression:
     def residual_rms(
         self, coefficients: np.ndarray, row_mask: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return what a fit leaves of each velocity's changes [n], root mean square."""
+        """Return the RMS residual [n] of each velocity under given coefficients [k, n]."""
         residuals = self.responses - self.regressors @ coefficients
         return _root_mean_square(residuals if row_mask is None else residuals[row_mask])
 
     def prediction_change(
         self, change_of_predictions: np.ndarray, coefficients: np.ndarray
     ) -> float:
-        """Return the largest change of the predictions [n] over what there is to predict.
+        """Return the largest relative change of the predictions.
 
-        Changes that drown in what no fit explains do not count.
+        Changes below the residuals of the fit do not count.
+
+        Args:
+            change_of_predictions: RMS change [n].
+            coefficients: of the fit [k, n].
         """
         counted_changes = np.where(
             change_of_predictions > _MIN_CHANGE_TO_RESIDUAL * self.residual_rms(coefficients),
@@ -129,18 +136,18 @@ def _excess_rms(rms_value: np.ndarray, typical_rms: np.ndarray) -> np.ndarray:
 
 
 def _threshold_reckoning_change(reckoning_changes: np.ndarray) -> float:
-    """Return the larger change of dead reckoning [2], 0 where it is within what receivers do."""
+    """Return the larger of two dead-reckoning changes [2]; 0 within receiver accuracy."""
     return (
         float(reckoning_changes.max()) if reckoning_changes.max() >= _MIN_RECKONING_CHANGE else 0.0
     )
 
 
 class FindingEffects:
-    """What single findings change in a one-step fit to a log, and in its dead reckoning.
+    """Effects of findings on the one-step fit and the dead reckoning of a log.
 
     Args:
-        log: of which a long one is told by a part.
-        sample_mask: [T] bool, samples that this part has to hold; None for evenly spread ones.
+        log: statistics of the log; a long log is represented by a subsample.
+        sample_mask: [T] bool, samples that the subsample must contain; None for evenly spread ones.
     """
 
     def __init__(self, log: LogStatistics, sample_mask: np.ndarray | None = None) -> None:
@@ -158,9 +165,9 @@ class FindingEffects:
         self._reckoning_errors = compute_reckoning_errors(log)
 
     def measure(self, finding: Finding) -> Finding:
-        """Return the finding with its effect, as a note where that is small.
+        """Return the finding with its measured effect; it becomes a note if the effect is small.
 
-        Only what concerns single samples, or says how it would be corrected, can be measured.
+        Only a finding with affected samples or with a correction can be measured.
         """
         if finding.level != "will mislead" or finding.is_record_fault:
             return finding
@@ -182,9 +189,12 @@ class FindingEffects:
         return dataclasses.replace(finding, level=level, effect=effect)
 
     def measure_omission(self, sample_mask: np.ndarray, affects_fit: bool = True) -> float | None:
-        """Return what changes where the samples at [T] bool are left out; None if unknown.
+        """Return the relative change without some samples; None if it cannot be estimated.
 
-        `affects_fit` says whether a fit sees the channels concerned, and not dead reckoning alone.
+        Args:
+            sample_mask: samples to omit [T] bool.
+            affects_fit: whether the affected channels enter the fit; if not, only dead reckoning
+                is compared.
         """
         comparison_masks = [
             np.roll(sample_mask, round(sample_mask.size * (k + 0.5) / _N_COMPARISON_SEGMENTS))
@@ -212,7 +222,7 @@ class FindingEffects:
         full_residual_rms = regression.residual_rms(coefficients)
 
         def refit_without(omitted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            """Return how far predictions [n] move, and what is left [n], without samples [T]."""
+            """Return the RMS change of the predictions [n] and the RMS residual [n] of a refit."""
             retained = regression.blocks.are_clear_of(omitted)
             new_coefficients = regression.fit_ridge(retained)
             return _root_mean_square(
@@ -223,7 +233,8 @@ class FindingEffects:
         comparison_changes, comparison_rms = zip(
             *(refit_without(comparison_mask) for comparison_mask in comparison_masks), strict=True
         )
-        # how much of the fit's error the samples had made, where no others had made as much
+        # share of the residual that the samples cause; it counts only if no comparison stretch
+        # reduces the residual as much
         is_significant = (remaining_rms < 0.95 * full_residual_rms) & (
             remaining_rms < 0.98 * np.min(comparison_rms, axis=0)
         )
@@ -239,7 +250,7 @@ class FindingEffects:
         return max(largest_change, float(error_caused.max(initial=0.0)), counted_reckoning_change)
 
     def measure_repair(self, repaired_log: Log, finding: Finding) -> float | None:
-        """Return what changes where the log is corrected; None if unknown."""
+        """Return the relative change with the corrected log; None if it cannot be estimated."""
         repaired_statistics = self._log.on_grid(repaired_log)
         counted_reckoning_change = _threshold_reckoning_change(
             _excess_rms(self._reckoning_errors, compute_reckoning_errors(repaired_statistics))
@@ -249,7 +260,9 @@ class FindingEffects:
         if abs(finding.figures.get("size", 0.0)) > _CERTAIN_T_STATISTIC * finding.figures.get(
             "error", np.inf
         ):
-            # one-step predictions may stay as good while the coefficients they give are wrong
+            # a fault such as a scale error is absorbed by the coefficients: one-step predictions do
+            # not
+            # show it
             for name in self._log.velocities:
                 rms_difference = float(
                     np.sqrt(np.nanmean((repaired_statistics[name] - self._log[name]) ** 2))
@@ -269,7 +282,7 @@ class FindingEffects:
                 else max(counted_reckoning_change, velocity_change)
             )
         new_coefficients = regression.fit_ridge()
-        # a correction that leaves the fit worse off is not what is wrong with the velocities
+        # a correction that increases the residual does not correct the velocities
         initial_rms = _root_mean_square(
             self._regression.residual_rms(coefficients) / self._regression.response_std
         )
@@ -289,15 +302,15 @@ class FindingEffects:
 
 
 def compute_reckoning_errors(log: LogStatistics, omitted: np.ndarray | None = None) -> np.ndarray:
-    """Return the errors [2] of dead reckoning over a minute in place and heading.
+    """Return the relative errors [2] of position and heading after one minute of dead reckoning.
 
-    They are shares of the way sailed; an error of the heading counts with the share by which it
-    displaces the end of a straight way.
+    The position error is a share of the distance travelled. The heading error is the share by which
+    it displaces the end of a straight line: half the angle in rad.
 
     Args:
         log: with an increasing clock.
-        omitted: [T] bool, samples that no window may touch; where that leaves too few windows, in
-            which none may begin or end.
+        omitted: [T] bool, samples that no window may contain; if too few windows remain, samples at
+            which no window may begin or end.
     """
     window_length, errors = (
         min(round(_RECKONING_DURATION / log.sampling_interval), len(log) // 3),

@@ -1,4 +1,4 @@
-"""How much of the vessel's envelope logs cover, and whether effects can be separated."""
+"""Checks of excitation: ranges, rest and collinearity of velocities and inputs."""
 
 from __future__ import annotations
 
@@ -19,24 +19,27 @@ from residnet.quality.findings import (
 from residnet.quality.statistics import LogStatistics, interpolate_gaps, moving_average
 
 _MAX_CONDITION_NUMBER = 30.0
-"""Condition number of harmful collinearity: Belsley, Kuh and Welsch, 1980."""
+"""Condition number from which collinearity is harmful (Belsley, Kuh and Welsch 1980)."""
 
 
 @check("excitation", "range", "note")
 def report_ranges(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report range and spectrum of velocities and inputs."""
+    """Report range, standard deviation and bandwidth of velocities and inputs."""
     for name in (*log.velocities, *log.inputs):
         values, unit = log[name][np.isfinite(log[name])], log.units[name]
         lower, upper, std = float(values.min()), float(values.max()), float(values.std())
         figures = {"min": lower, "max": upper, "std": std}
         if std <= 1e-6 * max(abs(lower), abs(upper)):
             text = (
-                f"{name} stays at {format_quantity(lower, unit)}: its effect cannot be identified from this log"
-                " alone"
+                f"{name} is constant at {format_quantity(lower, unit)}: its effect cannot be"
+                " identified from this log alone"
             )
             yield make_finding(text, figures, code="constant")
             continue
-        text = f"{name} from {format_quantity(lower, unit)} to {format_quantity(upper, unit)}, standard deviation"
+        text = (
+            f"{name} from {format_quantity(lower, unit)} to {format_quantity(upper, unit)},"
+            " standard deviation"
+        )
         text += f" {format_quantity(std, unit)}"
         if name in log.inputs and values.size >= 20:
             subsample = log.subsample
@@ -54,14 +57,14 @@ def report_ranges(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
 
 
 def find_rest(log: LogStatistics) -> np.ndarray:
-    """Return [T] bool: no motion beyond the noise over two seconds."""
+    """Return [T] bool: samples whose motion averaged over two seconds is within the noise."""
     n_samples = max(round(2.0 / log.sampling_interval), 5)
     is_at_rest = np.ones(len(log), dtype=bool)
     speeds = np.hypot(moving_average(log["u"], n_samples), moving_average(log["v"], n_samples))
     yaw_rates = np.abs(moving_average(log["r"], n_samples))
     noise_levels = np.hypot(log.noise_std("u"), log.noise_std("v")), log.noise_std("r")
     for values, noise_level in zip((speeds, yaw_rates), noise_levels, strict=True):
-        # what is left of the noise after averaging, but never a motion that is one for this vessel
+        # threshold: the averaged noise, bounded by shares of the speed that this vessel reaches
         high_level, averaged_noise = (
             nan_quantiles(values, 0.95)[0],
             4.0 * noise_level / np.sqrt(n_samples),
@@ -75,11 +78,11 @@ def find_rest(log: LogStatistics) -> np.ndarray:
 @check(
     "excitation",
     "standing",
-    fix="leave these parts out: they hold noise only",
+    fix="exclude these parts: they hold noise only",
     required_channels=("u", "v", "r"),
 )
 def check_rest(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report a vessel at rest; for a tenth of a log that makes it one about noise."""
+    """Report parts of a log in which the vessel is at rest."""
     is_at_rest = find_rest(log)
     starts, stops = find_runs(is_at_rest)
     rest_share = float(is_at_rest.mean())
@@ -91,8 +94,8 @@ def check_rest(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
             float(durations[longest_segment]),
         )
         text = (
-            f"the vessel rests for {format_share(rest_share)} of the time, at most {longest_duration:.1f} s on end from"
-            f" t = {start_time:.2f} s"
+            f"the vessel is at rest for {format_share(rest_share)} of the time, at most"
+            f" {longest_duration:.1f} s without a break from t = {start_time:.2f} s"
         )
         level: Level = "will mislead" if rest_share > 0.1 else "note"
         yield make_finding(
@@ -105,21 +108,21 @@ def check_rest(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
 
 @check("excitation", "slow", "note", "there is little to learn there", required_channels=("u", "v"))
 def check_slow_motion(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report a vessel that hardly moves."""
+    """Report parts of a log at less than a tenth of the usual speed."""
     speed = np.hypot(log["u"], log["v"])
     slow_speed = 0.1 * nan_quantiles(speed, 0.95)[0]
     slow_share = float(np.mean(speed[np.isfinite(speed)] <= slow_speed))
     if slow_share > 0.05:
         text = (
-            f"the vessel stands almost still (slower than {format_quantity(slow_speed, 'm/s')}, a tenth of its"
-            f" speed) for {format_share(slow_share)} of the time"
+            f"the vessel is almost at rest (slower than {format_quantity(slow_speed, 'm/s')}, a"
+            f" tenth of its speed) for {format_share(slow_share)} of the time"
         )
         yield make_finding(text, {"share": slow_share})
 
 
 @check("excitation", "condition", "note", on_subsample=True)
 def report_condition_number(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report velocities and inputs that move together in a log."""
+    """Report collinear velocities and inputs of a log."""
     names = [
         name
         for name in (*log.velocities, *log.inputs)
@@ -133,21 +136,27 @@ def report_condition_number(log: LogStatistics, make_finding: Check) -> Iterator
     text = f"condition number of {format_names(names)} (centred, scaled): {condition_number:.3g}"
     if condition_number > _MAX_CONDITION_NUMBER:
         text += (
-            f"; {', '.join(collinear_names)} move together in this log: their effects are separated by other"
-            " manoeuvres only"
+            f"; {', '.join(collinear_names)} are collinear in this log: only other manoeuvres can"
+            " separate their effects"
         )
     yield make_finding(text, {"condition": condition_number})
 
 
 def format_names(names: Sequence[str]) -> str:
-    """Return names in brackets, or how many they are where they are many."""
+    """Return the names in brackets, or their number if there are more than twelve."""
     return f"[{', '.join(names)}]" if len(names) <= 12 else f"{len(names)} channels"
 
 
 def compute_condition_number(columns: np.ndarray, names: Sequence[str]) -> tuple[float, list[str]]:
-    """Return the condition number of columns [N, k], and the names that move together most.
+    """Return the condition number of centred and scaled columns, and the most collinear ones.
 
-    Columns are centred and scaled; there are up to three names.
+    Args:
+        columns: [N, k].
+        names: of the columns.
+
+    Returns:
+        Ratio of the largest to the smallest singular value, and up to three names with the largest
+        entries in the right singular vector of the smallest one.
     """
     column_std = np.maximum(columns.std(axis=0), np.finfo(float).tiny)
     _, singular_values, singular_vectors = np.linalg.svd(

@@ -1,4 +1,4 @@
-"""Findings of the data doctor, the checks that make them, and the reports that hold them."""
+"""Findings of the data doctor, the registry of checks, and the inspection reports."""
 
 from __future__ import annotations
 
@@ -18,28 +18,29 @@ Level = Literal["note", "will mislead", "fatal"]
 LEVELS = ("note", "will mislead", "fatal")
 SCHEMA = "residnet.inspection/1"
 _MAX_SUMMARY_KINDS = 4
-"""Kinds of findings that a summary names, so that it stays one line."""
+"""Number of kinds of findings in a summary, which must fit into one line."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that the doctor saw.
+    """One fault or remark about a log.
 
     Attributes:
-        level: `note`, `will mislead` (a fit comes out wrong unless something is done) or `fatal`
-            (nothing can be learned from it).
-        code: what kind of finding, fixed for programs that read the report.
+        level: `note`, `will mislead` (a fit is wrong unless the user acts) or `fatal` (the log is
+            useless for a fit).
+        code: kind of finding, stable for programs that read the report.
         text: one line with figures.
-        figures: the numbers, SI.
-        action: what to do about it; empty where there is nothing to do.
-        sample_mask: [T] bool, the samples concerned, where it concerns single samples.
-        effect: what it does to a fit, measured: the share by which what a cheap one-step fit
-            predicts changes without it; None where that was not measured.
-        channels: that the samples concerned belong to, where it concerns single samples.
-        repair: returns a log with the fault corrected, where the finding says how; what it changes
-            is measured.
-        is_record_fault: a fault of the record itself, to be corrected whatever a fit makes of it.
-        invalidates_samples: the samples concerned are wrong, and no later check may rely on them.
+        figures: numbers in SI units.
+        action: recommended action; empty if there is none.
+        sample_mask: affected samples [T] bool; None if the finding is not about single samples.
+        effect: measured effect on a fit: relative change of the predictions of a one-step fit
+            without the fault; None if it was not measured.
+        channels: channels of the affected samples.
+        repair: returns a log with the fault corrected; None if no correction is known.
+        is_record_fault: whether the recording itself is faulty, so that it must be corrected
+            regardless of its effect on a fit.
+        invalidates_samples: whether the affected samples are wrong, so that later checks must not
+            use them.
     """
 
     level: Level
@@ -56,11 +57,11 @@ class Finding:
 
     @property
     def to_line(self) -> str:
-        """Level, text and what to do."""
+        """One line with level, text and action."""
         return f"{self.level}: {self.text}" + (f"; {self.action}" if self.action else "")
 
     def downgrade_if_masked(self, mask: np.ndarray) -> Finding:
-        """Return the finding as a note where masks [T] leave out every sample that it concerns."""
+        """Return the finding as a note if a mask [T] excludes every affected sample."""
         is_masked = (
             self.sample_mask is not None
             and self.sample_mask.any()
@@ -82,21 +83,22 @@ class Finding:
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that the doctor looks for.
+    """Registered check of a log.
 
-    Called with a text it makes the finding of this check; what is not given is that of the check.
+    A check is called with a text to create one of its findings, with its own code, level and
+    action as defaults.
 
     Attributes:
-        stage: when it looks, and at which state of a log (`residnet.quality.STAGES`).
-        code: of its findings.
-        level: of its findings.
-        fix: what to do about them.
-        required_channels: channels without which it has nothing to say.
+        stage: stage of the inspection, see `residnet.quality.STAGE_DESCRIPTIONS`.
+        code: default code of its findings.
+        level: default level of its findings.
+        fix: default action of its findings.
+        required_channels: channels without which the check is skipped.
         is_record_fault: see `Finding`.
         invalidates_samples: see `Finding`.
-        on_subsample: it tells nothing of single samples, and evenly spread stretches of a long log say what
-            the whole says (`LogStatistics.subsample`).
-        function: the function; given a log under examination (or several) and the check.
+        on_subsample: whether a long log is replaced by `LogStatistics.subsample`, because the check
+            is statistical and does not report single samples.
+        function: called with a log (or several) and the check; yields findings.
     """
 
     stage: str
@@ -121,7 +123,18 @@ class Check:
         channels: tuple[str, ...] = (),
         repair: Callable[[Log], Log] | None = None,
     ) -> Finding:
-        """Return a finding; `figures` are its numbers, SI."""
+        """Create a finding of this check; arguments that are not given default to the check.
+
+        Args:
+            text: one line with figures.
+            figures: numbers in SI units.
+            code: code of the finding.
+            level: level of the finding.
+            fix: recommended action.
+            sample_mask: affected samples [T] bool.
+            channels: channels of the affected samples.
+            repair: returns a log with the fault corrected.
+        """
         return Finding(
             self.level if level is None else level,
             code or self.code,
@@ -137,7 +150,7 @@ class Check:
 
 
 CHECKS: list[Check] = []
-"""All checks, in the order in which they look."""
+"""All checks in the order of execution."""
 
 _CheckFunction = Callable[[Any, Check], Iterable[Finding]]
 
@@ -175,9 +188,14 @@ def check(
 
 
 def run_checks(stage: str, statistics: Any) -> list[Finding]:
-    """Return what the checks of a stage find in a log, or between several."""
+    """Run the checks of a stage.
+
+    Args:
+        stage: see `residnet.quality.STAGE_DESCRIPTIONS`.
+        statistics: `LogStatistics` of one log, or the `LogSet` of several.
+    """
     findings: list[Finding] = []
-    # a stretch without a number is no news to who measured it
+    # NumPy warns about stretches of NaN, which the findings report themselves
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         for check_ in CHECKS:
@@ -192,12 +210,12 @@ def run_checks(stage: str, statistics: Any) -> list[Finding]:
 
 @dataclass(frozen=True)
 class InspectionReport:
-    """What the doctor found in one log, or in several logs beside each other.
+    """Findings about one log, or about a set of logs.
 
     Attributes:
-        name: the log; `between_logs` for several.
-        findings: in the order import, clock, values, frames, inputs, excitation.
-        source: file that it came from; empty where there is none.
+        name: name of the log; `together` for a set of logs.
+        findings: in the order of the stages.
+        source: file of the log; empty if unknown.
     """
 
     name: str
@@ -206,7 +224,7 @@ class InspectionReport:
 
     @property
     def has_problems(self) -> bool:
-        """Whether a fit to this log would be misled: any finding is above a note."""
+        """Whether any finding is worse than a note, so that a fit would be misled."""
         return any(finding.level != "note" for finding in self.findings)
 
     def with_findings(self, additional_findings: Sequence[Finding]) -> InspectionReport:
@@ -214,11 +232,11 @@ class InspectionReport:
         return dataclasses.replace(self, findings=(*self.findings, *additional_findings))
 
     def find_by_code(self, code: str) -> tuple[Finding, ...]:
-        """Return the findings of one code."""
+        """Return the findings with a code."""
         return tuple(finding for finding in self.findings if finding.code == code)
 
     def to_lines(self) -> list[str]:
-        """Return the report as text, one line per finding, the worst first."""
+        """Return the report as text, one line per finding, the most severe first."""
         sorted_findings = sorted(
             self.findings,
             key=lambda reported_finding: _severity_key(reported_finding.to_json()),
@@ -234,14 +252,19 @@ class InspectionReport:
 
 
 def convert_reader_findings(reader_notes: Iterable[Mapping[str, Any]]) -> list[Finding]:
-    """Return what a reader noted on the way in (`Log.meta["findings"]`)."""
+    """Convert the remarks of a reader (`Log.meta["findings"]`) to findings."""
     return [Finding(**{"action": "", "figures": {}, **entry}) for entry in reader_notes]
 
 
 def build_inspection(
     reports: Sequence[InspectionReport], between_logs: InspectionReport
 ) -> dict[str, Any]:
-    """Return all reports for JSON, schema residnet.inspection/1, with their tally."""
+    """Return all reports as plain values for JSON (schema residnet.inspection/1).
+
+    Args:
+        reports: one per log.
+        between_logs: report on the set of logs.
+    """
     content = {
         "schema": SCHEMA,
         "misled": any(report.has_problems for report in (*reports, between_logs)),
@@ -254,15 +277,15 @@ def build_inspection(
 
 @dataclass(frozen=True)
 class InspectionSummary:
-    """The findings above a note, counted.
+    """Counts of the findings that are worse than a note.
 
     Attributes:
-        n_logs: number of logs that were looked at.
-        n_logs_with_problems: number of logs with a finding above a note.
-        n_logs_by_code: code of a finding above a note -> number of logs that have it, the worst first;
-            findings between logs count as one.
+        n_logs: number of inspected logs.
+        n_logs_with_problems: number of logs with a finding that is worse than a note.
+        n_logs_by_code: code of such a finding -> number of logs that have it, the most severe
+            first; findings about the set of logs count as one log.
         tally: one sentence with these numbers.
-        first_action: one sentence that begins with "First fix this:"; empty where there is nothing.
+        first_action: one sentence about the most severe finding; empty if there is none.
     """
 
     n_logs: int
@@ -273,7 +296,7 @@ class InspectionSummary:
 
     @property
     def sentences(self) -> list[str]:
-        """The sentences that there are."""
+        """The non-empty sentences."""
         return [line for line in (self.tally, self.first_action) if line]
 
 
@@ -282,13 +305,13 @@ def _severity_key(finding: Mapping[str, Any]) -> tuple[int, float]:
 
 
 def summarize_inspection(inspection: Mapping[str, Any]) -> InspectionSummary:
-    """Return the tally of an inspection, and the finding to look at first.
+    """Count the findings of an inspection and select the most severe one.
 
     Findings are ranked by level, then by the largest measured effect on a fit, then by the number
     of logs that have them.
 
     Args:
-        inspection: content of doctor.json, or of `residnet inspect --json`.
+        inspection: content of doctor.json, or the output of `residnet inspect --json`.
     """
     logs: Sequence[Mapping[str, Any]] = inspection.get("logs") or []
     between_logs = {"name": "together", "findings": inspection.get("together") or []}
@@ -332,8 +355,12 @@ def summarize_inspection(inspection: Mapping[str, Any]) -> InspectionSummary:
         else ""
     )
     count_text = "the log holds" if n_logs == 1 else f"{n_logs_with_problems} of {n_logs} logs hold"
+    # a finding about the set of logs belongs to no single log
     subject_text = count_text if n_logs_with_problems else "the logs together hold"
-    tally = f"Data doctor: {subject_text} something that would mislead a fit: {', '.join(kind_texts)}{omitted_text}."
+    tally = (
+        f"Data doctor: {subject_text} something that would mislead a fit:"
+        f" {', '.join(kind_texts)}{omitted_text}."
+    )
     name, first_finding = max(
         findings_by_code[sorted_codes[0]],
         key=lambda name_and_finding: _severity_key(name_and_finding[1]),
@@ -353,21 +380,26 @@ def summarize_inspection(inspection: Mapping[str, Any]) -> InspectionSummary:
 
 
 def format_quantity(quantity: float, unit: str) -> str:
-    """Return a value in SI as text; angles in degrees, which people read more easily."""
+    """Format an SI value with its unit; angles are converted to degrees."""
     if unit.startswith("rad"):
         return f"{math.degrees(quantity):.3g} {unit.replace('rad', 'deg', 1)}"
     return f"{quantity:.3g} {unit}" if unit != "-" else f"{quantity:.3g}"
 
 
 def format_share(share: float) -> str:
-    """Return a share in per cent."""
+    """Format a share as a percentage."""
     return f"{100.0 * share:.2g} %" if share < 0.1 else f"{100.0 * share:.0f} %"
 
 
 def describe_unit_confusion(factor: float, *dimensions: str) -> str:
-    """Return the mistake of units that makes values too large by a factor, in brackets.
+    """Return the confusion of units that explains a scale factor, in brackets.
 
-    Empty where none of these dimensions, each told by its SI unit, has one within 8 %.
+    Args:
+        factor: by which the values are too large.
+        dimensions: SI units of the dimensions in question.
+
+    Returns:
+        For example ` (deg taken as rad)`; empty if no confusion is within 8 % of the factor.
     """
     if factor <= 0.0:
         return ""
@@ -385,14 +417,21 @@ def describe_unit_confusion(factor: float, *dimensions: str) -> str:
 
 
 def with_channels(log: Log, **channels: np.ndarray) -> Log:
-    """Return the log with some channels changed."""
+    """Return the log with some channels replaced."""
     return log.replace(channels={**log.channels, **channels})
 
 
 def make_correction(
     names: Sequence[str], factor: float = 1.0, offset: float = 0.0, delay: float = 0.0
 ) -> Callable[[Log], Log]:
-    """Return the repair of channels too large by `factor`, too small by `offset`, `delay` s late."""
+    """Create a function that corrects scale, offset and delay of channels of a log.
+
+    Args:
+        names: channels to correct.
+        factor: by which the channels are too large.
+        offset: added after scaling, SI.
+        delay: by which the channels are late, in s.
+    """
 
     def correct_channel(log: Log, name: str) -> np.ndarray:
         corrected = np.interp(log.t + delay, log.t, log[name]) if delay else log[name]

@@ -198,8 +198,10 @@ def compare_frames(log: LogStatistics) -> FrameAgreement | None:
     }
     velocity_pairs["y reversed"] = ground_velocity.conj(), declared_velocity
     overlaps = {
-        name: complex(np.vdot(body_values, ground_values))
-        / float(np.linalg.norm(ground_values) * np.linalg.norm(body_values))
+        name: (
+            complex(np.vdot(body_values, ground_values))
+            / float(np.linalg.norm(ground_values) * np.linalg.norm(body_values))
+        )
         for name, (ground_values, body_values) in velocity_pairs.items()
     }
     return FrameAgreement(
@@ -233,8 +235,8 @@ def check_frames(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
         math.degrees(np.angle(overlaps[best_name])),
     )
     text = (
-        f"x, y rates against R(psi) [u, v]: coherence {declared_coherence:.3f}, heading off by {heading_offset_deg:+.1f}"
-        f" deg, speed ratio {speed_ratio:.3f}"
+        f"x, y rates against R(psi) [u, v]: coherence {declared_coherence:.3f}, heading off by"
+        f" {heading_offset_deg:+.1f} deg, speed ratio {speed_ratio:.3f}"
     )
     level: Level = "will mislead"
     fix = None
@@ -425,8 +427,8 @@ def _compare_channel(
 
     Its sign, gain and lag; nothing where these cannot be told.
 
-    A lag alone misleads where the finer look is `is_certain` that pose and velocities differ at all:
-    slow channels correlate at any lag.
+    A lag alone misleads where the finer look is `is_certain` that pose and velocities differ at
+    all: slow channels correlate at any lag.
     """
     averaged_rates = log.cached(compute_averaged_rates)
     channel_std, reference_std = (
@@ -438,7 +440,10 @@ def _compare_channel(
         and channel_std < NEGLIGIBLE_MOTION_SHARE * reference_std
     ):
         return {
-            "text": f"{name} does not move, while {reference_text} does; the gyro is dead or another column",
+            "text": (
+                f"{name} does not move, while {reference_text} does; the gyro is dead or another"
+                " column"
+            ),
             "figures": {"correlation": 0.0, "gain": 0.0, "lag": 0.0},
             "code": f"follows_{name}",
             "level": "will mislead",
@@ -450,7 +455,10 @@ def _compare_channel(
     if channel_agreement is None or channel_agreement.reference_std < min_spread:
         return {}
     correlation, gain, lag, reference_spread = channel_agreement
-    text = f"{name} against {reference_text}: correlation {correlation:.3f}, gain {gain:.3f}, lag {lag:+.2f} s"
+    text = (
+        f"{name} against {reference_text}: correlation {correlation:.3f}, gain {gain:.3f}, lag"
+        f" {lag:+.2f} s"
+    )
     level: Level = "will mislead"
     fix = ""
     is_above_noise = name != "r" or reference_spread > 5.0 * averaged_rates.yaw_rate_noise

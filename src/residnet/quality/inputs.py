@@ -1,7 +1,7 @@
-"""Findings about the channels that drive the vessel, and about what stands beside the motion.
+"""Checks of input channels and of auxiliary channels.
 
-Jumps, limits, offset, astern, unit, stuck actuators; wind that contains the motion; positions
-against latitude and longitude.
+Inputs: jumps, limits, offset, astern propellers, unit, stuck actuators. Auxiliary channels:
+relative wind, which contains the motion, and positions against latitude and longitude.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _LONGITUDE_NAMES = (
     "longitude_deg",
     "lon_deg",
 )
-# mean radii of curvature are within .4 % of this
+# the mean radii of curvature of the ellipsoid are within .4 % of this value in m
 _EARTH_RADIUS = 6_371_000.0
 
 
@@ -57,7 +57,7 @@ _EARTH_RADIUS = 6_371_000.0
 def check_positions_against_coordinates(
     log: LogStatistics, make_finding: Check
 ) -> Iterator[Finding]:
-    """Report a scale or turn of x, y against latitude and longitude."""
+    """Report a scale error or a rotation of x, y against latitude and longitude."""
     names_by_lowercase = {name.lower(): name for name in log}
     latitude_name = next(
         (names_by_lowercase[name] for name in _LATITUDE_NAMES if name in names_by_lowercase), ""
@@ -96,11 +96,14 @@ def check_positions_against_coordinates(
     residual_share = residual_norm / max(position_norm, 1e-12)
     scale, rotation = abs(complex_gain), float(np.angle(complex_gain))
     if residual_share >= 0.2:
-        text = f"x, y do not follow {latitude_name}, {longitude_name}: {100.0 * residual_share:.0f} % is left"
+        text = (
+            f"x, y do not follow {latitude_name}, {longitude_name}: the residual is"
+            f" {100.0 * residual_share:.0f} %"
+        )
     elif abs(scale - 1.0) >= 0.02 or abs(rotation) >= math.radians(3.0):
         text = (
-            f"x, y are {scale:.3f} times as far as {latitude_name}, {longitude_name} say, turned by"
-            f" {math.degrees(rotation):+.1f} deg{describe_unit_confusion(scale, 'm')}"
+            f"x, y are {scale:.3f} times as large as by {latitude_name}, {longitude_name}, rotated"
+            f" by {math.degrees(rotation):+.1f} deg{describe_unit_confusion(scale, 'm')}"
         )
     else:
         return
@@ -124,7 +127,7 @@ def check_input_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Findi
         input_range = float(np.nanmax(log[name]) - np.nanmin(log[name]))
         largest_index = int(np.argmax(changes))
         largest, time = float(changes[largest_index]), float(log.t[largest_index + 1])
-        # a direction may wrap
+        # an angle other than a rudder angle may wrap
         if 0.0 < 0.25 * input_range < largest and (
             log.units[name] != "rad" or name in STEERING_CHANNELS
         ):
@@ -137,9 +140,9 @@ def check_input_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Findi
             )
 
 
-@check("inputs", "at_limits", "note", "what lies beyond is not learned")
+@check("inputs", "at_limits", "note", "a model cannot learn the behaviour beyond these limits")
 def check_input_limits(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report rests at the largest and smallest value, and where their middle lies."""
+    """Report inputs that are often at their limits, and asymmetric limits of a rudder."""
     for name in _finite_inputs(log):
         finite_values, unit = log[name][np.isfinite(log[name])], log.units[name]
         lower, upper = float(finite_values.min()), float(finite_values.max())
@@ -151,21 +154,22 @@ def check_input_limits(log: LogStatistics, make_finding: Check) -> Iterator[Find
         if max(limit_shares) <= 0.01 or np.unique(finite_values).size <= 2:
             continue
         text = (
-            f"{name} rests at its limits {format_quantity(lower, unit)} ({format_share(limit_shares[0])}) and"
-            f" {format_quantity(upper, unit)} ({format_share(limit_shares[1])})"
+            f"{name} is at its limits {format_quantity(lower, unit)}"
+            f" ({format_share(limit_shares[0])}) and {format_quantity(upper, unit)}"
+            f" ({format_share(limit_shares[1])})"
         )
         yield make_finding(text, {"low": lower, "high": upper, "share": sum(limit_shares)})
         midpoint = 0.5 * (lower + upper)
-        # only limits that are nearly the same on both sides are two ends of one actuator
+        # only nearly symmetric limits are the two end stops of one actuator
         is_nearly_symmetric = lower < 0.0 < upper and 1e-3 * upper < abs(midpoint) < 0.02 * (
             upper - lower
         )
         if is_nearly_symmetric and name in STEERING_CHANNELS and unit == "rad":
             text = (
-                f"{name} goes from {format_quantity(lower, unit)} to {format_quantity(upper, unit)}, not the same to both"
-                f" sides: an offset of {format_quantity(midpoint, unit)}"
+                f"{name} ranges from {format_quantity(lower, unit)} to"
+                f" {format_quantity(upper, unit)}: an offset of {format_quantity(midpoint, unit)}"
             )
-            fix = "take it off, or keep a constant among the regressors"
+            fix = "subtract it, or include a constant among the regressors"
             yield make_finding(
                 text,
                 {"offset": midpoint, "low": lower, "high": upper},
@@ -178,7 +182,7 @@ def check_input_limits(log: LogStatistics, make_finding: Check) -> Iterator[Find
     "inputs",
     "reversed",
     "note",
-    "a propeller astern obeys another law: give it terms of its own, or leave these parts out",
+    "a propeller astern has other characteristics: add separate terms, or exclude these parts",
 )
 def check_astern_propellers(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report propellers that run astern."""
@@ -187,13 +191,16 @@ def check_astern_propellers(log: LogStatistics, make_finding: Check) -> Iterator
         is_propeller = log.units[name] == "1/s" or name.split("_")[0] in ("n", "rpm", "rev")
         if is_propeller and 0.0 < astern_share < 1.0:
             lowest_text = format_quantity(float(np.nanmin(log[name])), log.units[name])
-            text = f"{name} is negative (astern) in {format_share(astern_share)} of the samples, down to {lowest_text}"
+            text = (
+                f"{name} is negative (astern) in {format_share(astern_share)} of the samples, down"
+                f" to {lowest_text}"
+            )
             yield make_finding(text, {"share": astern_share})
 
 
 @check("inputs", "unit", fix="correct the unit in the channel map", is_record_fault=True)
 def check_rudder_unit(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report a rudder angle that no rudder has."""
+    """Report rudder angles that are too large for any rudder."""
     for name in _finite_inputs(log):
         largest = abs_quantile(log[name], 0.99)
         if name in ("delta", "cmd_delta") and largest > math.radians(100.0):
@@ -202,20 +209,20 @@ def check_rudder_unit(log: LogStatistics, make_finding: Check) -> Iterator[Findi
             yield make_finding(text, {"largest": largest})
 
 
-# words that tell a demand from what the actuator does
+# parts of a name that mark a command instead of the state of the actuator
 _DEMAND_PATTERN = re.compile(
     r"^(cmd|ref|command|commanded|set|desired)_|_(cmd|ref|command|commanded|set|desired)(?=_|$)"
 )
 _MIN_STUCK_DURATION, _MIN_STUCK_ERROR = 5.0, 0.2
-"""An actuator that rests so long, s, so far from its demand, share of the demand's range, is stuck.
+"""Duration in s, and distance from the command as a share of its range, of a stuck actuator.
 
-Chosen by hand: longer than actuators lag, and farther than they are inaccurate.
+Chosen by hand, above the delay and the inaccuracy of actuators.
 """
 
 
-@check("inputs", "stuck", fix="leave this part out", is_record_fault=True)
+@check("inputs", "stuck", fix="exclude this part", is_record_fault=True)
 def check_stuck_actuators(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report actuators that rest although their demand goes elsewhere."""
+    """Report actuators that are constant although their command changes."""
     import pandas as pd
 
     for demand_name in log:
@@ -238,7 +245,8 @@ def check_stuck_actuators(log: LogStatistics, make_finding: Check) -> Iterator[F
             continue
         demanded_values, measured_values = log[demand_name], log[actual_name]
         rest_tolerance = max(6.0 * log.noise_std(actual_name), 1e-4 * demand_range)
-        # a slow gear moves less in a step than its sensor is noisy: ranges over many steps tell
+        # a slow gear moves less per step than its sensor noise, therefore the range over many steps
+        # decides
         n_window_samples = max(2, round(_MIN_STUCK_DURATION / log.sampling_interval))
         rolling = pd.Series(measured_values).rolling(n_window_samples, min_periods=1)
         is_at_rest = ~(
@@ -266,15 +274,15 @@ def check_stuck_actuators(log: LogStatistics, make_finding: Check) -> Iterator[F
             is_stuck, start_time = np.zeros(len(log), dtype=bool), float(log.t[longest_run.start])
             is_stuck[longest_run] = True
             text = (
-                f"{actual_name} rests for {longest_duration:.1f} s from t = {start_time:.2f} s while {demand_name} moves"
-                " on: stuck, or not recorded"
+                f"{actual_name} is constant for {longest_duration:.1f} s from t = {start_time:.2f}"
+                f" s while {demand_name} changes: stuck, or not recorded"
             )
             yield make_finding(
                 text, {"seconds": longest_duration, "t": start_time}, sample_mask=is_stuck
             )
 
 
-# a heading that goes so far one way and the other was steered
+# a heading that swings this far to both sides was steered
 _MIN_HEADING_SWING = math.radians(10.0)
 
 
@@ -288,7 +296,7 @@ _MIN_HEADING_SWING = math.radians(10.0)
 def check_constant_inputs_while_turning(
     log: LogStatistics, make_finding: Check
 ) -> Iterator[Finding]:
-    """Report a vessel that weaves although nothing that drives it moves."""
+    """Report a heading that oscillates although all inputs are constant."""
     driving_inputs = [name for name in log.inputs if not name.startswith(("wind", "current"))]
     if not driving_inputs or np.isfinite(log["psi"]).sum() < MIN_SAMPLES:
         return
@@ -298,7 +306,7 @@ def check_constant_inputs_while_turning(
             log[name], 1.0
         )
     starts, stops = find_runs(is_constant)
-    # a heading that turns round goes farther than it gets
+    # an oscillating heading travels farther than from its first to its last value
     heading_travel = np.append(0.0, np.cumsum(np.abs(np.diff(psi))))
     has_swing = (
         heading_travel[stops] - heading_travel[starts] - np.abs(psi[stops] - psi[starts])
@@ -312,8 +320,8 @@ def check_constant_inputs_while_turning(
             is_idle[start : stop + 1] = True
             duration, start_time = float(log.t[stop] - log.t[start]), float(log.t[start])
             text = (
-                f"no input moves for {duration:.1f} s from t = {start_time:.2f} s, yet the heading turns"
-                f" round {n_reversals} times"
+                f"no input changes for {duration:.1f} s from t = {start_time:.2f} s, yet the"
+                f" heading reverses {n_reversals} times"
             )
             yield make_finding(
                 text,
@@ -324,7 +332,7 @@ def check_constant_inputs_while_turning(
 
 @check("inputs", "relative_wind", required_channels=("psi",), on_subsample=True)
 def check_relative_wind(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report wind directions that turn against the heading: relative wind, not true wind."""
+    """Report wind directions that are relative to the bow instead of true."""
     direction_names = [
         n for n in log if "wind" in n and log.units[n] == "rad" and n not in BOW_WIND_CHANNELS
     ]
@@ -343,11 +351,11 @@ def check_relative_wind(log: LogStatistics, make_finding: Check) -> Iterator[Fin
             has_heading_slope or matching_name or "relative" in name or name.startswith("rel_")
         ):
             continue
-        text = f"{name} turns by {slope:+.2f} +- {2.0 * error:.2f} of every change of heading"
-        text += f", and plus psi it is {matching_name}" if matching_name else ""
+        text = f"{name} turns by {slope:+.2f} +- {2.0 * error:.2f} per unit change of heading"
+        text += f", and with psi added it equals {matching_name}" if matching_name else ""
         is_input = name in log.inputs
         level: Level = "will mislead" if is_input else "note"
-        fix = "a free run must not be given it" if is_input else "do not make it an input"
+        fix = "it must not drive a free run" if is_input else "do not use it as an input"
         text += ": a relative wind contains psi, u and v"
         yield make_finding(
             text, {"slope": slope, "error": error}, level=level, fix=f"{fix}: use the true wind"
@@ -355,7 +363,7 @@ def check_relative_wind(log: LogStatistics, make_finding: Check) -> Iterator[Fin
 
 
 def _is_same_direction(log: LogStatistics, relative_name: str, true_name: str) -> bool:
-    """Return whether one direction plus the heading is the other, where the heading tells."""
+    """Return whether a relative direction plus the heading equals a true direction."""
     coherence_with_heading, coherence_without_heading = (
         abs(np.nanmean(np.exp(1j * (log[relative_name] + heading - log[true_name]))))
         for heading in (log["psi"], 0.0)
@@ -366,9 +374,10 @@ def _is_same_direction(log: LogStatistics, relative_name: str, true_name: str) -
 
 
 def _estimate_slope_against_heading(log: LogStatistics, name: str) -> tuple[float, float]:
-    """Return the change of a direction over ten seconds per rad of heading, and its error.
+    """Estimate the change of a direction per rad change of heading, over ten seconds.
 
-    The error is a standard error; both are 0 where nothing can be said.
+    Returns:
+        Slope and its standard error; both 0 if the log is too short or the heading constant.
     """
     n_hop_samples = max(round(10.0 / log.sampling_interval), 1)
     if len(log) < 5 * n_hop_samples:
@@ -377,7 +386,7 @@ def _estimate_slope_against_heading(log: LogStatistics, name: str) -> tuple[floa
         np.exp(1j * (log[name][n_hop_samples:] - log[name][:-n_hop_samples]))
     )
     heading_changes = log["psi"][n_hop_samples:] - log["psi"][:-n_hop_samples]
-    # beyond half a circle a change of direction is ambiguous
+    # a change of direction by more than half a circle is ambiguous
     is_valid = (
         np.isfinite(direction_changes)
         & np.isfinite(heading_changes)

@@ -212,7 +212,8 @@ def _explain_increments(
 
     Args:
         measured_pose: [T] real or complex, NaN where it was not measured.
-        integrated_increments: its increments [T - 1] by the velocities, NaN where these are missing.
+        integrated_increments: its increments [T - 1] by the velocities, NaN where these are
+            missing.
         dt: time steps [T - 1], s.
         pose_noise: of the pose at each sample.
         rate_noise: noise [T - 1] of the velocity.

@@ -1,6 +1,6 @@
-"""What several checks need to know of a log: noise, smoothed channels, robust fits, agreement.
+"""Statistics of a log that several checks share: noise, smoothed channels, least-squares fits.
 
-A log under examination (`LogStatistics`) computes each of them once.
+`LogStatistics` wraps a log and computes each statistic once.
 """
 
 from __future__ import annotations
@@ -29,33 +29,33 @@ from residnet.preprocessing.derivatives import fit_local_polynomials
 from residnet.preprocessing.statistics import MIN_SAMPLES, OverlappingBlocks
 
 MOTION_CHANNELS = frozenset((*SIX_DOF_LAYOUT.state_names, *ACCELERATION_NAMES))
-"""Channels that a sensor or filter measures; all others drive the vessel."""
+"""Channels of states and accelerations; all other channels count as inputs."""
 STEERING_CHANNELS = ("delta", "tau_n", "acting_tau_n", "cmd_delta", "nozzle", "cmd_nozzle")
-"""Channels of which a positive value turns the vessel."""
+"""Channels whose deflection turns the vessel."""
 N_SECTIONS = 20
-"""Parts of a log whose errors are taken as independent of each other, and of nothing shorter."""
+"""Sections of a log whose residuals are assumed independent of each other."""
 SMOOTHING_SAMPLES = 15
-"""Samples of the parabola that smooths a channel."""
+"""Window length of the parabolic smoother in samples."""
 
 _MAX_SUBSAMPLE, _N_SUBSAMPLE_SEGMENTS = 40_000, 5
-"""Samples of a log beyond which statistics are of as many, and in how many stretches these lie.
+"""Size of a subsample in samples, and the number of stretches that form it.
 
-By choice; `tests/data/test_relations.py` compares what they say with what all samples say.
+Chosen by hand; `tests/io/test_relations.py` compares findings on the subsample and on all samples.
 """
 _SEAM_STEPS = 5
-"""Steps between such stretches: more than a grid bridges."""
+"""Gap between the stretches of a subsample in sampling intervals: too long for interpolation."""
 _T = TypeVar("_T")
 
 
 class LogStatistics:
-    """A log under examination, with what checks find out about it computed once.
+    """Log under inspection with cached statistics.
 
     Args:
         log: with an increasing clock.
         inputs: channels that drive the vessel.
-        seam_times: times in s at which the later of two stretches begins that are not of one moment.
-        subsample: what `subsample` is, where it is known; None takes evenly spread stretches of a long log.
-        invalid: [T] bool, samples whose measured channels are not known; None where all are as logged.
+        seam_times: start times in s of stretches that do not follow the previous one in time.
+        subsample: statistics of a subsample; None takes evenly spread stretches of a long log.
+        invalid: samples whose measured channels read as NaN [T] bool; None for no samples.
     """
 
     def __init__(
@@ -70,11 +70,11 @@ class LogStatistics:
         self.inputs, self._seams, self._subsample = tuple(inputs), seam_times, subsample
         self._invalid = invalid
         self.noise_std = cache(lambda name: estimate_noise_std(self.subsample[name]))
-        """Standard deviation of a channel's white noise."""
+        """Estimate the standard deviation of the white noise of a channel."""
         self.std = cache(lambda name: nan_std(self[name]))
-        """Standard deviation of a channel."""
+        """Compute the standard deviation of a channel."""
         self.smoothed = cache(lambda name: smooth_by_parabola(self.t, log[name]))
-        """A channel [T] smoothed by a parabola over 15 samples, NaN bridged."""
+        """Smooth a channel [T] by a moving parabola; NaN is interpolated."""
         self._cache: dict[Hashable, Any] = {}
         self._spikes: dict[str, np.ndarray] = {}
 
@@ -94,9 +94,9 @@ class LogStatistics:
         return len(self.log)
 
     def is_spike(self, name: str) -> np.ndarray:
-        """Return [T] bool: samples of a channel that stand far out of their neighbours."""
+        """Return [T] bool: outliers of a channel among their neighbours (Hampel filter)."""
         if name not in self._spikes:
-            # as many channels of a short log at once as stay in a core's cache
+            # several channels of a short log at once, as many as fit into the cache of a core
             channel_names = [n for n in self.measured_motion if n not in self._spikes and n != name]
             channel_names = (
                 [name, *channel_names[: CACHED_SAMPLES // len(self) - 1]]
@@ -109,22 +109,22 @@ class LogStatistics:
 
     @cached_property
     def sampling_interval(self) -> float:
-        """Usual time between samples in s."""
+        """Median time between samples in s."""
         return nan_median(np.diff(self.t)[:: max(len(self) // _MAX_SUBSAMPLE, 1)])
 
     @cached_property
     def measured_motion(self) -> list[str]:
-        """Channels of the motion, inputs left out."""
+        """Channels of states and accelerations that are not inputs."""
         return [name for name in self if name in MOTION_CHANNELS and name not in self.inputs]
 
     @cached_property
     def velocities(self) -> list[str]:
-        """Velocities that the log has."""
+        """Planar velocities (u, v, r) of the log."""
         return [name for name in VELOCITY_NAMES if name in self]
 
     @cached_property
     def rms_speed(self) -> float:
-        """Root mean square of the speed where it is known, m/s; 0 where it is not."""
+        """Root mean square of the speed in m/s; 0 if u or v is missing."""
         squared_speed = (
             self["u"] ** 2 + self["v"] ** 2 if "u" in self and "v" in self else np.zeros(1)
         )
@@ -134,8 +134,9 @@ class LogStatistics:
 
     @cached_property
     def subsample(self) -> LogStatistics:
-        """Stretches of a long log, evenly spread, one a short pause after the other; a short log
-        itself. Statistics are told by them; what single samples do is told by all rows.
+        """Evenly spread stretches of a long log with short gaps between them; a short log itself.
+
+        Statistics are computed from the subsample; findings about single samples use all rows.
         """
         if self._subsample is not None:
             return self._subsample
@@ -143,13 +144,17 @@ class LogStatistics:
 
     @cached_property
     def subsample_rows(self) -> np.ndarray:
-        """Rows [K] that `subsample` holds, all of a short log."""
+        """Rows [K] of the subsample; all rows of a short log."""
         return sample_rows(len(self), _MAX_SUBSAMPLE, _N_SUBSAMPLE_SEGMENTS)
 
     def excerpt_around(self, sample_mask: np.ndarray) -> tuple[np.ndarray, LogStatistics]:
-        """Return rows [K] and their record as `subsample` has them, one stretch about samples at [T].
+        """Return a subsample with one stretch around given samples.
 
-        Of several runs of such samples it is about the longest.
+        Args:
+            sample_mask: samples to include [T] bool; the stretch is centred on their longest run.
+
+        Returns:
+            Rows [K] of the subsample and its statistics.
         """
         starts, stops = runs_of(sample_mask)
         longest_segment = int(np.argmax(stops - starts))
@@ -163,6 +168,7 @@ class LogStatistics:
         return rows, excerpt if self._invalid is None else excerpt.mask_samples(self._invalid[rows])
 
     def _from_rows(self, rows: np.ndarray) -> LogStatistics:
+        """Return the statistics of some rows, with the gaps between stretches shortened."""
         if rows.size == len(self):
             return self
         log = self.log.select_rows(rows)
@@ -174,27 +180,27 @@ class LogStatistics:
         )
         time_shifts[0] = 0.0
         log = log.replace(t=log.t - np.cumsum(time_shifts))
-        # no increment leads from one stretch to the next
+        # the first sample of each stretch becomes NaN, so that no increment spans two stretches
         seam_times = log.t[np.flatnonzero(is_segment_start)[1:]]
         return LogStatistics(log, self.inputs, seam_times).mask_samples(is_segment_start)
 
     def on_grid(self, grid: Log) -> LogStatistics:
-        """Return the record of the same samples on a grid."""
+        """Return the statistics of the same log on a uniform grid."""
         return LogStatistics(grid, self.inputs, self._seams)
 
     def with_subsample(self, subsample: LogStatistics, log: Log) -> LogStatistics:
-        """Return the record of the same samples as another log holds them, with `subsample` of them."""
+        """Return the statistics of another log with the same samples and a given subsample."""
         return LogStatistics(log, self.inputs, self._seams, subsample, self._invalid)
 
     def near_seam(self, n_samples: int) -> np.ndarray:
-        """Return [T] bool: samples within so many of where two stretches meet."""
+        """Return [T] bool: samples within a distance in samples from a seam of two stretches."""
         seam_indices = np.searchsorted(self.t, np.zeros(0) if self._seams is None else self._seams)
         return mask_from_ranges(
             len(self), seam_indices - n_samples - _SEAM_STEPS, seam_indices + n_samples
         )
 
     def cached(self, statistic: Callable[..., _T], *arguments: Hashable) -> _T:
-        """Return a statistic of this record, `statistic(record, *about)`, computed once."""
+        """Return `statistic(self, *arguments)`, computed once."""
         key = (statistic, *arguments)
         if key not in self._cache:
             self._cache[key] = statistic(self, *arguments)
@@ -202,11 +208,12 @@ class LogStatistics:
         return result
 
     def mask_samples(self, invalid: np.ndarray) -> LogStatistics:
-        """Return the record with NaN in the measured channels where bad [T]."""
+        """Return the statistics with NaN in the measured channels at invalid samples [T]."""
         if not invalid.any():
             return self
         if len(self) > _MAX_SUBSAMPLE:
-            # copies of all channels of a long log would be as large again
+            # a view with a mask, because copies of all channels of a long log would double the
+            # memory
             subsample = self.subsample.mask_samples(invalid[self.subsample_rows])
             return LogStatistics(self.log, self.inputs, self._seams, subsample, invalid)
         channels = {
@@ -217,7 +224,7 @@ class LogStatistics:
 
 
 def interpolate_gaps(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return values [T] with straight lines where some are missing, 0 where all are."""
+    """Return values [T] with missing ones interpolated linearly; 0 if all are missing."""
     is_finite = np.isfinite(values)
     if is_finite.all():
         return values
@@ -227,13 +234,13 @@ def interpolate_gaps(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def smooth_by_parabola(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return values [T] smoothed by a parabola over 15 samples, NaN bridged by sample."""
+    """Smooth values [T] by a moving parabola over 15 samples; NaN is interpolated."""
     gap_free = interpolate_gaps(np.arange(t.size), values)
     return fit_local_polynomials(gap_free[:, None], SMOOTHING_SAMPLES, 2, 1.0)[0][:, 0]
 
 
 def moving_average(values: np.ndarray, n_samples: int) -> np.ndarray:
-    """Return the moving average [T] over so many samples, NaN left out; NaN where none is known."""
+    """Return the centred moving average [T] of the finite values; NaN in windows without any."""
     window_length, is_finite = min(n_samples, values.size), np.isfinite(values)
     padding = window_length // 2, (window_length - 1) // 2
     cumulative_sums = (
@@ -252,7 +259,7 @@ def moving_average(values: np.ndarray, n_samples: int) -> np.ndarray:
 
 
 def abs_quantile(values: np.ndarray, quantile_level: float = 0.95) -> float:
-    """Return the size that a channel reaches, by a quantile of its absolute values."""
+    """Return a quantile of the absolute values of a channel."""
     magnitudes = np.abs(values)
     return (
         float(np.nanmax(magnitudes))
@@ -262,14 +269,14 @@ def abs_quantile(values: np.ndarray, quantile_level: float = 0.95) -> float:
 
 
 def count_reversals(heading: np.ndarray, min_swing: float) -> int:
-    """Return how often a heading [T] rad turns round after having gone `min_swing` rad one way."""
+    """Count the reversals of a heading [T] in rad after swings of at least `min_swing` rad."""
     drop_from_maximum, rise_from_minimum = (
         np.maximum.accumulate(heading) - heading,
         heading - np.minimum.accumulate(heading),
     )
     if min(drop_from_maximum.max(), rise_from_minimum.max()) < min_swing:
         return 0
-    # where it goes the same way on, nothing turns
+    # only turning points can start or end a swing
     increments = np.diff(heading, prepend=heading[0], append=heading[-1])
     directions = np.sign(increments)
     n_reversals, direction, minimum, maximum = 0, 0, float(heading[0]), float(heading[0])
@@ -283,7 +290,7 @@ def count_reversals(heading: np.ndarray, min_swing: float) -> int:
 
 
 def estimate_resolution(values: np.ndarray) -> float:
-    """Return the least step between the values of a channel; 0 where it has no grid."""
+    """Return the quantization step of a channel; 0 if its values have no common step."""
     nonzero_changes = np.abs(np.diff(values))
     nonzero_changes = nonzero_changes[np.isfinite(nonzero_changes) & (nonzero_changes > 0.0)]
     if nonzero_changes.size < MIN_SAMPLES:
@@ -298,7 +305,7 @@ def estimate_resolution(values: np.ndarray) -> float:
 
 
 class LeastSquaresFit(NamedTuple):
-    """A least-squares fit: values [k], their covariance [k, k], what is left of known rows [N]."""
+    """Result of least squares: coefficients [k], covariance [k, k], residuals of finite rows [N]."""
 
     coefficients: np.ndarray
     covariance: np.ndarray
@@ -306,7 +313,7 @@ class LeastSquaresFit(NamedTuple):
 
     @property
     def sum_of_squares(self) -> float:
-        """Sum of squares of what is left."""
+        """Residual sum of squares."""
         return float(self.residuals @ self.residuals)
 
     @property
@@ -316,15 +323,19 @@ class LeastSquaresFit(NamedTuple):
 
     @property
     def t_statistic(self) -> float:
-        """The last value in its standard errors."""
+        """Last coefficient over its standard error."""
         return float(self.coefficients[-1] / self.standard_errors[-1])
 
 
 def fit_least_squares(x: np.ndarray, y: np.ndarray) -> LeastSquaresFit:
-    """Return y [N] fitted by the columns of x [N, k], over the rows that are known.
+    """Fit y by the columns of x with a cluster-robust covariance.
 
-    The covariance is a sandwich over sections: what filters leave hangs together, but not for
-    longer than a twentieth of the log. A column of zeros keeps a coefficient of zero.
+    The covariance is a sandwich estimator with the sections of the log as clusters, because
+    filtered residuals are correlated within a section. A column of zeros has a coefficient of zero.
+
+    Args:
+        x: regressors [N, k]; rows with NaN are omitted.
+        y: response [N].
     """
     is_finite = np.isfinite(x).all(axis=1) & np.isfinite(y)
     x, y = x[is_finite], y[is_finite]
@@ -345,24 +356,24 @@ def fit_least_squares(x: np.ndarray, y: np.ndarray) -> LeastSquaresFit:
 
 
 def _section_bounds(n_rows: int) -> np.ndarray:
-    """Return the rows [SECTIONS + 1] at which sections meet; the first ones may hold a row more."""
+    """Return the bounds [N_SECTIONS + 1] of the sections; the first sections may have one row more."""
     section_length, n_longer = divmod(n_rows, N_SECTIONS)
     section_indices = np.arange(N_SECTIONS + 1)
     return section_indices * section_length + np.minimum(section_indices, n_longer)
 
 
-# a block covers so many samples and so many seconds at least
+# shortest block in samples and in s
 _MIN_BLOCK_SAMPLES, _MIN_BLOCK_DURATION = 16, 3.0
-# blocks begin so many times in the length of one
+# number of blocks that overlap each sample
 _BLOCK_OVERLAP = 4
-# blocks of a long log that are looked at, evenly spread: more tell the same
+# largest number of blocks, evenly spread over a long log
 _MAX_BLOCKS = 5_000
-# over a block each velocity changes by so many standard deviations of its noise, where it can
+# smallest change of a velocity over a block, in standard deviations of its noise
 _MIN_SIGNAL_TO_NOISE = 10.0
 
 
 def make_blocks(log: LogStatistics, *velocities: str) -> OverlappingBlocks:
-    """Return blocks over which some velocities change by more than their noise."""
+    """Return overlapping blocks over which the given velocities change by more than their noise."""
     min_length = max(_MIN_BLOCK_SAMPLES, round(_MIN_BLOCK_DURATION / log.sampling_interval))
     block_length = min(3 * min_length, max(min_length, len(log) // 20))
     for candidate_length in (min_length, 2 * min_length, 3 * min_length):
@@ -388,7 +399,7 @@ def make_blocks(log: LogStatistics, *velocities: str) -> OverlappingBlocks:
 
 
 def make_velocity_terms(velocities: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-    """Return terms of second degree in velocities."""
+    """Return linear and quadratic terms of the velocities."""
     terms = [*velocities.values(), *(values * np.abs(values) for values in velocities.values())]
     if "u" in velocities:
         terms += [velocities["u"] * velocities[name] for name in ("v", "r") if name in velocities]
@@ -400,7 +411,13 @@ def make_velocity_terms(velocities: Mapping[str, np.ndarray]) -> list[np.ndarray
 def make_input_terms(
     input_values: Sequence[np.ndarray], u: np.ndarray | None, *, is_linear: bool
 ) -> list[np.ndarray]:
-    """Return terms of second degree that hold inputs; `u` is the speed ahead."""
+    """Return linear, quadratic and speed-dependent terms of the inputs.
+
+    Args:
+        input_values: one array [T] per input.
+        u: surge velocity [T]; None omits the terms with the speed.
+        is_linear: whether to return the linear terms only.
+    """
     if is_linear:
         return [*input_values]
     flow_terms = [] if u is None else [u * np.abs(u) * values for values in input_values]

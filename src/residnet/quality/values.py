@@ -1,4 +1,4 @@
-"""Findings about single channels: absent, frozen, outlying, clipped, coarse, filled values."""
+"""Checks of single channels: missing, frozen, outlying, clipped, coarse and filled values."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from residnet.quality.statistics import (
 
 @check("header", "channels", "note")
 def report_channels(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report names and units."""
+    """Report the names and units of the channels."""
     channels_text = ", ".join(f"{name} [{unit}]" for name, unit in log.units.items())
     summary_text = f"{len(log.units)} channels, {len(log)} samples, manoeuvre {log.log.manoeuvre}"
     yield make_finding(f"{summary_text}: {channels_text}")
@@ -52,7 +52,7 @@ def report_channels(log: LogStatistics, make_finding: Check) -> Iterator[Finding
 
 @check("values", "absent", "note")
 def report_missing_motion(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report what of the motion is not measured, and what is and no model takes."""
+    """Report states that are not measured, and measured states that no model uses."""
     dof = DegreesOfFreedom.from_channels(log.log.channels)
     missing_names = [name for name in STATE_NAMES if name not in log]
     if missing_names:
@@ -73,20 +73,20 @@ def report_missing_motion(log: LogStatistics, make_finding: Check) -> Iterator[F
                 yield make_finding(f"no {', '.join(missing_names)}: {dof.description}")
     if "p" in log and not dof.has_roll:
         text = "p of the roll is measured and not modelled: a model that rolls needs an angle phi"
-        yield make_finding(f"{text} that moves", code="roll")
+        yield make_finding(f"{text} that varies", code="roll")
     if {"z", "theta"} & {*log} and not dof.is_six_dof and {"x", "u"} & {*log}:
         text = "depth or pitch is measured and not modelled: six degrees of freedom need both, phi,"
         yield make_finding(f"{text} psi, and u and v or a position, that move", code="depth")
 
 
-# one full circle in rad, and in degrees that were taken for rad
+# one full circle in rad, and in degrees that were taken as rad
 _FULL_CIRCLES = ((2.0 * math.pi, ""), (360.0, " of 360: degrees taken as rad"))
 _ANGLE_CHANNELS = ("psi", "phi")
 
 
 @check("clock", "heading_wrap", fix="unwrap it before it is filtered or differentiated")
 def check_heading_wraps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report headings that were not made continuous: steps by about a full circle."""
+    """Report headings that wrap: steps by about a full circle."""
     for name in _ANGLE_CHANNELS:
         for full_circle, suffix in _FULL_CIRCLES if name in log else ():
             is_finite = np.isfinite(log[name])
@@ -96,18 +96,19 @@ def check_heading_wraps(log: LogStatistics, make_finding: Check) -> Iterator[Fin
             ]
             if wrap_indices.size:
                 text = (
-                    f"{name} wraps {wrap_indices.size} times{suffix}, first at t = {log.t[wrap_indices[0]]:.2f} s: logs"
-                    " hold it continuous"
+                    f"{name} wraps {wrap_indices.size} times{suffix}, first at t ="
+                    f" {log.t[wrap_indices[0]]:.2f} s: logs hold it continuous"
                 )
                 yield make_finding(text, {"count": wrap_indices.size, "t": log.t[wrap_indices[0]]})
 
 
 def horizontal_motion(log: Log) -> Log:
-    """Return a log with roll or pitch with its velocities as rates of place and angles.
+    """Return a log with the velocities u, v, r of the horizontal plane.
 
-    So do checks of the motion see a vessel under water as one on it, and one that heels as one that
-    does not. A gyro's yaw rate falls with the cosine of the roll and a compass's does not; whether
-    v and r are those of the hull is told by what they leave of the pose. Any other log stays.
+    The checks of the motion are planar. In a log with roll or pitch the body-fixed velocities are
+    rotated to the horizontal plane. With roll only, v and r may be body-fixed (a gyro's yaw rate
+    falls with the cosine of the roll) or planar (a compass): the convention that explains the pose
+    better is chosen. Any other log is returned unchanged.
     """
     dof = DegreesOfFreedom.from_channels(log.channels)
     if not dof.is_six_dof:
@@ -121,7 +122,7 @@ def horizontal_motion(log: Log) -> Log:
 
 
 def _select_yaw_rate_convention(log: Log) -> Log:
-    """Return a log whose v and r move the pose, from one in which they may be the hull's."""
+    """Return a log with planar v and r; whether they are body-fixed is inferred from the pose."""
     pose_increments = {"r": np.diff(log["psi"])} if log.channels.keys() >= {"psi", "r"} else {}
     if log.channels.keys() >= {"psi", "x", "y", "v"}:
         pose_increments["v"] = (
@@ -139,7 +140,7 @@ def _select_yaw_rate_convention(log: Log) -> Log:
 
 
 def unwrap_headings(log: Log) -> Log:
-    """Return the log with its headings continuous."""
+    """Return the log with continuous (unwrapped) headings and roll angles."""
     unwrapped_headings = {
         name: unwrap_angle(log[name]) for name in _ANGLE_CHANNELS if name in log.channels
     }
@@ -148,7 +149,7 @@ def unwrap_headings(log: Log) -> Log:
 
 @check("values", "nan", fix="split the log there (mask kind: nan)")
 def check_missing_values(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report samples that are missing, and channels that are slower than the log."""
+    """Report missing samples, and channels whose sampling rate is below that of the log."""
     for name in log:
         is_missing = ~np.isfinite(log[name])
         missing_share, valid_indices = float(is_missing.mean()), np.flatnonzero(~is_missing)
@@ -156,7 +157,7 @@ def check_missing_values(log: LogStatistics, make_finding: Check) -> Iterator[Fi
             continue
         intervals = np.diff(valid_indices)
         median_interval = float(np.median(intervals)) if intervals.size else 1.0
-        # longest of the intervals and of the ends
+        # gaps at both ends count as well
         longest_gap = max(
             intervals.max(initial=0), valid_indices[0], len(log) - 1 - valid_indices[-1]
         )
@@ -174,8 +175,8 @@ def check_missing_values(log: LogStatistics, make_finding: Check) -> Iterator[Fi
         start_time = float(log.t[starts[longest_segment]])
         duration = float(log.t[min(stops[longest_segment], len(log) - 1)]) - start_time
         text = (
-            f"{name} is missing in {format_share(missing_share)} of the samples, {starts.size} stretches, the"
-            f" longest {duration:.2f} s from t = {start_time:.2f} s"
+            f"{name} is missing in {format_share(missing_share)} of the samples, {starts.size}"
+            f" stretches, the longest {duration:.2f} s from t = {start_time:.2f} s"
         )
         level: Level = "fatal" if missing_share > 0.5 else "will mislead"
         figures = {
@@ -185,7 +186,7 @@ def check_missing_values(log: LogStatistics, make_finding: Check) -> Iterator[Fi
             "t": start_time,
         }
         if longest_gap <= MAX_BRIDGED_INTERVALS:
-            level, text = "note", f"{text}; so short ones are interpolated"
+            level, text = "note", f"{text}; short gaps are interpolated"
         yield make_finding(
             text, figures, level=level, sample_mask=is_missing, fix="" if level == "note" else None
         )
@@ -195,9 +196,10 @@ def check_missing_values(log: LogStatistics, make_finding: Check) -> Iterator[Fi
     "values", "repeated_rows", fix="delete them, or log at the sensors' rate", is_record_fault=True
 )
 def check_repeated_rows(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report rows that repeat the row before in every channel, more than by chance.
+    """Report rows that repeat the previous row in every channel more often than by chance.
 
-    Digits are few, so that now and then each channel repeats itself.
+    The expected number of repeats is the product of the channels' shares of equal neighbours,
+    because channels of low resolution repeat values by chance.
     """
     is_repeated, has_noisy_channel, n_expected = (
         np.ones(len(log) - 1, dtype=bool),
@@ -211,13 +213,13 @@ def check_repeated_rows(log: LogStatistics, make_finding: Check) -> Iterator[Fin
         has_noisy_channel |= name in MOTION_CHANNELS and float(is_equal_to_previous.mean()) < 0.5
     is_repeated = np.append(False, is_repeated)
     repeated_share = float(is_repeated.mean())
-    # commands alone rest for as long as nobody moves them
+    # a log of commands only repeats its rows while nobody changes them
     has_motion_channel = any(name in MOTION_CHANNELS for name in log)
     is_beyond_chance = int(is_repeated.sum()) > n_expected + 3.0 * np.sqrt(n_expected)
     if has_motion_channel and ((has_noisy_channel and is_beyond_chance) or repeated_share > 0.5):
         text = (
-            f"{int(is_repeated.sum())} rows ({format_share(repeated_share)}) repeat the row before in every channel:"
-            " logged twice, or faster than measured"
+            f"{int(is_repeated.sum())} rows ({format_share(repeated_share)}) repeat the row before"
+            " in every channel: logged twice, or faster than measured"
         )
         level: Level = "fatal" if repeated_share > 0.9 else "will mislead"
         yield make_finding(
@@ -230,14 +232,14 @@ def check_repeated_rows(log: LogStatistics, make_finding: Check) -> Iterator[Fin
 
 @check("values", "fill_values", fix="leave these cells empty", is_record_fault=True)
 def check_fill_values(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report values that stand for a missing measurement."""
+    """Report fill values, which represent a missing measurement."""
     for name in log:
         fill_indices = np.flatnonzero(is_fill_value(log[name]))
         if fill_indices.size:
             fill_value = float(log[name][fill_indices[0]])
             text = (
-                f"{fill_indices.size} samples of {name} hold the fill value {fill_value:g}, first at t ="
-                f" {log.t[fill_indices[0]]:.2f} s: nothing was measured there"
+                f"{fill_indices.size} samples of {name} hold the fill value {fill_value:g}, first"
+                f" at t = {log.t[fill_indices[0]]:.2f} s: nothing was measured there"
             )
             yield make_finding(
                 text, {"count": fill_indices.size, "value": fill_value}, channels=(name,)
@@ -246,7 +248,7 @@ def check_fill_values(log: LogStatistics, make_finding: Check) -> Iterator[Findi
 
 @check("values", "absurd", "fatal", "correct or empty them")
 def check_implausible_values(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report values that no vessel can have."""
+    """Report values outside the range of any vessel."""
     for name in log:
         values = log[name]
         implausible_indices = np.flatnonzero(is_implausible(values, log.units[name]))
@@ -257,23 +259,25 @@ def check_implausible_values(log: LogStatistics, make_finding: Check) -> Iterato
         )
         if implausible_indices.size:
             text = (
-                f"{name} is {format_quantity(float(values[implausible_indices[0]]), log.units[name])} at t ="
-                f" {log.t[implausible_indices[0]]:.2f} s, which no vessel reaches ({implausible_indices.size} such samples)"
+                f"{name} is"
+                f" {format_quantity(float(values[implausible_indices[0]]), log.units[name])} at t ="
+                f" {log.t[implausible_indices[0]]:.2f} s, which no vessel reaches"
+                f" ({implausible_indices.size} such samples)"
             )
             yield make_finding(text, {"count": implausible_indices.size})
 
 
 # shortest run of equal values that counts as frozen, in steps
 _MIN_FROZEN_STEPS = 5
-# after a receiver's freeze its filter needs so long to recover, s
+# time in s that the filter of a receiver needs to recover after a freeze
 _RECOVERY_DURATION = 2.0
-# a compass may rest for so long, s, while a heading is steady
+# duration in s for which a compass may be constant on a steady heading
 _MAX_STEADY_HEADING_DURATION = 3.0
 
 
 @check("values", "frozen", is_record_fault=True, invalidates_samples=True)
 def check_frozen_sensors(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report sensors that hold their last value although the vessel moves on."""
+    """Report sensors that hold their last value although the vessel moves."""
     position_frozen = np.zeros(len(log), dtype=bool)
     has_position = {"x", "y"} <= set(log.measured_motion)
     for names in (
@@ -284,7 +288,7 @@ def check_frozen_sensors(log: LogStatistics, make_finding: Check) -> Iterator[Fi
         if len(names) == 2:
             position_frozen = is_frozen
         elif has_position and names[0] in ("x", "y"):
-            # the stretches of the position have a finding already, its ends included
+            # stretches in which x and y freeze together were reported above
             is_frozen &= ~(np.convolve(position_frozen, np.ones(3))[1:-1] > 0.5)
         starts, stops = find_runs(is_frozen)
         if not starts.size:
@@ -322,33 +326,42 @@ def check_frozen_sensors(log: LogStatistics, make_finding: Check) -> Iterator[Fi
 
 
 def _find_frozen_samples(log: LogStatistics, names: tuple[str, ...]) -> np.ndarray:
-    """Return [T] bool: runs of equal values that neither chance nor rest explains."""
+    """Find runs of equal values that neither chance nor a vessel at rest explains.
+
+    Args:
+        log: statistics of the log.
+        names: channels that freeze together.
+
+    Returns:
+        [T] bool.
+    """
     is_frozen_sample = np.zeros(len(log), dtype=bool)
     is_multi_channel = len(names) > 1
     is_repeated = np.logical_and.reduce([log[name][1:] == log[name][:-1] for name in names])
     if not is_repeated.any():
         return is_frozen_sample
     starts, stops = find_runs(is_repeated)
-    # a slow sensor that repeats each value has steps of its own
+    # a slow sensor repeats each value: its steps are its update intervals
     min_run = _MIN_FROZEN_STEPS * median_update_interval(log.subsample.log.stack(names))
     is_long = stops - starts >= min_run
     n_outside = is_repeated.size - int((stops - starts)[is_long].sum())
     if n_outside < 0.02 * is_repeated.size:
         return is_frozen_sample
-    # share of equal neighbours where the channel moves: a coarse one repeats values anyhow
+    # share of equal neighbours outside long runs: a coarse channel repeats values by chance
     repeat_probability = min(float((stops - starts)[~is_long].sum()) / n_outside, 0.99)
-    # two channels that hold together are never chance
+    # a geometric distribution gives the run length that chance reaches; two channels that repeat
+    # together are no chance
     if repeat_probability > 0.0 and not is_multi_channel:
         min_run = max(
             min_run, int(np.ceil(np.log(1e-4 / is_repeated.size) / np.log(repeat_probability)))
         )
-    # the last digits of a noisy channel never rest, whatever the vessel does
+    # the last digits of a noisy channel change at every sample, even at rest
     is_rare = repeat_probability < (0.15 if is_multi_channel else 1e-3)
     is_long = stops - starts >= min_run
     if not is_long.any():
         return is_frozen_sample
     starts, stops = starts[is_long], stops[is_long]
-    # noise is a good part of what it does from sample to sample
+    # noise contributes to the increments; without noise, only a change after the run proves motion
     is_noisy = log.noise_std(names[0]) > 0.05 * nan_std(np.diff(log[names[0]]))
     is_noisy &= is_rare or names[0] not in POSE_NAMES
     vessel_moves = np.full(starts.size, is_noisy)
@@ -358,13 +371,18 @@ def _find_frozen_samples(log: LogStatistics, names: tuple[str, ...]) -> np.ndarr
 
 
 def _moves_after_run(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
-    """Return [R] bool: a channel [T] moves over runs that end at `stops` [R].
+    """Return whether a channel changes by a large step after each run of equal values.
 
-    It goes on far from where it stood.
+    Args:
+        values: channel [T].
+        stops: sample after each run [R].
+
+    Returns:
+        [R] bool: the step after the run exceeds three times those that follow it.
     """
     changes = np.abs(np.diff(values))
     min_change = nan_quantiles(changes[changes > 0.0], 0.1)[0] if (changes > 0.0).any() else 0.0
-    # the steps from the run's end on, no longer than the log
+    # the six steps after each run, padded at the end of the log
     following_changes = sliding_window_view(np.append(changes, np.full(5, np.nan)), 6)[
         np.minimum(stops, changes.size - 1)
     ]
@@ -373,7 +391,7 @@ def _moves_after_run(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
     return np.asarray((stops < changes.size - 3) & is_large_step)
 
 
-# share of the rows from which on repeats are no accident, and their longest run
+# smallest share of repeated rows that is reported, and the longest run of repeats in rows
 _MIN_REPEATED_SHARE, _MAX_REPEAT = 0.1, 5
 
 
@@ -385,14 +403,14 @@ _MIN_REPEATED_SHARE, _MAX_REPEAT = 0.1, 5
     is_record_fault=True,
 )
 def check_repeated_positions(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report single rows in which position stands still while the vessel moves."""
+    """Report single rows that repeat the position although the vessel moves."""
     increments = np.diff(log.log.stack(("x", "y")), axis=0)
     is_repeated = (increments == 0.0).all(axis=1)
     starts, stops = find_runs(is_repeated)
     is_short = stops - starts < _MAX_REPEAT
     short_repeats = mask_from_ranges(is_repeated.size, starts[is_short], stops[is_short])
     repeated_share = float(short_repeats.mean())
-    # a position moves by far more than its resolution where it moves
+    # the check needs steps that are much longer than the resolution of the position
     step_lengths = np.hypot(*increments[~is_repeated].T)
     step_lengths = step_lengths[np.isfinite(step_lengths)]
     north_changes = np.abs(increments[:, 0])
@@ -404,15 +422,15 @@ def check_repeated_positions(log: LogStatistics, make_finding: Check) -> Iterato
     ):
         return
     if median_update_interval(log.log.stack(("x", "y"))) > 1.0:
-        # a slow receiver: `held` says so, and a fit takes the repeats out
+        # a slow receiver is reported as `held`, and a fit excludes the repeats
         return
     names = ["x", "y"]
     for name in ("psi", "u", "v", "r"):
         if name in log and float((np.diff(log[name])[short_repeats] == 0.0).mean()) > 0.8:
             names.append(name)
     text = (
-        f"{int(short_repeats.sum())} rows ({format_share(repeated_share)}) repeat the last {', '.join(names)}: the fix"
-        " is older than the row"
+        f"{int(short_repeats.sum())} rows ({format_share(repeated_share)}) repeat the last"
+        f" {', '.join(names)}: the fix is older than the row"
     )
     affected = np.append(False, short_repeats)
     yield make_finding(
@@ -423,9 +441,9 @@ def check_repeated_positions(log: LogStatistics, make_finding: Check) -> Iterato
     )
 
 
-# shortest straight stretch, in samples and s
+# shortest straight stretch, in samples and in s
 _MIN_STRAIGHT_SAMPLES, _MIN_STRAIGHT_DURATION = 8, 1.0
-# share of a channel that may be straight before this is what the channel always does
+# largest straight share; above it, straight lines are the normal behaviour of the channel
 _MAX_STRAIGHT_SHARE = 0.4
 
 
@@ -437,7 +455,7 @@ _MAX_STRAIGHT_SHARE = 0.4
     invalidates_samples=True,
 )
 def check_interpolated_values(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report stretches that were filled by straight lines between the samples at their ends."""
+    """Report stretches that were filled by linear interpolation."""
     straight_by_channel = {
         name: _find_straight_samples(log, name)
         for name in log.measured_motion
@@ -452,9 +470,9 @@ def check_interpolated_values(log: LogStatistics, make_finding: Check) -> Iterat
     longest_segment = int(np.argmax(durations))
     start_time = float(log.t[starts[longest_segment]])
     text = (
-        f"{', '.join(names)} run along exactly straight lines for {durations.sum():.1f} s"
-        f" ({format_share(straight_share)}), the longest {durations[longest_segment]:.1f} s from t = {start_time:.2f} s: they"
-        " were interpolated"
+        f"{', '.join(names)} are exactly linear for {durations.sum():.1f} s"
+        f" ({format_share(straight_share)}), the longest {durations[longest_segment]:.1f} s from t"
+        f" = {start_time:.2f} s: they were interpolated"
     )
     figures = {"seconds": durations.sum(), "longest": durations[longest_segment]}
     yield make_finding(
@@ -466,7 +484,7 @@ def check_interpolated_values(log: LogStatistics, make_finding: Check) -> Iterat
 
 
 def _find_straight_samples(log: LogStatistics, name: str) -> np.ndarray:
-    """Return [T] bool: samples within runs without curvature, in a channel that has some."""
+    """Return [T] bool: samples in linear runs of a channel that is noisy elsewhere."""
     is_straight_sample, values = np.zeros(len(log), dtype=bool), log.subsample[name]
     second_differences = np.abs(np.diff(np.diff(values) / np.diff(log.subsample.t)))
     second_differences = second_differences[np.isfinite(second_differences)]
@@ -475,8 +493,8 @@ def _find_straight_samples(log: LogStatistics, name: str) -> np.ndarray:
     typical_bend = nan_median(second_differences)
     rounding_error = 1e-9 * float(np.nanmax(np.abs(values))) / log.sampling_interval
     resolution = estimate_resolution(values) / log.sampling_interval
-    # between few steps of its resolution a channel runs straight by itself, a smooth channel bends
-    # little anyhow: only noise bends at every sample
+    # a coarse or smooth channel has linear runs of its own; only noise changes the slope at every
+    # sample
     is_coarse = resolution > 0.0 and 8.0 * resolution >= typical_bend
     slope_noise = log.noise_std(name) * np.sqrt(6.0)
     is_noisy = slope_noise > 0.5 * nan_median(np.abs(np.diff(values, 2)))
@@ -502,15 +520,16 @@ def _find_straight_samples(log: LogStatistics, name: str) -> np.ndarray:
     invalidates_samples=True,
 )
 def check_spikes(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report single samples that leave all others and return at once."""
+    """Report single samples far outside the range of all other samples."""
     for name, is_spike in find_spikes(log.log).items():
         values = log[name]
         worst_index = int(
             np.argmax(np.where(is_spike, np.abs(values - np.nanmedian(values)), -1.0))
         )
         text = (
-            f"{int(is_spike.sum())} single samples of {name} stand far out, the worst"
-            f" {format_quantity(float(values[worst_index]), log.units[name])} at t = {log.t[worst_index]:.2f} s"
+            f"{int(is_spike.sum())} single samples of {name} are far outside the other values, the"
+            f" worst {format_quantity(float(values[worst_index]), log.units[name])} at t ="
+            f" {log.t[worst_index]:.2f} s"
         )
         yield make_finding(
             text,
@@ -522,9 +541,9 @@ def check_spikes(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
 
 @check("values", "outliers", invalidates_samples=True)
 def check_outliers(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report samples far out of their neighbours, by the rule of the mask `hampel`.
+    """Report outliers among neighbouring samples, by the rule of the mask `hampel`.
 
-    An input may jump: its outliers leave the range of all others too.
+    An input may jump, so its outliers must also be outside the range of its other values.
     """
     for name in (*log.measured_motion, *log.inputs):
         values, is_out_of_range = log[name], np.ones(1, dtype=bool)
@@ -533,7 +552,7 @@ def check_outliers(log: LogStatistics, make_finding: Check) -> Iterator[Finding]
             is_out_of_range = np.maximum(lower - values, values - upper) > 0.25 * max(
                 upper - lower, 1e-12
             )
-            # a direction may go anywhere at once, as that of a light wind does
+            # a direction, for example of a light wind, may change to any value at once
             if not is_out_of_range.any() or (
                 log.units[name] == "rad" and name not in STEERING_CHANNELS
             ):
@@ -551,8 +570,8 @@ def check_outliers(log: LogStatistics, make_finding: Check) -> Iterator[Finding]
         )
         outlier_share, time = n_outliers / len(log), float(log.t[worst_index])
         text = (
-            f"{n_outliers} samples of {name} ({format_share(outlier_share)}) stand far out of their neighbours, the"
-            f" worst at t = {time:.2f} s"
+            f"{n_outliers} samples of {name} ({format_share(outlier_share)}) are outliers among"
+            f" their neighbours, the worst at t = {time:.2f} s"
         )
         level: Level = "will mislead" if n_outliers > 2 else "note"
         fix = f"mask them (kind: hampel, channels: [{name}])"
@@ -564,7 +583,7 @@ def check_outliers(log: LogStatistics, make_finding: Check) -> Iterator[Finding]
 
 @check("values", "clipping", fix="mask them, or log with a wider range", invalidates_samples=True)
 def check_clipping(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report samples exactly at an extreme, many compared with the levels beside it."""
+    """Report channels with many more samples at an extreme than at the neighbouring levels."""
     for name in log.measured_motion:
         finite_values = log[name][np.isfinite(log[name])]
         if name in ("x", "y", "psi"):
@@ -579,16 +598,16 @@ def check_clipping(log: LogStatistics, make_finding: Check) -> Iterator[Finding]
             if levels.size < 10 or n_clipped < 4 * int(neighbour_counts.max()):
                 continue
             text = (
-                f"{name} is exactly at its limit {format_quantity(limit, log.units[name])} in {n_clipped} samples"
-                f" ({format_share(clipped_share)}): the sensor clips or holds"
+                f"{name} is exactly at its limit {format_quantity(limit, log.units[name])} in"
+                f" {n_clipped} samples ({format_share(clipped_share)}): the sensor clips or holds"
             )
             figures = {"count": n_clipped, "share": clipped_share, "limit": limit}
             yield make_finding(text, figures, sample_mask=log[name] == limit, channels=(name,))
 
 
-# levels between the 5th and the 95th percentile below which a resolution is too coarse
+# smallest number of levels between the 5th and the 95th percentile for a sufficient resolution
 _MIN_LEVELS = 50
-# of a channel that moves less nothing is learned: .05 deg/s either way, over a minute in an angle
+# a channel with a smaller range carries no information: .05 deg/s to both sides, 3 deg in a minute
 _NEGLIGIBLE_RANGES = {"rad": math.radians(3.0), "rad/s": math.radians(0.1)}
 
 
@@ -599,7 +618,7 @@ _NEGLIGIBLE_RANGES = {"rad": math.radians(3.0), "rad/s": math.radians(0.1)}
     on_subsample=True,
 )
 def check_resolution(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report the step of a channel's values, too coarse where few lie between its ends."""
+    """Report the resolution of channels; it is too coarse with few levels in their range."""
     for name in log.measured_motion:
         finite_values = log[name][np.isfinite(log[name])]
         lower, upper = nan_quantiles(finite_values, 0.05, 0.95)
@@ -608,13 +627,13 @@ def check_resolution(log: LogStatistics, make_finding: Check) -> Iterator[Findin
             continue
         level_step = float(np.median(np.diff(levels)))
         n_levels = (upper - lower) / level_step
-        # most samples differ from the one before by whole steps of the resolution, or it is none
+        # a resolution exists only if most increments are multiples of it
         increments_in_steps = np.diff(finite_values) / level_step
         if float((np.abs(increments_in_steps - np.round(increments_in_steps)) < 1e-3).mean()) < 0.9:
             continue
         text = (
-            f"{name} has a resolution of {format_quantity(level_step, log.units[name])}, {n_levels:.0f} levels between"
-            " its 5th and 95th percentile"
+            f"{name} has a resolution of {format_quantity(level_step, log.units[name])},"
+            f" {n_levels:.0f} levels between its 5th and 95th percentile"
         )
         is_fine = n_levels >= _MIN_LEVELS or upper - lower < _NEGLIGIBLE_RANGES.get(
             log.units[name], 0.0
@@ -629,16 +648,21 @@ def check_resolution(log: LogStatistics, make_finding: Check) -> Iterator[Findin
 @check(
     "values",
     "held",
-    fix="leave the cells between two measurements empty: held values are late by half an interval"
-    " and their derivative is spikes; a fit takes them out of the motion and smooths it",
+    fix=(
+        "leave the cells between two measurements empty: held values are late by half an interval"
+        " and their derivative consists of spikes; a fit excludes and smooths them"
+    ),
     on_subsample=True,
 )
 def check_sample_and_hold(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report slow sensors whose last value is repeated until the next."""
+    """Report slow sensors whose value is held until the next measurement."""
     for name in log.measured_motion:
         update_interval = median_update_interval(log[name])
         if update_interval >= 2.0:
-            text = f"{name} changes once in {update_interval:.0f} samples, its last value is held in between"
+            text = (
+                f"{name} changes once in {update_interval:.0f} samples, its last value is held in"
+                " between"
+            )
             yield make_finding(
                 text, {"every": update_interval}, level="note" if name in STATE_NAMES else None
             )
@@ -646,7 +670,7 @@ def check_sample_and_hold(log: LogStatistics, make_finding: Check) -> Iterator[F
 
 @check("values", "jump")
 def check_velocity_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report changes of a velocity's level within one sample, which a mass does not make."""
+    """Report steps of a velocity within one sample, which the inertia of a vessel excludes."""
     for name in (name for name in log.velocities if name in log.measured_motion):
         values = np.where(log.is_spike(name), np.nan, log[name])
         changes = np.abs(np.diff(values))
@@ -654,7 +678,7 @@ def check_velocity_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Fi
             continue
         changes = np.nan_to_num(changes)
         lower, upper = nan_quantiles(values, 0.01, 0.99)
-        # beyond noise, beyond what goes on beside it, and a good part of the whole range
+        # a step exceeds the noise, 30 % of the range, and four times the neighbouring changes
         min_jump = 0.3 * (upper - lower)
         min_jump = (
             max(8.0 * estimate_noise_std(values), min_jump) if changes.max() > min_jump else np.inf
@@ -669,7 +693,8 @@ def check_velocity_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Fi
             largest_index = int(np.argmax(np.where(is_jump, changes, 0.0)))
             text = (
                 f"{name} changes level {int(is_jump.sum())} times within one sample, at most by"
-                f" {format_quantity(changes[largest_index], log.units[name])} at t = {log.t[largest_index + 1]:.2f} s"
+                f" {format_quantity(changes[largest_index], log.units[name])} at t ="
+                f" {log.t[largest_index + 1]:.2f} s"
             )
             yield make_finding(
                 text,

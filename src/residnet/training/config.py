@@ -263,7 +263,7 @@ class TrainingConfig(MachineConfig):
         if self.beginnings is not None:
             lead = max(round(self.beginnings.initial / dt), 1)
         first = WindowStage(
-            round(one.window / dt), one.batch, 0, begun(one.batch), columns=("told", "good")
+            round(one.window / dt), one.batch, 0, begun(one.batch), columns=("precomputed", "trainable")
         )
         return [first if one.epochs else None] + [
             WindowStage(
@@ -272,7 +272,7 @@ class TrainingConfig(MachineConfig):
                 round(self.history / dt),
                 begun(stage.batch),
                 lead,
-                ("y", "smooth", "w", "usable"),
+                ("y", "smoothed", "w", "usable"),
             )
             for stage in self.multi_step
         ]

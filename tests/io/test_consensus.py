@@ -11,7 +11,7 @@ from fleets import CONTRADICTIONS, Fleet, drawn
 
 from residnet.core.log import Log
 from residnet.quality import Finding, inspect_log_set
-from residnet.quality.others import dead_commands
+from residnet.quality.consensus import find_unexplained_idle
 from residnet.quality.statistics import LogStatistics
 from residnet.tasks.fit.config import FitConfig
 from residnet.tasks.registry import load_task
@@ -25,13 +25,15 @@ def fleets(request: pytest.FixtureRequest) -> list[Fleet]:
     return drawn(request.param, _SEED, _COUNT)
 
 
-def found(logs: list[Log], fleet: Fleet) -> list[Finding]:
+def find_contradictions(logs: list[Log], fleet: Fleet) -> list[Finding]:
     findings = inspect_log_set(logs, fleet.inputs).findings
-    return [one for one in findings if one.code.startswith("contradicts")]
+    return [finding for finding in findings if finding.code.startswith("contradicts")]
 
 
 def test_clean_fleets_hold_no_contradiction(fleets: list[Fleet]) -> None:
-    assert [one.text for fleet in fleets[:2] for one in found(fleet.logs, fleet)] == []
+    assert [
+        one.text for fleet in fleets[:2] for one in find_contradictions(fleet.logs, fleet)
+    ] == []
 
 
 @pytest.mark.parametrize("what", CONTRADICTIONS)
@@ -42,7 +44,7 @@ def test_a_contradiction_is_named_with_its_cause(fleets: list[Fleet], what: str)
         logs, at, cause = CONTRADICTIONS[what](fleet, random)
         logs = [log.replace(name=f"log_{i:02d}") for i, log in enumerate(logs)]
         name = f"log_{at[0]:02d}" if at else fleet.steering
-        named = [one for one in found(logs, fleet) if one.text.startswith(name)]
+        named = [one for one in find_contradictions(logs, fleet) if one.text.startswith(name)]
         hits += any(cause in one.code for one in named)
         # scripts/bench/fleets.py tells how often, over many more of them
         if hits == _COUNT - 1:
@@ -62,7 +64,7 @@ def test_a_sign_an_offset_and_a_scale_are_told_apart(fleets: list[Fleet]) -> Non
         log = fleet.logs[2]
         channels = {**log.channels, name: change(log[name])}
         logs = [*fleet.logs[:2], log.replace(channels=channels), *fleet.logs[3:]]
-        (one,) = [one for one in found(logs, fleet) if one.text.startswith(log.name)]
+        (one,) = [one for one in find_contradictions(logs, fleet) if one.text.startswith(log.name)]
         assert one.code == f"contradicts_{cause}"
         assert f"{name} would have to" in one.text
         assert words in one.text
@@ -73,7 +75,7 @@ def test_no_log_of_the_quickstart_is_accused() -> None:
     task = load_task(Path("quickstart"))
     assert isinstance(task, FitConfig)
     logs = [log for members in task.load_logs().values() for log in members]
-    assert found(logs, Fleet("quickstart", logs, [], ("n_port", "n_stbd"), "")) == []
+    assert find_contradictions(logs, Fleet("quickstart", logs, [], ("n_port", "n_stbd"), "")) == []
 
 
 def _exchanged(log: Log) -> dict[str, np.ndarray]:
@@ -110,9 +112,9 @@ def test_logs_with_one_fault_do_not_hide_each_other(
         log.replace(channels={name: log[name] for name in (*states, *fleet.inputs)})
         for log in fleet.logs
     ]
-    assert found(logs, fleet) == []
+    assert find_contradictions(logs, fleet) == []
     wrong = [log.replace(channels={**log.channels, **change(log)}) for log in logs[:3]]
-    named = found([*wrong, *logs[3:]], fleet)
+    named = find_contradictions([*wrong, *logs[3:]], fleet)
     assert sorted(one.text.split(":")[0] for one in named) == [log.name for log in logs[:3]]
     assert {one.code for one in named} == {f"contradicts_{cause}"}
 
@@ -130,11 +132,13 @@ def _hand_on_the_wheel(fleet: Fleet) -> tuple[list[Log], slice]:
 def test_motion_without_a_command_is_found_where_it_is(fleets: list[Fleet]) -> None:
     fleet = fleets[0]
     records = [LogStatistics(log, fleet.inputs) for log in fleet.logs]
-    assert dead_commands(records, [], fleet.inputs) == {}
+    assert find_unexplained_idle(records, [], fleet.inputs) == {}
     logs, rows = _hand_on_the_wheel(fleet)
     records = [LogStatistics(log, fleet.inputs) for log in logs]
-    for learned, further in ((records, []), (records[1:], records[:1])):
-        ((start, stop),) = dead_commands(learned, further, fleet.inputs)[logs[0].name]
+    for training, predicted_only in ((records, []), (records[1:], records[:1])):
+        ((start, stop),) = find_unexplained_idle(training, predicted_only, fleet.inputs)[
+            logs[0].name
+        ]
         assert abs(start - rows.start) <= 1
         assert abs(stop - rows.stop) <= 1
     (told,) = inspect_log_set(logs, fleet.inputs).find_by_code("dead_commands")
@@ -145,8 +149,8 @@ def test_two_logs_that_contradict_each_other_are_named() -> None:
     (fleet,) = drawn("boat", _SEED, 1)
     log = fleet.logs[1]
     channels = {**log.channels, fleet.steering: -log[fleet.steering]}
-    assert found(fleet.logs[:2], fleet) == []
-    (one,) = found([fleet.logs[0], log.replace(channels=channels)], fleet)
+    assert find_contradictions(fleet.logs[:2], fleet) == []
+    (one,) = find_contradictions([fleet.logs[0], log.replace(channels=channels)], fleet)
     assert "no more than half of the logs agree" in one.text
 
 
@@ -164,8 +168,8 @@ def test_logs_of_a_surge_alone_are_looked_at_too() -> None:
 
     logs = [surge(number, 1.0) for number in range(6)]
     fleet = Fleet("lake", logs, [], ("n",), "n")
-    assert found(logs, fleet) == []
-    (one,) = found([*logs, surge(6, 0.3)], fleet)
+    assert find_contradictions(logs, fleet) == []
+    (one,) = find_contradictions([*logs, surge(6, 0.3)], fleet)
     assert one.text.startswith("run_6")
 
 
@@ -202,7 +206,7 @@ def test_what_no_other_log_has_run_accuses_none(name: str) -> None:
         motion += 0.003 * random.standard_normal(motion.shape)
         logs.append(Log(f"run_{number}", t, {"u": u, "v": v, "r": r, "n": n, name: angle}))
     fleet = Fleet("ferry", logs, [], ("n", name), name)
-    assert [one.text for one in found(logs, fleet)] == []
+    assert [one.text for one in find_contradictions(logs, fleet)] == []
     beyond = inspect_log_set(logs, fleet.inputs)
     assert [one.level for one in beyond.find_by_code("beyond_others")] == ["note"]
 
@@ -217,13 +221,17 @@ def test_gusts_on_straight_runs_are_no_dead_rudder(fleets: list[Fleet]) -> None:
         level = {name: np.full(len(log), float(np.median(log[name]))) for name in fleet.inputs}
         way = {"psi": psi, "r": np.gradient(psi, log.t), "v": 0.0 * psi}
         logs.append(log.replace(channels={**log.channels, **level, **way}))
-    assert [one.text for one in found(logs, fleet) if one.code == "contradicts_dead"] == []
+    assert [
+        one.text for one in find_contradictions(logs, fleet) if one.code == "contradicts_dead"
+    ] == []
 
 
 def test_a_log_of_one_sample_is_passed_over(fleets: list[Fleet]) -> None:
     fleet = fleets[0]
     short = fleet.logs[0].select_rows(slice(1)).replace(name="short")
-    assert found([short, *fleet.logs], fleet) == found(fleet.logs, fleet)
+    assert find_contradictions([short, *fleet.logs], fleet) == find_contradictions(
+        fleet.logs, fleet
+    )
 
 
 @pytest.mark.parametrize(("size", "speed"), [(2, 1.0), (10, 1.0), (400, 0.0)])

@@ -1,0 +1,1044 @@
+"""Find the logs of one vessel that contradict the other logs, and explain each outlier.
+
+Every log is predicted by a linear regression fitted to the *other* logs (leave-one-log-out). The
+regression is a one-step model without vessel knowledge: the change of each velocity over a block of
+a few seconds, regressed on the time integral of polynomial features of velocities and inputs.
+
+Two statistics flag a log. Both are relative to their spread over the inliers, so that noise, gusts
+and the polynomial's own misfit, which all logs share, flag none:
+
+- `rmse_ratio`: the log's residuals under the others' model, over what is usual among inliers;
+- `score_test`: whether the hull or an input would need a scale factor of its own in this log.
+
+An outlier is then predicted again under one hypothesis after the other (dead record, sign, scale,
+offset, delay, swapped sides, heading, current, other vessel). The most likely one is reported.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import scipy
+
+from residnet.core.arrays.paged import MAX_SAMPLES_IN_MEMORY
+from residnet.core.layout import SIX_DOF_LAYOUT
+from residnet.core.names import VELOCITY_NAMES, azimuth_thrusters, port_starboard_pairs
+from residnet.core.stretches import find_runs
+from residnet.core.units import unit_confusions
+from residnet.preprocessing.channel_values import SIGMA_OF_MAD
+from residnet.preprocessing.statistics import MIN_SAMPLES
+from residnet.quality.findings import describe_unit_confusion, format_quantity
+from residnet.quality.statistics import (
+    STEERING_CHANNELS,
+    LogStatistics,
+    count_reversals,
+    interpolate_gaps,
+    make_blocks,
+)
+
+# Regression
+RIDGE = 1e-6
+"""Ridge penalty over the mean of the Gram matrix's diagonal: collinear features stay solvable."""
+OVERLAP = 4.0
+"""Blocks that overlap each sample; so many of their residuals count as one independent residual."""
+MIN_BLOCKS, MAX_BLOCKS = 12, 1500
+"""Blocks below which a log decides nothing, and beyond which further ones only overlap more."""
+CHUNK_SAMPLES = 20_000
+"""Samples assembled at a time, of some thirty features: they stay in a core's cache."""
+POLYNOMIAL_PREFERENCE = 0.95
+"""The polynomial with constants is taken where its error is below this share of the other's."""
+
+# Outlier decision, calibrated on 80 random fleets so that 3 clean ones are flagged
+# (scripts/bench/fleets.py --seed 1, 2)
+MAX_SCORE_TEST, MAX_RMSE_RATIO, MAX_RMSE_Z = 4.8, 1.8, 5.5
+USUAL_SCORE_TEST = 1.3
+"""Expected score test of a correct model: mean of the largest of three chi over their size."""
+MIN_LOG_RMSE_STD = 0.1
+"""Least standard deviation of log(RMSE) among logs of one vessel."""
+MIN_MATERIAL_ERROR = 0.15
+"""Share of the response that must be mispredicted: smaller differences mislead no fit."""
+MAX_SUSPECTS, MIN_SUSPICION = 8, 0.5
+"""Logs left out in turn (bounds the time on large fleets), and the severity from which one is."""
+MAX_REFERENCES = 40
+"""Inliers, evenly spread, that define what is usual in a large fleet."""
+CV_FOLDS = 4
+"""Stretches of a log that are predicted from each other where there are too few logs."""
+LTS_STEPS = 3
+"""Concentration steps of the least-trimmed-squares search."""
+MIN_CONTAMINATION = 1.6
+"""RMSE of the clean half under the model of all logs, over its own, that reveals a shared fault.
+
+1.5 at most without one (`quickstart`; 1 in 48 random fleets); more in 33 of 36 random fleets in
+which two logs share a fault.
+"""
+RANGE_MARGIN, SIZE_MARGIN = 0.1, 0.02
+"""Share of the inliers' range, or of their size, within which extrapolation is still trusted."""
+
+# Motion that no input explains. Of 92 idle stretches of KVLCC2's logs none reaches 3.2; of 311 of
+# the tanker's six do, among them all three in which she accelerates with all inputs at exactly 0.
+MIN_UNEXPLAINED_Z, MAX_UNEXPLAINED_SHARE = 5.5, 0.2
+"""RMS standardized residual of an unexplained idle stretch, and the share of a log up to which
+such stretches are a manual override rather than a wrong log."""
+
+Samples = Mapping[str, np.ndarray]
+"""Channels at the samples of blocks, [K, samples of a block] each."""
+
+
+# --- features and block data -----------------------------------------------------------------
+
+
+def _thrust_components(log: Samples, inputs: Sequence[str]) -> tuple[list[np.ndarray], list[str]]:
+    """Return the thrust of azimuth thrusters along both body axes, and the remaining inputs."""
+    azimuths = azimuth_thrusters(inputs)
+    # quadratic in the revolutions; the azimuth angle turns the thrust, hence a complex number
+    thrusts = [log[n] * np.abs(log[n]) * np.exp(1j * log[angle]) for angle, n in azimuths.items()]
+    other_inputs = [
+        name for name in inputs if name not in azimuths and name not in azimuths.values()
+    ]
+    return [part for thrust in thrusts for part in (thrust.real, thrust.imag)], other_inputs
+
+
+def compute_block_features(
+    log: Samples,
+    units: Mapping[str, str],
+    velocities: Sequence[str],
+    inputs: Sequence[str],
+    *,
+    homogeneous: bool,
+) -> list[np.ndarray]:
+    """Compute the regression features of a log, one array per feature.
+
+    Args:
+        log: channels at the samples of the blocks, [K, samples of a block] each.
+        units: unit of each channel.
+        velocities: surge first.
+        inputs: channels that drive the vessel; wind among them adds its load.
+        homogeneous: forces of second degree in velocities and revolutions only, as of a hull in
+            water, which extrapolate to other speeds; else a polynomial with constant and linear
+            terms, which fits more vessels.
+    """
+    states = [log[name] for name in velocities]
+    u = states[0]
+    columns = [x * np.abs(x) for x in states]
+    columns += [a * b for a, b in itertools.combinations(states, 2)]
+    if "q" in velocities:
+        # weight and buoyancy act along the vertical, seen from the axes of a diving vessel
+        level = np.cos(log["theta"])
+        columns += [np.sin(log["theta"]), level * np.sin(log["phi"]), level * np.cos(log["phi"])]
+    actuators = [name for name in inputs if not name.startswith(("wind", "current"))]
+    thrusts, other_inputs = _thrust_components(log, actuators)
+    if homogeneous:
+        angles = [log[name] for name in other_inputs if units[name] == "rad"]
+        revs = [log[name] for name in other_inputs if units[name] != "rad"]
+        columns += [np.abs(u) * x for x in states[1:]]
+        columns += [*thrusts, *(u * thrust for thrust in thrusts)]
+        for n in revs:
+            columns += [n * np.abs(n), u * n]
+        if len(revs) <= 4:
+            columns += [np.abs(n) * x for n in revs for x in states[1:]]
+            columns += [a * b for a, b in itertools.combinations(revs, 2)]
+        for inflow in (u, *revs[:4]):
+            columns += [inflow * np.abs(inflow) * a**power for a in angles for power in (1, 2)]
+    else:
+        drives = [*thrusts, *(log[name] for name in other_inputs)]
+        columns += [np.ones_like(u), *states, *drives]
+        # beyond four inputs each enters linearly only, or the features outnumber the blocks
+        for a in drives if len(drives) <= 4 else ():
+            columns += [a * np.abs(a), u * a, u * np.abs(u) * a]
+            columns += [b * np.abs(b) * a for b in drives if b is not a]
+    if {"wind_speed", "wind_dir"} <= set(inputs) and "psi" in log:
+        pressure = log["wind_speed"] * np.abs(log["wind_speed"])
+        angle = log["wind_dir"] - log["psi"]
+        columns += [pressure * f for f in (np.cos(angle), np.sin(angle), np.sin(2.0 * angle))]
+    return columns
+
+
+@dataclass(frozen=True)
+class BlockData:
+    """Design matrix X [K, k] and response Y [K, n] of the blocks of one log.
+
+    Attributes:
+        start: first sample of each block [K].
+        length: samples of a block.
+        noise_var: variance [n] that sensor noise adds to Y.
+    """
+
+    X: np.ndarray
+    Y: np.ndarray
+    start: np.ndarray
+    length: int
+    noise_var: np.ndarray
+
+    @property
+    def is_sufficient(self) -> bool:
+        """Whether there are enough blocks to decide anything."""
+        return len(self.Y) >= MIN_BLOCKS
+
+    def subset(self, rows: np.ndarray) -> BlockData:
+        """Return some of the blocks, by indices or mask."""
+        return BlockData(self.X[rows], self.Y[rows], self.start[rows], self.length, self.noise_var)
+
+    @cached_property
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """X'X and X'Y."""
+        return self.X.T @ self.X, self.X.T @ self.Y
+
+
+def pool_moments(data: Iterable[BlockData]) -> list[np.ndarray]:
+    """Return X'X and X'Y summed over logs."""
+    return [np.sum(part, axis=0) for part in zip(*(d.moments for d in data), strict=True)]
+
+
+class RidgeFit:
+    """A ridge regression, from X'X and X'Y.
+
+    Attributes:
+        coef: [k, n].
+        gram_inv: regularised (X'X)^-1 [k, k].
+        residual_var: variance [n] that the model usually leaves, 1 until it is known.
+    """
+
+    def __init__(self, gram: np.ndarray, cross: np.ndarray) -> None:
+        # the Gram matrix of a vessel at rest is zero
+        penalty = RIDGE * (np.trace(gram) / len(gram) or 1.0)
+        self.gram_inv = np.linalg.inv(gram + penalty * np.eye(len(gram)))
+        self.coef = self.gram_inv @ cross
+        self.residual_var = np.ones(self.coef.shape[1])
+
+    def compute_residuals(self, data: BlockData) -> np.ndarray:
+        """Return Y - X coef [K, n]."""
+        return np.asarray(data.Y - data.X @ self.coef)
+
+    def compute_leverage(self, data: BlockData) -> np.ndarray:
+        """Return x' (X'X)^-1 x [K], the coefficients' share in the predictive variance."""
+        return np.asarray(((data.X @ self.gram_inv) * data.X).sum(1))
+
+    def compute_mse(self, data: BlockData) -> np.ndarray:
+        """Return the mean squared residual [n], corrected for leverage."""
+        return np.asarray(
+            (self.compute_residuals(data) ** 2 / (1.0 + self.compute_leverage(data))[:, None]).mean(
+                0
+            )
+        )
+
+    def compute_predictive_std(self, data: BlockData) -> np.ndarray:
+        """Return the standard deviation of a new response [K, n]."""
+        variance = self.residual_var + data.noise_var
+        return np.asarray(np.sqrt(variance * (1.0 + self.compute_leverage(data))[:, None]))
+
+    def standardize_residuals(self, data: BlockData) -> np.ndarray:
+        """Return the residuals over their predictive standard deviation [K, n]."""
+        return np.asarray(self.compute_residuals(data) / self.compute_predictive_std(data))
+
+    def compute_deviance(self, data: BlockData) -> float:
+        """Return minus twice the mean log-likelihood of a block, constants left out."""
+        fit = (self.standardize_residuals(data) ** 2).sum(1).mean()
+        return float(fit) + self.compute_leverage_penalty(data)
+
+    def compute_leverage_penalty(self, data: BlockData) -> float:
+        """Return the part of the deviance that does not depend on Y."""
+        return float(self.residual_var.size * np.log1p(self.compute_leverage(data)).mean())
+
+
+def cross_validate_mse(data: BlockData) -> np.ndarray:
+    """Return the mean squared residual [n] of a log's quarters under models of its others."""
+    folds = [data.subset(rows) for rows in np.array_split(np.arange(len(data.Y)), CV_FOLDS)]
+    return np.asarray(
+        np.mean(
+            [
+                RidgeFit(*pool_moments([*folds[:k], *folds[k + 1 :]])).compute_mse(fold)
+                for k, fold in enumerate(folds)
+            ],
+            axis=0,
+        )
+    )
+
+
+# --- a fleet of logs and its outliers --------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Score:
+    """How a log compares with the inliers.
+
+    Attributes:
+        score_test: of its contributions, in standard errors over what is usual.
+        rmse_ratio: its RMSE over what is usual [n].
+        rmse_z: log(RMSE) in standard deviations of the inliers', at most.
+        material_error: mispredicted share of the response.
+    """
+
+    score_test: float
+    rmse_ratio: np.ndarray
+    rmse_z: float
+    material_error: float
+
+    @property
+    def severity(self) -> float:
+        """Beyond 1 the log is an outlier."""
+        if self.material_error < MIN_MATERIAL_ERROR:
+            return 0.0
+        ratio = float(np.nanmax(self.rmse_ratio, initial=0.0)) / MAX_RMSE_RATIO
+        return max(self.score_test / MAX_SCORE_TEST, min(ratio, self.rmse_z / MAX_RMSE_Z))
+
+
+class Fleet:
+    """Logs of one vessel as regression data in common scales.
+
+    Args:
+        logs: each with an increasing clock, and the same channels.
+        inputs: channels that drive the vessel.
+
+    Attributes:
+        velocities: channels of the response.
+        actuators: inputs without wind and current.
+        data: one entry per log.
+        usable: indices of logs with is_sufficient data.
+    """
+
+    def __init__(self, logs: Sequence[LogStatistics], inputs: Sequence[str]) -> None:
+        self.logs, self.inputs = list(logs), tuple(inputs)
+        has_six_dof = all(name in log for log in logs for name in SIX_DOF_LAYOUT.dynamic_states)
+        common_velocities = [name for name in VELOCITY_NAMES if all(name in log for log in logs)]
+        self.velocities = list(SIX_DOF_LAYOUT.velocities) if has_six_dof else common_velocities
+        self.actuators = [name for name in inputs if not name.startswith(("wind", "current"))]
+        lengths = [
+            make_blocks(log, *self.velocities).length * log.sampling_interval
+            for log in logs
+            if len(log) >= MIN_SAMPLES
+        ]
+        self.block_seconds = float(np.median(lengths)) if lengths else 1.0
+        errors = {form: self._standardize(homogeneous=form) for form in (False, True)}
+        if errors[False] < POLYNOMIAL_PREFERENCE * errors[True]:
+            self._standardize(homogeneous=False)
+
+    def _standardize(self, *, homogeneous: bool) -> float:
+        """Set the data in one form of features; return the median leave-one-out error."""
+        self.homogeneous = homogeneous
+        raw = [self.assemble(log) for log in self.logs]
+        self.usable = [i for i, data in enumerate(raw) if data.is_sufficient]
+
+        def scale(of: Callable[[BlockData], np.ndarray]) -> np.ndarray:
+            squares = [np.mean(of(raw[i]) ** 2, axis=0) for i in self.usable]
+            rms = np.sqrt(np.mean(squares, axis=0)) if squares else np.ones(1)
+            return np.where(rms == 0.0, 1.0, rms)
+
+        self.x_scale, self.y_scale = scale(lambda data: data.X), scale(lambda data: data.Y)
+        self.data = [self._scale_data(data) for data in raw]
+        if len(self.usable) < 2:
+            return 0.0
+        fits = self.fit_leave_one_out(self.usable, self.usable)
+        return float(
+            np.median([np.sqrt(fits[i].compute_mse(self.data[i])).sum() for i in self.usable])
+        )
+
+    def assemble(self, log: LogStatistics) -> BlockData:
+        """Return the unscaled data of a log."""
+        length = len(log)
+        if length >= MIN_SAMPLES:
+            length = max(round(self.block_seconds / log.sampling_interval), 4)
+        stride = max(length // int(OVERLAP), (len(log) - length) // MAX_BLOCKS, 1)
+        start = np.arange(0, max(len(log) - length, 0), stride)
+        needed = {*self.velocities, *self.inputs, "psi", "phi", "theta"} & {*log}
+        integrals = []
+        for chunk in np.array_split(start, max(start.size * length // CHUNK_SAMPLES, 1)):
+            sample_index = chunk[:, None] + np.arange(length + 1)
+            samples = {name: log[name][sample_index] for name in needed}
+            dt = np.diff(log.t[sample_index], axis=1)
+            columns = compute_block_features(
+                samples, log.units, self.velocities, self.inputs, homogeneous=self.homogeneous
+            )
+            trapezoids = [0.5 * ((c[:, 1:] + c[:, :-1]) * dt).sum(1) for c in columns]
+            integrals.append(np.stack(trapezoids, axis=-1))
+        X = np.concatenate(integrals)
+        end = start + length
+        Y = np.stack([log[name][end] - log[name][start] for name in self.velocities], axis=-1)
+        valid = np.isfinite(X).all(1) & np.isfinite(Y).all(1)
+        # a block across a gap lasts longer
+        valid &= log.t[end] - log.t[start] <= (length + 3.0) * log.sampling_interval
+        noise_var = np.array([2.0 * log.noise_std(name) ** 2 for name in self.velocities])
+        return BlockData(X, Y, start, length, noise_var).subset(valid)
+
+    def _scale_data(self, data: BlockData) -> BlockData:
+        return BlockData(
+            data.X / self.x_scale,
+            data.Y / self.y_scale,
+            data.start,
+            data.length,
+            data.noise_var / self.y_scale**2,
+        )
+
+    def assemble_scaled(self, log: LogStatistics) -> BlockData:
+        """Return the data of any log in the scales of the fleet."""
+        return self._scale_data(self.assemble(log))
+
+    def with_data(self, data: Mapping[int, BlockData]) -> Fleet:
+        """Return the fleet with copied_fleet data of some logs."""
+        copied_fleet = copy.copy(self)
+        copied_fleet.data = [data.get(i, current) for i, current in enumerate(self.data)]
+        return copied_fleet
+
+    def fit_leave_one_out(self, members: Sequence[int], of: Iterable[int]) -> dict[int, RidgeFit]:
+        """Return for each log the fit to the members, itself left out."""
+        gram, cross = pool_moments(self.data[j] for j in members)
+        fits = {}
+        for i in of:
+            log_moments = self.data[i].moments if i in members else (0.0, 0.0)
+            fits[i] = RidgeFit(gram - log_moments[0], cross - log_moments[1])
+        return fits
+
+    def estimate_excess_var(
+        self, logs: Sequence[int], fits: Mapping[int, RidgeFit], members: int
+    ) -> dict[int, np.ndarray]:
+        """Return the residual variance [n] of logs beyond their sensor noise.
+
+        Fewer than three other logs predict too badly: then it is cross-validated within each log.
+        """
+        mse = {
+            i: (
+                fits[i].compute_mse(self.data[i])
+                if members > 3
+                else cross_validate_mse(self.data[i])
+            )
+            for i in logs
+        }
+        return {i: np.maximum(mse[i] - self.data[i].noise_var, 0.0) for i in logs}
+
+    def score_logs(self, inliers: Sequence[int], of: Sequence[int]) -> dict[int, Score]:
+        """Return how logs compare with the inliers, themselves left out."""
+        references = inliers[:: -(-len(inliers) // MAX_REFERENCES)]
+        logs = [i for i in dict.fromkeys((*references, *of)) if len(inliers) > (i in inliers)]
+        fits = self.fit_leave_one_out(inliers, logs)
+        mse = {i: fits[i].compute_mse(self.data[i]) for i in logs}
+        excess = self.estimate_excess_var(references, fits, len(references))
+        expected = {
+            i: np.median([excess[j] for j in references if j != i], axis=0) + self.data[i].noise_var
+            for i in logs
+        }
+        ratio = {i: np.sqrt(mse[i] / expected[i]) for i in logs}
+        log_ratio = {i: np.log(np.maximum(ratio[i], 1e-6)) for i in logs}
+        tests = {i: self.run_score_test(i, fits[i], expected[i]) for i in logs}
+        references = [i for i in references if i in ratio]
+        # a few logs have no spread to speak of
+        center, std, misfit = np.zeros(1), np.full(1, np.inf), 1.0
+        if len(references) > 4:
+            center = np.median([log_ratio[i] for i in references], axis=0)
+            mad = np.median([np.abs(log_ratio[i] - center) for i in references], axis=0)
+            std = np.hypot(SIGMA_OF_MAD * mad, MIN_LOG_RMSE_STD)
+        if len(references) > 2:
+            # features that do not fit the vessel fail the test in every log
+            usual = float(np.median([tests[i][0] for i in references]))
+            misfit = max(1.0, usual / USUAL_SCORE_TEST)
+        return {
+            i: Score(
+                tests[i][0] / misfit,
+                ratio[i],
+                float(((log_ratio[i] - center) / std).max()),
+                max(tests[i][1], float(np.sqrt(np.maximum(mse[i] - expected[i], 0.0)).max())),
+            )
+            for i in of
+        }
+
+    @cached_property
+    def feature_groups(self) -> list[np.ndarray]:
+        """Masks [k] of the features without any input, then of those that hold each actuator."""
+        log = self.logs[self.usable[0]]
+        X = self.assemble(log).X
+        groups = []
+        for name in self.actuators:
+            perturbed = self.assemble(replace_channels(log, {name: 1.7 * log[name] + 0.1})).X
+            rows = min(len(perturbed), len(X))
+            groups.append((np.abs(perturbed[:rows] - X[:rows]) > 0.0).any(0))
+        hull = ~np.logical_or.reduce(groups) if groups else np.ones(X.shape[1], dtype=bool)
+        return [hull, *groups]
+
+    def compute_contributions(self, i: int, fit: RidgeFit) -> np.ndarray:
+        """Return what hull and actuators contribute to the response [n, K, groups], 0 if tiny."""
+        X = self.data[i].X
+        parts = [X[:, group] @ fit.coef[group] for group in self.feature_groups]
+        table = np.stack(parts, axis=-1).transpose(1, 0, 2)
+        return np.asarray(table * (np.abs(table).max(axis=1, keepdims=True) > 1e-9))
+
+    def run_score_test(self, i: int, fit: RidgeFit, variance: np.ndarray) -> tuple[float, float]:
+        """Test whether a log needs a scale factor of its own on each contribution (Rao 1948).
+
+        Args:
+            variance: of the residuals that is expected [n].
+
+        Returns:
+            The statistic, RMS over the contributions, and the share of the response that such
+            factors change; both of the worst velocity.
+        """
+        data, table = self.data[i], self.compute_contributions(i, fit)
+        transposed = table.transpose(0, 2, 1)
+        score = transposed @ fit.compute_residuals(data).T[..., None]
+        information, cross = transposed @ table, transposed @ data.X
+        covariance = information + cross @ fit.gram_inv @ cross.transpose(0, 2, 1)
+        covariance = OVERLAP * np.maximum(variance, 1e-12)[:, None, None] * covariance
+        inverse = np.linalg.pinv(covariance, rcond=1e-9, hermitian=True)
+        statistic = (score.transpose(0, 2, 1) @ inverse @ score)[:, 0, 0]
+        count = np.maximum(table.any(axis=1).sum(axis=1), 1)
+        factors = np.linalg.pinv(information, rcond=1e-6, hermitian=True) @ score
+        change = np.sqrt(np.mean((table @ factors) ** 2, axis=1))
+        return float(np.sqrt(np.maximum(statistic, 0.0) / count).max()), float(change.max())
+
+    def find_least_trimmed_half(self) -> list[int]:
+        """Return the half of the logs that agree best.
+
+        Several logs with one fault spoil the model of all, so that none is an outlier. This is
+        least trimmed squares over logs (Rousseeuw and Van Driessen 2006), from single logs on.
+        """
+        within_log_mse = {
+            i: np.maximum(cross_validate_mse(self.data[i]), 1e-12) for i in self.usable
+        }
+        best, best_loss = list(self.usable), math.inf
+        for seed in self.usable[:: -(-len(self.usable) // MAX_SUSPECTS)]:
+            half = [seed]
+            for _ in range(LTS_STEPS):
+                loss = {}
+                fits = self.fit_leave_one_out(half, [i for i in self.usable if [i] != half])
+                for i in self.usable:
+                    ratio = (
+                        fits[i].compute_mse(self.data[i]) / within_log_mse[i]
+                        if i in fits
+                        else np.ones(1)
+                    )
+                    loss[i] = float(ratio.max())
+                half = sorted(loss, key=lambda i: loss[i])[: len(self.usable) // 2 + 1]
+            total = sum(loss[i] for i in half)
+            if total < best_loss:
+                best, best_loss = sorted(half), total
+        return best
+
+
+@dataclass
+class Consensus:
+    """The inliers and outliers of a fleet.
+
+    Attributes:
+        fleet: with the data that the decision is on.
+        inliers: indices of logs that agree.
+        outliers: indices of those that do not, the worst first.
+        idle: unexplained idle stretches that are known, by log.
+    """
+
+    fleet: Fleet
+    inliers: list[int]
+    outliers: list[int] = field(default_factory=list)
+    idle: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
+
+    @cached_property
+    def excess_var(self) -> dict[int, np.ndarray]:
+        """Residual variance [n] of each inlier beyond its noise, under the model of the others."""
+        has_several = len(self.inliers) > 1
+        fits = self.fleet.fit_leave_one_out(self.inliers, self.inliers) if has_several else {}
+        return self.fleet.estimate_excess_var(self.inliers, fits, len(self.inliers))
+
+    def fit_inliers(self, excluding: int | None = None) -> RidgeFit:
+        """Return the fit to the inliers, one of them left out, with its usual residuals."""
+        key = -1 if excluding is None else excluding
+        fit = self.fleet.fit_leave_one_out(self.inliers, [key])[key]
+        usual = [variance for i, variance in self.excess_var.items() if i != excluding]
+        fit.residual_var = np.maximum(np.median(usual, axis=0), 1e-12)
+        return fit
+
+    @property
+    def has_majority(self) -> bool:
+        """Whether most logs are inliers, so that the outliers are the wrong ones."""
+        return len(self.inliers) > max(1.0, len(self.fleet.usable) / 2.0)
+
+    def compute_rmse_ratio(self, i: int) -> float:
+        """Return the RMSE of a log over what is usual, of its worst velocity."""
+        return float(np.nanmax(self.fleet.score_logs(self.inliers, [i])[i].rmse_ratio))
+
+    def is_outlier(self, i: int, data: BlockData | None = None) -> bool:
+        """Return whether a log, or part of its data, contradicts the inliers."""
+        fleet = self.fleet if data is None else self.fleet.with_data({i: data})
+        return fleet.score_logs(self.inliers, [i])[i].severity > 1.0
+
+    def compute_influence(self, i: int) -> float:
+        """Return by how much a log changes the predictions of a fit to all, as a share of them."""
+        other_data = [self.fleet.data[j] for j in self.inliers if j != i]
+        fit_without = RidgeFit(*pool_moments(other_data))
+        fit_with = RidgeFit(*pool_moments([*other_data, self.fleet.data[i]]))
+        change = np.concatenate(
+            [data.X @ (fit_without.coef - fit_with.coef) for data in other_data]
+        )
+        return float(np.sqrt(np.mean(change**2, axis=0)).max())
+
+    def compute_residual_share(self) -> np.ndarray:
+        """Return the unexplained share of the change of each velocity [n]."""
+        return np.asarray(np.sqrt(np.median([*self.excess_var.values()], axis=0)))
+
+    def find_unexplained_idle(self, i: int) -> list[tuple[int, int]]:
+        """Return the unexplained idle stretches of one of the logs, first and last samples."""
+        fleet = self.fleet
+        if i not in fleet.usable or len(self.inliers) < 2 or not fleet.actuators:
+            return []
+        if i not in self.idle:
+            # nothing explains any part of an outlier: there only inputs at exactly zero count
+            at_zero = i not in self.inliers
+            self.idle[i] = self.find_idle_stretches(
+                fleet.logs[i], fleet.data[i], i, at_zero=at_zero
+            )
+        return self.idle[i]
+
+    def find_idle_stretches(
+        self,
+        log: LogStatistics,
+        data: BlockData,
+        excluding: int | None = None,
+        *,
+        at_zero: bool = False,
+    ) -> list[tuple[int, int]]:
+        """Return stretches in which all inputs are constant and nothing explains the motion.
+
+        None where they take up more than a fifth of the log, which then is a wrong one.
+
+        Args:
+            excluding: log that the model is not fitted to.
+            at_zero: inputs must be exactly zero.
+        """
+        inputs = log.log.stack(self.fleet.actuators)
+        constant = (np.diff(inputs, axis=0) == 0.0).all(1)
+        if at_zero:
+            constant &= (inputs[1:] == 0.0).all(1)
+        starts, stops = find_runs(np.append(constant, False))
+        is_long = stops - starts >= data.length
+        if not is_long.any():
+            return []
+        z = self.fit_inliers(excluding).standardize_residuals(data)
+        idle = []
+        for start, stop in zip(starts[is_long].tolist(), stops[is_long].tolist(), strict=True):
+            inside = (data.start >= start) & (data.start + data.length <= stop)
+            if inside.sum() > 1:
+                unexplained = np.sqrt(np.mean(z[inside] ** 2, axis=0)) > MIN_UNEXPLAINED_Z
+                material = np.sqrt(np.mean(data.Y[inside] ** 2, axis=0)) > MIN_MATERIAL_ERROR
+                if (unexplained & material).any():
+                    idle.append((start, stop))
+        is_mostly_idle = sum(b - a for a, b in idle) > MAX_UNEXPLAINED_SHARE * len(log)
+        return [] if is_mostly_idle else idle
+
+    def is_only_extrapolating(self, i: int) -> bool:
+        """Return whether a log leaves the inliers' range of inputs, and is an outlier only there.
+
+        A log that lies outside from end to end has no part that could confirm it.
+        """
+        fleet, data = self.fleet, self.fleet.data[i]
+
+        def collect_signals(log: LogStatistics) -> np.ndarray:
+            thrusts, other_inputs = _thrust_components(dict(log.log.channels), fleet.actuators)
+            return np.stack([*thrusts, *(log[name] for name in (*other_inputs, *fleet.velocities))])
+
+        inlier_signals = [collect_signals(fleet.logs[j]) for j in self.inliers if j != i]
+        lower = np.min([np.nanmin(values, axis=1) for values in inlier_signals], axis=0)
+        upper = np.max([np.nanmax(values, axis=1) for values in inlier_signals], axis=0)
+        size = np.maximum(np.abs(lower), np.abs(upper))
+        margin = np.maximum(RANGE_MARGIN * (upper - lower), SIZE_MARGIN * size)
+        log_signals = collect_signals(fleet.logs[i])
+        is_outside = (log_signals < (lower - margin)[:, None]) | (
+            log_signals > (upper + margin)[:, None]
+        )
+        is_input_outside = is_outside[: -len(fleet.velocities)].any(axis=0)
+        if not is_input_outside.any() or is_input_outside.all():
+            return False
+        # the unknown motion that such inputs lead to lasts longer than they do
+        is_outside = is_outside.any(axis=0)
+        for start, stop in zip(*find_runs(is_outside), strict=True):
+            is_outside[start:stop] = is_input_outside[start:stop].any()
+        count = np.append(0, np.cumsum(is_outside))
+        data_inside = data.subset(count[data.start + data.length + 1] == count[data.start])
+        return not data_inside.is_sufficient or not self.is_outlier(i, data_inside)
+
+
+def find_consensus(logs: Sequence[LogStatistics], inputs: Sequence[str]) -> Consensus:
+    """Return which logs of one vessel agree.
+
+    Args:
+        logs: each with an increasing clock, and the same channels.
+        inputs: channels that drive the vessel.
+    """
+    fleet = Fleet(logs, inputs)
+    if len(fleet.usable) < 2:
+        return Consensus(fleet, fleet.usable)
+    consensus = _partition_logs(fleet, fleet.usable)
+    # A fault that several logs share spoils the model of all, and none stands out. The best half
+    # is clean of it, but any log from the edge of the vessel's range is an outlier there: that
+    # half counts only where the model of all is clearly worse on it.
+    half = _partition_logs(consensus.fleet, consensus.fleet.find_least_trimmed_half())
+    fits = half.fleet.fit_leave_one_out(consensus.inliers, half.inliers)
+    under_all = half.fleet.estimate_excess_var(half.inliers, fits, len(half.inliers))
+    ratios = [under_all[i] / np.maximum(half.excess_var[i], 1e-12) for i in half.inliers]
+    contaminated = float(np.median(ratios, axis=0).max()) >= MIN_CONTAMINATION**2
+    return half if contaminated else consensus
+
+
+def _partition_logs(fleet: Fleet, start: Sequence[int]) -> Consensus:
+    """Return inliers and outliers: a start set grows by all that agree, then loses the worst."""
+    inliers = list(start)
+    while remaining := [i for i in fleet.usable if i not in inliers]:
+        agreeing = [i for i, s in fleet.score_logs(inliers, remaining).items() if s.severity <= 1.0]
+        if not agreeing:
+            break
+        inliers = sorted((*inliers, *agreeing))
+    while len(inliers) > max(1, len(fleet.usable) // 2):
+        severity = {i: score.severity for i, score in fleet.score_logs(inliers, inliers).items()}
+        # an outlier spoils the models of all others: the suspects are left out in turn
+        suspects = sorted(inliers, key=lambda i: -severity[i])[:MAX_SUSPECTS]
+        severity_without = {
+            i: fleet.score_logs([j for j in inliers if j != i], [i])[i].severity
+            for i in suspects
+            if severity[i] > MIN_SUSPICION
+        }
+        worst = max(severity_without, key=lambda i: severity_without[i], default=-1)
+        if worst < 0 or severity_without[worst] <= 1.0:
+            break
+        inliers.remove(worst)
+    consensus = Consensus(fleet, inliers)
+    remaining = [i for i in fleet.usable if i not in inliers]
+    # some seconds of manual override do not make a log an outlier
+    trimmed = {}
+    for i in remaining:
+        data = fleet.data[i]
+        idle = np.array(consensus.find_unexplained_idle(i), dtype=int).reshape(-1, 2)
+        is_clear = (data.start[:, None] + data.length <= idle[:, 0]) | (
+            data.start[:, None] >= idle[:, 1]
+        )
+        clear_data = data.subset(np.asarray(is_clear.all(axis=1)))
+        trimmed[i] = clear_data if clear_data.is_sufficient else data
+    scores = fleet.with_data(trimmed).score_logs(inliers, remaining) if remaining else {}
+    rejoined = {i: trimmed[i] for i in remaining if scores[i].severity <= 1.0}
+    outliers = sorted(set(remaining) - set(rejoined), key=lambda i: -scores[i].severity)
+    inliers = sorted((*inliers, *rejoined))
+    return Consensus(fleet.with_data(rejoined), inliers, outliers, consensus.idle)
+
+
+def replace_channels(log: LogStatistics, channels: Mapping[str, np.ndarray]) -> LogStatistics:
+    """Return a record with some channels replaced."""
+    return LogStatistics(log.log.replace(channels={**log.log.channels, **channels}), log.inputs)
+
+
+# --- what explains an outlier ----------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One change under which the inliers' model explains a log.
+
+    Attributes:
+        kind: dead, scale, sign, offset, late, exchanged, heading, current or vessel.
+        channel: concerned; empty where there is none.
+        size: factor, offset (SI), delay in s, angle in rad, or speed of the current in m/s.
+        deviance: of the log under it; the least is the most likely.
+        text: in words.
+    """
+
+    kind: str
+    channel: str
+    size: float
+    deviance: float
+    text: str
+
+
+SCALE_FACTORS = (0.2, 0.33, 0.5, 0.67, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0)
+SHIFTS = (-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0)
+"""Tried delays over the block length, and offsets over the input's standard deviation."""
+HEADING_STEP = math.radians(10.0)
+MANY_PARAMETERS_PENALTY = 2.0
+"""On the deviance of `vessel`: several factors per velocity fit more by chance than one number."""
+LINKED_CORRELATION = 0.9
+"""From which two inputs are moved by one lever: twin rudders, as most ships have."""
+MIN_RELATIVE_STD = 1e-3
+"""Share of an input's usual spread, or of its size, below which it is constant."""
+
+
+def rank_hypotheses(consensus: Consensus, i: int) -> list[Hypothesis]:
+    """Rank the changes of an outlier under which the inliers' model explains it.
+
+    Each hypothesis is evaluated by the deviance of the changed log; its size (factor, offset,
+    delay, angle, current) is the minimum of the deviance.
+
+    Args:
+        consensus: inliers and outliers of the fleet.
+        i: index of the log.
+
+    Returns:
+        Hypotheses by increasing deviance.
+    """
+    fleet = consensus.fleet
+    fit = consensus.fit_inliers(excluding=i)
+    log, data = fleet.logs[i], fleet.data[i]
+    penalty = fit.compute_leverage_penalty(data)
+
+    def deviance(channels: Mapping[str, np.ndarray]) -> float:
+        return fit.compute_deviance(fleet.assemble_scaled(replace_channels(log, channels)))
+
+    hypotheses: list[Hypothesis] = []
+    # velocities that follow from the position have its scale, and no sign of their own
+    derived = log.log.meta.get("derived", ())
+    single_channels = [
+        (name,) for name in (*fleet.actuators, *fleet.velocities) if name not in derived
+    ]
+    linked_channels = _find_linked_inputs(log, fleet.actuators)
+    for channels in dict.fromkeys(
+        (*single_channels, *linked_channels, *([derived] if derived else []))
+    ):
+        name = channels[0]
+        is_input = name in fleet.actuators
+        label = " and ".join(channels)
+        unit = log.units[name]
+        if channels == derived:
+            label, unit = "x, y", "m"
+        std = float(np.nanmedian([fleet.logs[j].std(name) for j in consensus.inliers])) or 1.0
+        if channels == (name,) and is_input and is_constant(fleet, i, name):
+            value = _deviance_with_free_input(consensus, fit, i, name, 0.01 * std) + penalty
+            text = f"the record of {name} is dead: it is constant while the vessel responds to it"
+            hypotheses.append(Hypothesis("dead", name, 0.0, value, text))
+            continue
+        grids: dict[str, list[float]] = {
+            "scale": [1.0 / factor for factor in unit_confusions(unit)]
+        }
+        if channels != derived:
+            grids["sign"] = [-1.0]
+        if is_input:
+            grids["scale"] += SCALE_FACTORS
+            grids["late"] = [shift * fleet.block_seconds for shift in SHIFTS]
+            grids["offset"] = [shift * std for shift in SHIFTS]
+        for kind, grid in grids.items():
+            if not grid:
+                continue
+
+            def objective(
+                size: float, kind: str = kind, channels: Sequence[str] = channels
+            ) -> float:
+                value = deviance({n: _change_channel(kind, log[n], log.t, size) for n in channels})
+                # a scaled response has another density
+                jacobian = 0.0 if channels[0] in fleet.actuators else math.log(abs(size))
+                return value - 2.0 * len(channels) * jacobian
+
+            size, value = _minimize(objective, grid, 8 if is_input and kind != "sign" else 0)
+            text = f"{label} would have to {_CHANGES[kind](size, unit)}"
+            hypotheses.append(Hypothesis(kind, name, size, value, text))
+    for port, stbd in port_starboard_pairs(fleet.actuators).items():
+        value = deviance({port: log[stbd], stbd: log[port]})
+        text = f"{port} and {stbd} would have to be exchanged"
+        hypotheses.append(Hypothesis("exchanged", port, 0.0, value, text))
+    if {"u", "v"} <= set(fleet.velocities):
+        velocity = log["u"] + 1j * log["v"]
+
+        def deviance_if_turned(angle: float) -> float:
+            rotated = velocity * np.exp(1j * angle)
+            return deviance({"u": rotated.real, "v": rotated.imag})
+
+        angles = [HEADING_STEP * k for k in range(-17, 19) if k]
+        angle, value = _minimize(deviance_if_turned, angles, 12)
+        text = (
+            f"psi would have to be {'larger' if angle < 0.0 else 'smaller'} by"
+            f" {abs(math.degrees(angle)):.3g} deg, or u and v turned by as much"
+        )
+        hypotheses.append(Hypothesis("heading", "psi", angle, value, text))
+        if "psi" in log:
+            to_body = np.exp(-1j * log["psi"])
+
+            def deviance_in_current(current: complex) -> float:
+                water = velocity - current * to_body
+                return deviance({"u": water.real, "v": water.imag})
+
+            usual = float(np.nanmedian([fleet.logs[j].rms_speed for j in consensus.inliers]))
+            current, value = _minimize_in_plane(deviance_in_current, usual)
+            if abs(current) >= 0.05 * usual:
+                towards = math.degrees(math.atan2(current.imag, current.real)) % 360.0
+                text = (
+                    f"it ran in a current of {abs(current):.2g} m/s towards {towards:.0f} deg, and"
+                    " u and v are over ground"
+                )
+                hypotheses.append(Hypothesis("current", "", abs(current), value, text))
+    value = MANY_PARAMETERS_PENALTY * _deviance_with_free_factors(fleet, fit, i) + penalty
+    text = (
+        "it is another vessel or another loading, or something acted that was not recorded: no"
+        " single_channels change of a channel explains it"
+    )
+    hypotheses.append(Hypothesis("vessel", "", 0.0, value, text))
+    # a change that leaves the log as unlikely as it was explains nothing
+    worst = MAX_RMSE_RATIO**2 * len(fleet.velocities) + penalty
+    return sorted(hypotheses, key=lambda h: (h.kind != "vessel" and h.deviance > worst, h.deviance))
+
+
+def is_constant(fleet: Fleet, i: int, name: str) -> bool:
+    """Return whether an input is constant in a log though it varies in other_std."""
+    other_std = [log.std(name) for j, log in enumerate(fleet.logs) if j != i]
+    return fleet.logs[i].std(name) <= MIN_RELATIVE_STD * max(float(np.median(other_std)), 1e-12)
+
+
+def _find_linked_inputs(log: LogStatistics, names: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return inputs that move together: they share a recorder, and so a fault."""
+    correlation = np.atleast_2d(np.corrcoef(np.nan_to_num(log.log.stack([*names]).T)))
+    commanded = np.array([[candidate == f"cmd_{name}" for candidate in names] for name in names])
+    linked = (correlation > LINKED_CORRELATION) | np.eye(len(names), dtype=bool) | commanded
+    return [tuple(np.array(names)[row].tolist()) for row in linked]
+
+
+def _change_channel(kind: str, values: np.ndarray, t: np.ndarray, size: float) -> np.ndarray:
+    """Return a channel [T] under a hypothesis on it."""
+    if kind == "late":
+        return np.asarray(np.interp(t - size, t, values))
+    return np.asarray(values + size if kind == "offset" else values * size)
+
+
+_CHANGES: dict[str, Callable[[float, str], str]] = {
+    "sign": lambda size, unit: "have the opposite sign",
+    "scale": lambda size, unit: (
+        f"be {size:.3g} times as large{describe_unit_confusion(1.0 / size, unit)}"
+    ),
+    "offset": lambda size, unit: f"be larger by {format_quantity(size, unit)}",
+    "late": lambda size, unit: (
+        f"act {abs(size):.2g} s {'later' if size > 0.0 else 'earlier'}: the clocks differ"
+    ),
+}
+
+
+def _minimize(
+    objective: Callable[[float], float], grid: Iterable[float], iterations: int
+) -> tuple[float, float]:
+    """Return the minimum on a grid, refined between its neighbours where iterations are given."""
+    sizes = sorted(grid)
+    values = [objective(size) for size in sizes]
+    k = int(np.argmin(values))
+    if iterations:
+        bounds = sizes[max(k - 1, 0)], sizes[min(k + 1, len(sizes) - 1)]
+        refined = scipy.optimize.minimize_scalar(
+            objective, bounds=bounds, options={"maxiter": iterations}
+        )
+        if refined.fun < values[k]:
+            return float(refined.x), float(refined.fun)
+    return sizes[k], values[k]
+
+
+def _minimize_in_plane(
+    objective: Callable[[complex], float], scale: float
+) -> tuple[complex, float]:
+    """Return the minimum by pattern search, from a polar grid up to half the scale."""
+    directions = np.exp(0.25j * np.pi * np.arange(8))
+    grid = [complex(r * scale * d) for r in (0.1, 0.2, 0.3, 0.4, 0.5) for d in directions]
+    value, k = min((objective(point), k) for k, point in enumerate(grid))
+    best, step = grid[k], 0.05 * scale
+    while step > 0.01 * scale:
+        lower, k = min((objective(best + step * d), k) for k, d in enumerate(directions))
+        if lower < value:
+            best, value = best + step * complex(directions[k]), lower
+        else:
+            step *= 0.5
+    return best, value
+
+
+def _deviance_with_free_input(
+    consensus: Consensus, fit: RidgeFit, i: int, name: str, step: float
+) -> float:
+    """Return the deviance of a log where an input may be anything at any time."""
+    fleet, data = consensus.fleet, consensus.fleet.data[i]
+    log = fleet.logs[i]
+    up, down = (
+        fleet.assemble_scaled(replace_channels(log, {name: log[name] + s})) for s in (step, -step)
+    )
+    direction = (up.X - down.X) @ fit.coef / np.sqrt(fit.residual_var + data.noise_var)
+    norm = np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = direction / np.maximum(norm, 1e-300)
+    z = fit.standardize_residuals(data)
+    z = z - (z * direction).sum(1, keepdims=True) * direction
+    # one degree of freedom per block was given away
+    n = z.shape[1]
+    return float((z**2).sum(1).mean()) * (n / (n - 1) if n > 1 else 1.0)
+
+
+def _deviance_with_free_factors(fleet: Fleet, fit: RidgeFit, i: int) -> float:
+    """Return the deviance of a log where each contribution may have a factor of its own."""
+    data = fleet.data[i]
+    total = 0.0
+    tables = fleet.compute_contributions(i, fit) / fit.compute_predictive_std(data).T[..., None]
+    for table, z in zip(tables, fit.standardize_residuals(data).T, strict=True):
+        factors = np.linalg.lstsq(table, z, rcond=1e-6)[0]
+        total += float(np.mean((z - table @ factors) ** 2))
+    return total
+
+
+# --- dead inputs -----------------------------------------------------------------------------
+
+
+def find_unexplained_idle(
+    training: Sequence[LogStatistics],
+    predicted_only: Sequence[LogStatistics],
+    inputs: Sequence[str],
+) -> dict[str, list[tuple[int, int]]]:
+    """Return stretches of motion that no recorded input explains while all inputs are constant.
+
+    Somebody took over by hand, say, or the recorder stopped.
+
+    Args:
+        training: logs that the models are fitted to; each is predicted by a model of the
+            other training logs.
+        predicted_only: logs that are predicted by the model of the training logs.
+        inputs: channels that drive the vessel.
+
+    Returns:
+        Name of a log -> first and last samples.
+    """
+
+    def is_usable(log: LogStatistics) -> bool:
+        sampled = 1 < len(log) <= MAX_SAMPLES_IN_MEMORY and bool((np.diff(log.t) > 0.0).all())
+        return sampled and all(name in log for name in inputs)
+
+    logs = [log for log in training if is_usable(log)]
+    if not any(all(name in log for log in logs) for name in VELOCITY_NAMES) or not logs:
+        return {}
+    consensus = find_consensus(logs, inputs)
+    fleet = consensus.fleet
+    idle = {log.name: consensus.find_unexplained_idle(i) for i, log in enumerate(logs)}
+    if len(consensus.inliers) > 1 and fleet.actuators:
+        for log in predicted_only:
+            if is_usable(log) and set(fleet.velocities) <= set(log):
+                idle[log.name] = consensus.find_idle_stretches(log, fleet.assemble_scaled(log))
+    return {name: stretches for name, stretches in idle.items() if stretches}
+
+
+# With all records alive .02 to .31 of the change of r is left, with the steering dead .30 to .71
+# (40 fleets of scripts/bench/fleets.py).
+MIN_UNSTEERED_SHARE = 0.3
+# A heading that swings so far one way and back was steered: by gusts no more than one in ten
+# straight runs does, of steered fleets no fewer than three in ten logs do.
+MIN_SWING, MIN_WEAVING_SHARE = math.radians(20.0), 0.2
+
+
+def find_dead_steering(consensus: Consensus) -> tuple[list[str], float]:
+    """Return steering records that are constant in every log, and the unexplained share of yaw.
+
+    The list is empty where one of them varies, or where the other inputs explain the yaw rate.
+    On a vessel with a propeller on either side, both steer.
+    """
+    fleet = consensus.fleet
+    if "r" not in fleet.velocities or len(consensus.inliers) < 2:
+        return [], 0.0
+
+    def is_always_constant(name: str) -> bool:
+        sizes = (max(float(np.nanmax(np.abs(log[name]))), 1e-12) for log in fleet.logs)
+        pairs = zip(fleet.logs, sizes, strict=True)
+        return all(log.std(name) <= MIN_RELATIVE_STD * size for log, size in pairs)
+
+    def is_weaving(log: LogStatistics) -> bool:
+        integrated = np.cumsum(np.nan_to_num(log["r"])) * log.sampling_interval
+        heading = interpolate_gaps(log.t, log["psi"]) if "psi" in log else integrated
+        return count_reversals(heading, MIN_SWING) >= 2
+
+    paired_inputs = [n for n in fleet.actuators if n.endswith(("port", "stbd", "left", "right"))]
+    steering = [n for n in fleet.actuators if n in STEERING_CHANNELS] or paired_inputs
+    dead_names = [name for name in steering if is_always_constant(name)]
+    share = float(consensus.compute_residual_share()[fleet.velocities.index("r")])
+    if not dead_names or share <= MIN_UNSTEERED_SHARE:
+        return [], share
+    has_weaving = np.mean([is_weaving(log) for log in fleet.logs]) >= MIN_WEAVING_SHARE
+    return (dead_names, share) if has_weaving else ([], share)
