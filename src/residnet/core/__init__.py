@@ -1,1 +1,1 @@
-"""What all packages build on: errors, names and units, frames, the canonical log, configs."""
+"""Foundation of all packages: errors, names and units, frames, the canonical log, configs."""

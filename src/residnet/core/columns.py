@@ -1,7 +1,8 @@
-"""Parts of states as tensors, for code that TorchScript compiles, which takes no global slices.
+"""Select parts of state tensors.
 
-The columns are those of `layout`; n is the number of what moves (`Live.size`). They stand apart, so
-that what reads logs imports no torch.
+TorchScript does not accept global slices, so the column numbers of `residnet.core.layout` are
+repeated here. n is the number of dynamic states (`DegreesOfFreedom.n_dynamic`). The module is
+separate from `layout` so that readers of logs do not import PyTorch.
 """
 
 from __future__ import annotations
@@ -18,27 +19,27 @@ def pose(x: Tensor) -> Tensor:
 
 
 def dynamic_states(x: Tensor, n_dynamic: int = 3) -> Tensor:
-    """Return what moves [..., n] of states [..., nx]: u, v, r, and p and phi of a roll."""
+    """Return the dynamic states [..., n] of states [..., nx]: u, v, r, and p and phi with roll."""
     return x[..., 3 : 3 + n_dynamic]
 
 
 def pose_and_dynamic_states(x: Tensor, n_dynamic: int = 3) -> Tensor:
-    """Return pose and what moves [..., 3 + n] of states [..., nx]."""
+    """Return pose and dynamic states [..., 3 + n] of states [..., nx]."""
     return x[..., : 3 + n_dynamic]
 
 
 def actuator_states(x: Tensor, n_dynamic: int = 3) -> Tensor:
-    """Return the states of actuators [..., nx - 3 - n] of states [..., nx]."""
+    """Return the actuator states [..., nx - 3 - n] of states [..., nx]."""
     return x[..., 3 + n_dynamic :]
 
 
 def motion_accelerations(x: Tensor) -> Tensor:
-    """Return the accelerations [..., 3] behind pose and velocities of a motion [..., 9]."""
+    """Return the accelerations [..., 3] of a motion [..., 9] of pose, velocities, accelerations."""
     return x[..., 6:9]
 
 
 def all_but_pose(x: Tensor) -> Tensor:
-    """Return all but the pose [..., nx - 3] of states [..., nx]: velocities and what follows."""
+    """Return the states [..., nx - 3] without the pose."""
     return x[..., 3:]
 
 
@@ -73,22 +74,22 @@ def roll_angle(x: Tensor) -> Tensor:
 
 
 def heading_rate(nu: Tensor, n_dynamic: int = 3) -> Tensor:
-    """Return the rate of the heading [..., 1] in rad/s from what moves on the surface [..., n]."""
+    """Return the heading rate [..., 1] in rad/s of dynamic states [..., n] of a surface vessel."""
     r = nu[..., 2:3]
     return r * torch.cos(nu[..., 4:5]) if n_dynamic == 5 else r
 
 
 def level_velocities(nu: Tensor) -> list[Tensor]:
-    """Return the velocity forward, to starboard and down [...] of what moves in six [..., 9]."""
+    """Return the velocities forward, starboard and down [...] in level axes, from [..., 9]."""
     return to_level_axes(nu[..., 0], nu[..., 1], nu[..., 3], nu[..., 7], nu[..., 8])
 
 
 def with_depth_rate(nu_dot: Tensor, nu: Tensor) -> Tensor:
-    """Return rates [..., 9] of what moves in six [..., 9] with that of the depth."""
+    """Return rates [..., 9] with the depth rate inserted, from dynamic states nu [..., 9]."""
     depth_rate = level_velocities(nu)[2].unsqueeze(-1)
     return torch.cat((nu_dot[..., :6], depth_rate, nu_dot[..., 7:]), dim=-1)
 
 
 def zero_acceleration(z: Tensor, n_dynamic: int = 3) -> Tensor:
-    """Return accelerations of zero [..., n], alike in type to channels [..., nz]."""
+    """Return zero accelerations [..., n] with the dtype and device of channels [..., nz]."""
     return torch.zeros_like(z[..., :n_dynamic])

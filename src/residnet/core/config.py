@@ -306,10 +306,10 @@ def _apply_removal(data: dict[str, Any], text: str) -> Override:
     for i, name in enumerate(keys):
         if not isinstance(container, dict) or name not in container:
             key_path = ".".join(keys[: i + 1])
+            has_keys = isinstance(container, dict) and bool(container)
+            hint = suggest_name(name, container) if has_keys else ""
             raise ConfigError(
-                f"{label}: there is no '{key_path}' to remove"
-                f"{suggest_name(name, container) if isinstance(container, dict) and container else ''}",
-                "config.override",
+                f"{label}: there is no '{key_path}' to remove{hint}", "config.override"
             )
         path += (name,)
         if i == len(keys) - 1:
@@ -607,12 +607,11 @@ def _parse_fault(details: ErrorDetails, model: Any) -> ConfigFault:
         case "literal_error" | "enum":
             valid_names = _find_quoted(error_context["expected"])
             is_unknown_value = isinstance(value, str) and bool(valid_names)
-            fault_text = (
-                "unknown value"
-                f" '{truncate(value)}'{format_renaming_hint(path, value) or suggest_name(value, valid_names)}"
-                if is_unknown_value
-                else f"expected {error_context['expected']} {format_given(value)}"
-            )
+            if is_unknown_value:
+                hint = format_renaming_hint(path, value) or suggest_name(value, valid_names)
+                fault_text = f"unknown value '{truncate(value)}'{hint}"
+            else:
+                fault_text = f"expected {error_context['expected']} {format_given(value)}"
         case "value_error" | "assertion_error":
             fault_text = str(error_context["error"])
             # the validator of a section names the key itself, so the section's value is omitted

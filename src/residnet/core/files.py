@@ -1,4 +1,4 @@
-"""Files that stand in their place whole or not at all, and those that come with residnet."""
+"""Atomic file writing, reading of JSON and Parquet, and the configs shipped with residnet."""
 
 from __future__ import annotations
 
@@ -33,27 +33,27 @@ if TYPE_CHECKING:
 _MIN_FREE_BYTES = 20_000_000
 """Bytes that must be free before a run."""
 _PROBE_BYTES = 65_536
-"""Bytes that are written on trial: some blocks of any disk, since quotas count blocks."""
+"""Bytes of a trial write: several disk blocks, because quotas count blocks."""
 _PATH_MARGIN_BYTES = 300
-"""Bytes that the names of a run's own folders and files add to its path, that of a log included."""
+"""Bytes reserved for the names of folders and files inside of a run folder."""
 
 
 @contextmanager
 def atomic_write(path: Path, manifest: Manifest | None = None) -> Iterator[Path]:
-    """Yield a path to write to, which takes the place of `path` once it is written to its end.
+    """Yield a temporary path that replaces `path` at the end of the context.
 
-    A process that is killed meanwhile leaves the old file, or none. The file's folder is made. In a
-    run folder, or with a manifest, the file is recorded, and replaces only what residnet wrote.
+    A process that is killed in between leaves the old file, or none. The folder is created. In a
+    run folder, or with a manifest, the file is recorded, and only a file of residnet is replaced.
 
     Args:
-        path: of the file.
-        manifest: that records the file; that of the run folder around it if None.
+        path: path of the file.
+        manifest: manifest that records the file; None uses that of the surrounding run folder.
 
     Raises:
-        UsageError: if the file cannot be written, or is not residnet's to replace.
+        UsageError: if the file cannot be written, or is not owned by residnet.
     """
     manifest = manifest or find_run_manifest(path)
-    # a name that no file of the user has
+    # a random name, which no file of the user has
     temporary_path = path.with_name(f"{path.name}.{secrets.token_hex(4)}.partial")
     try:
         if manifest is not None:
@@ -65,7 +65,7 @@ def atomic_write(path: Path, manifest: Manifest | None = None) -> Iterator[Path]
             manifest.record(path, sha256(temporary_path))
         temporary_path.replace(path)
     except BaseException as error:
-        # where the folder itself cannot be written, the error under way says so
+        # if the folder is not writable, the error in progress reports it
         with suppress(OSError):
             temporary_path.unlink(missing_ok=True)
         if isinstance(error, OSError):
@@ -75,13 +75,13 @@ def atomic_write(path: Path, manifest: Manifest | None = None) -> Iterator[Path]
 
 @contextmanager
 def write_owned(path: Path) -> Iterator[Path]:
-    """Yield a path to write to, as `atomic_write`, for a file that a command writes at any place.
+    """Yield a temporary path like `atomic_write`, for a file outside or inside of run folders.
 
-    The file is recorded in the manifest of its run folder or, outside, of its own folder. It
-    replaces nothing but a file that residnet wrote and nobody edited.
+    The file is recorded in the manifest of its run folder, or else of its own folder. It replaces
+    only a file that residnet wrote and nobody edited.
 
     Raises:
-        UsageError: if the file cannot be written, or is not residnet's to replace.
+        UsageError: if the file cannot be written, or is not owned by residnet.
     """
     manifest = find_manifest(path)
     with atomic_write(path, manifest) as temporary_path:
@@ -92,14 +92,14 @@ def write_owned(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def stage_files(file: Path, inputs: Iterable[Path] = ()) -> Iterator[Path]:
-    """Yield a path of the same name in an empty folder, for a writer of several files.
+    """Yield a path with the same name in a temporary folder, for a writer of several files.
 
-    At the end of the context all files that were written beside it move to the folder of `file`,
-    none of them if one would replace a file that is not owned.
+    At the end of the context all files of the temporary folder are moved to the folder of `file`,
+    or none of them if one would replace a file that is not owned.
 
     Args:
-        file: that is written.
-        inputs: files beside it that the writer reads; they are copied into the empty folder.
+        file: main file of the writer.
+        inputs: files that the writer reads; they are copied into the temporary folder.
 
     Raises:
         UsageError: if a file is the user's or was edited, or cannot be written.
@@ -111,7 +111,7 @@ def stage_files(file: Path, inputs: Iterable[Path] = ()) -> Iterator[Path]:
         try:
             yield staging / file.name
         except ResidnetError as error:
-            # the user knows the place that he asked for
+            # the message names the folder of the user instead of the temporary one
             message = str(error).replace(str(staging), str(file.parent))
             raise type(error)(message) from error
         found = (path for path in sorted(staging.rglob("*")) if path.is_file())
@@ -126,14 +126,14 @@ def stage_files(file: Path, inputs: Iterable[Path] = ()) -> Iterator[Path]:
 
 _UNSAFE_CHARACTERS = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff]+')
 _MAX_NAME_BYTES = 200
-"""Bytes of a file's name before its suffix; file systems take 255."""
+"""Largest length of a file name without suffix in bytes; file systems allow 255."""
 
 
 def make_file_stem(name: str) -> str:
-    """Return a log's, a manoeuvre's or a figure's name as that of a file within one folder.
+    """Convert the name of a log, a manoeuvre or a figure to a safe file stem.
 
-    What no file system takes, or what would lead to another folder, becomes `_`; such names end in
-    a part of their hash, so that two that differ stay apart.
+    Characters that file systems reject or that separate folders become `_`. A changed name ends in
+    a part of its hash, so that different names give different stems.
     """
     encoded_name = _UNSAFE_CHARACTERS.sub("_", name).lstrip(".").encode("utf-8")
     safe_name = encoded_name[:_MAX_NAME_BYTES].decode("utf-8", "ignore") or "_"
@@ -143,10 +143,10 @@ def make_file_stem(name: str) -> str:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the JSON object that a file holds.
+    """Read the JSON object in a file.
 
     Raises:
-        UsageError: where there is no such file, or it does not hold a JSON object.
+        UsageError: if the file is missing or does not contain a JSON object.
     """
     content = read_json_value(path)
     if not isinstance(content, dict):
@@ -163,10 +163,10 @@ def _json_kind(value: Any) -> str:
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """Return the table that a Parquet file holds.
+    """Read the table in a Parquet file.
 
     Raises:
-        UsageError: where the file is missing, cut off or no Parquet file.
+        UsageError: if the file is missing, truncated or not a Parquet file.
     """
     import pandas as pd
     import pyarrow as pa
@@ -182,12 +182,12 @@ def read_table(path: Path) -> pd.DataFrame:
 
 
 def require_free_space(folder: Path) -> None:
-    """Check that a folder, which need not be there yet, can be written and has room for a run.
+    """Check that a folder, existing or not, is writable and has enough free space for a run.
 
-    What the system allows is tried out: rights, quotas and limits show in no other way.
+    Permissions, quotas and limits are tested by a trial write.
 
     Raises:
-        UsageError: where it cannot be written, its name is too long, or less than 20 MB are free.
+        UsageError: if it is not writable, its name is too long, or less than 20 MB are free.
     """
     try:
         existing_parent = next(
@@ -216,15 +216,15 @@ def require_free_space(folder: Path) -> None:
     if free_bytes < _MIN_FREE_BYTES:
         raise UsageError(
             f"{folder}: only {free_bytes / 1e6:.1f} MB are free there, and a run takes up to"
-            f" {_MIN_FREE_BYTES / 1e6:.0f} MB or more; make room or give a place with more of it"
+            f" {_MIN_FREE_BYTES / 1e6:.0f} MB or more; free some space or choose another folder"
         )
 
 
 def require_writable_file(file: Path) -> None:
-    """Check that a file can be written in its place, before the work whose result it will hold.
+    """Check that a file can be written, before a long computation whose result it will hold.
 
     Raises:
-        UsageError: where it cannot.
+        UsageError: if it cannot.
     """
     try:
         if file.is_dir():
@@ -237,7 +237,7 @@ def require_writable_file(file: Path) -> None:
 
 
 def write_error(path: Path, error: OSError) -> UsageError:
-    """Return the error of a file that cannot be written, with the reason that the system gives."""
+    """Create the error for a file that cannot be written, with the reason of the system."""
     reason = error.strerror or str(error)
     return UsageError(
         f"{path}: cannot be written ({reason}); make room or give a place that can be written"
@@ -245,9 +245,9 @@ def write_error(path: Path, error: OSError) -> UsageError:
 
 
 def find_config_folder() -> Path:
-    """Return the folder `configs` that comes with residnet.
+    """Return the folder `configs` shipped with residnet.
 
-    It lies inside an installed package, or at the top of the checkout that is installed.
+    It is inside an installed package, or at the top of a source checkout.
     """
     package = Path(residnet.__file__).parent
     inside = package / "configs"
@@ -255,10 +255,10 @@ def find_config_folder() -> Path:
 
 
 def find_shipped_configs() -> dict[str, Path]:
-    """Return the configs that come with residnet by name; studies are named by their path too."""
+    """Return the shipped configs by stem and by relative path."""
     folder = find_config_folder()
     files = [file for file in sorted(folder.rglob("*.yaml")) if file.parent.name != "vessels"]
     by_path = {file.relative_to(folder).with_suffix("").as_posix(): file for file in files}
     stems = [file.stem for file in files]
-    # a stem that two studies share names neither
+    # an ambiguous stem is omitted
     return {file.stem: file for file in files if stems.count(file.stem) == 1} | by_path

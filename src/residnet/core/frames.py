@@ -1,6 +1,6 @@
-"""Frames and angles: NED, and body axes x forward, y starboard, z down (SNAME, Fossen).
+"""Transform vectors and angles between NED and body axes (x forward, y starboard, z down; SNAME).
 
-Angles are unwrapped in logs and states; only differences of angles are wrapped.
+Angles are unwrapped (continuous) in logs and states; only differences of angles are wrapped.
 """
 
 from __future__ import annotations
@@ -11,22 +11,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    # tensors are computed by their methods, so that readers of logs do not wait for PyTorch
+    # functions use methods of tensors, so that readers of logs do not import PyTorch
     from torch import Tensor
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
-    """Bring angles [rad] of any shape to [-pi, pi)."""
+    """Wrap angles [rad] of any shape to [-pi, pi)."""
     return (angle + math.pi).remainder(2.0 * math.pi) - math.pi
 
 
 def wrap_angle_array(angle: np.ndarray) -> np.ndarray:
-    """Bring angles [rad] of a NumPy array to [-pi, pi)."""
+    """Wrap angles [rad] of a NumPy array to [-pi, pi)."""
     return np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi
 
 
 def to_body(north: Tensor, east: Tensor, psi: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the components of an earth-fixed vector along body x and y; shapes broadcast.
+    """Rotate a horizontal vector from NED to body axes; shapes broadcast.
 
     Args:
         north: component along north.
@@ -40,7 +40,7 @@ def to_body(north: Tensor, east: Tensor, psi: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def to_earth(forward: Tensor, starboard: Tensor, psi: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the components of a body-fixed vector along north and east; shapes broadcast.
+    """Rotate a horizontal vector from body axes to NED; shapes broadcast.
 
     Args:
         forward: component along body x.
@@ -54,7 +54,7 @@ def to_earth(forward: Tensor, starboard: Tensor, psi: Tensor) -> tuple[Tensor, T
 
 
 def to_level_axes(u: Tensor, v: Tensor, w: Tensor, phi: Tensor, theta: Tensor) -> list[Tensor]:
-    """Return a body vector forward, to starboard and down, as one sees it who stands upright.
+    """Rotate a body-fixed vector to level axes: forward, starboard and down without roll and pitch.
 
     Args:
         u: component along body x; shapes broadcast.
@@ -71,7 +71,7 @@ def to_level_axes(u: Tensor, v: Tensor, w: Tensor, phi: Tensor, theta: Tensor) -
 
 
 def horizontal_to_body(north: Tensor, east: Tensor, angles: Tensor) -> list[Tensor]:
-    """Return a horizontal vector along the body's x, y and z.
+    """Rotate a horizontal vector from NED to body axes with roll, pitch and heading.
 
     Args:
         north: component along north [...].
@@ -85,15 +85,18 @@ def horizontal_to_body(north: Tensor, east: Tensor, angles: Tensor) -> list[Tens
 
 
 def compose_rotation(angles: Tensor, rotation_vector: Tensor) -> Tensor:
-    """Return the attitude [..., 3] after a further rotation, by way of unit quaternions.
+    """Apply a body-fixed rotation to an attitude by unit quaternions.
 
-    Nothing in it is singular but the angles themselves, at a pitch of 90 deg, where any pair of
-    roll and heading with the right difference means the same attitude. Roll and heading go on from
-    where they were, and so count whole turns.
+    The computation is singular only in the Euler angles themselves, at a pitch of 90 deg, where
+    only the difference of roll and heading is defined. Roll and heading are continuous with the
+    previous values, so they count full turns.
 
     Args:
-        angles: roll, pitch and heading [rad].
-        rotation_vector: the rotation vector about body axes [rad].
+        angles: roll, pitch and heading [..., 3] in rad.
+        rotation_vector: rotation about the body axes [..., 3] in rad.
+
+    Returns:
+        Roll, pitch and heading [..., 3] in rad.
 
     Source: Fossen 2021, section 2.2.2.
     """
@@ -104,7 +107,7 @@ def compose_rotation(angles: Tensor, rotation_vector: Tensor) -> Tensor:
     sf, st, sp = half_angles.sin().unbind(-1)
     w, x = cf * ct * cp + sf * st * sp, sf * ct * cp - cf * st * sp
     y, z = cf * st * cp + sf * ct * sp, cf * ct * sp - sf * st * cp
-    # the offset keeps the gradient finite where nothing turns
+    # the offset keeps the gradient finite for a zero rotation
     rotation_angle = torch.sqrt(rotation_vector.square().sum(-1) + 1e-24)
     cos_half_rotation = torch.cos(0.5 * rotation_angle)
     bx, by, bz = (
@@ -139,11 +142,11 @@ def cross_product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def rotation_angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the angle [...] in rad of the one rotation that leads from attitudes a to b.
+    """Return the angle [...] in rad of the rotation between two attitudes.
 
     Args:
         a: roll, pitch and heading [..., 3] in rad.
-        b: the same.
+        b: roll, pitch and heading [..., 3] in rad.
     """
     from scipy.spatial.transform import Rotation
 
@@ -154,13 +157,13 @@ def rotation_angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def unwrap_angle(angle: np.ndarray) -> np.ndarray:
-    """Return the angle [T] in rad made continuous over its finite samples; NaN stay where they are.
+    """Unwrap an angle [T] in rad over its finite samples; NaN values are preserved.
 
-    A turn of more than half a circle between two finite samples is ambiguous.
+    A change of more than half a circle between two finite samples is ambiguous.
     """
     unwrapped = np.asarray(angle, dtype=np.float64).copy()
     if unwrapped.size and np.abs(np.diff(unwrapped)).max(initial=0.0) < np.pi:
-        # nothing to unwrap, and no sample missing
+        # already continuous, without missing samples
         return unwrapped
     is_finite = np.isfinite(angle)
     unwrapped[is_finite] = np.unwrap(unwrapped[is_finite])
@@ -170,9 +173,10 @@ def unwrap_angle(angle: np.ndarray) -> np.ndarray:
 def rotate(
     x: np.ndarray | float, y: np.ndarray | float, angle: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return vectors [T] turned by angles [T]: from body axes to north and east by the heading.
+    """Rotate vectors [T] by angles [T] in rad.
 
-    Source: document 003 eq. (4); by minus the heading it is the way back.
+    The heading as the angle rotates from body axes to NED, minus the heading from NED to body axes.
+    Source: document 003 eq. (4).
     """
     c, s = np.cos(angle), np.sin(angle)
     return c * x - s * y, s * x + c * y

@@ -1,8 +1,8 @@
-"""Which states and degrees of freedom a model has, and where they stand in its tensors.
+"""States and degrees of freedom of a model, and their columns in its tensors.
 
-The columns below are those of the planar model, three degrees of freedom; no other module counts
-them. A model with roll keeps them, with p and phi behind; one of all six degrees of freedom has w,
-p, q and the depth z, roll and pitch there.
+The column constants are those of the planar model with three degrees of freedom. A model with roll
+has p and phi behind these columns; a model with six degrees of freedom has w, p, q, the depth z,
+roll and pitch there.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StateLayout:
-    """The states of a model in the order of its tensors: pose, what moves it, then its actuators'.
+    """States of a model in the order of its tensors: pose, dynamic states, actuator states.
 
-    What moves are the velocities and, behind them, those angles that forces depend on. The rates of
-    the angles follow from the velocities, and everything else about them is as with velocities:
-    they stand first among the channels, they have ranges, limits, scales and errors.
+    The dynamic states are the velocities and the states that forces depend on: roll, and for six
+    degrees of freedom depth and pitch. The rates of the latter follow from the velocities; in all
+    other respects (channels, ranges, limits, scales, errors) they are treated like velocities.
 
     Attributes:
         pose: names of the pose.
-        velocities: names of the velocities, one for each degree of freedom.
-        attitude: names of the angles that forces depend on.
+        velocities: names of the velocities, one per degree of freedom.
+        attitude: names of the angles and the depth that forces depend on.
     """
 
     pose: tuple[str, ...]
@@ -41,21 +41,20 @@ class StateLayout:
 
     @property
     def dynamic_states(self) -> tuple[str, ...]:
-        """Names of the velocities and of the angles that forces depend on."""
+        """Names of the velocities and of the attitude."""
         return (*self.velocities, *self.attitude)
 
     @property
     def state_names(self) -> tuple[str, ...]:
-        """Names of pose, velocities and angles."""
+        """Names of pose and dynamic states."""
         return (*self.pose, *self.dynamic_states)
 
     @property
     def band_channels(self) -> tuple[str, ...]:
-        """What free runs have bands of: u, v, r, heading, position, then what else moves."""
-        planar_velocities, other_states = (
-            self.dynamic_states[: len(names.VELOCITY_NAMES)],
-            self.dynamic_states[len(names.VELOCITY_NAMES) :],
-        )
+        """Channels with prediction intervals: u, v, r, heading, position, further states."""
+        n_planar = len(names.VELOCITY_NAMES)
+        planar_velocities = self.dynamic_states[:n_planar]
+        other_states = self.dynamic_states[n_planar:]
         return (*planar_velocities, "heading", "position", *other_states)
 
     @property
@@ -65,12 +64,12 @@ class StateLayout:
 
     @property
     def pose_columns(self) -> slice:
-        """The first columns, those of north, east and heading."""
+        """Columns of north, east and heading."""
         return slice(0, len(self.pose))
 
     @property
     def velocity_columns(self) -> slice:
-        """Columns of the velocities and of the angles behind them."""
+        """Columns of the dynamic states."""
         return slice(len(self.pose), len(self.state_names))
 
 
@@ -81,18 +80,18 @@ ROLL_LAYOUT = StateLayout(names.POSE_NAMES, (*names.VELOCITY_NAMES, "p"), ("phi"
 SIX_DOF_LAYOUT = StateLayout(
     names.POSE_NAMES, (*names.VELOCITY_NAMES, "w", "p", "q"), ("z", "phi", "theta")
 )
-"""Six degrees of freedom: x, y, psi, u, v, r, w, p, q, z, phi, theta. Rotations are composed."""
+"""Six degrees of freedom with quaternions: x, y, psi, u, v, r, w, p, q, z, phi, theta."""
 VERTICAL_PLANE_VELOCITIES = ("u", "w", "q")
-"""Velocities of a motion in an upright plane, which no roll and no turn leaves."""
+"""Velocities of a motion in the vertical plane, without roll, sway and yaw."""
 _RATE_OF_ANGLE = {"phi": "p", "theta": "q"}
-"""The velocity about whose axis an angle turns, and, where nothing else turns, its rate."""
+"""Angle -> velocity about its axis, which is its rate if the other angles are constant."""
 
 
 def _is_motion(angle: np.ndarray) -> bool:
-    """Return whether an angle [T] is a motion rather than a constant or the noise of a sensor.
+    """Return whether an angle [T] varies by more than the noise of its sensor.
 
-    Of a motion neighbouring samples are alike: their correlation is above a half where less of the
-    angle's variance is noise than is motion (von Neumann's ratio below 1; noise alone has 2).
+    The test is the ratio of the mean squared difference of neighbouring samples to the variance
+    (von Neumann's ratio): 2 for white noise, below 1 if the motion dominates.
     """
     finite = angle[np.isfinite(angle)]
     if finite.size <= _MIN_ANGLE_SAMPLES:
@@ -101,15 +100,16 @@ def _is_motion(angle: np.ndarray) -> bool:
 
 
 _MIN_ANGLE_SAMPLES = 50
-"""Samples of an angle that tell nothing yet."""
+"""Number of samples up to which the test is not possible."""
 _N_DEPTH_SPANS = 50
-"""Spans of a log over which its depth changes as its motion says, or does not."""
+"""Number of spans of a log over which depth changes are compared with the motion."""
 
 
 def _depth_follows_motion(channels: Mapping[str, np.ndarray]) -> bool:
-    """Return whether the depth follows from where the vessel points and moves.
+    """Return whether the measured depth correlates with the depth integrated from the motion.
 
-    The waves that lift a boat, the water below it and the drift of a receiver's height do not.
+    It does for a diving vessel. Heave in waves, the water depth and the drift of a receiver's
+    height do not correlate.
     """
     z = np.asarray(channels["z"])
     is_finite = {
@@ -141,34 +141,38 @@ def _depth_follows_motion(channels: Mapping[str, np.ndarray]) -> bool:
 
 
 _MIN_DEPTH_CORRELATION = 0.5
-"""Correlation of the depth's changes with those that the motion makes, of a vessel that dives."""
+"""Smallest correlation of measured and integrated depth changes of a diving vessel."""
 
 
 @dataclass(frozen=True)
 class DegreesOfFreedom:
-    """Which velocities a model moves: those of u, v and r that were recorded, p, or all six.
+    """Active velocities of a model: a subset of u, v and r, with p for roll, or six.
 
-    Of u, v and r the others are zero at all times: they have no equation, no term and no error. The
-    pose is what the live ones lead to, a straight line from surge alone, a turn on the spot from
-    yaw alone; so the time loop, exports and windows are those of the planar state. With p the
-    states are those of `ROLL_LAYOUT`; with w or q, beside u alone or all others, those of `SIX_DOF_LAYOUT`.
+    Inactive velocities are always zero and have no equation, no term and no error. The pose is
+    integrated from the active ones: surge alone gives a straight line, yaw alone a turn on the
+    spot. Tensors always have the columns of the layout. With p the layout is `ROLL_LAYOUT`; with w
+    or q (vertical plane or all six) it is `SIX_DOF_LAYOUT`.
 
     Attributes:
-        velocities: names of those that live, of u, v, r, w, p and q.
+        velocities: names of the active velocities, from u, v, r, w, p and q.
     """
 
     velocities: tuple[str, ...] = PLANAR_LAYOUT.velocities
 
     @classmethod
     def from_channels(cls, channels: Mapping[str, np.ndarray]) -> DegreesOfFreedom:
-        """Return the velocities that channels of a log tell; u, v and r where they tell none.
+        """Infer the active velocities from the channels of a log.
 
-        They are measured, or follow from a heading (r), from position and heading (all) or from a
-        roll angle that moves (p, which nothing tells without it). Heading, depth, roll and pitch
-        tell all six beside u and v or a position, where the depth follows from the motion.
+        A velocity is active if it is measured, or if it follows from other channels: r from the
+        heading; u, v and r from position and heading; p from a varying roll angle. Heading, depth,
+        roll and pitch with u and v or a position give all six, if the depth follows from the
+        motion.
 
         Args:
-            channels: by name, [T] each.
+            channels: name -> values [T].
+
+        Returns:
+            The active velocities; u, v and r if the channels determine none.
         """
         angles = ("phi", "theta", "z")
         recorded = {name for name in channels if name not in angles or _is_motion(channels[name])}
@@ -179,10 +183,12 @@ class DegreesOfFreedom:
             and has_planar_motion
             and _depth_follows_motion(channels)
         ):
-            # what turns and sinks the vessel follows from its attitude and depth
+            # the angular velocities and w follow from attitude and depth
             return cls(SIX_DOF_LAYOUT.velocities)
         vertical_velocities = cls.vertical_plane_dof(recorded)
-        # one that goes ahead may be a boat in waves over a bottom: its depth or its planes tell
+        # with a forward speed, depth and pitch may be those of a surface vessel in waves; dive
+        # planes or
+        # a depth that follows from the motion exclude it
         is_vertical_plane = bool({"delta_s", "cmd_delta_s"} & recorded) or (
             "z" in recorded and _depth_follows_motion(channels)
         )
@@ -199,9 +205,12 @@ class DegreesOfFreedom:
 
     @staticmethod
     def vertical_plane_dof(recorded: Iterable[str]) -> tuple[str, ...]:
-        """Return the velocities of a motion in an upright plane by channels; none of another.
+        """Return the velocities of a motion in the vertical plane; empty for other motions.
 
-        A depth beside a speed and nothing else may be that of the water below a boat.
+        Depth and speed alone do not suffice, because the depth may be the water depth.
+
+        Args:
+            recorded: names of the recorded channels.
         """
         recorded = set(recorded)
         vertical_velocities = recorded & {"w", "q"}
@@ -229,7 +238,7 @@ class DegreesOfFreedom:
 
     @classmethod
     def intersection(cls, dofs: Iterable[DegreesOfFreedom]) -> DegreesOfFreedom:
-        """Return the velocities that each of several tells; u, v and r where they share none."""
+        """Return the velocities that are active in all of `dofs`; u, v and r if there are none."""
         dofs = list(dofs)
         velocity_sets = [dof.velocities for dof in dofs]
         if dofs and all(dof.is_six_dof and dof == dofs[0] for dof in dofs):
@@ -242,69 +251,69 @@ class DegreesOfFreedom:
 
     @property
     def layout(self) -> StateLayout:
-        """The states of the model."""
+        """Layout of the states."""
         if "w" in self.velocities or "q" in self.velocities:
             return SIX_DOF_LAYOUT
         return ROLL_LAYOUT if "p" in self.velocities else PLANAR_LAYOUT
 
     @property
     def dynamic_states(self) -> tuple[str, ...]:
-        """Names of what moves: velocities, living or not, and the angles that forces depend on."""
+        """Names of the dynamic states, active or not."""
         return self.layout.dynamic_states
 
     @property
     def derivative_names(self) -> tuple[str, ...]:
-        """Names of the derivatives of what moves."""
+        """Names of the derivatives of the dynamic states."""
         return tuple(f"{name}_dot" for name in self.dynamic_states)
 
     @property
     def state_names(self) -> tuple[str, ...]:
-        """Names of the states: pose and what moves."""
+        """Names of pose and dynamic states."""
         return self.layout.state_names
 
     @property
     def n_dynamic(self) -> int:
-        """Number of what moves."""
+        """Number of dynamic states."""
         return len(self.dynamic_states)
 
     @property
     def dynamic_columns(self) -> slice:
-        """Columns of what moves among the states."""
+        """Columns of the dynamic states among the states."""
         return self.layout.velocity_columns
 
     @property
     def has_roll(self) -> bool:
-        """Whether the vessel rolls."""
+        """Whether the layout has a roll angle."""
         return self.layout is not PLANAR_LAYOUT
 
     @property
     def is_six_dof(self) -> bool:
-        """Whether it moves in all six degrees of freedom, so that its rotations are composed."""
+        """Whether the layout has six degrees of freedom, with quaternion kinematics."""
         return self.layout is SIX_DOF_LAYOUT
 
     @property
     def is_vertical_plane(self) -> bool:
-        """Whether it moves in an upright plane alone, so that it neither rolls nor turns."""
+        """Whether the vessel moves in the vertical plane only, without roll, sway and yaw."""
         return self.is_six_dof and set(self.velocities) <= set(VERTICAL_PLANE_VELOCITIES)
 
     @property
     def unmodelled_states(self) -> tuple[str, ...]:
-        """Names of what moves and drives nothing: dead velocities, and the depth."""
+        """Names of the dynamic states that enter no force: inactive states, and the depth."""
         return (*self.fixed_states, *(("z",) if self.is_six_dof else ()))
 
     @property
     def is_complete(self) -> bool:
-        """Whether all velocities of the layout live."""
+        """Whether all velocities of the layout are active."""
         return self.velocities == self.layout.velocities
 
     @property
     def is_planar(self) -> bool:
-        """Whether u, v and r live, and nothing else does."""
+        """Whether exactly u, v and r are active."""
         return self.velocities == PLANAR_LAYOUT.velocities
 
     @property
     def fixed_states(self) -> tuple[str, ...]:
-        """Names of those that do not, and of angles that nothing turns."""
+        """Names of the inactive velocities, and of the angles that they leave constant."""
         fixed_velocities = [name for name in self.layout.velocities if name not in self.velocities]
         fixed_angles = [
             name
@@ -315,32 +324,32 @@ class DegreesOfFreedom:
 
     @property
     def active_states(self) -> tuple[str, ...]:
-        """Names of what lives of what moves, and so has errors."""
+        """Names of the dynamic states that are not constant zero."""
         return tuple(name for name in self.dynamic_states if name not in self.fixed_states)
 
     @property
     def active_indices(self) -> list[int]:
-        """Places of what lives among what moves."""
+        """Indices of the active states among the dynamic states."""
         return [self.dynamic_states.index(name) for name in self.active_states]
 
     @property
     def regressed_indices(self) -> list[int]:
-        """Places of the live velocities among what moves: what has an equation to find."""
+        """Indices of the active velocities among the dynamic states: those with an equation."""
         return [self.dynamic_states.index(name) for name in self.velocities]
 
     @property
     def has_position(self) -> bool:
-        """Whether the position follows from them."""
+        """Whether the position changes, that is, u or v is active."""
         return "u" in self.velocities or "v" in self.velocities
 
     @property
     def has_heading(self) -> bool:
-        """Whether the heading does."""
+        """Whether the heading changes, that is, r is active."""
         return "r" in self.velocities
 
     @property
     def pose_error_names(self) -> tuple[str, ...]:
-        """Names of the errors of the pose that the velocities lead to, in `names.END_UNITS`."""
+        """Names of the pose errors of free runs, from `names.POSE_ERROR_UNITS`."""
         if self.is_six_dof:
             has_attitude = not self.is_vertical_plane or "q" in self.velocities
             return (*["position"] * self.has_position, "depth", *["attitude"] * has_attitude)
@@ -348,54 +357,67 @@ class DegreesOfFreedom:
 
     @property
     def description(self) -> str:
-        """What follows from the velocities not being u, v and r, for a reader; empty for these."""
+        """Sentence for reports about velocities other than u, v and r; empty for these."""
         if self.is_vertical_plane:
-            text = f"the logs tell {join_list(self.velocities)} alone: the vessel moves in an"
-            return f"{text} upright plane, without roll, turn or drift"
+            text = f"the logs contain only {join_list(self.velocities)}: the vessel moves in the"
+            return f"{text} vertical plane, without roll, yaw and sway"
         if self.is_six_dof:
             return "all six degrees of freedom, with depth, roll and pitch"
         if self.is_complete:
             return "surge, sway, yaw and roll, with the roll angle" if self.has_roll else ""
-        text = f"the logs tell {' and '.join(self.velocities)} alone, and"
-        text += f" {' and '.join(self.fixed_states)} {'are' if len(self.fixed_states) > 1 else 'is'} taken as zero"
+        verb = "are" if len(self.fixed_states) > 1 else "is"
+        text = (
+            f"the logs contain only {' and '.join(self.velocities)};"
+            f" {' and '.join(self.fixed_states)} {verb} assumed to be zero"
+        )
         if not self.has_position:
-            return f"{text}: the vessel turns on the spot, and has no error of position"
+            return f"{text}: the vessel turns on the spot and has no position error"
         if not self.has_heading:
-            return f"{text}: positions are the distance run on a straight line"
+            return f"{text}: the position is the distance travelled on a straight line"
         if "v" in self.velocities:
             return text
-        return f"{text}: the vessel moves over ground where it points, without drift"
+        return f"{text}: the course over ground equals the heading, without drift"
 
     def require_on_surface(self, subject: str) -> None:
-        """Check that the vessel does not dive, for what knows no depth and pitch.
+        """Check that the model has no depth and pitch.
+
+        Args:
+            subject: what supports no depth and pitch, as the subject of the message.
 
         Raises:
-            UsageError: where it does.
+            UsageError: if the model has six degrees of freedom.
         """
         if self.is_six_dof:
             raise UsageError(
-                f"{subject} knows no depth and pitch, but the model moves"
-                f" {', '.join(self.velocities)}; fit one of signals.velocities: [u, v, r] for it"
+                f"{subject} does not support depth and pitch, but the model has"
+                f" {', '.join(self.velocities)}; fit a model with signals.velocities: [u, v, r]"
             )
 
     def require_no_roll(self, subject: str) -> None:
-        """Check that the vessel does not roll, for what knows no roll.
+        """Check that the model has no roll, depth and pitch.
+
+        Args:
+            subject: what supports no roll, as the subject of the message.
 
         Raises:
-            UsageError: where it does.
+            UsageError: if the model has roll.
         """
         self.require_on_surface(subject)
         if self.has_roll:
             raise UsageError(
-                f"{subject} knows no roll, but the model moves {', '.join(self.velocities)}; fit one"
-                " without p (signals.velocities: [u, v, r])"
+                f"{subject} does not support roll, but the model has {', '.join(self.velocities)};"
+                " fit a model without p (signals.velocities: [u, v, r])"
             )
 
     def range_limits(self, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-        """Return the size [n] of what moves at the ends of its ranges, [n] or more each.
+        """Return the largest absolute value [n] of each dynamic state within its range.
 
-        Infinite for a depth, and for the angles of rotations that are composed: a vessel that loops
-        or dives deeper has not run away.
+        The limit is infinite for the depth and the angles of six degrees of freedom: a loop or a
+        deeper dive is not a divergence.
+
+        Args:
+            lower: lower ends of the ranges, [n] or more.
+            upper: upper ends of the ranges, [n] or more.
         """
         max_abs = np.asarray(np.maximum(np.abs(lower), np.abs(upper))[: self.n_dynamic])
         if self.is_six_dof:
@@ -403,7 +425,7 @@ class DegreesOfFreedom:
         return max_abs
 
     def equation_mask(self) -> Tensor:
-        """Return 1 for each that has an equation of its own and 0 for the others, [n] float64."""
+        """Return 1 for each dynamic state with an identified equation, else 0, [n] float64."""
         import torch
 
         is_regressed = torch.zeros(self.n_dynamic, dtype=torch.float64)
@@ -411,7 +433,7 @@ class DegreesOfFreedom:
         return is_regressed
 
     def active_mask(self) -> Tensor:
-        """Return 0 for each velocity that is zero at all times and 1 for the others, [n]."""
+        """Return 1 for each active dynamic state, else 0, [n] float64."""
         import torch
 
         is_active = torch.zeros(self.n_dynamic, dtype=torch.float64)
@@ -419,7 +441,7 @@ class DegreesOfFreedom:
         return is_active
 
     def angle_rate_matrix(self) -> Tensor:
-        """Return K [n, n] with nu K the rates of the angles, from what moves nu [..., n]."""
+        """Return K [n, n] such that nu K are the angle rates, with dynamic states nu [..., n]."""
         import torch
 
         rate_matrix = torch.zeros(self.n_dynamic, self.n_dynamic, dtype=torch.float64)
@@ -433,44 +455,48 @@ class DegreesOfFreedom:
 
 
 SURGE_SWAY_YAW = DegreesOfFreedom()
-"""All of u, v and r, and no other."""
+"""Exactly u, v and r."""
 
 POSE = PLANAR_LAYOUT.pose_columns
 VELOCITIES = PLANAR_LAYOUT.velocity_columns
 MOTION = slice(0, len(PLANAR_LAYOUT.state_names))
 ACCELERATIONS = slice(MOTION.stop, MOTION.stop + PLANAR_LAYOUT.n_dof)
-"""Of a motion with accelerations, which stand behind pose and velocities."""
+"""Columns of the accelerations of a motion, behind pose and velocities."""
 ACTUATORS = slice(MOTION.stop, None)
 DYNAMIC_STATES = slice(POSE.stop, None)
-"""Of a free run: what moves."""
+"""Columns of the dynamic states of a free run."""
 EXTRA_STATES = slice(MOTION.stop, None)
-"""Of a free run: what moves beside u, v and r."""
+"""Columns of the dynamic states of a free run behind u, v and r."""
 POSITION = slice(0, PLANAR_LAYOUT.pose.index("psi"))
 HEADING = PLANAR_LAYOUT.state_names.index("psi")
 SURGE = PLANAR_LAYOUT.state_names.index("u")
 SWAY = PLANAR_LAYOUT.state_names.index("v")
 YAW_RATE = PLANAR_LAYOUT.state_names.index("r")
 LATERAL = slice(SWAY, YAW_RATE + 1)
-"""Columns of sway and yaw, whose motion is that of steering."""
+"""Columns of sway and yaw rate, the states of steering."""
 
 RANGE_VELOCITIES = slice(0, PLANAR_LAYOUT.n_dof)
-"""Of ranges, channels and accelerations: velocities stand first."""
+"""Velocities in ranges, channels and accelerations, where they are first."""
 RANGE_INPUTS = slice(PLANAR_LAYOUT.n_dof, None)
-"""Of training ranges: inputs follow the velocities."""
+"""Inputs in training ranges, where they follow the velocities."""
 
 
 ATTITUDE = tuple(map(SIX_DOF_LAYOUT.state_names.index, ("phi", "theta", "psi")))
-"""Columns of states of six degrees of freedom, those of an attitude."""
+"""Columns of roll, pitch and heading among the states of six degrees of freedom."""
 
 
 _MIN_COS_PITCH = 1e-3
-"""Least cosine of the pitch by which the rate of a heading is divided."""
+"""Lower bound on cos(pitch) as a divisor of the heading rate."""
 
 
 def to_horizontal_plane(nu: np.ndarray) -> np.ndarray:
-    """Return what moves a pose [..., 3], u, v cos phi and r cos phi, from what moves [..., n].
+    """Return surge, sway and yaw rate of the horizontal plane [..., 3] from dynamic states.
 
-    Source: document 004, without heave and pitch; Fossen 2021, eq. (2.41) with them.
+    With roll only these are u, v cos(phi) and r cos(phi).
+    Source: document 004 without heave and pitch; Fossen 2021, eq. (2.41) with them.
+
+    Args:
+        nu: dynamic states [..., n].
     """
     if nu.shape[-1] == PLANAR_LAYOUT.n_dof:
         return nu

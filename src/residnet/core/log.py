@@ -1,4 +1,4 @@
-"""The canonical log: named SI channels over one clock, kept as a Parquet file."""
+"""The canonical log: named SI channels over one clock, stored as a Parquet file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from residnet.core.names import CHANNEL_UNITS, suggest_name
 
 SCHEMA = "residnet.log/1"
 _WRITE_ROWS = 500_000
-"""Rows that are written at a time: 4 MB of each channel."""
+"""Rows per write operation: 4 MB of each channel."""
 
 
 _FIELD_TYPES: dict[str, type | tuple[type, ...]] = {
@@ -26,7 +26,7 @@ _FIELD_TYPES: dict[str, type | tuple[type, ...]] = {
     **{"integrated": list, "stretch": list, "grid": dict},
     **{"epoch": (int, float), "epoch_ns": int},
 }
-"""What a file says of itself, and of its `meta` what residnet reads."""
+"""Types of the fields in the metadata of a file, and of the entries of `meta` that are read."""
 
 
 Level = Literal["note", "will mislead", "fatal"]
@@ -34,9 +34,13 @@ Remark = dict[str, Any]
 
 
 def make_remark(level: Level, code: str, text: str, **figures: float) -> Remark:
-    """Return a finding of the reader as `Log.meta["findings"]` holds it.
+    """Return a finding of a reader, as stored in `Log.meta["findings"]`.
 
-    It has level, code, text and figures (SI).
+    Args:
+        level: severity, see `residnet.quality.Finding`.
+        code: kind of finding, stable for programs.
+        text: one line with figures.
+        figures: numbers in SI units.
     """
     return {"level": level, "code": code, "text": text, "figures": figures}
 
@@ -46,14 +50,14 @@ class Log:
     """One recorded or simulated manoeuvre.
 
     Attributes:
-        name: unique within a run; the stem of its file names.
-        t: time [T] in s, strictly increasing, on the log's own clock.
-        channels: name -> values [T], float64, SI and radians; psi unwrapped; NaN where nothing was
-            measured.
+        name: unique within a run; stem of file names.
+        t: time [T] in s, strictly increasing, with any origin.
+        channels: name -> values [T], float64, SI units and radians, psi unwrapped, NaN for missing
+            measurements.
         units: name -> SI unit.
-        manoeuvre: kind of manoeuvre, for example `zigzag`; `unknown` where it is not known.
-        masks: reason -> [T] bool, True where samples must not be scored or learned from.
-        meta: anything else worth keeping (source file, SHA-256, set-up); JSON values only.
+        manoeuvre: kind of manoeuvre, for example `zigzag`; `unknown` by default.
+        masks: reason -> [T] bool, True at samples that are excluded from fits and scores.
+        meta: further information (source file, SHA-256, set-up); JSON values only.
     """
 
     name: str
@@ -89,7 +93,7 @@ class Log:
         """Return the values [T] of one channel.
 
         Raises:
-            UsageError: where the log has no such channel.
+            UsageError: if the log has no such channel.
         """
         if name not in self.channels:
             raise UsageError(
@@ -98,7 +102,7 @@ class Log:
         return self.channels[name]
 
     def stack(self, names: tuple[str, ...] | list[str]) -> np.ndarray:
-        """Return channels side by side, [T, len(names)]."""
+        """Return channels as the columns of an array [T, len(names)]."""
         return (
             np.stack([self[name] for name in names], axis=-1) if names else np.zeros((len(self), 0))
         )
@@ -112,11 +116,15 @@ class Log:
         return ~is_masked
 
     def replace(self, **changes: Any) -> Log:
-        """Return a copy with some attributes changed."""
+        """Return a copy with some attributes replaced."""
         return dataclasses.replace(self, **changes)
 
     def select_rows(self, selection: slice | np.ndarray) -> Log:
-        """Return the log at some of its samples, given as a slice or as a mask [T]."""
+        """Return the log with selected samples only.
+
+        Args:
+            selection: slice, indices or mask [T].
+        """
         return self.replace(
             t=self.t[selection],
             channels={name: values[selection] for name, values in self.channels.items()},
@@ -124,7 +132,7 @@ class Log:
         )
 
     def move_to_disk(self) -> Log:
-        """Return the same log with its arrays in a temporary file, out of memory."""
+        """Return the log with its arrays in a memory-mapped temporary file."""
         on_disk_log = self.replace(
             t=paged.copy_to_disk(self.t),
             channels={name: paged.copy_to_disk(values) for name, values in self.channels.items()},
@@ -136,8 +144,8 @@ class Log:
     def save(self, path: Path) -> None:
         """Write the log as a canonical Parquet file.
 
-        Its columns are t, the channels and `mask:<reason>`; the rest stands as JSON in its
-        metadata.
+        The columns are t, the channels and `mask:<reason>`. The other attributes are JSON in the
+        metadata of the file.
         """
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -158,7 +166,7 @@ class Log:
             {name: values[:0] for name, values in columns.items()}
         ).schema.with_metadata({"residnet": json.dumps(metadata)})
         with atomic_write(path) as file, pq.ParquetWriter(file, schema) as writer:
-            # piece by piece: the columns of a large log lie on disk
+            # in chunks, because the columns of a large log are memory-mapped
             for start in range(0, max(1, len(self)), _WRITE_ROWS):
                 writer.write_table(
                     pa.table(
@@ -190,8 +198,8 @@ class Log:
         """Read a file that `save` wrote.
 
         Raises:
-            UsageError: where the file is missing or not a canonical log.
-            DataError: where what it says of itself is damaged.
+            UsageError: if the file is missing or not a canonical log.
+            DataError: if its metadata are damaged.
         """
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -200,14 +208,15 @@ class Log:
             raise UsageError(f"{path}: no such file")
         if path.suffix.lower() != ".parquet":
             raise UsageError(
-                f"{path}: is no log that residnet wrote (.parquet), and only such are read here;"
+                f"{path}: is not a log that residnet wrote (.parquet);"
                 " the task `import` turns others into such logs"
             )
         try:
             table = pq.read_table(path)
         except UnicodeError as error:
             raise DataError(
-                f"{path}: the name of a column is no UTF-8 text; rename it where it is written"
+                f"{path}: the name of a column is not UTF-8 text; rename the column in the program"
+                " that wrote it"
             ) from error
         except (pa.ArrowException, OSError) as error:
             raise UsageError(
@@ -249,7 +258,7 @@ class Log:
                     " damaged, write it again"
                 )
             if name in columns:
-                raise DataError(f"{path}: column '{name}' stands twice; write the file again")
+                raise DataError(f"{path}: column '{name}' occurs twice; write the file again")
             dtype = bool if name.startswith("mask:") else np.float64
             columns[name] = np.asarray(values, dtype=dtype)
         if "t" not in columns:

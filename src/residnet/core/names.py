@@ -1,8 +1,8 @@
 """Names and SI units of the channels.
 
-Inside residnet everything is SI with angles in radians; propeller revolutions are in 1/s. A channel
-that enters declares its unit once (in the log's channel map or in a config value such as `"20
-deg"`) and is converted by `residnet.core.units`.
+All quantities are in SI units with angles in radians; propeller revolutions are in 1/s. Input data
+declare their unit once, in the channel map of a log or in a config value such as `"20 deg"`, and
+are converted by `residnet.core.units`.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ _BREAKS_A_COMMENT = ("*/", "/*", "//", "\\", '"')
 
 
 def require_plain_name(name: str) -> str:
-    """Check that a name can stand in a comment or a text of an exported program.
+    """Check that a name is safe in a comment or a string of an exported program.
 
-    Exports write the names of models and channels into C, which is compiled and run to compare it
-    with the model: a name that ends a comment would be code.
+    Exports write the names of models and channels into C code, which is compiled and run for
+    comparison with the model: a name that ends a comment would be executed.
 
     Raises:
         ValueError: if a character is not printable, or a comment or text would end there.
@@ -60,17 +60,16 @@ STATE_NAMES = POSE_NAMES + VELOCITY_NAMES
 """
 
 POSE_ERROR_UNITS = {"position": "m", "heading": "rad", "depth": "m", "attitude": "rad"}
-"""Errors of the pose at the end of a free run: a distance, the angle of one rotation and so on."""
+"""Errors of the pose at the end of a free run, with their SI units."""
 
 ACCELERATION_NAMES = tuple(f"{name}_dot" for name in VELOCITY_NAMES)
 
 WIND_INPUTS = ("wind_speed", "wind_dir")
-"""True wind as inputs of a plant: speed [m/s] and where it comes FROM [rad], earth-fixed."""
+"""Inputs of the true wind: speed [m/s] and the direction it comes FROM [rad], earth-fixed."""
 BOW_WIND_CHANNELS = ("wind_angle", "apparent_wind_speed", "apparent_wind_angle")
-"""A wind that is told from the bow: where the true wind comes from, and the wind that is felt."""
+"""Wind relative to the bow: direction of the true wind, speed and direction of the apparent."""
 
-# SI unit of the channels that residnet knows by name; any other channel keeps the SI unit that its
-# map declares
+# SI unit of the standard channels; any other channel has the SI unit that its channel map declares
 CHANNEL_UNITS: dict[str, str] = {
     "t": "s",
     "x": "m",
@@ -121,18 +120,18 @@ _SI_OF_PREFIX = {
     **{r"n(_|$)": "1/s", "delta|azimuth": "rad", "tau_x|tau_y|thrust": "N", "tau_n": "N m"},
     "throttle": "-",
 }
-"""How names of one's own begin -> SI unit."""
+"""Pattern of the start of a non-standard channel name -> SI unit."""
 
 
 def get_si_unit(channel: str) -> str | None:
-    """Return the SI unit of a channel, by its name where residnet does not know it, or None."""
+    """Return the SI unit of a channel, guessed from the start of a non-standard name; or None."""
     base_name = channel.removeprefix("cmd_")
     matches = (si for prefix, si in _SI_OF_PREFIX.items() if re.match(prefix, base_name))
     return CHANNEL_UNITS.get(channel) or next(matches, None)
 
 
 def port_starboard_pairs(names: Iterable[str]) -> dict[str, str]:
-    """Return the channels that end in `_port`, each with the one that ends in `_stbd`."""
+    """Return the pairs of channels `<name>_port` -> `<name>_stbd`."""
     known_names = dict.fromkeys(names)
     starboard_names = {
         name: f"{name[:-4]}stbd" for name in known_names if name[:-5] and name.endswith("_port")
@@ -141,13 +140,13 @@ def port_starboard_pairs(names: Iterable[str]) -> dict[str, str]:
 
 
 def truncate(text: object, max_length: int = 60) -> str:
-    """Return what a message quotes from a file, cut to `max_length` characters."""
+    """Return a text for a message, truncated to `max_length` characters."""
     full_text = str(text)
     return full_text if len(full_text) <= max_length else f"{full_text[: max_length - 3]}..."
 
 
 def suggest_name(name: str, valid: Iterable[str]) -> str:
-    """Return `; did you mean 'x'?` for error messages, or the valid names where none is near."""
+    """Return `; did you mean 'x'?` for error messages, or the valid names if none is similar."""
     names = sorted({truncate(valid_name) for valid_name in valid})
     close_matches = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     if close_matches:
@@ -156,7 +155,7 @@ def suggest_name(name: str, valid: Iterable[str]) -> str:
 
 
 def azimuth_thrusters(names: Sequence[str]) -> dict[str, str]:
-    """Return the angle of each azimuth thruster -> what its thrust goes with."""
+    """Return the angle channel of each azimuth thruster -> channel of its revolutions or thrust."""
     name_of_base = {channel.removeprefix("cmd_"): channel for channel in names}
     thrust_of_angle = {}
     for angle in (channel for channel in name_of_base if channel.startswith("azimuth")):

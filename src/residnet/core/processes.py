@@ -1,4 +1,4 @@
-"""Work in processes side by side, which end with the one that began them; memory that they keep."""
+"""Process pools whose workers end with their parent, and reuse of freed memory."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from residnet.core.errors import FitError
 from residnet.core.trust import is_trusted, set_trusted
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
-"""Numbers of the settings in malloc.h of the GNU C library."""
+"""Parameter numbers of `mallopt` in malloc.h of the GNU C library."""
 _MAX_KEPT_BYTES = 128 << 20
 _MAX_REUSED_BYTES = 64 << 20
 
 
 def retain_freed_memory() -> None:
-    """Let this process keep up to 128 MB of freed memory, so that tensors find it ready again.
+    """Let this process retain up to 128 MB of freed memory for new tensors.
 
-    By default the GNU C library gives the memory of tensors back when they are freed, and each new
-    one has to be filled with zeros page by page: a third of the time of training an LSTM of 100
-    units. Larger arrays than 64 MB are given back as before. Other C libraries are left alone.
+    By default the GNU C library returns the memory of freed tensors to the system, and the system
+    clears each page of a new tensor: a third of the time of training an LSTM of 100 units. Arrays
+    above 64 MB are returned as before. Other C libraries are not changed.
     """
     if platform.libc_ver()[0] != "glibc":
         return
@@ -42,20 +42,20 @@ _core_limit: ContextVar[int] = ContextVar("residnet_cores", default=1)
 
 
 def available_cores() -> int:
-    """Return how many cores work may spread over, where nobody names a number of processes.
+    """Return the default number of worker processes, set by `worker_limit`.
 
-    One, unless `worker_limit` says otherwise: a new process imports the program that it belongs to again,
-    and a program of the user's own need not be made for that.
+    The default is one, because a new process imports the main program again, and the program of a
+    user may not be protected against that.
     """
     return _core_limit.get()
 
 
 @contextmanager
 def worker_limit(cores: int | None = None) -> Iterator[None]:
-    """Let the work within the context spread over several cores.
+    """Set the default number of worker processes within the context.
 
     Args:
-        cores: number of them; None for all that this process may use.
+        cores: number of processes; None for all cores that this process may use.
     """
     if cores is None:
         from joblib import cpu_count
@@ -74,23 +74,23 @@ def process_pool(
     initializer: Callable[..., None] | None = None,
     initializer_arguments: tuple[Any, ...] = (),
 ) -> Iterator[Executor]:
-    """Hold processes for work side by side; an interruption ends them all at once.
+    """Create a process pool; an exception within the context terminates all workers.
 
     Args:
-        workers: number of processes; each is started when it is first needed.
-        initializer: is called once in each process, before its first work.
-        initializer_arguments: to `initializer`.
+        workers: largest number of processes; each is started when it is first needed.
+        initializer: called once in each process before its first task.
+        initializer_arguments: arguments of `initializer`.
 
     Raises:
-        FitError: where the system ends one of the processes.
+        FitError: if the system kills one of the processes.
     """
     with _make_pool(workers, initializer, initializer_arguments) as pool:
         try:
             yield pool
         except BrokenProcessPool as error:
             raise FitError(
-                "workers: the system has ended one of the processes; the memory may not be enough"
-                " for so many side by side, so give fewer and continue with --resume"
+                "workers: the system killed a process, possibly because the memory is exhausted;"
+                " use fewer workers and continue with --resume"
             ) from error
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
@@ -107,28 +107,28 @@ def _make_pool(
     return ProcessPoolExecutor(
         workers,
         get_context("spawn"),
-        initializer=_begin_pooled,
+        initializer=_initialise_pooled_worker,
         initargs=(is_trusted(), initializer, initializer_arguments),
     )
 
 
 class IsolatedProcessPool(Executor):
-    """Processes of which one that the system ends loses its own work alone, and is replaced.
+    """Executor whose processes fail independently of each other.
 
-    That work ends with a `BrokenProcessPool`. Leaving a `with` block by an exception ends all
-    processes at once.
+    If the system kills a process, only its task fails, with a `BrokenProcessPool`, and the process
+    is replaced. Leaving a `with` block by an exception terminates all processes.
 
     Args:
-        workers: number of processes, and of the works that may be under way.
+        workers: number of processes, and of tasks that may run at the same time.
     """
 
     def __init__(self, workers: int) -> None:
-        # one pool for each: a lost process ends its whole pool
+        # one pool per process, because a killed process breaks its whole pool
         self._pools = [_make_pool(1) for _ in range(workers)]
         self._last_futures: list[Future[Any] | None] = [None] * workers
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Hand work to a process that is free."""
+        """Submit a task to an idle process."""
         free_index = next(
             i
             for i, last_future in enumerate(self._last_futures)
@@ -144,7 +144,7 @@ class IsolatedProcessPool(Executor):
         return future
 
     def shutdown(self, wait_for_work: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes, after their work where it is waited for."""
+        """Stop the processes, after their tasks if `wait_for_work`."""
         for pool in self._pools:
             pool.shutdown(wait_for_work, cancel_futures=cancel_futures)
 
@@ -157,10 +157,10 @@ class IsolatedProcessPool(Executor):
 
 
 class InlineExecutor(Executor):
-    """An executor that does its work at once, in the process that hands it over."""
+    """Executor that runs each task immediately in the calling process."""
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Do the work; returns a future that is done, with what the work raised where it failed."""
+        """Run a task; return a completed future with its result or exception."""
         future: Future[Any] = Future()
         try:
             future.set_result(function(*args, **kwargs))
@@ -169,20 +169,23 @@ class InlineExecutor(Executor):
         return future
 
 
-def _begin_pooled(
-    trust: bool, begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()
+def _initialise_pooled_worker(
+    trust: bool,
+    initializer: Callable[..., None] | None = None,
+    initializer_arguments: tuple[Any, ...] = (),
 ) -> None:
-    """Take over what the parent may load, then begin as every worker."""
+    """Copy the permission of the parent to load untrusted code, then initialise the worker."""
     set_trusted(trust)
-    initialise_worker(begin, given)
+    initialise_worker(initializer, initializer_arguments)
 
 
 def initialise_worker(
     initializer: Callable[..., None] | None = None, initializer_arguments: tuple[Any, ...] = ()
 ) -> None:
-    """Leave Ctrl-C to the process that began this one, and end with it, however it ends.
+    """Ignore Ctrl-C in this worker process, and exit when the parent process ends.
 
-    Ctrl-C reaches every process of a terminal; a process that is killed cannot tell its children.
+    Ctrl-C reaches every process of a terminal, but the parent handles it. A parent that is killed
+    cannot stop its children, therefore a thread watches it.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()

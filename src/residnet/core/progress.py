@@ -1,8 +1,8 @@
-"""Progress of long work: one callback hears of it, on the command line and in Python alike.
+"""Report the progress of long computations to one callback.
 
-Code that takes long calls `report_progress`. Whoever wants to hear of it installs a callback with `on_progress`;
-without one nothing is printed. The callback is held in a context variable, so that it need not be
-handed through every function, and so that two threads can listen separately.
+Long computations call `report_progress`. The command line or a program installs a callback with
+`on_progress`; without one nothing is printed. The callback is a context variable, so that it is not
+passed through every function and each thread can have its own.
 """
 
 from __future__ import annotations
@@ -15,15 +15,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Progress:
-    """One report of long work.
+    """One progress report.
 
     Attributes:
-        stage: what is being done, for example `training lstm`.
-        done: how much of it is done, in any unit; None where the work cannot be counted.
-        total: how much there is to do in the same unit; None where it is not known.
-        message: a line for the log; empty where there is only a count.
-        score: of a training by then, its best validation error in free run; None where there is
-            none.
+        stage: name of the current step, for example `training lstm`.
+        done: completed amount in any unit; None if it cannot be counted.
+        total: total amount in the same unit; None if unknown.
+        message: line for the log; empty for a pure count.
+        score: best validation error in free run of a training so far; None if there is none.
     """
 
     stage: str
@@ -45,12 +44,14 @@ def report_progress(
     message: str = "",
     score: float | None = None,
 ) -> None:
-    """Tell the callback that listens, if there is one, how far a stage is.
+    """Send a progress report to the installed callback, if any.
 
     Args:
-        done: how much of it is done, in any unit; None where the work cannot be counted.
-        total: how much there is to do in the same unit; None where it is not known.
-        score: best validation error in free run of a training by then.
+        stage: name of the current step.
+        done: completed amount in any unit; None if it cannot be counted.
+        total: total amount in the same unit; None if unknown.
+        message: line for the log.
+        score: best validation error in free run of a training so far.
     """
     callback = _callback.get()
     if callback is not None:
@@ -58,23 +59,23 @@ def report_progress(
 
 
 def get_callback() -> ProgressCallback | None:
-    """Return the callback that listens, for threads, which do not inherit it; None for none."""
+    """Return the installed callback, to install it in a new thread; None if there is none."""
     return _callback.get()
 
 
 def log_message(message: str) -> None:
-    """Tell the callback that listens, if there is one, what the work has found."""
+    """Send a log message to the installed callback, if any."""
     report_progress("", message=message)
 
 
 def begin_stage(stage: str) -> None:
-    """Tell the callback that listens, if there is one, what is being done from now on."""
+    """Report the start of a stage to the installed callback, if any."""
     report_progress(stage, message=f"  {stage}")
 
 
 @contextmanager
 def on_progress(callback: ProgressCallback | None) -> Iterator[None]:
-    """Send the progress of everything within the context to `callback`; None keeps silent."""
+    """Install a callback for progress reports within the context; None discards them."""
     token = _callback.set(callback)
     try:
         yield

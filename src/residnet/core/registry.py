@@ -1,4 +1,4 @@
-"""Kinds of parts by name: built-in ones, and those of other installed packages by entry points.
+"""Registry of plug-in parts by kind: built-in parts and entry points of installed packages.
 
 A package declares its part in its own pyproject.toml, for example
 
@@ -6,12 +6,10 @@ A package declares its part in its own pyproject.toml, for example
     tide = "my_package.heads:TideConfig"
 
 and `kind: tide` works in YAML, in Python and in `residnet list heads`. A part that cannot be loaded
-is kept with its fault: it says so where it is used, and disturbs nothing else.
+is listed with its fault and raises an error only if it is used.
 
-The kinds of the core are listed in a table by name and `module:Class`. A wing of residnet (a package
-that the core never imports, such as `residnet.autopilot`) declares its kinds in the same form in its
-file entry_points.toml. A kind is imported when a config names it, and `residnet list` reads its first
-line from the source: neither waits for PyTorch.
+Built-in parts are listed as `module:Class`. A part is imported when a config names it, and
+`residnet list` reads its summary from the source, so that neither imports PyTorch.
 """
 
 from __future__ import annotations
@@ -40,10 +38,10 @@ class EntryPointPart:
     """An entry point of another package.
 
     Attributes:
-        name: the name that YAML and `residnet list` know it by.
-        package: name and version of the package that it comes from.
-        part: what the entry point leads to; None where it is broken.
-        fault: why it cannot be used, one line; empty where it can.
+        name: name in YAML and in `residnet list`.
+        package: name and version of the package.
+        part: loaded object; None if it is broken.
+        fault: one line why it cannot be used; empty if it can.
     """
 
     name: str
@@ -53,32 +51,32 @@ class EntryPointPart:
 
     @property
     def error_message(self) -> str:
-        """One line that says which part of which package cannot be used, and why."""
+        """Message that names the part, its package and its fault."""
         return (
             f"'{self.name}' of the package {self.package} cannot be used: {self.fault}; repair or"
             " uninstall that package"
         )
 
     def with_check(self, find_fault: Callable[[], str]) -> EntryPointPart:
-        """Return the entry point, with a fault instead of its part where `find_fault` returns one."""
+        """Return the entry point, without its part if `find_fault` returns a fault."""
         fault = self.fault or find_fault()
         return EntryPointPart(self.name, self.package, None, fault) if fault else self
 
 
 _loading_groups: list[str] = []
 _broken: dict[tuple[str, str, str], EntryPointPart] = {}
-"""Entry points that raised while they were loaded, by group, name and package."""
+"""Entry points that raised an error on loading, by group, name and package."""
 
 
 @functools.cache
 def load_entry_points(group: str) -> tuple[EntryPointPart, ...]:
-    """Return the entry points of one group, loaded once, sorted by name.
+    """Load the entry points of one group, once, sorted by name.
 
     Args:
-        group: of entry points, such as `residnet.heads`.
+        group: entry-point group, for example `residnet.heads`.
 
     Raises:
-        UsageError: where a part is needed while it is itself being imported.
+        UsageError: if a package needs the group while it is itself being imported.
     """
     if group in _loading_groups:
         raise UsageError(
@@ -106,7 +104,7 @@ def _load_entry_point(entry_point: importlib.metadata.EntryPoint) -> EntryPointP
         return EntryPointPart(entry_point.name, package, entry_point.load())
     except (KeyboardInterrupt, Terminated):
         raise
-    # a foreign package that raises anything at all, SystemExit included, must not stop the others
+    # a third-party package may raise anything, SystemExit included, and must not stop the others
     except BaseException as error:
         lines = str(error).splitlines() or [""]
         broken = EntryPointPart(
@@ -117,7 +115,7 @@ def _load_entry_point(entry_point: importlib.metadata.EntryPoint) -> EntryPointP
 
 
 def load_faults() -> list[str]:
-    """Return one line for each entry point that could not be loaded so far and was skipped."""
+    """Return one line for each entry point that was skipped because it could not be loaded."""
     return [
         f"entry point '{name}' in {group} of the package {package} was skipped ({part.fault});"
         " repair or uninstall that package"
@@ -127,12 +125,12 @@ def load_faults() -> list[str]:
 
 @functools.cache
 def type_adapter(model: Any) -> TypeAdapter[Any]:
-    """Return what reads a type; for a union of vessels pydantic takes 35 ms to make it."""
+    """Return a cached pydantic adapter: building one for the union of vessels takes 35 ms."""
     return TypeAdapter(model)
 
 
 def clear_caches() -> None:
-    """Read the entry points anew when they are next needed, for tests that install packages."""
+    """Clear the cached entry points, for tests that install packages."""
     load_entry_points.cache_clear()
     _broken.clear()
     type_adapter.cache_clear()
@@ -140,17 +138,17 @@ def clear_caches() -> None:
 
 @dataclass(frozen=True, eq=False)
 class PluginUnion:
-    """Marks a config field that takes one of several kinds, those of other packages included.
+    """Marker of a config field that accepts one of several kinds, from any installed package.
 
-    Parts that are no configs, such as formats of exports, are kinds told apart by an attribute.
-    `HeadConfig = Annotated[Any, Kinds("residnet.heads", "residnet.heads.base:HeadKind",
-    {"lstm": "residnet.heads.lstm:LstmConfig"})]`.
+    For example `HeadConfig = Annotated[Any, PluginUnion("residnet.heads",
+    "residnet.heads.base:BaseHeadConfig", {"lstm": "residnet.heads.lstm:LstmConfig"})]`. Parts that
+    are not configs, such as export formats, have the kind as a class attribute.
 
     Attributes:
-        group: of the entry points; one that nobody names is closed to other packages.
-        base: `module:Class` that the configs of other packages must extend.
-        core_kinds: the kinds of the core, each as `module:Class`.
-        key: field that tells the kinds apart.
+        group: entry-point group of the kinds of other packages.
+        base: `module:Class` that the kinds of other packages must extend.
+        builtin: built-in kinds, name -> `module:Class`.
+        key: discriminator field.
     """
 
     group: str
@@ -164,7 +162,7 @@ class PluginUnion:
         return {**self.core_kinds, **read_wing_entry_points().get(self.group, {})}
 
     def entry_point_parts(self) -> list[EntryPointPart]:
-        """Return the kinds of other packages, each checked against what a kind has to be."""
+        """Return the kinds of other packages, each with a fault if it violates the interface."""
         package_of_name = dict.fromkeys(self.builtin, "residnet")
         checked_parts = []
         for entry_point in load_entry_points(self.group):
@@ -196,18 +194,18 @@ class PluginUnion:
         )
 
     def find_kind(self, name: str) -> type[Any] | EntryPointPart:
-        """Return the class of one kind; a broken one of another package as it is kept."""
+        """Return the class of one kind, or the broken entry point of another package."""
         if name in self.builtin:
             kind_class: type[Any] = import_object(self.builtin[name])
             return kind_class
-        # a second part of the same name could never be told from the first
+        # the first part of a name counts; a second one has a fault
         entry_point = next(part for part in self.entry_point_parts() if part.name == name)
         return entry_point if entry_point.fault else entry_point.part
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        """Return the schema of a union that is told apart by `key` and imports what is named."""
+        """Return the schema of a tagged union that imports a kind when it is named."""
         return core_schema.tagged_union_schema(
             {
                 name: core_schema.with_info_plain_validator_function(
@@ -226,23 +224,23 @@ class PluginUnion:
         if isinstance(value, kind_class):
             return value
         if info.mode == "json":
-            # what is strict in JSON is stricter in Python: no list is a tuple there
+            # the Python mode of pydantic does not accept lists for tuples, the JSON mode does
             return kind_class.model_validate_json(to_json(value), strict=True, context=info.context)
         return kind_class.model_validate(value, context=info.context)
 
 
 def import_object(object_path: str) -> Any:
-    """Return what stands at `module:name`."""
+    """Import and return the object at `module:name`."""
     module, _, name = object_path.partition(":")
     return getattr(importlib.import_module(module), name)
 
 
 def make_lazy_getattr(package: str, module_of_name: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return the `__getattr__` of a package whose names are loaded when they are first used.
+    """Create a module-level `__getattr__` that imports names of a package on first use.
 
     Args:
-        package: its `__name__`.
-        module_of_name: module within the package, by the name that it offers.
+        package: `__name__` of the package.
+        module_of_name: public name -> module within the package.
     """
 
     def load(name: str) -> Any:
@@ -254,7 +252,7 @@ def make_lazy_getattr(package: str, module_of_name: Mapping[str, str]) -> Callab
 
 
 def get_kind(config: type[Any], key: str = "kind") -> str | None:
-    """Return the value of the field that tells a class from others; None without one."""
+    """Return the value of the discriminator field of a class; None without one."""
     if not issubclass(config, BaseModel):
         return config.__dict__.get(key)
     kind_field = config.model_fields.get(key)
@@ -264,21 +262,21 @@ def get_kind(config: type[Any], key: str = "kind") -> str | None:
 
 
 def get_plugin_union(union: Any) -> PluginUnion:
-    """Return the kinds that a field of this type takes.
+    """Return the plug-in marker of an annotated type.
 
     Raises:
-        UsageError: where other packages cannot add to the union.
+        UsageError: if the type has no such marker.
     """
     plugin_union = next(
         (metadata for metadata in get_args(union)[1:] if isinstance(metadata, PluginUnion)), None
     )
     if plugin_union is None:
-        raise UsageError(f"{union} is no union of kinds that other packages may add to")
+        raise UsageError(f"{union} is not a union that other packages can extend")
     return plugin_union
 
 
 def load_kinds(union: Any) -> dict[str, Any]:
-    """Return the config classes by kind, all imported: built-in ones, then those of other packages.
+    """Import all classes of a union, by kind: built-in ones first.
 
     Args:
         union: for example `residnet.heads.HeadConfig`.
@@ -293,7 +291,7 @@ def load_kinds(union: Any) -> dict[str, Any]:
 
 
 def list_parts(union: Any) -> list[tuple[str, str]]:
-    """Return name and first line of every part; residnet's own ones are read, not imported.
+    """Return name and summary of every part; built-in parts are read without import.
 
     Args:
         union: for example `residnet.heads.HeadConfig`.
@@ -309,12 +307,12 @@ def list_parts(union: Any) -> list[tuple[str, str]]:
 
 
 def describe_broken_part(part: EntryPointPart) -> str:
-    """Return what a list says about a part that cannot be used."""
+    """Return the entry of a list for a part that cannot be used."""
     return f"(cannot be used: {part.fault}; from {part.package})"
 
 
 def _summary_line(object_or_path: Any) -> str:
-    """Return `summary` of a class where it has one, else the first line of its docstring."""
+    """Return the attribute `about` of a class if it has one, else the first docstring line."""
     if not isinstance(object_or_path, str):
         summary: str = (
             getattr(object_or_path, "about", "")
@@ -336,17 +334,17 @@ def _summary_line(object_or_path: Any) -> str:
 def _subclass_fault(part: Any, base: type[Any]) -> str:
     abstract_methods: frozenset[str] = getattr(part, "__abstractmethods__", frozenset())
     if not (inspect.isclass(part) and issubclass(part, base)):
-        return f"its entry point is no subclass of {base.__module__}.{base.__name__}"
+        return f"its entry point is not a subclass of {base.__module__}.{base.__name__}"
     if abstract_methods:
         return f"{part.__name__} lacks {', '.join(sorted(abstract_methods))}"
     return ""
 
 
 def entry_point_folders(group: str) -> dict[str, Path | EntryPointPart]:
-    """Return the folders that packages offer in a group, by entry point; a broken one is kept.
+    """Return the folders of the packages in an entry-point group, by entry point.
 
-    An entry point of such a group names a package (a folder with an `__init__.py`); what it offers
-    lies beside that file.
+    An entry point of such a group names a package (a folder with an `__init__.py`) that contains
+    data files. A broken entry point is returned itself.
     """
     folder_of_name: dict[str, Path | EntryPointPart] = {}
     for entry_point in load_entry_points(group):
@@ -354,7 +352,7 @@ def entry_point_folders(group: str) -> dict[str, Path | EntryPointPart]:
         if entry_point.fault:
             folder_of_name[entry_point.name] = entry_point
         elif not inspect.ismodule(entry_point.part) or file is None:
-            fault = "its entry point is no package with files beside it"
+            fault = "its entry point is not a package with data files"
             folder_of_name[entry_point.name] = replace(entry_point, part=None, fault=fault)
         else:
             folder_of_name[entry_point.name] = Path(file).parent
@@ -362,7 +360,7 @@ def entry_point_folders(group: str) -> dict[str, Path | EntryPointPart]:
 
 
 def find_vessel_files() -> dict[str, Path]:
-    """Return names and files of the vessels of residnet, then those of other packages."""
+    """Return the vessel files by name: of residnet, then of other packages."""
     file_of_vessel = {
         path.stem: path for path in sorted((find_config_folder() / "vessels").glob("*.yaml"))
     }
@@ -374,7 +372,7 @@ def find_vessel_files() -> dict[str, Path]:
 
 
 def find_broken_vessels() -> list[EntryPointPart]:
-    """Return entry points of vessels that lead to no folder, and vessels whose name is taken."""
+    """Return broken entry points of vessels, and vessels whose name is already in use."""
     files, broken_parts = find_vessel_files(), []
     for name, folder in entry_point_folders("residnet.vessels").items():
         if isinstance(folder, EntryPointPart):

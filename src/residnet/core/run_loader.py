@@ -1,4 +1,4 @@
-"""Run folders that may come from somebody else: checked before anything in them is read.
+"""Check run folders from other people before anything in them is read.
 
 A folder is read only if it holds regular files and folders (no symbolic links, devices or FIFOs),
 each below the size limit of its kind, and if its manifest lists every file that is read, with the
@@ -56,13 +56,13 @@ READ_NAMES = frozenset(
     }
 )
 """Files at the top of a run folder or model that are read; `RunFiles` checks the others itself."""
-_MOST_ENTRIES = 1_000_000
-_DEEPEST = 32
+_MAX_ENTRIES = 1_000_000
+_MAX_DEPTH = 32
 _ACCEPT = "if you trust where it comes from, accept it as it is with: residnet trust"
 
 
 def files_of_run(run: Path) -> Iterator[Path]:
-    """Yield the regular files of a run folder, those of folders in it with a run too.
+    """Yield the regular files of a run folder, including nested runs.
 
     Raises:
         UsageError: if an entry is a symbolic link, a device, a FIFO or too large, or if there are
@@ -74,8 +74,8 @@ def files_of_run(run: Path) -> Iterator[Path]:
         folder, depth = folders.pop()
         for entry in sorted(folder.iterdir()):
             count += 1
-            if depth > _DEEPEST or count > _MOST_ENTRIES:
-                raise UsageError(f"{entry}: lies too deep, or the folder has too many files")
+            if depth > _MAX_DEPTH or count > _MAX_ENTRIES:
+                raise UsageError(f"{entry}: nested too deeply, or the folder has too many files")
             status = entry.lstat()
             if stat.S_ISDIR(status.st_mode):
                 folders.append((entry, depth + 1))
@@ -146,7 +146,7 @@ def _unlisted(file: Path, run: Path) -> UsageError:
 
 
 def accept_run(run: Path) -> list[str]:
-    """Write the manifest of a run folder anew, so that it is taken as it stands.
+    """Rewrite the manifest of a run folder, so that its present contents are accepted.
 
     Returns:
         One line for each file that the manifest did not list, or listed with another SHA-256.
@@ -167,9 +167,9 @@ def accept_run(run: Path) -> list[str]:
     for folder in (*sorted(nested, key=lambda path: -len(path.parts)), run):
         manifest = Manifest(folder)
         try:
-            before = manifest.read()
+            previous_digests = manifest.read()
         except UsageError:
-            before = {}
+            previous_digests = {}
         manifest.path.unlink(missing_ok=True)
         manifest.journal.unlink(missing_ok=True)
         manifest.start_recording()
@@ -181,7 +181,7 @@ def accept_run(run: Path) -> list[str]:
                 continue
             digest = sha256(file)
             manifest.record(file, digest)
-            if digest not in before.get(file.relative_to(folder).as_posix(), ()):
+            if digest not in previous_digests.get(file.relative_to(folder).as_posix(), ()):
                 lines.append(f"{file}: {file.stat().st_size} bytes, SHA-256 {digest}")
         manifest.compact()
     return lines
@@ -193,7 +193,7 @@ _last_key: ContextVar[tuple[Path, str] | None] = ContextVar("residnet_last_key",
 
 
 class JsonObject(dict[str, Any]):
-    """A JSON object that remembers which of its keys was read last."""
+    """JSON object that records the key that was read last."""
 
     place: tuple[Path, str]
 
@@ -207,7 +207,7 @@ class JsonObject(dict[str, Any]):
 
 
 class JsonArray(list[Any]):
-    """A JSON array that remembers which of its elements was read last."""
+    """JSON array that records the element that was read last."""
 
     place: tuple[Path, str]
 
@@ -217,14 +217,14 @@ class JsonArray(list[Any]):
 
 
 def _tracked(value: Any, file: Path, key: str) -> Any:
-    """Return JSON whose objects and arrays know their file and key."""
+    """Convert JSON values to objects and arrays that record their file and key."""
     if isinstance(value, dict):
         prefix = f"{key}." if key else ""
-        found = JsonObject(
+        tracked_object = JsonObject(
             (name, _tracked(part, file, f"{prefix}{name}")) for name, part in value.items()
         )
-        found.place = (file, key)
-        return found
+        tracked_object.place = (file, key)
+        return tracked_object
     if isinstance(value, list):
         array = JsonArray(
             _tracked(part, file, f"{key}.{place}".lstrip(".")) for place, part in enumerate(value)
@@ -235,11 +235,11 @@ def _tracked(value: Any, file: Path, key: str) -> Any:
 
 
 def read_json_value(path: Path, folder: Path | None = None) -> Any:
-    """Return what a JSON file of a run folder holds, as objects that know their keys.
+    """Read a JSON file of a run folder as objects that record their keys.
 
     Args:
-        path: of the file.
-        folder: that no symbolic link may lead out of; that of the file if None.
+        path: path of the file.
+        folder: folder that no symbolic link may leave; None for the folder of the file.
 
     Raises:
         UsageError: if there is no such regular file, or it is too large or no JSON.
@@ -280,11 +280,11 @@ def name_damaged_key(run: Path) -> Iterator[None]:
             # nothing was read from the folder, so its files are not at fault
             raise
         file, key = last
-        first = next(iter(str(error).splitlines()), "")
-        where = f"key '{key}'" if key else "its contents"
+        first_line = next(iter(str(error).splitlines()), "")
+        location = f"key '{key}'" if key else "its contents"
         raise UsageError(
-            f"{file}: {where} cannot be used ({type(error).__name__}: {first[:200]}); restore the"
-            f" folder or run it again, and report it if {run} is as residnet wrote it"
+            f"{file}: {location} cannot be used ({type(error).__name__}: {first_line[:200]});"
+            f" restore the folder or run it again, and report it if {run} is as residnet wrote it"
         ) from error
     finally:
         _last_key.reset(token)

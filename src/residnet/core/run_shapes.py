@@ -1,7 +1,6 @@
-"""Types of the values in the JSON files of a run that commands read back.
+"""Types of the values in the JSON files of a run that commands read.
 
-Keys that are not listed here are free. A value of another type ends in one line that names the file
-and the key.
+Other keys are not checked. A value of a wrong type raises an error that names the file and the key.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ from residnet.core.errors import UsageError
 from residnet.core.model_names import FORMER_NAMES
 
 Number = Annotated[float, Field(strict=True)] | None
-"""A number; None stands for one that is not finite."""
+"""A number; None represents a non-finite number."""
 Texts = list[StrictStr]
 
 
 class _Shape(BaseModel):
-    """An object whose listed keys have a type; others may be there."""
+    """JSON object with typed keys; further keys are allowed."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -140,17 +139,17 @@ def require_shape(path: Path, content: Any) -> None:
         is_fit = isinstance(content, dict) and content.get("schema") == "residnet.metrics/1"
         shape = _FitMetrics if is_fit else _Metrics
     if shape is None or not isinstance(content, dict):
-        # whoever reads the file says what it expects in place of a list or a number
+        # the reader of the file reports a list or a number in place of an object
         return
     try:
         _adapter(shape).validate_python(content)
     except ShapeError as error:
-        first = error.errors(include_url=False)[0]
-        # the alternatives of a union stand behind the key that they are of
-        key = ".".join(str(part) for part in first["loc"] if "[" not in str(part))
-        where = f"key '{key}'" if key else "its contents"
+        first_fault = error.errors(include_url=False)[0]
+        # the location of a union ends in the names of its members
+        key = ".".join(str(part) for part in first_fault["loc"] if "[" not in str(part))
+        location = f"key '{key}'" if key else "its contents"
         raise UsageError(
-            f"{path}: {where}: {first['msg'].lower()}; restore the folder or run it again"
+            f"{path}: {location}: {first_fault['msg'].lower()}; restore the folder or run it again"
         ) from None
     if shape is _FitMetrics:
         for index, row in enumerate(content["rows"]):

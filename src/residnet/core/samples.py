@@ -1,4 +1,4 @@
-"""Samples of identification, their tallies, and derivatives along directions."""
+"""Samples for identification, running moments, and directional derivatives."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ from residnet.core.arrays.paged import iterate_row_chunks, release_pages, take_r
 
 @dataclass(frozen=True)
 class Samples:
-    """The usable samples of all manoeuvres, one below the other.
+    """Concatenated usable samples of all manoeuvres.
 
     Attributes:
-        z: channels [N, nz], float64 (columns named by `names`).
-        target: what a fit explains, [N, n]: accelerations in m/s^2, m/s^2, rad/s^2, or what a
-            baseline leaves of them.
-        group: number of the manoeuvre of each sample, [N], ascending.
-        t: time since the manoeuvre's start [N] in s.
-        kinds: kind of each manoeuvre, by number.
+        z: channels [N, nz], float64.
+        target: response of a fit [N, n]: accelerations in SI units, or residuals of a baseline.
+        group: index of the manoeuvre of each sample [N], ascending.
+        t: time since the start of the manoeuvre [N] in s.
+        kinds: kind of each manoeuvre.
         names: names of the columns of z.
     """
 
@@ -37,7 +36,7 @@ class Samples:
         return int(self.z.shape[0])
 
     def select_manoeuvres(self, kinds: Collection[str]) -> Samples:
-        """Return the samples of manoeuvres of some kinds; all where `kinds` is empty."""
+        """Return the samples of manoeuvres of given kinds; all if `kinds` is empty."""
         if not kinds:
             return self
         is_selected = torch.tensor(
@@ -60,7 +59,7 @@ class Samples:
         return replace(self, target=target)
 
     def running_moments(self) -> tuple[RunningMoments, RunningMoments]:
-        """Return what the channels are like, and the target."""
+        """Return the moments of the channels and of the target."""
         channel_moments, target_moments = (
             RunningMoments(self.z.shape[1]),
             RunningMoments(self.target.shape[1]),
@@ -77,14 +76,14 @@ class Samples:
 
 
 class RunningMoments:
-    """What columns [N, J] are like, from pieces of their rows.
+    """Moments and ranges of columns [N, J], accumulated over chunks of rows.
 
     Attributes:
-        n_rows: rows so far.
-        mean: of each column [J].
+        n_rows: number of accumulated rows.
+        mean: mean of each column [J].
         sum_of_squares: sum of squares about the mean [J].
-        minimum: least value [J].
-        maximum: largest value [J].
+        minimum: smallest value of each column [J].
+        maximum: largest value of each column [J].
     """
 
     def __init__(self, n_columns: int) -> None:
@@ -95,13 +94,14 @@ class RunningMoments:
         self.maximum = torch.full((n_columns,), -torch.inf, dtype=torch.float64)
 
     def add_rows(self, rows: Tensor) -> None:
-        """Count rows [M, J] in, M at least 1."""
+        """Add rows [M, J], M at least 1."""
         n_new, new_mean = len(rows), rows.mean(0)
         new_sum_of_squares = rows.var(0, correction=0) * n_new
         if self.n_rows == 0:
             self.mean, self.sum_of_squares = new_mean, new_sum_of_squares
         else:
-            # the rule for joining two variances keeps their digits
+            # pairwise update of mean and sum of squares, which is numerically stable (Chan et al.
+            # 1983)
             n_total, mean_difference = self.n_rows + n_new, new_mean - self.mean
             self.sum_of_squares = (
                 self.sum_of_squares
@@ -121,14 +121,14 @@ class RunningMoments:
 def directional_derivatives(
     function: Callable[[Tensor], Tensor], z: Tensor, directions: Tensor
 ) -> Tensor:
-    """Return the derivatives [D, B, ...] of a function along directions, by forward mode.
+    """Return directional derivatives [D, B, ...] of a function by forward-mode differentiation.
 
-    It takes half the time of torch.func.jvp, and agrees with it to the last digits.
+    It takes half the time of torch.func.jvp with the same result.
 
     Args:
-        function: of rows z [B, n], each row for itself.
-        z: where the derivatives are taken [B, n].
-        directions: the directions [D, B, n].
+        function: maps rows [B, n] to [B, ...], each row independently.
+        z: points at which the derivatives are computed [B, n].
+        directions: directions [D, B, n].
     """
     n_directions, n_rows = directions.shape[:2]
     with forward_ad.dual_level():
@@ -136,7 +136,7 @@ def directional_derivatives(
             z.repeat(n_directions, 1), directions.reshape(n_directions * n_rows, -1)
         )
         value, derivative = forward_ad.unpack_dual(function(dual_state))
-    # None where nothing depends on the rows
+    # None if the value does not depend on the rows
     derivatives: Tensor = torch.zeros_like(value) if derivative is None else derivative
     derivatives_by_direction: Tensor = derivatives.unflatten(0, (n_directions, n_rows))
     return derivatives_by_direction

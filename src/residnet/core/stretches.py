@@ -1,4 +1,4 @@
-"""Contiguous stretches of samples: the one place that finds where they begin and end."""
+"""Runs: contiguous stretches of equally labelled samples."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 
 
 def find_runs(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first index [S] and the index past the last [S] of every stretch.
+    """Return the start index [S] and the end index (exclusive) [S] of every run.
 
     Args:
-        labels: of each sample [T]. Of bool, a stretch is a run of True; of int, a run of one and
-            the same number, where negative numbers belong to no stretch.
+        labels: label of each sample [T]. For bool, a run is a sequence of True; for int, a
+            sequence of one number, where negative numbers belong to no run.
     """
     run_labels = np.where(labels, 0, -1) if labels.dtype == bool else labels
     if run_labels.size == 0:
@@ -21,10 +21,10 @@ def find_runs(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def number_runs(labels: np.ndarray) -> np.ndarray:
-    """Return the number of each sample's stretch [T], counted from 0; -1 where it is in none.
+    """Return the number of the run of each sample [T], counted from 0; -1 outside of runs.
 
     Args:
-        labels: of each sample, as for `find_runs`.
+        labels: label of each sample, as for `find_runs`.
     """
     starts, stops = find_runs(labels)
     run_numbers = np.full(labels.size, -1)
@@ -33,19 +33,17 @@ def number_runs(labels: np.ndarray) -> np.ndarray:
 
 
 def find_run_bounds(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where each sample's stretch begins [T] and the index past its end [T].
+    """Return start [T] and end (exclusive) [T] of the run of each sample.
 
-    A sample that is in no stretch has its own index for both.
+    For a sample outside of runs both are its own index.
 
     Args:
-        labels: of each sample, as for `find_runs`.
+        labels: label of each sample, as for `find_runs`.
     """
     starts, stops = find_runs(labels)
-    run_starts, run_ends, is_in_run = (
-        np.arange(labels.size),
-        np.arange(labels.size),
-        _is_in_run(labels),
-    )
+    is_in_run = _is_in_run(labels)
+    run_starts = np.arange(labels.size)
+    run_ends = np.arange(labels.size)
     run_starts[is_in_run] = np.repeat(starts, stops - starts)
     run_ends[is_in_run] = np.repeat(stops, stops - starts)
     return run_starts, run_ends

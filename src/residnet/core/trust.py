@@ -1,4 +1,4 @@
-"""Whether the user has vouched for parts that residnet cannot store as data (`--trust`)."""
+"""Permission of the user to load code that is not on the allow-lists (`--trust`)."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ _trusted: ContextVar[bool] = ContextVar("residnet_trusted", default=False)
 
 
 def is_trusted() -> bool:
-    """Return whether parts outside of the allow-lists may be made and loaded here."""
+    """Return whether classes and functions outside of the allow-lists may be loaded."""
     return _trusted.get()
 
 
 @contextmanager
 def trusting(trust: bool = True) -> Iterator[None]:
-    """Allow parts outside of the allow-lists within the context.
+    """Allow classes and functions outside of the allow-lists within the context.
 
     Args:
-        trust: whether the user has vouched for them; False changes nothing.
+        trust: whether the user gave permission; False changes nothing.
     """
     token = _trusted.set(trust or _trusted.get())
     try:
@@ -29,5 +29,5 @@ def trusting(trust: bool = True) -> Iterator[None]:
 
 
 def set_trusted(trust: bool) -> None:
-    """Set whether they are allowed in this process, as a worker takes over its parent's setting."""
+    """Set the permission of this process; a worker process copies it from its parent."""
     _trusted.set(trust)

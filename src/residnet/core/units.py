@@ -1,8 +1,8 @@
-"""The one table of units, and what people write for them: `kt`, `°/s`, `rev/min`, `m s-1`, `RPM`.
+"""Convert units to SI, and parse their spellings: `kt`, `°/s`, `rev/min`, `m s-1`, `RPM`.
 
-Inside residnet everything is SI with angles in radians; propeller revolutions are in 1/s. A unit is
-read as it stands first and without regard to case after that. Where two units then differ in case
-alone (`kn` and `kN`), the dimension that is expected decides.
+All quantities are in SI units with angles in radians; propeller revolutions are in 1/s. A spelling
+is matched exactly first and case-insensitively second. If two units differ only in case (`kn` and
+`kN`), the expected dimension decides.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _UNITS = {
 }
 """SI unit of each unit's dimension, and the factor to it."""
 
-# a part of a unit -> what else people write for it
+# unit or part of a unit -> other spellings
 _SPELLINGS_OF_UNIT: dict[str, str] = {
     "%": "percent pct prozent procent prosent",
     "m": "meter meters metre metres mtr м 米 メートル",
@@ -69,13 +69,16 @@ _SPELLINGS_OF_UNIT: dict[str, str] = {
     "h": "hr hrs hour hours stunde stunden heure uur 時",
     "day": "days tag tage jour jours dag dagen",
     "Hz": "hertz",
-    "kn": "kt kts knot knots knoten nd nds noeud noeuds nœud nœuds nudo nudos knoop knopen knop"
-    " ノット",
+    "kn": (
+        "kt kts knot knots knoten nd nds noeud noeuds nœud nœuds nudo nudos knoop knopen knop ノット"
+    ),
     "rpm": "r.p.m. upm",
     "rps": "r.p.s.",
     "rad": "radian radians rads",
-    "deg": "° º degree degrees degs grader grados degré degrés degres graden graus gradi stopnie"
-    " stopni град 度",
+    "deg": (
+        "° º degree degrees degs grader grados degré degrés degres graden graus gradi stopnie"
+        " stopni град 度"
+    ),
     "N": "newton newtons",
     "N m": "Nm N·m newtonmeter newtonmetre",
     "kN m": "kNm kN·m",
@@ -91,19 +94,20 @@ _SPELLINGS_OF_UNIT: dict[str, str] = {
     "-": "none dimensionless",
 }
 _REVOLUTION_SPELLINGS = "rev revs revolutions r u tr o omw omdr obr об giri 转 turns vueltas 回転"
-# where one part of a quotient is written in another way than the table does
+# numerators whose other spellings also occur in quotients
 _QUOTIENT_PARTS = ("m", "km", "cm", "rad", "deg", "kg", "rpm", "1")
 _POWER_SPELLINGS = {"²": "^2", "³": "^3", "**": "^", "⁻": "^-", "¹": "1"}
 
 
 @cache
 def unit_confusions(si: str) -> dict[float, str]:
-    """Return factor by which values are too large -> the two units of a dimension in question."""
+    """Return the scale factor of each confusion of two units of a dimension -> description."""
     factors, confusions = _FACTORS_OF_DIMENSION.get(si, {}), dict[float, str]()
     for reference_unit in (si.replace("rad", "deg"), si):
         for unit, factor in factors.items() if reference_unit in factors else ():
             ratio = factors[reference_unit] / factor
-            # those closer together, as gon and deg, are no better explanation than chance
+            # units with a smaller ratio, such as gon and deg, explain a factor no better than
+            # chance
             if abs(math.log(ratio)) > 0.2:
                 confusions.setdefault(round(ratio, 9), f"{unit} taken as {reference_unit}")
                 confusions.setdefault(round(1.0 / ratio, 9), f"{reference_unit} taken as {unit}")
@@ -119,7 +123,7 @@ def si_unit(unit: str) -> str:
     """Return the SI unit of the dimension of `unit`.
 
     Raises:
-        UsageError: where the unit is not known, or may be one of two.
+        UsageError: if the unit is unknown or ambiguous.
     """
     return _UNITS[canonical_unit(unit)][0]
 
@@ -129,24 +133,25 @@ def to_si(unit: str, expected: str | None = None) -> float:
 
     Args:
         unit: name of a unit, for example `deg/s`.
-        expected: SI unit of the dimension that is wanted, for example `rad/s`; None takes any.
+        expected: SI unit of the required dimension, for example `rad/s`; None accepts any.
 
     Raises:
-        UsageError: where the unit is not known or of another dimension than `expected`.
+        UsageError: if the unit is unknown or has another dimension than `expected`.
     """
     return _UNITS[canonical_unit(unit, expected)][1]
 
 
 @lru_cache(maxsize=4096)
 def canonical_unit(unit: str, expected: str | None = None) -> str:
-    """Return residnet's own name of a unit, whatever its spelling.
+    """Return the canonical name of a unit from any spelling.
 
     Args:
-        expected: SI unit of the dimension that is wanted; None takes any.
+        unit: name or spelling of a unit.
+        expected: SI unit of the required dimension; None accepts any.
 
     Raises:
-        UsageError: where the unit is not known, of another dimension than `expected`, or, without
-            `expected`, may be one of two that differ in case.
+        UsageError: if the unit is unknown, has another dimension than `expected`, or, without
+            `expected`, may be one of two units that differ only in case.
     """
     possible_units, matches = _match_unit(unit, expected)
     if len({_UNITS[name] for name in matches}) == 1:
@@ -169,16 +174,16 @@ def canonical_unit(unit: str, expected: str | None = None) -> str:
             f"unit '{unit}' does not measure [{expected}]; units that do:"
             f" {', '.join(units_of_dimension) or 'none'}"
         )
-    raise UsageError(f"unit '{unit}' may be {' or '.join(matches)}; write the one that is meant")
+    raise UsageError(f"unit '{unit}' may be {' or '.join(matches)}; write the intended one")
 
 
 def is_unit(text: str) -> bool:
-    """Return whether a text is a unit that `canonical_unit` knows; no other name is looked for."""
+    """Return whether a text is a spelling of exactly one unit."""
     return len({_UNITS[name] for name in _match_unit(text, None)[1]}) == 1
 
 
 def _match_unit(unit: str, expected: str | None) -> tuple[tuple[str, ...], list[str]]:
-    """Return the units that a spelling may mean, and those of them that measure `expected`."""
+    """Return the units that match a spelling, and those among them of the expected dimension."""
     exact, casefolded = _units_of_spelling()
     unit_text = _normalise_unit_text(unit)
     possible_units: tuple[str, ...] = ()
@@ -192,7 +197,7 @@ def _match_unit(unit: str, expected: str | None) -> tuple[tuple[str, ...], list[
 
 
 def _normalise_unit_text(unit: str) -> str:
-    """Return a unit with its blanks, powers and quotients in one style."""
+    """Normalise blanks, powers and quotients of a unit."""
     unit_text = " ".join(unit.split())
     for spelling, exponent in _POWER_SPELLINGS.items():
         unit_text = unit_text.replace(spelling, exponent)
@@ -207,7 +212,7 @@ def _normalise_unit_text(unit: str) -> str:
 
 @cache
 def _units_of_spelling() -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
-    """Return what may be written for each unit, with and without regard to case."""
+    """Return spelling -> units, first exact and then case-folded spellings."""
     exact: dict[str, list[str]] = {}
     for text, unit in _iterate_spellings():
         if unit not in exact.setdefault(text, []):
@@ -223,7 +228,7 @@ def _units_of_spelling() -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[st
 
 
 def _iterate_spellings() -> Iterator[tuple[str, str]]:
-    """Yield (text, unit) for every spelling."""
+    """Yield (spelling, unit) for every spelling of every unit."""
     for unit in _UNITS:
         yield unit, unit
         for spelling in _SPELLINGS_OF_UNIT.get(unit, "").split():
@@ -231,7 +236,7 @@ def _iterate_spellings() -> Iterator[tuple[str, str]]:
         numerator, slash, denominator = unit.partition("/")
         if not slash:
             continue
-        # a power stays behind the word that it belongs to
+        # the exponent is kept behind each spelling of the denominator
         denominator, caret, exponent = denominator.partition("^")
         numerators = (
             [numerator, *_SPELLINGS_OF_UNIT.get(numerator, "").split()]
@@ -246,9 +251,9 @@ def _iterate_spellings() -> Iterator[tuple[str, str]]:
 
 
 def _suggest_unit(unit: str, expected: str | None) -> str | None:
-    """Return the spelling that a text is a slip of the pen of; None where there is no single one.
+    """Return the unit of the closest spelling of a mistyped unit; None if it is not unique.
 
-    What can be read in the text must stay as it is: `deg/m` is never taken for `deg/s`.
+    Only swapped letters and one misspelt word are corrected: `deg/m` never becomes `deg/s`.
     """
     exact, _ = _units_of_spelling()
     unit_text = _normalise_unit_text(unit)
@@ -262,7 +267,7 @@ def _suggest_unit(unit: str, expected: str | None) -> str | None:
         for spelling in difflib.get_close_matches(unit_text, allowed_spellings, n=6, cutoff=0.6)
         if sorted(spelling) == sorted(unit_text) or _differs_in_one_word(spelling, unit_text)
     ]
-    # swapped letters are likelier than another word
+    # swapped letters are more likely than a different word
     close_spellings = [
         spelling for spelling in close_spellings if sorted(spelling) == sorted(unit_text)
     ] or close_spellings
@@ -271,7 +276,7 @@ def _suggest_unit(unit: str, expected: str | None) -> str | None:
 
 
 def _differs_in_one_word(spelling: str, text: str) -> bool:
-    """Return whether one part of a quotient differs, by little: a word of three letters or more."""
+    """Return whether exactly one part of a quotient differs, and is a similar word."""
     spelling_parts, text_parts = spelling.casefold().split("/"), text.casefold().split("/")
     if len(spelling_parts) != len(text_parts):
         return False

@@ -1,4 +1,4 @@
-"""The version of residnet, written down once; packaging, model files and reports read it here."""
+"""The version of residnet, read by packaging, model files and reports."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Arrays of many samples: kept in files, and summed up piece by piece."""
+"""Arrays of many samples, stored in memory-mapped files."""

@@ -1,4 +1,4 @@
-"""Arrays of large data sets in files, whose pages the system may drop from memory."""
+"""Memory-mapped arrays for large data sets, whose pages can be released from memory."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 
 MAX_SAMPLES_IN_MEMORY = 200_000
-"""Samples of all logs together from which further ones are kept on disk."""
+"""Total number of samples of all logs beyond which arrays are memory-mapped."""
 CHUNK_ROWS = 50_000
-"""Rows that are worked on at a time."""
+"""Rows that are processed at a time."""
 _FILE_BYTES = 1 << 28
-"""Bytes of a file that many arrays share: each file holds a descriptor open."""
+"""Size of a file in bytes; many arrays share it to save file descriptors."""
 _ALIGNMENT_BYTES = 64
-"""Arrays begin at multiples of so many bytes, a cache line, as torch's own do."""
+"""Alignment of arrays in bytes: a cache line, as in PyTorch."""
 
 _MAX_RESIDENT_BYTES = 1 << 28
-"""Bytes of pages of files beyond which those of arrays are given back."""
+"""Resident bytes of file pages above which the pages of arrays are released."""
 _CHECK_INTERVAL = 0.02
-"""Seconds; pages that the system still has come back at gigabytes a second."""
+"""Interval of the check in s; cached pages return at gigabytes per second."""
 
 _mapped_files: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 _lock = Lock()
 
 
 class _FileArena:
-    """The file that arrays are being put into."""
+    """Allocator of arrays in a temporary memory-mapped file."""
 
     def __init__(self) -> None:
         self.file: mmap.mmap | None = None
         self.end_offset = 0
 
     def allocate(self, n_bytes: int) -> tuple[mmap.mmap, int]:
-        """Return a file with room for so many bytes, and where they go."""
+        """Return a mapped file with free space for `n_bytes`, and the offset of that space."""
         if self.file is None or self.end_offset + n_bytes > len(self.file):
             with tempfile.TemporaryFile(prefix="residnet-") as file:
                 try:
@@ -68,17 +68,17 @@ class _FileArena:
 
 
 class _PageReleaser:
-    """Gives back pages while others work with the arrays, who need not know where these lie.
+    """Background thread that releases the pages of mapped arrays when there are too many.
 
-    The system drops them only where another process lacks memory, and until then they count as
-    this one's. Where there is no /proc/self/statm they stay.
+    The system drops such pages only under memory pressure, and counts them as memory of this
+    process until then. Without /proc/self/statm (not on Linux) no pages are released.
     """
 
     def __init__(self) -> None:
         self._is_started = False
 
     def start(self) -> None:
-        """Look after the pages from now on; further calls change nothing."""
+        """Start the thread; further calls have no effect."""
         statm = Path("/proc/self/statm")
         if self._is_started or not statm.exists():
             return
@@ -95,7 +95,7 @@ class _PageReleaser:
 
 
 def _count_file_pages(statm: Path) -> int:
-    """Return how many pages of files this process holds in memory."""
+    """Return the number of resident file pages of this process."""
     return int(statm.read_text().split()[2])
 
 
@@ -103,10 +103,10 @@ _arena, _page_releaser = _FileArena(), _PageReleaser()
 
 
 def allocate_on_disk(shape: tuple[int, ...], dtype: Any = np.float64) -> np.ndarray:
-    """Return an array of zeros in a file that vanishes with the arrays in it.
+    """Return an array of zeros in a temporary file, which is deleted with its last array.
 
     Raises:
-        DataError: where the disk is full.
+        DataError: if the disk is full.
     """
     numpy_dtype = np.dtype(dtype)
     file, offset = _arena.allocate(max(math.prod(shape) * numpy_dtype.itemsize, 1))
@@ -114,7 +114,7 @@ def allocate_on_disk(shape: tuple[int, ...], dtype: Any = np.float64) -> np.ndar
 
 
 def copy_to_disk(values: np.ndarray) -> np.ndarray:
-    """Return a copy of an array in a file; the array itself where it lies in one."""
+    """Return a memory-mapped copy of an array; the array itself if it is memory-mapped."""
     if is_memory_mapped(values):
         return values
     array_on_disk = allocate_on_disk(values.shape, values.dtype)
@@ -123,7 +123,7 @@ def copy_to_disk(values: np.ndarray) -> np.ndarray:
 
 
 def is_memory_mapped(values: np.ndarray) -> bool:
-    """Return whether an array is a view of a file, one of these or another."""
+    """Return whether an array is a view of a memory-mapped file."""
     return _find_mapped_file(values) is not None
 
 
@@ -135,8 +135,8 @@ def _find_mapped_file(values: np.ndarray) -> mmap.mmap | None:
 
 
 def allocate_rows(n_rows: int, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
-    """Return a tensor [count, *shape] to be filled: in memory, or in a file where it is large."""
-    # what reads logs imports no torch
+    """Return a tensor of zeros [n_rows, *shape], memory-mapped if it has many rows."""
+    # readers of logs must not import PyTorch
     import torch
 
     dtype = torch.float64 if dtype is None else dtype
@@ -147,28 +147,28 @@ def allocate_rows(n_rows: int, *shape: int, dtype: torch.dtype | None = None) ->
 
 
 def iterate_row_chunks(n_rows: int) -> Iterator[slice]:
-    """Yield the rows of data: all at once, or in pieces where there are many."""
+    """Yield slices that cover `n_rows` rows: one slice, or chunks if there are many."""
     chunk_rows = CHUNK_ROWS if n_rows > MAX_SAMPLES_IN_MEMORY else max(n_rows, 1)
     for start in range(0, n_rows, chunk_rows):
         yield slice(start, min(start + chunk_rows, n_rows))
 
 
 class PageReleasingList(list[Item]):
-    """A list of items with arrays in files: on the way through, each item's pages are given back.
+    """List of items with mapped arrays that releases pages after each item of an iteration.
 
-    A loop that only looks at a few samples of each log reaches the pages of all logs sooner than
-    anyone else could notice.
+    A loop that reads few samples of each log would load pages of all logs faster than the
+    background thread checks.
     """
 
     def __iter__(self) -> Iterator[Item]:
-        """Yield the items; before each further one, no pages of arrays are held."""
+        """Yield the items and release all pages after each."""
         for item in super().__iter__():
             yield item
             release_pages()
 
 
 def take_rows(values: Tensor, mask: Tensor) -> Tensor:
-    """Return the rows of `values` [N, ...] where `mask` [N] is True; many of them in a file."""
+    """Return the rows of `values` [N, ...] where `mask` [N] is True, mapped if there are many."""
     selected = allocate_rows(int(mask.sum()), *values.shape[1:], dtype=values.dtype)
     first_row = 0
     for chunk in iterate_row_chunks(len(values)):
@@ -179,7 +179,7 @@ def take_rows(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def release_pages() -> None:
-    """Give back the memory of all arrays in files; they are read again when they are next used."""
+    """Release the memory of all mapped arrays; they are read again on their next use."""
     with _lock:
         files = list(_mapped_files)
     for file in files:
@@ -187,9 +187,9 @@ def release_pages() -> None:
 
 
 def release_pages_of(values: np.ndarray) -> None:
-    """Give back the memory of one array that lies in a file; others stay as they are.
+    """Release the memory of one mapped array; an array in memory is not changed.
 
-    So does a file of another's that may be written to: its changes might live in memory alone.
+    A writable file of another owner is not released, because its changes may exist in memory only.
     """
     file = _find_mapped_file(values)
     if file is not None and (file in _mapped_files or not values.flags.writeable):
