@@ -1,1 +1,1 @@
-"""From a log to samples: grid, masks, derivatives, missing velocities and windows."""
+"""Prepare logs for a fit: grid, masks, derivatives, missing velocities and windows."""

@@ -1,4 +1,4 @@
-"""Bring a log to a uniform time grid, without touching one that already lies on it."""
+"""Resample logs to a uniform time grid."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from residnet.core.frames import unwrap_angle
 from residnet.core.log import Log
 from residnet.preprocessing.masks import HARD_PREFIX
 
-# share of a step within which a sample counts as lying on the grid
+# tolerance of the sample times for a log that is already on the grid, as a share of a step
 _GRID_TOLERANCE = 1e-3
-# share of a time step within which a grid point is a sample, so that rounding of the clock does not
-# drag in the neighbour
+# distance of a grid point from a sample, as a share of a time step, within which they coincide, so
+# that rounding of the clock does not give weight to a neighbour
 _SAMPLE_TOLERANCE = 1e-5
-# grid points per sample beyond which the clock or its unit must be wrong
+# largest number of grid points per sample; above it the clock or its unit must be wrong
 _MAX_POINTS_PER_SAMPLE = 1000
 
 
 class GridConfig(Config):
-    """A uniform grid from the log's first sample on.
+    """Uniform time grid that starts at the first sample of the log.
 
     Attributes:
-        step: time between grid points, s.
-        held: channels whose last value holds until the next (commands); all others are interpolated
-            linearly, angles the short way round.
-        longest_gap: longest time step of the log that is interpolated across, s; null takes three
-            times the log's usual time step.
+        step: time between grid points in s.
+        held: channels that are held until the next value (commands); all other channels are
+            interpolated linearly, angles across the shorter arc.
+        longest_gap: longest time step of the log that is interpolated, in s; null for three median
+            time steps of the log.
     """
 
     step: Seconds = Field(gt=0.0)
@@ -43,29 +43,29 @@ def align_to_grid(
 ) -> Log:
     """Return the log on the grid.
 
+    A log that is on the grid within a thousandth of a step is not changed. If the grid is coarser
+    than the log by a factor of two or more, every channel that is not held is averaged over one
+    grid step around each grid point, to avoid aliasing. The average is the exact integral of the
+    interpolated signal: it has zero phase, accepts any sample times, and has a null at the new
+    sampling rate.
+
+    Grid points inside a gap, or whose value depends on a NaN, become NaN and are masked as
+    `hard:gap`. The masks of the log cover every grid point to which a masked sample contributes.
+
     Args:
         log: with an increasing clock.
-        required_channels: channels without which a sample is missing; all where None. What nobody uses must
-            cost no sample.
-
-    A log that lies on the grid to a thousandth of a step keeps its times and samples exactly. Where
-    the grid is coarser than the log by a factor of two or more, every channel that is not held is
-    averaged over one grid step around each grid point, or motion above the new Nyquist frequency
-    would fold into the samples. The average is the exact integral of the interpolated signal: zero
-    phase, any sample times, a null at the new rate.
-
-    Grid points inside a gap or whose value depends on a NaN become NaN and are masked as
-    `hard:gap`; the log's own masks cover every grid point that a masked sample enters.
+        config: the grid.
+        required_channels: channels whose NaN is masked; None for all channels. A channel that
+            nobody uses must not exclude samples.
 
     Raises:
-        DataError: where the log has fewer than two samples, or the grid would have more than a
+        DataError: if the log has fewer than two samples, or the grid would have more than a
             thousand points per sample.
-        UsageError: where the log lacks a held channel.
+        UsageError: if the log lacks a held channel.
     """
     if len(log) < 2:
         raise DataError(
-            f"log {log.name}: {len(log)} samples, at least 2 are needed for a time grid; leave"
-            " it out"
+            f"log {log.name}: {len(log)} samples, at least 2 are needed for a time grid; exclude it"
         )
     for name in config.held:
         log[name]
@@ -91,18 +91,21 @@ def align_to_grid(
     return gridded.replace(
         masks={
             **gridded.masks,
-            mask_reason: gridded.masks.get(mask_reason, np.zeros(len(gridded), dtype=bool))
-            | is_missing,
+            mask_reason: (
+                gridded.masks.get(mask_reason, np.zeros(len(gridded), dtype=bool)) | is_missing
+            ),
         }
     )
 
 
 def resample_at(log: Log, config: GridConfig, times: np.ndarray) -> Log:
-    """Return the log at given times [G], increasing, in s on its clock, by the rules of `align_to_grid`.
+    """Return the log at given times by the rules of `align_to_grid`.
 
-    NaN before its first sample and after its last.
-
-    The length that is averaged over is the config's step.
+    Args:
+        log: with an increasing clock.
+        config: its step is the averaging length.
+        times: increasing times [G] in s on the clock of the log; before the first and after the
+            last sample the result is NaN.
     """
     resampled = _resample(log, config, times)
     margin = _GRID_TOLERANCE * config.step
@@ -125,10 +128,8 @@ def _resample(log: Log, config: GridConfig, grid: np.ndarray) -> Log:
         if is_averaged
         else np.zeros_like(grid)
     )
-    averaging_weights, held_weights = (
-        _GridWeights(log.t, grid, half_window, is_gap),
-        _GridWeights(log.t, grid, np.zeros_like(grid), is_gap),
-    )
+    averaging_weights = _GridWeights(log.t, grid, half_window, is_gap)
+    held_weights = _GridWeights(log.t, grid, np.zeros_like(grid), is_gap)
     channel_names = tuple(log.channels)
     continuous = np.stack(
         [
@@ -138,8 +139,8 @@ def _resample(log: Log, config: GridConfig, grid: np.ndarray) -> Log:
         axis=-1,
     )
     is_held = np.array([name in config.held for name in channel_names], dtype=bool)
-    # a NaN would poison the whole running integral: zeros stand in for it, and every point that
-    # they reach is blanked below
+    # a NaN would propagate through the whole running integral: it is replaced by zero, and every
+    # grid point to which it contributes becomes NaN below
     values = np.where(
         is_held,
         held_weights.hold_previous(continuous),
@@ -174,13 +175,13 @@ def _resample(log: Log, config: GridConfig, grid: np.ndarray) -> Log:
 
 
 class _GridWeights:
-    """Which samples enter each point of a grid, and their weights.
+    """Weights of the samples in each grid point.
 
     Args:
-        t: sample times [T], s.
-        grid: grid points [G], s.
-        half_window: half the length [G] that a point is averaged over, s; zero interpolates.
-        is_gap: [T - 1] bool, time steps that must not be bridged.
+        t: sample times [T] in s.
+        grid: grid points [G] in s.
+        half_window: half of the averaging length of each point [G] in s; zero interpolates.
+        is_gap: time steps that must not be interpolated [T - 1] bool.
     """
 
     def __init__(
@@ -189,12 +190,12 @@ class _GridWeights:
         self._t, self._is_gap = t, is_gap
         self._window_start, self._start_weight = self._locate(grid - half_window)
         self._window_end, self._end_weight = self._locate(grid + half_window)
-        # first and last sample that carry weight
+        # first and last sample with a nonzero weight
         self._first_weighted = self._window_start + (self._start_weight == 1.0)
         self._last_weighted = self._window_end + (self._end_weight > 0.0)
 
     def _locate(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the index of the sample before each time, and the share of the way to the next."""
+        """Return the index of the sample before each time, and the fraction of the time step."""
         previous_index = np.clip(
             np.searchsorted(self._t, times, side="right") - 1, 0, self._t.size - 2
         )
@@ -216,8 +217,8 @@ class _GridWeights:
         return held_values
 
     def average(self, values: np.ndarray) -> np.ndarray:
-        """Return the mean of the linear interpolant over each point's reach, [G, n] from [T, n]."""
-        # without its mean the running integral keeps its digits for positions far from the origin
+        """Return the mean of the linear interpolant over each window, [G, n] from [T, n]."""
+        # centred values keep the digits of the running integral of positions far from the origin
         mean_value = values.mean(axis=0)
         centred_values, dt = values - mean_value, np.diff(self._t)[:, None]
         cumulative_integral = np.concatenate(
@@ -257,11 +258,11 @@ class _GridWeights:
         return means
 
     def any_weighted(self, flags: np.ndarray) -> np.ndarray:
-        """Return [G, k] bool: any flagged sample carries weight; flags [T, k]."""
+        """Return [G, k] bool: points to which a flagged sample contributes; flags [T, k]."""
         return _any_in_ranges(flags, self._first_weighted, self._last_weighted + 1)
 
     def is_unreliable(self, is_missing: np.ndarray) -> np.ndarray:
-        """Return [G, n] bool: a missing sample carries weight, or the reach crosses a gap."""
+        """Return [G, n] bool: points to which a missing sample contributes, or whose window has a gap."""
         unreliable: np.ndarray = self.any_weighted(is_missing) | _any_in_ranges(
             self._is_gap[:, None], self._first_weighted, self._last_weighted
         )
@@ -269,7 +270,7 @@ class _GridWeights:
 
 
 def _any_in_ranges(flags: np.ndarray, starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
-    """Return [G, k] bool: any of flags[first:stop], for index arrays [G]."""
+    """Return [G, k] bool: any of flags[start:stop], for index arrays [G]."""
     cumulative_flags = np.concatenate(
         [np.zeros((1, flags.shape[1]), dtype=np.int64), np.cumsum(flags, axis=0)]
     )
@@ -280,9 +281,12 @@ def _any_in_ranges(flags: np.ndarray, starts: np.ndarray, stops: np.ndarray) -> 
 def _rewrap(
     original_values: np.ndarray, unwrapped_values: np.ndarray, grid_values: np.ndarray
 ) -> np.ndarray:
-    """Return the grid values [G] in the range of the original channel [T].
+    """Wrap resampled angles to the range of the original channel, if that was wrapped.
 
-    Unwrapping may have left that range.
+    Args:
+        original_values: channel [T] of the log.
+        unwrapped_values: the same channel unwrapped [T].
+        grid_values: resampled unwrapped channel [G].
     """
     if np.array_equal(original_values, unwrapped_values, equal_nan=True):
         return grid_values

@@ -1,4 +1,4 @@
-"""What single channels hold beside measurements: noise, outliers, spikes, fills, held values."""
+"""Detect noise, outliers, spikes, fill values and held values in single channels."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from residnet.core.layout import SIX_DOF_LAYOUT
 from residnet.core.log import Log
 from residnet.core.stretches import find_runs
 
-# standard deviations of a Gaussian in its median absolute deviation
+# standard deviation of a Gaussian over its median absolute deviation
 SIGMA_OF_MAD = 1.4826
-# share of the spread of a motion below which a sensor of it does not move: no unit is off so far
+# share of the expected standard deviation below which a sensor is constant: no unit error is so
+# large
 NEGLIGIBLE_MOTION_SHARE = 1e-3
 # reason in `Log.masks`
 SPIKE_REASON = "spike"
-# a spike leaves the median of its neighbours by so many times the usual change from sample to
-# sample, or the usual distance from that median, and returns within so many samples
+# distance of a spike from the median of its neighbours, in 99 % quantiles of the change between
+# samples or of the distance from that median, and largest length of a spike in samples
 _MIN_SPIKE_CHANGES, _MIN_SPIKE_DISTANCES, _MAX_SPIKE_SAMPLES = 12.0, 30.0, 2
-# the least of both, in usual changes
+# lower bound of both limits, in 99 % quantiles of the change between samples
 _MIN_CHANGES_FOR_SCAN = 3.0
-# or leaves the range of the whole log by so many times that range
+# alternative limit: distance outside the range of the log, in ranges
 _MIN_RANGE_EXCESS = 0.9
 _MIN_SAMPLES = 20
-"""Samples below which a channel has no usual change; chosen by hand."""
+"""Smallest number of samples for the detection of spikes; chosen by hand."""
 CACHED_SAMPLES = 8_192
-"""Samples whose neighbours are compared at a time: they stay in a core's cache."""
+"""Samples per chunk, so that the neighbours fit into the cache of a core."""
 _MAX_SUBSAMPLE, _N_SUBSAMPLE_SEGMENTS = 40_000, 40
-"""Samples of a long channel that tell how far samples usually lie from their neighbours, and in how
-many stretches these lie."""
+"""Number of samples for quantiles of a long channel, and number of stretches that form them."""
 
 
 def estimate_noise_std(values: np.ndarray) -> float:
-    """Return the standard deviation of a channel's white noise, from third differences.
+    """Estimate the standard deviation of white noise in a channel from third differences.
 
-    These hardly see the motion. The differences are taken over the known samples only; 0 where
-    there are fewer than 8, or where most third differences vanish.
+    Third differences suppress the motion. The result is 0 with fewer than 8 finite samples, or if
+    most third differences are zero.
     """
     finite_values = values[np.isfinite(values)]
     if finite_values.size < 8:
@@ -48,9 +48,9 @@ def estimate_noise_std(values: np.ndarray) -> float:
 
 
 def nan_quantiles(values: np.ndarray, *levels: float) -> list[float]:
-    """Return quantiles of the numbers in values [T], NaN where there are none.
+    """Return quantiles of the values [T] that are not NaN; NaN if there are none.
 
-    They are those of numpy, which takes ten times as long for a short log.
+    The result equals numpy.nanquantile, which takes ten times as long for a short log.
     """
     finite_values = values[~np.isnan(values)]
     if not finite_values.size:
@@ -76,12 +76,12 @@ def nan_quantiles(values: np.ndarray, *levels: float) -> list[float]:
 
 
 def nan_median(values: np.ndarray) -> float:
-    """Return the median of the numbers in values [T], NaN where there are none."""
+    """Return the median of the values [T] that are not NaN; NaN if there are none."""
     return nan_quantiles(values, 0.5)[0]
 
 
 def nan_std(values: np.ndarray) -> float:
-    """Return the standard deviation of the finite values, NaN where there are none."""
+    """Return the standard deviation of the finite values; NaN if there are none."""
     finite_values = values[np.isfinite(values)]
     if not finite_values.size:
         return np.nan
@@ -92,10 +92,15 @@ def nan_std(values: np.ndarray) -> float:
 def _selection_medians(
     get_members: Callable[[slice], list[np.ndarray]], n_samples: int
 ) -> np.ndarray:
-    """Return the medians [T] of members, each [T], given for a part of the `count` samples.
+    """Return element-wise medians [T] by forgetful selection.
 
-    By forgetful selection: of half of them and two more neither the least nor the largest is in
-    the middle. Both go, and the next comes, until the middle is left.
+    Among any n/2 + 2 of n candidates, neither the minimum nor the maximum can be the median. Both
+    are removed and the next candidate is added, until one or two candidates remain. With vectorised
+    minima and maxima this is faster than sorting.
+
+    Args:
+        get_members: returns the members of the median for a chunk of samples, an array each.
+        n_samples: T.
     """
     medians = np.empty(n_samples)
     for start in range(0, n_samples, CACHED_SAMPLES):
@@ -113,7 +118,7 @@ def _selection_medians(
                     np.minimum(lower_candidate, upper_candidate),
                     np.maximum(lower_candidate, upper_candidate),
                 )
-            # one in the middle of an odd number may be either
+            # with an odd number the middle candidate may be the minimum or the maximum
             for i in range(1, len(candidates) - n_half):
                 lower_candidate, upper_candidate = candidates[0], candidates[i]
                 candidates[0], candidates[i] = (
@@ -137,10 +142,17 @@ def _selection_medians(
 def find_hampel_outliers(
     columns: Sequence[np.ndarray], sigmas: float = 6.0, samples: int = 11
 ) -> list[np.ndarray]:
-    """Return for each column [T], [T] bool: known values that stand out of their neighbours.
+    """Find outliers by the rule of `residnet.preprocessing.masks.HampelMask`.
 
-    The rule is that of the mask `Hampel`; `samples`, made odd, is the number of neighbours. Columns
-    are compared side by side: several short ones take hardly longer than one.
+    Several short columns are processed in one pass.
+
+    Args:
+        columns: channels, [T] each.
+        sigmas: distance of an outlier in robust standard deviations.
+        samples: number of neighbours, made odd.
+
+    Returns:
+        [T] bool for each column; False at missing values.
     """
     half_window = samples // 2
     max_distance, n_neighbours = 2 * half_window, 2 * half_window + 1
@@ -157,7 +169,7 @@ def find_hampel_outliers(
         return values[chunk.start + offset : chunk.stop + offset]
 
     def split_by_column(values: np.ndarray, margin: int) -> list[np.ndarray]:
-        """Return the part of each column of those that stand one behind the other."""
+        """Split values of the padded, concatenated columns into values of each column."""
         starts = np.cumsum(
             [0, *(column_values.size + 2 * margin for column_values in finite_values[:-1])]
         )
@@ -166,7 +178,7 @@ def find_hampel_outliers(
             for start, column_values in zip(starts, finite_values, strict=True)
         ]
 
-    # how far samples lie from the straight lines between their neighbours, and how usual that is
+    # distance from the median of the linear interpolations between pairs of neighbours
     padded = np.concatenate(
         [
             np.pad(sample_slice, max_distance, mode="reflect", reflect_type="odd")
@@ -206,8 +218,8 @@ def find_hampel_outliers(
         sampled_distances = distance[
             sample_rows(column_values.size, _MAX_SUBSAMPLE, _N_SUBSAMPLE_SEGMENTS)
         ]
-        # a coarse channel flickers by single steps of its resolution, a spread at the level of
-        # rounding is none
+        # lower bound of the deviation: flicker of a coarse channel by single steps of its
+        # resolution, and rounding errors
         resolution = (
             2.0 * nan_quantiles(sampled_distances[sampled_distances > 0.0], 0.1)[0]
             if sampled_distances.any()
@@ -218,7 +230,7 @@ def find_hampel_outliers(
             resolution,
             1e-9 * float(np.abs(column_values).max()),
         )
-        # what a smooth channel bends by anyhow is no outlier where it stops bending
+        # the curvature of a smooth channel is no outlier at the end of a turn
         suspect_indices = np.flatnonzero(
             distance > sigmas * np.maximum(floor, np.abs(median_deviation))
         )
@@ -238,9 +250,13 @@ def find_hampel_outliers(
 def sample_rows(
     n_rows: int, max_rows: int, n_segments: int, centre_row: int | None = None
 ) -> np.ndarray:
-    """Return rows [K] of evenly spread stretches, `most` in all; every row of no more than that.
+    """Return the rows [K] of evenly spread stretches; all rows if there are at most `max_rows`.
 
-    With a row `centre_row` the stretch nearest to it lies about it.
+    Args:
+        n_rows: number of rows.
+        max_rows: total length of the stretches.
+        n_segments: number of stretches.
+        centre_row: row around which the nearest stretch is centred; None for even spacing.
     """
     if n_rows <= max_rows:
         return np.arange(n_rows)
@@ -253,7 +269,7 @@ def sample_rows(
 
 
 def mask_from_ranges(n_samples: int, starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
-    """Return [size] bool, True inside any of the half-open ranges: the way back of `n_segments`."""
+    """Return [n_samples] bool: samples in any of the half-open ranges; inverse of `find_runs`."""
     boundary_counts = np.zeros(n_samples + 1, dtype=np.int64)
     np.add.at(boundary_counts, np.clip(starts, 0, n_samples), 1)
     np.add.at(boundary_counts, np.clip(stops, 0, n_samples), -1)
@@ -261,9 +277,12 @@ def mask_from_ranges(n_samples: int, starts: np.ndarray, stops: np.ndarray) -> n
 
 
 def find_steps_above(log: Log, channel: str, limit: float) -> np.ndarray:
-    """Return the indices [K] of samples at which `channel` arrives after a large step.
+    """Return the indices [K] of the samples after steps above a limit.
 
-    Large is more than `limit` (SI; angles the short way round).
+    Args:
+        log: the log.
+        channel: name of the channel; angles are unwrapped.
+        limit: largest regular difference of successive samples, SI.
     """
     values = log[channel]
     values = unwrap_angle(values) if log.units[channel] == "rad" else values
@@ -271,11 +290,14 @@ def find_steps_above(log: Log, channel: str, limit: float) -> np.ndarray:
 
 
 def find_spikes(log: Log) -> dict[str, np.ndarray]:
-    """Return channel -> [T] bool: single samples, or pairs, that no mass and no actuator follows.
+    """Find spikes: single samples or pairs that the inertia of vessel and actuators excludes.
 
-    A measured channel has one where it leaves the median of its neighbours by many times the usual
-    change or distance, and returns within two samples. Any other channel may jump; there
-    it must leave the whole range of the channel by half of that range.
+    In a channel of the motion, a spike is far from the median of its neighbours, compared with the
+    usual changes and distances, and ends within two samples. Other channels may jump; their spikes
+    must exceed the range of the channel by half of that range.
+
+    Returns:
+        Channel -> [T] bool, for channels with spikes.
     """
     spikes_by_channel = {}
     for name, values in log.channels.items():
@@ -289,12 +311,14 @@ def find_spikes(log: Log) -> dict[str, np.ndarray]:
 
 
 def bridge_spikes(log: Log, required_channels: Collection[str] | None = None) -> Log:
-    """Return the log with its spikes bridged and marked, the log itself where it has none.
+    """Replace spikes and add the mask `spike`; a log without spikes is returned unchanged.
 
-    Only channels that are needed are looked at, all where that is None.
+    Channels of the motion are interpolated, other channels hold their last value. The mask excludes
+    the samples from fits and scores.
 
-    Measured channels are interpolated, others hold their last value. The mask `spike` keeps the
-    samples from being learned from or scored.
+    Args:
+        log: the log.
+        required_channels: channels to check; None for all.
     """
     spikes_by_channel = {
         name: is_spike
@@ -330,21 +354,27 @@ def bridge_spikes(log: Log, required_channels: Collection[str] | None = None) ->
 
 
 def _find_channel_spikes(values: np.ndarray, is_measured_motion: bool) -> np.ndarray:
-    """Return [T] bool: the spikes of one channel [T]; `moved` says that a mass carries it."""
+    """Find the spikes of one channel.
+
+    Args:
+        values: channel [T], angles unwrapped.
+        is_measured_motion: whether the channel belongs to the motion and cannot jump.
+
+    Returns:
+        [T] bool.
+    """
     spike_mask = np.zeros(values.size, dtype=bool)
     finite_indices = np.flatnonzero(np.isfinite(values))
     if finite_indices.size < _MIN_SAMPLES:
         return spike_mask
     finite_values = values[finite_indices]
     changes = np.abs(np.diff(finite_values))
-    # of very many samples some tell what is usual
+    # quantiles of a long channel use a subsample
     subsample = slice(None, None, -(-finite_values.size // _MAX_SUBSAMPLE))
     lower_quantile, upper_quantile = nan_quantiles(finite_values[subsample], 0.005, 0.995)
-    value_range, high_change = (
-        upper_quantile - lower_quantile,
-        nan_quantiles(changes[subsample], 0.99)[0],
-    )
-    # a glance: without one large change there is no spike
+    value_range = upper_quantile - lower_quantile
+    high_change = nan_quantiles(changes[subsample], 0.99)[0]
+    # quick exit: without a large change there is no spike
     largest = float(changes.max())
     scan_threshold = (
         min(_MIN_CHANGES_FOR_SCAN * high_change, _MIN_RANGE_EXCESS * value_range)
@@ -353,7 +383,7 @@ def _find_channel_spikes(values: np.ndarray, is_measured_motion: bool) -> np.nda
     )
     if largest <= scan_threshold or not largest:
         return spike_mask
-    # what leaves the median of its neighbours makes a step, or three of them do
+    # a distance from the median of the neighbours requires one large step or three smaller ones
     step_indices = np.flatnonzero(
         changes > (scan_threshold / 3.0 if finite_values.size > _MAX_SUBSAMPLE else -1.0)
     )
@@ -381,12 +411,12 @@ def _find_channel_spikes(values: np.ndarray, is_measured_motion: bool) -> np.nda
             if finite_values.size > _MAX_SUBSAMPLE
             else distance
         )
-        # the neighbours of a spike in a steady channel leave their median by a few changes
+        # in a steady channel the neighbours of a spike are also a few changes from their median
         min_distance = min(
             _MIN_SPIKE_CHANGES * high_change,
             _MIN_SPIKE_DISTANCES * nan_quantiles(typical_distances, 0.99)[0],
         )
-        # what leaves the whole range of a noisy channel is a spike too
+        # in a noisy channel only the range of the channel reveals a spike
         is_out_of_range = (
             (range_excess > _MIN_RANGE_EXCESS * value_range)
             & (distance > _MIN_RANGE_EXCESS * value_range)
@@ -396,7 +426,7 @@ def _find_channel_spikes(values: np.ndarray, is_measured_motion: bool) -> np.nda
             distance > max(min_distance, _MIN_CHANGES_FOR_SCAN * high_change, 1e-6 * value_range)
         ) | is_out_of_range
     else:
-        # a display that flickers between its last digits leaves its range by one step of them
+        # a display that flickers in its last digit exceeds its range by one step of that digit
         min_excess = 0.5 * value_range + np.min(changes[changes > 0.0])
         is_outlier = (
             (np.minimum(range_excess, distance) > 1.001 * min_excess)
@@ -408,7 +438,7 @@ def _find_channel_spikes(values: np.ndarray, is_measured_motion: bool) -> np.nda
     spike_mask[finite_indices] = mask_from_ranges(
         finite_values.size, starts[is_single], stops[is_single]
     )
-    # many spikes are a fault of the sensor, not of single samples
+    # frequent spikes are a fault of the sensor instead of single samples
     return (
         spike_mask
         if spike_mask.sum() <= max(3, 0.01 * finite_values.size)
@@ -416,7 +446,7 @@ def _find_channel_spikes(values: np.ndarray, is_measured_motion: bool) -> np.nda
     )
 
 
-# what recorders, NetCDF and spreadsheets write where nothing was measured
+# values that recorders, NetCDF and spreadsheets write for missing measurements
 _FILL_VALUES = np.array(
     [
         *(-99.0, -999.0, -9999.0, -99999.0, -999999.0, -99.99, -999.99, -9999.99, -999.9, -999.25),
@@ -429,7 +459,7 @@ _FILL_VALUES = np.array(
     ]
 )
 _SORTED_FILL_VALUES = np.sort(_FILL_VALUES)
-# largest size that any vessel, manoeuvre or site gives a quantity, by its SI unit
+# largest plausible absolute value of a quantity by SI unit
 _MAX_MAGNITUDES = {
     "m": 5e7,
     "m/s": 300.0,
@@ -449,22 +479,22 @@ _MAX_MAGNITUDES = {
 
 
 def is_fill_value(values: np.ndarray) -> np.ndarray:
-    """Return [T] bool: cells that hold a usual fill value far from all that was measured.
+    """Return [T] bool: common fill values that are far from all other values.
 
-    Far is by more than the whole range of the other cells, so that a distance of 999 m between
-    900 m and 1100 m is a distance.
+    The distance must exceed the range of the other values, so that 999 m among distances from 900 m
+    to 1100 m is no fill value.
 
     Args:
-        values: a column as it stands in the file [T], NaN where empty.
+        values: column of a file [T], NaN for empty cells.
     """
     magnitudes = np.abs(values)
-    # most columns hold nothing of the kind: one comparison is enough for them
+    # most columns have no such value, which one comparison shows
     if not (magnitudes >= 99.0).any():
         return np.zeros(values.size, dtype=bool)
     is_finite = np.isfinite(values)
     min_value = float(np.min(values, where=is_finite, initial=np.inf))
     max_value = float(np.max(values, where=is_finite, initial=-np.inf))
-    # what is far from all else is the least or the largest
+    # a value far from all others is the minimum or the maximum
     if not _matches_fill_value(np.array([min_value, max_value])).any():
         return np.zeros(values.size, dtype=bool)
     is_candidate = np.zeros(values.size, dtype=bool)
@@ -480,13 +510,11 @@ def is_fill_value(values: np.ndarray) -> np.ndarray:
 
 
 def _matches_fill_value(values: np.ndarray) -> np.ndarray:
-    """Return [K] bool: values that are a usual fill value."""
-    insertion_indices, is_match = (
-        np.searchsorted(_SORTED_FILL_VALUES, values),
-        np.zeros(values.size, dtype=bool),
-    )
+    """Return [K] bool: values that equal a common fill value."""
+    insertion_indices = np.searchsorted(_SORTED_FILL_VALUES, values)
+    is_match = np.zeros(values.size, dtype=bool)
     for offset in (-1, 0):
-        # single precision keeps seven digits of a fill value
+        # in single precision a fill value has seven digits
         nearest_fill_value = _SORTED_FILL_VALUES[
             np.clip(insertion_indices + offset, 0, _SORTED_FILL_VALUES.size - 1)
         ]
@@ -495,36 +523,36 @@ def _matches_fill_value(values: np.ndarray) -> np.ndarray:
 
 
 def mask_fill_values(values: np.ndarray) -> np.ndarray:
-    """Return a column [T] with NaN in place of its fill values."""
+    """Return a column [T] with its fill values replaced by NaN."""
     is_fill = is_fill_value(values)
     return np.where(is_fill, np.nan, values) if is_fill.any() else values
 
 
 def max_magnitude(unit: str) -> float:
-    """Return the largest size of a quantity of this SI unit; infinite where it is not known."""
+    """Return the largest plausible absolute value for an SI unit; infinite for unknown units."""
     return _MAX_MAGNITUDES.get(unit, np.inf)
 
 
 def is_implausible(values: np.ndarray, unit: str) -> np.ndarray:
-    """Return [T] bool: values that no vessel, manoeuvre or site can have.
+    """Return [T] bool: values outside the plausible range of any vessel, manoeuvre or site.
 
     Args:
-        values: a channel [T], SI, NaN where missing.
-        unit: its SI unit; a unit that is not known has no limit.
+        values: channel [T], SI, NaN for missing values.
+        unit: SI unit of the channel; an unknown unit has no limit.
     """
     return np.asarray(np.abs(values) > max_magnitude(unit))
 
 
 _SENSOR_GROUPS = (("x", "y"), ("u", "v"), ("psi",), ("r",))
-"""Channels that come from one sensor: either may rest at a new measurement, both hardly ever do."""
+"""Channels of one sensor: one may be equal in two measurements, all of them rarely are."""
 _MIN_INTERVALS = 20
-"""Intervals between measurements that are needed to tell their rule."""
+"""Smallest number of update intervals for an estimate of their median."""
 INTERVAL_TOLERANCE, MIN_REGULAR_SHARE = 0.25, 0.9
-"""So large a share of the intervals is the usual one, within this share of it."""
+"""Relative tolerance of a regular interval, and smallest share of regular intervals."""
 
 
 def median_update_interval(values: np.ndarray) -> float:
-    """Return after how many samples channels [T] or [T, k] change; 1 where there is no rule."""
+    """Return the median update interval of channels [T] or [T, k] in samples; 1 if irregular."""
     has_changed = np.diff(values, axis=0) != 0.0
     intervals = np.diff(
         np.flatnonzero(has_changed if has_changed.ndim == 1 else has_changed.any(axis=1))
@@ -540,10 +568,10 @@ def median_update_interval(values: np.ndarray) -> float:
 
 
 def mask_held_values(log: Log) -> Log:
-    """Return the log with NaN where slow sensors of the motion repeat their last value.
+    """Replace held values of slow motion sensors by NaN.
 
-    Such values are late by up to an interval, and their derivative is spikes; left out, they are
-    made from the other sensors like those of any channel that is measured at some samples only.
+    Held values are late by up to an update interval, and their derivative consists of spikes. As
+    NaN they are estimated from the other sensors, like the values of any sparse channel.
     """
     fresh_values: dict[str, np.ndarray] = {}
     for sensor_channels in _SENSOR_GROUPS:

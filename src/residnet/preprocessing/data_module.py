@@ -1,4 +1,4 @@
-"""Training data for Lightning: batches that are drawn anew in every epoch, by its number alone."""
+"""Lightning data modules whose batches depend only on the seed and the number of the epoch."""
 
 from __future__ import annotations
 
@@ -14,16 +14,14 @@ from residnet.preprocessing.windows import WINDOW_COLUMNS, WindowStage, WindowSt
 
 
 class EpochDataModule(L.LightningDataModule, ABC):
-    """Batches that follow from the seed and the number of the epoch.
+    """Base class of data modules with batches that depend only on seed and epoch.
 
-    A run resumed at the end of an epoch sees what an undisturbed one did, and so does every process
-    of a training by several.
-
-    Windows of logs and rows of tensors have theirs below; a policy that meets new conditions in
-    every batch draws them in a subclass of its own.
+    A run that is resumed at the end of an epoch receives the same batches as an uninterrupted one,
+    and all processes of a distributed training agree.
 
     Args:
-        get_epoch: returns the number of the present epoch; None asks the trainer.
+        seed: seed of the random batches.
+        get_epoch: returns the number of the current epoch; None takes it from the trainer.
     """
 
     def __init__(self, seed: int, get_epoch: Callable[[], int] | None = None) -> None:
@@ -33,14 +31,14 @@ class EpochDataModule(L.LightningDataModule, ABC):
 
     @property
     def current_epoch(self) -> int:
-        """Number of the present epoch."""
+        """Number of the current epoch."""
         if self._get_epoch is not None:
             return self._get_epoch()
         return 0 if self.trainer is None else int(self.trainer.current_epoch)
 
     @property
     def rank_and_world_size(self) -> tuple[int, int]:
-        """Number of this process, and how many there are."""
+        """Rank of this process and number of processes."""
         if self.trainer is None:
             return 0, 1
         return int(self.trainer.global_rank), int(self.trainer.world_size)
@@ -48,20 +46,20 @@ class EpochDataModule(L.LightningDataModule, ABC):
     @property
     @abstractmethod
     def n_batches(self) -> int:
-        """Batches in an epoch."""
+        """Number of batches in an epoch."""
 
     @abstractmethod
     def iterate_batches(self, epoch: int) -> Iterator[Any]:
-        """Yield the batches of an epoch, those of this process."""
+        """Yield the batches of an epoch for this process."""
 
     def train_dataloader(self) -> EpochBatches:
-        """Return the batches of the present epoch, each time that it is gone through."""
+        """Return an iterable over the batches of the current epoch."""
         return EpochBatches(self)
 
 
 @final
 class EpochBatches:
-    """The batches of a data module's present epoch."""
+    """Iterable over the batches of the current epoch of a data module."""
 
     def __init__(self, module: EpochDataModule) -> None:
         self.module = module
@@ -74,13 +72,16 @@ class EpochBatches:
 
 
 class WindowBatch(NamedTuple):
-    """Windows of measured logs, B of L samples.
+    """Batch of B windows of L samples.
 
-    Attributes are those of `Prepared` [B, L, ...], positions from the start of the log, and:
+    The other attributes are those of `PreparedLog` [B, L, ...], with positions relative to the
+    start of the log.
+
+    Attributes:
         past_y: measured states before the window [B, H, 3 + n].
-        past_w: inputs before it [B, H, m].
-        n_elapsed: samples since the stretch began [B]; 0 where the window begins it.
-        precomputed: what a training adds of each sample [B, L, k].
+        past_w: inputs before the window [B, H, m].
+        n_elapsed: samples between the start of the segment and the window [B].
+        precomputed: additional columns of a training [B, L, k].
     """
 
     y: Tensor
@@ -98,24 +99,26 @@ class WindowBatch(NamedTuple):
 
 @final
 class WindowsDataModule(EpochDataModule):
-    """Training windows of measured logs, for any module that Lightning trains.
+    """Training windows of measured logs for any Lightning module.
 
-    A batch is a tuple of `WindowBatch`: those from anywhere, then, where the stage asks for them, those
-    that begin with a stretch. For example, with `prepared` logs and a module whose
-    `training_step(self, batch, number)` takes such a tuple:
+    A batch is a tuple of `WindowBatch`: windows at any row, then, if the stage has them, windows
+    near segment starts. For example, with `prepared` logs and a module whose
+    `training_step(self, batch, batch_index)` accepts such a tuple:
 
-        data = WindowsDataModule.of(prepared, WindowStage(length=100, batch=256), steps=50)
+        stage = WindowStage(n_window_samples=100, batch_size=256)
+        data = WindowsDataModule.from_logs(prepared, stage, n_batches=50)
         lightning.Trainer(max_epochs=20).fit(module, data)
 
-    A training in stages gives one entry for each and says which stage an epoch belongs to.
-
     Args:
-        stages: windows of each stage; None for a stage without epochs.
-        get_stage: epoch -> number of its stage; None where there is one.
-        get_epoch: as for `EpochDataModule`.
+        store: samples of all logs.
+        stages: settings of each stage; None for a stage without epochs.
+        n_batches: number of batches per epoch.
+        seed: seed of the random batches.
+        get_stage: returns the stage index of an epoch; None for a single stage.
+        get_epoch: see `EpochDataModule`.
 
     Raises:
-        DataError: where no log is long enough for a stage.
+        DataError: if no log is long enough for a stage.
     """
 
     def __init__(
@@ -140,7 +143,7 @@ class WindowsDataModule(EpochDataModule):
     def from_logs(
         cls, logs: Sequence[Any], stage: WindowStage, n_batches: int, seed: int = 0
     ) -> WindowsDataModule:
-        """Return the data module of one stage from prepared logs, in single precision."""
+        """Create a data module with one stage from prepared logs, in single precision."""
         return cls(WindowStore.from_logs(logs), [stage], n_batches, seed)
 
     @property
@@ -148,9 +151,10 @@ class WindowsDataModule(EpochDataModule):
         return self._n_batches
 
     def iterate_batches(self, epoch: int) -> Iterator[tuple[WindowBatch, ...]]:
-        """Yield the batches of an epoch: of each source the windows of this process."""
+        """Yield the batches of an epoch for this process."""
         stage_index = self._get_stage(epoch)
-        stage, (rank, world_size) = self.stages[stage_index], self.rank_and_world_size
+        stage = self.stages[stage_index]
+        rank, world_size = self.rank_and_world_size
         assert stage is not None, "an epoch of a stage without windows"
         histories = (stage.n_history, max(stage.n_lead, 1))
         starts_by_source = [
@@ -166,7 +170,14 @@ class WindowsDataModule(EpochDataModule):
     def make_window_batch(
         self, starts: Tensor, length: int, history: int, columns: Sequence[str] = WINDOW_COLUMNS
     ) -> WindowBatch:
-        """Return the windows of `length` samples from rows [B] of the store on."""
+        """Return the windows that begin at given rows of the store.
+
+        Args:
+            starts: rows [B].
+            length: samples in a window.
+            history: samples before a window.
+            columns: attributes of the store to include; others are empty.
+        """
         store = self.store
         window_columns = dict.fromkeys((*WINDOW_COLUMNS, "precomputed"), store.y[:0]) | {
             name: store.take_windows(getattr(store, name), starts, length) for name in columns
@@ -179,13 +190,13 @@ class WindowsDataModule(EpochDataModule):
 
 @final
 class RowsDataModule(EpochDataModule):
-    """Rows of tensors of one length, shuffled in every epoch; a batch is a tuple of their rows.
+    """Shuffled rows of tensors; a batch is a tuple with the same rows of each tensor.
 
     Args:
         tensors: each [N, ...].
-        batch_size: rows in a batch; the last batch of an epoch may have fewer.
-        seed: of the order.
-        get_epoch: as for `EpochDataModule`.
+        batch_size: rows in a batch; the last batch of an epoch may be smaller.
+        seed: seed of the order.
+        get_epoch: see `EpochDataModule`.
     """
 
     def __init__(
@@ -213,5 +224,5 @@ class RowsDataModule(EpochDataModule):
 
 
 def compute_epoch_seed(seed: int, epoch: int) -> int:
-    """Return a seed of torch, below 2^63: resumed trainings shuffle as uninterrupted ones do."""
+    """Return a seed below 2^63 for an epoch, so that resumed trainings use the same order."""
     return (seed * 7_919 + epoch) % (2**63)

@@ -1,7 +1,7 @@
-"""Rates of change of sampled channels, piece by piece and never across a gap.
+"""Differentiate sampled channels within contiguous segments.
 
-Positions and velocities are measured, accelerations hardly ever: they are differentiated here, and
-the smoothing that goes with it is stated.
+Accelerations are rarely measured. They are computed from velocities by differentiation with a
+stated smoothing.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from residnet.core.stretches import find_runs
 
 
 class DerivativeRule(Config, ABC):
-    """A rule that smooths and differentiates channels on a uniform grid.
+    """Base class of rules that smooth and differentiate channels on a uniform grid.
 
-    Where it has no smoother the values stay as they are, and where it has no rate of its own that
-    is the difference to the next sample; the last sample of a piece is then invalid.
+    The default does not smooth and takes the forward difference, so that the last sample of a
+    segment is invalid.
     """
 
     def derive(
         self, values: np.ndarray, dt: float, segments: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the smoothed values and their rates.
+        """Return smoothed values and their derivatives.
 
-        A piece is a run of samples with one number >= 0; it is cut further at samples that are not
-        finite, and nothing is smoothed across its ends.
+        Samples that are not finite split a segment further. Nothing is smoothed across the ends of
+        a segment.
 
         Args:
             values: channels [T, n], SI, angles unwrapped.
-            dt: time between samples, s.
-            segments: number of each sample's piece [T] int, -1 for samples of none
-                (`residnet.preprocessing.masks.segments`).
+            dt: time step in s.
+            segments: segment number of each sample [T] int, -1 outside of segments
+                (`residnet.preprocessing.masks.number_log_segments`).
 
         Returns:
-            smooth [T, n] and rate [T, n] in SI (per second), and valid [T] bool; both arrays are
-            NaN where valid is False.
+            Smoothed values [T, n], derivatives [T, n] in SI units per second, and validity [T]
+            bool; both arrays are NaN at invalid samples.
 
         Raises:
-            ConfigError: where a window or cut-off does not go with the step.
+            ConfigError: if the window is too short for the time step.
         """
         min_samples = self.min_samples(dt)
         smoothed, rates = np.full(values.shape, np.nan), np.full(values.shape, np.nan)
@@ -60,15 +60,15 @@ class DerivativeRule(Config, ABC):
         return smoothed, rates, is_valid
 
     def min_samples(self, dt: float) -> int:
-        """Return fewest samples of a piece that the rule can treat.
+        """Return the smallest number of samples of a segment that the rule can differentiate.
 
         Raises:
-            ConfigError: where the rule does not go with the step.
+            ConfigError: if the window is too short for the time step.
         """
         return 2
 
     def derive_segment(self, values: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the smoothed values and rates [T, n] of one piece, NaN where there is no rate."""
+        """Return smoothed values and derivatives [T, n] of one segment, NaN if undefined."""
         rates = np.full(values.shape, np.nan)
         rates[:-1] = np.diff(values, axis=0)
         return values, rates / dt
@@ -76,16 +76,14 @@ class DerivativeRule(Config, ABC):
 
 @final
 class SavitzkyGolay(DerivativeRule):
-    """Savitzky-Golay smoothing: polynomials fitted to a moving window.
+    """Savitzky-Golay filter: local polynomials in a moving window.
 
-    The window is made an odd number of samples, rounded up.
-
-    Near the ends of a piece the polynomial of the last full window is evaluated; a piece shorter
-    than the window is invalid.
+    The window is rounded up to an odd number of samples. Near the ends of a segment the polynomial
+    of the nearest full window is evaluated. A segment that is shorter than the window is invalid.
 
     Attributes:
         window: length of the window in s.
-        order: of the polynomials.
+        order: degree of the polynomials.
     """
 
     kind: Literal["savitzky_golay"] = "savitzky_golay"
@@ -93,16 +91,16 @@ class SavitzkyGolay(DerivativeRule):
     order: int = Field(default=2, ge=1)
 
     def n_window_samples(self, dt: float) -> int:
-        """Return the samples in the window at a time step in s."""
+        """Return the number of samples in the window at a time step in s."""
         return round(self.window / dt) // 2 * 2 + 1
 
     def min_samples(self, dt: float) -> int:
         if self.n_window_samples(dt) <= self.order:
             min_window = (self.order + 1 | 1) * dt
             raise ConfigError(
-                f"savitzky_golay: a window of {self.window:g} s holds {self.n_window_samples(dt)} samples"
-                f" of {dt:g} s, order {self.order} needs more; set window to {min_window:g} s or"
-                " longer"
+                f"savitzky_golay: a window of {self.window:g} s holds {self.n_window_samples(dt)}"
+                f" samples of {dt:g} s, order {self.order} needs more; set window to {min_window:g}"
+                " s or longer"
             )
         return self.n_window_samples(dt)
 
@@ -113,17 +111,25 @@ class SavitzkyGolay(DerivativeRule):
 def fit_local_polynomials(
     values: np.ndarray, window_samples: int, order: int, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return values [T, n] smoothed by polynomials over `window_samples` samples, an odd number, and rates.
+    """Smooth and differentiate values by local polynomials (Savitzky and Golay 1964).
 
-    As scipy.signal.savgol_filter, whose import takes longer than most checks of a config. The rates
-    are per s for a step in s.
+    The result equals scipy.signal.savgol_filter, whose import takes longer than the check of a
+    config.
+
+    Args:
+        values: [T, n].
+        window_samples: window length in samples, odd.
+        order: degree of the polynomials.
+        dt: time step in s.
+
+    Returns:
+        Smoothed values and derivatives [T, n].
     """
     half_window = window_samples // 2
     vandermonde, pseudo_inverse, vandermonde_slopes = _polynomial_matrices(window_samples, order)
-    first_coefficients, last_coefficients = (
-        pseudo_inverse @ values[:window_samples],
-        pseudo_inverse @ values[-window_samples:],
-    )
+    # the first and the last window also give the values near the ends
+    first_coefficients = pseudo_inverse @ values[:window_samples]
+    last_coefficients = pseudo_inverse @ values[-window_samples:]
     results = []
     for evaluation_matrix in (vandermonde, vandermonde_slopes / (half_window * dt)):
         weights = evaluation_matrix[half_window] @ pseudo_inverse
@@ -142,7 +148,7 @@ def fit_local_polynomials(
 def _polynomial_matrices(
     window_samples: int, order: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return powers [size, order + 1] of places from -1 to 1, their inverse and their slopes."""
+    """Return Vandermonde matrix on [-1, 1], its pseudo-inverse and its derivative."""
     vandermonde = np.vander(np.linspace(-1.0, 1.0, window_samples), order + 1, increasing=True)
     vandermonde_slopes = np.zeros_like(vandermonde)
     vandermonde_slopes[:, 1:] = vandermonde[:, :-1] * np.arange(1, order + 1)
@@ -151,13 +157,13 @@ def _polynomial_matrices(
 
 @final
 class ForwardDifference(DerivativeRule):
-    """The difference to the next sample; values are not smoothed.
+    """Forward difference without smoothing.
 
-    The last sample of a piece is invalid.
+    The last sample of a segment is invalid.
     """
 
     kind: Literal["forward"] = "forward"
 
 
 DerivativeConfig = Annotated[SavitzkyGolay | ForwardDifference, Field(discriminator="kind")]
-"""Any rule for derivatives; its `kind` says which."""
+"""Rule for derivatives, selected by its `kind`."""

@@ -1,11 +1,11 @@
-"""Masks: which samples of a log must not be trusted, and why.
+"""Rules that exclude samples of a log from fits and scores.
 
-A mask is stored in `Log.masks` under its reason, the kind with a prefix that says what it forbids:
+A mask is stored in `Log.masks` under its reason. The reason is the kind of the rule with a prefix:
 
-* `hard:<kind>`: the log is split there; nothing is simulated, filtered or learned across.
-* `<kind>`: simulated across, but neither scored nor learned from.
-* `rate:<kind>`: only the derivatives there are biased; free runs may be scored (`find_scored_samples`), one-step
-fits leave the samples out (`Log.usable`).
+* `hard:<kind>`: the log is split at these samples; no simulation or filter crosses them.
+* `<kind>`: simulations cross these samples, but they are excluded from scores and fits.
+* `rate:<kind>`: only derivatives are biased; free runs are scored (`find_scored_samples`), one-step
+  fits exclude the samples (`Log.usable`).
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from residnet.preprocessing.channel_values import (
 HARD_PREFIX = "hard:"
 RATE_PREFIX = "rate:"
 UNEXPLAINED_IDLE = f"{HARD_PREFIX}dead_commands"
-"""Reason of what no recorded input explains while all inputs rest (see `PrepareConfig`)."""
+"""Reason of motion that no input explains while all inputs are constant (`PrepareConfig`)."""
 
 
 class MaskRule(Config, ABC):
-    """A rule that marks samples of a log."""
+    """Base class of rules that mark samples of a log."""
 
     prefix: ClassVar[str] = ""
 
@@ -48,31 +48,30 @@ class MaskRule(Config, ABC):
 
     @property
     def reason(self) -> str:
-        """Key in `Log.masks`; rules of one kind share it."""
+        """Key in `Log.masks`, shared by rules of one kind."""
         return self.prefix + str(type(self).model_fields["kind"].default)
 
     @abstractmethod
     def apply(self, log: Log) -> np.ndarray:
-        """Return [T] bool, True where a sample is bad.
+        """Return [T] bool: marked samples.
 
         Raises:
-            UsageError: where the log lacks a channel that the rule names.
+            UsageError: if the log lacks a channel of the rule.
         """
 
 
 @final
 class FrozenMask(MaskRule):
-    """A receiver that holds its last fix: all `channels` bit-identical over several steps.
+    """Frozen receiver: all `channels` bit-identical over several steps.
 
-    Where a slow receiver repeats each value until its next one, a step is the time between these.
-
-    From the first of the equal samples until `after` seconds past the last of them: the filters
-    behind the receiver need that long to recover.
+    For a slow receiver that repeats its values, a step is its update interval. The mask begins at
+    the first repeated sample and ends `after` seconds after the last one, because the filter of the
+    receiver needs this time to recover.
 
     Attributes:
-        channels: that the receiver gives.
-        samples: least number of equal steps.
-        after: seconds that stay masked behind them.
+        channels: channels of the receiver.
+        samples: smallest number of equal steps.
+        after: duration in s that is masked after a freeze.
     """
 
     kind: Literal["frozen"] = "frozen"
@@ -85,7 +84,7 @@ class FrozenMask(MaskRule):
         starts, stops = find_runs((np.diff(values, axis=0) == 0.0).all(axis=1))
         is_long = stops - starts >= self.samples * median_update_interval(values)
         starts, last_indices = starts[is_long], stops[is_long]
-        # half a step of margin keeps `after` a whole number of samples in spite of rounding in t
+        # half a step of margin makes the end independent of rounding in t
         mask_ends = np.searchsorted(
             log.t, log.t[last_indices] + self.after - 0.5 * _median_time_step(log.t)
         )
@@ -94,10 +93,10 @@ class FrozenMask(MaskRule):
 
 @final
 class GapMask(MaskRule):
-    """Time steps longer than `longest`; the first sample after each is the one marked.
+    """Gaps: the first sample after each time step longer than `longest` is marked.
 
     Attributes:
-        longest: longest time step that is no gap, in s.
+        longest: longest regular time step in s.
     """
 
     prefix: ClassVar[str] = HARD_PREFIX
@@ -110,10 +109,10 @@ class GapMask(MaskRule):
 
 @final
 class MissingValues(MaskRule):
-    """NaN in any of `channels` (all channels where empty).
+    """Missing values (NaN) in any of `channels`.
 
     Attributes:
-        channels: to look at; all where empty.
+        channels: channels to check; empty for all channels.
     """
 
     prefix: ClassVar[str] = HARD_PREFIX
@@ -129,15 +128,15 @@ class MissingValues(MaskRule):
 
 @final
 class JumpMask(MaskRule):
-    """Differences of more than `limit` in `channel` (SI, per sample; angles the short way round).
+    """Jumps: differences of successive samples of a channel above `limit`.
 
-    Marked are the `before` last samples ahead of the difference and the `after` first ones past it.
+    Differences of angles are taken across the shorter arc.
 
     Attributes:
-        channel: to look at.
-        limit: largest difference from sample to sample, SI.
-        before: samples before the jump that are masked too.
-        after: samples behind it that are masked too.
+        channel: channel to check.
+        limit: largest regular difference of successive samples, SI.
+        before: number of masked samples before a jump.
+        after: number of masked samples after a jump.
     """
 
     kind: Literal["jump"] = "jump"
@@ -153,20 +152,20 @@ class JumpMask(MaskRule):
 
 @final
 class OutlierMask(MaskRule):
-    """Samples many standard deviations away from the moving average of their neighbours.
+    """Outliers: samples many standard deviations from the moving average of their neighbours.
 
-    Attributes:
-        channels: to look at.
-        sigmas: distance in standard deviations from which on a sample is an outlier.
-        samples: number of neighbours.
+    Mean and standard deviation are taken over the `samples` nearest *other* samples. In a window of
+    n samples that contains the sample itself, no distance can exceed (n - 1) / sqrt(n) standard
+    deviations: 2.85 for the 10 samples of the document, so that its limit of 3 would never be
+    exceeded. The standard deviation has a robust estimate over the complete channel as its lower
+    bound, because ten samples alone would mark 2 % of normal noise as outliers.
 
     Source: document 002, section 5.2.
 
-    Average and deviation are taken over the `samples` nearest *other* samples. Over a window of n
-    that holds the sample itself no distance can exceed (n - 1) / sqrt(n) standard deviations, 2.85
-    for the document's 10, so that its rule of 3, taken literally, never fires. The deviation is
-    kept above a robust estimate over the whole channel, because ten samples alone would call 2 % of
-    normal noise outliers.
+    Attributes:
+        channels: channels to check.
+        sigmas: distance of an outlier in standard deviations.
+        samples: number of neighbours.
     """
 
     kind: Literal["outlier"] = "outlier"
@@ -192,7 +191,7 @@ class OutlierMask(MaskRule):
         neighbours = windows[~is_centre].reshape(values.size, self.samples)
         deviations = np.abs(values - neighbours.mean(axis=1))
         typical_deviation = SIGMA_OF_MAD * float(np.median(deviations))
-        # a spread at the level of rounding is none
+        # a standard deviation at the level of rounding errors is not meaningful
         floor = 1e-9 * float(np.abs(values).max())
         neighbour_std = np.maximum(neighbours.std(axis=1, ddof=1), max(typical_deviation, floor))
         is_outlier[is_finite] = deviations > self.sigmas * neighbour_std
@@ -201,21 +200,19 @@ class OutlierMask(MaskRule):
 
 @final
 class HampelMask(MaskRule):
-    """Samples that stand out of their neighbours by many robust standard deviations.
+    """Outliers by the Hampel filter (Pearson 2002) on a detrended channel.
 
-    This is the Hampel filter (Pearson, 2002).
-
-    What is looked at is the distance of a sample from the median of the straight lines between its
-    neighbours on either side, up to `samples` away, so that a moving channel is judged as one at
-    rest; it is bad where that lies far from its running median over `samples`. The robust deviation
-    is 1.4826 times the median absolute deviation of those neighbours, and at least that of the
-    whole channel. A few bad samples move neither median, where they move average and deviation of
-    the rule of document 002 (`outlier`).
+    The trend is the median of the linear interpolations between pairs of neighbours, up to
+    `samples` to either side. A sample is an outlier if its distance from the trend deviates from
+    the running median of these distances by more than `sigmas` robust standard deviations. The
+    robust standard deviation is 1.4826 times the median absolute deviation of the neighbours, at
+    least that of the complete channel. A few outliers do not change a median, whereas they change
+    mean and standard deviation of the rule `outlier`.
 
     Attributes:
-        channels: to look at.
-        sigmas: distance in robust standard deviations from which on a sample is an outlier.
-        samples: neighbours on either side that are looked at.
+        channels: channels to check.
+        sigmas: distance of an outlier in robust standard deviations.
+        samples: number of neighbours, made odd.
     """
 
     kind: Literal["hampel"] = "hampel"
@@ -233,9 +230,9 @@ class HampelMask(MaskRule):
 
 @final
 class SpikeMask(MaskRule):
-    """Single samples, or pairs, that leave all others and return at once.
+    """Spikes: single samples or pairs far from all other samples.
 
-    Every run leaves them out by itself (`residnet.preprocessing.channel_values.spike_cells`).
+    Every run excludes them automatically (`residnet.preprocessing.channel_values.bridge_spikes`).
     """
 
     kind: Literal["spike"] = "spike"
@@ -249,16 +246,16 @@ class SpikeMask(MaskRule):
 
 @final
 class InputJumpMask(MaskRule):
-    """Steps of the inputs of more than `limit` per sample, with the seconds around them.
+    """Steps of inputs above `limit`, with a margin in time.
 
-    A smoothed derivative spreads the response to a step over the time before it, so that the
-    derivatives there are biased; the samples are good.
+    A smoothed derivative spreads the response to a step over the time before it. Therefore the
+    derivatives near the step are biased, although the samples themselves are valid.
 
     Attributes:
-        channels: inputs to look at.
-        limit: largest step from sample to sample, SI.
-        before: seconds before the step that are masked.
-        after: seconds behind it that are masked.
+        channels: inputs to check.
+        limit: largest regular difference of successive samples, SI.
+        before: duration in s that is masked before a step.
+        after: duration in s that is masked after a step.
     """
 
     prefix: ClassVar[str] = RATE_PREFIX
@@ -289,18 +286,17 @@ MaskConfig = Annotated[
     | InputJumpMask,
     Field(discriminator="kind"),
 ]
-"""Any masking rule; its `kind` says which."""
+"""Masking rule, selected by its `kind`."""
 
 
 def apply_masks(log: Log, rules: Sequence[MaskRule]) -> Log:
-    """Return the log with the masks of all rules added to those that it has.
+    """Return the log with the masks of all rules added to its masks.
 
-    Rules of one kind share one mask.
-
-    Masks are found best on the log as recorded: interpolation hides what is bit-identical.
+    Rules of one kind share one mask. Rules should be applied to the log as recorded, because
+    interpolation hides repeated values.
 
     Raises:
-        UsageError: where the log lacks a channel that a rule names.
+        UsageError: if the log lacks a channel of a rule.
     """
     masks = dict(log.masks)
     for rule in rules:
@@ -314,15 +310,12 @@ def make_hard_mask(log: Log) -> np.ndarray:
 
 
 def find_scored_samples(log: Log) -> np.ndarray:
-    """Return [T] bool: samples that a free run is scored on.
-
-    Neither a hard nor a soft mask excludes them.
-    """
+    """Return [T] bool: samples at which free runs are scored (no hard or soft mask)."""
     return ~_combine_masks(log, [name for name in log.masks if not name.startswith(RATE_PREFIX)])
 
 
 def number_log_segments(log: Log) -> np.ndarray:
-    """Return the number of the contiguous piece of each sample, [T] int from 0; -1 if masked."""
+    """Return the segment number of each sample [T] int, from 0; -1 at hard masks."""
     return number_runs(~make_hard_mask(log))
 
 
@@ -334,7 +327,7 @@ def _combine_masks(log: Log, reasons: Sequence[str]) -> np.ndarray:
 def _apply_per_channel(
     log: Log, names: Sequence[str], find_bad_samples: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
-    """Return [T] bool: samples that a rule marks in any channel, angles unwrapped."""
+    """Return [T] bool: samples that a rule marks in any of the channels, with angles unwrapped."""
     channels = {name: log[name] for name in names}
     channel_masks = (
         find_bad_samples(unwrap_angle(values) if log.units[channel_name] == "rad" else values)
@@ -344,5 +337,5 @@ def _apply_per_channel(
 
 
 def _median_time_step(t: np.ndarray) -> float:
-    """Return the usual time step in s."""
+    """Return the median time step in s."""
     return float(np.median(np.diff(t))) if t.size > 1 else 0.0

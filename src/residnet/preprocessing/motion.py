@@ -1,7 +1,7 @@
-"""The motion of a log at every sample, where sensors measured less: no velocities, or rare fixes.
+"""Complete the motion of a log at every sample if velocities are missing or positions are sparse.
 
-Position and heading are brought into one motion by a smoother that knows where the antenna stands
-and how old its positions are.
+Position, heading and velocities are combined by a smoother that accounts for the lever arm of the
+antenna and the delay of its positions.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ from residnet.preprocessing.channel_values import (
 )
 
 _MIN_DENSE_QUANTILE = 0.9
-"""Share of the samples that hold a value in a channel that is measured at every sample."""
+"""Quantile of the intervals between values that is one sample in a dense channel."""
 MAX_BRIDGED_INTERVALS = 3.0
-"""Usual intervals between the values of a channel that are bridged."""
+"""Longest gap that is interpolated, in median intervals between the values of a channel."""
 _JERK_LEVELS = 10.0 ** (0.5 * np.arange(-8, 5))
-"""Jerk in units of the noise over the cube of the usual interval between positions."""
+"""Candidate jerk intensities, in noise over the cube of the median position interval."""
 _MAX_TUNING_SAMPLES = 4000
-"""Samples from which the intensity of the jerk is found."""
+"""Largest number of samples for the estimate of the jerk intensity."""
 
 
 class Antenna(Config):
-    """The place of an antenna from the vessel's centre, in body axes.
+    """Lever arm of an antenna from the vessel's centre, in body axes.
 
     Attributes:
-        x: forward of the centre in m.
-        y: to starboard of the centre in m.
+        x: distance forward of the centre in m.
+        y: distance to starboard of the centre in m.
     """
 
     x: Metres = 0.0
@@ -54,17 +54,16 @@ class Antenna(Config):
 
 
 class MotionConfig(Config):
-    """How position, heading and velocities become one motion at every sample.
+    """Settings of the completion of states at every sample.
 
-    A channel of the motion that is measured at every sample stays as it is measured. One that the
-    log lacks, or that has values at some samples only (a position at 1 Hz beside a heading at 10
-    Hz, the samples between empty or the last value repeated), is made by a smoother from all
-    others. Stretches without a position or heading for longer than three of their usual intervals
-    stay gaps.
+    A channel that is measured at every sample is not changed. A missing or sparse channel (for
+    example a position at 1 Hz in a log at 10 Hz, with empty or repeated values in between) is
+    estimated by a smoother from all other channels. Gaps in position or heading of more than three
+    median intervals remain gaps.
 
     Attributes:
-        antenna: where the antenna stands; null where x and y are those of the vessel's centre.
-        delay: age of the positions in s: x and y at t are where the antenna was at t - delay.
+        antenna: lever arm of the antenna; null if x and y are those of the vessel's centre.
+        delay: delay of the positions in s: x and y at t are the position at t - delay.
     """
 
     antenna: Antenna | None = None
@@ -72,24 +71,24 @@ class MotionConfig(Config):
 
     @property
     def has_position_offset(self) -> bool:
-        """Whether positions are moved in place or time, so that all must be smoothed."""
+        """Whether positions must be corrected for a lever arm or a delay."""
         return self.delay > 0.0 or self.antenna is not None
 
 
 def complete_motion(log: Log, config: MotionConfig, dof: DegreesOfFreedom = SURGE_SWAY_YAW) -> Log:
-    """Return the log with the states of a model at every sample, measured or smoothed.
+    """Return the log with all states of a model at every sample, measured or smoothed.
 
-    What was smoothed stands in `meta["smoothed"]`, and as a note in `meta["findings"]`. A wind that
-    is told from the bow becomes the true wind.
+    Smoothed channels are listed in `meta["smoothed"]` and as a note in `meta["findings"]`. Relative
+    wind is converted to true wind.
 
     Args:
-        log: in SI.
-        dof: velocities that the log tells; the others are zero, and so is what of the pose they
-            alone would move. With p the roll angle is told, and p by it where it is not measured.
+        log: in SI units.
+        config: settings of the completion.
+        dof: active velocities; the others are zero. With p the log needs the roll angle.
 
     Raises:
-        UsageError: where the log lacks position or heading, or the roll angle of a roll.
-        DataError: where these hold hardly a value.
+        UsageError: if the log lacks position or heading, or the roll angle of a model with roll.
+        DataError: if these have too few values.
     """
     return add_true_wind(_complete_states(log, config, dof))
 
@@ -107,9 +106,10 @@ def _complete_states(log: Log, config: MotionConfig, dof: DegreesOfFreedom) -> L
             name for name in dof.state_names if name not in (*STATE_NAMES, *dense_states)
         ]:
             raise UsageError(
-                f"log {log.name}: {', '.join(missing_states)} {'are' if len(missing_states) > 1 else 'is'} not measured"
-                f" at every sample, which a model of {', '.join(dof.velocities)} needs; name the"
-                " columns, or let it move on the surface alone (signals.velocities: [u, v, r])"
+                f"log {log.name}: {', '.join(missing_states)}"
+                f" {'are' if len(missing_states) > 1 else 'is'} not measured at every sample, which"
+                f" a model of {', '.join(dof.velocities)} needs; name the columns, or let it move"
+                " on the surface alone (signals.velocities: [u, v, r])"
             )
     log_without_held = mask_held_values(log)
     missing_channels = [name for name in STATE_NAMES if name not in log.channels]
@@ -121,16 +121,19 @@ def _complete_states(log: Log, config: MotionConfig, dof: DegreesOfFreedom) -> L
     if not (made_names or config.has_position_offset):
         return log
     if missing_pose := [name for name in POSE_NAMES if name in missing_channels]:
-        # a heading from the rate alone would not be that of positions which were measured
+        # a heading integrated from the yaw rate would not agree with measured positions
         if {"x", "y"} <= set(missing_channels) <= set(POSE_NAMES):
             return _integrate_pose(log, missing_pose)
         dof = DegreesOfFreedom.from_channels(log.channels)
         velocities_text = ", ".join(dof.velocities)
-        velocities_text = f", or let the model be one of {velocities_text} alone (signals.velocities: [{velocities_text}])"
+        velocities_text = (
+            f", or let the model be one of {velocities_text} alone (signals.velocities:"
+            f" [{velocities_text}])"
+        )
         raise UsageError(
-            f"log {log.name}: no channel {', '.join(missing_channels)}; give position and heading, or u, v"
-            " and r without a position: either makes the other where it was not measured; name"
-            f" their columns{'' if dof.is_complete else velocities_text}"
+            f"log {log.name}: no channel {', '.join(missing_channels)}; give position and heading,"
+            " or u, v and r without a position: either makes the other where it was not measured;"
+            f" name their columns{'' if dof.is_complete else velocities_text}"
         )
     made_names |= set(POSE_NAMES) if config.has_position_offset else set()
     smoothed_names = [name for name in STATE_NAMES if name in made_names]
@@ -151,7 +154,7 @@ def _with_channels(
     code: str = "smoothed_motion",
     **meta: Any,
 ) -> Log:
-    """Return the log with channels that were made, and a note of it where there is a text."""
+    """Return the log with computed channels, and with a note if there is a text."""
     if finding_text:
         finding = make_remark("note", code, finding_text, channels=len(new_channels))
         meta["findings"] = [*log.meta.get("findings", ()), finding]
@@ -163,11 +166,11 @@ def _with_channels(
 
 
 def add_true_wind(log: Log) -> Log:
-    """Return the log with the true wind where it tells a wind from the bow.
+    """Compute the true wind from a wind relative to the bow.
 
-    `wind_angle` is where the true wind comes from, clockwise from the bow; `apparent_wind_angle`
-    and `apparent_wind_speed` are of the wind that the moving vessel feels. Without a heading it is
-    counted from where the integral of the yaw rate begins.
+    `wind_angle` is the direction that the true wind comes from, clockwise from the bow.
+    `apparent_wind_angle` and `apparent_wind_speed` are measured on the moving vessel. Without a
+    heading, directions are relative to the initial heading.
     """
     has_apparent_wind = {"apparent_wind_angle", "apparent_wind_speed"} <= log.channels.keys()
     required_channels = ("u", "v") if has_apparent_wind else ("wind_angle", "wind_speed")
@@ -180,10 +183,10 @@ def add_true_wind(log: Log) -> Log:
     if not _is_dense(log[heading_channel]) or (
         has_apparent_wind and not all(_is_dense(log[name]) for name in required_channels)
     ):
-        # the smoother will tell the motion at every sample
+        # called again after the smoother has completed the motion
         return log
     if has_apparent_wind:
-        # what the vessel's own speed adds comes from ahead
+        # the apparent wind is the true wind minus the velocity of the vessel
         complex_wind = log["apparent_wind_speed"] * np.exp(1j * log["apparent_wind_angle"])
         complex_wind = complex_wind - (log["u"] + 1j * log["v"])
         speed, angle = np.abs(complex_wind), np.angle(complex_wind)
@@ -194,9 +197,9 @@ def add_true_wind(log: Log) -> Log:
 
 
 def original_input_names(log: Log, inputs: Sequence[str]) -> list[str]:
-    """Return inputs by the channels that tell them before the motion is complete.
+    """Return the recorded channels of inputs, before the completion of the motion.
 
-    Without u and v of its own a log holds the wind that the moving vessel feels, not the true one.
+    The true wind is replaced by the channels of the relative wind if the log has only these.
     """
     missing_wind = {*WIND_INPUTS} & {*inputs} - {*log.channels}
     bow_wind_channels = [
@@ -209,9 +212,9 @@ def original_input_names(log: Log, inputs: Sequence[str]) -> list[str]:
 
 
 def _fill_zero_motion(log: Log, dof: DegreesOfFreedom) -> Log:
-    """Return the log with zeros where a velocity is dead, and no pose but that of the live ones.
+    """Return the log with zeros for inactive velocities, and only the pose of the active ones.
 
-    A heading stays where the vessel turns, and a position where it moves as well.
+    The heading is retained if the yaw rate is active, the position if also a linear velocity is.
     """
     retained_pose = {"psi"} if dof.has_heading else set[str]()
     if dof.has_heading and dof.has_position and log.channels.keys() >= {*POSE_NAMES}:
@@ -227,7 +230,7 @@ def _fill_zero_motion(log: Log, dof: DegreesOfFreedom) -> Log:
 
 
 def _complete_yaw_rate(log: Log) -> Log:
-    """Return a log without positions with the yaw rate that its heading tells."""
+    """Return a log without positions with the yaw rate derived from its heading."""
     if "psi" not in log.channels or {"x", "y"} & log.channels.keys():
         return log
     if "r" in log.channels and _is_dense(log["r"]):
@@ -248,7 +251,7 @@ def _complete_yaw_rate(log: Log) -> Log:
 
 
 def _complete_roll(log: Log) -> Log:
-    """Return a log with roll angle and roll rate at every sample, from both or the first."""
+    """Return a log with roll angle and roll rate at every sample, smoothed if necessary."""
     roll_angle = log.channels.get("phi", np.full(len(log), np.nan))
     is_finite = np.isfinite(roll_angle)
     if is_finite.sum() < 5:
@@ -269,9 +272,9 @@ def _complete_roll(log: Log) -> Log:
 
 
 def _complete_six_dof(log: Log) -> Log:
-    """Return a log under water with velocities and rates of turn that were not measured.
+    """Return a log of six degrees of freedom with missing velocities and angular rates derived.
 
-    They follow from attitude and depth, and from the position where u or v were not measured.
+    They follow from attitude and depth, and from the position if u or v was not measured.
     """
     missing_channels = [
         n for n in SIX_DOF_LAYOUT.velocities if n not in log.channels or not _is_dense(log[n])
@@ -284,7 +287,7 @@ def _complete_six_dof(log: Log) -> Log:
         return log
     rates = {name: _smooth_angle(log, log[name], "")[1] for name in required_channels}
     phi, theta = log["phi"], log["theta"]
-    # of the angles of Euler, roll within pitch within heading
+    # kinematics of the Euler angles: heading, then pitch, then roll
     pitch_rate, projected_yaw_rate = rates["theta"], rates["psi"] * np.cos(theta)
     derived = {
         "p": rates["phi"] - rates["psi"] * np.sin(theta),
@@ -302,15 +305,18 @@ def _complete_six_dof(log: Log) -> Log:
             rates["z"] + log["u"] * np.sin(theta) - log["v"] * np.cos(theta) * np.sin(phi)
         )
         derived["w"] = heave_numerator / (np.cos(theta) * np.cos(phi))
-    note = f"{', '.join(missing_channels)} are not measured and follow from {', '.join(required_channels)}"
+    note = (
+        f"{', '.join(missing_channels)} are not measured and follow from"
+        f" {', '.join(required_channels)}"
+    )
     return _with_channels(log, {name: derived[name] for name in missing_channels}, note)
 
 
 def _complete_vertical_plane(log: Log, dof: DegreesOfFreedom) -> Log:
-    """Return a log of a motion in an upright plane with what of it follows from the rest.
+    """Return a log of a motion in the vertical plane with missing channels derived.
 
-    Pitch and its rate tell each other, heave and depth do with the speed forward. A depth and a
-    pitch that come more slowly than the samples are smoothed over them.
+    Pitch and pitch rate follow from each other, heave and depth with the surge velocity. Sparse
+    depth and pitch are smoothed.
     """
     dense_channels = {name: log[name] for name in log.channels if _is_dense(log[name])}
     derived: dict[str, np.ndarray] = {}
@@ -352,10 +358,15 @@ def _complete_vertical_plane(log: Log, dof: DegreesOfFreedom) -> Log:
 
 
 def _smooth_angle(log: Log, angle: np.ndarray, rate_name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return a smoothed angle [T] in rad and its rate [T] in rad/s, from both or the first.
+    """Smooth an angle with its rate, if that is measured.
 
     Args:
-        angle: as measured, [T].
+        log: the log.
+        angle: measured angle [T] in rad.
+        rate_name: channel of the rate; it may be missing.
+
+    Returns:
+        Angle [T] in rad and rate [T] in rad/s.
     """
     angular_rate = log.channels.get(rate_name, np.full(angle.size, np.nan))
     noise_ratio = max(estimate_noise_std(angular_rate), 1e-7) / max(estimate_noise_std(angle), 1e-7)
@@ -366,7 +377,7 @@ def _smooth_angle(log: Log, angle: np.ndarray, rate_name: str) -> tuple[np.ndarr
 
 
 def _integrate_rate(t: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Return the integral [T] of a rate [T] from the first sample on."""
+    """Return the integral [T] of a rate [T] by the trapezoidal rule, 0 at the first sample."""
     dt, finite_rate = np.diff(t, prepend=t[:1]), np.nan_to_num(rate)
     return np.asarray(
         np.cumsum(0.5 * dt * (finite_rate + np.concatenate((finite_rate[:1], finite_rate[:-1]))))
@@ -374,15 +385,15 @@ def _integrate_rate(t: np.ndarray, rate: np.ndarray) -> np.ndarray:
 
 
 def _integrate_pose(log: Log, missing_names: Sequence[str]) -> Log:
-    """Return a log of velocities with the pose that they lead to, from the origin on.
+    """Return a log of velocities with the pose integrated from the origin.
 
-    A model of velocities needs no pose. Errors of position and heading are then those of the
-    integrated velocities, and not of a place.
+    A model of velocities needs no measured pose. Errors of position and heading then refer to the
+    integrated velocities.
     """
     integrated_pose = {
-        "psi": _integrate_rate(log.t, log["r"])
-        if "psi" in missing_names
-        else np.asarray(log["psi"])
+        "psi": (
+            _integrate_rate(log.t, log["r"]) if "psi" in missing_names else np.asarray(log["psi"])
+        )
     }
     heading = np.exp(1j * np.nan_to_num(integrated_pose["psi"]))
     forward_velocity = np.nan_to_num(log["u"])
@@ -398,8 +409,8 @@ def _integrate_pose(log: Log, missing_names: Sequence[str]) -> Log:
     }
     new_channels = {name: integrated_pose[name] for name in missing_names}
     note = (
-        f"{', '.join(missing_names)} were not measured and are integrated from the velocities: errors of"
-        " position and heading are those of integrated velocities, and not of a place"
+        f"{', '.join(missing_names)} were not measured and are integrated from the velocities:"
+        " errors of position and heading are those of integrated velocities, and not of a place"
     )
     return _with_channels(
         log, new_channels, note, "integrated_pose", integrated=list(missing_names)
@@ -407,7 +418,7 @@ def _integrate_pose(log: Log, missing_names: Sequence[str]) -> Log:
 
 
 def remove_pauses(t: np.ndarray) -> np.ndarray:
-    """Return times [T] in s from zero on, pauses of the recorder cut to what is bridged."""
+    """Return times [T] in s from zero, with pauses shortened to the longest interpolated gap."""
     time_steps = np.diff(t)
     return np.append(
         0.0, np.cumsum(np.minimum(time_steps, MAX_BRIDGED_INTERVALS * np.median(time_steps)))
@@ -415,10 +426,14 @@ def remove_pauses(t: np.ndarray) -> np.ndarray:
 
 
 def fill_sparse(log: Log, channel_names: tuple[str, ...], held_channels: tuple[str, ...]) -> Log:
-    """Return the log with values at every sample of channels that lack some, or come more rarely.
+    """Return the log with sparse channels interpolated or held at every sample.
 
-    Between two values a channel is interpolated, or held where `held` names it, unless they lie
-    further apart than three of their usual intervals: as a grid does it with rows that lack.
+    Gaps of more than three median intervals between values remain gaps.
+
+    Args:
+        log: the log.
+        channel_names: channels to fill.
+        held_channels: channels that are held instead of interpolated.
     """
     filled_channels = {}
     for name in channel_names:
@@ -448,10 +463,7 @@ def fill_sparse(log: Log, channel_names: tuple[str, ...], held_channels: tuple[s
 
 
 def _is_dense(values: np.ndarray) -> bool:
-    """Return whether a channel has a value at nearly every sample between its first and last.
-
-    One that fails in stretches, and is there at every sample otherwise, counts as such.
-    """
+    """Return whether a channel has values at nearly all samples, apart from gaps."""
     intervals = np.diff(np.flatnonzero(np.isfinite(values)))
     return bool(
         intervals.size
@@ -461,7 +473,7 @@ def _is_dense(values: np.ndarray) -> bool:
 
 
 def _describe_source(log: Log, name: str) -> str:
-    """Return how a channel was measured, in words."""
+    """Describe how often a channel was measured."""
     if name not in log.channels:
         return "was not measured"
     measurement_times = log.t[np.isfinite(log[name])]
@@ -472,7 +484,7 @@ def _describe_source(log: Log, name: str) -> str:
 
 
 def _is_within_bridged_interval(t: np.ndarray, measurement_times: np.ndarray) -> np.ndarray:
-    """Return [T] bool: samples between values at `at` that are no further apart than usual."""
+    """Return [T] bool: samples between two measurements with a regular interval."""
     median_interval = float(np.median(np.diff(measurement_times)))
     is_inside = (t >= measurement_times[0] - 1e-9) & (t <= measurement_times[-1] + 1e-9)
     next_times = measurement_times[
@@ -490,7 +502,7 @@ def _is_within_bridged_interval(t: np.ndarray, measurement_times: np.ndarray) ->
 
 
 def _smooth_planar_motion(log: Log, config: MotionConfig) -> dict[str, np.ndarray]:
-    """Return the smoothed motion by channel [T], NaN in gaps of position or heading."""
+    """Smooth the planar motion; NaN in gaps of position or heading."""
     t, psi = log.t, unwrap_angle(log["psi"])
     positions = np.stack((log["x"], log["y"]), axis=1)
     is_heading_outlier, *is_position_outlier = find_hampel_outliers([psi, log["x"], log["y"]])
@@ -499,12 +511,12 @@ def _smooth_planar_motion(log: Log, config: MotionConfig) -> dict[str, np.ndarra
     heading_indices = np.flatnonzero(np.isfinite(psi))
     if min(fix_indices.size, heading_indices.size) < 5:
         raise DataError(
-            f"log {log.name}: {fix_indices.size} positions and {heading_indices.size} headings, at least 5 of"
-            " each are needed to tell the motion; leave the log out"
+            f"log {log.name}: {fix_indices.size} positions and {heading_indices.size} headings, at"
+            " least 5 of each are needed to estimate the motion; exclude the log"
         )
     u, v = (log.channels.get(name, np.full(t.size, np.nan)) for name in ("u", "v"))
     heading, yaw_rate = _smooth_angle(log, psi, "r")
-    # positions belong to times between the samples where they are older than their row
+    # delayed positions belong to times between the samples
     fix_times = t[fix_indices] - config.delay
     filter_times = np.union1d(t, fix_times) if config.delay else t
     sample_indices, headings_at_clock = (
@@ -541,14 +553,13 @@ def _smooth_planar_motion(log: Log, config: MotionConfig) -> dict[str, np.ndarra
 def smooth_measured_motion(
     measurements: np.ndarray, noise: Sequence[float], dt: float
 ) -> np.ndarray:
-    """Return the smoothed motion [N, 9] from x, y, psi, u, v, r, u_dot, v_dot, r_dot [N, 9], SI.
+    """Smooth measured x, y, psi, u, v, r, u_dot, v_dot, r_dot [N, 9] in SI units.
 
-    Heading and its rates are smoothed first, then north and east in the earth with the smoothed
-    heading.
+    Heading and its derivatives are smoothed first, then north and east with the smoothed heading.
 
     Args:
-        measurements: measured, the heading unwrapped; a quantity without a measurement has an infinite
-            noise.
+        measurements: measured, the heading unwrapped; a quantity without a measurement has an
+            infinite noise.
         noise: standard deviations of the nine.
         dt: sampling interval in s.
     """
@@ -557,8 +568,8 @@ def smooth_measured_motion(
             int(index_array[0]) for index_array in np.nonzero(~np.isfinite(measurements))
         )
         raise DataError(
-            f"measured motion: column {column} is not finite at sample {sample_index}; mask or fill the gap"
-            " first"
+            f"measured motion: column {column} is not finite at sample {sample_index}; mask or fill"
+            " the gap first"
         )
     t, noise_std = dt * np.arange(len(measurements)), np.asarray(noise)
     x, y, psi, u, v, r, surge_acceleration, sway_acceleration, yaw_acceleration = measurements.T
@@ -597,18 +608,17 @@ def smooth_measured_motion(
 
 
 def smooth_track(t: np.ndarray, measurements: np.ndarray, noise_std: ArrayLike) -> np.ndarray:
-    """Return smoothed position, rate and acceleration [T, 3, A] along axes measured together.
+    """Smooth position, rate and acceleration along one or more axes by a Kalman smoother.
 
-    A triple integrator driven by white jerk is filtered forwards and smoothed backwards (Rauch,
-    Tung and Striebel, 1965), so that past and future of a sample count alike and nothing lags. The
-    intensity of the jerk, and the size of the noise, are those under which the measurements are
-    likeliest.
+    The model is a triple integrator driven by white jerk. The Rauch-Tung-Striebel smoother (1965)
+    has no lag. Jerk intensity and noise level are maximum-likelihood estimates.
 
     Args:
         t: times [T] in s, increasing.
-        measurements: measured positions, then rates, then accelerations as far as there are any, [T, k, A];
-            a row of NaN where there is no measurement.
-        noise_std: standard deviations [k], of which ratios count; infinite where nothing is measured.
+        measurements: measured positions, then rates, then accelerations as far as there are any,
+            [T, k, A]; a row of NaN where there is no measurement.
+        noise_std: standard deviations [k], of which ratios count; infinite where nothing is
+            measured.
     """
     noise_std = np.maximum(np.asarray(noise_std, dtype=np.float64), 1e-9)
     measurements = np.where(np.isfinite(noise_std)[None, :, None], measurements, np.nan)
@@ -648,9 +658,11 @@ _StatesAndCovariances = tuple[np.ndarray, np.ndarray]
 def _filter_track(
     t: np.ndarray, measurements: np.ndarray, noise: np.ndarray, jerk_intensities: np.ndarray
 ) -> tuple[np.ndarray, tuple[_StatesAndCovariances, _StatesAndCovariances]]:
-    """Return the cost of each intensity of jerk [K], and states and covariances of the first.
+    """Run a Kalman filter for several jerk intensities.
 
-    Before each sample's measurements and after them: states [T, 3, A], covariances [T, 3, 3].
+    Returns:
+        Minus twice the log-likelihood of each intensity [K], and predicted and filtered states
+        [T, 3, A] and covariances [T, 3, 3] of the first intensity.
     """
     n_samples, n_axes, dt = t.size, measurements.shape[2], np.diff(t, prepend=t[0])
     is_measured = np.isfinite(measurements).all(axis=2)
@@ -664,7 +676,7 @@ def _filter_track(
     ]
     state = np.zeros((jerk_intensities.size, 3, n_axes))
     state[:, first_derivative_order] = first_measurements[0]
-    # nothing is known of what is not measured at the start
+    # the initial covariance is large, because unmeasured states are unknown
     initial_std = float(np.ptp(first_measurements, axis=0).max(initial=0.0)) + 1.0
     covariance = np.tile(initial_std**2 * np.eye(3), (jerk_intensities.size, 1, 1))
     predicted = np.empty((n_samples, 3, n_axes)), np.empty((n_samples, 3, 3))
@@ -682,7 +694,7 @@ def _filter_track(
             )
         predicted[0][k], predicted[1][k] = state[0], covariance[0]
         for derivative_order in np.flatnonzero(is_measured[k]):
-            # rounding may leave less than nothing of a variance
+            # rounding may make a variance negative
             innovation_variance = (
                 np.maximum(covariance[:, derivative_order, derivative_order], 0.0)
                 + variance[derivative_order]
@@ -694,7 +706,7 @@ def _filter_track(
             normalized_squares += (innovation**2).sum(axis=1) / innovation_variance
             log_determinant += n_axes * np.log(innovation_variance)
         filtered[0][k], filtered[1][k] = state[0], covariance[0]
-    # the size of the noise is the one that suits each intensity best
+    # the noise level is the maximum-likelihood estimate for each intensity
     n_measurements = n_axes * int(is_measured.sum())
     cost = (
         n_measurements * np.log(np.maximum(normalized_squares / max(n_measurements, 1), 1e-60))
@@ -704,7 +716,7 @@ def _filter_track(
 
 
 def _transition_matrices(dt: np.ndarray) -> np.ndarray:
-    """Return the transition over each step, [T, 3, 3]."""
+    """Return the transition matrices of the triple integrator over each step [T, 3, 3]."""
     transitions = np.tile(np.eye(3), (dt.size, 1, 1))
     transitions[:, 0, 1] = transitions[:, 1, 2] = dt
     transitions[:, 0, 2] = dt**2 / 2
@@ -712,14 +724,20 @@ def _transition_matrices(dt: np.ndarray) -> np.ndarray:
 
 
 def _jerk_covariances(dt: np.ndarray) -> np.ndarray:
-    """Return the covariance that white jerk of unit intensity adds over each step, [T, 3, 3]."""
+    """Return the process noise covariances of unit white jerk over each step [T, 3, 3]."""
     (
         position_variance,
         position_rate_covariance,
         position_acceleration_covariance,
         rate_variance,
         rate_acceleration_covariance,
-    ) = dt**5 / 20, dt**4 / 8, dt**3 / 6, dt**3 / 3, dt**2 / 2
+    ) = (
+        dt**5 / 20,
+        dt**4 / 8,
+        dt**3 / 6,
+        dt**3 / 3,
+        dt**2 / 2,
+    )
     return np.array(
         [
             [position_variance, position_rate_covariance, position_acceleration_covariance],

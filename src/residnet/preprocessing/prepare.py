@@ -1,4 +1,4 @@
-"""From logs to identification data: a uniform grid, masks, smoothed states and derivatives."""
+"""Prepare logs for identification: uniform grid, masks, smoothed states and derivatives."""
 
 from __future__ import annotations
 
@@ -31,33 +31,32 @@ from residnet.preprocessing.masks import (
 )
 from residnet.preprocessing.motion import MotionConfig, complete_motion, fill_sparse
 
-# share of the samples at either end of a velocity's range that may be bad
+# share of samples at either end of the range of a velocity that may be outliers
 _TAIL_SHARE = 0.005
 
 
 class PrepareConfig(Config):
-    """How logs become samples.
+    """Settings of the preparation of logs.
 
     Attributes:
-        grid: the uniform time grid; its step is the model's dt.
-        masks: which samples are excluded, and why.
-        derivative: how velocities are smoothed and differentiated.
-        motion: how the motion is told where a log holds position and heading only, or some of
-            the motion at some samples only.
-        trim: seconds cut from the start and the end of every log before samples are taken for
+        grid: uniform time grid; its step is the time step of the model.
+        masks: rules that exclude samples.
+        derivative: smoothing and differentiation of velocities.
+        motion: completion of states that were not measured, or not at every sample.
+        trim: duration in s at the start and the end of every log that is excluded from
             identification.
-        hold: what a model is given as an input over the step that follows a sample. `start`: the
-            sample itself, exact for a command that changes on the grid. `mean`: the mean of the
-            samples at both ends of the step, for a measured quantity that moves on during the step,
-            such as shaft revolutions; held from the start it would lag by half a step.
-        beside: what states and inputs stand beside a rate that is learned. `make_samples`: those of its
-            sample, the states smoothed. `window_means`: their means over the samples that the rate is
-            taken from, weighed as it weighs these. A smoothed rate is such a mean of rates; beside
-            means it lags no step of an input, and a swing as short as the smoothing is no softer
-            in it than in them.
-        dead_commands: what is done with stretches in which all inputs rest while the vessel moves
-            as a model of the other logs does not explain: somebody took over by hand, or the record
-            stopped. `mask` splits the log there, `keep` takes them as they are.
+        hold: input over the step that follows a sample. `start`: the value at the sample, exact for
+            a command that changes on the grid. `mean`: the mean of the values at both ends of the
+            step, for a measured quantity such as shaft revolutions; its value at the sample would
+            lag by half a step.
+        beside: states and inputs that are paired with a derivative in regressions. `samples`: those
+            at the sample, with smoothed states. `means`: their weighted means over the samples of
+            the derivative filter, with the weights of the filter. With `means` the derivative does
+            not lag a step of an input, and short oscillations are attenuated equally on both sides
+            of the equation.
+        dead_commands: treatment of stretches in which all inputs are constant while the vessel
+            moves as no model of the other logs explains: manual control, or a stopped recorder.
+            `mask` splits the log there, `keep` includes them.
     """
 
     grid: GridConfig
@@ -72,22 +71,22 @@ class PrepareConfig(Config):
 
 @dataclass(frozen=True)
 class PreparedLog:
-    """One log on the grid, with all that identification and evaluation need.
+    """One log on the grid with all data for identification and evaluation.
 
     Arrays are float64 with T samples.
 
     Attributes:
         log: the aligned log with its masks.
         split: train, validation, test or external.
-        y: measured states [T, 3 + n], the pose and what moves (`Live.moving`).
-        smoothed: states with smoothed velocities [T, 3 + n].
-        nu_dot: rates of what moves [T, n].
-        w: inputs held over the step that follows each sample [T, m].
-        rate_inputs: inputs that go with the rates [T, m]: those at the samples, or means beside them.
-        segment: number of the stretch that nothing crosses, [T]; -1 where there is none.
-        usable: samples that may be scored [T].
-        trainable: samples whose smoothed state and derivative may be learned from [T].
-        dof: which velocities the log tells; the others are zero.
+        y: measured states [T, 3 + n]: pose and dynamic states (`DegreesOfFreedom.state_names`).
+        smoothed: states with smoothed dynamic states [T, 3 + n].
+        nu_dot: derivatives of the dynamic states [T, n].
+        w: inputs over the step that follows each sample [T, m].
+        rate_inputs: inputs that are paired with the derivatives [T, m], see `PrepareConfig.beside`.
+        segment: segment number of each sample [T]; -1 outside of segments.
+        usable: samples at which free runs are scored [T] bool.
+        trainable: samples whose smoothed state and derivative enter fits [T] bool.
+        dof: active velocities; the others are zero.
     """
 
     log: Log
@@ -106,10 +105,10 @@ class PreparedLog:
         return len(self.log)
 
     def to_table_row(self, split: str) -> dict[str, str | float | None]:
-        """Return a row of a table: what the log is, and which shares are usable and learned from.
+        """Return a row of the table of logs, with the shares of usable and trainable samples.
 
         Args:
-            split: that it stands under in the table.
+            split: split in the table.
         """
         return {
             "log": self.log.name,
@@ -122,7 +121,7 @@ class PreparedLog:
         }
 
     def on_disk(self) -> PreparedLog:
-        """Return the same with its arrays in a temporary file, out of memory."""
+        """Return the log with its arrays in a memory-mapped temporary file."""
         paged_arrays: dict[str, Any] = {
             field_.name: paged.copy_to_disk(getattr(self, field_.name))
             for field_ in fields(self)
@@ -140,40 +139,43 @@ def prepare_log(
 ) -> PreparedLog:
     """Align, mask, smooth and differentiate one log.
 
-    Single samples that no vessel follows are bridged and left out (`Log.meta["spikes"]`).
+    Spikes are interpolated and excluded (`Log.meta["spikes"]`).
 
     Args:
-        log: canonical log; needs the channels x, y, psi and `input_names`; u, v, r come from a
-            smoother where it lacks them. A roll needs phi.
-        input_names: input channels, in the order of w.
-        dof: velocities that the model moves (`SignalsConfig.live`); the others are zero.
+        log: canonical log with the channels x, y, psi and `input_names`; missing u, v, r are
+            estimated by a smoother. A model with roll needs phi.
+        split: train, validation, test or external.
+        input_names: input channels in the order of w.
+        config: settings of the preparation.
+        dof: active velocities of the model; the others are zero.
 
     Raises:
-        UsageError: where a channel is missing.
-        DataError: where no sample remains, or a value is none that a vessel can have.
+        UsageError: if a channel is missing.
+        DataError: if no sample is usable, or a value is outside the range of any vessel.
     """
     is_on_disk = paged.is_memory_mapped(log.t)
-    # a channel that the model does not use changes nothing
+    # channels that the model does not use must not change the result
     required_channels = {*dof.state_names, *input_names}
     for name in (*dof.state_names, *input_names):
         if name in log.channels:
             implausible_indices = np.flatnonzero(is_implausible(log[name], log.units[name]))
             if implausible_indices.size:
                 raise DataError(
-                    f"log {log.name}: {name} is {log[name][implausible_indices[0]]:g} {log.units[name]} at t ="
-                    f" {log.t[implausible_indices[0]]:.2f} s, which no vessel reaches ({implausible_indices.size} such samples);"
-                    " correct them, or set them to NaN"
+                    f"log {log.name}: {name} is {log[name][implausible_indices[0]]:g}"
+                    f" {log.units[name]} at t = {log.t[implausible_indices[0]]:.2f} s, which no"
+                    f" vessel reaches ({implausible_indices.size} such samples); correct them, or"
+                    " set them to NaN"
                 )
     log = bridge_spikes(log, required_channels)
     completed_log = complete_motion(log, config.motion, dof)
     filled_log = fill_sparse(completed_log, (*dof.state_names, *input_names), config.grid.held)
-    # masks look at the samples as recorded: interpolation hides a frozen sensor
+    # masks are applied to the samples as recorded: interpolation hides a frozen sensor
     recorded_channels = (
         filled_log
         if completed_log is log
         else completed_log.replace(channels=completed_log.channels | log.channels)
     )
-    # what is zero at all times, or follows from it, is no sensor that stands still
+    # inactive states are constant zero and must not be marked as a frozen sensor
     checked_channels = {*(dof.state_names if dof.is_complete else dof.active_states), *input_names}
     checked_channels |= {
         name for mask in config.masks for name in mask.model_dump().get("channels", ())
@@ -198,10 +200,10 @@ def prepare_log(
             or "NaN in a channel that the model needs"
         )
         raise DataError(
-            f"log {log.name}: no sample is usable ({reasons_text}); check the masks and the channels"
-            f" {', '.join((*dof.state_names, *input_names))}"
+            f"log {log.name}: no sample is usable ({reasons_text}); check the masks and the"
+            f" channels {', '.join((*dof.state_names, *input_names))}"
         )
-    # derivatives must not see masked samples, so a piece ends at each of them
+    # a segment ends at each masked sample, so that no derivative depends on it
     clean_segment = number_runs(np.where(log.usable & usable, segment, -1))
     nu = y[:, dof.dynamic_columns]
     smoothed_nu, nu_dot, has_derivative = config.derivative.derive(
@@ -210,7 +212,7 @@ def prepare_log(
     held_inputs = _step_means(w, segment) if config.hold == "mean" else w
     rate_inputs = w
     if config.beside == "means":
-        # the rate of an integral, by the same rule, is the mean that the rule takes
+        # the derivative of an integral by the same filter is the weighted mean over its window
         step_values = np.concatenate((0.5 * (nu[:-1] + nu[1:]), held_inputs[:-1]), axis=1)
         cumulative_steps = np.concatenate(
             (0.0 * step_values[:1], np.nan_to_num(step_values).cumsum(axis=0))
@@ -226,7 +228,7 @@ def prepare_log(
         (y[:, POSE], np.where(has_derivative[:, None], smoothed_nu, nu)), axis=1
     )
     if dof.has_roll:
-        # the rate of an angle is what its velocity says
+        # the derivative of an angle follows from the kinematics
         nu = smoothed[:, dof.dynamic_columns]
         kinematic_rates = nu @ dof.angle_rate_matrix().numpy()
         if dof.is_six_dof:
@@ -245,7 +247,7 @@ def prepare_log(
 
 
 def _step_means(w: np.ndarray, segment: np.ndarray) -> np.ndarray:
-    """Return the mean of each sample and the next [T, m]; the sample itself at a piece's end."""
+    """Return the mean of each sample and the next [T, m]; the sample itself at a segment's end."""
     means = w.copy()
     is_followed = (segment[:-1] >= 0) & (segment[1:] == segment[:-1])
     means[:-1][is_followed] = 0.5 * (w[:-1] + w[1:])[is_followed]
@@ -255,16 +257,17 @@ def _step_means(w: np.ndarray, segment: np.ndarray) -> np.ndarray:
 def compute_channels(
     log: PreparedLog, signals: Signals, is_selected: np.ndarray | None = None
 ) -> torch.Tensor:
-    """Return what a model sees at the samples of a log, z [T, nz].
+    """Compute the channels z [T, nz] of a model at the samples of a log.
 
-    States are the smoothed ones, inputs those at the samples: a rate at an instant belongs to the
-    inputs of that instant, while a rollout is given what is held over each step (`Prepared.w`).
-    Everything that sets a model against measured accelerations takes this.
+    States are smoothed, and inputs are those of the derivatives (`PreparedLog.rate_inputs`): the
+    derivative at an instant depends on the inputs at that instant, whereas a rollout uses the
+    inputs over each step (`PreparedLog.w`). Comparisons with measured accelerations use these
+    channels.
 
     Args:
         log: prepared log.
-        signals: of the model, float64.
-        is_selected: samples that are wanted [T] bool; None for all, where gaps are filled with 0.
+        signals: signals of the model, float64.
+        is_selected: selected samples [T] bool; None for all, with 0 in gaps.
     """
     states, inputs = log.smoothed, log.rate_inputs
     states, inputs = (
@@ -280,14 +283,17 @@ def compute_channels(
 
 
 def make_samples(logs: Sequence[PreparedLog], signals: Signals) -> Samples:
-    """Return the samples of identification from prepared logs, float64.
+    """Collect the trainable samples of prepared logs, float64.
 
-    They hold smoothed channels and measured accelerations.
+    The samples contain smoothed channels and measured accelerations.
+
+    Raises:
+        DataError: if there are none.
     """
     if not any(log.trainable.any() for log in logs):
         raise DataError(
-            f"none of {len(logs)} training logs has a sample to learn from; are the logs shorter"
-            " than the derivative's window?"
+            f"none of {len(logs)} training logs has a trainable sample; check whether the logs are"
+            " shorter than the window of the derivative"
         )
     n_trainable = [int(log.trainable.sum()) for log in logs]
     n_samples = sum(n_trainable)
@@ -303,7 +309,7 @@ def make_samples(logs: Sequence[PreparedLog], signals: Signals) -> Samples:
         channel_values[row_slice] = compute_channels(log, signals, log.trainable)
         target[row_slice] = torch.from_numpy(log.nu_dot[log.trainable])
         if dof.has_roll:
-            # what is known of an angle's rate is nothing to learn
+            # the rate of an angle follows from the kinematics and is not learned
             target[row_slice] *= dof.equation_mask()
         group[row_slice] = log_index
         time[row_slice] = torch.from_numpy(log.log.t[log.trainable] - log.log.t[0])
@@ -314,17 +320,17 @@ def make_samples(logs: Sequence[PreparedLog], signals: Signals) -> Samples:
 
 
 def compute_training_ranges(logs: Sequence[PreparedLog]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest measured velocities and inputs, [n + m] each.
+    """Return the lower and upper bounds of measured velocities and inputs, [n + m] each.
 
-    Only usable samples count, and velocities no further beyond the quantiles of 0.5 % and 99.5 %
-    than these lie apart.
+    Only usable samples count. The bounds of velocities exceed the 0.5 % and 99.5 % quantiles by at
+    most the distance between these quantiles.
     """
     velocity_bounds = []
-    # one column at a time: of large data all of them would fill the memory
+    # one column at a time, to limit the memory for large data
     for column in range(*logs[0].dof.dynamic_columns.indices(logs[0].y.shape[1])):
         values = np.concatenate([log.y[log.usable, column] for log in logs])
         lower, upper = values.min(), values.max()
-        # a few bad samples must not widen the range in which a free run counts as sound
+        # a few outliers must not widen the range in which a free run is valid
         low_quantile, high_quantile = np.quantile(
             values, (_TAIL_SHARE, 1.0 - _TAIL_SHARE), overwrite_input=True
         )

@@ -1,4 +1,4 @@
-"""How one channel follows another, and equations of motion integrated over blocks of samples."""
+"""Agreement of two channels, and integrals of channels over blocks of samples."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 MIN_SAMPLES = 50
-"""Samples below which nothing is compared."""
+"""Smallest number of samples for a comparison of channels."""
 CHUNK_SAMPLES = 40_000
-"""Samples that are shifted at a time: each of some ten columns stays in a core's cache."""
+"""Samples per chunk, so that some ten columns fit into the cache of a core."""
 _MAX_LAG_SAMPLES = 20_000
-"""Samples that a lag is looked for in, evenly spread: more tell the same."""
+"""Largest number of samples, evenly spread, for the estimate of a lag."""
 
 
 @dataclass(frozen=True)
 class OverlappingBlocks:
     """Overlapping blocks of a log over which equations of motion are integrated.
 
-    Noise then needs no derivative and averages out.
+    Integrated equations need no derivatives of noisy channels, and the noise averages out.
 
     Attributes:
-        t: times of the log [T].
-        starts: sample at which each block begins [K].
+        t: times of the log [T] in s.
+        starts: first sample of each block [K].
         length: number of samples in a block.
     """
 
@@ -34,15 +34,20 @@ class OverlappingBlocks:
     length: int
 
     def compute_changes(self, values: np.ndarray, shift: ArrayLike = 0) -> np.ndarray:
-        """Return the changes [K, ...] of values [T, ...] over the blocks, `subsample_shift` samples early.
+        """Return the changes of values over the blocks.
 
-        Of several shifts [S] they are [K, S, ...].
+        Args:
+            values: [T, ...].
+            shift: number of samples by which the blocks are moved to earlier times; scalar or [S].
+
+        Returns:
+            [K, ...], or [K, S, ...] for several shifts.
         """
         starts = np.subtract.outer(self.starts, shift)
         return np.asarray(values[starts + self.length] - values[starts])
 
     def are_clear_of(self, invalid: np.ndarray, shift: ArrayLike = 0) -> np.ndarray:
-        """Return the blocks [K, ...] bool that touch none of the samples bad [T, ...]."""
+        """Return [K, ...] bool: blocks without invalid samples [T, ...], moved as by `compute_changes`."""
         cumulative_invalid = np.zeros((len(invalid) + 1, *invalid.shape[1:]), dtype=int)
         np.cumsum(invalid, axis=0, out=cumulative_invalid[1:])
         starts = np.subtract.outer(self.starts, shift)
@@ -51,9 +56,14 @@ class OverlappingBlocks:
         )
 
     def make_integrator(self, columns: np.ndarray) -> Callable[[ArrayLike], np.ndarray]:
-        """Return the integrals of columns [T, ...] over the blocks, by shift as of `compute_changes`.
+        """Create a function that integrates columns over the blocks.
 
-        They are NaN where a sample of the block is.
+        Args:
+            columns: [T, ...].
+
+        Returns:
+            Function of the shift as for `compute_changes`; the integral over a block with NaN is
+            NaN.
         """
         is_missing, cumulative_integral = ~np.isfinite(columns), np.zeros(columns.shape)
         has_missing = bool(is_missing.any())
@@ -73,12 +83,12 @@ class OverlappingBlocks:
 
 
 class ChannelAgreement(NamedTuple):
-    """How one channel follows another.
+    """Agreement of a channel with a reference.
 
     Attributes:
-        correlation: means removed, at the lag where it is largest.
-        gain: least squares through the origin at that lag.
-        lag: in s, positive where the channel trails.
+        correlation: largest correlation coefficient over all lags.
+        gain: regression coefficient through the origin at that lag.
+        lag: lag in s, positive if the channel is late.
         reference_std: standard deviation of the reference.
     """
 
@@ -91,14 +101,20 @@ class ChannelAgreement(NamedTuple):
 def estimate_agreement(
     reference: np.ndarray, measured: np.ndarray, step: float
 ) -> ChannelAgreement | None:
-    """Return how `measured` [T] follows `reference` [T], at lags of up to 3 s.
+    """Estimate correlation, gain and lag of a channel by cross-correlation at lags up to 3 s.
 
-    None where fewer than 50 samples can be compared at all lags, or either does not vary.
+    Args:
+        reference: [T].
+        measured: [T].
+        step: sampling interval in s.
+
+    Returns:
+        None if fewer than 50 samples are available at all lags, or a channel is constant.
     """
     max_lag = max(round(3.0 / step), 10)
     if reference.size < 2 * max_lag + MIN_SAMPLES:
         return None
-    # the same samples for every lag, or the comparison of lags would be one of samples
+    # all lags use the same samples, so that their correlations are comparable
     cumulative_missing = np.append(0, np.cumsum(~np.isfinite(measured)))
     is_complete = cumulative_missing[2 * max_lag + 1 :] == cumulative_missing[: -2 * max_lag - 1]
     compared_indices = (
@@ -107,22 +123,22 @@ def estimate_agreement(
     if compared_indices.size < MIN_SAMPLES:
         return None
     compared_indices = compared_indices[:: -(-compared_indices.size // _MAX_LAG_SAMPLES)]
-    reference_values, lags = reference[compared_indices], np.arange(-max_lag, max_lag + 1)
-    reference_std, measured_std, correlations = (
-        float(reference_values.std()),
-        np.empty(lags.size),
-        np.empty(lags.size),
-    )
+    reference_values = reference[compared_indices]
+    lags = np.arange(-max_lag, max_lag + 1)
+    reference_std = float(reference_values.std())
+    measured_std = np.empty(lags.size)
+    correlations = np.empty(lags.size)
     for lag_chunk in np.array_split(lags, -(-lags.size * compared_indices.size // CHUNK_SAMPLES)):
         lagged_values = measured[compared_indices + lag_chunk[:, None]]
-        measured_std[lag_chunk + max_lag], correlations[lag_chunk + max_lag] = (
-            lagged_values.std(axis=1),
-            lagged_values @ (reference_values - reference_values.mean()),
+        measured_std[lag_chunk + max_lag] = lagged_values.std(axis=1)
+        correlations[lag_chunk + max_lag] = lagged_values @ (
+            reference_values - reference_values.mean()
         )
     if reference_std == 0.0 or measured_std.min() <= 1e-12 * np.nanmax(np.abs(measured)):
         return None
     correlations /= compared_indices.size * reference_std * measured_std
     best_index = int(np.argmax(np.abs(correlations)))
+    # a parabola through the peak and its neighbours refines the lag below one sample
     subsample_shift = 0.0
     if 0 < best_index < 2 * max_lag:
         left_value, peak, right_value = np.abs(correlations[best_index - 1 : best_index + 2])

@@ -1,4 +1,4 @@
-"""Training windows as batches of indices over one tensor."""
+"""Training windows as indices into one tensor of all logs."""
 
 from __future__ import annotations
 
@@ -18,14 +18,17 @@ from residnet.preprocessing.prepare import PreparedLog
 
 @dataclass(frozen=True)
 class WindowStore:
-    """All logs end to end, N samples.
+    """Concatenated samples of all logs, N in total.
 
-    Attributes are those of `Prepared`, positions from the start of each log, and:
-        n_remaining: samples from here to the end of the stretch, itself included, [N]; 0 where
-            there is none.
-        n_elapsed: samples since the stretch began, [N].
-        log_index: number of the log, in the order gathered, [N].
-        precomputed: what a training adds of each sample [N, k]; None where it adds nothing.
+    The other attributes are those of `PreparedLog`, with positions relative to the start of the
+    log.
+
+    Attributes:
+        n_remaining: samples up to the end of the segment, including this one [N]; 0 outside of
+            segments.
+        n_elapsed: samples since the start of the segment [N].
+        log_index: index of the log [N].
+        precomputed: additional columns of a training [N, k]; None without.
     """
 
     y: Tensor
@@ -46,7 +49,7 @@ class WindowStore:
     ) -> WindowStore:
         """Build the store from prepared logs.
 
-        Positions are counted from each log's start so that float32 keeps them exact enough.
+        Positions are relative to the start of each log, to keep their precision in float32.
         """
         lengths = [len(log) for log in logs]
         n_samples = sum(lengths)
@@ -82,19 +85,20 @@ class WindowStore:
         )
 
     def coarsen(self, stride: int, angle_columns: Sequence[int] = ()) -> WindowStore:
-        """Return the same logs in steps so many times as long: once for each sample to begin with.
+        """Return the logs with a longer time step, once for each of the `stride` first samples.
 
-        States are sampled; inputs over a long step are the mean of those over its short ones.
+        States are subsampled. The input over a long step is the mean over its short steps.
 
         Args:
-            angle_columns: columns of w that are angles, whose means keep to the circle.
+            stride: number of short steps in a long step.
+            angle_columns: columns of w with angles, which are averaged on the circle.
         """
         if stride == 1:
             return self
         row_order = torch.cat([torch.arange(k, len(self.y), stride) for k in range(stride)])
 
         def average_over_step(values: Tensor) -> Tensor:
-            # the last samples of all have no step behind them
+            # the last samples have no following step; their last value is repeated
             padded = torch.cat((values, values[-1:].expand(stride - 1, -1)))
             step_values = padded.unfold(0, stride, 1)
             differences = step_values - step_values[..., :1]
@@ -122,10 +126,17 @@ class WindowStore:
         )
 
     def find_starts(self, length: int, min_usable_share: float = 0.5) -> Tensor:
-        """Return the rows at which a window of `n_window_samples` samples may start.
+        """Return the rows [S] at which a window may start.
 
-        It lies within one stretch, its first sample is good, and at least `min_usable_share` of all
-        are usable.
+        A window is within one segment, its first sample is trainable, and a minimum share of its
+        samples is usable.
+
+        Args:
+            length: samples in a window.
+            min_usable_share: smallest share of usable samples.
+
+        Raises:
+            DataError: if no log has such a window.
         """
         cumulative_usable = torch.nn.functional.pad(self.usable.cumsum(0), (1, 0))
         is_long_enough = self.trainable & (self.n_remaining >= length)
@@ -136,46 +147,61 @@ class WindowStore:
         ]
         if start_rows.numel() == 0:
             raise DataError(
-                f"no training log holds a window of {length} samples without a break; shorten the"
+                f"no training log holds a window of {length} samples without a gap; shorten the"
                 " horizon or give longer logs"
             )
         return start_rows
 
     def find_segment_starts(self, length: int, n_lead: int) -> Tensor:
-        """Return the rows `n_lead` samples after a stretch's beginning where a window may start."""
+        """Return the rows [S], `n_lead` samples after the start of a segment, of valid windows.
+
+        Args:
+            length: samples in a window.
+            n_lead: samples between the start of the segment and the window.
+
+        Raises:
+            DataError: if no log has such a window.
+        """
         start_rows = self.find_starts(length)
         start_rows = start_rows[self.n_elapsed[start_rows] == n_lead]
         if start_rows.numel() == 0:
             raise DataError(
-                f"no training log holds a window of {length} samples from {n_lead} samples after"
-                " its beginning on; shorten it or leave out `find_segment_starts`"
+                f"no training log holds a window of {length} samples that starts {n_lead} samples"
+                " after the start of a segment; shorten the window or remove `beginnings`"
             )
         return start_rows
 
     def take_windows(self, values: Tensor, starts: Tensor, length: int) -> Tensor:
-        """Return the windows [B, length, ...] of one of the tensors, from rows `find_starts` [B] on."""
-        # all windows that there are, which lie in one another
+        """Return windows [B, length, ...] of one of the tensors that begin at rows `starts` [B]."""
+        # a strided view of all overlapping windows, without a copy
         view_shape = (len(values) - length + 1, length, *values.shape[1:])
         return values.as_strided(view_shape, (values.stride(0), *values.stride()))[starts]
 
     def take_history(self, starts: Tensor, length: int) -> tuple[Tensor, Tensor]:
-        """Return the measured states and inputs of the `n_window_samples` samples before each start.
+        """Return the measured states and inputs of the `length` samples before each start.
 
-        Where the stretch is shorter, its first sample is repeated.
+        If the segment is shorter, its first sample is repeated.
+
+        Args:
+            starts: rows [B].
+            length: number of samples H.
+
+        Returns:
+            States [B, H, 3 + n] and inputs [B, H, m].
         """
         offsets = torch.arange(-length, 0, device=starts.device)
         row_indices = starts[:, None] + torch.maximum(offsets, -self.n_elapsed[starts][:, None])
         flat_rows = row_indices.reshape(-1)
         window_shape = (starts.numel(), length)
-        return self.y.index_select(0, flat_rows).unflatten(0, window_shape), self.w.index_select(
-            0, flat_rows
-        ).unflatten(0, window_shape)
+        past_y = self.y.index_select(0, flat_rows).unflatten(0, window_shape)
+        past_w = self.w.index_select(0, flat_rows).unflatten(0, window_shape)
+        return past_y, past_w
 
 
 class WindowSampler:
-    """Random batches of window starts, the same for the same seed, stage and epoch.
+    """Random batches of window starts, reproducible by seed and epoch.
 
-    A resumed run sees what an undisturbed one did.
+    A resumed run draws the same batches as an uninterrupted one.
     """
 
     def __init__(self, starts: Tensor, batch_size: int, n_batches: int) -> None:
@@ -184,7 +210,7 @@ class WindowSampler:
         self.n_batches = n_batches
 
     def draw_epoch(self, seed: int, epoch: int) -> Tensor:
-        """Return the starts [steps, batch] of one epoch, drawn without replacement."""
+        """Return the starts [n_batches, batch_size] of one epoch, drawn without replacement."""
         generator = torch.Generator().manual_seed((seed * 1_000_003 + epoch) % (2**63))
         n_starts = self.batch_size * self.n_batches
         n_permutations = -(-n_starts // self.starts.numel())
@@ -198,22 +224,23 @@ class WindowSampler:
 
 
 WINDOW_COLUMNS = ("y", "smoothed", "nu_dot", "w", "rate_inputs", "usable", "trainable")
-"""What the windows of a log hold of each sample."""
+"""Attributes of `WindowStore` that windows contain by default."""
 
 
 @dataclass(frozen=True)
 class WindowStage:
-    """The windows of one stage of a training.
+    """Settings of the windows in one stage of a training.
 
     Attributes:
         n_window_samples: samples in a window.
         batch_size: windows in a batch.
-        n_history: samples before a window that come with it; where the stretch is shorter, its
-            first is repeated.
-        n_segment_start_windows: how many of the batch begin near the start of a stretch, as a free
-            run does.
-        n_lead: how many samples after it these begin; their history is as long, and at least one.
-        columns: of the store that its windows hold, the others are left empty.
+        n_history: samples before a window that are provided with it; if the segment is shorter, its
+            first sample is repeated.
+        n_segment_start_windows: windows of a batch that begin near the start of a segment, as a
+            free run does.
+        n_lead: samples between the start of the segment and these windows; their history has the
+            same length, at least one sample.
+        columns: attributes of the store that the windows contain; others are empty.
     """
 
     n_window_samples: int
@@ -224,10 +251,14 @@ class WindowStage:
     columns: Sequence[str] = WINDOW_COLUMNS
 
     def make_samplers(self, store: WindowStore, n_batches: int) -> list[WindowSampler]:
-        """Return where the windows of `steps` batches come from: anywhere, then beginnings.
+        """Create the samplers of windows at any row and of windows near segment starts.
+
+        Args:
+            store: samples of all logs.
+            n_batches: number of batches per epoch.
 
         Raises:
-            DataError: where no log is long enough.
+            DataError: if no log is long enough.
         """
         samplers = [
             WindowSampler(
