@@ -1,4 +1,4 @@
-"""What the motion says against propellers, rudders and the clock of the inputs."""
+"""Checks of propellers, rudders and the clock of the inputs against the motion."""
 
 from __future__ import annotations
 
@@ -28,30 +28,30 @@ from residnet.quality.statistics import (
 )
 
 _MIN_T_STATISTIC = 6.0
-"""Standard errors that call a sign wrong: many, since to turn a right one would ruin a fit."""
-_REVERSE_SIGN_FIX = "turn it in the channel map (sign: -1)"
+"""t statistic of a wrong sign: high, because reversing a correct sign would ruin a fit."""
+_REVERSE_SIGN_FIX = "reverse it in the channel map (sign: -1)"
 _REVERSE_SIGN_AND_CHECK_FIX = f"{_REVERSE_SIGN_FIX}, and check the sign of r and psi"
 
 
 def find_propellers(log: LogStatistics) -> list[str]:
-    """Return the inputs that are revolutions."""
+    """Return the inputs that are propeller revolutions."""
     revolution_inputs = [
         name
         for name in log.inputs
         if log.units[name] == "1/s" and abs_quantile(log[name], 1.0) > 0.0
     ]
-    # what a shaft does tells more than what it was told to do
+    # measured revolutions are preferred to commands
     return [name for name in revolution_inputs if not name.startswith("cmd_")] or revolution_inputs
 
 
-# rad of turning per revolution, at full rudder; vessels lie between .003 and .03
+# limits of the yaw angle per revolution at full rudder in rad; vessels have .003 to .03
 _MIN_TURN_RATIO, _MAX_TURN_RATIO = 8e-4, 0.3
-# no propeller of a vessel turns faster, 1/s
+# largest plausible propeller revolutions in 1/s
 _MAX_REVOLUTIONS = 250.0
 _FULL_RUDDER = 0.35
-"""Angle of full rudder in rad."""
+"""Full rudder angle in rad."""
 _MIN_STEERING_SHARE = 0.2
-"""Share of full rudder from which on the turning of a vessel tells how fast its propellers are."""
+"""Smallest share of full rudder for which the yaw rate indicates the unit of revolutions."""
 
 
 @check(
@@ -62,13 +62,13 @@ _MIN_STEERING_SHARE = 0.2
     on_subsample=True,
 )
 def check_propeller_unit(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report revolutions that cannot be revolutions per second."""
+    """Report revolutions whose unit cannot be 1/s."""
     names = log.cached(find_propellers)
-    # one of several may hardly turn while the others drive the vessel
+    # the fastest propeller counts, because one of several may be almost stopped
     max_revolutions = max((abs_quantile(log[name]) for name in names), default=0.0)
     for name in names:
         revolutions, factor = abs_quantile(log[name]), 0.0
-        text = f"{name} reaches {revolutions:.3g} 1/s, out of proportion to how the vessel turns"
+        text = f"{name} reaches {revolutions:.3g} 1/s, out of proportion to the yaw rate"
         steering_share = _steering_share(log, names) if "r" in log else 0.0
         if revolutions > _MAX_REVOLUTIONS:
             text, factor = f"{name} reaches {revolutions:.4g} 1/s, more than any propeller", 60.0
@@ -88,10 +88,13 @@ def check_propeller_unit(log: LogStatistics, make_finding: Check) -> Iterator[Fi
 
 
 def _steering_share(log: LogStatistics, names: Sequence[str]) -> float:
-    """Return how far the vessel was steered, as a share of full rudder; 0 where nothing tells.
+    """Return the steering effort as a share of full rudder.
 
-    Without a rudder it is steered by propellers that differ. A vessel that was not steered does
-    not turn, however fast its propellers are.
+    Without a rudder angle, it is the difference of the propeller revolutions over their size.
+
+    Args:
+        log: statistics of the log.
+        names: channels of propeller revolutions.
     """
     rudder_shares = [
         abs_quantile(log[name]) / _FULL_RUDDER for name in ("delta", "cmd_delta") if name in log
@@ -113,7 +116,7 @@ def _steering_share(log: LogStatistics, names: Sequence[str]) -> float:
     on_subsample=True,
 )
 def check_propeller_sign(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report propellers that turn against the way that the vessel goes, or slow it down."""
+    """Report propellers whose sign contradicts the direction of motion or the acceleration."""
     names = log.cached(find_propellers)
     is_moving = np.abs(log["u"]) > 0.3 * abs_quantile(log["u"], 0.9)
     if not names or not is_moving.any():
@@ -129,39 +132,37 @@ def check_propeller_sign(log: LogStatistics, make_finding: Check) -> Iterator[Fi
         np.abs(yaw_rate).mean()
     )
     if len(opposing_propellers) < len(names) and is_one_sided:
-        # a propeller that runs astern beside one that runs ahead is how such a vessel turns
+        # a turn with one propeller ahead and one astern is no fault
         opposing_propellers = []
     for name in opposing_propellers:
-        text = f"{name} turns against the way that the vessel goes"
+        text = f"{name} turns against the direction of motion"
         yield make_finding(text, repair=make_correction((name,), factor=-1.0))
     for name, t_statistic in (
         () if opposing_propellers else _find_reversed_propellers(log, names).items()
     ):
-        text = f"more {name} makes the vessel slower ({t_statistic:.0f} standard errors)"
+        text = f"more {name} decelerates the vessel ({t_statistic:.0f} standard errors)"
         yield make_finding(text, {"t": t_statistic}, repair=make_correction((name,), factor=-1.0))
 
 
 def _find_reversed_propellers(log: LogStatistics, names: Sequence[str]) -> dict[str, float]:
-    """Return reversed propellers, and by how many standard errors their thrust is the wrong way.
+    """Find propellers with a reversed sign by regression of the surge acceleration.
 
-    All choices of signs are compared by how well the sum of thrusts explains the surge: effects of
-    single propellers cannot be told apart where one runs ahead while the other runs astern.
+    All combinations of signs are compared by the residual of a fit with the sum of the thrusts,
+    because the effects of single propellers are collinear when one runs ahead and one astern.
+
+    Returns:
+        Name of a reversed propeller -> absolute t statistic of the thrust.
     """
     blocks, u = log.cached(make_blocks, "u"), log["u"]
     drift_terms = [log["v"] * log["r"], log["r"] ** 2] if "v" in log and "r" in log else []
     thrusts = np.stack([log[name] * np.abs(log[name]) for name in names], axis=-1)
     regressors = np.column_stack((np.ones(len(log)), u, u * np.abs(u), *drift_terms, thrusts))
-    integrated_regressors, velocity_changes = (
-        blocks.make_integrator(regressors)(0),
-        blocks.compute_changes(u),
-    )
+    integrated_regressors = blocks.make_integrator(regressors)(0)
+    velocity_changes = blocks.compute_changes(u)
     if (np.isfinite(integrated_regressors).all(axis=1) & np.isfinite(velocity_changes)).sum() < 40:
         return {}
-    common_terms, thrust_integrals = (
-        integrated_regressors[:, : -len(names)],
-        integrated_regressors[:, -len(names) :],
-    )
-
+    common_terms = integrated_regressors[:, : -len(names)]
+    thrust_integrals = integrated_regressors[:, -len(names) :]
     sign_choices = [
         np.array((1.0, *other_signs))
         for other_signs in itertools.product((1.0, -1.0), repeat=len(names) - 1)
@@ -173,11 +174,11 @@ def _find_reversed_propellers(log: LogStatistics, names: Sequence[str]) -> dict[
         for signs in sign_choices
     ]
     best_index = min(range(len(fits)), key=lambda i: fits[i].sum_of_squares)
-    # other signs must leave clearly less than those that were logged
+    # other signs must reduce the residual clearly below that of the recorded signs
     best_index = best_index if fits[best_index].sum_of_squares < 0.6 * fits[0].sum_of_squares else 0
     signs, t_statistic = sign_choices[best_index], fits[best_index].t_statistic
     total_thrust = thrusts @ signs
-    # of a thrust that hardly varies the effect cannot be told
+    # the effect of an almost constant thrust is not identifiable
     relative_variation = nan_std(total_thrust) / max(abs_quantile(total_thrust, 1.0), 1e-12)
     if abs(t_statistic) < _MIN_T_STATISTIC or relative_variation < 0.2:
         return {}
@@ -190,7 +191,14 @@ def _find_reversed_propellers(log: LogStatistics, names: Sequence[str]) -> dict[
 
 @dataclass(frozen=True)
 class NeutralRudderAngle:
-    """The rudder angle at which the vessel goes straight, rad, and its standard error."""
+    """Neutral rudder angle: the angle at which the vessel goes straight.
+
+    Attributes:
+        angle: neutral angle in rad.
+        standard_error: standard error of the angle in rad.
+        rudder_effect: coefficient of the rudder angle in the yaw model.
+        rudder_effect_error: standard error of that coefficient.
+    """
 
     angle: float
     standard_error: float
@@ -199,7 +207,7 @@ class NeutralRudderAngle:
 
 
 def estimate_neutral_angle(log: LogStatistics) -> NeutralRudderAngle | None:
-    """Return the neutral angle of delta, from the yaw moment that is there without any rudder."""
+    """Estimate the neutral angle of delta by a yaw model; None if it is not identifiable."""
     yaw_fit = _fit_yaw_model(log)
     if yaw_fit is None or not abs(yaw_fit.coefficients[1]) > 4.0 * yaw_fit.standard_errors[1]:
         return None
@@ -214,10 +222,10 @@ def estimate_neutral_angle(log: LogStatistics) -> NeutralRudderAngle | None:
 def _yaw_regression_data(
     log: LogStatistics, *additional_angles: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of a yaw model linear in the rudder angle, x [K, k] and y [K].
+    """Return regressors [K, k] and response [K] of a yaw model that is linear in the rudder angle.
 
-    The first two columns are the moment without rudder and the effect of the rudder, those of
-    `additional_angles` ones [T], which act as the rudder does, come next.
+    The first two columns are the constant moment and the effect of the rudder, followed by one
+    column for each of `additional_angles` [T], which act like the rudder angle.
     """
     blocks, u, r = log.cached(make_blocks, "r"), log["u"], log["r"]
     v = log["v"] if "v" in log else np.zeros(len(log))
@@ -242,7 +250,7 @@ def _yaw_regression_data(
 
 
 def _fit_yaw_model(log: LogStatistics, *additional_angles: np.ndarray) -> LeastSquaresFit | None:
-    """Return the fit of the yaw model; None where the log does not tell."""
+    """Fit the yaw model; None with missing channels, too few rows or a constant rudder."""
     if any(name not in log for name in ("delta", "u", "r")):
         return None
     yaw_fit = fit_least_squares(*_yaw_regression_data(log, *additional_angles))
@@ -258,7 +266,7 @@ def _fit_yaw_model(log: LogStatistics, *additional_angles: np.ndarray) -> LeastS
     on_subsample=True,
 )
 def check_rudder_bias(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report a rudder whose zero is not where the vessel goes straight, or that is reversed."""
+    """Report a rudder with a large neutral angle or a reversed sign."""
     neutral = log.cached(estimate_neutral_angle) if "delta" in log.inputs else None
     if neutral is None:
         return
@@ -270,8 +278,8 @@ def check_rudder_bias(log: LogStatistics, make_finding: Check) -> Iterator[Findi
             code="rudder_sign",
             fix=_REVERSE_SIGN_AND_CHECK_FIX,
         )
-    # hulls and single propellers have a neutral angle of a degree or so; beyond 2.6 even a wind is
-    # no excuse
+    # hulls and single propellers cause a neutral angle of about one degree; wind does not explain
+    # more than 2.6 degrees
     elif abs(neutral.angle) > max(math.radians(2.6), _MIN_T_STATISTIC * neutral.standard_error):
         text = (
             f"the vessel goes straight at delta = {math.degrees(neutral.angle):+.1f} +-"
@@ -280,15 +288,15 @@ def check_rudder_bias(log: LogStatistics, make_finding: Check) -> Iterator[Findi
         yield make_finding(
             text,
             {"angle": neutral.angle, "error": neutral.standard_error},
-            fix="take the offset off, or give a steady wind or current as an input",
+            fix="subtract the offset, or provide a steady wind or current as an input",
             repair=make_correction(("delta",), offset=-neutral.angle),
         )
 
 
-_WIDER_RANGE_FIX = "log with a wider range, or leave these parts out"
+_WIDER_RANGE_FIX = "log with a wider range, or exclude these parts"
 
 
-# share of the time at one end, and how much harder the vessel then turns
+# smallest share of time at the limit, ratio of the yaw moments, and t statistic of the difference
 _MIN_SHARE_AT_LIMIT, _MIN_EFFECT_RATIO, _MIN_T_STATISTIC_AT_LIMIT = 0.03, 1.3, 4.5
 
 
@@ -301,18 +309,18 @@ _MIN_SHARE_AT_LIMIT, _MIN_EFFECT_RATIO, _MIN_T_STATISTIC_AT_LIMIT = 0.03, 1.3, 4
     on_subsample=True,
 )
 def check_rudder_clipping(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report a rudder at whose recorded limit the vessel turns harder than the angle explains."""
+    """Report a clipped rudder record: at its limit the yaw moment exceeds the model."""
     rudder_limit = abs_quantile(log["delta"], 1.0)
     is_at_limit = np.abs(log["delta"]) > 0.999 * rudder_limit
     share_at_limit, n_visits = float(is_at_limit.mean()), find_runs(is_at_limit)[0].size
-    # a turning circle goes there once, and all of it lies there
+    # several visits are needed, because a turning circle is at one angle throughout
     if (
         "delta" not in log.inputs
         or not _MIN_SHARE_AT_LIMIT < share_at_limit < 1.0 - _MIN_SHARE_AT_LIMIT
         or n_visits < 3
     ):
         return
-    # the ramps of a zigzag tell the effect of smaller angles
+    # the additional term is identifiable if smaller angles occur as well, as in zigzags
     yaw_fit, excess_statistic = _fit_yaw_model(log, np.sign(log["delta"]) * is_at_limit), 0.0
     if yaw_fit is not None:
         t_statistic = float(abs(yaw_fit.coefficients[2]) / yaw_fit.standard_errors[2])
@@ -327,30 +335,35 @@ def check_rudder_clipping(log: LogStatistics, make_finding: Check) -> Iterator[F
     )
     if excess_statistic > 0.0:
         text = (
-            f"at {math.degrees(rudder_limit):.1f} deg of delta the vessel turns harder than smaller"
-            f" angles explain ({excess_statistic:.1f} times what they leave open): its record is"
-            " cut off there"
+            f"at {math.degrees(rudder_limit):.1f} deg of delta the vessel turns faster than"
+            f" predicted from smaller angles ({excess_statistic:.1f} times the residual): the"
+            " record is clipped"
         )
         yield make_finding(text, {"limit": rudder_limit, "harder": excess_statistic})
 
 
 def _excess_turning_at_limit(log: LogStatistics, is_at_limit: np.ndarray) -> float:
-    """Return how much harder the vessel turns at the limit, over what a fit elsewhere leaves.
+    """Return the mean excess of the yaw acceleration at the rudder limit, over the RMS residual.
 
-    The fit is one to all that lies off the limit, so it must hold rests at smaller angles; 0 where
-    it does not, or explains what happens at the limit.
+    The yaw model is fitted to the blocks away from the limit. The result is 0 if these contain too
+    few constant smaller angles, or if the excess is not significant.
+
+    Args:
+        log: statistics of the log.
+        is_at_limit: samples at the recorded limit [T] bool.
     """
-    blocks, values, (x, y) = log.cached(make_blocks, "r"), log["delta"], _yaw_regression_data(log)
+    blocks = log.cached(make_blocks, "r")
+    values = log["delta"]
+    x, y = _yaw_regression_data(log)
     is_finite = np.isfinite(x).all(axis=1) & np.isfinite(y)
-    is_inside_limit, is_outside_limit = (
-        is_finite & blocks.are_clear_of(~is_at_limit),
-        is_finite & blocks.are_clear_of(is_at_limit),
-    )
-    initial_angles, half_blocks = values[blocks.starts], replace(blocks, length=blocks.length // 2)
-    rudder_travel, max_angle = (
-        np.abs(blocks.compute_changes(values)) + np.abs(half_blocks.compute_changes(values)),
-        abs_quantile(values, 1.0),
-    )
+    is_inside_limit = is_finite & blocks.are_clear_of(~is_at_limit)
+    is_outside_limit = is_finite & blocks.are_clear_of(is_at_limit)
+    initial_angles = values[blocks.starts]
+    max_angle = abs_quantile(values, 1.0)
+    # the changes over a block and over its half exclude a rudder that returns to its first angle
+    half_blocks = replace(blocks, length=blocks.length // 2)
+    rudder_travel = np.abs(blocks.compute_changes(values))
+    rudder_travel = rudder_travel + np.abs(half_blocks.compute_changes(values))
     is_rudder_constant = (
         is_outside_limit
         & (rudder_travel < 0.05 * max_angle)
@@ -367,13 +380,14 @@ def _excess_turning_at_limit(log: LogStatistics, is_at_limit: np.ndarray) -> flo
     return excess if excess > _MIN_T_STATISTIC_AT_LIMIT else 0.0
 
 
-# so many times less must be left with the inputs shifted in time, and more without the steering
+# smallest ratios of residual sums of squares: unshifted over shifted inputs, and without over with
+# steering
 _MIN_SHIFT_IMPROVEMENT, _MIN_STEERING_IMPROVEMENT = 1.3, 1.2
 
 
 @check("inputs", "rudder_sign", required_channels=("r",), is_record_fault=True, on_subsample=True)
 def check_rudder_sign(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report the side to which what steers turns the vessel."""
+    """Report the sign of the steering response; a rudder to starboard must turn to starboard."""
     name, steering = _find_steering(log)
     if not name or np.isfinite(log["r"]).sum() < 2 * MIN_SAMPLES:
         return
@@ -383,16 +397,16 @@ def check_rudder_sign(log: LogStatistics, make_finding: Check) -> Iterator[Findi
         is_one_sided = all(
             abs(signal.sum()) > 0.95 * np.abs(signal).sum() for signal in (r, steering_values)
         )
-        # of a turning circle the loss of speed slows the turn, which no rudder does
+        # in a turning circle the yaw rate falls with the speed, so only its sign is evaluated
         if is_one_sided and float(r.sum()) * float(steering_values.sum()) < 0.0:
-            text = f"{name} stays on one side and the vessel turns to the other"
+            text = f"{name} is always on one side and the vessel turns to the other side"
             yield make_finding(text, fix=_REVERSE_SIGN_AND_CHECK_FIX)
         elif is_one_sided:
-            text = f"{name} stays on one side and the vessel turns to it"
+            text = f"{name} is always on one side and the vessel turns to this side"
             yield make_finding(text, level="note", fix="")
         if is_one_sided:
             return
-    # a rudder turns by the square of the speed past it
+    # the rudder force is proportional to the square of the inflow speed
     flow_speed = np.ones(len(log))
     if "delta" in name and "u" in log:
         flow_speed, is_finite = np.abs(log.smoothed("u")), is_finite & np.isfinite(log["u"])
@@ -409,7 +423,7 @@ def check_rudder_sign(log: LogStatistics, make_finding: Check) -> Iterator[Findi
         unshifted_fit.t_statistic,
         fits_by_shift[best_shift].t_statistic,
     )
-    # with the shift where that is surer and of the same sign
+    # the shifted fit counts if it is more significant and has the same sign
     is_consistent = (
         unshifted_t_statistic * shifted_t_statistic > 0.0
         and abs(unshifted_t_statistic) > 0.5 * _MIN_T_STATISTIC
@@ -449,7 +463,7 @@ def check_rudder_sign(log: LogStatistics, make_finding: Check) -> Iterator[Findi
 
 
 def _find_steering(log: LogStatistics) -> tuple[str, np.ndarray]:
-    """Return what steers and its values [T], positive to starboard; no name where none is known."""
+    """Return name and values [T] of the steering, positive to starboard; empty name if unknown."""
     for name in STEERING_CHANNELS[:4]:
         if name in log and log.std(name) > 1e-9:
             return name, log[name]
@@ -464,33 +478,38 @@ def _find_steering(log: LogStatistics) -> tuple[str, np.ndarray]:
 
 
 _MIN_STEERING_VARIATION = 0.02
-"""Share of its size within which a rudder is held; of 24 helices of a torpedo all lie within 1.6 %,
-of its zigzags and random steps all beyond 46 %."""
+"""Relative standard deviation below which a rudder counts as constant.
+
+24 helices of a torpedo have at most 1.6 %, its zigzags and random steps at least 46 %.
+"""
 _MAX_BLOCKS = 10_000
-"""Blocks that a rudder's side is told by: more only overlap."""
+"""Largest number of blocks for the steering response: more only overlap."""
 
 
 def _fit_steering_responses(
     log: LogStatistics, steering: np.ndarray, flow: np.ndarray, is_known: np.ndarray
 ) -> tuple[float, dict[int, LeastSquaresFit]]:
-    """Return what a yaw model leaves without steering, and fits with it by shift in samples: that
-    without a shift, and the one that leaves least.
+    """Fit a yaw model without steering, with steering, and with steering shifted in time.
 
-    Over blocks of a second or so: the change of r on the integrals of U^2, U r, r|r|, U v, v|v| and
-    U^2 times the steering, with the latter shifted in time; nothing where that says nothing.
+    The change of r over blocks of about one second is regressed on the integrals of U^2, U r, r|r|,
+    U v, v|v| and U^2 times the steering.
 
     Args:
-        log: with r.
-        steering: what steers [T].
-        flow: the speed U that it acts by [T]; 1 where it acts without any.
-        is_known: samples that are known [T].
+        log: statistics of a log with r.
+        steering: steering channel [T].
+        flow: inflow speed U [T]; 1 if the steering does not depend on it.
+        is_known: valid samples [T] bool.
+
+    Returns:
+        Sum of squares without steering, and shift in samples -> fit for no shift and for the best
+        shift; empty if the response is not identifiable.
     """
     r, block_length = log.smoothed("r"), max(round(1.0 / log.sampling_interval), SMOOTHING_SAMPLES)
     lower, upper = nan_quantiles(log["r"], 0.05, 0.95)
     v = np.zeros(len(log))
     if "v" in log and np.isfinite(log["v"]).sum() > 2 * MIN_SAMPLES:
         v = log.smoothed("v")
-    # a shift can be recognised as far as the yaw rate is correlated with itself
+    # shifts are limited to the first zero of the autocorrelation of the yaw rate
     power_spectrum = np.abs(np.fft.rfft(r - r.mean(), 2 * r.size)) ** 2
     autocorrelation = np.append(np.fft.irfft(power_spectrum)[: r.size], -1.0)
     max_shift = max(
@@ -518,7 +537,7 @@ def _fit_steering_responses(
         {round(float(shift)) for shift in np.linspace(-max_shift, max_shift, 61)}
     )
     is_finite = np.isfinite(integrated_terms).all(axis=1) & np.isfinite(y)
-    # of a rudder that is held through a steady turn only its shifted entry would seem to answer
+    # with a constant rudder in a steady turn, only shifted steps at its start would correlate
     mean_steering = steering_integrals(0)[is_finite, 0] / np.maximum(
         integrated_terms[is_finite, 0], 1e-300
     )
@@ -532,7 +551,7 @@ def _fit_steering_responses(
         integrated_terms[is_finite] / column_norms, full_matrices=False
     )
     left_singular_vectors = left_singular_vectors[:, singular_values > 1e-5 * singular_values[0]]
-    # what steers explains by the part of it that the other terms do not
+    # partial regression: both sides are orthogonalised to the other terms
     shifted_steering = steering_integrals(candidate_shifts)[is_finite][..., 0]
     residual_response, residual_steering = (
         signal - left_singular_vectors @ (left_singular_vectors.T @ signal)
@@ -549,25 +568,23 @@ def _fit_steering_responses(
     return fit_least_squares(integrated_terms, y).sum_of_squares, fits_by_shift
 
 
-# an answer so early, s, is no inaccuracy
+# a response earlier than this in s is not an inaccuracy
 MIN_LEAD_TIME = 0.45
-# minima that are looked at closely, and how many times the least counts as good a fit
+# number of minima that are refined, and ratio to the smallest sum of squares of an equivalent fit
 _N_MINIMA, _MAX_EQUIVALENT_RATIO = 4, 1.15
 _N_SHIFTS_PER_SIDE = 12
-"""To either side, coarse ones first; chosen by hand: each costs a fit."""
+"""Coarse shifts to either side; chosen by hand, because each costs a fit."""
 
 
 @dataclass(frozen=True)
 class ResponseDelay:
-    """When the motion answers an input.
+    """Delay between an input and the response of a velocity.
 
     Attributes:
-        delay: how late the answer comes; negative where it comes before the input.
-        standard_error: standard error of that, s.
-        improvement: what a fit leaves without the shift, over what it leaves with it (sums of
-            squares).
-        late_answer_ratio: what the best shift leaves that is no early answer, over the least that
-            any leaves.
+        delay: delay in s; negative if the response precedes the input.
+        standard_error: standard error of the delay in s.
+        improvement: residual sum of squares without the shift over that with it.
+        late_answer_ratio: residual sum of squares of the best causal shift over the smallest one.
     """
 
     delay: float
@@ -579,9 +596,10 @@ class ResponseDelay:
 def estimate_delays(
     log: LogStatistics,
 ) -> dict[tuple[str, str], tuple[tuple[str, ...], ResponseDelay]]:
-    """Return (channels, the velocity that answers) -> the channels one by one, and the delay.
+    """Estimate the delays of the first steering channel and of all propellers together.
 
-    Channels that may be shifted together are the first that steers, and all propellers.
+    Returns:
+        (names of the channels, responding velocity) -> the channels and their delay.
     """
     input_groups: list[tuple[tuple[str, ...], str]] = []
     rudder_name = next((name for name in STEERING_CHANNELS if name in log.inputs), "")
@@ -593,17 +611,27 @@ def estimate_delays(
         [(propeller_names, "u" if len(propeller_names) == 1 else "r")] if propeller_names else []
     )
     delays_by_input = {}
-    for names, answer in input_groups:
+    for names, velocity in input_groups:
         is_excited = all(log.std(n) > 0.02 * np.nanmax(np.abs(log[n])) for n in names)
-        delay = estimate_delay(log, names, answer) if answer in log and is_excited else None
+        delay = estimate_delay(log, names, velocity) if velocity in log and is_excited else None
         if delay is not None:
-            delays_by_input[", ".join(names), answer] = names, delay
+            delays_by_input[", ".join(names), velocity] = names, delay
     return delays_by_input
 
 
-def estimate_delay(log: LogStatistics, names: Sequence[str], answer: str) -> ResponseDelay | None:
-    """Return how late a velocity answers inputs; None where the log does not tell."""
-    step, blocks = log.sampling_interval, log.cached(make_blocks, answer)
+def estimate_delay(log: LogStatistics, names: Sequence[str], velocity: str) -> ResponseDelay | None:
+    """Estimate the delay of inputs by the time shift with the smallest one-step residual.
+
+    Args:
+        log: statistics of the log.
+        names: input channels that are shifted together.
+        velocity: velocity that responds.
+
+    Returns:
+        None if the log is too short or the best shift is at the end of the range.
+    """
+    step = log.sampling_interval
+    blocks = log.cached(make_blocks, velocity)
     max_shift = max(2 * blocks.length, round(3.0 / step))
     if len(log) < max(20 * blocks.length, 6 * max_shift):
         return None
@@ -615,14 +643,11 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], answer: str) -> Res
     other_inputs = [
         name for name in log if name in ("n", "delta", "wind_speed") and name not in names
     ]
-    velocity_changes = blocks.compute_changes(log[answer])
-    # shift -> the squares [K] that a fit leaves with the inputs shifted, NaN where unknown, and sum
-    squared_residuals_by_shift, sum_of_squares_by_shift = (
-        dict[int, np.ndarray](),
-        dict[int, float](),
-    )
-    # the flow over a rudder falls as the vessel turns: without their product in the fit the answer
-    # seems to come early
+    velocity_changes = blocks.compute_changes(log[velocity])
+    # shift -> squared residuals [K] of the fit with shifted inputs (NaN if unknown), and their sum
+    squared_residuals_by_shift: dict[int, np.ndarray] = {}
+    sum_of_squares_by_shift: dict[int, float] = {}
+    # the inflow of the rudder falls in a turn: without the product of both the response seems early
     velocity_columns = {name: log[name][:, None] for name in log.velocities}
     driving_inputs = [name for name in (*other_inputs, *names) if log.std(name) > 0.0]
     is_linear = len(driving_inputs) > 4
@@ -630,7 +655,7 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], answer: str) -> Res
     def make_shifted_terms(
         input_names: Sequence[str], shifts: Sequence[int] | np.ndarray
     ) -> list[np.ndarray]:
-        """Return terms [T, S] of inputs that are shifted by so many samples each."""
+        """Return input terms [T, S], one column for each shift in samples."""
         shifted_indices = np.arange(len(log))[:, None] - np.array(shifts)
         inputs = [
             np.take(log[name], shifted_indices, mode="wrap")
@@ -683,7 +708,7 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], answer: str) -> Res
             )
 
     def find_minima() -> list[int]:
-        """Return the shifts of the minima so far, the lowest first."""
+        """Return the shifts of the local minima evaluated so far, the lowest first."""
         shifts = sorted(sum_of_squares_by_shift)
         sums_of_squares = np.array([sum_of_squares_by_shift[shift] for shift in shifts])
         padded = np.concatenate(([np.inf], sums_of_squares, [np.inf]))
@@ -702,8 +727,8 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], answer: str) -> Res
         for min_shift in find_minima()[:_N_MINIMA]
         for k in range(-6, 7)
     )
-    # of several that fit alike the least that is no early answer: an input that repeats itself, as
-    # that of a zigzag, fits as well half a period away
+    # among equivalent minima the smallest causal shift counts: a periodic input, as in a zigzag,
+    # fits equally well half a period away
     min_sum_of_squares = max(min(sum_of_squares_by_shift.values()), 1e-300)
     equivalent_shifts = [
         shift
@@ -720,11 +745,9 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], answer: str) -> Res
         fixed_terms.shape[2] + len(make_shifted_terms(names, [0]))
     ):
         return None
-    # how well the least is determined: its scatter over sections of the log
-    tried_delays, squared_residuals = (
-        np.array([*squared_residuals_by_shift]) * step,
-        np.array([*squared_residuals_by_shift.values()]),
-    )
+    # standard error: scatter of the best shift over sections of the log
+    tried_delays = np.array([*squared_residuals_by_shift]) * step
+    squared_residuals = np.array([*squared_residuals_by_shift.values()])
     section_indices = np.array_split(np.flatnonzero(is_finite), N_SECTIONS // 2)
     best_delay_by_section = [
         tried_delays[
@@ -763,12 +786,12 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], answer: str) -> Res
     on_subsample=True,
 )
 def check_acausal_response(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report inputs that the motion answers before they are given.
+    """Report inputs whose response precedes them.
 
-    A vessel cannot answer before it is told. That it answers late may be its actuators; among logs
-    of one vessel, though, the delay is the same (`between`).
+    A response cannot precede its input. A late response may be due to the actuators, but the delay
+    must then be the same in all logs of one vessel (`between`).
     """
-    for (channels, answer), (names, delay) in log.cached(estimate_delays).items():
+    for (channels, velocity), (names, delay) in log.cached(estimate_delays).items():
         lead_time = -delay.delay
         is_significant = (
             delay.improvement > 1.35 and delay.late_answer_ratio > _MAX_EQUIVALENT_RATIO
@@ -777,9 +800,9 @@ def check_acausal_response(log: LogStatistics, make_finding: Check) -> Iterator[
             MIN_LEAD_TIME, 1.5 * log.sampling_interval, 3.0 * delay.standard_error
         ):
             text = (
-                f"{answer} answers {channels} {lead_time:.2f} +- {2.0 * delay.standard_error:.2f} s"
-                f" before it is given (a fit leaves {delay.improvement:.1f} times less with it"
-                " shifted)"
+                f"{velocity} responds {lead_time:.2f} +- {2.0 * delay.standard_error:.2f} s before"
+                f" {channels} (the residual sum of squares is {delay.improvement:.1f} times smaller"
+                " with a shifted input)"
             )
             figures = {
                 "lag": delay.delay,

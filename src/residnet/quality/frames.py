@@ -1,7 +1,7 @@
-"""Whether position, heading and velocities of a log describe one motion.
+"""Check the consistency of position, heading and velocities of a log.
 
-Frames, signs and units come first, then what is finer (`kinematics`). All look at a log on a
-uniform grid, with NaN where a channel is not to be trusted.
+Frames, signs and units are checked first, then gains, lags and biases (`kinematics`). All checks
+use a log on a uniform grid, with NaN at invalid samples.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from residnet.quality.kinematics import (
 )
 from residnet.quality.statistics import LogStatistics, interpolate_gaps
 
-# (change of sign, constant angle in deg) -> how a user would say it; psi, y and v reversed cover
-# all, because any two equal the third
+# (reversed channel, constant angle in deg) -> description; reversals of psi, y and v are complete,
+# because any two of them equal the third
 _CONVENTION_TEXTS = {
-    ("as declared", 180): "u and v (or x and y) with the sign turned",
+    ("as declared", 180): "u and v (or x and y) with reversed sign",
     ("psi reversed", 0): "psi counted counter-clockwise (sign: -1)",
     ("psi reversed", 90): "psi counted counter-clockwise from east (frame: enu)",
     ("y reversed", 0): "y positive to the west (sign: -1)",
@@ -57,17 +57,17 @@ _PLANAR_MOTION = (*POSE_NAMES, "u", "v")
 
 @dataclass(frozen=True)
 class AveragedRates:
-    """The rates of a log on a uniform grid, all averaged over the same few seconds.
+    """Rates of a log on a uniform grid, averaged over the same window.
 
-    Pose and velocities are thus filtered alike.
+    The common window gives derivatives of the pose and measured velocities the same filter.
 
     Attributes:
-        ground_velocity: rate of the position, north + i east, [T] in m/s.
-        body_velocity: the same from psi, u, v [T], for each convention.
-        yaw_rate: rate of psi [T] in rad/s.
-        averaged_velocities: u, v, r as far as the log has them, [T].
-        yaw_rate_noise: the larger of those in `yaw_rate` and in the averaged r, rad/s.
-        sway_noise: noise in the averaged v, m/s.
+        ground_velocity: derivative of the position, north + 1j east, [T] in m/s.
+        body_velocity: velocity over ground from psi, u, v [T] in m/s, by convention.
+        yaw_rate: derivative of psi [T] in rad/s.
+        averaged_velocities: averaged u, v, r of the log [T].
+        yaw_rate_noise: larger standard deviation of the noise of `yaw_rate` and averaged r, rad/s.
+        sway_noise: standard deviation of the noise of averaged v, m/s.
     """
 
     ground_velocity: np.ndarray
@@ -79,7 +79,7 @@ class AveragedRates:
 
 
 def compute_averaged_rates(log: LogStatistics) -> AveragedRates:
-    """Return the rates over windows in which the pose moves by several times its noise."""
+    """Compute rates over windows in which the pose changes by several times its noise."""
     velocity_names = [name for name in log.velocities if np.isfinite(log[name]).any()]
     yaw_rate_std = log.std("r") if "r" in velocity_names else 0.0
 
@@ -95,7 +95,7 @@ def compute_averaged_rates(log: LogStatistics) -> AveragedRates:
         )
 
     def central_difference(values: np.ndarray, half_window: int) -> np.ndarray:
-        """Return central differences [T] over 2 half steps, NaN at the ends."""
+        """Return central differences [T] over the window, NaN at the ends."""
         differences = np.full(values.shape, np.nan, dtype=values.dtype)
         if values.size > 2 * half_window:
             differences[half_window:-half_window] = (
@@ -105,7 +105,7 @@ def compute_averaged_rates(log: LogStatistics) -> AveragedRates:
         return differences
 
     def trapezoidal_mean(values: np.ndarray, half_window: int) -> np.ndarray:
-        """Return trapezoidal means [T] over 2 half steps, NaN at the ends and around a gap."""
+        """Return trapezoidal means [T] over the window, NaN at the ends and near gaps."""
         means = np.full(values.shape, np.nan, dtype=values.dtype)
         if values.size > 2 * half_window:
             weights, is_finite = np.ones(2 * half_window + 1), np.isfinite(values)
@@ -155,7 +155,7 @@ def compute_averaged_rates(log: LogStatistics) -> AveragedRates:
 
 @check("grid", "frames_unchecked", "note")
 def report_unchecked_frames(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report a log without what is needed."""
+    """Report a log without the channels for the checks of frames."""
     missing_names = [name for name in POSE_NAMES if name not in log]
     if missing_names or not log.velocities:
         yield make_finding(
@@ -165,12 +165,12 @@ def report_unchecked_frames(log: LogStatistics, make_finding: Check) -> Iterator
 
 @dataclass(frozen=True)
 class FrameAgreement:
-    """How the velocity over ground agrees with R(psi) [u, v] under each convention.
+    """Agreement of the velocity over ground with R(psi) [u, v] under several conventions.
 
     Attributes:
-        overlaps: complex for each convention; its size, the coherence, is 1 where both agree, and
-            its angle is what would have to be added to psi.
-        speed_ratio: size of the declared velocity over that of the velocity over ground.
+        overlaps: convention -> complex correlation. Its absolute value is the coherence (1 for full
+            agreement); its angle is the correction of psi in rad.
+        speed_ratio: norm of the declared velocity over that of the velocity over ground.
     """
 
     overlaps: dict[str, complex]
@@ -178,12 +178,12 @@ class FrameAgreement:
 
     @property
     def is_consistent(self) -> bool:
-        """Whether frames and units are right, so that finer causes can be looked for."""
+        """Whether frames and units agree, so that smaller inconsistencies can be estimated."""
         return self.overlaps["as declared"].real > 0.8 and 0.8 < self.speed_ratio < 1.25
 
 
 def compare_frames(log: LogStatistics) -> FrameAgreement | None:
-    """Return how position and velocities agree; None where fewer than 50 samples tell."""
+    """Compare position and velocities; None with fewer than 50 samples in motion."""
     averaged_rates = log.cached(compute_averaged_rates)
     is_finite = np.isfinite(averaged_rates.ground_velocity)
     for values in averaged_rates.body_velocity.values():
@@ -217,7 +217,7 @@ def compare_frames(log: LogStatistics) -> FrameAgreement | None:
     on_subsample=True,
 )
 def check_frames(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report frames, signs and units of position and velocities."""
+    """Report wrong frames, signs and units of position and velocities."""
     agreement_ = log.cached(compare_frames)
     if agreement_ is None:
         text = f"u, v not checked against position: fewer than {MIN_SAMPLES} samples with motion"
@@ -228,7 +228,7 @@ def check_frames(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
         overlaps["as declared"].real,
         math.degrees(np.angle(overlaps["as declared"])),
     )
-    # on a straight course all conventions do equally well: the declared one wins
+    # on a straight course all conventions agree equally: the declared one is preferred
     best_name = max(overlaps, key=lambda name: abs(overlaps[name]) + 1e-3 * (name == "as declared"))
     best_coherence, best_offset_deg = (
         abs(overlaps[best_name]),
@@ -289,7 +289,7 @@ def check_frames(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     required_channels=_PLANAR_MOTION,
 )
 def check_position_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report steps of the position that the velocities do not explain."""
+    """Report jumps of the position that the velocities do not explain."""
     earth_velocity = (log["u"] + 1j * log["v"]) * np.exp(1j * log["psi"])
     explained_steps = (
         0.5 * _time_steps_without_gaps(log) * (earth_velocity[1:] + earth_velocity[:-1])
@@ -309,7 +309,7 @@ def check_position_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Fi
 
 
 def _time_steps_without_gaps(log: LogStatistics) -> np.ndarray:
-    """Return the steps [T - 1] in s, NaN where they are longer than a grid bridges."""
+    """Return the time steps [T - 1] in s, NaN for gaps."""
     dt = np.diff(log.t)
     return np.where(dt > 3.5 * log.sampling_interval, np.nan, dt)
 
@@ -323,7 +323,7 @@ def _report_jumps(
     channels: tuple[str, ...],
     factor: float = 1.0,
 ) -> Iterator[Finding]:
-    """Return the steps of a pose whose excess [T - 1] is beyond a limit, if any."""
+    """Yield a finding if the excess of a pose step [T - 1] exceeds a limit."""
     is_jump = np.abs(excess_steps) > limit
     if is_jump.any():
         worst_index = int(np.argmax(np.abs(excess_steps)))
@@ -345,7 +345,7 @@ def _report_jumps(
     on_subsample=True,
 )
 def check_course_as_heading(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report a heading that follows the course over ground where velocities tell of drift."""
+    """Report a heading that equals the course over ground although the vessel drifts."""
     averaged_rates = log.cached(compute_averaged_rates)
     if not {"u", "v"} <= averaged_rates.averaged_velocities.keys():
         return
@@ -360,7 +360,7 @@ def check_course_as_heading(log: LogStatistics, make_finding: Check) -> Iterator
             np.abs(drift_angles) < 1.2
         )
     drift_std = float(np.std(drift_angles[is_valid])) if is_valid.sum() >= 100 else 0.0
-    # the drift angle must vary by so much, beyond its noise, before it tells heading from course
+    # heading and course are distinguishable only if the drift angle varies beyond its noise
     drift_noise = (
         float(np.sqrt(np.mean((averaged_rates.sway_noise / speed[is_valid]) ** 2)))
         if drift_std
@@ -387,7 +387,7 @@ def check_course_as_heading(log: LogStatistics, make_finding: Check) -> Iterator
 
 @check("grid", "follows", required_channels=_PLANAR_MOTION, on_subsample=True)
 def check_velocities_against_position(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report sign, gain and lag of u and v against the rate of the position."""
+    """Report sign, gain and lag of u and v against the derivative of the position."""
     frame_agreement = log.cached(compare_frames)
     body_ground_velocity = log.cached(compute_averaged_rates).ground_velocity * np.exp(
         -1j * log["psi"]
@@ -398,7 +398,7 @@ def check_velocities_against_position(log: LogStatistics, make_finding: Check) -
         or not np.isfinite(body_ground_velocity).any()
     ):
         return
-    # an offset or a current is found by the comparison of increments, wrong axes are not
+    # the comparison of increments detects an offset or a current, but not wrong axes
     is_certain = any(
         cause.is_significant for cause in log.cached(estimate_position_causes).values()
     )
@@ -423,12 +423,19 @@ def _compare_channel(
     reference_text: str,
     is_certain: bool,
 ) -> dict[str, Any]:
-    """Return what a finding says of a channel against a reference [T] of `min_spread` variation.
+    """Return the arguments of a finding about sign, gain and lag of a channel.
 
-    Its sign, gain and lag; nothing where these cannot be told.
+    Args:
+        log: statistics of the log.
+        name: channel to compare.
+        reference: derivative of the pose [T].
+        min_spread: smallest standard deviation for a comparison.
+        reference_text: description of the reference.
+        is_certain: whether the comparison of increments found a significant difference. Only then
+            a lag misleads, because slow channels correlate at any lag.
 
-    A lag alone misleads where the finer look is `is_certain` that pose and velocities differ at
-    all: slow channels correlate at any lag.
+    Returns:
+        Keyword arguments of the check; empty if the comparison is not possible.
     """
     averaged_rates = log.cached(compute_averaged_rates)
     channel_std, reference_std = (
@@ -471,7 +478,7 @@ def _compare_channel(
         text += f"; check its unit{describe_unit_confusion(gain, log.units[name])}"
         fix = "correct the unit in the channel map"
     else:
-        # how far a lag misleads is measured with the causes, which tell the channels apart
+        # the causes of `kinematics` distinguish the channels, so the lag is only a note here
         level = "note"
         if (
             correlation > 0.9
@@ -486,7 +493,7 @@ def _compare_channel(
 
 @check("grid", "position_causes", required_channels=_PLANAR_MOTION, on_subsample=True)
 def check_position_causes(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report what makes position and velocities differ, where the frames are right."""
+    """Report the causes of differences between position and velocities in correct frames."""
     frame_agreement = log.cached(compare_frames)
     if frame_agreement is not None and frame_agreement.is_consistent:
         yield from make_cause_findings(
@@ -495,7 +502,7 @@ def check_position_causes(log: LogStatistics, make_finding: Check) -> Iterator[F
 
 
 def compare_yaw_rate(log: LogStatistics) -> dict[str, Any]:
-    """Return what a finding says of r against the rate of psi."""
+    """Return the arguments of a finding about r against the derivative of psi."""
     if "r" not in log.cached(compute_averaged_rates).averaged_velocities:
         return {}
     is_certain = any(cause.is_significant for cause in log.cached(estimate_yaw_causes).values())
@@ -506,7 +513,7 @@ def compare_yaw_rate(log: LogStatistics) -> dict[str, Any]:
 
 
 def _is_yaw_consistent(log: LogStatistics) -> bool:
-    """Return whether psi and r describe one motion, but for what is finer."""
+    """Return whether psi and r agree in sign, unit and scale."""
     has_both_channels = min(int(np.isfinite(log[name]).sum()) for name in ("psi", "r")) > 1
     return has_both_channels and log.cached(compare_yaw_rate).get("level", "note") == "note"
 
@@ -516,7 +523,7 @@ _YAW_MOTION = (*POSE_NAMES, "r")
 
 @check("grid", "follows", required_channels=_YAW_MOTION, on_subsample=True)
 def check_yaw_rate_against_heading(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report sign, gain and lag of r against the rate of psi."""
+    """Report sign, gain and lag of r against the derivative of psi."""
     finding_arguments = log.cached(compare_yaw_rate)
     if finding_arguments:
         yield make_finding(**finding_arguments)
@@ -529,7 +536,7 @@ def check_yaw_rate_against_heading(log: LogStatistics, make_finding: Check) -> I
     required_channels=_YAW_MOTION,
 )
 def check_heading_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report steps of the heading that the yaw rate does not explain."""
+    """Report jumps of the heading that the yaw rate does not explain."""
     psi, r = log["psi"], log["r"]
     excess_steps = np.diff(psi) - 0.5 * _time_steps_without_gaps(log) * (r[1:] + r[:-1])
     scatter = nan_median(np.abs(excess_steps)) if np.isfinite(excess_steps).any() else 0.0
@@ -559,7 +566,7 @@ def check_yaw_drift(log: LogStatistics, make_finding: Check) -> Iterator[Finding
     yaw_rate_std, bias = max(log.std("r"), 1e-12), final_drift / duration
     causes = log.subsample.cached(estimate_yaw_causes)
     bias_cause = causes.get("bias") or causes.get("ramp")
-    # a bias misleads from 1.8 deg a minute and 5 % of the yaw rate on, or by what it adds up to
+    # a bias misleads above 1.8 deg per minute and 5 % of the yaw rate, or by its integral
     is_large = abs(bias) > max(math.radians(0.03), 0.05 * yaw_rate_std) or max_drift > math.radians(
         15.0
     )
@@ -591,7 +598,7 @@ def check_yaw_causes(log: LogStatistics, make_finding: Check) -> Iterator[Findin
 
 
 _MIN_ROLL_CORRELATION = 0.8
-"""Correlation from which steps of an angle and integrals of its rate are measures of one motion."""
+"""Smallest correlation of angle increments and rate integrals for a comparison of scales."""
 
 
 @check(
@@ -602,7 +609,7 @@ _MIN_ROLL_CORRELATION = 0.8
     on_subsample=True,
 )
 def check_roll_rate(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report a roll rate that is not the rate of the roll angle: another sign, or a unit."""
+    """Report a roll rate with a wrong sign or unit against the roll angle."""
     phi, p = interpolate_gaps(log.t, log["phi"]), interpolate_gaps(log.t, log["p"])
     integrated_rate = np.append(0.0, np.cumsum(0.5 * np.diff(log.t) * (p[1:] + p[:-1])))
     one_second_slice = slice(None, None, max(round(1.0 / log.sampling_interval), 1))
@@ -618,6 +625,6 @@ def check_roll_rate(log: LogStatistics, make_finding: Check) -> Iterator[Finding
     ):
         return
     gain = float(angle_increments @ rate_integrals) / float(rate_integrals @ rate_integrals)
-    # a mistaken sign makes it -1, a mistaken unit 57 or a 57th
+    # a wrong sign gives a gain of -1, a wrong unit 57 or 1/57
     if not 0.5 < gain < 2.0:
         yield make_finding(f"phi moves by {gain:.2g} times what its rate p says")

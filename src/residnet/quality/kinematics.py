@@ -1,13 +1,12 @@
-"""Whether position, heading and velocities describe one motion, to the accuracy of their noise.
+"""Estimate inconsistencies between position, heading and velocities of a log.
 
-Gains, lags, biases, lever arm and drift are estimated.
+The estimated causes are gains, lags, biases, the lever arm of the receiver and a current.
 
-Increments of the pose between neighbouring samples are compared with the integral of the velocities
-over them. White noise on pose and velocities gives the increments a tridiagonal covariance, by
-which they are whitened; what remains is explained by as few causes as it takes, one after the
-other, each by what it would add to the increments (orthogonal matching pursuit over groups of
-columns). Intervals are those of a sandwich estimate over twenty sections of the log, because
-filters leave errors that are not white.
+Increments of the pose between successive samples are compared with the integrals of the velocities.
+White noise on pose and velocities gives the increments a tridiagonal covariance, by which they are
+whitened. The difference is explained by few causes, selected by orthogonal matching pursuit over
+groups of columns: each cause has columns with its effect on the increments. Standard errors are
+sandwich estimates over twenty sections of the log, because filtered errors are not white.
 """
 
 from __future__ import annotations
@@ -33,30 +32,29 @@ from residnet.quality.statistics import (
 )
 
 MIN_LAG = 0.2
-"""A lag below this matters to no rollout of a vessel, s."""
+"""Smallest lag in s that affects a rollout of a vessel."""
 _MAX_CAUSES = 4
-"""Causes of one difference; chosen by hand: further ones would explain one another."""
-# a cause must lower the sum of squares by this many variances of the noise, and be this many
-# standard errors from nothing
+"""Largest number of causes; chosen by hand, because further ones are collinear."""
+# smallest reduction of the sum of squares by a cause in noise variances, and smallest t statistic
 _MIN_IMPROVEMENT, _MIN_T_STATISTIC = 60.0, 3.5
 _HALF_WINDOW = SMOOTHING_SAMPLES // 2
 _IS_DISTANT = np.abs(np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)) > 1
 _LEAVE_OUT_WEIGHTS = np.zeros(SMOOTHING_SAMPLES)
-"""Weights of the samples about one in the parabola that leaves it and its neighbours out."""
+"""Weights of the parabolic smoother without the central sample and its neighbours."""
 _LEAVE_OUT_WEIGHTS[_IS_DISTANT] = np.linalg.pinv(
     np.vander(np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)[_IS_DISTANT], 3)
 )[-1]
 _COLLINEARITY_TOLERANCE = 1e-9
-"""Square of what others leave of columns of length 1, below which they are sums of theirs."""
+"""Squared residual of a unit column regressed on others, below which it is collinear."""
 
 
 @dataclass(frozen=True)
 class KinematicCause:
-    """What explains a difference between two measurements.
+    """Estimated cause of a difference between two measurements.
 
     Attributes:
-        estimates: its size, one number for each column.
-        standard_errors: their standard errors.
+        estimates: size of the cause, one number per column.
+        standard_errors: standard errors of the estimates.
     """
 
     estimates: np.ndarray
@@ -64,28 +62,28 @@ class KinematicCause:
 
     @property
     def is_significant(self) -> bool:
-        """Whether any of its numbers differs from zero."""
+        """Whether any estimate differs significantly from zero."""
         return bool((np.abs(self.estimates) > _MIN_T_STATISTIC * self.standard_errors).any())
 
 
-# standard deviations of a heading's noise by which it has to move before the scale of r is told:
-# smoothing leaves .4 of them
+# smallest standard deviation of the heading for an estimate of the gain of r, in standard
+# deviations
+# of its noise, of which smoothing leaves .4
 _MIN_HEADING_SIGNAL_TO_NOISE = 3.0
 
 
 def estimate_yaw_causes(log: LogStatistics) -> dict[str, KinematicCause]:
-    """Return what makes the increments of psi differ from the integral of r.
+    """Estimate the causes of differences between the increments of psi and the integral of r.
 
-    Causes: `gain` (r is too large by 1 + value), `lag` (r trails psi, s), `bias` (of r, rad/s, the
-    negative of what psi gains over it) and `ramp` (its growth over the log, rad/s from start to
-    end).
+    Causes: `gain` (r is 1 + value times too large), `lag` (delay of r against psi in s), `bias` (of
+    r in rad/s) and `ramp` (growth of the bias from start to end in rad/s).
     """
     psi, r, t = log["psi"], log["r"], log.t
     dt = np.diff(t)
     smoothed_rate = log.cached(_smooth_leaving_out_centre, "r")
     normalized_time = (0.5 * (t[1:] + t[:-1]) - t.mean()) / max(float(t[-1] - t[0]), 1e-12)
     columns = {"bias": [-dt], "ramp": [-dt, -dt * normalized_time]}
-    # where the heading does not move, a bias of r would be all gain
+    # with a constant heading, gain and bias of r are collinear
     heading_std = nan_std(log.cached(_smooth_leaving_out_centre, "psi"))
     if _is_significant(log, "r") and heading_std > _MIN_HEADING_SIGNAL_TO_NOISE * log.noise_std(
         "psi"
@@ -102,21 +100,22 @@ def estimate_yaw_causes(log: LogStatistics) -> dict[str, KinematicCause]:
 
 
 def estimate_position_causes(log: LogStatistics) -> dict[str, KinematicCause]:
-    """Return what makes the increments of x, y differ from the integral of R(psi) [u, v].
+    """Estimate the causes of differences between increments of x, y and integrals of R(psi) [u, v].
 
-    Causes: `gain_u`, `gain_v`, `gain` (u, v, or both too large by 1 + value), `heading` (to be
-    added to psi, rad), `lag_u`, `lag_v`, `lag` (they trail the position, s), `lag_psi` (psi trails,
-    s), `lag_xy` (x, y trail all else, s), `lever_arm` (the receiver stands so far forward and to
-    starboard, m), `current` (u, v are through water that moves north, east, m/s), `bias` (of u, v,
-    m/s).
+    Causes: `gain_u`, `gain_v`, `gain` (u, v or both are 1 + value times too large), `heading`
+    (correction of psi in rad), `lag_u`, `lag_v`, `lag` (delays of u, v or both against the position
+    in s), `lag_psi` (delay of psi in s), `lag_xy` (delay of x, y in s), `lever_arm` (position of
+    the receiver forward and to starboard in m), `current` (north and east in m/s, if u, v are
+    relative to the water), `bias` (of u, v in m/s).
     """
     dt, psi = np.diff(log.t), log["psi"]
-    heading_rotation, mid_rotation = np.exp(1j * psi), np.exp(0.5j * (psi[1:] + psi[:-1]))
-    u, v = log.cached(_smooth_leaving_out_centre, "u"), log.cached(_smooth_leaving_out_centre, "v")
-    surge_increments, sway_increments = (
-        _integrate_steps(dt, heading_rotation * u),
-        _integrate_steps(dt, 1j * heading_rotation * v),
-    )
+    # horizontal vectors are complex numbers: north + 1j east, or forward + 1j starboard
+    heading_rotation = np.exp(1j * psi)
+    mid_rotation = np.exp(0.5j * (psi[1:] + psi[:-1]))
+    u = log.cached(_smooth_leaving_out_centre, "u")
+    v = log.cached(_smooth_leaving_out_centre, "v")
+    surge_increments = _integrate_steps(dt, heading_rotation * u)
+    sway_increments = _integrate_steps(dt, 1j * heading_rotation * v)
     lag_u, lag_v = mid_rotation * np.diff(u), 1j * mid_rotation * np.diff(v)
     earth_velocity = heading_rotation * (u + 1j * v)
     lag_psi = (
@@ -163,7 +162,7 @@ def estimate_position_causes(log: LogStatistics) -> dict[str, KinematicCause]:
     )
 
 
-# channel -> causes that cannot be found where it holds noise only: the noise would explain itself
+# channel -> causes that are not identifiable if it holds noise only, because of the shared noise
 _UNIDENTIFIABLE_CAUSES = {
     "u": ("gain_u", "lag_u", "gain", "lag", "lag_xy", "heading"),
     "v": ("gain_v", "lag_v"),
@@ -172,23 +171,22 @@ _UNIDENTIFIABLE_CAUSES = {
 
 
 def _integrate_steps(dt: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Return the integrals [T - 1] of a rate [T] over each step."""
+    """Return the trapezoidal integrals [T - 1] of a rate [T] over each step."""
     return np.asarray(0.5 * dt * (rates[1:] + rates[:-1]))
 
 
 def _is_significant(log: LogStatistics, name: str) -> bool:
-    """Return whether a channel does more than its noise."""
+    """Return whether the RMS of a smoothed channel exceeds its noise."""
     return float(
         np.sqrt(np.nanmean(log.cached(_smooth_leaving_out_centre, name) ** 2))
     ) > 1.2 * log.noise_std(name)
 
 
 def _smooth_leaving_out_centre(log: LogStatistics, name: str) -> np.ndarray:
-    """Return a channel [T] smoothed by a parabola over 15 samples; NaN stay where they are.
+    """Smooth a channel [T] by a parabola over 15 samples without the central three.
 
-    The parabola is that of the samples around each one, without it and its neighbours: columns then
-    share no noise with what they explain, which holds the noise of these samples. Near the ends of
-    a log they do.
+    Smoothed regressors then share no noise with the response, which contains the noise of the
+    central samples. Near the ends of a log the central samples are included. NaN is preserved.
     """
     values = log[name]
     is_finite = np.isfinite(values)
@@ -208,21 +206,23 @@ def _explain_increments(
     rate_noise: np.ndarray,
     columns: Mapping[str, list[np.ndarray]],
 ) -> dict[str, KinematicCause]:
-    """Return the causes that it takes to explain a pose, in the order of their weight.
+    """Select and estimate the causes that explain the increments of a pose.
 
     Args:
-        measured_pose: [T] real or complex, NaN where it was not measured.
-        integrated_increments: its increments [T - 1] by the velocities, NaN where these are
-            missing.
-        dt: time steps [T - 1], s.
-        pose_noise: of the pose at each sample.
-        rate_noise: noise [T - 1] of the velocity.
-        columns: what each cause adds to the increments, [T - 1] each.
+        measured_pose: [T] real or complex, NaN if missing.
+        integrated_increments: integrals of the velocities [T - 1], NaN if missing.
+        dt: time steps [T - 1] in s.
+        pose_noise: standard deviation of the noise of the pose.
+        rate_noise: standard deviation of the noise of the velocity [T - 1].
+        columns: effect of each cause of unit size on the increments, arrays [T - 1].
+
+    Returns:
+        Cause -> estimate, in the order of selection.
     """
     measured_indices = np.flatnonzero(np.isfinite(measured_pose))
 
     def sum_between_poses(steps: np.ndarray) -> np.ndarray:
-        """Return the sums [K, ...] of steps [T - 1, ...] from one pose to the next, NaN as well."""
+        """Return the sums [K, ...] of steps [T - 1, ...] between measured poses; NaN if any is."""
         if measured_indices.size == measured_pose.size:
             return steps
         is_missing, initial_zeros = ~np.isfinite(steps), np.zeros((1, *steps.shape[1:]))
@@ -234,11 +234,10 @@ def _explain_increments(
 
     if measured_indices.size < MIN_SAMPLES:
         return {}
-    unexplained_increments, durations, variance = (
-        np.diff(measured_pose[measured_indices]) - sum_between_poses(integrated_increments),
-        sum_between_poses(dt),
-        (dt * rate_noise) ** 2,
-    )
+    unexplained_increments = np.diff(measured_pose[measured_indices])
+    unexplained_increments = unexplained_increments - sum_between_poses(integrated_increments)
+    durations = sum_between_poses(dt)
+    variance = (dt * rate_noise) ** 2
     cause_columns = sum_between_poses(
         np.stack(
             [column for columns_of_cause in columns.values() for column in columns_of_cause],
@@ -259,12 +258,12 @@ def _explain_increments(
         np.isfinite(shared_variance), np.minimum(shared_variance, total_variance), total_variance
     )
     min_deviation = 1e-3 * nan_median(np.abs(unexplained_increments[retained_indices])) + 1e-12
-    # the trapezoid shares half a sample with its neighbour, which noise of the pose hides at least
-    # in part: increments are never taken as more alike than independent ones, or the whitening
-    # would look at the highest frequencies alone
+    # successive increments share one noisy pose (negative covariance) and half a noisy velocity
+    # (positive covariance); the sum is limited to non-positive values, because a positive one would
+    # make the whitening amplify the highest frequencies
     end_variance = np.maximum(pose_noise**2 - 0.25 * shared_variance, 0.0)
     is_adjacent = np.append(retained_indices[1:] == retained_indices[:-1] + 1, False)
-    # noise of the pose alone is singular in the limit: a little of the diagonal keeps the factor
+    # with noise of the pose only, the covariance is almost singular: the diagonal is increased
     covariance_band = np.stack(
         (
             1.0001 * (total_variance + 2.0 * end_variance + min_deviation**2),
@@ -272,7 +271,7 @@ def _explain_increments(
         )
     )
     cholesky_factor = scipy.linalg.cholesky_banded(covariance_band, lower=True)
-    # real and imaginary parts of a sample side by side, so that sections hold both
+    # real and imaginary parts become successive rows, so that a section contains both
     whitened_rows = np.column_stack(
         (unexplained_increments[retained_indices], cause_columns[retained_indices])
     )
@@ -284,7 +283,7 @@ def _explain_increments(
             -1, whitened_rows.shape[1]
         )
     y, cause_columns = whitened_rows[:, 0], whitened_rows[:, 1:]
-    # rows that stand far out and that no cause explains are jumps
+    # large residuals that no cause explains are jumps of the pose, which are excluded
     column_scales = np.maximum(np.abs(cause_columns).max(axis=0), 1e-300)
     scaled_columns = cause_columns / column_scales
     abs_residuals = np.abs(
@@ -302,24 +301,28 @@ def _explain_increments(
 def _orthogonal_matching_pursuit(
     response: np.ndarray, regressors: np.ndarray, names: np.ndarray
 ) -> dict[str, KinematicCause]:
-    """Select groups of columns one at a time, then drop those that others made superfluous."""
+    """Select groups of columns by orthogonal matching pursuit, then remove redundant groups.
+
+    Args:
+        response: whitened response [N].
+        regressors: whitened columns [N, k].
+        names: cause of each column [k].
+    """
     column_norms = np.linalg.norm(regressors, axis=0)
     regressors, names = (
         regressors[:, column_norms > 0.0] / column_norms[column_norms > 0.0],
         names[column_norms > 0.0],
     )
     column_norms = column_norms[column_norms > 0.0]
-    gram, product, energy = (
-        regressors.T @ regressors,
-        regressors.T @ response,
-        float(response @ response),
-    )
+    gram = regressors.T @ regressors
+    product = regressors.T @ response
+    energy = float(response @ response)
     columns_by_cause = {
         name: np.flatnonzero(names == name) for name in dict.fromkeys(names.tolist())
     }
 
     def compute_residual_energy(causes: Iterable[str]) -> float:
-        """Return the sum of squares that some causes leave."""
+        """Return the residual sum of squares of a fit with some causes."""
         column_indices = np.concatenate([columns_by_cause[name] for name in causes])
         coefficients = np.linalg.lstsq(
             gram[column_indices][:, column_indices],
@@ -344,8 +347,9 @@ def _orthogonal_matching_pursuit(
             for name in columns_by_cause
             if name not in selected_causes
         }
-        # of causes that explain the same, as lags of all channels but one and of that one do, the
-        # first counts
+        # among equivalent causes (a lag of one channel, or of all others) the first counts;
+        # rounding
+        # makes their gains equal
         net_gain_by_cause = {
             cause_name: round(
                 (residual_energy - energy_of_cause - min_gain_by_cause[cause_name])
@@ -357,10 +361,9 @@ def _orthogonal_matching_pursuit(
         best_cause = max(net_gain_by_cause, key=lambda name: net_gain_by_cause[name], default="")
         if not best_cause or net_gain_by_cause[best_cause] <= 0.0:
             break
-        selected_causes, residual_energy = (
-            [*selected_causes, best_cause],
-            residual_energy_by_cause[best_cause],
-        )
+        selected_causes = [*selected_causes, best_cause]
+        residual_energy = residual_energy_by_cause[best_cause]
+    # backward elimination of causes that later ones made redundant
     for name in list(selected_causes[:-1]):
         reduced_causes = [cause for cause in selected_causes if cause != name]
         selected_causes = (
@@ -396,15 +399,15 @@ def _orthogonal_matching_pursuit(
 
 @dataclass(frozen=True)
 class CauseLimit:
-    """What a cause of disagreement is called, and the size from which on it misleads.
+    """Description of a cause, and the size from which it misleads a fit.
 
     Attributes:
-        text: before its size.
-        unit: of the size as shown.
-        min_size: size from which on it misleads, SI.
-        fix: what to do about it.
-        min_time_steps: least size in time steps.
-        min_speed_share: least size as a share of the speed.
+        text: text before the size.
+        unit: display unit of the size.
+        min_size: size from which the cause misleads, SI.
+        fix: recommended action.
+        min_time_steps: lower bound on that size in time steps.
+        min_speed_share: lower bound on that size as a share of the RMS speed.
     """
 
     text: str
@@ -416,7 +419,7 @@ class CauseLimit:
 
 
 def _lag_limit(text: str, min_size: float = MIN_LAG) -> CauseLimit:
-    fix = "shift it in time, or estimate the lag where the reader can"
+    fix = "shift it in time, or let the reader estimate the lag"
     return CauseLimit(text, "s", min_size, fix, min_time_steps=1.0)
 
 
@@ -438,7 +441,7 @@ POSITION_LIMITS = {
         "psi is off against course and drift by",
         "deg",
         math.radians(3.0),
-        "take the offset off psi",
+        "subtract the offset from psi",
     ),
     "lag_u": _lag_limit("u trails the position by"),
     "lag_v": _lag_limit("v trails the position by"),
@@ -446,24 +449,24 @@ POSITION_LIMITS = {
     "lag_psi": _lag_limit("psi trails position and velocities by", 2.0 * MIN_LAG),
     "lag_xy": _lag_limit("x, y trail heading and velocities by"),
     "lever_arm": CauseLimit(
-        "x, y belong to a point forward and to starboard of where u, v hold by",
+        "x, y refer to a point forward and to starboard of that of u, v by",
         "m",
         0.3,
         "move it to the vessel's centre (lever arm)",
         min_speed_share=0.05,
     ),
     "current": CauseLimit(
-        "u, v are through water that moves north and east by",
+        "u, v are relative to water that moves north and east by",
         "m/s",
         0.02,
-        "give the current as an input",
+        "provide the current as an input",
         min_speed_share=0.1,
     ),
     "bias": CauseLimit(
         "u, v are too large against the position by",
         "m/s",
         0.02,
-        "take the bias off",
+        "subtract the bias",
         min_speed_share=0.1,
     ),
 }
@@ -475,7 +478,14 @@ def make_cause_findings(
     log: LogStatistics,
     make_finding: Check,
 ) -> Iterator[Finding]:
-    """Return the findings for the causes that are certain and large enough to matter."""
+    """Yield findings for significant causes that are large enough.
+
+    Args:
+        causes: estimated causes.
+        limits: descriptions and limits of the causes to report.
+        log: statistics of the log.
+        make_finding: the check that reports.
+    """
     for name, cause in causes.items():
         limit = limits.get(name)
         if limit is None or not cause.is_significant:
@@ -519,7 +529,13 @@ def make_cause_findings(
 def _make_repair(
     name: str, estimates: np.ndarray, velocity_names: tuple[str, ...]
 ) -> Callable[[Log], Log] | None:
-    """Return what corrects a cause; `velocity_names` are the channels that are compared with the pose."""
+    """Create a function that corrects a cause in a log; None if there is no correction.
+
+    Args:
+        name: name of the cause.
+        estimates: its size.
+        velocity_names: velocities that are compared with the pose.
+    """
     cause_kind, _, channel_suffix = name.partition("_")
     channel_names = {"": velocity_names, "xy": ("x", "y")}.get(channel_suffix, (channel_suffix,))
     if cause_kind == "gain":
