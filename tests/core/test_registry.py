@@ -73,11 +73,14 @@ def test_a_broken_part_says_so_where_it_is_used_and_disturbs_nothing_else() -> N
 @pytest.mark.parametrize(
     ("target", "fault"),
     [
-        ("residnet.heads.linear:PlsrConfig", "no subclass of residnet.heads.base.BaseHeadConfig"),
+        (
+            "residnet.heads.linear:PlsrConfig",
+            "not a subclass of residnet.heads.base.BaseHeadConfig",
+        ),
         ("residnet.heads.base:BaseHeadConfig", "BaseHeadConfig lacks build"),
         ("residnet_sample.slow_water:SlowWaterConfig", "has no field `kind: Literal['odd']`"),
         ("residnet_sample.slow_water:Nothing", "AttributeError"),
-        ("os", "no subclass"),
+        ("os", "not a subclass"),
     ],
 )
 def test_faults_of_kinds(installed: Path, target: str, fault: str) -> None:
@@ -136,5 +139,5 @@ def test_faults_of_formats_and_vessels(installed: Path) -> None:
 
 def test_a_vessel_package_without_files(installed: Path) -> None:
     declare(installed / "site", "residnet.vessels", odd="residnet_sample.pulse:Pulse")
-    assert "no package with files" in dict(list_catalogue("vessels"))["odd"]
+    assert "not a package with data files" in dict(list_catalogue("vessels"))["odd"]
     assert "sample package" in dict(list_catalogue("vessels"))["sample_ferry"]

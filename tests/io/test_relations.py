@@ -200,8 +200,8 @@ def test_a_long_log_tells_by_stretches_what_it_tells_whole(
     log = log.select_rows(np.r_[0:8_500, 8_500 + gap : len(log)])
     whole = inspect_log(log, ["delta"])
     monkeypatch.setattr(statistics, "_MAX_SUBSAMPLE", 12_000)
-    monkeypatch.setattr(channels, "_FEW", 6_000)
-    few = statistics.Record(log).subsample
+    monkeypatch.setattr(channels, "_MAX_SUBSAMPLE", 6_000)
+    few = statistics.LogStatistics(log).subsample
     assert len(few) == 12_000
     assert np.flatnonzero(np.isnan(few["r"])).tolist() == list(range(0, 12_000, 2_400))
     told = inspect_log(log, ["delta"])
@@ -234,7 +234,7 @@ def test_what_a_repair_of_a_long_log_does_is_measured_within_its_stretches(
     finding, found = Finding("will mislead", "heading", "", repair=repair), []
     for longest in (12_000, 30_000):
         monkeypatch.setattr(statistics, "_MAX_SUBSAMPLE", longest)
-        effects = FindingEffects(statistics.Record(log, ["delta"]))
+        effects = FindingEffects(statistics.LogStatistics(log, ["delta"]))
         found.append(effects.measure(finding).effect)
     assert found[0] == pytest.approx(found[1], rel=0.2)
     assert found[1] == pytest.approx(2.0 * np.sin(off / 2.0), rel=0.5)

@@ -53,14 +53,14 @@ def sha256(path: Path) -> str:
 
 
 def resolve_name(folder: Path, name: object, source: Path | None = None) -> Path:
-    """Return the path of a file by the relative name that stands in a JSON file.
+    """Return the path of a file by its relative name in a JSON file.
 
-    The name is one that `PurePosixPath` leaves as it is: relative, without `..`. Symbolic links are
-    not looked at, see `require_inside`.
+    The name must be a normalised relative POSIX path without `..`. Symbolic links are not checked,
+    see `require_inside`.
 
     Args:
-        folder: that the name is relative to.
-        name: what the JSON file holds.
+        folder: folder of the relative name.
+        name: value in the JSON file.
         source: the JSON file, for the error message; the folder if None.
 
     Raises:
@@ -207,7 +207,7 @@ class Manifest:
         self._append(json.dumps({"name": self._relative_name(path), "sha256": digest}) + "\n")
 
     def record_existing(self) -> None:
-        """Record every regular file of the folder as it is, except those of a nested manifest."""
+        """Record every regular file of the folder with its SHA-256, without nested manifests."""
         for path, manifest in self._iterate_files(self.folder):
             if manifest is self and not path.is_symlink() and path.is_file():
                 self.record(path, sha256(path))
@@ -231,7 +231,7 @@ class Manifest:
         raise self._ownership_error(path, digests)
 
     def require_recorded_unchanged(self, *names: str) -> None:
-        """Check that what was recorded may be written again: it is unchanged or gone.
+        """Check that recorded files may be written again: each is unchanged or deleted.
 
         Args:
             names: of files, and of folders whose recorded files are checked.
@@ -411,7 +411,7 @@ class Manifest:
             ) from error
 
     def _read_merged(self) -> dict[str, str | None]:
-        """Return the entries of the manifest file without those of the journal."""
+        """Return the entries of the manifest file, without the journal."""
         try:
             content: Any = json.loads(self._read(self.path))
         except (ValueError, RecursionError) as error:
@@ -447,8 +447,8 @@ class Manifest:
 def find_run_manifest(path: Path) -> Manifest | None:
     """Return the manifest of the run folder that a path lies in; None outside of run folders.
 
-    In nested run folders it is the innermost; a folder that a symbolic link stands for counts only
-    if no other run folder lies above.
+    In nested run folders it is the innermost one. A symbolic link to a folder counts only if no
+    other run folder is above it.
     """
     linked_manifest: Manifest | None = None
     for folder in path.parents:

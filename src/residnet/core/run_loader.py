@@ -40,7 +40,7 @@ SIZE_LIMITS = {
 UNREAD_FOLDERS = frozenset({"exports", "tensorboard", "checkpoints"})
 """Folders whose files no command reads back as a result."""
 READ_FOLDERS = frozenset({"figures", "logs", "models", "rollouts"})
-"""Folders of which every file of these kinds is read, whatever its name."""
+"""Folders in which files of these kinds are read under any name."""
 READ_NAMES = frozenset(
     {
         "bands.json",
@@ -97,7 +97,7 @@ def files_of_run(run: Path) -> Iterator[Path]:
 
 
 def require_trustworthy(run: Path) -> None:
-    """Check a run folder, or that of a single model, before anything in it is read.
+    """Check the folder of a run or of a single model before anything in it is read.
 
     Raises:
         UsageError: if the manifest is missing, if an entry is no regular file or too large, or if a

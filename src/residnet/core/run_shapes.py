@@ -128,8 +128,8 @@ def require_shape(path: Path, content: Any) -> None:
     """Check the types of the known keys of a JSON file of a run.
 
     Args:
-        path: of the file; its name says what it holds.
-        content: what was read from it.
+        path: path of the file, whose name determines the expected keys.
+        content: parsed content of the file.
 
     Raises:
         UsageError: if a value has another type, or a key is missing.

@@ -262,7 +262,7 @@ class _GridWeights:
         return _any_in_ranges(flags, self._first_weighted, self._last_weighted + 1)
 
     def is_unreliable(self, is_missing: np.ndarray) -> np.ndarray:
-        """Return [G, n] bool: points to which a missing sample contributes, or whose window has a gap."""
+        """Return [G, n] bool: points with a missing sample or a gap in their window."""
         unreliable: np.ndarray = self.any_weighted(is_missing) | _any_in_ranges(
             self._is_gap[:, None], self._first_weighted, self._last_weighted
         )

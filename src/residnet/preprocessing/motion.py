@@ -616,7 +616,7 @@ def smooth_track(t: np.ndarray, measurements: np.ndarray, noise_std: ArrayLike) 
     Args:
         t: times [T] in s, increasing.
         measurements: measured positions, then rates, then accelerations as far as there are any,
-            [T, k, A]; a row of NaN where there is no measurement.
+            [T, k, A]; NaN for missing measurements.
         noise_std: standard deviations [k], of which ratios count; infinite where nothing is
             measured.
     """

@@ -47,7 +47,7 @@ class OverlappingBlocks:
         return np.asarray(values[starts + self.length] - values[starts])
 
     def are_clear_of(self, invalid: np.ndarray, shift: ArrayLike = 0) -> np.ndarray:
-        """Return [K, ...] bool: blocks without invalid samples [T, ...], moved as by `compute_changes`."""
+        """Return [K, ...] bool: shifted blocks without invalid samples [T, ...]."""
         cumulative_invalid = np.zeros((len(invalid) + 1, *invalid.shape[1:]), dtype=int)
         np.cumsum(invalid, axis=0, out=cumulative_invalid[1:])
         starts = np.subtract.outer(self.starts, shift)

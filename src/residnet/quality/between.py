@@ -288,7 +288,7 @@ def check_overlapping_logs(logs: LogSet, make_finding: Check) -> Iterator[Findin
 
 
 _COMPARED_ROWS = 50 * 4 ** np.arange(12) - 1
-"""Rows at which commands are compared first; late ones too, as manoeuvres may begin alike."""
+"""Rows at which commands are compared first; manoeuvres may have equal starts."""
 
 
 @check(

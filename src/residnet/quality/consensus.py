@@ -5,12 +5,12 @@ regression is a one-step model without vessel knowledge: the change of each velo
 a few seconds, regressed on the time integral of polynomial features of velocities and inputs.
 
 Two statistics flag a log. Both are relative to their spread over the inliers, so that noise, gusts
-and the polynomial's own misfit, which all logs share, flag none:
+and the misfit of the polynomial, which affect all logs, flag none:
 
-- `rmse_ratio`: the log's residuals under the others' model, over what is usual among inliers;
-- `score_test`: whether the hull or an input would need a scale factor of its own in this log.
+- `rmse_ratio`: RMSE of the log under the model of the other logs, over the median of the inliers;
+- `score_test`: test whether the hull or an input needs a separate scale factor in this log.
 
-An outlier is then predicted again under one hypothesis after the other (dead record, sign, scale,
+An outlier is then predicted again under each of several hypotheses (dead record, sign, scale,
 offset, delay, swapped sides, heading, current, other vessel). The most likely one is reported.
 """
 
@@ -44,15 +44,15 @@ from residnet.quality.statistics import (
 
 # Regression
 RIDGE = 1e-6
-"""Ridge penalty over the mean of the Gram matrix's diagonal: collinear features stay solvable."""
+"""Ridge penalty over the mean of the Gram matrix's diagonal: collinear features are solvable."""
 OVERLAP = 4.0
-"""Blocks that overlap each sample; so many of their residuals count as one independent residual."""
+"""Number of blocks that overlap each sample; their residuals count as one independent one."""
 MIN_BLOCKS, MAX_BLOCKS = 12, 1500
-"""Blocks below which a log decides nothing, and beyond which further ones only overlap more."""
+"""Smallest number of blocks for a decision, and largest number, above which they only overlap."""
 CHUNK_SAMPLES = 20_000
-"""Samples assembled at a time, of some thirty features: they stay in a core's cache."""
+"""Samples per chunk, so that some thirty features fit into the cache of a core."""
 POLYNOMIAL_PREFERENCE = 0.95
-"""The polynomial with constants is taken where its error is below this share of the other's."""
+"""Ratio of errors below which the polynomial is preferred to the homogeneous features."""
 
 # Outlier decision, calibrated on 80 random fleets so that 3 clean ones are flagged
 # (scripts/bench/fleets.py --seed 1, 2)
@@ -60,15 +60,15 @@ MAX_SCORE_TEST, MAX_RMSE_RATIO, MAX_RMSE_Z = 4.8, 1.8, 5.5
 USUAL_SCORE_TEST = 1.3
 """Expected score test of a correct model: mean of the largest of three chi over their size."""
 MIN_LOG_RMSE_STD = 0.1
-"""Least standard deviation of log(RMSE) among logs of one vessel."""
+"""Lower bound on the standard deviation of log(RMSE) among logs of one vessel."""
 MIN_MATERIAL_ERROR = 0.15
-"""Share of the response that must be mispredicted: smaller differences mislead no fit."""
+"""Smallest mispredicted share of the response that misleads a fit."""
 MAX_SUSPECTS, MIN_SUSPICION = 8, 0.5
-"""Logs left out in turn (bounds the time on large fleets), and the severity from which one is."""
+"""Largest number of logs that are left out in turn, and the severity from which a log is."""
 MAX_REFERENCES = 40
-"""Inliers, evenly spread, that define what is usual in a large fleet."""
+"""Largest number of inliers, evenly spread, that serve as the reference of a large fleet."""
 CV_FOLDS = 4
-"""Stretches of a log that are predicted from each other where there are too few logs."""
+"""Folds of the cross-validation within a log, used if there are too few logs."""
 LTS_STEPS = 3
 """Concentration steps of the least-trimmed-squares search."""
 MIN_CONTAMINATION = 1.6
@@ -128,7 +128,7 @@ def compute_block_features(
     columns = [x * np.abs(x) for x in states]
     columns += [a * b for a, b in itertools.combinations(states, 2)]
     if "q" in velocities:
-        # weight and buoyancy act along the vertical, seen from the axes of a diving vessel
+        # weight and buoyancy act along the vertical, in body axes of a diving vessel
         level = np.cos(log["theta"])
         columns += [np.sin(log["theta"]), level * np.sin(log["phi"]), level * np.cos(log["phi"])]
     actuators = [name for name in inputs if not name.startswith(("wind", "current"))]
@@ -201,11 +201,11 @@ class RidgeFit:
     Attributes:
         coef: [k, n].
         gram_inv: regularised (X'X)^-1 [k, k].
-        residual_var: variance [n] that the model usually leaves, 1 until it is known.
+        residual_var: usual residual variance [n], 1 until it is set.
     """
 
     def __init__(self, gram: np.ndarray, cross: np.ndarray) -> None:
-        # the Gram matrix of a vessel at rest is zero
+        # a vessel at rest has a zero Gram matrix
         penalty = RIDGE * (np.trace(gram) / len(gram) or 1.0)
         self.gram_inv = np.linalg.inv(gram + penalty * np.eye(len(gram)))
         self.coef = self.gram_inv @ cross
@@ -247,7 +247,7 @@ class RidgeFit:
 
 
 def cross_validate_mse(data: BlockData) -> np.ndarray:
-    """Return the mean squared residual [n] of a log's quarters under models of its others."""
+    """Return the mean squared residual [n] of a cross-validation within one log."""
     folds = [data.subset(rows) for rows in np.array_split(np.arange(len(data.Y)), CV_FOLDS)]
     return np.asarray(
         np.mean(
@@ -265,12 +265,12 @@ def cross_validate_mse(data: BlockData) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Score:
-    """How a log compares with the inliers.
+    """Comparison of a log with the inliers.
 
     Attributes:
-        score_test: of its contributions, in standard errors over what is usual.
-        rmse_ratio: its RMSE over what is usual [n].
-        rmse_z: log(RMSE) in standard deviations of the inliers', at most.
+        score_test: score test of its contributions, over its usual value.
+        rmse_ratio: RMSE over the usual RMSE [n].
+        rmse_z: largest log(RMSE) in standard deviations of the inliers.
         material_error: mispredicted share of the response.
     """
 
@@ -281,7 +281,7 @@ class Score:
 
     @property
     def severity(self) -> float:
-        """Beyond 1 the log is an outlier."""
+        """Severity of the deviation; above 1 the log is an outlier."""
         if self.material_error < MIN_MATERIAL_ERROR:
             return 0.0
         ratio = float(np.nanmax(self.rmse_ratio, initial=0.0)) / MAX_RMSE_RATIO
@@ -385,7 +385,12 @@ class Fleet:
         return copied_fleet
 
     def fit_leave_one_out(self, members: Sequence[int], of: Iterable[int]) -> dict[int, RidgeFit]:
-        """Return for each log the fit to the members, itself left out."""
+        """Fit the members once for each log, without that log.
+
+        Args:
+            members: indices of the logs in the fit.
+            of: indices of the logs to leave out.
+        """
         gram, cross = pool_moments(self.data[j] for j in members)
         fits = {}
         for i in of:
@@ -411,7 +416,12 @@ class Fleet:
         return {i: np.maximum(mse[i] - self.data[i].noise_var, 0.0) for i in logs}
 
     def score_logs(self, inliers: Sequence[int], of: Sequence[int]) -> dict[int, Score]:
-        """Return how logs compare with the inliers, themselves left out."""
+        """Compare logs with a fit to the inliers without them.
+
+        Args:
+            inliers: indices of the inliers.
+            of: indices of the logs to compare.
+        """
         references = inliers[:: -(-len(inliers) // MAX_REFERENCES)]
         logs = [i for i in dict.fromkeys((*references, *of)) if len(inliers) > (i in inliers)]
         fits = self.fit_leave_one_out(inliers, logs)
@@ -425,7 +435,7 @@ class Fleet:
         log_ratio = {i: np.log(np.maximum(ratio[i], 1e-6)) for i in logs}
         tests = {i: self.run_score_test(i, fits[i], expected[i]) for i in logs}
         references = [i for i in references if i in ratio]
-        # a few logs have no spread to speak of
+        # too few logs give no estimate of the spread
         center, std, misfit = np.zeros(1), np.full(1, np.inf), 1.0
         if len(references) > 4:
             center = np.median([log_ratio[i] for i in references], axis=0)
@@ -447,7 +457,7 @@ class Fleet:
 
     @cached_property
     def feature_groups(self) -> list[np.ndarray]:
-        """Masks [k] of the features without any input, then of those that hold each actuator."""
+        """Masks [k] of the features without inputs, then of the features with each actuator."""
         log = self.logs[self.usable[0]]
         X = self.assemble(log).X
         groups = []
@@ -459,7 +469,7 @@ class Fleet:
         return [hull, *groups]
 
     def compute_contributions(self, i: int, fit: RidgeFit) -> np.ndarray:
-        """Return what hull and actuators contribute to the response [n, K, groups], 0 if tiny."""
+        """Return the contributions of hull and actuators to the response [n, K, groups]."""
         X = self.data[i].X
         parts = [X[:, group] @ fit.coef[group] for group in self.feature_groups]
         table = np.stack(parts, axis=-1).transpose(1, 0, 2)
@@ -489,10 +499,11 @@ class Fleet:
         return float(np.sqrt(np.maximum(statistic, 0.0) / count).max()), float(change.max())
 
     def find_least_trimmed_half(self) -> list[int]:
-        """Return the half of the logs that agree best.
+        """Return the half of the logs with the best mutual agreement.
 
-        Several logs with one fault spoil the model of all, so that none is an outlier. This is
-        least trimmed squares over logs (Rousseeuw and Van Driessen 2006), from single logs on.
+        Several logs with the same fault corrupt the model of all logs, so that none is an outlier.
+        Least trimmed squares over logs (Rousseeuw and Van Driessen 2006) avoids this; the search
+        starts from single logs.
         """
         within_log_mse = {
             i: np.maximum(cross_validate_mse(self.data[i]), 1e-12) for i in self.usable
@@ -522,10 +533,10 @@ class Consensus:
     """The inliers and outliers of a fleet.
 
     Attributes:
-        fleet: with the data that the decision is on.
-        inliers: indices of logs that agree.
-        outliers: indices of those that do not, the worst first.
-        idle: unexplained idle stretches that are known, by log.
+        fleet: the logs with the data of the decision.
+        inliers: indices of the agreeing logs.
+        outliers: indices of the contradicting logs, the most severe first.
+        idle: cache of the unexplained idle stretches by log.
     """
 
     fleet: Fleet
@@ -541,7 +552,7 @@ class Consensus:
         return self.fleet.estimate_excess_var(self.inliers, fits, len(self.inliers))
 
     def fit_inliers(self, excluding: int | None = None) -> RidgeFit:
-        """Return the fit to the inliers, one of them left out, with its usual residuals."""
+        """Return the fit to the inliers without one of them, with the usual residual variance."""
         key = -1 if excluding is None else excluding
         fit = self.fleet.fit_leave_one_out(self.inliers, [key])[key]
         usual = [variance for i, variance in self.excess_var.items() if i != excluding]
@@ -550,11 +561,11 @@ class Consensus:
 
     @property
     def has_majority(self) -> bool:
-        """Whether most logs are inliers, so that the outliers are the wrong ones."""
+        """Whether more than half of the logs are inliers, so that the outliers are wrong."""
         return len(self.inliers) > max(1.0, len(self.fleet.usable) / 2.0)
 
     def compute_rmse_ratio(self, i: int) -> float:
-        """Return the RMSE of a log over what is usual, of its worst velocity."""
+        """Return the RMSE of a log over the usual RMSE, for its worst velocity."""
         return float(np.nanmax(self.fleet.score_logs(self.inliers, [i])[i].rmse_ratio))
 
     def is_outlier(self, i: int, data: BlockData | None = None) -> bool:
@@ -563,7 +574,7 @@ class Consensus:
         return fleet.score_logs(self.inliers, [i])[i].severity > 1.0
 
     def compute_influence(self, i: int) -> float:
-        """Return by how much a log changes the predictions of a fit to all, as a share of them."""
+        """Return the relative change of the predictions by including a log in the fit."""
         other_data = [self.fleet.data[j] for j in self.inliers if j != i]
         fit_without = RidgeFit(*pool_moments(other_data))
         fit_with = RidgeFit(*pool_moments([*other_data, self.fleet.data[i]]))
@@ -582,7 +593,7 @@ class Consensus:
         if i not in fleet.usable or len(self.inliers) < 2 or not fleet.actuators:
             return []
         if i not in self.idle:
-            # nothing explains any part of an outlier: there only inputs at exactly zero count
+            # all of an outlier is unexplained, so there only inputs at exactly zero count
             at_zero = i not in self.inliers
             self.idle[i] = self.find_idle_stretches(
                 fleet.logs[i], fleet.data[i], i, at_zero=at_zero
@@ -599,7 +610,7 @@ class Consensus:
     ) -> list[tuple[int, int]]:
         """Return stretches in which all inputs are constant and nothing explains the motion.
 
-        None where they take up more than a fifth of the log, which then is a wrong one.
+        Empty if they exceed a fifth of the log, which then is wrong as a whole.
 
         Args:
             excluding: log that the model is not fitted to.
@@ -626,7 +637,7 @@ class Consensus:
         return [] if is_mostly_idle else idle
 
     def is_only_extrapolating(self, i: int) -> bool:
-        """Return whether a log leaves the inliers' range of inputs, and is an outlier only there.
+        """Return whether a log is an outlier only outside of the inliers' range of inputs.
 
         A log that lies outside from end to end has no part that could confirm it.
         """
@@ -648,7 +659,7 @@ class Consensus:
         is_input_outside = is_outside[: -len(fleet.velocities)].any(axis=0)
         if not is_input_outside.any() or is_input_outside.all():
             return False
-        # the unknown motion that such inputs lead to lasts longer than they do
+        # the motion caused by such inputs lasts longer than the inputs
         is_outside = is_outside.any(axis=0)
         for start, stop in zip(*find_runs(is_outside), strict=True):
             is_outside[start:stop] = is_input_outside[start:stop].any()
@@ -668,9 +679,9 @@ def find_consensus(logs: Sequence[LogStatistics], inputs: Sequence[str]) -> Cons
     if len(fleet.usable) < 2:
         return Consensus(fleet, fleet.usable)
     consensus = _partition_logs(fleet, fleet.usable)
-    # A fault that several logs share spoils the model of all, and none stands out. The best half
-    # is clean of it, but any log from the edge of the vessel's range is an outlier there: that
-    # half counts only where the model of all is clearly worse on it.
+    # A fault that several logs share corrupts the model of all, and none is an outlier. The best
+    # half has no such fault, but logs at the edge of the vessel's range are outliers of it.
+    # Therefore the half counts only if the model of all is clearly worse on it.
     half = _partition_logs(consensus.fleet, consensus.fleet.find_least_trimmed_half())
     fits = half.fleet.fit_leave_one_out(consensus.inliers, half.inliers)
     under_all = half.fleet.estimate_excess_var(half.inliers, fits, len(half.inliers))
@@ -680,7 +691,7 @@ def find_consensus(logs: Sequence[LogStatistics], inputs: Sequence[str]) -> Cons
 
 
 def _partition_logs(fleet: Fleet, start: Sequence[int]) -> Consensus:
-    """Return inliers and outliers: a start set grows by all that agree, then loses the worst."""
+    """Partition logs: a start set grows by all agreeing logs, then loses the worst ones."""
     inliers = list(start)
     while remaining := [i for i in fleet.usable if i not in inliers]:
         agreeing = [i for i, s in fleet.score_logs(inliers, remaining).items() if s.severity <= 1.0]
@@ -689,7 +700,7 @@ def _partition_logs(fleet: Fleet, start: Sequence[int]) -> Consensus:
         inliers = sorted((*inliers, *agreeing))
     while len(inliers) > max(1, len(fleet.usable) // 2):
         severity = {i: score.severity for i, score in fleet.score_logs(inliers, inliers).items()}
-        # an outlier spoils the models of all others: the suspects are left out in turn
+        # an outlier corrupts the models of all others: the suspects are left out in turn
         suspects = sorted(inliers, key=lambda i: -severity[i])[:MAX_SUSPECTS]
         severity_without = {
             i: fleet.score_logs([j for j in inliers if j != i], [i])[i].severity
@@ -702,7 +713,7 @@ def _partition_logs(fleet: Fleet, start: Sequence[int]) -> Consensus:
         inliers.remove(worst)
     consensus = Consensus(fleet, inliers)
     remaining = [i for i in fleet.usable if i not in inliers]
-    # some seconds of manual override do not make a log an outlier
+    # some seconds of manual control do not make a log an outlier
     trimmed = {}
     for i in remaining:
         data = fleet.data[i]
@@ -733,10 +744,10 @@ class Hypothesis:
 
     Attributes:
         kind: dead, scale, sign, offset, late, exchanged, heading, current or vessel.
-        channel: concerned; empty where there is none.
+        channel: affected channel; empty for current and vessel.
         size: factor, offset (SI), delay in s, angle in rad, or speed of the current in m/s.
-        deviance: of the log under it; the least is the most likely.
-        text: in words.
+        deviance: deviance of the log under the hypothesis; the smallest is the most likely.
+        text: description for the user.
     """
 
     kind: str
@@ -748,14 +759,14 @@ class Hypothesis:
 
 SCALE_FACTORS = (0.2, 0.33, 0.5, 0.67, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0)
 SHIFTS = (-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0)
-"""Tried delays over the block length, and offsets over the input's standard deviation."""
+"""Candidate delays in block lengths, and offsets in standard deviations of the input."""
 HEADING_STEP = math.radians(10.0)
 MANY_PARAMETERS_PENALTY = 2.0
-"""On the deviance of `vessel`: several factors per velocity fit more by chance than one number."""
+"""Factor on the deviance of `vessel`, whose several factors fit more by chance than one."""
 LINKED_CORRELATION = 0.9
-"""From which two inputs are moved by one lever: twin rudders, as most ships have."""
+"""Correlation from which two inputs are linked, such as twin rudders."""
 MIN_RELATIVE_STD = 1e-3
-"""Share of an input's usual spread, or of its size, below which it is constant."""
+"""Relative standard deviation of an input below which it is constant."""
 
 
 def rank_hypotheses(consensus: Consensus, i: int) -> list[Hypothesis]:
@@ -865,7 +876,7 @@ def rank_hypotheses(consensus: Consensus, i: int) -> list[Hypothesis]:
         " single_channels change of a channel explains it"
     )
     hypotheses.append(Hypothesis("vessel", "", 0.0, value, text))
-    # a change that leaves the log as unlikely as it was explains nothing
+    # a hypothesis under which the log is still unlikely explains nothing
     worst = MAX_RMSE_RATIO**2 * len(fleet.velocities) + penalty
     return sorted(hypotheses, key=lambda h: (h.kind != "vessel" and h.deviance > worst, h.deviance))
 
@@ -877,7 +888,7 @@ def is_constant(fleet: Fleet, i: int, name: str) -> bool:
 
 
 def _find_linked_inputs(log: LogStatistics, names: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return inputs that move together: they share a recorder, and so a fault."""
+    """Return groups of linked inputs, which share a recorder and its faults."""
     correlation = np.atleast_2d(np.corrcoef(np.nan_to_num(log.log.stack([*names]).T)))
     commanded = np.array([[candidate == f"cmd_{name}" for candidate in names] for name in names])
     linked = (correlation > LINKED_CORRELATION) | np.eye(len(names), dtype=bool) | commanded
@@ -906,7 +917,7 @@ _CHANGES: dict[str, Callable[[float, str], str]] = {
 def _minimize(
     objective: Callable[[float], float], grid: Iterable[float], iterations: int
 ) -> tuple[float, float]:
-    """Return the minimum on a grid, refined between its neighbours where iterations are given."""
+    """Return the minimum on a grid, refined between the neighbours if iterations > 0."""
     sizes = sorted(grid)
     values = [objective(size) for size in sizes]
     k = int(np.argmin(values))
@@ -940,7 +951,7 @@ def _minimize_in_plane(
 def _deviance_with_free_input(
     consensus: Consensus, fit: RidgeFit, i: int, name: str, step: float
 ) -> float:
-    """Return the deviance of a log where an input may be anything at any time."""
+    """Return the deviance of a log if an input may have any value at any time."""
     fleet, data = consensus.fleet, consensus.fleet.data[i]
     log = fleet.logs[i]
     up, down = (
@@ -951,13 +962,13 @@ def _deviance_with_free_input(
     direction = direction / np.maximum(norm, 1e-300)
     z = fit.standardize_residuals(data)
     z = z - (z * direction).sum(1, keepdims=True) * direction
-    # one degree of freedom per block was given away
+    # correct for the degree of freedom per block that the free input uses
     n = z.shape[1]
     return float((z**2).sum(1).mean()) * (n / (n - 1) if n > 1 else 1.0)
 
 
 def _deviance_with_free_factors(fleet: Fleet, fit: RidgeFit, i: int) -> float:
-    """Return the deviance of a log where each contribution may have a factor of its own."""
+    """Return the deviance of a log if each contribution has a free factor."""
     data = fleet.data[i]
     total = 0.0
     tables = fleet.compute_contributions(i, fit) / fit.compute_predictive_std(data).T[..., None]
@@ -977,7 +988,7 @@ def find_unexplained_idle(
 ) -> dict[str, list[tuple[int, int]]]:
     """Return stretches of motion that no recorded input explains while all inputs are constant.
 
-    Somebody took over by hand, say, or the recorder stopped.
+    Causes are manual control or a stopped recorder.
 
     Args:
         training: logs that the models are fitted to; each is predicted by a model of the
@@ -1006,11 +1017,11 @@ def find_unexplained_idle(
     return {name: stretches for name, stretches in idle.items() if stretches}
 
 
-# With all records alive .02 to .31 of the change of r is left, with the steering dead .30 to .71
-# (40 fleets of scripts/bench/fleets.py).
+# The residual share of the changes of r is .02 to .31 with valid records, and .30 to .71 with dead
+# steering (40 fleets of scripts/bench/fleets.py).
 MIN_UNSTEERED_SHARE = 0.3
-# A heading that swings so far one way and back was steered: by gusts no more than one in ten
-# straight runs does, of steered fleets no fewer than three in ten logs do.
+# A heading that swings this far to both sides was steered: gusts cause it in at most one of ten
+# straight runs; in steered fleets at least three of ten logs do it.
 MIN_SWING, MIN_WEAVING_SHARE = math.radians(20.0), 0.2
 
 

@@ -305,7 +305,7 @@ def estimate_resolution(values: np.ndarray) -> float:
 
 
 class LeastSquaresFit(NamedTuple):
-    """Result of least squares: coefficients [k], covariance [k, k], residuals of finite rows [N]."""
+    """Return the bounds [N_SECTIONS + 1] of the sections, whose lengths differ by at most one."""
 
     coefficients: np.ndarray
     covariance: np.ndarray
@@ -356,7 +356,7 @@ def fit_least_squares(x: np.ndarray, y: np.ndarray) -> LeastSquaresFit:
 
 
 def _section_bounds(n_rows: int) -> np.ndarray:
-    """Return the bounds [N_SECTIONS + 1] of the sections; the first sections may have one row more."""
+    """Return the bounds [N_SECTIONS + 1] of the sections; the first ones may be longer."""
     section_length, n_longer = divmod(n_rows, N_SECTIONS)
     section_indices = np.arange(N_SECTIONS + 1)
     return section_indices * section_length + np.minimum(section_indices, n_longer)
@@ -373,7 +373,7 @@ _MIN_SIGNAL_TO_NOISE = 10.0
 
 
 def make_blocks(log: LogStatistics, *velocities: str) -> OverlappingBlocks:
-    """Return overlapping blocks over which the given velocities change by more than their noise."""
+    """Return overlapping blocks over which velocities change by more than their noise."""
     min_length = max(_MIN_BLOCK_SAMPLES, round(_MIN_BLOCK_DURATION / log.sampling_interval))
     block_length = min(3 * min_length, max(min_length, len(log) // 20))
     for candidate_length in (min_length, 2 * min_length, 3 * min_length):
