@@ -8,8 +8,10 @@ A package declares its part in its own pyproject.toml, for example
 and `kind: tide` works in YAML, in Python and in `residnet list heads`. A part that cannot be loaded
 is listed with its fault and raises an error only if it is used.
 
-Built-in parts are listed as `module:Class`. A part is imported when a config names it, and
-`residnet list` reads its summary from the source, so that neither imports PyTorch.
+Parts of the core are listed as `module:Class`. A wing of residnet (a package that the core never
+imports, such as `residnet.autopilot`) declares its parts in the same form in its file
+entry_points.toml. A part is imported when a config names it, and `residnet list` reads its summary
+from the source, so that neither imports PyTorch.
 """
 
 from __future__ import annotations
