@@ -578,7 +578,9 @@ def _join_alternatives(texts: list[str]) -> str:
 def _parse_fault(details: ErrorDetails, model: Any) -> ConfigFault:
     """Convert one error of pydantic to a fault with the key path of the user."""
     path, parents, value_types = _locate_key(details["loc"], model)
-    error_type, error_context, value = details["type"], details.get("ctx", {}), details["input"]
+    error_type = details["type"]
+    error_context = details.get("ctx", {})
+    value = details["input"]
     match error_type:
         case "missing" if path and isinstance(path[-1], int):
             fault_text = f"item {path[-1]} is missing {format_given(value)}"
@@ -675,13 +677,11 @@ def _locate_key(
             value_types = _select_union_members(value_types, str(element))
         elif element != "[key]":
             path.append(element)
-            parents, value_types = (
-                value_types,
-                tuple(
-                    element_type
-                    for value_type in value_types
-                    for element_type in _element_types(value_type, element)
-                ),
+            parents = value_types
+            value_types = tuple(
+                element_type
+                for value_type in value_types
+                for element_type in _element_types(value_type, element)
             )
     return tuple(path), parents, value_types
 

@@ -206,13 +206,15 @@ def _copy_without_aliases(value: Any) -> Any:
 
 def find_line(root: Node, path: KeyPath) -> int:
     """Return the line (from 1) of the key at `path`, or of its nearest ancestor in the document."""
-    node, line = root, root.start_mark.line
+    node = root
+    line = root.start_mark.line
     for path_element in path:
         child: Node | None = None
         if isinstance(node, MappingNode):
             for key, value in node.value:
                 if key.value == str(path_element):
-                    child, line = value, key.start_mark.line
+                    child = value
+                    line = key.start_mark.line
         elif (
             isinstance(node, SequenceNode)
             and isinstance(path_element, int)

@@ -35,7 +35,8 @@ def to_body(north: Tensor, east: Tensor, psi: Tensor) -> tuple[Tensor, Tensor]:
 
     Source: document 003 eq. (4), transposed.
     """
-    cos_psi, sin_psi = psi.cos(), psi.sin()
+    cos_psi = psi.cos()
+    sin_psi = psi.sin()
     return cos_psi * north + sin_psi * east, cos_psi * east - sin_psi * north
 
 
@@ -49,7 +50,8 @@ def to_earth(forward: Tensor, starboard: Tensor, psi: Tensor) -> tuple[Tensor, T
 
     Source: document 003 eq. (4).
     """
-    cos_psi, sin_psi = psi.cos(), psi.sin()
+    cos_psi = psi.cos()
+    sin_psi = psi.sin()
     return cos_psi * forward - sin_psi * starboard, sin_psi * forward + cos_psi * starboard
 
 
@@ -105,8 +107,10 @@ def compose_rotation(angles: Tensor, rotation_vector: Tensor) -> Tensor:
     half_angles = 0.5 * angles
     cf, ct, cp = half_angles.cos().unbind(-1)
     sf, st, sp = half_angles.sin().unbind(-1)
-    w, x = cf * ct * cp + sf * st * sp, sf * ct * cp - cf * st * sp
-    y, z = cf * st * cp + sf * ct * sp, cf * ct * sp - sf * st * cp
+    w = cf * ct * cp + sf * st * sp
+    x = sf * ct * cp - cf * st * sp
+    y = cf * st * cp + sf * ct * sp
+    z = cf * ct * sp - sf * st * cp
     # the offset keeps the gradient finite for a zero rotation
     rotation_angle = torch.sqrt(rotation_vector.square().sum(-1) + 1e-24)
     cos_half_rotation = torch.cos(0.5 * rotation_angle)
@@ -120,12 +124,17 @@ def compose_rotation(angles: Tensor, rotation_vector: Tensor) -> Tensor:
         w * bz + x * by - y * bx + z * cos_half_rotation,
     )
     inverse_norm = torch.rsqrt(w * w + x * x + y * y + z * z)
-    w, x, y, z = w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm
-    sin_roll_component, cos_roll_component = 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+    w = w * inverse_norm
+    x = x * inverse_norm
+    y = y * inverse_norm
+    z = z * inverse_norm
+    sin_roll_component = 2.0 * (y * z + w * x)
+    cos_roll_component = 1.0 - 2.0 * (x * x + y * y)
     horizontal_norm = torch.sqrt(
         sin_roll_component * sin_roll_component + cos_roll_component * cos_roll_component + 1e-24
     )
-    phi, psi = angles[..., 0], angles[..., 2]
+    phi = angles[..., 0]
+    psi = angles[..., 2]
     return torch.stack(
         (
             phi + wrap_angle(torch.atan2(sin_roll_component, cos_roll_component) - phi),
@@ -178,5 +187,6 @@ def rotate(
     The heading as the angle rotates from body axes to NED, minus the heading from NED to body axes.
     Source: document 003 eq. (4).
     """
-    c, s = np.cos(angle), np.sin(angle)
+    c = np.cos(angle)
+    s = np.sin(angle)
     return c * x - s * y, s * x + c * y

@@ -115,7 +115,8 @@ def _depth_follows_motion(channels: Mapping[str, np.ndarray]) -> bool:
     is_finite = {
         name: channels.get(name, np.zeros(z.size)) for name in SIX_DOF_LAYOUT.dynamic_states
     }
-    phi, theta = is_finite["phi"], is_finite["theta"]
+    phi = is_finite["phi"]
+    theta = is_finite["theta"]
     if channels.keys() >= {"x", "y"} and not channels.keys() >= {"u", "v"}:
         distance = np.hypot(*(np.diff(channels[name], prepend=np.nan) for name in ("x", "y")))
         depth_rate = -distance * np.tan(theta)
@@ -124,10 +125,8 @@ def _depth_follows_motion(channels: Mapping[str, np.ndarray]) -> bool:
         depth_rate = cross_flow_down * np.cos(theta) - is_finite["u"] * np.sin(theta)
     span_samples = max(1, z.size // _N_DEPTH_SPANS)
     predicted_change = np.cumsum(np.nan_to_num(depth_rate))
-    predicted_change, measured_change = (
-        predicted_change[span_samples:] - predicted_change[:-span_samples],
-        z[span_samples:] - z[:-span_samples],
-    )
+    predicted_change = predicted_change[span_samples:] - predicted_change[:-span_samples]
+    measured_change = z[span_samples:] - z[:-span_samples]
     is_finite = np.isfinite(measured_change)
     if (
         min(float(np.std(predicted_change[is_finite])), float(np.std(measured_change[is_finite])))

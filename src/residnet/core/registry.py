@@ -375,7 +375,8 @@ def find_vessel_files() -> dict[str, Path]:
 
 def find_broken_vessels() -> list[EntryPointPart]:
     """Return broken entry points of vessels, and vessels whose name is already in use."""
-    files, broken_parts = find_vessel_files(), []
+    files = find_vessel_files()
+    broken_parts = []
     for name, folder in entry_point_folders("residnet.vessels").items():
         if isinstance(folder, EntryPointPart):
             broken_parts.append(folder)

@@ -60,10 +60,8 @@ class Samples:
 
     def running_moments(self) -> tuple[RunningMoments, RunningMoments]:
         """Return the moments of the channels and of the target."""
-        channel_moments, target_moments = (
-            RunningMoments(self.z.shape[1]),
-            RunningMoments(self.target.shape[1]),
-        )
+        channel_moments = RunningMoments(self.z.shape[1])
+        target_moments = RunningMoments(self.target.shape[1])
         for rows in iterate_row_chunks(len(self)):
             channel_moments.add_rows(self.z[rows])
             target_moments.add_rows(self.target[rows])
@@ -95,14 +93,17 @@ class RunningMoments:
 
     def add_rows(self, rows: Tensor) -> None:
         """Add rows [M, J], M at least 1."""
-        n_new, new_mean = len(rows), rows.mean(0)
+        n_new = len(rows)
+        new_mean = rows.mean(0)
         new_sum_of_squares = rows.var(0, correction=0) * n_new
         if self.n_rows == 0:
-            self.mean, self.sum_of_squares = new_mean, new_sum_of_squares
+            self.mean = new_mean
+            self.sum_of_squares = new_sum_of_squares
         else:
             # pairwise update of mean and sum of squares, which is numerically stable (Chan et al.
             # 1983)
-            n_total, mean_difference = self.n_rows + n_new, new_mean - self.mean
+            n_total = self.n_rows + n_new
+            mean_difference = new_mean - self.mean
             self.sum_of_squares = (
                 self.sum_of_squares
                 + new_sum_of_squares

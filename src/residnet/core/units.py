@@ -102,7 +102,8 @@ _POWER_SPELLINGS = {"²": "^2", "³": "^3", "**": "^", "⁻": "^-", "¹": "1"}
 @cache
 def unit_confusions(si: str) -> dict[float, str]:
     """Return the scale factor of each confusion of two units of a dimension -> description."""
-    factors, confusions = _FACTORS_OF_DIMENSION.get(si, {}), dict[float, str]()
+    factors = _FACTORS_OF_DIMENSION.get(si, {})
+    confusions = dict[float, str]()
     for reference_unit in (si.replace("rad", "deg"), si):
         for unit, factor in factors.items() if reference_unit in factors else ():
             ratio = factors[reference_unit] / factor
@@ -277,7 +278,8 @@ def _suggest_unit(unit: str, expected: str | None) -> str | None:
 
 def _differs_in_one_word(spelling: str, text: str) -> bool:
     """Return whether exactly one part of a quotient differs, and is a similar word."""
-    spelling_parts, text_parts = spelling.casefold().split("/"), text.casefold().split("/")
+    spelling_parts = spelling.casefold().split("/")
+    text_parts = text.casefold().split("/")
     if len(spelling_parts) != len(text_parts):
         return False
     different_parts = [

@@ -1,8 +1,8 @@
 """Entry points of residnet's wings: packages of residnet that the core never imports.
 
-A wing, such as `residnet.autopilot`, is a folder with a file entry_points.toml. The file declares the
-wing's parts in the groups and the syntax that another package uses in its pyproject.toml, each as
-`module:name`. A part is imported when it is first used. Nothing heavy is imported here, because
+A wing, such as `residnet.autopilot`, is a folder with a file entry_points.toml. The file declares
+the wing's parts in the groups and the syntax that another package uses in its pyproject.toml, each
+as `module:name`. A part is imported when it is first used. Nothing heavy is imported here, because
 `residnet --help` lists the commands of the wings.
 """
 

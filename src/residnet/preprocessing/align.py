@@ -187,7 +187,8 @@ class _GridWeights:
     def __init__(
         self, t: np.ndarray, grid: np.ndarray, half_window: np.ndarray, is_gap: np.ndarray
     ) -> None:
-        self._t, self._is_gap = t, is_gap
+        self._t = t
+        self._is_gap = is_gap
         self._window_start, self._start_weight = self._locate(grid - half_window)
         self._window_end, self._end_weight = self._locate(grid + half_window)
         # first and last sample with a nonzero weight
@@ -220,7 +221,8 @@ class _GridWeights:
         """Return the mean of the linear interpolant over each window, [G, n] from [T, n]."""
         # centred values keep the digits of the running integral of positions far from the origin
         mean_value = values.mean(axis=0)
-        centred_values, dt = values - mean_value, np.diff(self._t)[:, None]
+        centred_values = values - mean_value
+        dt = np.diff(self._t)[:, None]
         cumulative_integral = np.concatenate(
             [
                 np.zeros((1, values.shape[1])),
@@ -229,11 +231,9 @@ class _GridWeights:
         )
 
         def integral(previous_index: np.ndarray, weight: np.ndarray) -> np.ndarray:
-            weights, left_values, right_values = (
-                weight[:, None],
-                centred_values[previous_index],
-                centred_values[previous_index + 1],
-            )
+            weights = weight[:, None]
+            left_values = centred_values[previous_index]
+            right_values = centred_values[previous_index + 1]
             integral_values: np.ndarray = cumulative_integral[previous_index] + dt[
                 previous_index
             ] * weights * (left_values + 0.5 * weights * (right_values - left_values))

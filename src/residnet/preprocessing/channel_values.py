@@ -106,31 +106,26 @@ def _selection_medians(
     for start in range(0, n_samples, CACHED_SAMPLES):
         chunk = slice(start, min(start + CACHED_SAMPLES, n_samples))
         remaining = get_members(chunk)
-        candidates, remaining = (
-            remaining[: len(remaining) // 2 + 2],
-            remaining[len(remaining) // 2 + 2 :],
-        )
+        candidates = remaining[: len(remaining) // 2 + 2]
+        remaining = remaining[len(remaining) // 2 + 2 :]
         while len(candidates) > 2:
             n_half = len(candidates) // 2
             for i in range(n_half):
-                lower_candidate, upper_candidate = candidates[i], candidates[-1 - i]
-                candidates[i], candidates[-1 - i] = (
-                    np.minimum(lower_candidate, upper_candidate),
-                    np.maximum(lower_candidate, upper_candidate),
-                )
+                lower_candidate = candidates[i]
+                upper_candidate = candidates[-1 - i]
+                candidates[i] = np.minimum(lower_candidate, upper_candidate)
+                candidates[-1 - i] = np.maximum(lower_candidate, upper_candidate)
             # with an odd number the middle candidate may be the minimum or the maximum
             for i in range(1, len(candidates) - n_half):
-                lower_candidate, upper_candidate = candidates[0], candidates[i]
-                candidates[0], candidates[i] = (
-                    np.minimum(lower_candidate, upper_candidate),
-                    np.maximum(lower_candidate, upper_candidate),
-                )
+                lower_candidate = candidates[0]
+                upper_candidate = candidates[i]
+                candidates[0] = np.minimum(lower_candidate, upper_candidate)
+                candidates[i] = np.maximum(lower_candidate, upper_candidate)
             for i in range(len(candidates) - 2, n_half - 1, -1):
-                lower_candidate, upper_candidate = candidates[-1], candidates[i]
-                candidates[-1], candidates[i] = (
-                    np.maximum(lower_candidate, upper_candidate),
-                    np.minimum(lower_candidate, upper_candidate),
-                )
+                lower_candidate = candidates[-1]
+                upper_candidate = candidates[i]
+                candidates[-1] = np.maximum(lower_candidate, upper_candidate)
+                candidates[i] = np.minimum(lower_candidate, upper_candidate)
             candidates = candidates[1:-1] + remaining[:1]
             remaining = remaining[1:]
         medians[chunk] = (
@@ -155,7 +150,8 @@ def find_hampel_outliers(
         [T] bool for each column; False at missing values.
     """
     half_window = samples // 2
-    max_distance, n_neighbours = 2 * half_window, 2 * half_window + 1
+    max_distance = 2 * half_window
+    n_neighbours = 2 * half_window + 1
     outlier_masks = [np.zeros(values.size, dtype=bool) for values in columns]
     finite_indices = [np.flatnonzero(np.isfinite(values)) for values in columns]
     usable_columns = [
@@ -400,7 +396,8 @@ def _find_channel_spikes(values: np.ndarray, is_measured_motion: bool) -> np.nda
         )
         return np.asarray(np.abs(finite_values[indices] - neighbour_medians))
 
-    distance, is_outlier = np.zeros(finite_values.size), np.zeros(finite_values.size, dtype=bool)
+    distance = np.zeros(finite_values.size)
+    is_outlier = np.zeros(finite_values.size, dtype=bool)
     distance[candidate_indices] = distance_from_median(candidate_indices)
     range_excess = np.maximum(lower_quantile - finite_values, finite_values - upper_quantile)
     if is_measured_motion:
@@ -503,7 +500,8 @@ def is_fill_value(values: np.ndarray) -> np.ndarray:
     other_values = values[is_finite & ~is_candidate]
     if not is_candidate.any() or not other_values.size:
         return np.zeros(values.size, dtype=bool)
-    lower, upper = float(other_values.min()), float(other_values.max())
+    lower = float(other_values.min())
+    upper = float(other_values.max())
     value_range = upper - lower
     is_far: np.ndarray = (values < lower - value_range) | (values > upper + value_range)
     return np.asarray(is_candidate & is_far)

@@ -133,7 +133,8 @@ class WindowsDataModule(EpochDataModule):
         super().__init__(seed, get_epoch)
         self.store = store
         self.stages = list(stages)
-        self._n_batches, self._get_stage = n_batches, get_stage or (lambda epoch: 0)
+        self._n_batches = n_batches
+        self._get_stage = get_stage or (lambda epoch: 0)
         self._samplers = [
             stage_settings.make_samplers(store, n_batches) if stage_settings else []
             for stage_settings in self.stages

@@ -47,7 +47,8 @@ class DerivativeRule(Config, ABC):
             ConfigError: if the window is too short for the time step.
         """
         min_samples = self.min_samples(dt)
-        smoothed, rates = np.full(values.shape, np.nan), np.full(values.shape, np.nan)
+        smoothed = np.full(values.shape, np.nan)
+        rates = np.full(values.shape, np.nan)
         segment_bounds = find_runs(np.where(np.isfinite(values).all(axis=1), segments, -1))
         for start, stop in zip(*segment_bounds, strict=True):
             segment_slice = slice(start, stop)
@@ -56,7 +57,8 @@ class DerivativeRule(Config, ABC):
                     values[segment_slice], dt
                 )
         is_valid = np.isfinite(rates).all(axis=1)
-        smoothed[~is_valid], rates[~is_valid] = np.nan, np.nan
+        smoothed[~is_valid] = np.nan
+        rates[~is_valid] = np.nan
         return smoothed, rates, is_valid
 
     def min_samples(self, dt: float) -> int:

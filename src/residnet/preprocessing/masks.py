@@ -83,7 +83,8 @@ class FrozenMask(MaskRule):
         values = log.stack(self.channels)
         starts, stops = find_runs((np.diff(values, axis=0) == 0.0).all(axis=1))
         is_long = stops - starts >= self.samples * median_update_interval(values)
-        starts, last_indices = starts[is_long], stops[is_long]
+        starts = starts[is_long]
+        last_indices = stops[is_long]
         # half a step of margin makes the end independent of rounding in t
         mask_ends = np.searchsorted(
             log.t, log.t[last_indices] + self.after - 0.5 * _median_time_step(log.t)
@@ -178,7 +179,8 @@ class OutlierMask(MaskRule):
 
     def find_outliers(self, channel: np.ndarray) -> np.ndarray:
         """Return [T] bool for a channel [T]."""
-        is_outlier, is_finite = np.zeros(channel.size, dtype=bool), np.isfinite(channel)
+        is_outlier = np.zeros(channel.size, dtype=bool)
+        is_finite = np.isfinite(channel)
         values = channel[is_finite]
         if values.size <= self.samples:
             return is_outlier

@@ -189,9 +189,11 @@ def add_true_wind(log: Log) -> Log:
         # the apparent wind is the true wind minus the velocity of the vessel
         complex_wind = log["apparent_wind_speed"] * np.exp(1j * log["apparent_wind_angle"])
         complex_wind = complex_wind - (log["u"] + 1j * log["v"])
-        speed, angle = np.abs(complex_wind), np.angle(complex_wind)
+        speed = np.abs(complex_wind)
+        angle = np.angle(complex_wind)
     else:
-        speed, angle = log["wind_speed"], log["wind_angle"]
+        speed = log["wind_speed"]
+        angle = log["wind_angle"]
     heading = log["psi"] if heading_channel == "psi" else _integrate_rate(log.t, log["r"])
     return _with_channels(log, {"wind_speed": speed, "wind_dir": unwrap_angle(heading + angle)})
 
@@ -286,9 +288,11 @@ def _complete_six_dof(log: Log) -> Log:
     ):
         return log
     rates = {name: _smooth_angle(log, log[name], "")[1] for name in required_channels}
-    phi, theta = log["phi"], log["theta"]
+    phi = log["phi"]
+    theta = log["theta"]
     # kinematics of the Euler angles: heading, then pitch, then roll
-    pitch_rate, projected_yaw_rate = rates["theta"], rates["psi"] * np.cos(theta)
+    pitch_rate = rates["theta"]
+    projected_yaw_rate = rates["psi"] * np.cos(theta)
     derived = {
         "p": rates["phi"] - rates["psi"] * np.sin(theta),
         "q": pitch_rate * np.cos(phi) + projected_yaw_rate * np.sin(phi),
@@ -320,7 +324,8 @@ def _complete_vertical_plane(log: Log, dof: DegreesOfFreedom) -> Log:
     """
     dense_channels = {name: log[name] for name in log.channels if _is_dense(log[name])}
     derived: dict[str, np.ndarray] = {}
-    zeros, smoothed_rates = np.zeros(len(log)), {}
+    zeros = np.zeros(len(log))
+    smoothed_rates = {}
     for channel, rate_name in (("theta", "q"), ("z", "w")):
         is_finite = np.isfinite(log.channels.get(channel, np.array(np.nan)))
         if (
@@ -378,7 +383,8 @@ def _smooth_angle(log: Log, angle: np.ndarray, rate_name: str) -> tuple[np.ndarr
 
 def _integrate_rate(t: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Return the integral [T] of a rate [T] by the trapezoidal rule, 0 at the first sample."""
-    dt, finite_rate = np.diff(t, prepend=t[:1]), np.nan_to_num(rate)
+    dt = np.diff(t, prepend=t[:1])
+    finite_rate = np.nan_to_num(rate)
     return np.asarray(
         np.cumsum(0.5 * dt * (finite_rate + np.concatenate((finite_rate[:1], finite_rate[:-1]))))
     )
@@ -503,10 +509,12 @@ def _is_within_bridged_interval(t: np.ndarray, measurement_times: np.ndarray) ->
 
 def _smooth_planar_motion(log: Log, config: MotionConfig) -> dict[str, np.ndarray]:
     """Smooth the planar motion; NaN in gaps of position or heading."""
-    t, psi = log.t, unwrap_angle(log["psi"])
+    t = log.t
+    psi = unwrap_angle(log["psi"])
     positions = np.stack((log["x"], log["y"]), axis=1)
     is_heading_outlier, *is_position_outlier = find_hampel_outliers([psi, log["x"], log["y"]])
-    psi[is_heading_outlier], positions[np.logical_or(*is_position_outlier)] = np.nan, np.nan
+    psi[is_heading_outlier] = np.nan
+    positions[np.logical_or(*is_position_outlier)] = np.nan
     fix_indices = np.flatnonzero(np.isfinite(positions).all(axis=1))
     heading_indices = np.flatnonzero(np.isfinite(psi))
     if min(fix_indices.size, heading_indices.size) < 5:
@@ -519,10 +527,8 @@ def _smooth_planar_motion(log: Log, config: MotionConfig) -> dict[str, np.ndarra
     # delayed positions belong to times between the samples
     fix_times = t[fix_indices] - config.delay
     filter_times = np.union1d(t, fix_times) if config.delay else t
-    sample_indices, headings_at_clock = (
-        np.searchsorted(filter_times, t),
-        np.interp(filter_times, t, heading),
-    )
+    sample_indices = np.searchsorted(filter_times, t)
+    headings_at_clock = np.interp(filter_times, t, heading)
     measurements = np.full((filter_times.size, 2, 2), np.nan)
     measurements[np.searchsorted(filter_times, fix_times), 0] = positions[fix_indices]
     antenna = config.antenna or Antenna()
@@ -571,7 +577,8 @@ def smooth_measured_motion(
             f"measured motion: column {column} is not finite at sample {sample_index}; mask or fill"
             " the gap first"
         )
-    t, noise_std = dt * np.arange(len(measurements)), np.asarray(noise)
+    t = dt * np.arange(len(measurements))
+    noise_std = np.asarray(noise)
     x, y, psi, u, v, r, surge_acceleration, sway_acceleration, yaw_acceleration = measurements.T
     yaw_measurements = np.stack((psi, r, yaw_acceleration), axis=1)[:, :, None]
     psi, r, yaw_acceleration = smooth_track(t, yaw_measurements, noise_std[[2, 5, 8]])[:, :, 0].T
@@ -664,13 +671,13 @@ def _filter_track(
         Minus twice the log-likelihood of each intensity [K], and predicted and filtered states
         [T, 3, A] and covariances [T, 3, 3] of the first intensity.
     """
-    n_samples, n_axes, dt = t.size, measurements.shape[2], np.diff(t, prepend=t[0])
+    n_samples = t.size
+    n_axes = measurements.shape[2]
+    dt = np.diff(t, prepend=t[0])
     is_measured = np.isfinite(measurements).all(axis=2)
     first_derivative_order = int(np.argmax(is_measured.any(axis=0)))
-    transitions, process_covariances = (
-        _transition_matrices(dt),
-        jerk_intensities[:, None, None] ** 2 * _jerk_covariances(dt)[:, None],
-    )
+    transitions = _transition_matrices(dt)
+    process_covariances = jerk_intensities[:, None, None] ** 2 * _jerk_covariances(dt)[:, None]
     first_measurements = measurements[
         is_measured[:, first_derivative_order], first_derivative_order
     ]
@@ -681,18 +688,15 @@ def _filter_track(
     covariance = np.tile(initial_std**2 * np.eye(3), (jerk_intensities.size, 1, 1))
     predicted = np.empty((n_samples, 3, n_axes)), np.empty((n_samples, 3, 3))
     filtered = np.empty((n_samples, 3, n_axes)), np.empty((n_samples, 3, 3))
-    normalized_squares, log_determinant = (
-        np.zeros(jerk_intensities.size),
-        np.zeros(jerk_intensities.size),
-    )
+    normalized_squares = np.zeros(jerk_intensities.size)
+    log_determinant = np.zeros(jerk_intensities.size)
     variance = noise**2
     for k in range(n_samples):
         if k:
-            state, covariance = (
-                transitions[k] @ state,
-                transitions[k] @ covariance @ transitions[k].T + process_covariances[k],
-            )
-        predicted[0][k], predicted[1][k] = state[0], covariance[0]
+            state = transitions[k] @ state
+            covariance = transitions[k] @ covariance @ transitions[k].T + process_covariances[k]
+        predicted[0][k] = state[0]
+        predicted[1][k] = covariance[0]
         for derivative_order in np.flatnonzero(is_measured[k]):
             # rounding may make a variance negative
             innovation_variance = (
@@ -705,7 +709,8 @@ def _filter_track(
             covariance = covariance - gain[:, :, None] * covariance[:, derivative_order, None, :]
             normalized_squares += (innovation**2).sum(axis=1) / innovation_variance
             log_determinant += n_axes * np.log(innovation_variance)
-        filtered[0][k], filtered[1][k] = state[0], covariance[0]
+        filtered[0][k] = state[0]
+        filtered[1][k] = covariance[0]
     # the noise level is the maximum-likelihood estimate for each intensity
     n_measurements = n_axes * int(is_measured.sum())
     cost = (
@@ -725,19 +730,11 @@ def _transition_matrices(dt: np.ndarray) -> np.ndarray:
 
 def _jerk_covariances(dt: np.ndarray) -> np.ndarray:
     """Return the process noise covariances of unit white jerk over each step [T, 3, 3]."""
-    (
-        position_variance,
-        position_rate_covariance,
-        position_acceleration_covariance,
-        rate_variance,
-        rate_acceleration_covariance,
-    ) = (
-        dt**5 / 20,
-        dt**4 / 8,
-        dt**3 / 6,
-        dt**3 / 3,
-        dt**2 / 2,
-    )
+    position_variance = dt**5 / 20
+    position_rate_covariance = dt**4 / 8
+    position_acceleration_covariance = dt**3 / 6
+    rate_variance = dt**3 / 3
+    rate_acceleration_covariance = dt**2 / 2
     return np.array(
         [
             [position_variance, position_rate_covariance, position_acceleration_covariance],

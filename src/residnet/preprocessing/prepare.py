@@ -187,7 +187,8 @@ def prepare_log(
     }
     masks = apply_masks(recorded_channels.replace(channels=checked_values), config.masks).masks
     log = align_to_grid(filled_log.replace(masks=masks), config.grid, required_channels)
-    y, w = log.stack(dof.state_names), log.stack(tuple(input_names))
+    y = log.stack(dof.state_names)
+    w = log.stack(tuple(input_names))
     segment = np.where(np.isfinite(y).all(1) & np.isfinite(w).all(1), number_log_segments(log), -1)
     usable = find_scored_samples(log) & (segment >= 0)
     if not usable.any():
@@ -220,10 +221,8 @@ def prepare_log(
         window_means = config.derivative.derive(
             config.grid.step * cumulative_steps, config.grid.step, clean_segment
         )[1]
-        smoothed_nu, rate_inputs = (
-            window_means[:, : dof.n_dynamic],
-            np.where(has_derivative[:, None], window_means[:, dof.n_dynamic :], w),
-        )
+        smoothed_nu = window_means[:, : dof.n_dynamic]
+        rate_inputs = np.where(has_derivative[:, None], window_means[:, dof.n_dynamic :], w)
     smoothed = np.concatenate(
         (y[:, POSE], np.where(has_derivative[:, None], smoothed_nu, nu)), axis=1
     )
@@ -269,7 +268,8 @@ def compute_channels(
         signals: signals of the model, float64.
         is_selected: selected samples [T] bool; None for all, with 0 in gaps.
     """
-    states, inputs = log.smoothed, log.rate_inputs
+    states = log.smoothed
+    inputs = log.rate_inputs
     states, inputs = (
         (np.nan_to_num(states), np.nan_to_num(inputs))
         if is_selected is None
@@ -329,7 +329,8 @@ def compute_training_ranges(logs: Sequence[PreparedLog]) -> tuple[np.ndarray, np
     # one column at a time, to limit the memory for large data
     for column in range(*logs[0].dof.dynamic_columns.indices(logs[0].y.shape[1])):
         values = np.concatenate([log.y[log.usable, column] for log in logs])
-        lower, upper = values.min(), values.max()
+        lower = values.min()
+        upper = values.max()
         # a few outliers must not widen the range in which a free run is valid
         low_quantile, high_quantile = np.quantile(
             values, (_TAIL_SHARE, 1.0 - _TAIL_SHARE), overwrite_input=True

@@ -65,7 +65,8 @@ class OverlappingBlocks:
             Function of the shift as for `compute_changes`; the integral over a block with NaN is
             NaN.
         """
-        is_missing, cumulative_integral = ~np.isfinite(columns), np.zeros(columns.shape)
+        is_missing = ~np.isfinite(columns)
+        cumulative_integral = np.zeros(columns.shape)
         has_missing = bool(is_missing.any())
         finite_values = np.where(is_missing, 0.0, columns) if has_missing else columns
         half_time_steps = 0.5 * np.diff(self.t).reshape(-1, *(1 for _ in columns.shape[1:]))

@@ -67,11 +67,13 @@ def check_propeller_unit(log: LogStatistics, make_finding: Check) -> Iterator[Fi
     # the fastest propeller counts, because one of several may be almost stopped
     max_revolutions = max((abs_quantile(log[name]) for name in names), default=0.0)
     for name in names:
-        revolutions, factor = abs_quantile(log[name]), 0.0
+        revolutions = abs_quantile(log[name])
+        factor = 0.0
         text = f"{name} reaches {revolutions:.3g} 1/s, out of proportion to the yaw rate"
         steering_share = _steering_share(log, names) if "r" in log else 0.0
         if revolutions > _MAX_REVOLUTIONS:
-            text, factor = f"{name} reaches {revolutions:.4g} 1/s, more than any propeller", 60.0
+            text = f"{name} reaches {revolutions:.4g} 1/s, more than any propeller"
+            factor = 60.0
         elif steering_share > _MIN_STEERING_SHARE:
             turn_ratio = (
                 abs_quantile(log["r"]) / min(steering_share, 1.0) / max(max_revolutions, 1e-12)
@@ -153,7 +155,8 @@ def _find_reversed_propellers(log: LogStatistics, names: Sequence[str]) -> dict[
     Returns:
         Name of a reversed propeller -> absolute t statistic of the thrust.
     """
-    blocks, u = log.cached(make_blocks, "u"), log["u"]
+    blocks = log.cached(make_blocks, "u")
+    u = log["u"]
     drift_terms = [log["v"] * log["r"], log["r"] ** 2] if "v" in log and "r" in log else []
     thrusts = np.stack([log[name] * np.abs(log[name]) for name in names], axis=-1)
     regressors = np.column_stack((np.ones(len(log)), u, u * np.abs(u), *drift_terms, thrusts))
@@ -176,7 +179,8 @@ def _find_reversed_propellers(log: LogStatistics, names: Sequence[str]) -> dict[
     best_index = min(range(len(fits)), key=lambda i: fits[i].sum_of_squares)
     # other signs must reduce the residual clearly below that of the recorded signs
     best_index = best_index if fits[best_index].sum_of_squares < 0.6 * fits[0].sum_of_squares else 0
-    signs, t_statistic = sign_choices[best_index], fits[best_index].t_statistic
+    signs = sign_choices[best_index]
+    t_statistic = fits[best_index].t_statistic
     total_thrust = thrusts @ signs
     # the effect of an almost constant thrust is not identifiable
     relative_variation = nan_std(total_thrust) / max(abs_quantile(total_thrust, 1.0), 1e-12)
@@ -227,7 +231,9 @@ def _yaw_regression_data(
     The first two columns are the constant moment and the effect of the rudder, followed by one
     column for each of `additional_angles` [T], which act like the rudder angle.
     """
-    blocks, u, r = log.cached(make_blocks, "r"), log["u"], log["r"]
+    blocks = log.cached(make_blocks, "r")
+    u = log["u"]
+    r = log["r"]
     v = log["v"] if "v" in log else np.zeros(len(log))
     flow_squared = u * np.abs(u)
     if "n" in log:
@@ -312,7 +318,8 @@ def check_rudder_clipping(log: LogStatistics, make_finding: Check) -> Iterator[F
     """Report a clipped rudder record: at its limit the yaw moment exceeds the model."""
     rudder_limit = abs_quantile(log["delta"], 1.0)
     is_at_limit = np.abs(log["delta"]) > 0.999 * rudder_limit
-    share_at_limit, n_visits = float(is_at_limit.mean()), find_runs(is_at_limit)[0].size
+    share_at_limit = float(is_at_limit.mean())
+    n_visits = find_runs(is_at_limit)[0].size
     # several visits are needed, because a turning circle is at one angle throughout
     if (
         "delta" not in log.inputs
@@ -321,7 +328,8 @@ def check_rudder_clipping(log: LogStatistics, make_finding: Check) -> Iterator[F
     ):
         return
     # the additional term is identifiable if smaller angles occur as well, as in zigzags
-    yaw_fit, excess_statistic = _fit_yaw_model(log, np.sign(log["delta"]) * is_at_limit), 0.0
+    yaw_fit = _fit_yaw_model(log, np.sign(log["delta"]) * is_at_limit)
+    excess_statistic = 0.0
     if yaw_fit is not None:
         t_statistic = float(abs(yaw_fit.coefficients[2]) / yaw_fit.standard_errors[2])
         relative_effect = float(yaw_fit.coefficients[2] / (yaw_fit.coefficients[1] * rudder_limit))
@@ -392,7 +400,8 @@ def check_rudder_sign(log: LogStatistics, make_finding: Check) -> Iterator[Findi
     if not name or np.isfinite(log["r"]).sum() < 2 * MIN_SAMPLES:
         return
     is_finite = np.isfinite(log["r"]) & np.isfinite(steering)
-    r, steering_values = log.smoothed("r")[is_finite], steering[is_finite]
+    r = log.smoothed("r")[is_finite]
+    steering_values = steering[is_finite]
     if is_finite.sum() >= 2 * MIN_SAMPLES and float(np.abs(r).mean()) >= 6.0 * log.noise_std("r"):
         is_one_sided = all(
             abs(signal.sum()) > 0.95 * np.abs(signal).sum() for signal in (r, steering_values)
@@ -409,20 +418,17 @@ def check_rudder_sign(log: LogStatistics, make_finding: Check) -> Iterator[Findi
     # the rudder force is proportional to the square of the inflow speed
     flow_speed = np.ones(len(log))
     if "delta" in name and "u" in log:
-        flow_speed, is_finite = np.abs(log.smoothed("u")), is_finite & np.isfinite(log["u"])
+        flow_speed = np.abs(log.smoothed("u"))
+        is_finite = is_finite & np.isfinite(log["u"])
     sum_of_squares_without_steering, fits_by_shift = _fit_steering_responses(
         log, steering, flow_speed, is_finite
     )
     if not fits_by_shift:
         return
-    unshifted_fit, best_shift = (
-        fits_by_shift[0],
-        min(fits_by_shift, key=lambda shift: fits_by_shift[shift].sum_of_squares),
-    )
-    unshifted_t_statistic, shifted_t_statistic = (
-        unshifted_fit.t_statistic,
-        fits_by_shift[best_shift].t_statistic,
-    )
+    unshifted_fit = fits_by_shift[0]
+    best_shift = min(fits_by_shift, key=lambda shift: fits_by_shift[shift].sum_of_squares)
+    unshifted_t_statistic = unshifted_fit.t_statistic
+    shifted_t_statistic = fits_by_shift[best_shift].t_statistic
     # the shifted fit counts if it is more significant and has the same sign
     is_consistent = (
         unshifted_t_statistic * shifted_t_statistic > 0.0
@@ -504,7 +510,8 @@ def _fit_steering_responses(
         Sum of squares without steering, and shift in samples -> fit for no shift and for the best
         shift; empty if the response is not identifiable.
     """
-    r, block_length = log.smoothed("r"), max(round(1.0 / log.sampling_interval), SMOOTHING_SAMPLES)
+    r = log.smoothed("r")
+    block_length = max(round(1.0 / log.sampling_interval), SMOOTHING_SAMPLES)
     lower, upper = nan_quantiles(log["r"], 0.05, 0.95)
     v = np.zeros(len(log))
     if "v" in log and np.isfinite(log["v"]).sum() > 2 * MIN_SAMPLES:
@@ -531,7 +538,8 @@ def _fit_steering_responses(
     if blocks.starts.size < MIN_SAMPLES or upper - lower < 4.0 * log.noise_std("r"):
         return 0.0, {}
     regressors = np.stack((flow**2, flow * r, r * np.abs(r), flow * v, v * np.abs(v)), axis=-1)
-    integrated_terms, y = blocks.make_integrator(regressors)(0), blocks.compute_changes(r)
+    integrated_terms = blocks.make_integrator(regressors)(0)
+    y = blocks.compute_changes(r)
     steering_integrals = blocks.make_integrator((flow**2 * np.nan_to_num(steering))[:, None])
     candidate_shifts = sorted(
         {round(float(shift)) for shift in np.linspace(-max_shift, max_shift, 61)}
@@ -692,10 +700,8 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], velocity: str) -> R
                 (fixed_terms.repeat(shift_batch.size, axis=1), shifted_terms), axis=2
             ).transpose(1, 0, 2)
             is_finite = np.isfinite(x).all(axis=2) & np.isfinite(velocity_changes)
-            regressors, target = (
-                np.where(is_finite[..., None], x, 0.0),
-                np.where(is_finite, velocity_changes, 0.0)[..., None],
-            )
+            regressors = np.where(is_finite[..., None], x, 0.0)
+            target = np.where(is_finite, velocity_changes, 0.0)[..., None]
             regressors /= np.maximum(np.linalg.norm(regressors, axis=1, keepdims=True), 1e-300)
             transposed = regressors.transpose(0, 2, 1)
             gram = transposed @ regressors + 1e-9 * np.eye(regressors.shape[2])

@@ -160,14 +160,13 @@ def check_copies(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
         is_shared[shared_places] = True
         starts, stops = find_runs(is_shared)
         longest_segment = int(np.argmax(stops - starts))
-        n_copied, start = (
-            int(stops[longest_segment] - starts[longest_segment]),
-            int(starts[longest_segment]),
-        )
+        n_copied = int(stops[longest_segment] - starts[longest_segment])
+        start = int(starts[longest_segment])
         if n_copied < _MIN_COPIED_ROWS or (i == j and offset == 1):
             continue
         figures = {"rows": n_copied, "first": start, "offset": offset}
-        a, b = candidate_logs[i], candidate_logs[j]
+        a = candidate_logs[i]
+        b = candidate_logs[j]
         if i == j:
             text = (
                 f"{a.name}: rows {start} to {start + n_copied - 1} are repeated from row"
@@ -182,10 +181,8 @@ def check_copies(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
             level = "note"
         conflict_text = f" ({split_conflict})" if split_conflict else ""
         if n_copied >= max(len(a), len(b)) - 1:
-            text, fix = (
-                f"{a.name} and {b.name} are the same{conflict_text}",
-                "exclude one of them",
-            )
+            text = f"{a.name} and {b.name} are the same{conflict_text}"
+            fix = "exclude one of them"
             yield make_finding(text, figures, code="duplicate_log", level=level, fix=fix)
             continue
         first_row = start + offset
@@ -219,14 +216,10 @@ def check_continued_logs(logs: LogSet, make_finding: Check) -> Iterator[Finding]
             ]
         )
 
-    initial_states, final_states = (
-        compute_per_log(lambda x: float(x[:3].mean())),
-        compute_per_log(lambda x: float(x[-3:].mean())),
-    )
-    noise_levels, high_levels = (
-        compute_per_log(estimate_noise_std),
-        compute_per_log(lambda x: float(abs_quantile(x, 0.9))),
-    )
+    initial_states = compute_per_log(lambda x: float(x[:3].mean()))
+    final_states = compute_per_log(lambda x: float(x[-3:].mean()))
+    noise_levels = compute_per_log(estimate_noise_std)
+    high_levels = compute_per_log(lambda x: float(abs_quantile(x, 0.9)))
     typical_changes = compute_per_log(lambda x: nan_median(np.abs(np.diff(x))))
     for i, a in enumerate(logs.logs):
         normalized_differences = np.abs(initial_states - final_states[i]) / np.maximum(
@@ -239,7 +232,8 @@ def check_continued_logs(logs: LogSet, make_finding: Check) -> Iterator[Finding]
             b = logs.logs[j]
             if j == i or not (is_comparable[i] and is_comparable[j]):
                 continue
-            pause_duration, start_offset = float(b.t[0] - a.t[-1]), float(abs(b.t[0]))
+            pause_duration = float(b.t[0] - a.t[-1])
+            start_offset = float(abs(b.t[0]))
             is_contiguous = (
                 min(abs(a.t[-1]), start_offset) > 2.0 * a.sampling_interval
                 and 0.0 < pause_duration < 3.0 * a.sampling_interval
@@ -280,7 +274,8 @@ def check_overlapping_logs(logs: LogSet, make_finding: Check) -> Iterator[Findin
         )
         is_dated = np.minimum(a.t[0], start_times[i + 1 :]) > MIN_UNIX_TIME
         for j in np.flatnonzero(is_dated & (overlap_durations > 0.0)).tolist():
-            b, overlap_duration = logs.logs[i + 1 + j], float(overlap_durations[j])
+            b = logs.logs[i + 1 + j]
+            overlap_duration = float(overlap_durations[j])
             yield make_finding(
                 f"{a.name} and {b.name} overlap in time for {overlap_duration:.1f} s",
                 {"seconds": overlap_duration},
@@ -403,7 +398,8 @@ def _excitation_ratio(log: LogStatistics, name: str) -> float:
 @check("between", "no_excitation", fix="record manoeuvres: zigzag, 3-2-1-1")
 def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     """Report missing or collinear excitation in the set of logs."""
-    n_logs, velocities = len(logs.logs), [name for name in VELOCITY_NAMES if name in logs]
+    n_logs = len(logs.logs)
+    velocities = [name for name in VELOCITY_NAMES if name in logs]
     subsamples = [log.subsample for log in logs.logs]
     excitation_by_velocity = {
         name: max(_excitation_ratio(log, name) for log in subsamples) for name in velocities
@@ -427,7 +423,8 @@ def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
         port_share = float(
             np.nansum(np.abs(yaw_rates[yaw_rates < 0.0])) / np.nansum(np.abs(yaw_rates))
         )
-        text, turning_side = "", "port" if port_share > 0.5 else "starboard"
+        text = ""
+        turning_side = "port" if port_share > 0.5 else "starboard"
         if excitation_by_velocity["r"] < 1.0:
             text = f"none of {n_logs} logs turns beyond its noise: steering cannot be learned"
         elif min(port_share, 1.0 - port_share) < _MIN_TURN_SHARE:

@@ -34,7 +34,8 @@ _CLOCK_RESTART_FIX = "sort the rows, or split the log where its clock restarts"
 @check("order", "time_missing", "fatal", "delete them or restore their time")
 def check_time_order(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report samples without a time, and times that decrease or repeat."""
-    n_missing, increments = int((~np.isfinite(log.t)).sum()), np.diff(log.t)
+    n_missing = int((~np.isfinite(log.t)).sum())
+    increments = np.diff(log.t)
     if n_missing:
         yield make_finding(f"{n_missing} of {len(log)} samples have no time", {"count": n_missing})
         return
@@ -65,7 +66,9 @@ def check_sampling_rate(log: LogStatistics, make_finding: Check) -> Iterator[Fin
     Jitter matters only as far as the vessel's velocity changes during it, therefore the level
     depends on the resulting velocity error.
     """
-    dt, step, duration = np.diff(log.t), log.sampling_interval, float(log.t[-1] - log.t[0])
+    dt = np.diff(log.t)
+    step = log.sampling_interval
+    duration = float(log.t[-1] - log.t[0])
     jitter = float(dt[dt <= 1.5 * step].std() / step)
     velocities = log.velocities if len(log) > SMOOTHING_SAMPLES else []
     relative_changes = [
@@ -163,7 +166,8 @@ def find_clock_rate_errors(log: Log, path: Path) -> list[Finding]:
         One finding for each column of dates that runs faster or slower than the log's time.
     """
     has_dropped_rows = log.meta.get("rows_dropped", 0) > _MIN_RATE_ERROR * len(log)
-    date_columns, findings = None if has_dropped_rows else _read_date_columns(path), []
+    date_columns = None if has_dropped_rows else _read_date_columns(path)
+    findings = []
     if date_columns is None:
         return []
     for name in date_columns.columns:
@@ -172,7 +176,8 @@ def find_clock_rate_errors(log: Log, path: Path) -> list[Finding]:
         is_too_short = dates.size < min(len(log), _MAX_DATE_ROWS) or is_finite.sum() < _MIN_DATES
         if is_too_short or float(np.ptp(dates[is_finite])) <= 0.0:
             continue
-        t, dates = log.t[: dates.size][is_finite] - log.t[0], dates[is_finite] - dates[is_finite][0]
+        t = log.t[: dates.size][is_finite] - log.t[0]
+        dates = dates[is_finite] - dates[is_finite][0]
         clock_rate = float(np.polyfit(t, dates, 1)[0])
         correlation = float(np.corrcoef(t, dates)[0, 1])
         if (

@@ -303,7 +303,8 @@ class Fleet:
     """
 
     def __init__(self, logs: Sequence[LogStatistics], inputs: Sequence[str]) -> None:
-        self.logs, self.inputs = list(logs), tuple(inputs)
+        self.logs = list(logs)
+        self.inputs = tuple(inputs)
         has_six_dof = all(name in log for log in logs for name in SIX_DOF_LAYOUT.dynamic_states)
         common_velocities = [name for name in VELOCITY_NAMES if all(name in log for log in logs)]
         self.velocities = list(SIX_DOF_LAYOUT.velocities) if has_six_dof else common_velocities
@@ -329,7 +330,8 @@ class Fleet:
             rms = np.sqrt(np.mean(squares, axis=0)) if squares else np.ones(1)
             return np.where(rms == 0.0, 1.0, rms)
 
-        self.x_scale, self.y_scale = scale(lambda data: data.X), scale(lambda data: data.Y)
+        self.x_scale = scale(lambda data: data.X)
+        self.y_scale = scale(lambda data: data.Y)
         self.data = [self._scale_data(data) for data in raw]
         if len(self.usable) < 2:
             return 0.0
@@ -436,7 +438,9 @@ class Fleet:
         tests = {i: self.run_score_test(i, fits[i], expected[i]) for i in logs}
         references = [i for i in references if i in ratio]
         # too few logs give no estimate of the spread
-        center, std, misfit = np.zeros(1), np.full(1, np.inf), 1.0
+        center = np.zeros(1)
+        std = np.full(1, np.inf)
+        misfit = 1.0
         if len(references) > 4:
             center = np.median([log_ratio[i] for i in references], axis=0)
             mad = np.median([np.abs(log_ratio[i] - center) for i in references], axis=0)
@@ -485,10 +489,12 @@ class Fleet:
             The statistic, RMS over the contributions, and the share of the response that such
             factors change; both of the worst velocity.
         """
-        data, table = self.data[i], self.compute_contributions(i, fit)
+        data = self.data[i]
+        table = self.compute_contributions(i, fit)
         transposed = table.transpose(0, 2, 1)
         score = transposed @ fit.compute_residuals(data).T[..., None]
-        information, cross = transposed @ table, transposed @ data.X
+        information = transposed @ table
+        cross = transposed @ data.X
         covariance = information + cross @ fit.gram_inv @ cross.transpose(0, 2, 1)
         covariance = OVERLAP * np.maximum(variance, 1e-12)[:, None, None] * covariance
         inverse = np.linalg.pinv(covariance, rcond=1e-9, hermitian=True)
@@ -508,7 +514,8 @@ class Fleet:
         within_log_mse = {
             i: np.maximum(cross_validate_mse(self.data[i]), 1e-12) for i in self.usable
         }
-        best, best_loss = list(self.usable), math.inf
+        best = list(self.usable)
+        best_loss = math.inf
         for seed in self.usable[:: -(-len(self.usable) // MAX_SUSPECTS)]:
             half = [seed]
             for _ in range(LTS_STEPS):
@@ -524,7 +531,8 @@ class Fleet:
                 half = sorted(loss, key=lambda i: loss[i])[: len(self.usable) // 2 + 1]
             total = sum(loss[i] for i in half)
             if total < best_loss:
-                best, best_loss = sorted(half), total
+                best = sorted(half)
+                best_loss = total
         return best
 
 
@@ -641,7 +649,8 @@ class Consensus:
 
         A log that lies outside from end to end has no part that could confirm it.
         """
-        fleet, data = self.fleet, self.fleet.data[i]
+        fleet = self.fleet
+        data = self.fleet.data[i]
 
         def collect_signals(log: LogStatistics) -> np.ndarray:
             thrusts, other_inputs = _thrust_components(dict(log.log.channels), fleet.actuators)
@@ -784,7 +793,8 @@ def rank_hypotheses(consensus: Consensus, i: int) -> list[Hypothesis]:
     """
     fleet = consensus.fleet
     fit = consensus.fit_inliers(excluding=i)
-    log, data = fleet.logs[i], fleet.data[i]
+    log = fleet.logs[i]
+    data = fleet.data[i]
     penalty = fit.compute_leverage_penalty(data)
 
     def deviance(channels: Mapping[str, np.ndarray]) -> float:
@@ -805,7 +815,8 @@ def rank_hypotheses(consensus: Consensus, i: int) -> list[Hypothesis]:
         label = " and ".join(channels)
         unit = log.units[name]
         if channels == derived:
-            label, unit = "x, y", "m"
+            label = "x, y"
+            unit = "m"
         std = float(np.nanmedian([fleet.logs[j].std(name) for j in consensus.inliers])) or 1.0
         if channels == (name,) and is_input and is_constant(fleet, i, name):
             value = _deviance_with_free_input(consensus, fit, i, name, 0.01 * std) + penalty
@@ -938,11 +949,13 @@ def _minimize_in_plane(
     directions = np.exp(0.25j * np.pi * np.arange(8))
     grid = [complex(r * scale * d) for r in (0.1, 0.2, 0.3, 0.4, 0.5) for d in directions]
     value, k = min((objective(point), k) for k, point in enumerate(grid))
-    best, step = grid[k], 0.05 * scale
+    best = grid[k]
+    step = 0.05 * scale
     while step > 0.01 * scale:
         lower, k = min((objective(best + step * d), k) for k, d in enumerate(directions))
         if lower < value:
-            best, value = best + step * complex(directions[k]), lower
+            best = best + step * complex(directions[k])
+            value = lower
         else:
             step *= 0.5
     return best, value
@@ -952,7 +965,8 @@ def _deviance_with_free_input(
     consensus: Consensus, fit: RidgeFit, i: int, name: str, step: float
 ) -> float:
     """Return the deviance of a log if an input may have any value at any time."""
-    fleet, data = consensus.fleet, consensus.fleet.data[i]
+    fleet = consensus.fleet
+    data = consensus.fleet.data[i]
     log = fleet.logs[i]
     up, down = (
         fleet.assemble_scaled(replace_channels(log, {name: log[name] + s})) for s in (step, -step)

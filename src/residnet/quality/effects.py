@@ -80,7 +80,8 @@ class OneStepRegression:
         self.blocks: OverlappingBlocks = dataclasses.replace(
             blocks, starts=blocks.starts[is_finite]
         )
-        self.regressors, self.responses = regressors[is_finite], responses[is_finite]
+        self.regressors = regressors[is_finite]
+        self.responses = responses[is_finite]
         self.response_std = (
             np.maximum(self.responses.std(axis=0), 1e-12) if is_finite.any() else np.ones(1)
         )
@@ -97,7 +98,8 @@ class OneStepRegression:
         )
         column_scales = np.maximum(np.sqrt(np.mean(x**2, axis=0)), 1e-300)
         x = x / column_scales
-        gram, cross_moments = x.T @ x / len(x), x.T @ y / len(x)
+        gram = x.T @ x / len(x)
+        cross_moments = x.T @ y / len(x)
         coefficients = np.linalg.solve(gram + _RIDGE * np.eye(x.shape[1]), cross_moments)
         return np.asarray(coefficients / column_scales[:, None])
 
@@ -157,7 +159,8 @@ class FindingEffects:
             if sample_mask is None
             else log.excerpt_around(sample_mask)
         )
-        self._log, self._regression = log, OneStepRegression(log)
+        self._log = log
+        self._regression = OneStepRegression(log)
         has_enough_rows = (
             len(self._regression) >= _MIN_ROWS_PER_COLUMN * self._regression.regressors.shape[1]
         )
@@ -214,7 +217,8 @@ class FindingEffects:
         )
         if not affects_fit:
             return counted_reckoning_change
-        regression, coefficients = self._regression, self._coefficients
+        regression = self._regression
+        coefficients = self._coefficients
         if coefficients is None or regression.blocks.are_clear_of(sample_mask).sum() < max(
             0.3 * len(regression), 1
         ):
@@ -256,7 +260,8 @@ class FindingEffects:
             _excess_rms(self._reckoning_errors, compute_reckoning_errors(repaired_statistics))
         )
         regression = OneStepRegression(repaired_statistics, self._regression)
-        coefficients, velocity_change = self._coefficients, 0.0
+        coefficients = self._coefficients
+        velocity_change = 0.0
         if abs(finding.figures.get("size", 0.0)) > _CERTAIN_T_STATISTIC * finding.figures.get(
             "error", np.inf
         ):
@@ -312,10 +317,8 @@ def compute_reckoning_errors(log: LogStatistics, omitted: np.ndarray | None = No
         omitted: [T] bool, samples that no window may contain; if too few windows remain, samples at
             which no window may begin or end.
     """
-    window_length, errors = (
-        min(round(_RECKONING_DURATION / log.sampling_interval), len(log) // 3),
-        np.zeros(2),
-    )
+    window_length = min(round(_RECKONING_DURATION / log.sampling_interval), len(log) // 3)
+    errors = np.zeros(2)
     is_omitted = log.near_seam(0) if omitted is None else omitted | log.near_seam(0)
     cumulative_omitted = np.append(0, np.cumsum(is_omitted))
     window_starts = np.flatnonzero(

@@ -26,8 +26,11 @@ _MAX_CONDITION_NUMBER = 30.0
 def report_ranges(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report range, standard deviation and bandwidth of velocities and inputs."""
     for name in (*log.velocities, *log.inputs):
-        values, unit = log[name][np.isfinite(log[name])], log.units[name]
-        lower, upper, std = float(values.min()), float(values.max()), float(values.std())
+        values = log[name][np.isfinite(log[name])]
+        unit = log.units[name]
+        lower = float(values.min())
+        upper = float(values.max())
+        std = float(values.std())
         figures = {"min": lower, "max": upper, "std": std}
         if std <= 1e-6 * max(abs(lower), abs(upper)):
             text = (
@@ -65,10 +68,8 @@ def find_rest(log: LogStatistics) -> np.ndarray:
     noise_levels = np.hypot(log.noise_std("u"), log.noise_std("v")), log.noise_std("r")
     for values, noise_level in zip((speeds, yaw_rates), noise_levels, strict=True):
         # threshold: the averaged noise, bounded by shares of the speed that this vessel reaches
-        high_level, averaged_noise = (
-            nan_quantiles(values, 0.95)[0],
-            4.0 * noise_level / np.sqrt(n_samples),
-        )
+        high_level = nan_quantiles(values, 0.95)[0]
+        averaged_noise = 4.0 * noise_level / np.sqrt(n_samples)
         is_at_rest &= values < min(
             max(0.03 * high_level, averaged_noise), max(0.2 * high_level, averaged_noise)
         )
@@ -89,10 +90,8 @@ def check_rest(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     durations = log.t[stops - 1] - log.t[starts]
     longest_segment = int(np.argmax(stops - starts)) if starts.size else 0
     if rest_share > 0.02 and durations[longest_segment] > 3.0:
-        start_time, longest_duration = (
-            float(log.t[starts[longest_segment]]),
-            float(durations[longest_segment]),
-        )
+        start_time = float(log.t[starts[longest_segment]])
+        longest_duration = float(durations[longest_segment])
         text = (
             f"the vessel is at rest for {format_share(rest_share)} of the time, at most"
             f" {longest_duration:.1f} s without a break from t = {start_time:.2f} s"

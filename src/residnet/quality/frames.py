@@ -108,7 +108,8 @@ def compute_averaged_rates(log: LogStatistics) -> AveragedRates:
         """Return trapezoidal means [T] over the window, NaN at the ends and near gaps."""
         means = np.full(values.shape, np.nan, dtype=values.dtype)
         if values.size > 2 * half_window:
-            weights, is_finite = np.ones(2 * half_window + 1), np.isfinite(values)
+            weights = np.ones(2 * half_window + 1)
+            is_finite = np.isfinite(values)
             has_missing = np.convolve(~is_finite, weights, mode="valid") > 0.5
             weights[[0, -1]] = 0.5
             window_means = np.convolve(
@@ -223,17 +224,14 @@ def check_frames(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
         text = f"u, v not checked against position: fewer than {MIN_SAMPLES} samples with motion"
         yield make_finding(text, code="frames_unchecked", level="note", fix="")
         return
-    overlaps, speed_ratio = agreement_.overlaps, agreement_.speed_ratio
-    declared_coherence, heading_offset_deg = (
-        overlaps["as declared"].real,
-        math.degrees(np.angle(overlaps["as declared"])),
-    )
+    overlaps = agreement_.overlaps
+    speed_ratio = agreement_.speed_ratio
+    declared_coherence = overlaps["as declared"].real
+    heading_offset_deg = math.degrees(np.angle(overlaps["as declared"]))
     # on a straight course all conventions agree equally: the declared one is preferred
     best_name = max(overlaps, key=lambda name: abs(overlaps[name]) + 1e-3 * (name == "as declared"))
-    best_coherence, best_offset_deg = (
-        abs(overlaps[best_name]),
-        math.degrees(np.angle(overlaps[best_name])),
-    )
+    best_coherence = abs(overlaps[best_name])
+    best_offset_deg = math.degrees(np.angle(overlaps[best_name]))
     text = (
         f"x, y rates against R(psi) [u, v]: coherence {declared_coherence:.3f}, heading off by"
         f" {heading_offset_deg:+.1f} deg, speed ratio {speed_ratio:.3f}"
@@ -257,7 +255,8 @@ def check_frames(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
                 convention_text = description
         text += f"; the frames do not fit: coherence {best_coherence:.3f} with {convention_text}"
     elif declared_coherence < 0.8:
-        level, fix = "fatal", "are the columns of one run, one clock and one vessel?"
+        level = "fatal"
+        fix = "are the columns of one run, one clock and one vessel?"
         text += "; no change of sign or angle makes them fit"
     elif not 0.8 < speed_ratio < 1.25:
         text += (
@@ -267,7 +266,8 @@ def check_frames(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
         text += "; a compass offset, or velocities through the water in a current"
         fix = "correct psi, or give the current as an input"
     else:
-        level, fix = "note", ""
+        level = "note"
+        fix = ""
     yield make_finding(
         text,
         {
@@ -327,7 +327,8 @@ def _report_jumps(
     is_jump = np.abs(excess_steps) > limit
     if is_jump.any():
         worst_index = int(np.argmax(np.abs(excess_steps)))
-        largest_excess, time = float(abs(excess_steps[worst_index])), float(log.t[worst_index + 1])
+        largest_excess = float(abs(excess_steps[worst_index]))
+        time = float(log.t[worst_index + 1])
         yield make_finding(
             message_template.format(int(is_jump.sum()), factor * excess_steps[worst_index])
             + f" at t = {time:.2f} s",
@@ -470,9 +471,11 @@ def _compare_channel(
     fix = ""
     is_above_noise = name != "r" or reference_spread > 5.0 * averaged_rates.yaw_rate_noise
     if correlation < -0.8 or (correlation < -0.5 and is_above_noise):
-        text, fix = f"{text}; it has the opposite sign", "turn it in the channel map (sign: -1)"
+        text = f"{text}; it has the opposite sign"
+        fix = "turn it in the channel map (sign: -1)"
     elif correlation < 0.5 and name == "r" and is_above_noise:
-        level, fix = "fatal", "are both columns of this vessel and this clock?"
+        level = "fatal"
+        fix = "are both columns of this vessel and this clock?"
         text += "; they do not describe one motion"
     elif correlation > 0.9 and is_above_noise and not 0.6 < gain < 1.6:
         text += f"; check its unit{describe_unit_confusion(gain, log.units[name])}"
@@ -537,7 +540,8 @@ def check_yaw_rate_against_heading(log: LogStatistics, make_finding: Check) -> I
 )
 def check_heading_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report jumps of the heading that the yaw rate does not explain."""
-    psi, r = log["psi"], log["r"]
+    psi = log["psi"]
+    r = log["r"]
     excess_steps = np.diff(psi) - 0.5 * _time_steps_without_gaps(log) * (r[1:] + r[:-1])
     scatter = nan_median(np.abs(excess_steps)) if np.isfinite(excess_steps).any() else 0.0
     noise = max(log.noise_std("psi") * math.sqrt(2.0), SIGMA_OF_MAD * scatter)
@@ -554,16 +558,16 @@ def check_yaw_drift(log: LogStatistics, make_finding: Check) -> Iterator[Finding
     """Report the bias of r against psi."""
     if not _is_yaw_consistent(log.subsample):
         return
-    psi, r = interpolate_gaps(log.t, log["psi"]), interpolate_gaps(log.t, log["r"])
+    psi = interpolate_gaps(log.t, log["psi"])
+    r = interpolate_gaps(log.t, log["r"])
     heading_drift = (
         psi - psi[0] - np.append(0.0, np.cumsum(0.5 * np.diff(log.t) * (r[1:] + r[:-1])))
     )
-    final_drift, max_drift, duration = (
-        float(heading_drift[-1]),
-        float(np.abs(heading_drift).max()),
-        float(log.t[-1] - log.t[0]),
-    )
-    yaw_rate_std, bias = max(log.std("r"), 1e-12), final_drift / duration
+    final_drift = float(heading_drift[-1])
+    max_drift = float(np.abs(heading_drift).max())
+    duration = float(log.t[-1] - log.t[0])
+    yaw_rate_std = max(log.std("r"), 1e-12)
+    bias = final_drift / duration
     causes = log.subsample.cached(estimate_yaw_causes)
     bias_cause = causes.get("bias") or causes.get("ramp")
     # a bias misleads above 1.8 deg per minute and 5 % of the yaw rate, or by its integral
@@ -610,13 +614,12 @@ _MIN_ROLL_CORRELATION = 0.8
 )
 def check_roll_rate(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report a roll rate with a wrong sign or unit against the roll angle."""
-    phi, p = interpolate_gaps(log.t, log["phi"]), interpolate_gaps(log.t, log["p"])
+    phi = interpolate_gaps(log.t, log["phi"])
+    p = interpolate_gaps(log.t, log["p"])
     integrated_rate = np.append(0.0, np.cumsum(0.5 * np.diff(log.t) * (p[1:] + p[:-1])))
     one_second_slice = slice(None, None, max(round(1.0 / log.sampling_interval), 1))
-    angle_increments, rate_integrals = (
-        np.diff(phi[one_second_slice]),
-        np.diff(integrated_rate[one_second_slice]),
-    )
+    angle_increments = np.diff(phi[one_second_slice])
+    rate_integrals = np.diff(integrated_rate[one_second_slice])
     norm_product = float(np.linalg.norm(angle_increments) * np.linalg.norm(rate_integrals))
     if (
         angle_increments.size < MIN_SAMPLES

@@ -80,21 +80,18 @@ def check_positions_against_coordinates(
     is_finite = np.isfinite(coordinate_positions) & np.isfinite(logged_positions)
     if is_finite.sum() < MIN_SAMPLES:
         return
-    coordinate_positions, logged_positions = (
-        coordinate_positions[is_finite] - coordinate_positions[is_finite].mean(),
-        logged_positions[is_finite] - logged_positions[is_finite].mean(),
-    )
+    coordinate_positions = coordinate_positions[is_finite] - coordinate_positions[is_finite].mean()
+    logged_positions = logged_positions[is_finite] - logged_positions[is_finite].mean()
     if float(np.abs(coordinate_positions).max()) < 1.0:
         return
     complex_gain = complex(np.vdot(coordinate_positions, logged_positions)) / float(
         np.vdot(coordinate_positions, coordinate_positions).real
     )
-    position_norm, residual_norm = (
-        float(np.linalg.norm(logged_positions)),
-        float(np.linalg.norm(logged_positions - complex_gain * coordinate_positions)),
-    )
+    position_norm = float(np.linalg.norm(logged_positions))
+    residual_norm = float(np.linalg.norm(logged_positions - complex_gain * coordinate_positions))
     residual_share = residual_norm / max(position_norm, 1e-12)
-    scale, rotation = abs(complex_gain), float(np.angle(complex_gain))
+    scale = abs(complex_gain)
+    rotation = float(np.angle(complex_gain))
     if residual_share >= 0.2:
         text = (
             f"x, y do not follow {latitude_name}, {longitude_name}: the residual is"
@@ -126,7 +123,8 @@ def check_input_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Findi
         changes = np.abs(np.nan_to_num(np.diff(log[name])))
         input_range = float(np.nanmax(log[name]) - np.nanmin(log[name]))
         largest_index = int(np.argmax(changes))
-        largest, time = float(changes[largest_index]), float(log.t[largest_index + 1])
+        largest = float(changes[largest_index])
+        time = float(log.t[largest_index + 1])
         # an angle other than a rudder angle may wrap
         if 0.0 < 0.25 * input_range < largest and (
             log.units[name] != "rad" or name in STEERING_CHANNELS
@@ -144,8 +142,10 @@ def check_input_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Findi
 def check_input_limits(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report inputs that are often at their limits, and asymmetric limits of a rudder."""
     for name in _finite_inputs(log):
-        finite_values, unit = log[name][np.isfinite(log[name])], log.units[name]
-        lower, upper = float(finite_values.min()), float(finite_values.max())
+        finite_values = log[name][np.isfinite(log[name])]
+        unit = log.units[name]
+        lower = float(finite_values.min())
+        upper = float(finite_values.max())
         margin = 1e-3 * (upper - lower)
         limit_shares = (
             float((finite_values <= lower + margin).mean()),
@@ -243,7 +243,8 @@ def check_stuck_actuators(log: LogStatistics, make_finding: Check) -> Iterator[F
             or demand_range <= 0.0
         ):
             continue
-        demanded_values, measured_values = log[demand_name], log[actual_name]
+        demanded_values = log[demand_name]
+        measured_values = log[actual_name]
         rest_tolerance = max(6.0 * log.noise_std(actual_name), 1e-4 * demand_range)
         # a slow gear moves less per step than its sensor noise, therefore the range over many steps
         # decides
@@ -269,9 +270,11 @@ def check_stuck_actuators(log: LogStatistics, make_finding: Check) -> Iterator[F
                 and has_demand_moved
                 and float(is_far_from_demand.sum()) * log.sampling_interval >= _MIN_STUCK_DURATION
             ):
-                longest_run, longest_duration = segment, duration
+                longest_run = segment
+                longest_duration = duration
         if longest_duration:
-            is_stuck, start_time = np.zeros(len(log), dtype=bool), float(log.t[longest_run.start])
+            is_stuck = np.zeros(len(log), dtype=bool)
+            start_time = float(log.t[longest_run.start])
             is_stuck[longest_run] = True
             text = (
                 f"{actual_name} is constant for {longest_duration:.1f} s from t = {start_time:.2f}"
@@ -300,7 +303,8 @@ def check_constant_inputs_while_turning(
     driving_inputs = [name for name in log.inputs if not name.startswith(("wind", "current"))]
     if not driving_inputs or np.isfinite(log["psi"]).sum() < MIN_SAMPLES:
         return
-    psi, is_constant = interpolate_gaps(log.t, log["psi"]), np.ones(len(log) - 1, dtype=bool)
+    psi = interpolate_gaps(log.t, log["psi"])
+    is_constant = np.ones(len(log) - 1, dtype=bool)
     for name in driving_inputs:
         is_constant &= np.abs(np.nan_to_num(np.diff(log[name]))) <= 1e-9 * abs_quantile(
             log[name], 1.0
@@ -318,7 +322,8 @@ def check_constant_inputs_while_turning(
         if n_reversals >= 2:
             is_idle = np.zeros(len(log), dtype=bool)
             is_idle[start : stop + 1] = True
-            duration, start_time = float(log.t[stop] - log.t[start]), float(log.t[start])
+            duration = float(log.t[stop] - log.t[start])
+            start_time = float(log.t[start])
             text = (
                 f"no input changes for {duration:.1f} s from t = {start_time:.2f} s, yet the"
                 f" heading reverses {n_reversals} times"
@@ -394,9 +399,7 @@ def _estimate_slope_against_heading(log: LogStatistics, name: str) -> tuple[floa
     )
     if is_valid.sum() < 100 or float(np.std(heading_changes[is_valid])) < math.radians(1.0):
         return 0.0, 0.0
-    centred_turn, centred_change = (
-        heading_changes[is_valid] - heading_changes[is_valid].mean(),
-        direction_changes[is_valid] - direction_changes[is_valid].mean(),
-    )
+    centred_turn = heading_changes[is_valid] - heading_changes[is_valid].mean()
+    centred_change = direction_changes[is_valid] - direction_changes[is_valid].mean()
     slope_fit = fit_least_squares(centred_turn[:, None], centred_change)
     return float(slope_fit.coefficients[0]), float(slope_fit.standard_errors[0])

@@ -78,7 +78,9 @@ def estimate_yaw_causes(log: LogStatistics) -> dict[str, KinematicCause]:
     Causes: `gain` (r is 1 + value times too large), `lag` (delay of r against psi in s), `bias` (of
     r in rad/s) and `ramp` (growth of the bias from start to end in rad/s).
     """
-    psi, r, t = log["psi"], log["r"], log.t
+    psi = log["psi"]
+    r = log["r"]
+    t = log.t
     dt = np.diff(t)
     smoothed_rate = log.cached(_smooth_leaving_out_centre, "r")
     normalized_time = (0.5 * (t[1:] + t[:-1]) - t.mean()) / max(float(t[-1] - t[0]), 1e-12)
@@ -108,7 +110,8 @@ def estimate_position_causes(log: LogStatistics) -> dict[str, KinematicCause]:
     the receiver forward and to starboard in m), `current` (north and east in m/s, if u, v are
     relative to the water), `bias` (of u, v in m/s).
     """
-    dt, psi = np.diff(log.t), log["psi"]
+    dt = np.diff(log.t)
+    psi = log["psi"]
     # horizontal vectors are complex numbers: north + 1j east, or forward + 1j starboard
     heading_rotation = np.exp(1j * psi)
     mid_rotation = np.exp(0.5j * (psi[1:] + psi[:-1]))
@@ -116,7 +119,8 @@ def estimate_position_causes(log: LogStatistics) -> dict[str, KinematicCause]:
     v = log.cached(_smooth_leaving_out_centre, "v")
     surge_increments = _integrate_steps(dt, heading_rotation * u)
     sway_increments = _integrate_steps(dt, 1j * heading_rotation * v)
-    lag_u, lag_v = mid_rotation * np.diff(u), 1j * mid_rotation * np.diff(v)
+    lag_u = mid_rotation * np.diff(u)
+    lag_v = 1j * mid_rotation * np.diff(v)
     earth_velocity = heading_rotation * (u + 1j * v)
     lag_psi = (
         0.5j
@@ -225,7 +229,8 @@ def _explain_increments(
         """Return the sums [K, ...] of steps [T - 1, ...] between measured poses; NaN if any is."""
         if measured_indices.size == measured_pose.size:
             return steps
-        is_missing, initial_zeros = ~np.isfinite(steps), np.zeros((1, *steps.shape[1:]))
+        is_missing = ~np.isfinite(steps)
+        initial_zeros = np.zeros((1, *steps.shape[1:]))
         cumulative_sums = np.concatenate(
             (initial_zeros, np.cumsum(np.where(is_missing, 0.0, steps), axis=0))
         )[measured_indices]
@@ -282,7 +287,8 @@ def _explain_increments(
         whitened_rows = np.stack((whitened_rows.real, whitened_rows.imag), axis=1).reshape(
             -1, whitened_rows.shape[1]
         )
-    y, cause_columns = whitened_rows[:, 0], whitened_rows[:, 1:]
+    y = whitened_rows[:, 0]
+    cause_columns = whitened_rows[:, 1:]
     # large residuals that no cause explains are jumps of the pose, which are excluded
     column_scales = np.maximum(np.abs(cause_columns).max(axis=0), 1e-300)
     scaled_columns = cause_columns / column_scales
@@ -309,10 +315,8 @@ def _orthogonal_matching_pursuit(
         names: cause of each column [k].
     """
     column_norms = np.linalg.norm(regressors, axis=0)
-    regressors, names = (
-        regressors[:, column_norms > 0.0] / column_norms[column_norms > 0.0],
-        names[column_norms > 0.0],
-    )
+    regressors = regressors[:, column_norms > 0.0] / column_norms[column_norms > 0.0]
+    names = names[column_norms > 0.0]
     column_norms = column_norms[column_norms > 0.0]
     gram = regressors.T @ regressors
     product = regressors.T @ response
@@ -340,7 +344,8 @@ def _orthogonal_matching_pursuit(
         cause_name: _MIN_IMPROVEMENT * variance * (1.0 + 0.2 * is_selected.size)
         for cause_name, is_selected in columns_by_cause.items()
     }
-    selected_causes, residual_energy = list[str](), energy
+    selected_causes = list[str]()
+    residual_energy = energy
     while len(selected_causes) < _MAX_CAUSES:
         residual_energy_by_cause = {
             name: compute_residual_energy([*selected_causes, name])
@@ -375,11 +380,9 @@ def _orthogonal_matching_pursuit(
     if not selected_causes:
         return {}
     is_selected = np.isin(names, selected_causes)
-    columns, names, column_norms = (
-        regressors[:, is_selected],
-        names[is_selected],
-        column_norms[is_selected],
-    )
+    columns = regressors[:, is_selected]
+    names = names[is_selected]
+    column_norms = column_norms[is_selected]
     least_squares_fit = fit_least_squares(columns, response)
     white_noise_covariance = (
         np.linalg.pinv(columns.T @ columns)

@@ -66,8 +66,13 @@ class LogStatistics:
         subsample: LogStatistics | None = None,
         invalid: np.ndarray | None = None,
     ) -> None:
-        self.log, self.t, self.units, self.name = log, log.t, log.units, log.name
-        self.inputs, self._seams, self._subsample = tuple(inputs), seam_times, subsample
+        self.log = log
+        self.t = log.t
+        self.units = log.units
+        self.name = log.name
+        self.inputs = tuple(inputs)
+        self._seams = seam_times
+        self._subsample = subsample
         self._invalid = invalid
         self.noise_std = cache(lambda name: estimate_noise_std(self.subsample[name]))
         """Estimate the standard deviation of the white noise of a channel."""
@@ -241,7 +246,8 @@ def smooth_by_parabola(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def moving_average(values: np.ndarray, n_samples: int) -> np.ndarray:
     """Return the centred moving average [T] of the finite values; NaN in windows without any."""
-    window_length, is_finite = min(n_samples, values.size), np.isfinite(values)
+    window_length = min(n_samples, values.size)
+    is_finite = np.isfinite(values)
     padding = window_length // 2, (window_length - 1) // 2
     cumulative_sums = (
         np.cumsum(cumulative_sum)
@@ -270,22 +276,28 @@ def abs_quantile(values: np.ndarray, quantile_level: float = 0.95) -> float:
 
 def count_reversals(heading: np.ndarray, min_swing: float) -> int:
     """Count the reversals of a heading [T] in rad after swings of at least `min_swing` rad."""
-    drop_from_maximum, rise_from_minimum = (
-        np.maximum.accumulate(heading) - heading,
-        heading - np.minimum.accumulate(heading),
-    )
+    drop_from_maximum = np.maximum.accumulate(heading) - heading
+    rise_from_minimum = heading - np.minimum.accumulate(heading)
     if min(drop_from_maximum.max(), rise_from_minimum.max()) < min_swing:
         return 0
     # only turning points can start or end a swing
     increments = np.diff(heading, prepend=heading[0], append=heading[-1])
     directions = np.sign(increments)
-    n_reversals, direction, minimum, maximum = 0, 0, float(heading[0]), float(heading[0])
+    n_reversals = 0
+    direction = 0
+    minimum = float(heading[0])
+    maximum = float(heading[0])
     for heading_value in heading[directions[1:] * directions[:-1] <= 0.0].tolist():
         if direction >= 0 and maximum - heading_value >= min_swing:
-            n_reversals, direction, minimum = n_reversals + direction, -1, heading_value
+            n_reversals = n_reversals + direction
+            direction = -1
+            minimum = heading_value
         elif direction <= 0 and heading_value - minimum >= min_swing:
-            n_reversals, direction, maximum = n_reversals - direction, 1, heading_value
-        minimum, maximum = min(minimum, heading_value), max(maximum, heading_value)
+            n_reversals = n_reversals - direction
+            direction = 1
+            maximum = heading_value
+        minimum = min(minimum, heading_value)
+        maximum = max(maximum, heading_value)
     return n_reversals
 
 
@@ -338,7 +350,8 @@ def fit_least_squares(x: np.ndarray, y: np.ndarray) -> LeastSquaresFit:
         y: response [N].
     """
     is_finite = np.isfinite(x).all(axis=1) & np.isfinite(y)
-    x, y = x[is_finite], y[is_finite]
+    x = x[is_finite]
+    y = y[is_finite]
     column_norms = np.linalg.norm(x, axis=0)
     column_scales = np.where(column_norms > 0.0, column_norms, 1.0)
     x = x / column_scales

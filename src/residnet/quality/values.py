@@ -152,7 +152,8 @@ def check_missing_values(log: LogStatistics, make_finding: Check) -> Iterator[Fi
     """Report missing samples, and channels whose sampling rate is below that of the log."""
     for name in log:
         is_missing = ~np.isfinite(log[name])
-        missing_share, valid_indices = float(is_missing.mean()), np.flatnonzero(~is_missing)
+        missing_share = float(is_missing.mean())
+        valid_indices = np.flatnonzero(~is_missing)
         if not missing_share:
             continue
         intervals = np.diff(valid_indices)
@@ -186,7 +187,8 @@ def check_missing_values(log: LogStatistics, make_finding: Check) -> Iterator[Fi
             "t": start_time,
         }
         if longest_gap <= MAX_BRIDGED_INTERVALS:
-            level, text = "note", f"{text}; short gaps are interpolated"
+            level = "note"
+            text = f"{text}; short gaps are interpolated"
         yield make_finding(
             text, figures, level=level, sample_mask=is_missing, fix="" if level == "note" else None
         )
@@ -201,11 +203,9 @@ def check_repeated_rows(log: LogStatistics, make_finding: Check) -> Iterator[Fin
     The expected number of repeats is the product of the channels' shares of equal neighbours,
     because channels of low resolution repeat values by chance.
     """
-    is_repeated, has_noisy_channel, n_expected = (
-        np.ones(len(log) - 1, dtype=bool),
-        False,
-        float(len(log)),
-    )
+    is_repeated = np.ones(len(log) - 1, dtype=bool)
+    has_noisy_channel = False
+    n_expected = float(len(log))
     for name in log:
         is_equal_to_previous = log[name][1:] == log[name][:-1]
         is_repeated &= is_equal_to_previous
@@ -293,13 +293,15 @@ def check_frozen_sensors(log: LogStatistics, make_finding: Check) -> Iterator[Fi
         starts, stops = find_runs(is_frozen)
         if not starts.size:
             continue
-        durations, affected = log.t[stops - 1] - log.t[starts], is_frozen
+        durations = log.t[stops - 1] - log.t[starts]
+        affected = is_frozen
         if names[0] in ("x", "y"):
             recovery_ends = np.searchsorted(log.t, log.t[stops - 1] + _RECOVERY_DURATION - 1e-9)
             affected = is_frozen | mask_from_ranges(
                 len(log), stops, np.maximum(recovery_ends, stops)
             )
-        affected_share, longest_run = float(affected.mean()), int(np.argmax(durations))
+        affected_share = float(affected.mean())
+        longest_run = int(np.argmax(durations))
         text = (
             f"{'position' if len(names) == 2 else names[0]} is bit-identical in {starts.size}"
             f" stretches of {_MIN_FROZEN_STEPS} steps or more while the vessel moves,"
@@ -360,7 +362,8 @@ def _find_frozen_samples(log: LogStatistics, names: tuple[str, ...]) -> np.ndarr
     is_long = stops - starts >= min_run
     if not is_long.any():
         return is_frozen_sample
-    starts, stops = starts[is_long], stops[is_long]
+    starts = starts[is_long]
+    stops = stops[is_long]
     # noise contributes to the increments; without noise, only a change after the run proves motion
     is_noisy = log.noise_std(names[0]) > 0.05 * nan_std(np.diff(log[names[0]]))
     is_noisy &= is_rare or names[0] not in POSE_NAMES
@@ -466,7 +469,8 @@ def check_interpolated_values(log: LogStatistics, make_finding: Check) -> Iterat
         return
     is_straight = np.logical_or.reduce([straight_by_channel[name] for name in names])
     starts, stops = find_runs(is_straight)
-    durations, straight_share = log.t[stops - 1] - log.t[starts], float(is_straight.mean())
+    durations = log.t[stops - 1] - log.t[starts]
+    straight_share = float(is_straight.mean())
     longest_segment = int(np.argmax(durations))
     start_time = float(log.t[starts[longest_segment]])
     text = (
@@ -485,7 +489,8 @@ def check_interpolated_values(log: LogStatistics, make_finding: Check) -> Iterat
 
 def _find_straight_samples(log: LogStatistics, name: str) -> np.ndarray:
     """Return [T] bool: samples in linear runs of a channel that is noisy elsewhere."""
-    is_straight_sample, values = np.zeros(len(log), dtype=bool), log.subsample[name]
+    is_straight_sample = np.zeros(len(log), dtype=bool)
+    values = log.subsample[name]
     second_differences = np.abs(np.diff(np.diff(values) / np.diff(log.subsample.t)))
     second_differences = second_differences[np.isfinite(second_differences)]
     if second_differences.size < 100:
@@ -546,7 +551,8 @@ def check_outliers(log: LogStatistics, make_finding: Check) -> Iterator[Finding]
     An input may jump, so its outliers must also be outside the range of its other values.
     """
     for name in (*log.measured_motion, *log.inputs):
-        values, is_out_of_range = log[name], np.ones(1, dtype=bool)
+        values = log[name]
+        is_out_of_range = np.ones(1, dtype=bool)
         if name not in log.measured_motion:
             lower, upper = nan_quantiles(values, 0.01, 0.99)
             is_out_of_range = np.maximum(lower - values, values - upper) > 0.25 * max(
@@ -561,14 +567,16 @@ def check_outliers(log: LogStatistics, make_finding: Check) -> Iterator[Finding]
         n_outliers = int(is_outlier.sum())
         if not n_outliers:
             continue
-        is_inlier, sample_indices = np.isfinite(values) & ~is_outlier, np.arange(len(log))
+        is_inlier = np.isfinite(values) & ~is_outlier
+        sample_indices = np.arange(len(log))
         interpolated_values = np.interp(
             sample_indices, sample_indices[is_inlier], values[is_inlier]
         )
         worst_index = int(
             np.argmax(np.where(is_outlier, np.abs(values - interpolated_values), 0.0))
         )
-        outlier_share, time = n_outliers / len(log), float(log.t[worst_index])
+        outlier_share = n_outliers / len(log)
+        time = float(log.t[worst_index])
         text = (
             f"{n_outliers} samples of {name} ({format_share(outlier_share)}) are outliers among"
             f" their neighbours, the worst at t = {time:.2f} s"
