@@ -50,7 +50,7 @@ def lstm_model() -> HybridDynamics:
     torch.manual_seed(0)
     model = linear(head=LstmConfig(hidden_size=8).build(("u", "v", "r", "tau_x", "tau_n")))
     with torch.no_grad():
-        model.head.scale.spread.fill_(0.3)  # type: ignore[operator, union-attr]
+        model.head.scale.std.fill_(0.3)  # type: ignore[operator, union-attr]
     return model.double().eval()
 
 

@@ -78,7 +78,7 @@ def truth() -> np.ndarray:
 
     def rate(_: float, x: np.ndarray) -> np.ndarray:
         row = torch.from_numpy(x)[None]
-        return model.rate(row, row, row)[0].numpy()
+        return model.state_derivative(row, row, row)[0].numpy()
 
     solution = solve_ivp(rate, (0.0, SECONDS), START, method="DOP853", rtol=1e-13, atol=1e-14)
     return solution.y[:, -1]

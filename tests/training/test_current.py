@@ -125,14 +125,20 @@ def test_a_start_in_a_wrong_valley_is_left() -> None:
     """
     logs, truth = sailed(drifting=True)
     signals = SIGNALS.build()
-    problem = module._Problem(
+    problem = module._CurrentProblem(
         RegressorsConfig(sets=("fossen",)).build(signals.names), signals, logs, 4.0
     )
     right = torch.from_numpy(truth)
     _, state = problem.solve(right)
+    # the differentiable regression is that of the transformed logs
+    moved = make_samples(
+        [through_water(log, c, signals) for log, c in zip(logs, truth, strict=True)], signals
+    )
+    torch.testing.assert_close(state.phi, problem.baseline.library(moved.z), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(state.error + state.phi @ state.theta.T, moved.target)
     wrong = right.clone()
     wrong[3] += torch.tensor([0.3, -0.4], dtype=torch.float64)
-    found = problem.search(wrong, state, 0.5)
+    found = problem.search_grid(wrong, state, 0.5)
     assert float((found[3] - right[3]).norm()) < 0.1 < float((wrong[3] - right[3]).norm())
 
 
@@ -158,8 +164,8 @@ def test_standard_errors_hold_where_the_regressors_are_not_the_true_ones() -> No
     claimed = np.array([row["standard_error"] for row in table])
     off = ((found - np.concatenate((truth[3:], truth[:3]))) / claimed) ** 2
     assert 0.3 < np.sqrt(off.mean()) < 2.0
-    problem = module._Problem(linear, signals, logs[3:], 4.0)
-    alone = problem.step(
+    problem = module._CurrentProblem(linear, signals, logs[3:], 4.0)
+    alone = problem.gauss_newton_step(
         torch.from_numpy(found[:-3]), problem.solve(torch.from_numpy(found[:-3]))[1]
     )
     assert (claimed[:-3].ravel() > 2.0 * alone[1].diagonal().sqrt().numpy()).all()

@@ -1,15 +1,16 @@
-"""Ambient currents of logs, estimated together with a baseline, and motion through water.
+"""Estimate the ambient current of each log together with a baseline.
 
-A log measures velocities over ground, a hull feels those through the water: nu_r = nu - R(psi)'
-[c_north, c_east, 0]. Without the current, least squares takes what it does for properties of the
-hull. Here every log has a constant current of its own, which turns in body axes as the vessel does;
-Gauss-Newton finds all of them, the coefficients eliminated (variable projection).
+A log measures velocities over ground, a hull is moved by those through the water: nu_r = nu -
+R(psi)' [c_north, c_east, 0]. Without the current, least squares attributes its effect to the hull.
+Each log has a constant current here, which rotates in body axes with the heading; Gauss-Newton
+estimates all currents, with the coefficients eliminated (variable projection).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -22,12 +23,12 @@ from residnet.core.config import Config, MetresPerSecond
 from residnet.core.errors import FitError
 from residnet.core.layout import HEADING, POSITION, VELOCITIES, YAW_RATE
 from residnet.physics.signals import Signals
-from residnet.preprocessing.prepare import PreparedLog, make_samples
+from residnet.preprocessing.prepare import PreparedLog
 
-_ROUNDS = 4
-"""Most rounds of search and descent; one that gains nothing ends them."""
-_THIN = 10
-"""The search looks at every so many samples."""
+_MAX_ROUNDS = 4
+"""Most rounds of grid search and Gauss-Newton; the first without a gain is the last."""
+_SEARCH_STRIDE = 10
+"""Every how many samples the grid search uses."""
 
 
 class CurrentConfig(Config):
@@ -76,117 +77,138 @@ def estimate_currents(
         FitError: where a log has no sample to learn from, or the logs do not determine their
             currents.
     """
-    for p in (*logs, *others):
-        if not p.trainable.any():
+    for log in (*logs, *others):
+        if not log.trainable.any():
             raise FitError(
-                f"log {p.log.name}: has no sample to estimate its current from; leave it out"
+                f"log {log.log.name}: has no sample to estimate its current from; leave it out"
             )
     precision = config.spread**-2
-    problem = _Problem(baseline, signals, logs, precision)
-    current, error, theta = _found(problem, config)
+    # all samples give the currents
+    problem = _CurrentProblem(baseline, signals, logs, precision)
+    current, error, theta = _estimate(problem, config)
+    # the two halves of each log give the Birge ratio, by which standard errors are too small
     halves = []
-    for p in logs:
-        late = np.arange(len(p)) >= np.flatnonzero(p.trainable)[p.trainable.sum() // 2]
-        halves += [replace(p, trainable=p.trainable & half) for half in (~late, late)]
-    apart, alone, _ = _found(replace(problem, logs=halves), config)
-    first, second = apart.reshape(-1, 2, 2).unbind(1)
-    scatter = (first - second).square() / alone.reshape(-1, 2, 2).square().sum(1)
-    widened = max(float(scatter.mean().sqrt()), 1.0)
+    for log in logs:
+        middle = np.flatnonzero(log.trainable)[log.trainable.sum() // 2]
+        is_late = np.arange(len(log)) >= middle
+        halves += [replace(log, trainable=log.trainable & half) for half in (~is_late, is_late)]
+    half_current, half_error, _ = _estimate(replace(problem, logs=halves), config)
+    first, second = half_current.reshape(-1, 2, 2).unbind(1)
+    variance_ratio = (first - second).square() / half_error.reshape(-1, 2, 2).square().sum(1)
+    birge_ratio = max(float(variance_ratio.mean().sqrt()), 1.0)
     if others:
-        known = _found(replace(problem, logs=others, theta=theta), config)
-        current, error = torch.cat((current, known[0])), torch.cat((error, known[1]))
+        # logs that are not fitted: their currents at the coefficients of the fitted ones
+        other_problem = replace(problem, logs=others, theta=theta)
+        other_current, other_error, _ = _estimate(other_problem, config)
+        current = torch.cat((current, other_current))
+        error = torch.cat((error, other_error))
     rows = [
         {
             "log": p.log.name,
             "fitted": i < len(logs),
             "current_north": float(c[0]),
             "current_east": float(c[1]),
-            "standard_error": (widened * e).tolist(),
+            "standard_error": (birge_ratio * e).tolist(),
         }
         for i, (p, c, e) in enumerate(zip((*logs, *others), current, error, strict=True))
     ]
     return current.numpy(), rows
 
 
-def _found(problem: _Problem, config: CurrentConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """Return currents [L, 2], the standard errors of least squares [L, 2], and coefficients."""
-    current = torch.zeros(len(problem.logs), 2, dtype=torch.float64)
-    best = _descend(problem, current, config)
-    for _round in range(_ROUNDS):
-        again = _descend(problem, problem.search(best[1], best[2], config.spread), config)
-        if again[0] > best[0] - 0.1:
+def _estimate(problem: _CurrentProblem, config: CurrentConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Return currents [L, 2], their least-squares standard errors [L, 2], and coefficients."""
+    best = _minimise(problem, torch.zeros(len(problem.logs), 2, dtype=torch.float64), config)
+    for _ in range(_MAX_ROUNDS):
+        _, current, fit = best
+        candidate = _minimise(problem, problem.search_grid(current, fit, config.spread), config)
+        if candidate[0] > best[0] - 0.1:
             break
-        best = again
-    _cost, current, state = best
-    error = problem.step(current, state)[1].diagonal().sqrt().reshape(-1, 2)
-    return current, error, state.theta
+        best = candidate
+    _, current, fit = best
+    covariance = problem.gauss_newton_step(current, fit)[1]
+    return current, covariance.diagonal().sqrt().reshape(-1, 2), fit.theta
 
 
-def _descend(
-    problem: _Problem, current: Tensor, config: CurrentConfig
-) -> tuple[float, Tensor, _State]:
-    """Gauss-Newton from some currents [L, 2] on; the best on the way, with its cost."""
-    cost, state = problem.solve(current)
-    best = (cost, current, state)
+def _minimise(
+    problem: _CurrentProblem, current: Tensor, config: CurrentConfig
+) -> tuple[float, Tensor, _RegressionFit]:
+    """Return the best point of a Gauss-Newton search from currents [L, 2], with its cost."""
+    cost, fit = problem.solve(current)
+    best = (cost, current, fit)
     for _ in range(config.iterations):
-        step, _covariance = problem.step(current, state)
-        # magnitudes make the cost rugged far from the true current: full steps cross what a search
-        # along the line would stop at
+        step, _ = problem.gauss_newton_step(current, fit)
+        # regressors with magnitudes make the cost rugged far from the true current: full steps
+        # cross local minima at which a line search would stop
         step = step * (config.spread / step.norm(dim=1, keepdim=True)).clamp(max=1.0)
         current = current + step
-        cost, state = problem.solve(current)
+        cost, fit = problem.solve(current)
         if cost < best[0]:
-            best = (cost, current, state)
+            best = (cost, current, fit)
         if float(step.abs().max()) < 1e-4:
             break
     return best
 
 
 def through_water(log: PreparedLog, current: np.ndarray, signals: Signals) -> PreparedLog:
-    """Return a log as seen from a frame that drifts with the current [2].
+    """Return a log in a frame that drifts with the current.
 
-    Positions, velocities, accelerations and the wind change.
+    Positions, velocities, accelerations and the true wind are transformed.
+
+    Args:
+        log: log over ground.
+        current: to the north and to the east [2], m/s.
+        signals: signals of the model.
     """
-    psi, drifted = log.y[:, HEADING], (log.log.t - log.log.t[0])[:, None] * current
-    along = np.cos(psi) * current[0] + np.sin(psi) * current[1]
-    across = np.cos(psi) * current[1] - np.sin(psi) * current[0]
-    drift = np.stack((along, across, np.zeros_like(along)), axis=1)
-    # the current is constant in earth axes, so it turns in body axes
-    turning = log.smoothed[:, YAW_RATE, None] * np.stack(
-        (across, -along, np.zeros_like(along)), axis=1
-    )
+    psi = log.y[:, HEADING]
+    drift = (log.log.t - log.log.t[0])[:, None] * current
+    surge = np.cos(psi) * current[0] + np.sin(psi) * current[1]
+    sway = np.cos(psi) * current[1] - np.sin(psi) * current[0]
+    zero = np.zeros_like(surge)
+    body_current = np.stack((surge, sway, zero), axis=1)
+    # the current is constant in earth axes and therefore rotates in body axes
+    yaw_rate = log.smoothed[:, YAW_RATE, None]
+    current_acceleration = yaw_rate * np.stack((sway, -surge, zero), axis=1)
 
-    def less(x: np.ndarray) -> np.ndarray:
+    def transform(x: np.ndarray) -> np.ndarray:
+        position = x[:, POSITION] - drift
         return np.concatenate(
-            (x[:, POSITION] - drifted, x[:, HEADING, None], x[:, VELOCITIES] - drift), axis=1
+            (position, x[:, HEADING, None], x[:, VELOCITIES] - body_current), axis=1
         )
 
     return replace(
         log,
-        y=less(log.y),
-        smoothed=less(log.smoothed),
-        nu_dot=log.nu_dot - turning,
-        w=_felt(log.w, current, signals),
-        rate_inputs=_felt(log.rate_inputs, current, signals),
+        y=transform(log.y),
+        smoothed=transform(log.smoothed),
+        nu_dot=log.nu_dot - current_acceleration,
+        w=_transform_wind(log.w, current, signals),
+        rate_inputs=_transform_wind(log.rate_inputs, current, signals),
     )
 
 
-def _felt(w: np.ndarray, current: np.ndarray, signals: Signals) -> np.ndarray:
-    """Inputs [T, m] with the true wind as one that drifts with the current sees it."""
+def _transform_wind(w: np.ndarray, current: np.ndarray, signals: Signals) -> np.ndarray:
+    """Return inputs [T, m] whose true wind is that of the frame that drifts with the current."""
     if not signals.has_wind:
         return w
-    speed, direction = w[:, signals.speed_column], w[:, signals.direction_column]
-    north, east = -speed * np.cos(direction) - current[0], -speed * np.sin(direction) - current[1]
-    out = w.copy()
-    out[:, signals.speed_column] = np.hypot(north, east)
-    out[:, signals.direction_column] = np.arctan2(-east, -north)
-    return out
+    speed = w[:, signals.speed_column]
+    direction = w[:, signals.direction_column]
+    north = -speed * np.cos(direction) - current[0]
+    east = -speed * np.sin(direction) - current[1]
+    transformed = w.copy()
+    transformed[:, signals.speed_column] = np.hypot(north, east)
+    transformed[:, signals.direction_column] = np.arctan2(-east, -north)
+    return transformed
 
 
 @dataclass(frozen=True)
-class _State:
-    """Coefficients [3, J] at given currents, and what is left: errors [N, 3], their variances [3],
-    regressors [N, J], log of each sample [N].
+class _RegressionFit:
+    """The regression at given currents.
+
+    Attributes:
+        theta: coefficients [3, J].
+        error: residuals [N, 3].
+        variance: variances of the residuals [3].
+        phi: regressors [N, J].
+        group: log of each sample [N].
     """
 
     theta: Tensor
@@ -197,122 +219,155 @@ class _State:
 
 
 @dataclass(frozen=True)
-class _Problem:
+class _CurrentProblem:
+    """The regression of accelerations on the motion through the water.
+
+    Attributes:
+        baseline: its library gives the regressors.
+        signals: signals of the logs.
+        logs: L logs over ground.
+        precision: prior precision of each component of a current.
+        theta: known coefficients [3, J]; None where they are eliminated.
+    """
+
     baseline: RegressorBaseline
     signals: Signals
     logs: Sequence[PreparedLog]
     precision: float
     theta: Tensor | None = None
-    """Coefficients [3, J] that are known and stay; else they are eliminated."""
 
-    def regression(self, current: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return regressors [N, J], accelerations [N, 3] and log [N] of all samples.
+    @cached_property
+    def _samples(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Heading [N], states [N, nx], prepared inputs [N, k], accelerations [N, 3], log [N]."""
+        parts: list[list[np.ndarray]] = [[], [], [], [], []]
+        for number, log in enumerate(self.logs):
+            rows = log.trainable
+            columns = (log.y[:, HEADING], log.smoothed, log.rate_inputs, log.nu_dot)
+            for part, values in zip(parts, columns, strict=False):
+                part.append(values[rows])
+            parts[4].append(np.full(int(rows.sum()), number))
+        psi, x, w, nu_dot, group = (torch.from_numpy(np.concatenate(part)) for part in parts)
+        return psi, x, self.signals.prepare(w), nu_dot, group
 
-        They are of the motion through the water.
+    def regression(self, current: Tensor) -> tuple[Tensor, Tensor]:
+        """Return regressors [N, J] and accelerations [N, 3] through the water.
+
+        Args:
+            current: current of each sample [N, 2].
         """
-        moved = make_samples(
-            [
-                through_water(p, c, self.signals)
-                for p, c in zip(self.logs, current.numpy(), strict=True)
-            ],
-            self.signals,
-        )
-        return self.baseline.library(moved.z), moved.target, moved.group
+        psi, x, p, nu_dot, _ = self._samples
+        surge = torch.cos(psi) * current[:, 0] + torch.sin(psi) * current[:, 1]
+        sway = torch.cos(psi) * current[:, 1] - torch.sin(psi) * current[:, 0]
+        zero = torch.zeros_like(surge)
+        body_current = torch.stack((surge, sway, zero), dim=1)
+        current_acceleration = x[:, YAW_RATE, None] * torch.stack((sway, -surge, zero), dim=1)
+        state = torch.cat((x[:, : VELOCITIES.start], x[:, VELOCITIES] - body_current), dim=1)
+        if self.signals.has_wind:
+            # the last two prepared inputs are the velocity of the air over ground
+            p = torch.cat((p[:, :-2], p[:, -2:] - current), dim=1)
+        return self.baseline.library(self.signals(state, p)), nu_dot - current_acceleration
 
-    def solve(self, current: Tensor) -> tuple[float, _State]:
-        """Return the negative log-likelihood and least-squares fit at currents [L, 2].
+    def residuals(self, current: Tensor, theta: Tensor) -> Tensor:
+        """Return the errors [N, 3] at the current of each sample [N, 2]."""
+        phi, target = self.regression(current)
+        return target - phi @ theta.T
 
-        The likelihood holds the prior of the currents.
-        """
-        phi, target, group = self.regression(current)
+    def solve(self, current: Tensor) -> tuple[float, _RegressionFit]:
+        """Return the negative log-posterior and the least-squares fit at currents [L, 2]."""
+        group = self._samples[4]
+        phi, target = self.regression(current[group])
         theta = torch.zeros_like(self.baseline.theta) if self.theta is None else self.theta
         for axis in range(3) if self.theta is None else ():
             columns = self.baseline.term_columns(axis)
             theta[axis, columns] = torch.linalg.solve(
-                _gram(phi[:, columns]), phi[:, columns].T @ target[:, axis]
+                _regularised_gram(phi[:, columns]), phi[:, columns].T @ target[:, axis]
             )
         error = target - phi @ theta.T
         variance = error.square().mean(0).clamp(min=1e-300)
-        cost = 0.5 * len(phi) * float(variance.log().sum()) + 0.5 * self.precision * float(
-            current.square().sum()
-        )
-        return cost, _State(theta, error, variance, phi, group)
+        log_likelihood = -0.5 * len(phi) * float(variance.log().sum())
+        log_prior = -0.5 * self.precision * float(current.square().sum())
+        return -log_likelihood - log_prior, _RegressionFit(theta, error, variance, phi, group)
 
-    def step(self, current: Tensor, state: _State) -> tuple[Tensor, Tensor]:
-        """Return the Gauss-Newton step [L, 2] and covariance [2L, 2L] of the currents."""
-        count = len(self.logs)
-        slopes = torch.stack(
-            [self._slope(current, direction, state) for direction in range(2)], dim=2
-        )
-        hessian = self.precision * torch.eye(2 * count, dtype=torch.float64)
+    def gauss_newton_step(self, current: Tensor, fit: _RegressionFit) -> tuple[Tensor, Tensor]:
+        """Return the Gauss-Newton step [L, 2] and covariance [2L, 2L] of the currents.
+
+        The coefficients are eliminated (variable projection, Kaufman's approximation).
+        """
+        n_logs = len(self.logs)
+        # exact derivatives of the errors by the current of each sample [N, 3, 2]
+        current_of_sample = current[fit.group]
+        columns_of_jacobian = []
+        for direction in torch.eye(2, dtype=torch.float64):
+            _, derivative = torch.func.jvp(
+                lambda c: self.residuals(c, fit.theta),
+                (current_of_sample,),
+                (direction.expand_as(current_of_sample),),
+            )
+            columns_of_jacobian.append(derivative)
+        jacobian = torch.stack(columns_of_jacobian, dim=2)
+        hessian = self.precision * torch.eye(2 * n_logs, dtype=torch.float64)
         gradient = self.precision * current
         for axis in range(3):
-            slope, columns = slopes[:, axis], self.baseline.term_columns(axis)
-            phi, weight = state.phi[:, columns], 1.0 / state.variance[axis]
-            blocks = torch.zeros(count, 2, 2, dtype=torch.float64).index_add_(
-                0, state.group, slope[:, :, None] * slope[:, None, :]
+            slope = jacobian[:, axis]
+            weight = 1.0 / fit.variance[axis]
+            blocks = torch.zeros(n_logs, 2, 2, dtype=torch.float64).index_add_(
+                0, fit.group, slope[:, :, None] * slope[:, None, :]
             )
             hessian += weight * torch.block_diag(*blocks)
             if self.theta is None:
-                mixed = torch.zeros(count, len(columns), 2, dtype=torch.float64).index_add_(
-                    0, state.group, phi[:, :, None] * slope[:, None, :]
+                columns = self.baseline.term_columns(axis)
+                phi = fit.phi[:, columns]
+                mixed = torch.zeros(n_logs, len(columns), 2, dtype=torch.float64).index_add_(
+                    0, fit.group, phi[:, :, None] * slope[:, None, :]
                 )
-                mixed = mixed.permute(1, 0, 2).reshape(len(columns), 2 * count)
-                hessian -= weight * (mixed.T @ torch.linalg.solve(_gram(phi), mixed))
+                mixed = mixed.permute(1, 0, 2).reshape(len(columns), 2 * n_logs)
+                hessian -= weight * (mixed.T @ torch.linalg.solve(_regularised_gram(phi), mixed))
             gradient = gradient + weight * torch.zeros_like(current).index_add_(
-                0, state.group, slope * state.error[:, axis : axis + 1]
+                0, fit.group, slope * fit.error[:, axis : axis + 1]
             )
         covariance = torch.linalg.inv(hessian)
         return -(covariance @ gradient.flatten()).reshape(-1, 2), covariance
 
-    def search(self, current: Tensor, state: _State, spread: float) -> Tensor:
-        """Return currents [L, 2] with a lower cost than `current` at the same coefficients.
+    def search_grid(self, current: Tensor, fit: _RegressionFit, spread: float) -> Tensor:
+        """Return currents [L, 2] of lowest cost at fixed coefficients on a grid, log by log.
 
-        Searched log by log on a grid over what is likely; else as they are.
+        Args:
+            current: currents [L, 2], which are returned where the grid has no better ones.
+            fit: fit at these currents.
+            spread: prior standard deviation of a component of a current, m/s.
         """
-        thin = replace(
-            self,
-            logs=[
-                replace(p, trainable=p.trainable & (np.arange(len(p)) % _THIN == 0))
-                for p in self.logs
-            ],
-        )
-        count = len(self.logs)
+        thinned_logs = [
+            replace(log, trainable=log.trainable & (np.arange(len(log)) % _SEARCH_STRIDE == 0))
+            for log in self.logs
+        ]
+        thinned = replace(self, logs=thinned_logs)
+        group = thinned._samples[4]
+        n_logs = len(self.logs)
 
-        def cost(trial: Tensor) -> Tensor:
-            phi, target, group = thin.regression(trial)
-            square = ((target - phi @ state.theta.T).square() / state.variance).sum(1)
-            return _THIN * torch.zeros(count, dtype=torch.float64).index_add_(
-                0, group, square
-            ) + self.precision * trial.square().sum(1)
+        def cost_of_logs(trial: Tensor) -> Tensor:
+            error = thinned.residuals(trial[group], fit.theta)
+            square = (error.square() / fit.variance).sum(1)
+            total = torch.zeros(n_logs, dtype=torch.float64).index_add_(0, group, square)
+            return _SEARCH_STRIDE * total + self.precision * trial.square().sum(1)
 
-        best, found = cost(current), current.clone()
-        radius, spacing = 1.25 * spread, spread / 6
+        lowest_cost = cost_of_logs(current)
+        best = current.clone()
+        radius = 1.25 * spread
+        spacing = spread / 6
         line = torch.arange(-radius, radius + spacing / 2, spacing, dtype=torch.float64)
         points = torch.cartesian_prod(line, line)
         for point in points[points.norm(dim=1) <= radius]:
-            trial = point.expand(count, 2)
-            trial_cost = cost(trial)
-            found = torch.where((trial_cost < best)[:, None], trial, found)
-            best = torch.minimum(best, trial_cost)
-        return found
-
-    def _slope(self, current: Tensor, direction: int, state: _State) -> Tensor:
-        """Derivative of the errors [N, 3] with respect to one component of each sample's own
-        current, the coefficients held.
-        """
-        little = torch.zeros_like(current)
-        little[:, direction] = 1e-4
-        ends = []
-        for moved in (current + little, current - little):
-            phi, target, _ = self.regression(moved)
-            ends.append(target - phi @ state.theta.T)
-        return (ends[0] - ends[1]) / 2e-4
+            trial = point.expand(n_logs, 2)
+            trial_cost = cost_of_logs(trial)
+            best = torch.where((trial_cost < lowest_cost)[:, None], trial, best)
+            lowest_cost = torch.minimum(lowest_cost, trial_cost)
+        return best
 
 
-def _gram(phi: Tensor) -> Tensor:
-    """phi' phi [J, J] with a trace of its diagonal, so that regressors which the data cannot tell
-    apart share what they explain.
+def _regularised_gram(phi: Tensor) -> Tensor:
+    """Return phi' phi [J, J] with a slightly larger diagonal.
+
+    Collinear regressors then share what they explain.
     """
     gram = phi.T @ phi
     return gram + 1e-12 * torch.diag(gram.diagonal().clamp(min=1e-300))
