@@ -347,7 +347,7 @@ def test_samples_outside_the_training_range_are_counted(
     assert found["share"] == pytest.approx(1 / 6)
     assert found["channels"] == {"u": pytest.approx(1 / 6)}
     # nor does a channel that drives nothing, as the depth
-    monkeypatch.setattr(DegreesOfFreedom, "hidden", property(lambda _: ("u",)))
+    monkeypatch.setattr(DegreesOfFreedom, "unmodelled_states", property(lambda _: ("u",)))
     assert ProtocolEvaluation(run, CANDIDATES, logs, SCALES).share_outside_training_range() == {
         "share": 0.0,
         "channels": {},

@@ -116,7 +116,7 @@ def test_unsound_models_and_divergences_are_named() -> None:
     fault = {"models": [{"model": "mlp", "faults": ["its damping has the wrong sign"]}]}
     rows = {"constant_velocity": row(0.5), "mlp": row(0.2, diverged=7)}
     said = write_verdict(evidence(selection=fault, rows_by_model=rows))
-    assert "7/12 diverged, which count with the error of zero" in said[0]
+    assert "7/12 diverged, which count with the constant-velocity error" in said[0]
     assert said[1] == (
         "It is UNSOUND: its damping has the wrong sign; 7 of its 12 test windows diverged."
     )
@@ -170,8 +170,10 @@ def test_the_verdict_names_what_stands_beside_and_for_what_it_holds() -> None:
     assert said[0].endswith(
         "is off by 3.0 m (2.7 to 3.3, 5.0 % of the 60 m sailed) and 5.0 deg (4.5 to 5.5)."
     )
-    assert said[1].startswith("Beside it: zero 30 m (27 to 33) and 40 deg (36 to 44); the baseline")
-    assert said[1].endswith("floor (measured velocities, integrated) 0.10 m and 0.20 deg.")
+    assert said[1].startswith(
+        "Reference models: constant velocity 30 m (27 to 33) and 40 deg (36 to 44); baseline"
+    )
+    assert said[1].endswith("noise floor (measured velocities, integrated) 0.10 m and 0.20 deg.")
     assert said[2] == "At other times of these free runs: 0.50 m and 2.0 deg after 10 s."
     assert said[3] == "It holds for 12 free runs (T30) of 4 logs at mean speeds of 1.5 to 2.5 m/s."
     # no number has an exponent that a reader must work out

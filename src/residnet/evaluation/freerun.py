@@ -237,7 +237,7 @@ def run_free_runs(
         windows_with_divergence = [
             i
             for i, predictions_of_window in enumerate(member_predictions)
-            if any(entry.diverged for entry in predictions_of_window)
+            if any(entry.has_diverged for entry in predictions_of_window)
         ]
         rerun_predictions = iter(
             _run_candidate(

@@ -265,7 +265,7 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
             f"Good would be within {good_limits_text} up to the upper end of the interval, or twice the noise"
             " floor, without a diverged window and near the best model of the run."
         ]
-    reference_labels = {CONSTANT_VELOCITY: CONSTANT_VELOCITY, evidence.baseline: "the baseline"}
+    reference_labels = {CONSTANT_VELOCITY: "constant velocity", evidence.baseline: "baseline"}
     reference_texts = [
         f"{label} {_format_errors_with_intervals(main_entry, name)}"
         for name, label in reference_labels.items()
@@ -273,7 +273,7 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
     ]
     # a pose that was integrated from the velocities has no floor but rounding
     has_noise_floor = any(main_entry["floor"][error_name] > 1e-9 for error_name in error_names)
-    noise_floor_text = f"the noise floor (measured velocities, integrated) {_format_pose_errors(main_entry['floor'])}"
+    noise_floor_text = f"noise floor (measured velocities, integrated) {_format_pose_errors(main_entry['floor'])}"
     other_horizons = [
         f"{_format_pose_errors(horizon_entry['models'][evidence.selected])} after {horizon_entry['seconds']:.4g} s"
         for horizon_entry in horizon_entries
@@ -288,7 +288,7 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
     )
     return [
         lead_sentence,
-        f"Beside it: {'; '.join([*reference_texts, *([noise_floor_text] if has_noise_floor else [])])}.",
+        f"Reference models: {'; '.join([*reference_texts, *([noise_floor_text] if has_noise_floor else [])])}.",
         *criterion_sentences,
         *(
             [f"At other times of these free runs: {'; '.join(other_horizons)}."]
