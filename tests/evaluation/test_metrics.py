@@ -18,7 +18,7 @@ from residnet.evaluation.metrics import (
     ProtocolEvaluation,
     bootstrap_intervals,
     bootstrap_tail_probability,
-    build_metrics_content,
+    build_metrics_file,
     build_metrics_table,
     find_row,
     make_resampling_blocks,
@@ -154,7 +154,7 @@ def test_a_table_has_one_column_per_number_and_the_file_marks_the_selected_model
     for wanted, told in (({"model": "c"}, "0 rows"), ({"split": "test"}, "2 rows")):
         with pytest.raises(KeyError, match=told):
             find_row(rows, **wanted)
-    content = build_metrics_content("run", {"u": "m/s"}, {"u": 1.0}, "b", "c", "c", rows)
+    content = build_metrics_file("run", {"u": "m/s"}, {"u": 1.0}, "b", "c", "c", rows).to_content()
     assert content["schema"] == "residnet.metrics/1"
     assert (content["selected"], content["selected_ensemble"]) == ("b", "c")
     marked = build_metrics_table(content["rows"])["selected"].tolist()

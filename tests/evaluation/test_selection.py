@@ -133,7 +133,7 @@ def test_ensembles_are_compared_among_themselves() -> None:
 
 def test_the_file_says_of_each_model_what_decided() -> None:
     lead = baseline(0.5, 0.1)
-    content = chosen(lead, contender("mlp", "network", 0.7, diverged=2)).to_json()
+    content = chosen(lead, contender("mlp", "network", 0.7, diverged=2)).to_record().to_content()
     assert (content["schema"], content["selected"]) == ("residnet.selection/2", "baseline")
     assert content["blocks"] == {"of": "logs", "count": 5}
     rows = {row["model"]: row for row in content["models"]}

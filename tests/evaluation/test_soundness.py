@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping
@@ -16,7 +15,7 @@ from kinds import of_kind
 from torch import Tensor
 
 from residnet.baselines.regressors import RegressorBaseline
-from residnet.core.errors import DataError
+from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
@@ -29,7 +28,7 @@ from residnet.evaluation.soundness import (
     SYMMETRY,
     SanityFinding,
     TrainingPoints,
-    build_sanity_content,
+    build_sanity_file,
     check_model,
     compute_growth_rate,
     find_contradicting_steady_run,
@@ -371,9 +370,9 @@ def test_findings_go_through_the_file_of_a_run(tmp_path: Path) -> None:
     spec, model = made({**RUDDER, "u": (0.02, 0, 0)})
     found = check_model(spec, model, recorded(spec))
     assert read_sanity_findings(tmp_path) == []
-    content = build_sanity_content({"made": found})
-    (tmp_path / "sanity.json").write_text(json.dumps(content), encoding="utf-8")
+    content = build_sanity_file({"made": found})
+    (tmp_path / "sanity.json").write_text(content.to_json_text(), encoding="utf-8")
     assert read_sanity_findings(tmp_path) == found
     (tmp_path / "sanity.json").write_text("{", encoding="utf-8")
-    with pytest.raises(DataError, match=r"sanity.json: not readable .*delete the file"):
+    with pytest.raises(UsageError, match=r"sanity\.json: not readable as JSON"):
         read_sanity_findings(tmp_path)

@@ -22,10 +22,10 @@ from residnet.core.format import format_interval, format_number
 from residnet.core.log import Log
 from residnet.evaluation.goodness import (
     OneStepResiduals,
-    build_goodness_content,
+    build_goodness_file,
     build_goodness_table,
 )
-from residnet.evaluation.soundness import CHECKS, SanityFinding, build_sanity_content
+from residnet.evaluation.soundness import CHECKS, SanityFinding, build_sanity_file
 from residnet.evaluation.verdict import LEVEL_TEXTS
 from residnet.quality import build_inspection, inspect_log, inspect_log_set
 from residnet.report.blocks import Section, Table, Text
@@ -289,7 +289,7 @@ def test_what_doctor_sanity_refit_and_currents_found_is_shown(run: Path) -> None
     checks = [
         SanityFinding("plsr", check, check != "damping", f"words on {check}") for check in CHECKS
     ]
-    write_json(run / "sanity.json", build_sanity_content({"plsr": checks}))
+    write_json(run / "sanity.json", build_sanity_file({"plsr": checks}).to_content())
     fit = run / "models" / "baseline" / "fit.json"
     write_json(fit, json.loads(fit.read_text()) | {"refit": {"iterations": 3}})
     current = {"current_north": 0.31, "current_east": -0.1, "standard_error": [0.02, 0.015]}
@@ -320,7 +320,8 @@ def test_goodness_of_fit_is_as_the_file_says(run: Path) -> None:
     ]
     rows = build_goodness_table(models, [target], 0.1)
     write_json(
-        run / "goodness.json", build_goodness_content("made", {"train": rows, "test": rows}, 0.1)
+        run / "goodness.json",
+        build_goodness_file("made", {"train": rows, "test": rows}, 0.1).to_content(),
     )
     found = goodness_section(RunFiles(run))
     assert found is not None

@@ -312,7 +312,7 @@ class Models(dict[str, Model]):
             split,
             rows_by_model,
             "baseline",
-            self.selection.to_json(),
+            self.selection.to_record().to_content(),
             evaluation.limits_by_protocol,
             protocol=protocol,
         )

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from residnet.core.config import Config, Seconds
 from residnet.core.layout import DYNAMIC_STATES, EXTRA_STATES, HEADING, PLANAR_LAYOUT, VELOCITIES
+from residnet.evaluation.records import BandsFile
 
 if TYPE_CHECKING:
     from residnet.dynamics.store import BandTable
@@ -394,21 +395,18 @@ def largest_error_ratios(errors: Sequence[np.ndarray], widths: Sequence[np.ndarr
 SCHEMA = "residnet.bands/1"
 
 
-def bands_content(run: str, bands: BandsByModel) -> dict[str, Any]:
+def build_bands_file(run: str, bands: BandsByModel) -> BandsFile:
     """Return the contents of bands.json.
 
     Args:
         bands: by model and protocol; models without any are left out.
     """
-    return {
-        "schema": SCHEMA,
-        "run": run,
-        "models": {
-            model: {protocol: band.to_json() for protocol, band in bands_by_protocol.items()}
-            for model, bands_by_protocol in bands.items()
-            if bands_by_protocol
-        },
+    models = {
+        model: {protocol: band.to_json() for protocol, band in bands_by_protocol.items()}
+        for model, bands_by_protocol in bands.items()
+        if bands_by_protocol
     }
+    return BandsFile.model_validate({"schema": SCHEMA, "run": run, "models": models})
 
 
 def read_bands(content: Mapping[str, Any]) -> dict[str, dict[str, Band]]:

@@ -13,6 +13,7 @@ from residnet.core.config import Config, Metres, Quantity, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
+from residnet.evaluation.records import BookletFile
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.manoeuvres.actuated import InputShare
 from residnet.manoeuvres.base import Manoeuvre
@@ -109,7 +110,7 @@ class BookletPage:
 
 def build_booklet(
     model: str, length: float, scale: float, draws: int, level: float, pages: Sequence[BookletPage]
-) -> dict[str, Any]:
+) -> BookletFile:
     """Return the contents of booklet.json, SI and rad, in the scale of the logs.
 
     `ship` beside an index is its value for the ship.
@@ -127,7 +128,8 @@ def build_booklet(
         "draws": draws,
         "level": level,
     }
-    return metadata | {"units": {name: INDEX_UNITS[name] for name in index_names}, "pages": rows}
+    units = {name: INDEX_UNITS[name] for name in index_names}
+    return BookletFile.model_validate({**metadata, "units": units, "pages": rows})
 
 
 def _page_row(page: BookletPage, length: float, scale: float, level: float) -> dict[str, Any]:

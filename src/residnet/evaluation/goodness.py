@@ -15,6 +15,7 @@ from residnet.core.layout import HEADING, POSE, POSITION
 from residnet.core.names import ACCELERATION_NAMES
 from residnet.evaluation.metrics import CONFIDENCE_LEVEL, bootstrap_tail_probability
 from residnet.evaluation.protocol import ProtocolConfig, Window
+from residnet.evaluation.records import GoodnessFile
 from residnet.preprocessing.prepare import PreparedLog
 
 _COMMAND_TOLERANCE, _START_TOLERANCE, _SEARCH_INTERVAL = 0.05, 0.25, 0.5
@@ -624,8 +625,10 @@ def _finite_bounds(lower: float, upper: float) -> list[float] | None:
     return [lower, upper] if math.isfinite(lower) and math.isfinite(upper) else None
 
 
-def build_goodness_content(
+def build_goodness_file(
     run: str, splits: Mapping[str, list[dict[str, Any]]], dt: float
-) -> dict[str, Any]:
+) -> GoodnessFile:
     """Return the contents of goodness.json."""
-    return {"schema": SCHEMA, "run": run, "lags": N_LAGS, "step": dt, "splits": dict(splits)}
+    return GoodnessFile.model_validate(
+        {"schema": SCHEMA, "run": run, "lags": N_LAGS, "step": dt, "splits": dict(splits)}
+    )

@@ -18,6 +18,7 @@ from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.core.names import POSE_ERROR_UNITS
 from residnet.evaluation.band import BandsByModel
 from residnet.evaluation.bands import band_limits, compute_run_errors, count_coverage
+from residnet.evaluation.records import MetricsFile
 from residnet.evaluation.verdict import MIN_LOGS_FOR_INTERVAL, describe_divergence
 
 if TYPE_CHECKING:
@@ -44,8 +45,8 @@ class ResamplingBlocks:
 
     Attributes:
         block_indices: number of each window's block, [W], from 0 on.
-        block_kind: `log_indices` where a block is all windows of a log, else `windows`: consecutive windows of one
-            log.
+        block_kind: `logs` if a block is all windows of a log, else `windows`: consecutive windows of
+            one log.
         n_blocks: number of blocks.
     """
 
@@ -292,7 +293,7 @@ class ProtocolEvaluation:
         """Return the rows of metrics.json.
 
         Every model, over all windows, every kind of manoeuvre and every named group of kinds.
-        `paired_difference` compares a model with its reference (`Candidate.reference`); None where it has
+        `difference` compares a model with its reference (`Candidate.reference`); None where it has
         none. Models with a band have its coverage and interval score, too.
         """
         manoeuvre_kinds = [log.log.manoeuvre for log, _ in self.log_slices]
@@ -398,8 +399,8 @@ class ProtocolEvaluation:
 
         Returns:
             One entry for 10, 30 and 100 s, as far as the windows go, and for the end of the longest
-            window: `seconds`; `windows` and `log_indices` that last so long, `slowest` and `fastest` of
-            them (mean speeds, m/s) and the mean way `distances` in m; `integration_errors`: what integrated
+            window: `seconds`; `windows` and `logs` that last so long, `slowest` and `fastest` of
+            them (mean speeds, m/s) and the mean way `sailed` in m; `floor`: what integrated
             measured velocities are off in each of `Live.ends`; and by model the mean of each over
             the windows, with `intervals` for as many new logs, see `prediction_intervals`.
         """
@@ -494,8 +495,8 @@ class ProtocolEvaluation:
 
         The wind only where every log has it. A band of fewer than three windows is left out, and
         so is a quantity of which one band remains. Each entry: `by` (speed or wind), `low` and
-        `upper` in m/s (extremes of the windows' means), `windows`, and by model `nrmse_mean` and
-        `paired_difference` as in metrics.json.
+        `high` in m/s (extremes of the windows' means), `windows`, and by model `nrmse_mean` and
+        `difference` as in metrics.json.
         """
         values_by_quantity = {"speed": self._mean_speeds()}
         if all(_WIND_CHANNEL in log.log.channels for log, _ in self.log_slices):
@@ -659,7 +660,7 @@ _CHANNEL_COLUMNS = ("rmse", "mae", "nrmse")
 _POSE_ERROR_COLUMNS = tuple(f"{end}_error_end" for end in POSE_ERROR_UNITS)
 
 
-def build_metrics_content(
+def build_metrics_file(
     run: str,
     units: Mapping[str, str],
     scales: Mapping[str, float],
@@ -667,7 +668,7 @@ def build_metrics_content(
     selected_ensemble: str | None,
     predictor: str,
     rows: Sequence[Mapping[str, Any]],
-) -> dict[str, Any]:
+) -> MetricsFile:
     """Return the contents of metrics.json.
 
     Args:
@@ -677,16 +678,18 @@ def build_metrics_content(
         rows: of all splits, without `selected`.
     """
     marked_rows = [{**row, "selected": row["model"] == selected} for row in rows]
-    return {
-        "schema": SCHEMA,
-        "run": run,
-        "channels": dict(units),
-        "scales": dict(scales),
-        "selected": selected,
-        "selected_ensemble": selected_ensemble,
-        "predictor": predictor,
-        "rows": marked_rows,
-    }
+    return MetricsFile.model_validate(
+        {
+            "schema": SCHEMA,
+            "run": run,
+            "channels": dict(units),
+            "scales": dict(scales),
+            "selected": selected,
+            "selected_ensemble": selected_ensemble,
+            "predictor": predictor,
+            "rows": marked_rows,
+        }
+    )
 
 
 def build_metrics_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from residnet.core.format import format_number
 from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.evaluation.freerun import FreeRun, FreeRunErrors
 from residnet.evaluation.metrics import MIN_LOGS_AS_BLOCKS, TARGET_BLOCKS
+from residnet.evaluation.records import SelectionFile
 from residnet.preprocessing.prepare import PreparedLog
 
 SCHEMA = "residnet.selection/2"
@@ -150,37 +150,40 @@ class Selection:
         """Name of the model that is reported first and exported where none is named."""
         return self.selected if self.default_ensemble is None else self.default_ensemble
 
-    def to_json(self) -> dict[str, Any]:
+    def to_record(self) -> SelectionFile:
         """Return the contents of selection.json."""
         selected_candidate = next(
             candidate for candidate in self.candidates if candidate.name == self.selected
         )
-        return {
-            "schema": SCHEMA,
-            "selected": self.selected,
-            "selected_ensemble": self.selected_ensemble,
-            "predictor": self.default_model,
-            "reason": self.reason,
-            "blocks": {"of": self.blocks.block_kind, "count": self.blocks.n_blocks},
-            "models": [
+        rows = []
+        for candidate in self.candidates:
+            mean_log_ratio, standard_error = log_error_ratio(
+                candidate, selected_candidate, self.blocks
+            )
+            rows.append(
                 {
                     "model": candidate.name,
                     "family": candidate.family,
                     "parameters": candidate.n_parameters,
                     "nrmse_mean": candidate.mean_nrmse,
-                    "ratio": math.exp(
-                        log_error_ratio(candidate, selected_candidate, self.blocks)[0]
-                    ),
-                    "standard_error": log_error_ratio(candidate, selected_candidate, self.blocks)[
-                        1
-                    ],
+                    "ratio": math.exp(mean_log_ratio),
+                    "standard_error": standard_error,
                     "diverged": candidate.n_diverged,
                     "sound": candidate.is_sound,
-                    "faults": list(candidate.faults),
+                    "faults": candidate.faults,
                 }
-                for candidate in self.candidates
-            ],
-        }
+            )
+        return SelectionFile.model_validate(
+            {
+                "schema": SCHEMA,
+                "selected": self.selected,
+                "selected_ensemble": self.selected_ensemble,
+                "predictor": self.default_model,
+                "reason": self.reason,
+                "blocks": {"of": self.blocks.block_kind, "count": self.blocks.n_blocks},
+                "models": rows,
+            }
+        )
 
 
 def select_models(candidates: Iterable[SelectionCandidate], blocks: SelectionBlocks) -> Selection:

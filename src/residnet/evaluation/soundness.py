@@ -18,15 +18,12 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from residnet.core.columns import all_but_pose
-from residnet.core.errors import DataError
-from residnet.core.files import read_json
 from residnet.core.format import display_unit, format_interval, format_number
 from residnet.core.layout import LATERAL, POSE, SURGE, SWAY
 from residnet.core.names import WIND_INPUTS
@@ -36,6 +33,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import Rollout
+from residnet.evaluation.records import SanityFile
 from residnet.physics.symmetry import (
     find_heeling_propellers,
     get_axis_parities,
@@ -716,24 +714,23 @@ def check_boundedness(
     return _to_sanity_finding(spec, BOUNDEDNESS, False, text, "")
 
 
-def build_sanity_content(findings: Mapping[str, Sequence[SanityFinding]]) -> dict[str, Any]:
+def build_sanity_file(findings: Mapping[str, Sequence[SanityFinding]]) -> SanityFile:
     """Return the contents of sanity.json from the findings of each model."""
     rows = [asdict(finding) for model_findings in findings.values() for finding in model_findings]
-    return {"schema": SCHEMA, "findings": rows}
+    return SanityFile.model_validate({"schema": SCHEMA, "findings": rows})
 
 
 def read_sanity_findings(run_folder: Path) -> list[SanityFinding]:
     """Return the findings in a run folder's sanity.json; none where there is no such file.
 
     Raises:
-        DataError: where the file cannot be read.
+        UsageError: if the file is not readable as JSON.
+        DataError: if a key is missing, unknown or of another type.
     """
     path = run_folder / "sanity.json"
     if not path.is_file():
         return []
-    try:
-        return [SanityFinding(**row) for row in read_json(path)["findings"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(
-            f"{path}: not readable as the findings of a run ({error}); delete the file"
-        ) from None
+    return [
+        SanityFinding(row.model, row.check, row.ok, row.text, row.fault)
+        for row in SanityFile.read(path).findings
+    ]

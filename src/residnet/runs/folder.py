@@ -25,6 +25,8 @@ from residnet.core.version import __version__
 if TYPE_CHECKING:
     import pandas as pd
 
+    from residnet.core.records import FileRecord
+
 
 SUMMARY_SCHEMA = "residnet.summary/1"
 """Schema of summary.json."""
@@ -221,6 +223,10 @@ class RunFolder:
     def write_json(self, path: Path, content: Any) -> None:
         """Write a file of standard JSON, without NaN and infinity."""
         self.write(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+    def write_record(self, path: Path, record: FileRecord) -> None:
+        """Write the typed contents of a JSON file."""
+        self.write(path, record.to_json_text())
 
     def write_table(self, path: Path, table: pd.DataFrame) -> None:
         """Write a table as Parquet, without its index."""

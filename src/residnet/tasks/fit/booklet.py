@@ -85,7 +85,7 @@ def write_booklet(
         ):
             renamed_flights = [replace(flight, manoeuvre=zigzag) for flight in flights]
             pages.append(_make_page(craft, config, renamed_flights, limit, *measured_log))
-    folder.write_json(
+    folder.write_record(
         folder.booklet,
         build_booklet(config.model, config.length, config.scale, config.draws, config.level, pages),
     )

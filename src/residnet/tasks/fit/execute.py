@@ -14,9 +14,9 @@ from residnet.core.model_names import CONSTANT_VELOCITY, PLANT
 from residnet.core.names import suggest_name
 from residnet.core.progress import begin_stage, log_message
 from residnet.dynamics.store import load_model, model_names
-from residnet.evaluation.band import bands_content
-from residnet.evaluation.goodness import build_goodness_content
-from residnet.evaluation.soundness import build_sanity_content
+from residnet.evaluation.band import build_bands_file
+from residnet.evaluation.goodness import build_goodness_file
+from residnet.evaluation.soundness import build_sanity_file
 from residnet.evaluation.verdict import list_model_objections, rate_model, write_verdict
 from residnet.export.vessel import ExportedVessel
 from residnet.identification.fit import fit_models
@@ -108,7 +108,7 @@ def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:
     fitted_models, time_step = list(identified_models.values()), config.prepare.grid.step
     if config.bands is not None:
         bands = {entry.name: entry.bands for entry in fitted_models}
-        folder.write_json(folder.bands, bands_content(config.name, bands))
+        folder.write_record(folder.bands, build_bands_file(config.name, bands))
     evaluation_logs = {str(split): logs[split] for split in config.evaluation.splits}
     evaluations = identified_models.evaluate(evaluation_logs, config.data)
     selection = identified_models.select_models(evaluations)
@@ -116,8 +116,8 @@ def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:
         "" if selection.default_ensemble is None else f"; predictor: {selection.default_ensemble}"
     )
     log_message(f"  selected: {selection.selected}{predictor_text}")
-    folder.write_json(folder.selection, selection.to_json())
-    folder.write_json(folder.sanity, build_sanity_content(identified_models.sanity_findings))
+    folder.write_record(folder.selection, selection.to_record())
+    folder.write_record(folder.sanity, build_sanity_file(identified_models.sanity_findings))
     names = (selection.selected, selection.selected_ensemble, selection.default_model)
     write_evaluation(folder, config, evaluations, names, logs)
     for table_path, result_table in {
@@ -127,8 +127,8 @@ def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:
         if len(result_table):
             folder.write_table(table_path, result_table)
     goodness_by_split = build_goodness_rows(fitted_models, logs, time_step)
-    folder.write_json(
-        folder.goodness, build_goodness_content(config.name, goodness_by_split, time_step)
+    folder.write_record(
+        folder.goodness, build_goodness_file(config.name, goodness_by_split, time_step)
     )
     failure = ""
     if config.booklet is not None:

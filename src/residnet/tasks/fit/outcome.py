@@ -13,7 +13,8 @@ from residnet.core.names import CHANNEL_UNITS, POSE_ERROR_UNITS, si_unit
 from residnet.core.progress import begin_stage, log_message
 from residnet.dynamics.store import ModelSpec
 from residnet.evaluation.goodness import assess_repeatability
-from residnet.evaluation.metrics import LIMITS_SCHEMA, build_metrics_content, write_rollouts
+from residnet.evaluation.metrics import LIMITS_SCHEMA, build_metrics_file, write_rollouts
+from residnet.evaluation.records import LimitsFile
 from residnet.identification.identified import SplitEvaluation
 from residnet.identification.prepared import compute_velocity_limits
 from residnet.io.drafting.reading import find_log_files
@@ -94,8 +95,8 @@ def write_evaluation(
         if name in states
     }
     rows = [row for evaluation in evaluations.values() for row in evaluation.rows]
-    folder.write_json(
-        folder.metrics, build_metrics_content(config.name, units, scales, *names, rows)
+    folder.write_record(
+        folder.metrics, build_metrics_file(config.name, units, scales, *names, rows)
     )
     n_commands, step = len(config.signals.inputs), config.prepare.grid.step
     evaluated_logs = [log for evaluation in evaluations.values() for log in evaluation.logs]
@@ -110,7 +111,7 @@ def write_evaluation(
             for name, protocol in config.evaluation.protocols.items()
         },
     }
-    folder.write_json(folder.limits, limits)
+    folder.write_record(folder.limits, LimitsFile.model_validate(limits))
     quality = [
         {
             **log.to_table_row(split),

@@ -1,0 +1,535 @@
+"""Typed contents of the JSON files that an evaluation writes into a run folder, one model per file.
+
+A writer builds the record, so that a key or a type that the format does not have fails there. The
+keys are a contract with other programs; values are in SI units and rad.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from residnet.core.records import FileRecord, Record
+
+ByChannel = dict[str, float]
+"""A number for each channel."""
+Interval = tuple[float, float]
+"""Lower and upper limit."""
+ModelKind = Literal["constant_velocity", "baseline", "head", "plant", "ensemble"]
+"""What a model is."""
+
+# metrics.json
+
+
+class BlockCount(Record):
+    """The blocks that a bootstrap resamples or a selection pairs.
+
+    Attributes:
+        of: what a block is: all windows of a log (`logs`), or parts of logs.
+        count: number of blocks.
+    """
+
+    of: Literal["logs", "windows", "stretches"]
+    count: int
+
+
+class PairedDifference(Record):
+    """The difference of the mean errors of two models over the same windows.
+
+    Attributes:
+        to: name of the reference model.
+        nrmse_mean: model minus reference; negative if the model is better.
+        ci95: 95 % confidence interval; None if there are too few logs.
+        excludes_zero: whether the interval excludes zero.
+        ratio: error of the model over that of the reference; None if the latter is zero.
+        worse: whether the ratio is above 1.05.
+    """
+
+    to: str
+    nrmse_mean: float
+    ci95: Interval | None
+    excludes_zero: bool
+    ratio: float | None
+    worse: bool
+
+
+class MetricsRow(Record):
+    """Free-run errors of one model over the windows of one split, protocol and kind of manoeuvre.
+
+    Attributes:
+        model: name of the model.
+        kind: what the model is.
+        split: train, validation, test or external.
+        protocol: name of the protocol, for example `T100`.
+        manoeuvre: `all`, one kind, or a group of kinds that the config names.
+        windows: number of windows.
+        n: number of scored samples.
+        diverged: number of diverged windows; they count with the constant-velocity error.
+        rmse: mean over the windows of the root mean square error of each velocity.
+        mae: the same of the mean absolute error.
+        nrmse: `rmse` over the scales of the config, and its `mean` over the velocities.
+        rmse_ci95: bootstrap 95 % confidence intervals of `rmse`; None if there are too few windows.
+        nrmse_mean_ci95: that of the mean of `nrmse`.
+        ci95_blocks: the blocks that were resampled.
+        position_error_end: distance in m at the end of a window, mean over the windows.
+        heading_error_end: heading error in rad at the end of a window, mean over the windows.
+        depth_error_end: depth error in m, of a vessel that dives.
+        attitude_error_end: attitude error in rad, of a vessel that dives.
+        difference: paired difference to the reference model of this model.
+        band_coverage: share of the samples within the prediction interval by channel, their `mean`,
+            and `whole`: the share of windows that stay within the interval of whole runs.
+        band_score: mean interval score in units of the constant-velocity error.
+        band_score_constant: that of an interval of constant width.
+        selected: whether validation data chose this single model.
+    """
+
+    model: str
+    kind: ModelKind
+    split: str
+    protocol: str
+    manoeuvre: str
+    windows: int
+    n: int
+    diverged: int
+    rmse: ByChannel
+    mae: ByChannel
+    nrmse: ByChannel
+    rmse_ci95: dict[str, Interval | None]
+    nrmse_mean_ci95: Interval | None
+    ci95_blocks: BlockCount | None
+    position_error_end: float | None = None
+    position_error_end_ci95: Interval | None = None
+    heading_error_end: float | None = None
+    heading_error_end_ci95: Interval | None = None
+    depth_error_end: float | None = None
+    depth_error_end_ci95: Interval | None = None
+    attitude_error_end: float | None = None
+    attitude_error_end_ci95: Interval | None = None
+    difference: PairedDifference | None = None
+    band_coverage: ByChannel | None = None
+    band_score: float | None = None
+    band_score_constant: float | None = None
+    selected: bool
+
+
+class MetricsFile(FileRecord):
+    """metrics.json of a fit or of an evaluation on other logs.
+
+    Attributes:
+        run: name of the run.
+        channels: unit of each state.
+        scales: scale of each velocity, the denominators of `nrmse`.
+        selected: name of the single model that validation data chose.
+        selected_ensemble: name of the best ensemble; None if there is none.
+        predictor: name of the model that is reported first and exported by default.
+        rows: errors by model, split, protocol and kind of manoeuvre.
+    """
+
+    schema_name: Literal["residnet.metrics/1"] = Field(alias="schema")
+    run: str
+    channels: dict[str, str]
+    scales: ByChannel
+    selected: str
+    selected_ensemble: str | None
+    predictor: str
+    rows: tuple[MetricsRow, ...]
+
+
+# selection.json
+
+
+class SelectionRow(Record):
+    """A model as the selection sees it.
+
+    Attributes:
+        model: name of the model.
+        family: its complexity class, see `evaluation.selection.MODEL_FAMILIES`.
+        parameters: number of parameters.
+        nrmse_mean: mean validation error.
+        ratio: geometric mean over the blocks of its error over that of the selected model.
+        standard_error: that of the logarithm of `ratio`.
+        diverged: number of diverged validation windows.
+        sound: whether it passed all checks.
+        faults: what the checks object to.
+    """
+
+    model: str
+    family: str
+    parameters: int
+    nrmse_mean: float
+    ratio: float
+    standard_error: float
+    diverged: int
+    sound: bool
+    faults: tuple[str, ...]
+
+
+class SelectionFile(FileRecord):
+    """selection.json: the chosen models and the reason.
+
+    Attributes:
+        selected: name of the chosen single model.
+        selected_ensemble: name of the best ensemble; None if there is none.
+        predictor: name of the model that is reported first.
+        reason: one sentence on the choice of the single model.
+        blocks: blocks of validation data over which errors were paired.
+        models: all candidates.
+    """
+
+    schema_name: Literal["residnet.selection/2"] = Field(alias="schema")
+    selected: str
+    selected_ensemble: str | None
+    predictor: str
+    reason: str
+    blocks: BlockCount
+    models: tuple[SelectionRow, ...]
+
+
+# limits.json
+
+
+class PoseErrors(Record):
+    """Mean errors of the pose at a horizon, with 95 % prediction intervals for as many new logs."""
+
+    position: float | None = None
+    heading: float | None = None
+    depth: float | None = None
+    attitude: float | None = None
+    intervals: dict[str, Interval | None]
+
+
+class HorizonRow(Record):
+    """Pose errors of all models after one horizon.
+
+    Attributes:
+        seconds: the horizon in s.
+        windows: number of windows that reach it.
+        logs: number of logs that these windows come from.
+        slowest: smallest mean speed of a window in m/s.
+        fastest: largest mean speed of a window in m/s.
+        sailed: mean distance travelled in m.
+        floor: errors of the integrated measured velocities (noise floor).
+        models: errors by model.
+    """
+
+    seconds: float
+    windows: int
+    logs: int
+    slowest: float
+    fastest: float
+    sailed: float
+    floor: PoseErrors
+    models: dict[str, PoseErrors]
+
+
+class ClassErrors(Record):
+    """Error of a model over the windows of one class."""
+
+    nrmse_mean: float
+    difference: PairedDifference | None
+
+
+class ClassRow(Record):
+    """Errors over the windows of one third of the range of speed or wind speed.
+
+    Attributes:
+        by: speed of the vessel, or true wind speed.
+        low: smallest mean of a window in m/s.
+        high: largest mean of a window in m/s.
+        windows: number of windows.
+        models: errors by model.
+    """
+
+    by: Literal["speed", "wind"]
+    low: float
+    high: float
+    windows: int
+    models: dict[str, ClassErrors]
+
+
+class WorstWindow(Record):
+    """A window with one of the largest errors of a model; `t` is its start in the log in s."""
+
+    log: str
+    manoeuvre: str
+    t: float
+    nrmse: float
+    rmse: ByChannel
+    position_error_end: float | None = None
+    heading_error_end: float | None = None
+    depth_error_end: float | None = None
+    attitude_error_end: float | None = None
+
+
+class OutsideRange(Record):
+    """Share of samples outside the training range, in all and by channel; empty if unknown."""
+
+    share: float | None = None
+    channels: ByChannel | None = None
+
+
+class ProtocolLimits(Record):
+    """Where the models fail under one protocol of one split.
+
+    Attributes:
+        kinematics: number of windows, and mean and root mean square of each pose error of the
+            integrated measured velocities.
+        bands: errors by class of speed and wind speed.
+        worst: the windows with the largest errors, by model.
+        compared: paired differences by model and reference model.
+        outside: share of the samples outside the training range.
+        horizons: pose errors by horizon.
+    """
+
+    kinematics: dict[str, int | float]
+    bands: tuple[ClassRow, ...]
+    worst: dict[str, tuple[WorstWindow, ...]]
+    compared: dict[str, dict[str, PairedDifference | None]]
+    outside: OutsideRange
+    horizons: tuple[HorizonRow, ...]
+
+
+class LimitsFile(FileRecord):
+    """limits.json: errors by horizon, class and window.
+
+    Attributes:
+        run: name of the run.
+        splits: by split and protocol.
+        repeatability: by protocol, differences between repeated manoeuvres.
+    """
+
+    schema_name: Literal["residnet.limits/1"] = Field(alias="schema")
+    run: str
+    splits: dict[str, dict[str, ProtocolLimits]]
+    repeatability: dict[str, dict[str, Any]]
+
+
+# bands.json
+
+
+class Activity(Record):
+    """How the width of a prediction interval depends on the motion of the run.
+
+    Attributes:
+        measures: velocities and accelerations whose mean squares measure the motion.
+        floor: smallest value of each measure.
+        centre: mean logarithm of each measure.
+        spread: standard deviation of that logarithm.
+        slope: slope of the log width against the standardised measures, by channel.
+    """
+
+    measures: tuple[str, ...]
+    floor: tuple[float, ...]
+    centre: tuple[float, ...]
+    spread: tuple[float, ...]
+    slope: dict[str, Any]
+
+
+class BandRow(Record):
+    """Prediction intervals of the free runs of one model under one protocol, by channel.
+
+    Attributes:
+        level: nominal coverage.
+        step: time step in s.
+        horizon: longest calibrated horizon in s.
+        logs: number of logs that calibrated the intervals.
+        independent_scores: equivalent number of independent calibration scores.
+        cautions: sentences on what the intervals do not cover.
+        steps: horizons in time steps; the tables below have one value for each.
+        half_width: half widths for a run of typical motion.
+        half_width_of_any_run: half widths that do not depend on the motion of the run.
+        whole_run_factor: factor on the half widths for a whole run.
+        constant_half_width: half widths of intervals of constant width.
+        score_unit: root mean square constant-velocity errors, the unit of interval scores.
+        activity: dependence of the width on the motion.
+        usual_spread: typical disagreement of the members of an ensemble; None for other models.
+    """
+
+    level: float
+    step: float
+    horizon: float
+    logs: int
+    independent_scores: float
+    cautions: tuple[str, ...]
+    steps: tuple[float, ...]
+    half_width: dict[str, Any]
+    half_width_of_any_run: dict[str, Any]
+    whole_run_factor: dict[str, Any]
+    constant_half_width: dict[str, Any]
+    score_unit: dict[str, Any]
+    activity: Activity
+    usual_spread: dict[str, Any] | None
+
+
+class BandsFile(FileRecord):
+    """bands.json: prediction intervals by model and protocol."""
+
+    schema_name: Literal["residnet.bands/1"] = Field(alias="schema")
+    run: str
+    models: dict[str, dict[str, BandRow]]
+
+
+# goodness.json
+
+
+class MaeDifference(Record):
+    """Paired difference of the mean absolute one-step residuals of two models."""
+
+    to: str
+    mae: float
+    ci95: Interval | None
+    excludes_zero: bool
+    ratio: float | None
+
+
+class GoodnessRow(Record):
+    """Goodness of fit of one model on one axis; criteria of document 000, section 9.
+
+    Attributes:
+        model: name of the model.
+        kind: what the model is.
+        axis: name of the acceleration.
+        samples: number of samples.
+        parameters: number of fitted parameters of this axis.
+        rmse: root mean square residual.
+        r2: coefficient of determination; None if the target is constant.
+        r2_adjusted: adjusted for the number of parameters.
+        cp: Mallows' C_p.
+        aic: Akaike's criterion; None without noise.
+        bic: Bayesian criterion; None without noise.
+        mae: mean absolute residual, with its block-bootstrap interval and the interval for
+            independent samples.
+        block_seconds: length of a bootstrap block in s.
+        mean: mean residual.
+        effective: number of independent samples with the same variance of the mean.
+        autocorrelation: at lags from one sample on.
+        ljung_box: statistic of the test for white residuals.
+        white_p: its p-value.
+        difference: paired difference to the reference model.
+    """
+
+    model: str
+    kind: ModelKind
+    axis: str
+    samples: int
+    parameters: float
+    rmse: float
+    r2: float | None
+    r2_adjusted: float | None
+    cp: float
+    aic: float | None
+    bic: float | None
+    mae: float
+    mae_ci95: Interval | None
+    mae_ci95_independent: Interval | None
+    block_seconds: float
+    mean: float
+    mean_ci95: Interval | None
+    effective: float
+    autocorrelation: tuple[float, ...]
+    ljung_box: float
+    white_p: float
+    difference: MaeDifference | None = None
+
+
+class GoodnessFile(FileRecord):
+    """goodness.json: one-step residuals along measured states.
+
+    Attributes:
+        run: name of the run.
+        lags: number of lags of the autocorrelation.
+        step: time step in s.
+        splits: rows by split.
+    """
+
+    schema_name: Literal["residnet.goodness/1"] = Field(alias="schema")
+    run: str
+    lags: int
+    step: float
+    splits: dict[str, tuple[GoodnessRow, ...]]
+
+
+# sanity.json
+
+
+class SanityRow(Record):
+    """The result of one physical check of one model; `ok` is None if it was not made."""
+
+    model: str
+    check: str
+    ok: bool | None
+    text: str
+    fault: str = ""
+
+
+class SanityFile(FileRecord):
+    """sanity.json: results of the physical checks."""
+
+    schema_name: Literal["residnet.sanity/1"] = Field(alias="schema")
+    findings: tuple[SanityRow, ...]
+
+
+# booklet.json
+
+
+class BookletIndex(Record):
+    """A manoeuvring index.
+
+    Attributes:
+        value: of the fitted parameters, in the scale of the logs.
+        ship: the same in the scale of the ship.
+        draws: number of parameter draws that gave it.
+        interval: prediction interval over the draws.
+        lengths: in lengths of the hull.
+        measured: of the measured manoeuvre.
+        difference: simulated minus measured.
+        limit: limit of IMO in the scale of the ship.
+        kept: whether the limit is met.
+        kept_share: share of the draws that meet it.
+    """
+
+    value: float
+    ship: float
+    draws: int
+    interval: Interval | None = None
+    lengths: float | None = None
+    measured: float | None = None
+    difference: float | None = None
+    limit: float | None = None
+    kept: bool | None = None
+    kept_share: float | None = None
+
+
+class BookletRow(Record):
+    """Indices of one manoeuvre; `demand` holds its settings, `faults` counts failed draws."""
+
+    name: str
+    manoeuvre: str
+    demand: dict[str, Any]
+    split: str
+    faults: int
+    indices: dict[str, BookletIndex]
+
+
+class BookletFile(FileRecord):
+    """booklet.json: manoeuvring indices with intervals.
+
+    Attributes:
+        model: name of the model.
+        length: length of the hull in m in the scale of the logs.
+        scale: scale of the ship over that of the logs.
+        draws: number of parameter draws.
+        level: level of the intervals.
+        units: unit of each index.
+        pages: indices by manoeuvre.
+    """
+
+    schema_name: Literal["residnet.booklet/1"] = Field(alias="schema")
+    model: str
+    length: float
+    scale: float
+    draws: int
+    level: float
+    units: dict[str, str]
+    pages: tuple[BookletRow, ...]
