@@ -50,19 +50,19 @@ _PARAMETER_TITLES = {
     ("step", "dead_time"): "dead time",
 }
 _DISPLAY_UNITS = {"1/s": ("rpm", 60.0), "1/s^2": ("rpm/s", 60.0)}
-"""Units of revolutions as test engineers read them, with the factor from SI."""
+"""Display units with the factor from SI, by SI unit."""
 
 
 MeasuredStep = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Time in s, command and measured revolutions in 1/s of one step response, each [N]."""
+"""Time in s, commanded and measured shaft speed in 1/s of one step response, each [N]."""
 
 
 class CsvColumn(Config):
     """A column of a csv file and its unit.
 
     Attributes:
-        column: its title in the first line of the file.
-        unit: of its numbers, for example `rpm`.
+        column: title in the first line of the file.
+        unit: unit of the numbers, for example `rpm`.
     """
 
     column: str
@@ -96,29 +96,30 @@ class ActuatorTest(Config):
     files: Annotated[tuple[ExistingPath, ...], Field(min_length=1)]
 
     def read_columns(self) -> list[tuple[np.ndarray, ...]]:
-        """Return the columns [N] of each file in SI, in the order of the keys; rows with an empty
-        cell are left out.
+        """Read the columns [N] of each file in SI units, in the order of the keys.
+
+        Rows with an empty cell are skipped.
 
         Raises:
             UsageError: if a column is missing.
-            DataError: if a cell is no number, or no row is complete.
+            DataError: if a cell is not a number, or no row is complete.
         """
         keys = [key for key in type(self).model_fields if key not in ("files", "thrusters")]
         return [_read_columns(path, [getattr(self, key) for key in keys]) for path in self.files]
 
     def read_concatenated(self) -> tuple[np.ndarray, ...]:
-        """Return the columns of all files as one."""
+        """Return the columns [N] of all files, concatenated."""
         return tuple(
             np.concatenate(file_columns) for file_columns in zip(*self.read_columns(), strict=True)
         )
 
 
 class ThrottleTest(ActuatorTest):
-    """Steady revolutions over throttle, one row for each point.
+    """Steady shaft speed against throttle, one row for each operating point.
 
     Attributes:
         throttle: column of the throttle, from -1 to 1 (`-`) or in `%`.
-        n: column of the revolutions, for example in `rpm`.
+        n: column of the shaft speed, for example in `rpm`.
     """
 
     throttle: DimensionlessColumn
@@ -126,7 +127,7 @@ class ThrottleTest(ActuatorTest):
 
 
 class StepTest(ActuatorTest):
-    """Revolutions over time after steps of the command, one file for each step response.
+    """Shaft speed after a step of the command, one file for each step response.
 
     Attributes:
         t: column of the time, for example in `s`.
@@ -149,12 +150,12 @@ class StepTest(ActuatorTest):
 
 
 class BollardTest(ActuatorTest):
-    """Steady pull on a tether over revolutions, of all thrusters together.
+    """Steady bollard pull of all thrusters against shaft speed.
 
     Attributes:
         n: column of the revolutions, for example in `rpm`.
         pull: column of the pull, positive ahead, for example in `N`.
-        thrusters: how many pull together.
+        thrusters: number of thrusters.
     """
 
     n: RevolutionsColumn
@@ -190,19 +191,19 @@ class ActuatorsTaskConfig(Task):
         """Check that the logs can be read.
 
         Raises:
-            ResidnetError: if a column is missing or holds what is no number.
+            ResidnetError: if a column is missing or contains a cell that is not a number.
         """
         for test in self._configured_tests():
             test.read_columns()
 
     def input_files(self) -> list[Path]:
-        """Return the files of all logs that the task reads."""
+        """Return the files of all tests."""
         return [path for test in self._configured_tests() for path in test.files]
 
     def execute(self, folder: RunFolder) -> TaskOutcome:
         """Identify the actuators, and write actuators.json, actuators.yaml and a figure.
 
-        actuators.yaml holds the lines for the section `actuators` of a vessel file.
+        actuators.yaml contains the section `actuators` of a vessel file.
 
         Raises:
             ResidnetError: if the logs cannot be used or do not determine the actuators.
@@ -336,7 +337,7 @@ def _read_columns(path: Path, columns: Sequence[CsvColumn]) -> tuple[np.ndarray,
 
 
 def build_parameter_table(actuator_json: Mapping[str, Any]) -> Table:
-    """Return a row for each parameter of actuators.json with its 95 % interval."""
+    """Return a table of the parameters of actuators.json with 95 % confidence intervals."""
     rows: list[JsonObject] = []
     for test, test_results in actuator_json.items():
         estimates = test_results.items() if isinstance(test_results, Mapping) else ()
@@ -380,7 +381,7 @@ def plot_actuator_tests(
     step_data: tuple[Sequence[MeasuredStep], StepResponse] | None = None,
     bollard_data: tuple[np.ndarray, np.ndarray, tuple[ThrustFit, ThrustFit]] | None = None,
 ) -> Figure:
-    """Draw measurements as dots and the fits over them, a panel for each test (Figs. 4, 6, 7).
+    """Plot measurements and fitted curves, one panel for each test (document 003, Figs. 4, 6, 7).
 
     Args:
         throttle_data: throttle [N], revolutions [N] in 1/s, and the fitted map.

@@ -1,4 +1,4 @@
-"""Realistic logs of a simulated boat with the faults of real ones, to try things on."""
+"""`residnet demo`: realistic logs of a simulated boat, with typical errors of recordings."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ DEMO_TRIALS: dict[str, Any] = {
         "v": 0.03,
         "r": "0.2 deg/s",
         "sensors": {
-            # the receiver tells where the antenna was 0.3 s ago
+            # the position of the receiver is delayed by 0.3 s
             "x": {"noise": 0.03, "latency": "300 ms"},
             "y": {"noise": 0.03, "latency": "300 ms"},
             "psi": {"noise": "0.3 deg"},
-            # the rudder's zero was set by eye
+            # offset of the rudder angle sensor
             "delta": {"bias": "2 deg", "noise": "0.1 deg"},
             "n": {"noise": 0.05},
             "wind_speed": {"noise": 0.3},
@@ -65,19 +65,20 @@ COLUMN_NAMES = {
     "wind_dir": ("true wind direction [deg]", 180.0 / np.pi),
 }
 _GAP_SECONDS = (30.0, 32.5)
-"""Seconds that every fifth log lacks."""
+"""Start and end in s of the gap in every fifth log."""
 _START_EPOCH = 1_717_000_000
-"""Unix time at which the made recordings begin, in May 2024."""
+"""Unix time of the start of the recordings, in May 2024."""
 
 
 def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:
-    """Write the logs in several layouts; returns what to say.
+    """Write the logs in several layouts; returns the lines for the terminal.
 
     Args:
-        folder: that a folder for each layout is made in.
+        folder: parent of the folders of the layouts.
+        overwrite: replace the logs of an earlier demo.
 
     Raises:
-        UsageError: if they exist already, or cannot be written.
+        UsageError: if the logs exist already, or cannot be written.
     """
     manifest = Manifest(folder)
     for name in LAYOUTS:
@@ -114,7 +115,7 @@ def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:
 
 
 def _cut_gap(log: Log, number: int) -> Log:
-    """Return every fifth log without some seconds."""
+    """Cut a gap of some seconds into every fifth log."""
     is_kept_mask = np.ones(len(log), dtype=bool)
     if number % 5 == 0:
         is_kept_mask = (log.t < _GAP_SECONDS[0]) | (log.t >= _GAP_SECONDS[1])
@@ -123,7 +124,7 @@ def _cut_gap(log: Log, number: int) -> Log:
 
 
 def _to_recorder_table(log: Log) -> pd.DataFrame:
-    """Return a log in the units of its recorder, its time first."""
+    """Return the table of a log in the units of its recorder, with the time first."""
     import pandas as pd
 
     table = {"time [s]": np.round(log.t, 3)}
@@ -140,7 +141,7 @@ _ACTUATOR_COLUMNS = [COLUMN_NAMES[name][0] for name in ("delta", "n")]
 
 
 def _actuators_as_pulses(table: pd.DataFrame) -> pd.DataFrame:
-    """Return rudder and propeller as the pulses that drive them, in us: 35 deg, 1500 rpm."""
+    """Convert rudder and propeller commands to pulse widths in us (full scale 35 deg, 1500 rpm)."""
     rudder, propeller = (table[name] for name in _ACTUATOR_COLUMNS)
     table = table.drop(columns=_ACTUATOR_COLUMNS)
     table["rudder_pwm"] = (1500.0 + 500.0 / 35.0 * rudder).round().astype(int)
@@ -149,9 +150,9 @@ def _actuators_as_pulses(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _split_recorders(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return what a receiver with compass and anemometer writes, and what the motors do."""
+    """Split a log into the tables of a receiver with compass and anemometer, and of the motors."""
     actuator_table = _actuators_as_pulses(table)[["time [s]", "rudder_pwm", "motor_pwm"]]
-    # the board was switched on seven seconds before the receiver began
+    # the clock of the motor controller starts seven seconds before the receiver
     actuator_table["time [s]"] = (1e3 * actuator_table["time [s]"] + 7e3).round().astype(int)
     receiver_table = table.drop(columns=[*_VELOCITY_COLUMNS, *_ACTUATOR_COLUMNS])[::2]
     receiver_table["time [s]"] += _START_EPOCH
@@ -162,7 +163,7 @@ def _split_recorders(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
 
 def _decimate_columns(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return positions in each fifth row and wind in each tenth, as one logger of all writes."""
+    """Keep positions in each fifth row and wind in each tenth, like a logger of several sensors."""
     table = table.copy()
     for stride, names in ((5, ("x", "y")), (10, ("wind_speed", "wind_dir"))):
         table.loc[np.arange(len(table)) % stride > 0, [COLUMN_NAMES[name][0] for name in names]] = (
@@ -188,4 +189,4 @@ LAYOUTS: dict[str, tuple[str, Callable[[pd.DataFrame], dict[str, pd.DataFrame]]]
         lambda table: {"": table[["time [s]", *_SURGE_COLUMNS]]},
     ),
 }
-"""Folder -> what it holds, and the tables of a log by the word that its file's name begins with."""
+"""Layouts by folder: description, and function that returns the tables by prefix of the file."""

@@ -1,6 +1,6 @@
-"""`residnet new`: a complete config of a fit from logs alone, with a comment at each guess.
+"""`residnet new`: draft a complete config of a fit from logs, with a comment on each guess.
 
-What drives the vessel is chosen among channels that say the same.
+The inputs of the model are selected from channels of commands and actuators.
 """
 
 from __future__ import annotations
@@ -56,20 +56,20 @@ _UNMATCHED_COLUMN_NOTES = (
     "fields that no channel takes",
 )
 _MAX_INSPECTED_LOGS = 12
-"""Logs that the data doctor looks at."""
+"""Maximum number of logs that are inspected."""
 _MAX_SHOWN_GUESSES = 12
-"""Guesses that the terminal shows."""
+"""Maximum number of guesses shown on the terminal."""
 
 
 @dataclass(frozen=True)
 class ConfigDraft:
-    """A config that runs, and what of it is a guess.
+    """A drafted config that runs without changes, with its guessed values.
 
     Attributes:
-        config: the content of the YAML file.
-        guesses: key -> why its value is a guess.
-        text: the YAML with its comments.
-        warnings: what the logs hold and the config does not use, and what would mislead a fit.
+        config: content of the YAML file.
+        guesses: pairs of a key and the reason of its guess.
+        text: the YAML text with comments.
+        warnings: unused channels and logs, and errors of the data that would mislead a fit.
     """
 
     config: dict[str, Any]
@@ -81,7 +81,7 @@ class ConfigDraft:
         """Write the config as YAML with its comments; returns the path of the file.
 
         Raises:
-            UsageError: if the file cannot be written, or is not residnet's to replace.
+            UsageError: if the file cannot be written, or was not written by residnet.
         """
         path = Path(file)
         with write_owned(path) as partial:
@@ -96,10 +96,13 @@ def write_new_config(
     *,
     overwrite: bool,
 ) -> list[str]:
-    """Write a config for logs; returns what the terminal shows.
+    """Draft a config for logs and write it; returns the lines for the terminal.
 
     Args:
-        answer_question: asks the user; None takes every default.
+        logs: files, folders and bags.
+        output_file: file of the config.
+        answer_question: asks the user; None for the default answers.
+        overwrite: replace an earlier config.
 
     Raises:
         UsageError: if the file exists already, or a path does not.
@@ -134,14 +137,16 @@ def write_new_config(
 def draft_fit_config(
     paths: Sequence[Path], folder: Path, name: str, answer_question: AnswerCallback | None = None
 ) -> ConfigDraft:
-    """Return a config for logs that the task `fit` runs as it is.
+    """Draft a config of the task `fit` for logs.
 
     Args:
-        folder: where the config will lie; its paths start from there.
-        answer_question: answers questions; None takes every default and marks it.
+        paths: files, folders and bags.
+        folder: folder of the config; its paths are relative to this folder.
+        name: name of the run.
+        answer_question: answers questions; None for the default answers, marked as guesses.
 
     Raises:
-        UsageError: if a path does not exist, or nothing drives the vessel in the logs.
+        UsageError: if a path does not exist.
         DataError: if no log can be used.
     """
     draft_notes = DraftNotes(answer_question)
@@ -151,20 +156,20 @@ def draft_fit_config(
         channel_names = ", ".join(next(iter(draft_logs.complete_logs.values())).channels)
         draft_notes.add_guess(
             INPUTS_KEY,
-            "no channel of the logs is a rudder, a propeller or another command (they hold"
-            f" {channel_names}): a model without them can only predict how the vessel coasts; name the"
-            " columns that drive it",
+            "no channel of the logs is a rudder, a propeller or another command (channels:"
+            f" {channel_names}): a model without inputs can only predict how the vessel coasts; name"
+            " the columns of the commands",
         )
     elif missing := missing_control(inputs, draft_logs.dof):
         draft_notes.add_guess(
             INPUTS_KEY,
-            f"nothing among the inputs {missing} the vessel; where a column that no channel takes"
-            " does, name it under data.reader.channels",
+            f"no input {missing} the vessel; if an unused column does, name it under"
+            " data.reader.channels",
         )
     inputs = draft_logs.keep_inputs(inputs, draft_notes)
     dof = draft_logs.dof
     finding_codes, quality_warnings = _data_quality_warnings(list(draft_logs.logs.values()), inputs)
-    # torch takes 190 MB, which do not stand beside what the doctor takes of a long log
+    # importing torch takes 190 MB: the inspection of long logs is done before
     from residnet.identification.recipe import (
         PreparationPlan,
         choose_integrator,
@@ -191,7 +196,7 @@ def draft_fit_config(
         if name in measured_channels and name not in ROLL_LAYOUT.dynamic_states
     ]
     if depth_channels and not dof.is_six_dof:
-        text = f"{', '.join(depth_channels)}: left out: six degrees of freedom need depth, pitch and roll"
+        text = f"{', '.join(depth_channels)}: not used: six degrees of freedom need depth, pitch and roll"
         draft_notes.add_note(
             CHANNELS_KEY, f"{text} angles, and u and v or a position, that move in all logs"
         )
@@ -199,7 +204,7 @@ def draft_fit_config(
         {*WIND_INPUTS} <= {*log.channels} for log in draft_logs.logs.values()
     ):
         draft_notes.add_note(
-            CHANNELS_KEY, "the wind is left out: its loads need u, v, r and a measured heading"
+            CHANNELS_KEY, "the wind is not used: its loads need u, v, r and a measured heading"
         )
     preparation = preparation_recipe.to_config()
     for text in quality_warnings:
@@ -212,7 +217,7 @@ def draft_fit_config(
     )
     root, split_entries = _split_logs(draft_logs, usable_logs, folder, draft_notes)
     if not splits_from_names(list(usable_logs.values())):
-        # a split that the folders tell stays as it is
+        # a split given by the names of folders is not changed
         _move_short_logs_to_training(
             split_entries, preparation_recipe.correlation_time, draft_notes
         )
@@ -225,7 +230,8 @@ def draft_fit_config(
     draft_notes.add_note(("prepare", "grid"), preparation_recipe.reason)
     draft_notes.add_note(
         ("evaluation", "protocols"),
-        f"free runs as long as most logs hold; {evaluation_settings['selection']} chooses, on validation logs",
+        f"free runs of a length that most logs contain; {evaluation_settings['selection']} is used for"
+        " model selection on validation logs",
     )
     draft_notes.add_note(
         ("evaluation", "scales"), "standard deviations over training and validation logs"
@@ -258,7 +264,7 @@ def draft_fit_config(
 def _data_quality_warnings(
     logs: Sequence[Log], inputs: Sequence[str]
 ) -> tuple[set[str], list[str]]:
-    """Return the codes of what the data doctor finds in some of the logs, and its words."""
+    """Inspect some of the logs; returns codes and texts of the findings above a note."""
     texts_by_code: dict[str, list[str]] = {}
     warnings = []
     for log in logs[:: max(1, len(logs) // _MAX_INSPECTED_LOGS)]:
@@ -281,12 +287,13 @@ class _DraftLogs:
 
     Attributes:
         reader: `data.reader` of the config.
-        dof: velocities that most of the logs tell.
-        logs: path -> log, in SI, as the reader gives it.
-        complete_logs: path -> the same with the motion at every sample.
-        exclusion_reasons: path -> why it is not used.
-        longest_times: path -> the longest time in s without a gap that preparing leaves of it.
-        longest_gapless_time: returns that of any part of a log, in SI as the reader gives it.
+        dof: degrees of freedom that most of the logs measure.
+        logs: log by path, in SI units, as returned by the reader.
+        complete_logs: log by path, with the motion at every sample.
+        exclusion_reasons: reason by path of a log that is not used.
+        longest_times: longest usable time in s without a gap after preparation, by path.
+        longest_gapless_time: function that returns the longest usable time in s of any part of a
+            log.
     """
 
     longest_gapless_time: Callable[[Log], float]
@@ -298,7 +305,7 @@ class _DraftLogs:
         self.exclusion_reasons = {path: str(error) for path, error in draft_result.errors.items()}
         self.logs: dict[Path, Log] = {}
         self.complete_logs: dict[Path, Log] = {}
-        # parts that are not sure to be of one moment would teach a wrong answer
+        # parts whose relative time is uncertain would bias the fitted response
         ambiguous_logs = {
             path: finding["text"]
             for path, log in draft_result.logs.items()
@@ -322,7 +329,7 @@ class _DraftLogs:
             except ResidnetError as error:
                 self.exclusion_reasons[path] = str(error)
         if not self.complete_logs:
-            # what the names of columns did not tell may be what is missing
+            # an unrecognised column may be the missing channel
             unmatched_notes = "; ".join(
                 text for _, text in draft_notes.notes if text.startswith(_UNMATCHED_COLUMN_NOTES)
             )
@@ -330,9 +337,7 @@ class _DraftLogs:
             raise DataError(f"{reason} ({unmatched_notes})" if unmatched_notes else reason)
 
     def keep_inputs(self, inputs: Sequence[str], draft_notes: DraftNotes) -> tuple[str, ...]:
-        """Rename chosen forces to tau_x, tau_y, tau_n, drop channels that nothing uses; returns the
-        inputs.
-        """
+        """Rename selected forces to tau_x, tau_y, tau_n, and drop unused channels; returns inputs."""
         renamed_inputs = {
             name: next((f for f in ("tau_x", "tau_y", "tau_n") if name.startswith(f"{f}_")), name)
             for name in inputs
@@ -369,7 +374,7 @@ class _DraftLogs:
     def select_usable(
         self, columns: Sequence[str], preparation: Mapping[str, Any]
     ) -> dict[Path, Log]:
-        """Return the logs that can be prepared; the others are left out with the reason."""
+        """Return the logs that can be prepared; for others, the reason is recorded."""
         from residnet.identification.recipe import longest_usable_duration
         from residnet.preprocessing.prepare import PrepareConfig
 
@@ -399,7 +404,7 @@ class _DraftLogs:
         return {path: log for path, log in usable_logs.items() if path not in copies}
 
     def header_lines(self) -> list[str]:
-        """Return the lines at the top of the config."""
+        """Return the comment lines at the top of the config."""
         lines = [
             "Drafted by `residnet new` from the logs alone. Lines with 'guess' say what the logs do"
             " not tell, and why this value was taken: read them before the results are trusted."
@@ -423,22 +428,21 @@ class _DraftLogs:
 
 
 _SplitEntry = tuple[Any, Log, float]
-"""Entry of a split in a config, its log with the whole motion, and the longest time in s without a
-gap that preparing leaves of it."""
+"""Entry of a split in a config, its log, and the longest usable time in s without a gap."""
 
 
 def _split_logs(
     draft_logs: _DraftLogs, usable_logs: Mapping[Path, Log], folder: Path, draft_notes: DraftNotes
 ) -> tuple[str, dict[str, list[_SplitEntry]]]:
-    """Return the folder of the logs and their split.
+    """Return the common folder of the logs and their split.
 
     Raises:
-        DataError: if nothing that can be prepared is left of the logs for a split.
+        DataError: if no usable log is available for a split.
     """
     paths = {log.name: path for path, log in usable_logs.items()}
     common_folder = Path(os.path.commonpath([path.resolve().parent for path in usable_logs]))
     relative_root = os.path.relpath(common_folder, folder.resolve())
-    # absolute where it lies far from the config
+    # the path is absolute if the folder is far from the config
     root = (
         common_folder.as_posix()
         if relative_root.count("..") > 2
@@ -454,7 +458,7 @@ def _split_logs(
     for split, logs in split_logs(list(usable_logs.values())).items():
         for log in logs:
             segment_limits = log.meta.get("stretch")
-            # the name of a stretch begins with that of its log, and may with a shorter one
+            # the name of a stretch starts with the name of its log; a shorter log name may match, too
             matching_names = [
                 n for n in paths if n == log.name or (segment_limits and log.name.startswith(n))
             ]
@@ -500,7 +504,7 @@ def _split_logs(
 def _move_short_logs_to_training(
     split_entries: dict[str, list[_SplitEntry]], memory_time: float, draft_notes: DraftNotes
 ) -> None:
-    """Learn from the logs that are too short to be judged on, but for the last one of a split."""
+    """Move logs that are too short for evaluation to the training split, unless it is the last one."""
     from residnet.identification.recipe import choose_window_length, make_protocols
 
     for name in SPLITS[1:]:
@@ -529,30 +533,30 @@ _NON_INPUT_CHANNELS = (
     *(*WIND_INPUTS, *BOW_WIND_CHANNELS, "current_north", "current_east"),
 )
 _MIN_RELATIVE_STD = 2e-3
-"""Spread of an input, as a share of its size, below which it stays where it is."""
+"""Standard deviation of an input, relative to its magnitude, below which it is constant."""
 _MIN_DUPLICATE_CORRELATION = 0.9995
-"""Correlation from which two inputs count as one."""
+"""Correlation above which two inputs are considered identical."""
 _MAX_INPUTS = 8
-"""Most inputs that a drafted config takes."""
+"""Maximum number of inputs of a drafted config."""
 _FORCE_CHANNELS = ("tau_x", "tau_y", "tau_n")
 
 
 def choose_inputs(logs: Sequence[Log], draft_notes: DraftNotes) -> tuple[str, ...]:
-    """Return the channels that drive the vessel; empty if the logs hold none.
+    """Select the input channels of the model; empty if the logs contain none.
 
-    Those that stay where they are, what was ordered beside what was measured, and one of two that
-    move alike are left out.
+    Constant channels, commands whose outcome is measured, and one of two identical channels are
+    not selected.
 
     Args:
-        logs: in SI.
-        draft_notes: is told what was left out and why.
+        logs: logs in SI units.
+        draft_notes: receives the reasons for channels that are not selected.
     """
     values = {
         name: np.concatenate([log[name] for log in logs])
         for name in logs[0].channels
         if name not in _NON_INPUT_CHANNELS and all(name in log.channels for log in logs)
     }
-    # the signals of a control loop: of e_yaw, r_yaw, u_yaw and y_yaw the second drives the vessel
+    # signals of a control loop: of e_yaw, r_yaw, u_yaw and y_yaw only u_yaw is an input
     control_loops = {
         n[2:] for n in values if n.startswith("y_") and {f"u{n[1:]}", f"r{n[1:]}"} <= {*values}
     }
@@ -584,7 +588,7 @@ def choose_inputs(logs: Sequence[Log], draft_notes: DraftNotes) -> tuple[str, ..
             inputs.append(name)
             continue
         if name in CHANNEL_UNITS and duplicate not in CHANNEL_UNITS:
-            # an angle or revolutions say more than a share or pulses
+            # an angle or a shaft speed is more informative than a share or a pulse width
             inputs[inputs.index(duplicate)], name, duplicate = name, duplicate, name
         draft_notes.add_guess(
             INPUTS_KEY, f"{name} moves as {duplicate} does in every log, and is left out"
@@ -597,7 +601,7 @@ def choose_inputs(logs: Sequence[Log], draft_notes: DraftNotes) -> tuple[str, ..
 
 
 def _is_actuator_name(name: str, draft_notes: DraftNotes) -> bool:
-    """Return whether the name of a channel does not say that it measures something else."""
+    """Return whether the name of a channel allows that it is an input."""
     parsed_name = parse_name(name)
     if match_input_channel(parsed_name) is not None:
         return True
@@ -627,7 +631,7 @@ def _is_excited(name: str, values: np.ndarray, draft_notes: DraftNotes) -> bool:
 def _choose_force_set(
     logs: Sequence[Log], names: Sequence[str], draft_notes: DraftNotes
 ) -> list[str]:
-    """Return one set of forces where there are any; it stands for all actuators."""
+    """Return one set of force channels, which replaces all actuators; empty if there is none."""
     force_sets: dict[str, list[str]] = {}
     for name in names:
         force = next((f for f in _FORCE_CHANNELS if name == f or name.startswith(f"{f}_")), None)
@@ -651,7 +655,7 @@ def _choose_force_set(
 
 
 def _explained_variance(logs: Sequence[Log], names: Sequence[str]) -> float:
-    """Return the mean share of the accelerations that velocities and inputs explain in a line."""
+    """Return the mean R² of a linear regression of the accelerations on velocities and inputs."""
     rows, velocity_changes = [], []
     for log in logs:
         columns = [name for name in (*STATE_NAMES[3:], *names) if name in log.channels]
@@ -677,7 +681,7 @@ def _explained_variance(logs: Sequence[Log], names: Sequence[str]) -> float:
 
 
 def _prefer_measured_inputs(names: Sequence[str], draft_notes: DraftNotes) -> list[str]:
-    """Return the channels without commands whose outcome is measured, and thrust beside turns."""
+    """Remove commands whose outcome is measured, and thrust if the shaft speed is measured."""
     shaft_inputs = [name for name in names if name == "n" or name.startswith("n_")]
     selected = []
     for name in names:
@@ -723,16 +727,15 @@ def _are_duplicates(first: np.ndarray, second: np.ndarray) -> bool:
 
 
 def missing_control(names: Sequence[str], dof: DegreesOfFreedom = SURGE_SWAY_YAW) -> str:
-    """Return what no input does, `drives` or `steers`; empty if both are done.
+    """Return the missing effect of the inputs, `drives` or `steers`; empty if none is missing.
 
-    A vessel that does not turn needs none that steers, one that does not move none that drives.
-
-    Forces, thrusters that turn, and several thrusters do both.
+    A vessel without yaw needs no input that steers, a vessel without surge none that drives. Forces,
+    azimuth thrusters and several thrusters have both effects.
     """
     base_names = [name.removeprefix("cmd_") for name in names if not PLANE_PATTERN.match(name)]
     is_steering = [name.startswith("delta") for name in base_names]
     is_driving = [name in ("n", "thrust", "throttle") for name in base_names]
-    # one whose name says neither may do either
+    # an input with an unknown name may have either effect
     undetermined = [
         n for n, s, d in zip(base_names, is_steering, is_driving, strict=True) if not (s or d)
     ]

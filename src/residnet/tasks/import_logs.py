@@ -1,4 +1,4 @@
-"""Task `import`: recordings of any format become canonical logs with findings."""
+"""Task `import`: convert recordings of any format to canonical logs and inspect them."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ from residnet.runs.folder import RunFolder
 from residnet.runs.task import SummaryMetric, Task, TaskOutcome
 
 _MAX_CHECKED_BYTES = 50_000_000
-"""Bytes of the largest recording that a check reads."""
+"""Size in bytes of the largest recording that a check reads."""
 _NOTE_LEVEL = "note"
 
 
 class ImportConfig(Task):
-    """Recordings of any format that become canonical logs, with what was noticed on the way in.
+    """Convert recordings of any format to canonical logs and inspect them.
 
     Attributes:
-        reader: how the recordings are read.
-        root: folder that `logs` start from; the current folder if not given.
+        reader: format of the recordings and channel map.
+        root: folder of relative paths in `logs`; the current folder if not given.
         logs: files, folders (for readers of folders) or patterns such as `raw_*`.
     """
 
@@ -60,8 +60,7 @@ class ImportConfig(Task):
         The smallest recording of each kind of file is read, unless it is large.
 
         Raises:
-            ResidnetError: if a pattern matches nothing, or a recording cannot be read as the
-                config says.
+            ResidnetError: if a pattern matches nothing, or the reader cannot read a recording.
         """
         reader = self.reader.build()
         smallest_by_suffix: dict[str, tuple[int, Path]] = {}
@@ -79,11 +78,11 @@ class ImportConfig(Task):
         return [file for path in self._find_paths() for file in list_files(path)]
 
     def execute(self, folder: RunFolder) -> TaskOutcome:
-        """Read the recordings, and write logs and findings.
+        """Convert the recordings, and write logs and findings.
 
         Raises:
             UsageError: if a recording, topic or package is missing.
-            DataError: if a recording cannot be used; those before it have been written.
+            DataError: if a recording cannot be used; earlier recordings are already written.
         """
         paths = self._find_paths()
         reader, names = self.reader.build(), assign_log_names(paths)
@@ -164,10 +163,10 @@ def _expand_pattern(root: Path, pattern: str) -> list[Path]:
 
 
 def plot_recordings(logs: Sequence[Log]) -> Figure:
-    """Return the tracks of the recordings, one to be chosen; else a channel that all of them hold.
+    """Return a figure of the tracks; without positions, of a channel that all logs contain.
 
     Args:
-        logs: at least one; positions count from the first of each.
+        logs: at least one log; positions are relative to the first one of each log.
     """
     common_channels = [
         name for name in logs[0].channels if all(name in log.channels for log in logs)
@@ -199,7 +198,7 @@ def plot_recordings(logs: Sequence[Log]) -> Figure:
 
 
 def warning_lines(findings: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
-    """Return a line for each finding above a note, by the name of its log."""
+    """Return a line for each finding above the level `note`, by name of the log."""
     return [
         f"{log}: {finding['level']}: {format_minus_signs(str(finding['text']))}"
         for log, log_findings in findings.items()
@@ -209,7 +208,7 @@ def warning_lines(findings: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[s
 
 
 def describe_log(log: Log, findings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return what a log holds, and how many of its findings are above a note."""
+    """Return a summary of a log with its number of findings above the level `note`."""
     return {
         "log": log.name,
         "samples": len(log),
@@ -224,7 +223,7 @@ def describe_log(log: Log, findings: Sequence[Mapping[str, Any]]) -> dict[str, A
 
 
 def tabulate_logs(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return a row for each log, as `describe_log` describes it."""
+    """Return a table with the summary of each log, see `describe_log`."""
     return build_table(
         rows,
         [
@@ -245,7 +244,7 @@ def tabulate_logs(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def tabulate_channels(log: Log) -> Table:
-    """Return a row for each channel: unit, range, and how many samples are missing."""
+    """Return a table with unit, range and missing samples of each channel."""
     rows = []
     for name, values in log.channels.items():
         unit, factor = display_unit(log.units.get(name, "-"))

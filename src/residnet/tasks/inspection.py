@@ -1,4 +1,4 @@
-"""`residnet inspect`: the data doctor over files."""
+"""`residnet inspect`: check log files for errors that would mislead a fit."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ if TYPE_CHECKING:
     from residnet.tasks.fit.config import FitConfig
 
 _ILL_CONDITIONED = 1e6
-"""Condition number from which regressors leave their coefficients to the noise."""
+"""Condition number of regressors above which noise dominates the coefficients."""
 
 
 @dataclass(frozen=True)
 class InspectionResult:
-    """What the doctor found.
+    """Findings of an inspection.
 
     Attributes:
-        text: for the terminal.
-        content: the same for JSON (schema residnet.inspection/1).
+        text: text for the terminal.
+        content: content of the JSON file (schema residnet.inspection/1).
     """
 
     text: str
@@ -49,7 +49,7 @@ class InspectionResult:
 
     @property
     def has_problems(self) -> bool:
-        """Whether a fit to these logs would be misled."""
+        """Whether the findings would mislead a fit to these logs."""
         return bool(self.content["misled"])
 
     def write(self, file: Path) -> None:
@@ -63,11 +63,12 @@ class InspectionResult:
 
 
 def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult:
-    """Return what the doctor finds in each log and between them.
+    """Inspect each log, and the logs in comparison.
 
     Args:
-        config: a run or import whose channel map reads them; None if they describe themselves,
-            or to have a map drafted.
+        paths: files or folders of logs.
+        config: config of a fit or import whose channel map reads the logs; None for logs that
+            describe themselves, or to draft a channel map.
 
     Raises:
         ResidnetError: if a path does not exist, the config cannot be used, or the only log
@@ -98,7 +99,7 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult
                 results[file] = reader.read(file)
             except DataError as error:
                 results[file] = error
-    # files that only belong to others are no logs
+    # companion files of another log are not logs
     files = [file for file in files if file in results]
     names = assign_log_names(files)
     logs: list[Log] = []
@@ -141,12 +142,12 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult
 
 
 def _load_logs_task(config: Path) -> tuple[Any, FitConfig | None]:
-    """Return the task of a config that says how its logs are read, and the same if it is a fit.
+    """Load a config with a channel map; returns the task, and the task again if it is a fit.
 
     Raises:
-        ConfigError: if it is no config of logs.
+        ConfigError: if the config has no channel map.
     """
-    # logs that need no config need neither models nor torch
+    # torch is not needed to inspect logs without a config
     from residnet.io.sources import MeasuredLogs
     from residnet.tasks.fit.config import FitConfig
     from residnet.tasks.import_logs import ImportConfig
@@ -163,14 +164,14 @@ def _load_logs_task(config: Path) -> tuple[Any, FitConfig | None]:
 
 
 def _split_of_logs(fit_config: FitConfig, names: Mapping[Path, str]) -> dict[str, str]:
-    """Return the split of each log that the config names."""
+    """Return the split of each log that is part of the config's split."""
     from residnet.io.sources import MeasuredLogs
 
     assert isinstance(fit_config.data, MeasuredLogs)
     try:
         resolved = fit_config.data.split.resolve_paths()
     except ConfigError:
-        # the split's own files need not be here to look at others
+        # other logs can be inspected although files of the split are missing
         return {}
     split_by_path = {path.resolve(): split for split, paths in resolved.items() for path in paths}
     return {
@@ -181,7 +182,7 @@ def _split_of_logs(fit_config: FitConfig, names: Mapping[Path, str]) -> dict[str
 
 
 def _check_regressor_conditioning(logs: Sequence[Log], fit_config: FitConfig) -> list[Finding]:
-    """Return how well the prepared logs condition the regressors of each baseline."""
+    """Return findings on the condition number of the regressors of each baseline."""
     from residnet.baselines.regressors import RegressorBaseline
     from residnet.preprocessing.prepare import make_samples, prepare_log
 
@@ -230,7 +231,7 @@ def _check_regressor_conditioning(logs: Sequence[Log], fit_config: FitConfig) ->
             else ""
         )
         conditioning_figures = {"condition": condition, "regressors": len(varying_indices)}
-        # a log or two are looked at, not fitted: what they lack others have
+        # one or two logs are inspected, but not fitted: other logs may excite the regressors
         level: Any = "will mislead" if is_ill_conditioned and len(logs) > 2 else "note"
         findings.append(Finding(level, "regressors", text, conditioning_figures, action))
     return findings

@@ -1,6 +1,4 @@
-"""Task `study`: variants of one fit, each over several seeds, in one table with paired intervals
-(an ablation).
-"""
+"""Task `study`: ablation of a fit, with several seeds for each variant and paired intervals."""
 
 from __future__ import annotations
 
@@ -52,16 +50,16 @@ class StudyConfig(Task):
     """Variants of one fit, each over several seeds, compared window by window.
 
     Attributes:
-        base: config of a fit, by its path or by the name of one that comes with residnet; paths in
-            it are taken from its own folder.
+        base: config of a fit: a path, or the name of a config that comes with residnet; paths in it
+            are relative to its own folder.
         common: overrides of the base for all variants.
-        variants: overrides by the variant's name; the files differ in nothing else.
-        reference: the variant that the others are compared with.
-        model: whose free-run errors are compared; `selected` for the one that each run selects on
-            validation data.
-        split: whose windows.
-        seeds: each variant is fitted with each of them.
-        workers: runs at a time, one process each.
+        variants: overrides of the base by name of the variant.
+        reference: variant with which the others are compared.
+        model: model whose free-run errors are compared; `selected` for the model that each run
+            selects on validation data.
+        split: split of the compared windows.
+        seeds: seeds with which each variant is fitted.
+        workers: number of runs in parallel processes.
     """
 
     task: Literal["study"]
@@ -86,7 +84,7 @@ class StudyConfig(Task):
         return self
 
     def build_overrides(self, variant: str, seed: int) -> list[str]:
-        """Overrides of the base for one run."""
+        """Return the overrides of the base for one run."""
         return [
             *self.common,
             *self.variants[variant],
@@ -95,11 +93,11 @@ class StudyConfig(Task):
         ]
 
     def check(self) -> None:
-        """Check that every variant is a valid fit, holds the model and finds its files.
+        """Check that every variant is a valid fit with the compared model.
 
         Raises:
-            ConfigError: if one does not.
-            UsageError: if one has no such model.
+            ConfigError: if a variant is not a valid config.
+            UsageError: if a variant has no such model.
         """
         for variant in self.variants:
             fit = load_config(self.base, self.build_overrides(variant, self.seeds[0]), FitConfig)
@@ -118,7 +116,7 @@ class StudyConfig(Task):
         return self.seeds[0]
 
     def execute(self, folder: RunFolder) -> TaskOutcome:
-        """Fit all variants and write the comparison; runs that are there already are kept.
+        """Fit all variants and write the comparison; finished runs are reused.
 
         Raises:
             ResidnetError: if a variant cannot be run, or the system ends a process.
@@ -187,11 +185,11 @@ class StudyConfig(Task):
 
 
 def _summarize_variants(rows: Sequence[dict[str, Any]], reference: str) -> list[str]:
-    """Return for each protocol which variant has the least error, and by how much."""
+    """Return a sentence for each protocol on the variant with the lowest error."""
     sentences = []
     for protocol in dict.fromkeys(row["protocol"] for row in rows):
         protocol_rows = [row for row in rows if row["protocol"] == protocol]
-        # the error of runs that diverged is the constant-velocity error: a steady variant comes before them
+        # diverged runs have the constant-velocity error: variants without them are ranked first
         best_row = min(
             protocol_rows, key=lambda row: (int(row["diverged"]) > 0, float(row["nrmse_mean"]))
         )
@@ -223,7 +221,7 @@ def _summarize_variants(rows: Sequence[dict[str, Any]], reference: str) -> list[
 
 
 def _run_variant(study: StudyConfig, variant: str, seed: int, folder_path: Path) -> float:
-    """Run one variant with one seed unless it is finished; returns the seconds that it took."""
+    """Run one variant with one seed unless it is finished; returns the duration in s."""
     if not RunFolder(folder_path).is_finished:
         overrides = study.build_overrides(variant, seed)
         load_config(study.base, overrides, FitConfig).run(
@@ -240,14 +238,14 @@ def compute_window_errors(run: Path, model: str, split: str) -> pd.DataFrame:
     """Return the errors of one model of a finished run, from its stored rollouts.
 
     Args:
-        model: name of a model, `selected` for the one chosen on validation data.
+        model: name of a model; `selected` for the model chosen on validation data.
 
     Returns:
-        A row for each window: protocol, log, window, nrmse (mean over what moves; a window that
-        diverged has the error of `constant_velocity`) and diverged.
+        A row for each window: protocol, log, window, nrmse (mean over the velocities; a diverged
+        window has the error of `constant_velocity`) and diverged.
 
     Raises:
-        DataError: if the run holds no such model or split.
+        DataError: if the run has no such model or split.
     """
     import pandas as pd
 
@@ -280,8 +278,8 @@ def compare_variants(errors: pd.DataFrame, reference: str) -> list[dict[str, Any
     95 % interval by blocks of windows.
 
     Args:
-        errors: as of `compute_window_errors`, by variant and seed.
-        reference: name of the variant that differences are taken to.
+        errors: results of `compute_window_errors`, by variant and seed.
+        reference: name of the reference variant.
     """
     import pandas as pd
 
@@ -319,10 +317,10 @@ def compare_variants(errors: pd.DataFrame, reference: str) -> list[dict[str, Any
 
 
 def plot_differences(rows: Sequence[JsonObject], reference: str) -> Figure:
-    """Draw the differences to the reference with their intervals, a panel for each protocol.
+    """Plot the differences to the reference with intervals, one panel for each protocol.
 
     Args:
-        reference: name of the variant that differences are taken to.
+        reference: name of the reference variant.
     """
     protocols = list(dict.fromkeys(row["protocol"] for row in rows))
     names = [name for name in dict.fromkeys(row["variant"] for row in rows) if name != reference]
@@ -378,10 +376,10 @@ def plot_differences(rows: Sequence[JsonObject], reference: str) -> Figure:
 
 
 def tabulate_variants(rows: Sequence[JsonObject], reference: str) -> Table:
-    """Return a row for each variant with its error and difference under each protocol.
+    """Return the table of variants with error and difference under each protocol.
 
     Args:
-        reference: name of the variant that differences are taken to.
+        reference: name of the reference variant.
     """
     by_variant: dict[str, dict[str, JsonObject]] = {}
     for row in rows:
@@ -389,7 +387,7 @@ def tabulate_variants(rows: Sequence[JsonObject], reference: str) -> Table:
     protocols = list(dict.fromkeys(row["protocol"] for row in rows))
 
     def format_error(row: JsonObject) -> Cell:
-        # a study of an earlier version does not know what diverged
+        # results of earlier versions have no count of diverged windows
         n_diverged = int(row.get("diverged", 0))
         note = f"{n_diverged} diverged" if n_diverged else ""
         protocol_rows = [other for other in rows if other["protocol"] == row["protocol"]]

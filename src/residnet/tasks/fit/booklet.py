@@ -42,14 +42,17 @@ def write_booklet(
     logs: Mapping[str, Sequence[PreparedLog]],
     limit: np.ndarray,
 ) -> str:
-    """Fly, and write booklet.json and booklet.parquet; returns a line for the log.
+    """Simulate the booklet; write booklet.json and booklet.parquet; returns a line for the log.
 
     Args:
-        config: what to fly.
-        limit: [n] of what moves beyond which a free run has diverged.
+        folder: run folder.
+        config: settings of the booklet.
+        fitted_model: the refitted baseline.
+        logs: prepared logs by split.
+        limit: velocities [n] beyond which a simulated run has diverged.
 
     Raises:
-        ResidnetError: if the model cannot fly the manoeuvres, or no interval can be had.
+        ResidnetError: if the model cannot perform the manoeuvres, or no interval is available.
     """
     import pandas as pd
 
@@ -94,7 +97,7 @@ def write_booklet(
         motion_by_draw = [(-1, page.measured_log)] if page.measured_log is not None else []
         motion_by_draw += [(i, f.true_log) for i, f in enumerate(page.runs) if page.indices[i]]
         for draw, log in motion_by_draw:
-            # of drawn flights every half second or so
+            # trajectories of the draws are stored about every half second
             stride = max(round(0.5 / float(log.t[1] - log.t[0])), 1) if draw > 0 else 1
             columns = {name: log[name][::stride] for name in STATE_NAMES}
             rudder_angle = log[rudder] if rudder in log.channels else log[f"cmd_{rudder}"]
@@ -110,11 +113,11 @@ def write_booklet(
 
 
 def require_flyable(config: BookletConfig, fitted_model: FittedModel) -> None:
-    """Check that a model can be steered through the booklet's manoeuvres; nothing is flown.
+    """Check that a model has the inputs and states of the booklet, without a simulation.
 
     Raises:
-        ConfigError: if an input or a state is not the model's.
-        UsageError: if the model lacks what a manoeuvre needs.
+        ConfigError: if the model lacks an input or a state of the config.
+        UsageError: if the model lacks a state that a manoeuvre needs.
     """
     craft = _build_craft(config, fitted_model, config.inputs)
     make_manoeuvre_source(
@@ -127,7 +130,7 @@ def require_flyable(config: BookletConfig, fitted_model: FittedModel) -> None:
 def _build_craft(
     config: BookletConfig, fitted_model: FittedModel, inputs: Mapping[str, InputShare]
 ) -> SimulatedVessel:
-    """Return the model behind the gear of its inputs; its rows are draws."""
+    """Return the model with its actuators as a simulated vessel; batch rows are draws."""
     spec, model = fitted_model.spec, fitted_model.model.double()
     gear = GivenActuators(inputs, spec.signals.exogenous, spec.dt)
     actuated = ActuatedDynamics(model, spec.signals.input_columns, spec.hold, gear)
@@ -149,7 +152,7 @@ def _simulate_draws(
     fitted_model: FittedModel,
     manoeuvres: Sequence[Manoeuvre],
 ) -> Iterator[list[ManoeuvreRun]]:
-    """Yield the flights of each manoeuvre: fitted parameters first, then the drawn ones."""
+    """Yield the simulated runs of each manoeuvre: fitted parameters first, then the draws."""
     parameter_draws = sample_parameters(fitted_model, config.draws, config.seed)
     repeated_manoeuvres = [
         manoeuvre for manoeuvre in manoeuvres for _ in range(len(parameter_draws))
@@ -173,7 +176,7 @@ def _simulate_draws(
 
 
 def _initial_state_of_log(craft: SimulatedVessel, log: Log) -> torch.Tensor:
-    """State [1, nx] that a log began with, as far as it holds the states of a craft."""
+    """Return the initial state [1, nx] of a log, for the states that it contains."""
     x = craft.initial_state[:1].clone()
     for column, name in enumerate(craft.helm.state):
         if name in log.channels and np.isfinite(log[name][0]):
@@ -182,9 +185,7 @@ def _initial_state_of_log(craft: SimulatedVessel, log: Log) -> torch.Tensor:
 
 
 def sample_parameters(fitted_model: FittedModel, draws: int, seed: int) -> torch.Tensor:
-    """Parameters of a refitted baseline: as fitted, then `draws` times from their normal
-    distribution, [1 + draws, ...].
-    """
+    """Return fitted parameters and `draws` samples of their normal distribution, [1 + draws, ...]."""
     baseline = fitted_model.model.baseline
     assert isinstance(baseline, ParametricBaseline), "the configuration was validated"
     assert fitted_model.covariance is not None, "the configuration was validated"
@@ -200,7 +201,7 @@ def sample_parameters(fitted_model: FittedModel, draws: int, seed: int) -> torch
 
 
 def _input_shares_from_logs(config: BookletConfig, logs: Sequence[Log]) -> dict[str, InputShare]:
-    """Return the shares of the inputs; full drive and steer are the most that the logs have."""
+    """Return the input shares with full drive and steer scaled to the largest inputs of the logs."""
     rudder = config.steering_input()
     max_rudder = max(identify_zigzag(log, rudder).angle for log in logs)
     return {
@@ -216,10 +217,11 @@ def _input_shares_from_logs(config: BookletConfig, logs: Sequence[Log]) -> dict[
 def _replicate_zigzag(
     log: Log, rudder: str, shares: Mapping[str, InputShare], time_step: float
 ) -> tuple[Zigzag, Zigzag]:
-    """Return the zigzag of a log, and the same with reversals where its rudder left its side.
+    """Return the zigzag of a log, and the same with the reversals at the measured headings.
 
-    The gear of a model moves at once, the trial's did after its order took effect. A bound on the
-    heading is seen at the next step, on average half a step of `time_step` seconds late.
+    The steering gear of the model reacts immediately, the real one after a delay: the headings at
+    which the measured rudder leaves its position are used. Reversals are detected half a step of
+    `time_step` seconds late on average, which is corrected.
     """
     steered_indices = identify_zigzag(log, rudder)
     drive_shares = [
@@ -241,9 +243,7 @@ def _replicate_zigzag(
 
 
 def is_valid_flight(flight: ManoeuvreRun, limit: np.ndarray) -> bool:
-    """Whether a flight ended as it should, with what moves within the limit [n] beyond which a free
-    run has diverged.
-    """
+    """Return whether a run ended by its stop condition with all velocities below the limit [n]."""
     motion_states = np.abs(flight.true_log.stack(ROLL_LAYOUT.dynamic_states[: len(limit)]))
     return flight.fault_text is None and bool((motion_states <= limit).all())
 
@@ -256,10 +256,10 @@ def _make_page(
     log: Log | None = None,
     split: str = "",
 ) -> BookletPage:
-    """One manoeuvre with its indices by flight, beside those of the log that it repeats.
+    """Return the page of one manoeuvre: indices of all draws and of the repeated log.
 
     Raises:
-        DataError: if the fitted model itself does not end the manoeuvre, or diverges.
+        DataError: if the run with fitted parameters does not end, or diverges.
     """
     manoeuvre, name = flights[0].manoeuvre, flights[0].true_log.name
     if flights[0].fault_text:

@@ -60,13 +60,13 @@ _MODEL_ALIASES = ("predictor", "selected")
 
 
 def check(config: FitConfig) -> None:
-    """Check that the logs hold what every part of the fit asks for, without fitting.
+    """Check that the logs contain all that the parts of the fit need, without fitting.
 
-    Measured logs are read. In the place of simulated ones, which take long to fly, stand logs
-    of the same channels, lengths and kinds.
+    Measured logs are read. Simulated trials, whose simulation takes long, are replaced by logs of
+    the same channels, lengths and manoeuvres.
 
     Raises:
-        ResidnetError: what the run itself would refuse before it fits anything.
+        ResidnetError: if the run would refuse the config or its logs.
     """
     settings: FitSettings = config
     if isinstance(config.data, SimulatedTrials):
@@ -74,7 +74,7 @@ def check(config: FitConfig) -> None:
         split_names = config.data.assign_splits(config.data.draw_manoeuvres())
         for log, split in zip(make_dummy_logs(config.data), split_names, strict=True):
             logs[split].append(log)
-        # what masks leave of a motion is not known before it is flown
+        # the effect of masks is unknown before the trials are simulated
         prepare = config.prepare.model_copy(update={"masks": ()})
         settings = config.model_copy(update={"prepare": prepare})
     else:
@@ -141,7 +141,7 @@ def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:
                 )
             )
         except DataError as error:
-            # the fit itself is done, and its report is worth having
+            # the fit is complete: write its report before the error ends the run
             failure = str(error)
     exports = {
         name: partial(export_model, config, ExportRequest(folder, name))
@@ -159,23 +159,10 @@ def evaluate_on_logs(
     resume: bool = False,
     overwrite: bool = False,
 ) -> FinishedRun:
-    """Free-run every model of a fit on logs that it has never seen.
-
-    Its reader, masks, protocols and scales are used; `constant_velocity` comes first, then the config's
-    order.
-
-    Args:
-        output_folder: folder of the results; RUN/external-<time> if none is given.
-        resume: carry out an interrupted evaluation of the same logs again in its folder.
-        overwrite: replace an earlier evaluation in its folder.
-
-    Raises:
-        DataError: if a log cannot be used or is too short.
-        UsageError: if a path or a channel is missing, or the folder may not be used.
-    """
+    """Evaluate all models in free run on other logs; see `FitConfig.evaluate_on_logs`."""
     folder_path = output_folder or run.path / time.strftime("external-%Y%m%dT%H%M%S")
     resolved = dump_config(config)
-    # before the logs are read, which may take long
+    # refuse an unusable folder before the logs are read, which may take long
     require_apart(folder_path, [run.resolved_config])
     RunFolder(folder_path).require_usable(resolved, resume=resume, overwrite=overwrite)
     input_paths, raw_logs, prepared = read_external_logs(config, logs)
@@ -205,7 +192,7 @@ def evaluate_on_logs(
         evaluations = evaluate_splits(
             models, {EXTERNAL_SPLIT: prepared}, config.evaluation, config.prepare.grid.step, limit
         )
-        # bands, and why the model was selected, are the fit's own; the report shows them
+        # the report shows bands and model selection of the fit
         for source_path, target_path in (
             (run.bands, folder.bands),
             (run.selection, folder.selection),
@@ -225,16 +212,7 @@ def evaluate_on_logs(
 
 
 def export_model(config: FitConfig, request: ExportRequest) -> Path:
-    """Export one model of a fit, and return the file.
-
-    `predictor` stands for the one that is reported first, `selected` for the single one chosen
-    on validation data.
-
-    Raises:
-        UsageError: if there is no such model.
-        WithheldError: if it is worse than doing without it, but for `asked.anyway`.
-        ExportError: if the exported model does not agree with the one that it came from.
-    """
+    """Export one model of a finished fit; see `FitConfig.export_model`."""
     run, name, metrics = request.run, request.model, request.run.read_metrics()
     model_name = str(metrics.get(name, metrics["selected"])) if name in _MODEL_ALIASES else name
     available_models = model_names(run.models)
@@ -247,7 +225,7 @@ def export_model(config: FitConfig, request: ExportRequest) -> Path:
         row for row in metrics["rows"] if row["model"] == model_name and row["manoeuvre"] == "all"
     ]
     found = collect_evidence(RunFiles(run.path), model_name)
-    # a model without free runs on the split that counts has no verdict
+    # a model without free runs on the reported split has no verdict
     sentences = write_verdict(found) if model_name in found.rows_by_model else []
     judged = (rate_model(found), sentences)
     return request.write(

@@ -1,4 +1,4 @@
-"""What free runs of a fit's models leave in a folder, be it of the run or of another evaluation."""
+"""Result files of the free runs of a fit, for the run itself and for later evaluations."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ EXTERNAL_SPLIT = "external"
 def write_inspection(
     folder: RunFolder, splits: Mapping[str, Sequence[Log]], config: FitConfig
 ) -> None:
-    """Write doctor.json: what the doctor finds in all logs as the run's masks leave them."""
-    # a check does not wait for the doctor
+    """Write doctor.json: the inspection of all logs with the masks of the run."""
+    # the check of a config does not need this import
     from residnet.quality import (
         build_inspection,
         inspect_log,
@@ -59,7 +59,7 @@ def write_inspection(
             log_message(f"  {report.name}: {finding.text}")
     inspection_json = build_inspection(reports, joint_report)
     folder.write_json(folder.path / "doctor.json", inspection_json)
-    # the tally stands in the verdict; what may be corrected is told before the fit takes its time
+    # a correctable error is reported before the fit takes its time; the verdict counts all findings
     if first_finding := summarize_inspection(inspection_json).first_action:
         log_message(f"  {first_finding}")
 
@@ -71,13 +71,14 @@ def write_evaluation(
     names: tuple[str, str | None, str],
     logs: Mapping[str, Sequence[PreparedLog]],
 ) -> None:
-    """Write what free runs show: rollouts, metrics.json, limits.json and data_quality.json.
+    """Write rollouts, metrics.json, limits.json and data_quality.json.
 
     Args:
-        folder: of the run, or of an evaluation.
+        folder: folder of the run, or of an evaluation.
+        config: config of the fit.
         evaluations: free runs by split.
-        names: of the selected model, of the selected mean of models, and of the predictor.
-        logs: by split, those that were not judged too.
+        names: names of the selected model, of the selected ensemble, and of the predictor.
+        logs: prepared logs by split, including splits without evaluation.
     """
     for split, evaluation in evaluations.items():
         write_rollouts(
@@ -140,10 +141,10 @@ def build_fit_outcome(
     """Return the verdict of a fit or an evaluation, and the errors of its selected model.
 
     Args:
-        folder: where the results stand.
-        split: that is shown.
-        exports: what writes each export when the run ends; None for none.
-        failure_message: a line where a result fails a check.
+        folder: folder of the results.
+        split: split of the shown errors.
+        exports: functions that write the exports when the run ends; None for none.
+        failure_message: message if a result failed a check; empty otherwise.
     """
     files = RunFiles(folder.path)
     row = files.find_row(files.main_model, split, files.protocols[0])
@@ -176,16 +177,16 @@ def build_fit_outcome(
 def read_external_logs(
     config: FitConfig, paths: Sequence[Path]
 ) -> tuple[list[Path], list[Log], list[PreparedLog]]:
-    """Return the files of other logs, the logs, and the logs prepared as those of the fit.
+    """Read other logs like those of a fit; returns their files, the logs, and prepared logs.
 
-    They are read as the fit read its own; canonical files are recognised by their own mark.
+    The reader of the fit is used. Canonical files are recognised by their metadata.
 
     Raises:
         ResidnetError: if a file cannot be read.
     """
     data = config.data
     fit_reader = CanonicalConfig() if isinstance(data, SimulatedTrials) else data.reader
-    # a folder may be one log, as a ROS 2 bag is, or hold sheets and lines of JSON
+    # a folder may be a single log, such as a ROS 2 bag
     log_paths = fit_reader.build().select_logs(find_log_files(paths))
     readers = {
         path: (CanonicalConfig() if Log.is_canonical_log(path) else fit_reader).build()
@@ -212,7 +213,7 @@ def read_external_logs(
 
 
 def divergence_limit(spec: ModelSpec, config: FitConfig) -> np.ndarray:
-    """Return the |u, v, r| [3] beyond which a free run of a model has diverged."""
+    """Return the absolute velocities [n] beyond which a free run of a model has diverged."""
     return compute_velocity_limits(
         np.array(spec.low), np.array(spec.high), config.evaluation.divergence, spec.signals.dof
     )

@@ -1,4 +1,4 @@
-"""A fit in service: watched on new logs, refitted to a changed vessel, its next trials planned."""
+"""Services of a finished fit: monitoring of new logs, recursive refit, planning of trials."""
 
 from __future__ import annotations
 
@@ -78,23 +78,23 @@ if TYPE_CHECKING:
     from residnet.tasks.fit.config import FitConfig
 
 _MAX_NAMED_CAUSES = 3
-"""Causes that are named."""
+"""Maximum number of hypotheses in the text output."""
 _HOLD_OUT_RATIO = 3
-"""One log of so many, the last ones, is kept to judge a refit by."""
+"""One of this many logs, the last ones, is held out to evaluate a refit."""
 _MAX_SHOWN_TRIALS = 12
-"""Candidates for trials in the table."""
+"""Maximum number of candidate trials in the table."""
 
 
 @dataclass(frozen=True)
 class MonitoredLog:
-    """What a monitor found in one log.
+    """Result of monitoring one log.
 
     Attributes:
-        name: of the log.
-        alarm_time: time in s from its start to the first alarm; None if there was none.
-        final_verdict: the verdict at its end.
-        window_seconds: length of its windows in s.
-        scores: the largest score of any cause after each of them.
+        name: name of the log.
+        alarm_time: time in s from the start of the log to the first alarm; None without alarm.
+        final_verdict: verdict at the end of the log.
+        window_seconds: length of the windows in s.
+        scores: largest score of all hypotheses after each window.
     """
 
     name: str
@@ -105,7 +105,7 @@ class MonitoredLog:
 
     @property
     def n_windows(self) -> int:
-        """How many windows it held."""
+        """Number of windows."""
         return len(self.scores)
 
     def to_json(self) -> dict[str, Any]:
@@ -130,7 +130,7 @@ class MonitoredLog:
         }
 
     def to_lines(self) -> list[str]:
-        """Return what was found in words."""
+        """Return the result as lines for the terminal."""
         alarm_text = (
             "no alarm" if self.alarm_time is None else f"ALARM after {self.alarm_time:.0f} s"
         )
@@ -146,16 +146,18 @@ class MonitoredLog:
 
 
 class FittedModelService:
-    """A model in service, the watch over it, and the logs that are new.
+    """A model in service with its change detector and new logs.
 
     Args:
-        log_paths: logs, in the order of time.
-        model: name of the model; `selected` for the one chosen on validation data.
-        settings: of `MonitorConfig`.
+        config: config of the fit.
+        run: folder of the fit.
+        log_paths: new logs, in the order of time.
+        model: name of the model; `selected` for the model chosen on validation data.
+        settings: keys of `MonitorConfig`.
 
     Raises:
         UsageError: if there is no such model or path.
-        DataError: if a log cannot be used, or clean logs are too few.
+        DataError: if a log cannot be used, or there are too few reference logs.
     """
 
     def __init__(
@@ -174,7 +176,7 @@ class FittedModelService:
             raise UsageError(f"{run.path}: no model '{name}'{suggest_name(name, valid_names)}")
         self.config, self.run, self.fitted_model = config, run, store.load(name)
         self.input_paths, _, self.logs = read_external_logs(config, log_paths)
-        # clean logs over ground, as new ones are: a current is taken out of either alike
+        # reference logs over ground like the new ones: the detector removes currents from both
         clean_splits = prepare_splits(config.load_logs(), config)
         reference_logs = [*clean_splits["train"], *clean_splits["validation"]]
         self.detector = ChangeDetector.from_logs(
@@ -182,10 +184,10 @@ class FittedModelService:
         )
 
     def monitor_logs(self) -> list[MonitoredLog]:
-        """Watch the logs one after the other; what is looked back over goes on between them.
+        """Monitor the logs one after the other; the score statistics continue between logs.
 
         Raises:
-            DataError: if a log holds no window.
+            DataError: if a log contains no window.
         """
         online_detector, monitored = OnlineChangeDetector(self.detector), []
         for log in self.logs:
@@ -210,21 +212,22 @@ class FittedModelService:
 
 
 def write_monitoring_page(folder: Path, logs: Sequence[MonitoredLog]) -> Path:
-    """Write the page of what a monitor found: which logs raise an alarm, and the scores over time.
+    """Write the monitoring page with the alarms and the scores over time; returns the page.
 
     Args:
-        logs: in the order of time.
+        folder: folder of the page.
+        logs: results in the order of time.
     """
     step = logs[0].window_seconds / 60.0
     logs_with_alarm = [log for log in logs if log.alarm_time is not None]
     summary = [
-        f"No alarm in {format_count(len(logs), 'log')}: the model fits them as it fitted its own."
+        f"No alarm in {format_count(len(logs), 'log')}: the innovations are as those of the reference logs."
     ]
     if logs_with_alarm:
         likeliest_change = logs_with_alarm[-1].final_verdict.hypotheses[0].change
         summary = [
             f"ALARM in {len(logs_with_alarm)} of {format_count(len(logs), 'log')}: as if {likeliest_change.description}.",
-            "Another cause may look alike: see the scores of all causes.",
+            "Other causes may have similar effects: see the scores of all causes.",
         ]
     log_end_times = step * np.cumsum([log.n_windows for log in logs])
     scores = np.concatenate([log.scores for log in logs])
@@ -237,7 +240,7 @@ def write_monitoring_page(folder: Path, logs: Sequence[MonitoredLog]) -> Path:
     figure = Figure(
         "scores",
         "Largest score over time",
-        "The largest score of any cause after each window; above the threshold it is an alarm.",
+        "Largest score of all causes after each window; a score above the threshold is an alarm.",
         {
             "score": replace(SOLID_STYLE, label="largest score"),
             "threshold": replace(DASHED_STYLE, label="threshold", kind="across"),
@@ -296,14 +299,14 @@ def write_monitoring_page(folder: Path, logs: Sequence[MonitoredLog]) -> Path:
 
 @dataclass(frozen=True)
 class RefitResult:
-    """What a recursive refit has found, and whether it is worth taking.
+    """Result of a recursive refit, evaluated on held-out logs.
 
     Attributes:
-        recursive_refit: the changes that were put into the model.
-        folder: of the new run; None if the monitor named no change to refit.
-        old: mean free-run error (NRMSE) of the old model on the logs that were held out.
-        new: that of the new one.
-        worth: whether the new one is better by more than a paired interval leaves open.
+        recursive_refit: identified changes of the model.
+        folder: folder of the new run; None if no change was identified.
+        old: mean free-run error (NRMSE) of the old model on the held-out logs.
+        new: mean free-run error (NRMSE) of the new model on the held-out logs.
+        worth: whether the new model is significantly better by a paired interval.
     """
 
     recursive_refit: RecursiveRefit
@@ -313,7 +316,7 @@ class RefitResult:
     worth: bool = False
 
     def to_lines(self) -> list[str]:
-        """Return what was found in words."""
+        """Return the result as lines for the terminal."""
         lines = [
             f"refit: {changed_parameter.change.name} {changed_parameter.estimated_size:+.3g} +- {changed_parameter.standard_error:.2g} {changed_parameter.change.unit}, after"
             f" each log {', '.join(f'{size_after_log:+.3g}' for size_after_log in changed_parameter.size_by_log)}"
@@ -353,30 +356,32 @@ class RefitResult:
 
 
 def require_refit_folder(run: RunFolder, output_folder: Path, config: FitConfig) -> None:
-    """Check that a refit may write its run, before any work.
+    """Check that the folder of a refit can be written, before any work.
 
     Raises:
-        UsageError: if the folder exists, or lies within that of the old run.
+        UsageError: if the folder exists, or lies in the folder of the fit.
     """
     if output_folder.resolve().is_relative_to(run.path.resolve()):
         raise UsageError(
-            f"{output_folder}: lies within the run {run.path}, which a refit leaves as it is; give another"
+            f"{output_folder}: lies in the run {run.path}, which a refit does not change; choose another"
             " folder for --refit"
         )
     RunFolder(output_folder).require_usable(dump_config(config))
 
 
 def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
-    """Refit a model on the first two thirds of the new logs, and judge it on the others.
+    """Refit a model on the first two thirds of the new logs, and evaluate it on the others.
 
-    The new run holds `constant_velocity`, the old model under its name, and the new one as `<name>_refit`.
+    The new run contains `constant_velocity`, the old model under its name, and the new model as
+    `<name>_refit`.
 
     Args:
-        service: the model, the watch over it and the new logs.
+        service: the model, its change detector and the new logs.
+        output_folder: folder of the new run.
 
     Raises:
-        UsageError: if the folder may not be used, or the model has no parameters to move.
-        DataError: if there are fewer than two logs, or one is too short.
+        UsageError: if the folder may not be used, or the model has no parameters to change.
+        DataError: if there are fewer than two logs, or a log is too short.
     """
     config, original_model = service.config, service.fitted_model
     if len(service.logs) < 2:
@@ -473,11 +478,11 @@ def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
 
 @dataclass(frozen=True)
 class NextTrials:
-    """The next trials of a run.
+    """Planned trials for a refitted baseline.
 
     Attributes:
-        model: the refitted baseline that they are for.
-        plan: candidates and choice.
+        model: name of the refitted baseline.
+        plan: candidate and selected trials.
     """
 
     model: str
@@ -485,7 +490,7 @@ class NextTrials:
 
     @property
     def table(self) -> Table:
-        """The candidates, the most telling per minute first; those to run are marked."""
+        """Candidates in the order of information per minute; selected trials are marked."""
         return build_table(
             self.plan.candidates[:_MAX_SHOWN_TRIALS],
             [
@@ -503,7 +508,7 @@ class NextTrials:
                     str,
                 ),
             ],
-            caption=f"Candidates for {self.model}, by what they narrow per minute.",
+            caption=f"Candidate trials for {self.model}, in the order of information per minute.",
             is_selected=lambda trial: any(
                 trial is selected_trial for selected_trial in self.plan.selected_trials
             ),
@@ -511,19 +516,19 @@ class NextTrials:
 
     @property
     def recommendation(self) -> str:
-        """What to run, and by how much that narrows predictions, in a sentence."""
+        """Sentence with the selected trials and the expected reduction of the prediction intervals."""
         names = ", ".join(trial.simulated_run.true_log.name for trial in self.plan.selected_trials)
         return (
-            f"Run {names}: together they narrow the intervals of predictions by"
-            f" {100 * self.plan.uncertainty_reduction:.0f} %, as the model expects it."
+            f"Run {names}: the model expects that together they narrow the prediction intervals by"
+            f" {100 * self.plan.uncertainty_reduction:.0f} %."
         )
 
     def to_text(self) -> str:
-        """Return the table and the choice in words."""
+        """Return the table and the recommendation as text."""
         return f"{self.table.to_text()}\n{self.recommendation}"
 
     def write_files(self, folder: Path) -> list[Path]:
-        """Write the chosen manoeuvres as YAML, tracks as CSV, and a page; returns the files."""
+        """Write the selected manoeuvres as YAML, tracks as CSV, and a page; returns the files."""
         with record_folder(folder):
             return self._write(folder)
 
@@ -551,7 +556,7 @@ class NextTrials:
         }
         panel = Panel("north [m]", "east [m]", kind="map", height=300)
         figure = Figure(
-            "tracks", "Tracks", "As the model flies them.", style_family(curves), [panel],
+            "tracks", "Tracks", "Simulated by the model.", style_family(curves), [panel],
             [Case("", [curves])],
         )  # fmt: skip
         shown = Section(
@@ -566,7 +571,7 @@ class NextTrials:
 def plan_next_trials(
     config: FitConfig, run: RunFolder, model: str, limits: Mapping[str, Any]
 ) -> NextTrials:
-    """Return the trials that would tell most about a refitted baseline, see `FitConfig`."""
+    """Plan the most informative trials for a refitted baseline; see `FitConfig.plan_trial`."""
     trial_limits = validate_config(dict(limits), TrialLimits, "plan-trial")
     refitted_names = [name for name in config.refit if "refit" in run.read_fit_notes(name)]
     if not refitted_names:
@@ -601,7 +606,7 @@ def plan_next_trials(
         input_shares = infer_input_shares(fitted_model.spec)
     else:
         initial = {key: float(value) for key, value in booklet.initial.items()}
-        # zigzags and turns of one kind fly together
+        # manoeuvres of one kind are simulated in one batch
         manoeuvres = sorted(booklet.manoeuvres, key=lambda manoeuvre: manoeuvre.kind)
         goal, input_shares = PredictionGoal(manoeuvres, booklet.duration, initial), booklet.inputs
     return NextTrials(
