@@ -1,6 +1,6 @@
-"""Contracts of every kind of part, to be run by residnet and by packages that add parts to it.
+"""Contract checks of all kinds of parts, for the tests of residnet and of third-party packages.
 
-Each function takes a part and raises an `AssertionError` of one line where it breaks a contract:
+Each function checks a part and raises an `AssertionError` of one line if it violates a contract:
 
     from residnet.testing import check_head
     from my_package.heads import TideConfig

@@ -1,6 +1,6 @@
-"""Contracts of heads, baselines, vessels, manoeuvres, readers and export formats.
+"""Contract checks of heads, baselines, vessels, manoeuvres, readers and export formats.
 
-Each complaint is one line that names the part, what it does, and what it should do.
+Every error message is one line with the part, the actual and the expected behaviour.
 """
 
 from __future__ import annotations
@@ -60,15 +60,15 @@ from residnet.physics.vessel import load_vessel
 from residnet.preprocessing.prepare import PrepareConfig, make_samples, prepare_log
 
 EXAMPLE_SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").with_thrusters()
-"""Inputs of the example models: the revolutions of two propellers, and the forces they make."""
+"""Signals of the example models: revolutions of two propellers and their forces."""
 
 ROLLING_SIGNALS = SignalsConfig(inputs=("delta", "cmd_thrust"), velocities=("u", "v", "r", "p"))
-"""Inputs of example models of a patrol vessel that rolls."""
+"""Signals of example models of a patrol vessel with roll."""
 
 SUBMERGED_SIGNALS = SignalsConfig(
     inputs=("delta", "delta_s", "n"), velocities=("u", "v", "r", "w", "p", "q")
 )
-"""Inputs of example models of a torpedo in six degrees of freedom."""
+"""Signals of example models of a torpedo-shaped vehicle in six degrees of freedom."""
 
 _VESSEL_OF_LAYOUT = {
     PLANAR_LAYOUT: "wam_v_cal",
@@ -77,7 +77,7 @@ _VESSEL_OF_LAYOUT = {
 }
 
 EXAMPLE_TIME_STEP = 0.1
-"""Step of the example models in s."""
+"""Time step of the example models in s."""
 
 
 _DERIVATIVE_SETTINGS = {"kind": "savitzky_golay", "window": 1.1, "order": 2}
@@ -87,16 +87,16 @@ _DERIVATIVE_SETTINGS = {"kind": "savitzky_golay", "window": 1.1, "order": 2}
 def make_example_samples(
     vessel: str = "", signals: SignalsConfig = EXAMPLE_SIGNALS, duration: float = 20.0
 ) -> Samples:
-    """Return samples of simulated trials: channels z [N, nz], accelerations [N, n], float64, SI.
+    """Simulate trials and return samples: channels z [N, nz], accelerations [N, n], float64, SI.
 
-    Without arguments these are trials of a catamaran with the channels u, v, r, n_port, n_stbd,
-    tau_x, tau_y, tau_n.
+    The default vessel is a catamaran with the channels u, v, r, n_port, n_stbd, tau_x, tau_y,
+    tau_n.
 
     Args:
-        vessel: name of the vessel; that catamaran, a patrol vessel for signals with roll, or a
-            torpedo for six degrees of freedom.
-        signals: what drives the model; channels of the vessel's logs.
-        duration: of each manoeuvre in s.
+        vessel: name of the vessel. If empty, a catamaran, a patrol vessel for signals with roll, or
+            a torpedo-shaped vehicle for six degrees of freedom.
+        signals: inputs of the model, which are channels of the logs of the vessel.
+        duration: duration of each manoeuvre in s.
     """
     trial_settings = SimulatedTrials.model_validate(
         {
@@ -134,10 +134,10 @@ def make_example_samples(
 def make_example_spec(
     head: FeatureConfig | None, signals: SignalsConfig = EXAMPLE_SIGNALS
 ) -> ModelSpec:
-    """Return the description of a model with an equation as baseline and a head, or none.
+    """Return the specification of a model with a regression baseline and a head.
 
     Args:
-        head: config of any head.
+        head: config of any head; None for the baseline only.
         signals: inputs, forces and velocities of the model.
     """
     example_channels = make_example_samples(signals=signals).z[
@@ -163,15 +163,15 @@ def make_example_spec(
 
 
 def make_example_models() -> list[tuple[ModelSpec, HybridDynamics]]:
-    """Return fitted models: a baseline alone, one with a memoryless head, one with a memory."""
+    """Return fitted models: a baseline, one with a memoryless head, one with a recurrent head."""
     heads = (None, RidgeConfig(), LstmConfig(hidden_size=4))
     return [(spec, make_example_model(spec)) for spec in map(make_example_spec, heads)]
 
 
 def make_example_model(spec: ModelSpec) -> HybridDynamics:
-    """Return the model of a description from `make_example_spec`, its baseline identified.
+    """Build the model of a specification of `make_example_spec` and identify its baseline.
 
-    A head takes its scales from the example samples; a closed form is fitted on them too.
+    The head is calibrated on the example samples; a closed-form head is fitted to them.
     """
     torch.manual_seed(0)
     model = spec.build()
@@ -198,17 +198,19 @@ _SHORT_SAMPLES = 4
 
 
 def assert_true(condition: bool, message: str) -> None:
-    """Stop where a contract is broken.
+    """Raise an error if a condition is false.
 
     Raises:
-        AssertionError: with the message, where the condition does not hold.
+        AssertionError: with the message.
     """
     if not condition:
         raise AssertionError(message)
 
 
 def assert_close(actual: Tensor, expected: Tensor, tolerance: float, message: str) -> None:
-    """Stop where two tensors of one shape differ by more than a share of the larger number.
+    """Raise an error if two tensors differ by more than a relative tolerance.
+
+    The largest difference is divided by one plus the largest expected magnitude.
 
     Raises:
         AssertionError: with the message and the largest difference.
@@ -222,7 +224,7 @@ def assert_close(actual: Tensor, expected: Tensor, tolerance: float, message: st
 
 
 def assert_finite(values: Tensor, message: str) -> None:
-    """Stop where a tensor holds what is no number.
+    """Raise an error if a tensor has infinite or NaN elements.
 
     Raises:
         AssertionError: with the message.
@@ -230,11 +232,11 @@ def assert_finite(values: Tensor, message: str) -> None:
     assert_true(bool(torch.isfinite(values).all()), message)
 
 
-def _traced(module: nn.Module, examples: tuple[Tensor, ...], who: str) -> Any:
-    """Record a module as a TorchScript graph, as training and exports do with a model's step."""
+def _trace_module(module: nn.Module, examples: tuple[Tensor, ...], subject: str) -> Any:
+    """Trace a module to a TorchScript graph, as training and exports do with the step."""
     frozen = copy.deepcopy(module).requires_grad_(False)
     try:
-        return trace_function(frozen, examples, who)
+        return trace_function(frozen, examples, subject)
     except ExportError as error:
         raise AssertionError(str(error)) from error
 
@@ -246,42 +248,42 @@ def _check_round_trip(config: Config, config_union: Any, subject: str) -> None:
             validate_config(serialised, config_type, "written")
             for config_type in (type(config), config_union)
         )
-    except Exception as error:  # also of a validator that the part brings
-        raise AssertionError(f"{subject}: its config cannot be read back: {error}") from error
+    except Exception as error:  # validators of a third-party part may raise any error
+        raise AssertionError(f"{subject}: its config cannot be read again: {error}") from error
     assert_true(
         reloaded == config, f"{subject}: its config changes when it is written and read back"
     )
     assert_true(
         type(from_union) is type(config),
-        f"{subject}: its name leads to {type(from_union).__name__} instead",
+        f"{subject}: its kind selects {type(from_union).__name__} instead",
     )
 
 
 def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) -> None:
-    """Check everything that residnet relies on in a head.
+    """Check the contracts of a residual head.
 
-    Shapes and precision, a residual that is not zero, equal answers for equal questions, rows of a
-    batch that do not see each other, sequences that equal steps, the memory of a past, TorchScript,
-    finite answers far outside of the training range, gradients, and a model that is stored and
-    loaded without a change.
+    The checks cover shapes and dtypes, a nonzero residual, deterministic results, independence of
+    the rows of a batch, equality of sequences and steps, the memory after a warm-up, tracing,
+    finite results far outside the training range, gradients, and storing and loading of a model.
 
     Args:
-        config: of the head; it must work with the channels of `make_example_samples`.
-        signals: of the models; those of `examples.ROLLING` move roll too.
+        config: config of the head, which must support the channels of `make_example_samples`.
+        signals: signals of the example models, for example `ROLLING_SIGNALS` for models with roll.
 
     Raises:
-        AssertionError: one line that says which contract is broken.
+        AssertionError: one line with the violated contract.
     """
     subject = f"head {get_kind(type(config))}"
+    # an example model with this head, fitted and stored below
     spec = make_example_spec(config, signals)
     n_dynamic = signals.dof.n_dynamic
     _check_round_trip(config, HeadConfig, subject)
     fitted_model = make_example_model(spec)
     samples = make_example_samples(signals=signals).z
-    # what follows changes precision
+    # the checks change the precision of the copy
     model = copy.deepcopy(fitted_model)
     head = model.head.eval()
-    # channels [4, 12, nz] from the middle of the example samples
+    # channel sequences [_N_ROWS, _N_STEPS, nz] of the example samples
     start_rows = torch.arange(_N_ROWS) * (len(samples) // _N_ROWS) + 30
     z = samples[start_rows[:, None] + torch.arange(_N_STEPS)[None]]
 
@@ -297,6 +299,7 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
         return torch.stack(residuals, dim=1), s
 
     with torch.no_grad():
+        # shape, dtype and determinism of a step in both precisions
         for dtype in (torch.float32, torch.float64):
             first_channels = z[:, 0].to(dtype)
             s = zero_memory(_N_ROWS, dtype)
@@ -315,12 +318,15 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
                 assert_true(shape == (_N_ROWS, n_columns), message)
             assert_true(
                 rho.dtype == next_memory.dtype == dtype,
-                f"{subject}: answers {rho.dtype} and {next_memory.dtype} where it is asked in {dtype}",
+                f"{subject}: returns {rho.dtype} and {next_memory.dtype} for inputs in {dtype}",
             )
             assert_finite(rho, f"{subject}: the residual at a training sample is not finite")
             assert_true(float(rho.abs().max()) > 0, f"{subject}: the residual is zero everywhere")
-            message = f"{subject}: two answers to one question differ; is it in eval?"
+            message = (
+                f"{subject}: two calls with equal inputs differ; is dropout active in eval mode?"
+            )
             assert_true(torch.equal(rho, repeated), message)
+        # sequences, warm-up and rows of a batch agree with single steps
         residuals, memory = run_steps(head, z)
         sequence_residuals = head.teacher_forced_residuals(z)
         assert_close(sequence_residuals, residuals, 1e-9, f"{subject}: sequence differs from steps")
@@ -339,15 +345,19 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
                 message,
             )
             assert_close(run_steps(head, single_row)[0], residuals[i : i + 1], 1e-9, message)
+        # the traced head agrees with the module
         single_precision = z.float()
         rho, memory = run_steps(head.float(), single_precision)
         examples = (single_precision[:, 0], zero_memory(_N_ROWS, torch.float32))
-        traced = head if head.export_error else _traced(head, examples, subject)
+        traced = head if head.export_error else _trace_module(head, examples, subject)
         scripted_residuals, next_memory = run_steps(traced, single_precision)
         assert_close(
             scripted_residuals, rho, 1e-5, f"{subject}: the traced head gives other residuals"
         )
-        assert_close(next_memory, memory, 1e-5, f"{subject}: the traced head keeps another memory")
+        assert_close(
+            next_memory, memory, 1e-5, f"{subject}: the traced head returns another memory"
+        )
+        # extrapolation far outside the training range, and a free run
         head.double()
         far_channels, farther_channels = (
             samples.mean(0) + std_multiple * samples.std(0) for std_multiple in (1e6, 1e9)
@@ -367,19 +377,18 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
         assert_close(states[:, -1], x, 1e-9, message)
         assert_close(memory, s, 1e-9, f"{message}' memory")
     assert_finite(
-        torch.cat((rho, far_residual)), f"{subject}: not finite far outside of the training range"
+        torch.cat((rho, far_residual)), f"{subject}: not finite far outside the training range"
     )
-    assert_finite(memory, f"{subject}: its memory is not finite far outside of the training range")
-    assert_finite(
-        far_sequence, f"{subject}: not finite after 200 steps outside of the training range"
-    )
+    assert_finite(memory, f"{subject}: its memory is not finite far outside the training range")
+    assert_finite(far_sequence, f"{subject}: not finite after 200 steps outside the training range")
     max_inside = float(sequence_residuals.abs().max())
     max_outside = float(far_sequence.abs().max())
     assert_true(
         max_outside < 50 * max_inside + 10,
-        f"{subject}: runs away outside of the training range ({max_outside:.3g}, inside {max_inside:.3g});"
-        " hold the features at its edge (residnet.heads.base.Features)",
+        f"{subject}: diverges outside the training range ({max_outside:.3g}, inside"
+        f" {max_inside:.3g}); clamp the features (residnet.heads.base.Features)",
     )
+    # gradients, and the values that losses and reports use
     first_channels = z[:, 0].clone().requires_grad_()
     head(first_channels, zero_memory(_N_ROWS, z.dtype))[0].sum().backward()
     gradient = first_channels.grad
@@ -394,12 +403,14 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
     assert_true(
         len(parameter_counts) == n_dynamic
         and all(parameter_count >= 0 for parameter_count in parameter_counts),
-        f"{subject}: parameter_count gives {parameter_counts}, not one number for each of {n_dynamic} axes",
+        f"{subject}: parameter_counts returns {parameter_counts}, expected {n_dynamic} numbers",
     )
     assert_true(
         residual_std.shape == (n_dynamic,) and bool((residual_std > 0).all()),
-        f"{subject}: residual_std gives {residual_std.tolist()}, not {n_dynamic} positive numbers",
+        f"{subject}: residual_scale returns {residual_std.tolist()}, expected {n_dynamic} positive"
+        " numbers",
     )
+    # a stored model has the same state and results
     with tempfile.TemporaryDirectory() as folder:
         save_model(Path(folder) / "example", spec, fitted_model)
         stored_spec, stored = load_model(Path(folder) / "example")
@@ -424,19 +435,18 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
 
 
 def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> None:
-    """Check everything that residnet relies on in a baseline.
+    """Check the contracts of a baseline.
 
-    It is identified from samples, twice with the same result; its accelerations have the right
-    shape and precision, are finite, do not depend on the company of a row, can be differentiated
-    and recorded by torch; its numbers survive a state dict, its config a file.
+    The checks cover reproducible identification, shape, dtype and finiteness of the accelerations,
+    independence of the rows of a batch, gradients, tracing, and storing of state and config.
 
     Args:
-        config: of the baseline.
-        samples: whose target is the measured acceleration [N, n]; those of a catamaran with two
-            propellers (`make_example_samples`) where None.
+        config: config of the baseline.
+        samples: samples whose target is the measured acceleration [N, n]; those of
+            `make_example_samples` if None.
 
     Raises:
-        AssertionError: one line that says which contract is broken.
+        AssertionError: one line with the violated contract.
     """
     subject = f"baseline {get_kind(type(config))}"
     training_samples = make_example_samples() if samples is None else samples
@@ -453,10 +463,11 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
         accelerations = baseline(z)
         assert_true(
             accelerations.shape == (len(z), n_dynamic),
-            f"{subject}: the accelerations have the shape {accelerations.shape}, not [N, {n_dynamic}]",
+            f"{subject}: the accelerations have the shape {accelerations.shape},"
+            f" expected [N, {n_dynamic}]",
         )
         assert_finite(accelerations, f"{subject}: its accelerations are not finite")
-        assert_close(refitted(z), accelerations, 0.0, f"{subject}: two fits give different answers")
+        assert_close(refitted(z), accelerations, 0.0, f"{subject}: two fits give different results")
         batched = baseline(z[None].expand(2, -1, -1))
         assert_close(batched[1], accelerations, 1e-12, f"{subject}: fails for channels [B, T, nz]")
         message = f"{subject}: the answer for a row depends on the other rows of the batch"
@@ -464,45 +475,43 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
         single_precision = copy.deepcopy(baseline).float()(z.float())
         assert_true(
             single_precision.dtype == torch.float32,
-            f"{subject}: answers {single_precision.dtype} in float32",
+            f"{subject}: returns {single_precision.dtype} for float32",
         )
         assert_close(
             single_precision.double(), accelerations, 1e-3, f"{subject}: float32 differs too much"
         )
     differentiable = z.clone().requires_grad_()
-    # a baseline that knows nothing may answer with a constant
+    # a baseline may be constant, so add a term that depends on the channels
     (baseline(differentiable).sum() + 0.0 * differentiable.sum()).backward()
     gradient = torch.zeros_like(z) if differentiable.grad is None else differentiable.grad
     assert_finite(gradient, f"{subject}: its gradient with respect to the channels is not finite")
-    traced = _traced(baseline, (z,), subject)
+    traced = _trace_module(baseline, (z,), subject)
     with torch.no_grad():
-        assert_close(traced(z), accelerations, 1e-9, f"{subject}: traced, it answers otherwise")
+        assert_close(traced(z), accelerations, 1e-9, f"{subject}: the traced baseline differs")
     parameter_counts = baseline.parameter_counts()
     assert_true(
         len(parameter_counts) == n_dynamic,
-        f"{subject}: parameter_count gives {parameter_counts}, not one for each axis",
+        f"{subject}: parameter_counts returns {parameter_counts}, expected one per axis",
     )
     unfitted = resolved.build(training_samples.names)
     unfitted.load_state_dict(baseline.state_dict())
     with torch.no_grad():
-        assert_close(
-            unfitted(z), accelerations, 0.0, f"{subject}: its state dict does not hold it all"
-        )
+        assert_close(unfitted(z), accelerations, 0.0, f"{subject}: its state dict is incomplete")
     _check_round_trip(resolved, BaselineConfig, subject)
 
 
 def check_vessel(name: str, time_step: float = 0.1) -> None:
-    """Check that a vessel can be built and stepped.
+    """Check the contracts of a vessel file.
 
-    Its description is one line, its length positive, its motion under half drive finite, and equal
-    for a vessel alone and one of several.
+    The description is one line, the length is positive, and the simulated motion at half drive is
+    finite and does not depend on other rows of the batch.
 
     Args:
-        name: of the vessel, or path of its file.
-        time_step: of the simulation in s.
+        name: name of the vessel, or path of its file.
+        time_step: time step of the simulation in s.
 
     Raises:
-        AssertionError: one line that says which contract is broken.
+        AssertionError: one line with the violated contract.
     """
     subject = f"vessel {name}"
     vessel = load_vessel(name)
@@ -528,26 +537,28 @@ def check_vessel(name: str, time_step: float = 0.1) -> None:
             initial_state[:1], w[:1], dynamics.initial_state(1).to(x.dtype)
         )
     assert_close(
-        next_state, next_states[:1], 1e-12, f"{subject}: moves otherwise beside other vessels"
+        next_state,
+        next_states[:1],
+        1e-12,
+        f"{subject}: its motion depends on the other rows of the batch",
     )
 
 
 def check_manoeuvre(
     manoeuvre: Manoeuvre, vessel: str = "wam_v_cal", duration: float = 30.0
 ) -> ManoeuvreRun:
-    """Check everything that residnet relies on in a manoeuvre, and return a flight of it.
+    """Check the contracts of a manoeuvre and return a simulation of it.
 
-    It is written and read back, flown alone and beside another of its kind with equal results, with
-    a finite motion; inputs that are not commands pass through it; its indices are asked for, of the
-    whole flight and of one that is too short for any.
+    The checks cover storing of the config, a finite motion that does not depend on other rows of
+    the batch, unchanged exogenous inputs, and indices of a complete and of a truncated log.
 
     Args:
-        manoeuvre: what to fly.
-        vessel: name of the vessel that flies it.
-        duration: in s, where the manoeuvre gives none.
+        manoeuvre: the manoeuvre.
+        vessel: name of the simulated vessel.
+        duration: duration in s if the manoeuvre does not define it.
 
     Raises:
-        AssertionError: one line that says which contract is broken.
+        AssertionError: one line with the violated contract.
     """
     subject = f"manoeuvre {get_kind(type(manoeuvre))}"
     reloaded = validate_config(manoeuvre.model_dump(mode="json"), ManoeuvreConfig, "written")
@@ -562,10 +573,10 @@ def check_manoeuvre(
     n_commands = dynamics.plant.n_commands
     assert_true(
         bool((inputs[:, :, n_commands:] == 0.01).all()),
-        f"{subject}: changes inputs that are no commands, such as wind and current",
+        f"{subject}: changes exogenous inputs, such as wind and current",
     )
     for row in range(2):
-        message = f"{subject}: flown beside another one it does something else"
+        message = f"{subject}: its motion depends on the other rows of the batch"
         assert_close(paired_states[row], single_states[0], 1e-9, message)
         assert_close(commands[row, :, :n_commands], inputs[0, :, :n_commands], 1e-9, message)
     helm = Helm.from_plant(plant)
@@ -589,7 +600,7 @@ def check_manoeuvre(
 def _simulate(
     manoeuvres: list[Manoeuvre], dynamics: RecordedPlantDynamics, duration: float
 ) -> tuple[Tensor, Tensor]:
-    """Return states [B, T+1, nx] and inputs [B, T, m] of manoeuvres of one kind side by side."""
+    """Simulate a batch of manoeuvres; return states [B, T+1, nx] and inputs [B, T, m]."""
     plant = dynamics.plant
     helm = Helm.from_plant(plant)
     t = torch.arange(max(round(duration / _TIME_STEP), 2), dtype=torch.float64) * _TIME_STEP
@@ -613,27 +624,27 @@ def _check_indices(indices: dict[str, Any], subject: str) -> None:
         assert_true(
             index_values.dtype.kind in "fiub"
             and bool(np.isfinite(index_values.astype(float)).all()),
-            f"{subject}: its index '{name}' is {value!r}, not finite numbers; leave it out instead",
+            f"{subject}: its index '{name}' is {value!r}, not finite numbers; omit the index instead",
         )
 
 
 def check_reader(config: Config, file: Path) -> Log:
-    """Check everything that residnet relies on in a reader, and return the log that it read.
+    """Check the contracts of a reader and return the log that it reads.
 
-    Time that strictly increases, channels in SI units as float64, a heading without jumps, the
-    file's identity, the same log twice, and one-line errors for a file that is missing, a folder,
-    an empty file and a damaged one.
+    The checks cover strictly increasing time, float64 channels in SI units, an unwrapped heading,
+    the provenance of the file, reproducible results, and one-line errors for a missing file, a
+    folder, an empty file and a corrupt file.
 
     Args:
-        config: of the reader.
-        file: a recording that the reader can read.
+        config: config of the reader.
+        file: a recording in the format of the reader.
 
     Raises:
-        AssertionError: one line that says which contract is broken.
+        AssertionError: one line with the violated contract.
     """
     subject = f"reader {get_kind(type(config))}"
     reader: LogReader = getattr(config, "build")()  # noqa: B009  readers have no common base
-    assert_true(isinstance(reader, LogReader), f"{subject}: build gives no LogReader")
+    assert_true(isinstance(reader, LogReader), f"{subject}: build does not return a LogReader")
     file = Path(file)
     log = reader.read(file)
     reread = reader.read(file)
@@ -651,7 +662,8 @@ def check_reader(config: Config, file: Path) -> Log:
     if "psi" in log.channels:
         psi = log["psi"][np.isfinite(log["psi"])]
         assert_true(
-            bool((np.abs(np.diff(psi)) < np.pi).all()), f"{subject}: psi jumps by half a circle"
+            bool((np.abs(np.diff(psi)) < np.pi).all()),
+            f"{subject}: psi jumps by more than 180 deg; unwrap it",
         )
     missing = [key for key in ("source", "sha256") if key not in log.meta]
     assert_true(not missing, f"{subject}: the log's meta lacks {', '.join(missing)}")
@@ -688,23 +700,24 @@ def _check_error_messages(reader: LogReader, folder: Path, file: Path, subject: 
             assert_true(is_file_named, f"{subject}: its error does not name the file")
         except Exception as error:
             raise AssertionError(
-                f"{subject}: a file that is {description} raises {type(error).__name__}, not {error_type.__name__}"
+                f"{subject}: a file that is {description} raises {type(error).__name__},"
+                f" expected {error_type.__name__}"
             ) from error
         else:
             raise AssertionError(f"{subject}: reads a file that is {description}")
 
 
 def check_exporter(exporter: Exporter) -> None:
-    """Check everything that residnet relies on in an export format.
+    """Check the contracts of an export format.
 
-    It writes the file that it is given, in a folder that does not exist yet, returns a card, leaves
-    the model's numbers as they are, and refuses with one line what it cannot hold.
+    The exporter creates the file and its folder, returns a card, does not change the model, and
+    rejects unsupported models with a one-line error.
 
     Args:
-        exporter: the format.
+        exporter: the export format.
 
     Raises:
-        AssertionError: one line that says which contract is broken.
+        AssertionError: one line with the violated contract.
     """
     subject = f"export format {exporter.name}"
     assert_true(
@@ -721,10 +734,10 @@ def check_exporter(exporter: Exporter) -> None:
                 card = exporter.export(ExportedVessel(spec, model), file)
             except UsageError as error:
                 assert_true(
-                    "\n" not in str(error), f"{subject}: refuses a model in more than one line"
+                    "\n" not in str(error), f"{subject}: rejects a model with more than one line"
                 )
                 assert_true(
-                    not file.exists(), f"{subject}: leaves a file of a model that it refuses"
+                    not file.exists(), f"{subject}: writes a file of a model that it rejects"
                 )
                 continue
             assert_true(file.exists(), f"{subject}: writes no {file.name}")
@@ -744,32 +757,32 @@ _PAST_STEPS = 6
 _FREE_STEPS = 8
 """Number of steps of that free run."""
 _BAD_STEP_INDEX = 3
-"""Step of bad values: good ones come before it and after it."""
+"""Index of the step with bad values; all other steps have valid values."""
 _FAR_VALUES = (1e38, -1e38, 1e20, -1e20, 1e9, -1e9, 1e5)
 _BAD_VALUES = (float("nan"), float("inf"), float("-inf"), *_FAR_VALUES)
-"""Values that stand in the place of an entry; times of the range's edge are drawn as well."""
+"""Bad values of an entry, in addition to random multiples of the limits of its range."""
 
 
 def check_bad_inputs(
     exported: Any, spec: ModelSpec, model: HybridDynamics, *, cases: int = 200, seed: int = 0
 ) -> None:
-    """Check that an exported model gives a flag and finite numbers, whatever it is given.
+    """Check that an exported model flags bad inputs and always returns finite values.
 
-    Each case is a short free run in which entries of a state, of inputs or of a memory are replaced
-    at one step by what is no number, infinite or far off. All that comes out is finite; what is
-    beyond the training range is flagged, and nothing else; what is not flagged is the model's own
-    answer; good samples after the bad one are answered as if it had not been.
+    Each case is a short free run. At one step, elements of the state, the inputs or the memory are
+    NaN, infinite or far outside the training range. All results must be finite. The flag must be
+    set for values outside the range and for no others. Unflagged results must equal those of the
+    model, and results after the bad step must not depend on it.
 
     Args:
-        exported: anything with `initial_state`, `warmup`, `time_step` and `rollout` that takes and gives
-            tensors, as `residnet.export.base` says.
-        spec: of the model that was exported.
-        model: that model; its precision is changed to float32.
+        exported: an object with the methods `initial_state`, `warmup`, `step` and `rollout` of
+            `residnet.export.base`.
+        spec: specification of the model.
+        model: the model; it is converted to float32.
         cases: number of free runs.
-        seed: of the cases.
+        seed: random seed of the cases.
 
     Raises:
-        AssertionError: one line that says which contract is broken.
+        AssertionError: one line with the violated contract.
     """
     subject = f"exported {spec.name}"
     guard = GuardedDynamics(model.float().eval(), spec)
@@ -792,7 +805,10 @@ def check_bad_inputs(
         w = w[:, _PAST_STEPS:]
         s = exported.warmup(past_states, past_inputs)
         assert_close(
-            s, model.warmup(past_states, past_inputs), 1e-4, f"{subject}: warms up otherwise"
+            s,
+            model.warmup(past_states, past_inputs),
+            1e-4,
+            f"{subject}: the memory after the warm-up differs from that of the model",
         )
         _check_steps(exported, guard, x, w, s, generator, subject)
         _check_rollout(exported, x, w, s, generator, subject)
@@ -802,7 +818,7 @@ def check_bad_inputs(
 def replace_entries(
     values: Tensor, upper_edge: Tensor, damaged_share: float, generator: torch.Generator
 ) -> Tensor:
-    """Return values [B, k] with a share of the entries replaced, some just beyond the edge [k]."""
+    """Replace a share of the values [B, k] by bad values, some just above the limits [k]."""
     bad_values = torch.tensor(_BAD_VALUES)[
         torch.randint(len(_BAD_VALUES), values.shape, generator=generator)
     ]
@@ -822,7 +838,7 @@ def _check_steps(
     generator: torch.Generator,
     subject: str,
 ) -> None:
-    """Step freely with one bad sample, then on with good ones."""
+    """Check the steps of a free run with one bad step."""
     columns = x.shape[1]
     for k in range(w.shape[1]):
         state = x
@@ -844,7 +860,7 @@ def _check_steps(
         x, s, outside = exported.step(state, inputs, memory)
         _check_answer(guard, (state, inputs, memory), (x, s, outside), f"{subject}, step {k}")
         if k == _BAD_STEP_INDEX:
-            # what the controller measures next is good again, and so is what it remembers
+            # the next measurement is valid again, with the returned or a new memory
             midpoints = 0.5 * (guard.ranges.lower + guard.ranges.upper).expand(len(x), -1)
             measured_state = midpoints[:, :columns]
             inputs = midpoints[:, columns:]
@@ -864,7 +880,7 @@ def _check_answer(
     answer: tuple[Tensor, Tensor, Tensor],
     subject: str,
 ) -> None:
-    """Check what came out of one step: finite, flagged where it must be, else the model's own."""
+    """Check the result of a step: finite, correctly flagged, and equal to that of the model."""
     x, w, s = step_inputs
     next_state, memory, outside = answer
     assert_true(outside.dtype == torch.bool, f"{subject}: the flag is {outside.dtype}, not bool")
@@ -896,27 +912,33 @@ def _check_answer(
         next_state[is_sound],
         model_state[is_sound],
         1e-4,
-        f"{subject}: a good sample is answered otherwise",
+        f"{subject}: the state of a valid sample differs from that of the model",
     )
     assert_close(
         memory[is_sound],
         model_memory[is_sound],
         1e-4,
-        f"{subject}: a good sample is remembered otherwise",
+        f"{subject}: the memory of a valid sample differs from that of the model",
     )
     expected, guarded_memory, _ = guard.flagged_step(x, w, s)
     assert_close(
-        next_state, expected, 1e-4, f"{subject}: a bad sample is answered otherwise than stated"
+        next_state,
+        expected,
+        1e-4,
+        f"{subject}: the state of a bad sample differs from the specification",
     )
     assert_close(
-        memory, guarded_memory, 1e-4, f"{subject}: a bad sample is remembered otherwise than stated"
+        memory,
+        guarded_memory,
+        1e-4,
+        f"{subject}: the memory of a bad sample differs from the specification",
     )
 
 
 def _check_rollout(
     exported: Any, x: Tensor, w: Tensor, s: Tensor, generator: torch.Generator, subject: str
 ) -> None:
-    """Check that a rollout with bad samples is the same as its steps."""
+    """Check that a rollout with bad values equals its steps."""
     w = w.clone()
     w[:, _BAD_STEP_INDEX] = replace_entries(w[:, _BAD_STEP_INDEX], w.amax((0, 1)), 0.5, generator)
     first_state = replace_entries(x, x.amax(0), 0.1, generator)
@@ -950,20 +972,22 @@ def _check_histories(
     generator: torch.Generator,
     subject: str,
 ) -> None:
-    """Check that bad samples of a history are left out."""
+    """Check that bad samples of a history are ignored."""
     y = past_states.clone()
     w = past_inputs.clone()
     is_bad = torch.rand(y.shape[:2], generator=generator) < 0.4
     y[is_bad] = torch.nan
     w[is_bad.roll(1, dims=0)] = torch.inf
-    assert_finite(exported.warmup(y, w), f"{subject}: a history with gaps leaves what is no number")
+    assert_finite(
+        exported.warmup(y, w), f"{subject}: the memory after a history with gaps is not finite"
+    )
     initial_memory = exported.initial_state(len(y))
     warmed_without_data = exported.warmup(torch.full_like(y, torch.nan), w)
     assert_close(
         warmed_without_data,
         initial_memory,
         0.0,
-        f"{subject}: a history without a number leaves a memory",
+        f"{subject}: a history of NaN changes the memory",
     )
     repeated = past_states.clone()
     repeated[:, 2] = repeated[:, 1]
@@ -975,5 +999,5 @@ def _check_histories(
         exported.warmup(missing_sample, past_inputs),
         exported.warmup(repeated, w),
         1e-5,
-        f"{subject}: the last good sample does not stand for a bad one in a history",
+        f"{subject}: a bad sample of a history is not replaced by the last valid sample",
     )
