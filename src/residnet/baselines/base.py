@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Self, final
 
 import torch
@@ -12,23 +13,30 @@ from torch import Tensor, nn
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
+from residnet.core.names import PLANAR_LAYOUT
 from residnet.physics.symmetry import get_dof
 from residnet.regression.estimator import Coefficient, Solution
+from residnet.regression.least_squares import minimize_levenberg_marquardt
 
 
 class Baseline(nn.Module, ABC):
     """Memoryless model of the accelerations [..., n] at channels z [..., nz].
 
     Accelerations are in m/s^2 and rad/s^2. A subclass needs `forward` only.
+
+    Attributes:
+        n_dof: number of accelerations n; surge, sway and yaw by default.
     """
+
+    n_dof: int = PLANAR_LAYOUT.n_dof
 
     @abstractmethod
     def forward(self, z: Tensor) -> Tensor:
         """Compute nu_dot [..., n] at channels z [..., nz] (see `residnet.physics.signals`)."""
 
-    @abstractmethod
     def parameter_counts(self) -> list[float]:
-        """Return the number of fitted parameters per axis."""
+        """Return the number of fitted parameters per axis, by default all parameters for each."""
+        return [float(sum(parameter.numel() for parameter in self.parameters()))] * self.n_dof
 
     def inertia_matrix(self) -> Tensor | None:
         """Return the inertia matrix [3, 3], float64; None if the baseline models no forces."""
@@ -157,9 +165,11 @@ class IdentifiedConfig(Config, ABC):
             FitError: if they do not.
         """
 
-    @abstractmethod
     def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
         """Identify the baseline from samples whose target is the measured acceleration.
+
+        By default all parameters (`torch.nn.Parameter`) of the baseline are fitted by
+        `fit_parameters`.
 
         Returns:
             The solution; or several candidates for a selection by free runs, the preferred one
@@ -168,6 +178,7 @@ class IdentifiedConfig(Config, ABC):
         Raises:
             FitError: if the data do not determine a coefficient.
         """
+        return [fit_parameters(baseline, samples)]
 
     @final
     def fit_preferred(self, baseline: Baseline, samples: Samples) -> list[Coefficient]:
@@ -213,3 +224,117 @@ def select_manoeuvres(samples: Samples, kinds: Sequence[str]) -> Samples:
             f" the data: {sorted(set(samples.kinds))}"
         )
     return selected
+
+
+_MAX_FIT_SAMPLES = 4000
+"""Maximum number of samples of `fit_parameters`; more samples are thinned evenly."""
+_MAX_FIT_STEPS = 100
+"""Maximum number of Levenberg-Marquardt steps of `fit_parameters`."""
+_MIN_FIT_DECREASE = 1e-10
+"""Relative decrease of the cost below which `fit_parameters` ends."""
+_MIN_TARGET_STD = 1e-9
+"""Lower bound of the standard deviation of an acceleration in a denominator."""
+
+
+def fit_parameters(baseline: Baseline, samples: Samples) -> Solution:
+    """Fit all parameters of a baseline by nonlinear least squares, from their current values.
+
+    The residuals are those of the accelerations, divided by the standard deviation of each axis.
+    Standard errors are cluster-robust over manoeuvres.
+
+    Args:
+        baseline: baseline whose `forward` is differentiable.
+        samples: samples whose target is the measured acceleration [N, n].
+
+    Raises:
+        FitError: if a parameter has no effect on the accelerations, or parameters are collinear.
+    """
+    parameters = {name: value.detach().double() for name, value in baseline.named_parameters()}
+    if not parameters:
+        return Solution({}, {})
+    shapes = [value.shape for value in parameters.values()]
+    sizes = [value.numel() for value in parameters.values()]
+    labels = [
+        name if size == 1 else f"{name}[{i}]"
+        for name, size in zip(parameters, sizes, strict=True)
+        for i in range(size)
+    ]
+    rows = torch.linspace(0, len(samples) - 1, min(len(samples), _MAX_FIT_SAMPLES)).long()
+    z = samples.z[rows]
+    target = samples.target[rows]
+    target_std = target.std(0).clamp(min=_MIN_TARGET_STD)
+
+    def to_state(theta: Tensor) -> dict[str, Tensor]:
+        parts = theta.split(sizes)
+        return {
+            name: part.reshape(shape)
+            for name, part, shape in zip(parameters, parts, shapes, strict=True)
+        }
+
+    def compute_residuals(theta: Tensor) -> Tensor:
+        acceleration: Tensor = torch.func.functional_call(baseline, to_state(theta), (z,))
+        return ((acceleration - target) / target_std).flatten()
+
+    def compute_jacobian(theta: Tensor) -> Tensor:
+        jacobian: Tensor = torch.func.jacfwd(compute_residuals)(theta)
+        return jacobian
+
+    def linearize(theta: Tensor) -> tuple[float, Callable[[float], tuple[float, Tensor]]]:
+        with torch.no_grad():
+            residuals = compute_residuals(theta)
+            jacobian = compute_jacobian(theta)
+        gram = jacobian.T @ jacobian
+        gradient = jacobian.T @ residuals
+        _require_effect(gram.diagonal(), labels)
+
+        def try_step(damping: float) -> tuple[float, Tensor]:
+            damped = gram + damping * torch.diag(gram.diagonal())
+            factor, info = torch.linalg.cholesky_ex(damped)
+            if int(info) != 0:
+                return math.inf, theta
+            step = torch.cholesky_solve(gradient[:, None], factor)[:, 0]
+            with torch.no_grad():
+                trial_residuals = compute_residuals(theta - step)
+            return float(trial_residuals.square().sum()), theta - step
+
+        return float(residuals.square().sum()), try_step
+
+    initial_theta = torch.cat([value.flatten() for value in parameters.values()])
+    theta = minimize_levenberg_marquardt(
+        initial_theta, linearize, _MAX_FIT_STEPS, min_relative_decrease=_MIN_FIT_DECREASE
+    ).minimizer
+    # sandwich estimator of the covariance, with the residuals of a manoeuvre as a cluster
+    with torch.no_grad():
+        residuals = compute_residuals(theta)
+        jacobian = compute_jacobian(theta)
+    gram = jacobian.T @ jacobian
+    factor, info = torch.linalg.cholesky_ex(gram)
+    if int(info) != 0:
+        raise FitError(
+            f"the parameters {', '.join(labels)} are collinear on these data; fix one of them or"
+            " give data that excite them separately"
+        )
+    inverse = torch.cholesky_inverse(factor)
+    groups, group_index = torch.unique(samples.group[rows], return_inverse=True)
+    scores = jacobian * residuals[:, None]
+    if len(groups) > 1:
+        cluster_index = group_index.repeat_interleave(target.shape[1])
+        cluster_scores = scores.new_zeros(len(groups), len(theta))
+        scores = cluster_scores.index_add_(0, cluster_index, scores)
+    standard_errors = (inverse @ scores.T @ scores @ inverse).diagonal().clamp(min=0).sqrt()
+    table = tuple(
+        Coefficient("", label, value, standard_error)
+        for label, value, standard_error in zip(
+            labels, theta.tolist(), standard_errors.tolist(), strict=True
+        )
+    )
+    return Solution({}, to_state(theta), table)
+
+
+def _require_effect(squared_norms: Tensor, labels: Sequence[str]) -> None:
+    if bool((squared_norms == 0).any()):
+        label = labels[int((squared_norms == 0).nonzero()[0, 0])]
+        raise FitError(
+            f"parameter '{label}' of the baseline has no effect on the accelerations of these data;"
+            " remove it, start it at another value, or give data that excite it"
+        )

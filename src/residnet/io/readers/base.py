@@ -50,14 +50,6 @@ class LogReader(ABC):
         """
 
 
-class ConfiguredReader(Config, LogReader):
-    """Reader whose settings are its own fields."""
-
-    def build(self) -> Self:
-        """Return this object, which is config and reader in one."""
-        return self
-
-
 class ReaderKind(Config, ABC):
     """Base class of reader configs in other packages.
 
@@ -70,6 +62,14 @@ class ReaderKind(Config, ABC):
     @abstractmethod
     def build(self) -> LogReader:
         """Build the reader of this config."""
+
+
+class ConfiguredReader(ReaderKind, LogReader):
+    """Config and reader in one class; a subclass needs `kind` and `read` only."""
+
+    def build(self) -> Self:
+        """Return this object, which is config and reader in one."""
+        return self
 
 
 def require_file(path: Path) -> None:
