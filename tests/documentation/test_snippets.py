@@ -150,20 +150,39 @@ def test_python_is_right(block: Block) -> None:
     assert used <= set(dir(residnet)), f"{block}: residnet has no {used - set(dir(residnet))}"
 
 
+CONTRIBUTED_PARTS = {
+    "head": ("brake", "BrakeConfig", "check_head(BrakeConfig())"),
+    "baseline": ("drag", "DragConfig", "check_baseline(DragConfig())"),
+    "reader": (
+        "keel",
+        "KeelConfig",
+        "check_reader(KeelConfig(channels=channels), Path('log.keel'))",
+    ),
+}
+KEEL_CHANNELS = {"u": ("u", "kn"), "r": ("r", "deg/s"), "n": ("n", "1/min")}
+
+
 @pytest.mark.long
-def test_the_head_of_contributing_keeps_the_contract(tmp_path: Path) -> None:
-    block = next(b for b in BLOCKS if b.page == "CONTRIBUTING.md" and "BrakeConfig" in b.text)
-    (tmp_path / "brake.py").write_text(block.text)
-    about = tmp_path / "brake-1.0.dist-info"
+@pytest.mark.parametrize("kind", CONTRIBUTED_PARTS)
+def test_example_of_contributing_fulfils_its_contract(kind: str, tmp_path: Path) -> None:
+    name, config, check = CONTRIBUTED_PARTS[kind]
+    block = next(b for b in BLOCKS if b.page == "CONTRIBUTING.md" and f"class {config}" in b.text)
+    (tmp_path / f"{name}.py").write_text(block.text)
+    about = tmp_path / f"{name}-1.0.dist-info"
     about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: brake\nVersion: 1.0\n")
-    points = "[residnet.heads]\nbrake = brake:BrakeConfig\n"
-    (about / "entry_points.txt").write_text(points)
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[residnet.{kind}s]\n{name} = {name}:{config}\n")
+    rows = [f"{0.1 * k},{3 + 0.1 * (k % 7)},0.1,{k % 5},{100 + k}" for k in range(100)]
+    (tmp_path / "log.keel").write_text("\n".join(rows))
     source = Path(residnet.__file__).parents[1]
     lines = [
-        "from brake import BrakeConfig",
-        "from residnet.testing import check_head",
-        "check_head(BrakeConfig())",
+        "from pathlib import Path",
+        f"from {name} import {config}",
+        "from residnet.io.readers.quantities import FieldMap",
+        "from residnet.testing import check_baseline, check_head, check_reader",
+        f"fields = {KEEL_CHANNELS}",
+        "channels = {n: FieldMap(field=f, unit=u) for n, (f, u) in fields.items()}",
+        check,
     ]
     path = os.pathsep.join((str(source), str(tmp_path)))
     run = subprocess.run(

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError, FitError
+from residnet.core.layout import PLANAR_LAYOUT
 from residnet.core.samples import Samples
-from residnet.core.names import PLANAR_LAYOUT
 from residnet.physics.symmetry import get_dof
 from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.least_squares import minimize_levenberg_marquardt
@@ -220,8 +220,8 @@ def select_manoeuvres(samples: Samples, kinds: Sequence[str]) -> Samples:
     selected = samples.select_manoeuvres(kinds)
     if len(selected) == 0:
         raise FitError(
-            f"no sample is of the manoeuvres {list(kinds)} on which the baseline is fitted; kinds in"
-            f" the data: {sorted(set(samples.kinds))}"
+            f"no sample is of the manoeuvres {list(kinds)} of the baseline; kinds in the data:"
+            f" {sorted(set(samples.kinds))}"
         )
     return selected
 

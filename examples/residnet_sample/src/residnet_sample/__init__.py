@@ -1,1 +1,1 @@
-"""An example of a package that adds parts of its own to residnet."""
+"""An example of a package that adds parts to residnet."""

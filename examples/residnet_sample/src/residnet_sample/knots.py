@@ -1,4 +1,4 @@
-"""A reader of the plain tables of one logger: time, pose, speed in knots, yaw rate, commands."""
+"""A reader of the tables of one logger: time, pose, speed in knots, yaw rate, commands."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from residnet.core.errors import DataError
 from residnet.core.frames import unwrap_angle
 from residnet.core.log import Log
 from residnet.io.readers.base import (
-    LogReader,
-    ReaderKind,
+    ConfiguredReader,
     describe_provenance,
     require_file,
     require_increasing,
@@ -23,33 +22,27 @@ from residnet.io.readers.base import (
 _KNOT = 1852.0 / 3600.0
 
 
-class KnotsConfig(ReaderKind):
-    """Tables whose columns are t [s], x [m], y [m], heading [deg], u [kn], v [kn], yaw [deg/s].
+@final
+class KnotsConfig(ConfiguredReader):
+    """Tables without a header: t [s], x [m], y [m], heading [deg], u [kn], v [kn], yaw rate [deg/s].
+
+    Columns after the seventh are the revolutions of the propellers in 1/s.
 
     Attributes:
-        kind: names this reader in a config.
+        kind: name of this reader in a config.
     """
 
     kind: Literal["knots"] = "knots"
 
-    def build(self) -> LogReader:
-        """Return the reader."""
-        return KnotsReader()
-
-
-@final
-class KnotsReader(LogReader):
-    """Reads one table without a header line; columns after the seventh are commands in 1/s."""
-
     def read(self, path: Path) -> Log:
-        """Return the log in one file, in SI units, psi unwrapped."""
+        """Read a log in SI units with unwrapped psi."""
         require_file(path)
         try:
             table = np.loadtxt(path, delimiter=",", ndmin=2)
         except ValueError as error:
-            raise DataError(f"{path}: not a table of numbers ({error})") from error
+            raise DataError(f"{path}: not a table of numbers ({error}); export it again") from error
         if table.shape[1] < 7:
-            raise DataError(f"{path}: {table.shape[1]} columns, at least 7 are needed")
+            raise DataError(f"{path}: expected at least 7 columns, got {table.shape[1]}")
         t = table[:, 0]
         require_samples(path, t)
         require_increasing(path, t, lambda i: f"line {i + 1}")

@@ -1,4 +1,4 @@
-"""An export format: the parameters of a model as one table of text, one number a line."""
+"""An export format: the parameters of a model as a text table with one value per line."""
 
 from __future__ import annotations
 
@@ -15,16 +15,18 @@ from residnet.export.vessel import ExportedVessel
 
 @final
 class NumbersExporter(Exporter):
-    """Every number of a model, as `name,index,value` lines."""
+    """Exports the state of a model as lines `name,index,value`."""
 
     name: ClassVar[str] = "numbers"
     suffix: ClassVar[str] = ".csv"
-    about: ClassVar[str] = "every number of a model as a table of text (sample package)"
+    about: ClassVar[str] = "the state of a model as a text table (sample package)"
 
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
-        """Write the table, read it back, and return how many numbers it holds."""
+        """Write the table, verify it, and return the number of values."""
         if not isinstance(exported, ExportedVessel):
-            raise UsageError(f"{exported.label}: only the numbers of vessel models are written")
+            raise UsageError(
+                f"{exported.label}: format numbers supports vessel models only; use another format"
+            )
         numbers = [
             (f"{name},{index}", float(value))
             for name, tensor in exported.model.state_dict().items()
@@ -32,7 +34,7 @@ class NumbersExporter(Exporter):
         ]
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text("".join(f"{name},{value!r}\n" for name, value in numbers))
-        back = [float(line.rsplit(",", 1)[1]) for line in file.read_text().splitlines()]
-        if not np.array_equal(back, [value for _, value in numbers], equal_nan=True):
-            raise ExportError(f"{file}: the table does not give the model's numbers back")
+        written_values = [float(line.rsplit(",", 1)[1]) for line in file.read_text().splitlines()]
+        if not np.array_equal(written_values, [value for _, value in numbers], equal_nan=True):
+            raise ExportError(f"{file}: the written table differs from the model; export it again")
         return {"model": exported.name, "numbers": len(numbers)}

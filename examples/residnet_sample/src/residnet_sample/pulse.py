@@ -1,4 +1,4 @@
-"""A manoeuvre: one pulse of steer on a straight course."""
+"""A manoeuvre: a pulse of steer on a straight course."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from residnet.manoeuvres.base import ScheduledManoeuvre
 
 @final
 class Pulse(ScheduledManoeuvre):
-    """Steer for a while, then straight on.
+    """Pulse of steer between straight courses.
 
     Attributes:
-        kind: names this manoeuvre in a config.
-        drive: share of full drive, held throughout.
+        kind: name of this manoeuvre in a config.
+        drive: constant share of full drive.
         steer: share of full steer during the pulse; positive turns to starboard.
-        start: when the pulse begins, in s.
-        length: of the pulse, in s.
+        start: start of the pulse.
+        length: duration of the pulse.
     """
 
     kind: Literal["pulse"] = "pulse"
@@ -32,5 +32,5 @@ class Pulse(ScheduledManoeuvre):
 
     def demands_at(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Return drive and steer [T] at times t [T] in s."""
-        within = (t >= self.start) & (t < self.start + self.length)
-        return torch.full_like(t, self.drive), torch.where(within, self.steer, 0.0).to(t.dtype)
+        is_pulse = (t >= self.start) & (t < self.start + self.length)
+        return torch.full_like(t, self.drive), torch.where(is_pulse, self.steer, 0.0).to(t.dtype)
