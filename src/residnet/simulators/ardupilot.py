@@ -1,9 +1,9 @@
-"""A physics back end for ArduPilot's software in the loop, over its JSON interface.
+"""Physics back end for ArduPilot software-in-the-loop simulation over its JSON interface.
 
-ArduPilot sends a binary packet of servo outputs over UDP and waits for a line of JSON with what the
-inertial sensors measure (ArduPilot, libraries/SITL/examples/JSON/readme.md). Packets of 16 servos
-carry the number 18458, those of 32 the number 29569, then the frame rate, the frame count and the
-pulse widths, all little-endian.
+ArduPilot sends a binary packet of servo outputs over UDP and waits for a line of JSON with the
+measurements of the inertial sensors (ArduPilot, libraries/SITL/examples/JSON/readme.md). A packet
+starts with the number 18458 (16 servos) or 29569 (32 servos), followed by the frame rate, the frame
+count and the pulse widths, all little-endian.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _FRAME_RATE_RANGE = (10, 4000)
 
 @dataclass(frozen=True)
 class Servo:
-    """Which servo output stands for a command.
+    """Mapping from a servo output to a command.
 
     Attributes:
         channel: number of the output, from 1.
@@ -48,7 +48,7 @@ class Servo:
     upper_command: float
 
     def command_at(self, pulse: int) -> float:
-        """Return the command that a pulse width stands for; the middle where there is none."""
+        """Return the command of a pulse width; the centre command for a missing pulse."""
         share = 0.5 if pulse == 0 else min(max((pulse - 1000) / 1000, 0.0), 1.0)
         return self.lower_command + share * (self.upper_command - self.lower_command)
 
@@ -89,18 +89,18 @@ def assign_servos(vehicle: Vehicle, servo_texts: Sequence[str] = ()) -> list[Ser
 
 @final
 class ArduPilotBackend:
-    """Answers ArduPilot's packets with the motion of a vehicle.
+    """Server that replies to ArduPilot's packets with the motion of a vehicle.
 
-    Frames advance by the frame rate that ArduPilot asks for. The vehicle has steps of its own, so
-    that inputs act from its next step on and the motion between two of its steps is interpolated.
-    A packet that comes twice is answered twice and advances nothing; one that is lost is never
-    made up for; a frame count that goes back begins anew; what is no such packet is left out.
+    Frames advance at the frame rate requested by ArduPilot. The vehicle has its own time step:
+    inputs act from its next step, and the motion is interpolated between steps. A repeated packet
+    gets the same reply without advancing the time. Lost packets are not compensated. A decreasing
+    frame count restarts the simulation. Invalid packets are ignored.
 
     Args:
-        vehicle: what moves.
-        servos: one for each of its commands.
-        port: UDP port that ArduPilot sends to; 0 takes a free one.
-        host: address to listen at.
+        vehicle: simulated vehicle.
+        servos: one servo for each command of the vehicle.
+        port: UDP port; 0 selects a free port.
+        host: address to listen on.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class ArduPilotBackend:
         self._reset()
 
     def _reset(self) -> None:
-        """Stand at the start."""
+        """Reset the vehicle to its initial state."""
         self.last_frame = -1
         self.reply = b""
         self.time = 0.0
@@ -152,7 +152,7 @@ class ArduPilotBackend:
         self.socket.close()
 
     def reply_to(self, data: bytes) -> bytes | None:
-        """Return the reply to a packet; None to what is no packet of ArduPilot."""
+        """Return the reply to a packet; None for an invalid packet."""
         layout = _PACKET_FORMATS.get(int.from_bytes(data[:2], "little"))
         if layout is None or len(data) != layout.size:
             self.n_invalid_packets += 1

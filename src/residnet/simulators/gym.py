@@ -1,9 +1,9 @@
-"""A Gymnasium environment over any vessel or learned model, single and vectorised.
+"""Gymnasium environments (single and vectorised) for vessels and learned models.
 
 Needs the extra `gymnasium`. An action in [-1, 1] covers each command's range; an observation holds
-the velocities, what the task shows of its goal, and the last action. Observations and rewards of
-the reference tasks are in units of the vehicle's cruise speed and of its look-ahead, the way that
-it goes in ten seconds at that speed.
+the velocities, the goal observation of the task and the last action. Observations and rewards of
+the reference tasks are scaled by the cruise speed of the vehicle and by its look-ahead distance,
+the distance travelled in ten seconds at cruise speed.
 """
 
 from __future__ import annotations
@@ -35,12 +35,13 @@ LOOK_AHEAD_TIME = 10.0
 
 
 class ReferenceTask(ABC):
-    """What an agent shall do: a goal drawn for each episode, what is seen of it, and a reward.
+    """A task of an agent: a random goal for each episode, its observation and the reward.
 
     Attributes:
-        name: of the task.
+        name: name of the task.
         goal_size: number of entries of a goal.
-        observation_size: number of entries of an observation that the task adds to the motion's five.
+        observation_size: number of entries of an observation that the task adds to the motion's
+            five.
     """
 
     name: ClassVar[str]
@@ -53,7 +54,7 @@ class ReferenceTask(ABC):
 
     @abstractmethod
     def observe(self, x: Tensor, goal: Tensor, cruise: float) -> Tensor:
-        """Return what is seen of the goal, [B, seen]."""
+        """Return the observation of the goal [B, observation_size]."""
 
     @abstractmethod
     def reward(self, x: Tensor, goal: Tensor, cruise: float) -> Tensor:
@@ -132,7 +133,7 @@ class DockingTask(ReferenceTask):
         return torch.cat((speed, heading(x).unsqueeze(-1)), dim=-1)
 
     def observe(self, x: Tensor, goal: Tensor, cruise: float) -> Tensor:
-        """Return the error of the speed, and sine and cosine of that of the heading."""
+        """Return the speed error and the sine and cosine of the heading error."""
         error = goal[:, 1] - heading(x)
         speed_error = (goal[:, 0] - surge(x)) / cruise
         return torch.stack((speed_error, torch.sin(error), torch.cos(error)), dim=-1)
@@ -153,16 +154,16 @@ def _sample_uniform(n_rows: int, generator: torch.Generator, dtype_source: Tenso
 
 
 class EpisodeBatch:
-    """Episodes of one task side by side, in tensors.
+    """Batched simulation of the episodes of one task.
 
     Args:
-        vehicle: what moves.
+        vehicle: simulated vehicle.
         task: name of the task.
-        n_episodes: number of episodes side by side.
+        n_episodes: number of parallel episodes.
         episode_length: length of an episode.
 
     Raises:
-        UsageError: where there is no such task.
+        UsageError: if the task does not exist.
     """
 
     def __init__(self, vehicle: Vehicle, task: str, n_episodes: int, episode_length: int) -> None:
@@ -201,7 +202,7 @@ class EpisodeBatch:
         self.step_count[mask] = 0
 
     def observe(self) -> np.ndarray:
-        """Return what is seen, [B, size] float32."""
+        """Return the observation [B, size] in float32."""
         cruise, (u, v, r) = self.vehicle.cruise, dynamic_states(self.x).unbind(-1)
         # yaw in turns of a look-ahead
         motion = torch.stack((u / cruise, v / cruise, r * LOOK_AHEAD_TIME), dim=-1)
@@ -333,7 +334,7 @@ class VesselVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Step all; those that had ended stand at their new start, with no reward."""
+        """Step all environments; episodes that ended before are reset, with zero reward."""
         reward, diverged, finished = self.episodes.step(actions)
         restarted_mask = self.needs_reset
         if bool(restarted_mask.any()):

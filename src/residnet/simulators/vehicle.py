@@ -20,24 +20,24 @@ from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 
 _SETTLING_STEPS = 600
-"""Steps within which a vessel reaches the speed that its middle drive stands for."""
+"""Number of steps to reach the speed of half drive, which is the cruise speed."""
 
 
 @dataclass(frozen=True)
 class Vehicle:
-    """What a simulator steps.
+    """A vessel or learned model with command limits, as the simulators step it.
 
     Attributes:
-        name: of the vessel or model.
-        dynamics: its step, defined for whatever it is given.
-        states: names of the columns of x; pose and velocities stand first.
-        inputs: names of the columns of w: commands, then what nobody commands.
-        n_commands: how many of the inputs are commands.
-        lower_commands: least commands [c], SI.
-        upper_commands: largest commands [c], SI.
-        exogenous_inputs: values of the other inputs [m - c] in calm water.
-        initial_state: state [nx] that an episode starts from.
-        cruise: speed in m/s that errors are measured by.
+        name: name of the vessel or model.
+        dynamics: guarded dynamics, defined for every input.
+        states: names of the columns of x, starting with pose and velocities.
+        inputs: names of the columns of w: commands, then exogenous inputs.
+        n_commands: number of commands among the inputs.
+        lower_commands: lower limits of the commands [c], SI.
+        upper_commands: upper limits of the commands [c], SI.
+        exogenous_inputs: values of the exogenous inputs [m - c] in calm water.
+        initial_state: initial state [nx] of an episode.
+        cruise: cruise speed in m/s, the unit of speed errors.
     """
 
     name: str
@@ -62,15 +62,15 @@ class Vehicle:
 
 
 def load_vehicle(source: str | Path, *, model: str = "selected", dt: float = 0.1) -> Vehicle:
-    """Return a learned model of a run's folder, or a vessel by its name or file.
+    """Return a vehicle from a run folder, a vessel name or a vessel file.
 
     Args:
-        source: folder of a finished fit; or a vessel's name, or the path of its file.
-        model: which model of the run.
-        dt: step in s of a vessel; a learned model has its own.
+        source: folder of a finished fit, name of a vessel or path of a vessel file.
+        model: name of the model of the run.
+        dt: time step of a vessel in s; ignored for a learned model.
 
     Raises:
-        UsageError: where there is no such vessel, run or model, or it has no planar motion.
+        UsageError: if the vessel, run or model does not exist or its motion is not planar.
     """
     if Path(source).is_dir():
         return load_learned_vehicle(Path(source), model)
@@ -125,14 +125,15 @@ class _UnflaggedStep(Dynamics):
 def build_plant_vehicle(name: str, plant: Plant, dt: float) -> Vehicle:
     """Return a vessel as a vehicle in calm water.
 
-    Its limits are the commands that full drive and full steering of a manoeuvre stand for.
+    The limits are the commands of full drive and full steering.
 
     Raises:
-        UsageError: where it moves in other degrees of freedom than surge, sway and yaw.
+        UsageError: if it has other degrees of freedom than surge, sway and yaw.
     """
     if plant.state_names[: len(STATE_NAMES)] != STATE_NAMES:
         raise UsageError(
-            f"vessel {name}: its states are {', '.join(plant.state_names)}; simulators take vessels with"
+            f"vessel {name}: its states are {', '.join(plant.state_names)}; simulators take"
+            f" vessels with"
             f" {', '.join(STATE_NAMES)} first"
         )
     plant = plant.eval().requires_grad_(False)
