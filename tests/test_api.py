@@ -309,7 +309,7 @@ WRONG = [
     ("load(folder)", "no model here"),
     ("vessel('wam_v_call')", "did you mean 'wam_v_cal'"),
     ("simulate('wam_v_cal', 'zigzagg')", "unknown value 'zigzagg'; did you mean 'zigzag'"),
-    ("simulate('wam_v_cal')", "nothing is flown"),
+    ("simulate('wam_v_cal')", "no manoeuvre"),
     ("list_available('head')", "did you mean 'heads'"),
     ("run({'task': 'fitt'})", "did you mean 'fit'"),
     ("run(3)", "expected the path of a YAML file"),

@@ -1,4 +1,4 @@
-"""The command line; imports stay inside the commands: `--help` must not wait for PyTorch."""
+"""The command line. Commands import what they need, so that `--help` is fast."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ if TYPE_CHECKING:
 
 
 SILENCE_SECONDS = 5.0
-"""Seconds without a line after which one says what is still being done."""
+"""Seconds without output after which the current work is printed."""
 LineSink = Callable[[str], None]
-"""Is given one line after the other."""
+"""Function that receives lines of text."""
 
 
 @contextmanager
 def show_progress(*, quiet: bool = False, sink: LineSink | None = None) -> Iterator[None]:
-    """Draw the progress of everything within the context on standard error.
+    """Show the progress of the context's work on standard error.
 
     Args:
-        quiet: draw nothing.
-        sink: is given every line, whatever is drawn.
+        quiet: show nothing.
+        sink: receives every line, even if `quiet` is set.
     """
     progress_display: AbstractContextManager[ProgressCallback | None] = nullcontext()
     if not quiet:
@@ -60,9 +60,9 @@ def show_progress(*, quiet: bool = False, sink: LineSink | None = None) -> Itera
 
 
 class _PlainProgress:
-    """One line for each message, and one for each counted stage that ends without a message.
+    """Progress display with one line for each message and each completed stage.
 
-    Where neither comes for a while, a line tells what is still being done, how far, and since when.
+    After a while without output, the current work, its progress and its duration are printed.
     """
 
     def __init__(self) -> None:
@@ -112,9 +112,9 @@ class _PlainProgress:
 
 @contextmanager
 def _progress_bars() -> Iterator[ProgressCallback]:
-    """Draw one bar for each counted stage that is under way, and one for the stage begun last.
+    """Progress display with one bar for each counted stage, and one for the current stage.
 
-    Bars move, and tell the time that is gone, without a word of the work.
+    Bars show the elapsed time even if the work reports no progress.
     """
     from rich import progress as rich
     from rich.console import Console
@@ -151,14 +151,14 @@ def _progress_bars() -> Iterator[ProgressCallback]:
 
 
 def interactive_prompt() -> AnswerCallback | None:
-    """Return what asks the user; None if nobody sits at the terminal."""
+    """Return the function that asks the user; None without an interactive terminal."""
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         return None
     return _prompt_for_answer
 
 
 def _prompt_for_answer(question: Question) -> str:
-    """Ask one question until its answer can be used; an empty answer takes the default."""
+    """Ask one question until the answer is valid; an empty answer selects the default."""
     options = f" ({', '.join(question.options)})" if question.options else ""
     print(f"{question.text}: {question.reason}", file=sys.stderr)
     prompt = f"  {'.'.join(question.key)}{options} [{question.default}]: "
@@ -167,16 +167,19 @@ def _prompt_for_answer(question: Question) -> str:
         answer = input().strip() or question.default
         if not question.options or answer in question.options:
             return answer
-        print(f"  '{answer}' is none of {', '.join(question.options)}", file=sys.stderr)
+        print(f"  '{answer}' is not one of {', '.join(question.options)}", file=sys.stderr)
 
 
 @final
 class ProgressLogFile:
-    """Lines with the time of day, written as they come once the run's folder stands.
+    """Log file of a run with the time of day of each line.
+
+    Lines are buffered until the run folder exists.
 
     Args:
-        folder: that the run will have; a run that ends before it stands has its log beside it.
-        is_enabled: keep the lines; else nothing is written.
+        folder: future run folder; if the run ends before it exists, the log file is written next to
+            it.
+        is_enabled: write the log file.
     """
 
     def __init__(self, folder: Path, *, is_enabled: bool = True) -> None:
@@ -189,7 +192,7 @@ class ProgressLogFile:
         self._append(f"{time.strftime('%H:%M:%S')} {text.strip()}\n")
 
     def start_file(self, folder: Path) -> None:
-        """Write into a folder from now on, behind what an interrupted run left there."""
+        """Write to the log file in a folder from now on; an existing log file is continued."""
         self._file = folder / "log.txt"
         if self._is_enabled:
             self._claim(self._file)
@@ -197,12 +200,12 @@ class ProgressLogFile:
 
     @contextmanager
     def log_traceback(self) -> Iterator[None]:
-        """Add the traceback where what is done within the context ends badly, Ctrl-C included."""
+        """Add the traceback of an exception of the context, including Ctrl-C."""
         try:
             yield
         except BaseException as error:
             if self._file is None and self._is_enabled:
-                # the error under way counts more than a log that cannot be written
+                # an unwritable log file must not hide the original error
                 with suppress(ResidnetError):
                     self._claim(self._fallback_path)
                     self._file = self._fallback_path
@@ -211,10 +214,10 @@ class ProgressLogFile:
 
     @staticmethod
     def _claim(file: Path) -> None:
-        """Record a log before its first line.
+        """Record the log file in the manifest before its first line.
 
         Raises:
-            UsageError: if the file is the user's.
+            UsageError: if the file was not written by residnet.
         """
         manifest = find_manifest(file)
         manifest.require_replaceable(file)
@@ -229,7 +232,7 @@ class ProgressLogFile:
 
 
 class _WingGroup(TyperGroup):
-    """The commands of the core, and those of wings, which are imported when they are called."""
+    """Group of the core commands and the commands of wings, which are imported on use."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return [*super().list_commands(ctx), *self._wing_commands()]
@@ -263,7 +266,7 @@ app = typer.Typer(
 
 
 def _print_version(is_requested: bool) -> None:
-    """Print the version and end, where it was asked for."""
+    """Print the version and exit, if requested."""
     if is_requested:
         from residnet.core.version import __version__
 
@@ -281,7 +284,7 @@ def _set_thread_limits(
     ] = False,
 ) -> None:
     """Options of all commands."""
-    # small products are thirty times slower where several libraries fight for the cores
+    # small matrix products are thirty times slower if several thread pools compete for the cores
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
 
@@ -294,7 +297,7 @@ OverridesOption = Annotated[
         "-s",
         "--set",
         metavar="KEY=VALUE",
-        help="Override a key of the config, or take one away with ~KEY; may be repeated.",
+        help="Override a key of the config, or remove one with ~KEY; may be repeated.",
     ),
 ]
 LogArguments = Annotated[
@@ -308,7 +311,7 @@ LogOptions = Annotated[
 
 
 def _trust(context: typer.Context, trust: bool) -> bool:
-    """Allow parts outside of the allow-lists until the command ends, where the user asks for it."""
+    """Allow parts outside of the allow-lists until the command ends, if requested."""
     if trust:
         from residnet.core.trust import trusting
 
@@ -334,7 +337,7 @@ def run(
     overrides: OverridesOption = None,
     output_folder: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="Run folder; runs/<name> where not given."),
+        typer.Option("--out", metavar="DIR", help="Run folder; runs/<name> if not given."),
     ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted run in its folder.")
@@ -348,7 +351,7 @@ def run(
             min=1,
             max=1024,
             metavar="N",
-            help="Models of a fit that are fitted side by side; one a core where not given.",
+            help="Models that are fitted in parallel; the number of cores if not given.",
         ),
     ] = None,
     trust: Trust = False,
@@ -360,7 +363,7 @@ def run(
         bool, typer.Option("-v", "--verbose", help="Write all progress into RUN/log.txt.")
     ] = False,
 ) -> None:
-    """Carry out a run: fit, evaluate, report and export, or any other task."""
+    """Run a task: fit, evaluate, report and export, or any other task."""
     from residnet.core.processes import worker_limit
     from residnet.tasks.registry import load_task, resolve_config_file
 
@@ -399,14 +402,14 @@ def new(
         bool, typer.Option("--overwrite", help="Replace an earlier config of this name.")
     ] = False,
     defaults: Annotated[
-        bool, typer.Option("--defaults", help="Ask nothing: take and mark every default.")
+        bool, typer.Option("--defaults", help="Ask nothing: use defaults and mark them as guesses.")
     ] = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Draft a complete config from logs: `residnet run` takes it as it is.
+    """Draft a complete config for `residnet run` from logs.
 
-    Channels, units, frames, inputs, splits, protocols and models are proposed. What the logs do
-    not tell is asked on a terminal; elsewhere the default is taken and marked as a guess.
+    Channels, units, frames, inputs, splits, protocols and models are proposed. Questions that the
+    logs do not answer are asked on a terminal; otherwise the default is marked as a guess.
     """
     from residnet.tasks.drafting import write_new_config
 
@@ -429,7 +432,7 @@ def demo(
     ] = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Write realistic logs of a simulated boat to try things on, in several layouts."""
+    """Write example logs of a simulated boat in several layouts."""
     from residnet.tasks.demo import write_demo
 
     with show_progress(quiet=quiet):
@@ -444,7 +447,7 @@ def check(
     trust: Trust = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Validate a config and everything that it names, without running it."""
+    """Validate a config and its files, models and packages, without running it."""
     from residnet.tasks.registry import load_task
 
     with show_progress(quiet=quiet):
@@ -459,7 +462,7 @@ def inspect(
         list[Path],
         typer.Argument(
             metavar="LOG...",
-            help="Logs: canonical Parquet, or anything that the config's reader reads.",
+            help="Logs: canonical Parquet, or any format that the reader of the config supports.",
         ),
     ],
     config: Annotated[
@@ -470,7 +473,7 @@ def inspect(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE", help="Write the findings to a file as JSON, too."),
+        typer.Option("--out", metavar="FILE", help="Also write the findings to a file as JSON."),
     ] = None,
     trust: Trust = False,
     as_json: Annotated[
@@ -478,10 +481,10 @@ def inspect(
     ] = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Check logs for faults that would mislead a fit.
+    """Check logs for errors that would mislead a fit.
 
     Clocks, gaps, jumps, frozen channels, reference frames, lags, copied channels and excitation
-    are checked. The exit code is 1 where a fit would be misled.
+    are checked. The exit code is 1 if a fit would be misled.
     """
     from residnet.core.files import require_writable_file
     from residnet.tasks.inspection import inspect_logs
@@ -499,16 +502,16 @@ def inspect(
 
 
 def _collect_log_paths(run: Path, *path_groups: list[Path] | None) -> list[Path]:
-    """Return the logs that a command line names.
+    """Return the logs of a command line.
 
     Raises:
-        UsageError: if there is none.
+        UsageError: if there is no log.
     """
     from residnet.core.errors import UsageError
 
     logs = [path for path_group in path_groups for path in path_group or ()]
     if not logs:
-        raise UsageError(f"{run}: which logs? Name files or folders of logs behind the run")
+        raise UsageError(f"{run}: no logs given; name files or folders of logs after the run")
     return logs
 
 
@@ -520,7 +523,7 @@ def evaluate(
     output_folder: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="DIR", help="Where results go; RUN/external-<time> where not given."
+            "--out", metavar="DIR", help="Folder of the results; RUN/external-<time> if not given."
         ),
     ] = None,
     trust: Trust = False,
@@ -555,7 +558,7 @@ def monitor(
     log_options: LogOptions = None,
     model: Annotated[str, typer.Option(help="Name of the model.")] = "selected",
     window: Annotated[str, typer.Option(help="Length of the short free runs.")] = "10 s",
-    stretch: Annotated[str, typer.Option(help="Time that is looked back over.")] = "300 s",
+    stretch: Annotated[str, typer.Option(help="Time span of the score tests.")] = "300 s",
     false_alarm: Annotated[str, typer.Option(help="Mean time between false alarms.")] = "10 h",
     output_folder: Annotated[
         Path | None,
@@ -566,18 +569,18 @@ def monitor(
         typer.Option(
             "--refit",
             metavar="DIR",
-            help="Put the changes that are named into a copy of the model, in a new run folder.",
+            help="Apply the identified changes to a copy of the model, in a new run folder.",
         ),
     ] = None,
     trust: Trust = False,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print what was found as JSON, for machines.")
+        bool, typer.Option("--json", help="Print the results as JSON, for machines.")
     ] = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Watch new logs with a model of a finished fit, and name what has changed.
+    """Detect changes of a vessel in new logs with a model of a finished fit.
 
-    The exit code is 1 where there is an alarm. A refit leaves the run as it is.
+    The exit code is 1 if there is an alarm. A refit does not change the run.
     """
     from residnet.core.files import atomic_write, require_free_space
     from residnet.core.run_loader import name_damaged_key
@@ -615,9 +618,9 @@ def monitor(
 def plan_trial(
     folder: RunArgument,
     model: Annotated[
-        str, typer.Option(help="Refitted baseline; the booklet's or the first if not given.")
+        str, typer.Option(help="Refitted baseline; that of the booklet or the first if not given.")
     ] = "",
-    time: Annotated[str, typer.Option(help="How long each trial lasts.")] = "120 s",
+    time: Annotated[str, typer.Option(help="Duration of each trial.")] = "120 s",
     area: Annotated[
         str | None, typer.Option(help="Largest distance from the start, such as '200 m'.")
     ] = None,
@@ -631,7 +634,7 @@ def plan_trial(
     trust: Trust = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Say which manoeuvres to run next, and by how much they would narrow the predictions."""
+    """Plan the next trials, with the expected reduction of the prediction intervals."""
     from residnet.core.files import require_free_space
     from residnet.core.run_loader import name_damaged_key
     from residnet.tasks.registry import open_finished_task
@@ -656,8 +659,8 @@ def export(
         typer.Option(
             "--model",
             metavar="NAME",
-            help="Name of the model; 'selected' for the single one chosen on validation data; the"
-            " one that is reported first where not given.",
+            help="Name of the model; 'selected' for the single model chosen on validation data; the"
+            " model reported first if not given.",
         ),
     ] = "predictor",
     file_format: Annotated[
@@ -668,14 +671,15 @@ def export(
         typer.Option(
             "--out",
             metavar="FILE",
-            help="File to write; RUN/exports/<model>.pt where not given, and RUN/exports/<run>.c"
-            " for C, whose names begin with the file's.",
+            help="File to write; RUN/exports/<model>.pt if not given, and RUN/exports/<run>.c for"
+            " C, whose symbols begin with the name of the file.",
         ),
     ] = None,
     allows_objections: Annotated[
         bool,
         typer.Option(
-            "--anyway", help="Write what is worse than doing without it, too; its card says so."
+            "--anyway",
+            help="Export even if the model is worse than the baseline; its card says so.",
         ),
     ] = False,
     trust: Trust = False,
@@ -722,7 +726,7 @@ def ardupilot(
 
     vehicle_model = load_vehicle(source, model=model, dt=0.0025)
     back_end = ArduPilotBackend(vehicle_model, assign_servos(vehicle_model, servo or ()), port)
-    print(f"{vehicle_model.name} listens at UDP port {back_end.port}; Ctrl-C ends it", flush=True)
+    print(f"{vehicle_model.name} listens on UDP port {back_end.port}; Ctrl-C stops it", flush=True)
     for name, servo_output in zip(vehicle_model.inputs, back_end.servos, strict=False):
         print(
             f"  {name}: servo output {servo_output.channel}, {servo_output.lower_command:g} to {servo_output.upper_command:g}",
@@ -733,7 +737,7 @@ def ardupilot(
 
 @app.command()
 def report(folder: RunArgument, quiet: QuietOption = False) -> None:
-    """Write the figures and the report of a finished run again."""
+    """Rewrite the figures and the report of a finished run."""
     from residnet.tasks.registry import report_run
 
     with show_progress(quiet=quiet):
@@ -747,10 +751,10 @@ def trust(
         Path, typer.Argument(metavar="RUN", help="Folder of a run, or of a single model.")
     ],
 ) -> None:
-    """Accept a run folder as it stands: list what is new or changed, and write its checksums.
+    """Accept the files of a run folder: list new and changed files, and write checksums.
 
-    Do this only if you trust where the folder comes from. Nothing in it runs, but its numbers are
-    taken as those of a run, and later commands may replace the listed files.
+    Do this only if you trust the source of the folder. No code in it runs, but its numbers are
+    used as results of a run, and later commands may replace the listed files.
     """
     from residnet.core.run_loader import accept_run
 
@@ -768,7 +772,7 @@ def compare(
     ] = Path("comparison"),
     quiet: QuietOption = False,
 ) -> None:
-    """Set finished fits in parallel: errors on common logs, paired intervals, configs."""
+    """Compare finished fits: errors on common logs, paired intervals, settings."""
     from residnet.core.run_loader import name_damaged_key
     from residnet.tasks.compare import compare_runs
 
@@ -799,7 +803,7 @@ def list_names(
         typer.Argument(help="Kind of part to list."),
     ],
 ) -> None:
-    """List the parts that a config may name, with a line about each."""
+    """List the parts that a config can use, each with a description."""
     from residnet.tasks.registry import list_catalogue
 
     for name, description in list_catalogue(part_kind):

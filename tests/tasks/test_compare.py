@@ -49,7 +49,7 @@ def test_two_runs_side_by_side(two: list[Path], tmp_path: Path) -> None:
     entry = compare_paired(open_fit_runs(two))["whole"]["second"]
     assert (entry["mean"], entry["nrmse_mean"]) == pytest.approx((0.04, -0.04))
     assert entry["ci95"] == pytest.approx([-0.04, -0.04])
-    assert "second (plsr) has the least error: -0.040 against first, beyond chance." in text
+    assert "second (plsr) has the lowest error: -0.040 against first (significant)." in text
     assert "seed" in text
     assert "same" not in text
     assert "Where the runs differ" in plain(page)
@@ -82,7 +82,7 @@ def test_what_cannot_be_compared(two: list[Path], tmp_path: Path) -> None:
     accept_run(two[1])
     for runs, said in (
         (two[:1], "name at least two runs"),
-        (two[:1] * 2, "named twice"),
+        (two[:1] * 2, "given twice"),
         (two, "runs of fits can be compared"),
     ):
         with pytest.raises(UsageError, match=said):

@@ -86,7 +86,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("'heads.mlp={kind: mlp, features: [u_dot]}'", "only a residual in force space knows it"),
     ],
     "ship": [
-        ("~programme.vessel", "nothing flies"),
+        ("~programme.vessel", "no vessel"),
         (f"'{M}zigzag, drive: 0.5, heading: 10 deg}}]'", "give either steer"),
         (f"'{M}zigzag, drive: 0.5, rudder: 10 deg, heading: 10 deg}}]'", "has no rudder"),
         (f"programme.vessel=mariner '{M}turning_circle, drive: 1, rudder: 60 deg}}]'", "to 40 deg"),

@@ -1,4 +1,4 @@
-"""`residnet compare`: finished fits in parallel over common windows, and what they differ in."""
+"""`residnet compare`: compare finished fits over common windows, and their settings."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ from residnet.report.sections.runs import error_growth
 from residnet.runs.folder import RunFolder
 
 _MAX_DIFFERENCES = 60
-"""Settings in which runs differ that the page shows."""
+"""Maximum number of different settings on the page."""
 _ABSENT = object()
 WindowKey = tuple[str, str, float]
-"""Log, protocol and first time of a window."""
+"""Log, protocol and start time in s of a window."""
 
 
 class EvaluatedRun(RunFiles):
-    """A finished fit, as far as runs are compared: by its selected model.
+    """A finished fit in a comparison, represented by its selected model.
 
     Attributes:
-        name: that tells it from the others.
+        name: unique name of the run in the comparison.
+        model: name of the selected model.
     """
 
     def __init__(self, name: str, path: Path) -> None:
@@ -45,7 +46,7 @@ class EvaluatedRun(RunFiles):
 
     @cached_property
     def windows_by_key(self) -> dict[WindowKey, StoredWindow]:
-        """The free runs that it was judged on."""
+        """The evaluated free runs by log, protocol and start time."""
         stored_windows = self.read_split_windows(self.report_split)
         return {
             (window.log, window.protocol, round(float(window.t[0]), 3)): window
@@ -54,13 +55,14 @@ class EvaluatedRun(RunFiles):
 
 
 def compare_runs(paths: Sequence[Path], output_folder: Path) -> tuple[str, Path]:
-    """Compare finished fits; returns the table for the terminal and the page.
+    """Compare finished fits; returns the text for the terminal and the page.
 
     Args:
-        paths: folders of the runs; the first is what the others are compared with.
+        paths: folders of the runs; the first run is the reference.
+        output_folder: folder of the page.
 
     Raises:
-        UsageError: if a folder holds no finished fit, or the page cannot be written.
+        UsageError: if a folder has no finished fit, or the page cannot be written.
     """
     runs = open_fit_runs(paths)
     comparisons = compare_paired(runs)
@@ -72,27 +74,25 @@ def compare_runs(paths: Sequence[Path], output_folder: Path) -> tuple[str, Path]
         pair for pair in config_differences if pair[0] not in ("name", "description")
     ]
     truncation_note = (
-        f" The first {_MAX_DIFFERENCES} of {len(config_differences)} stand here."
+        f" The first {_MAX_DIFFERENCES} of {len(config_differences)} are shown."
         if len(config_differences) > _MAX_DIFFERENCES
         else ""
     )
-    caption = (
-        f"What the runs were asked to do differently; what is alike is left out.{truncation_note}"
-    )
+    caption = f"Settings in which the runs differ.{truncation_note}"
     difference_table = build_table(
         config_differences[:_MAX_DIFFERENCES],
         [
             ("setting", lambda pair: pair[0]),
             *((run.name, lambda pair, i=i: pair[1][i]) for i, run in enumerate(runs)),
         ],
-        caption=caption if config_differences else "The runs were asked to do the same.",
+        caption=caption if config_differences else "The runs have the same settings.",
     )
     paired_tables = [_build_paired_table(runs, comparisons)] if comparisons else []
     verdict = _write_conclusion(runs, comparisons)
     with record_folder(output_folder):
         sections = []
         if comparisons:
-            # of the first protocol, for the first screen: error, difference, interval
+            # the top of the page shows the first protocol only
             first_protocol = {protocol: comparisons[protocol] for protocol in list(comparisons)[:1]}
             summary_table = _build_paired_table(runs, first_protocol).select_columns(3, 6)
             summary_table.caption = f"Selected models, {next(iter(first_protocol))}."
@@ -109,10 +109,10 @@ def compare_runs(paths: Sequence[Path], output_folder: Path) -> tuple[str, Path]
 
 
 def open_fit_runs(paths: Sequence[Path]) -> list[EvaluatedRun]:
-    """Return the runs in folders.
+    """Open the runs of a comparison.
 
     Raises:
-        UsageError: if there is no finished fit in one of them, or fewer than two are named.
+        UsageError: if a folder has no finished fit, or there are fewer than two folders.
     """
     if len(paths) < 2:
         raise UsageError("compare: name at least two runs")
@@ -123,7 +123,7 @@ def open_fit_runs(paths: Sequence[Path]) -> list[EvaluatedRun]:
         else [str(path) for path in paths]
     )
     if len(set(names)) < len(names):
-        raise UsageError("compare: a run is named twice")
+        raise UsageError("compare: the same run is given twice")
     runs = [EvaluatedRun(name, path) for name, path in zip(names, paths, strict=True)]
     for run in runs:
         if not common_channels([runs[0], run]):
@@ -136,14 +136,14 @@ def open_fit_runs(paths: Sequence[Path]) -> list[EvaluatedRun]:
 
 
 def common_channels(runs: Sequence[EvaluatedRun]) -> list[str]:
-    """Return what moves in all runs, in the order of the first: what they are compared by."""
+    """Return the velocities that all runs model, in the order of the first run."""
     return [
         name for name in runs[0].dof.active_states if all(name in r.dof.active_states for r in runs)
     ]
 
 
 def _common_windows(runs: Sequence[EvaluatedRun]) -> dict[str, list[WindowKey]]:
-    """Return the windows by protocol that all runs were judged on, of one and the same length."""
+    """Return the windows by protocol that all runs evaluated with the same length."""
     common_keys = set.intersection(*(set(run.windows_by_key) for run in runs))
     windows_by_protocol: dict[str, list[WindowKey]] = {}
     for window in sorted(common_keys):
@@ -153,10 +153,13 @@ def _common_windows(runs: Sequence[EvaluatedRun]) -> dict[str, list[WindowKey]]:
 
 
 def compare_paired(runs: Sequence[EvaluatedRun]) -> dict[str, dict[str, Any]]:
-    """Return protocol -> run -> difference to the first run over common windows.
+    """Compute paired differences to the first run over common windows.
 
-    Errors are normalised root mean squares, the mean over what moves in all runs, by the first
-    run's scales.
+    Errors are normalised root mean square errors (NRMSE), averaged over the velocities of all runs,
+    with the scales of the first run.
+
+    Returns:
+        By protocol and run: number of windows, mean error, difference and its 95 % interval.
     """
     comparisons: dict[str, dict[str, Any]] = {}
     scales = {str(name): float(scale) for name, scale in _reference_scales(runs).items()}
@@ -181,7 +184,7 @@ def compare_paired(runs: Sequence[EvaluatedRun]) -> dict[str, dict[str, Any]]:
 
 
 def _reference_scales(runs: Sequence[EvaluatedRun]) -> pd.Series:
-    """Return the first run's scales of what moves in all runs."""
+    """Return the scales of the first run for the common velocities."""
     return pd.Series(runs[0].metrics["scales"], dtype=float)[common_channels(runs)]
 
 
@@ -217,7 +220,7 @@ def _build_paired_table(
             ("difference", format_difference, str),
             ("95 % interval", format_interval),
         ],
-        caption="Selected models over the windows that all runs were judged on, by the scales of"
+        caption="Selected models over the windows that all runs evaluated, with the scales of"
         f" {reference_name}; differences to {reference_name}, negative where the run is better.",
         is_selected=lambda row: row["mean"] == lowest_error[row["protocol"]],
         group_key=lambda row: row["protocol"],
@@ -225,7 +228,7 @@ def _build_paired_table(
 
 
 def _find_config_differences(values: Sequence[Any], path: str) -> list[tuple[str, list[str]]]:
-    """Return the paths below which values differ, with what each says there."""
+    """Return the keys at which nested settings differ, with their values as text."""
     if all(value == values[0] for value in values):
         return []
     if not all(isinstance(value, Mapping) for value in values):
@@ -240,7 +243,7 @@ def _find_config_differences(values: Sequence[Any], path: str) -> list[tuple[str
 
 
 def _summarize_value(value: Any) -> str:
-    """Return a value in a few words; of a part with many settings its kind or its first ones."""
+    """Return a short text of a value; for a mapping its kind or its first items."""
     match value:
         case None | [] | ():
             return "none"
@@ -265,21 +268,21 @@ def _write_conclusion(
     runs: Sequence[EvaluatedRun], comparisons: Mapping[str, Mapping[str, Any]]
 ) -> str:
     if not comparisons:
-        return "The runs have no window of a log in common: their errors stand beside each other."
+        return "The runs have no common window: their errors cannot be compared in pairs."
     protocol, entries = next(iter(comparisons.items()))
     best_run = min(runs, key=lambda run: float(entries[run.name]["mean"]))
     if best_run is runs[0]:
         return f"Over the common windows of {protocol}, no run is better than {best_run.name}."
     entry = entries[best_run.name]
-    certainty = ", beyond chance." if entry["excludes_zero"] else ", which may be chance."
+    certainty = " (significant)." if entry["excludes_zero"] else " (not significant)."
     return (
         f"Over {entry['windows']} common windows of {protocol}, {best_run.name} ({best_run.model}) has"
-        f" the least error: {entry['nrmse_mean']:+.3f} against {runs[0].name}{certainty}"
+        f" the lowest error: {entry['nrmse_mean']:+.3f} against {runs[0].name}{certainty}"
     )
 
 
 def _plot_error_growth(runs: Sequence[EvaluatedRun], output_folder: Path) -> Block:
-    """Draw how the errors of the selected models grow over the common windows."""
+    """Plot the growth of the errors of the selected models over the common windows."""
     protocol, windows = next(iter(_common_windows(runs).items()))
     scales, error_curves = _reference_scales(runs), {}
     for run in runs:

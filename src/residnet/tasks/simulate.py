@@ -1,4 +1,4 @@
-"""Task `simulate`: sea trials as canonical logs, with manoeuvring indices and figures."""
+"""Task `simulate`: simulated sea trials as canonical logs, with manoeuvring indices."""
 
 from __future__ import annotations
 
@@ -54,21 +54,21 @@ from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, SummaryMetric, TaskOutcome
 
 _MAX_SHOWN_ROWS = 24
-"""Manoeuvres whose indices are shown on the terminal; more stand in a file."""
+"""Maximum number of manoeuvres whose indices are shown on the terminal."""
 DEFAULT_TIME_STEP = 0.05
-"""Step in s between the samples of a simulation, if none is given."""
+"""Default time step of a simulation in s."""
 
 
 class ModelChoice(Config):
-    """A learned model of a finished run, with actuators in front.
+    """A learned model of a finished run, driven through actuators.
 
     Attributes:
         run: folder of the run.
-        name: of the model; `selected` is the one chosen on validation data.
-        actuators: vessel (name or file) whose actuators turn commands into the model's inputs; the
-            programme's vessel if absent.
-        inputs: instead of a vessel's actuators, each input of the model by its share in drive and
-            steer, with limits and rates.
+        name: name of the model; `selected` is the model chosen on validation data.
+        actuators: vessel (name or file) whose actuators convert commands to the inputs of the
+            model; null for the vessel of the programme.
+        inputs: instead of the actuators of a vessel: drive and steer shares, limits and rates of
+            each input of the model.
     """
 
     run: ExistingPath
@@ -87,24 +87,24 @@ class ModelChoice(Config):
         """The folder of the model in its run.
 
         Raises:
-            UsageError: if the run holds no such model.
+            UsageError: if the run has no such model.
         """
         return self.run / "models" / chosen_model(self.run, self.name)
 
 
 class Programme(Config):
-    """Manoeuvres and what flies them.
+    """A list of manoeuvres with the vessel or model that performs them.
 
     Attributes:
-        vessel: name or file of a vessel that flies them.
-        model: a learned model that flies them instead, or besides.
-        manoeuvres: in their order.
-        families: further ones drawn at random by `seed`.
-        duration: of manoeuvres that give none; for one with a stop condition the time after which
-            it has failed.
-        step: of the logs; that of the model if there is one, else 0.05 s.
-        substeps: steps of the vessel within one step of the logs.
-        initial: states (by name) that trials start from, where not as the vessel's kind does.
+        vessel: name or file of a vessel.
+        model: a learned model, instead of the vessel or in addition to it.
+        manoeuvres: manoeuvres in their order.
+        families: families from which further manoeuvres are drawn at random by `seed`.
+        duration: duration of manoeuvres without their own; for a manoeuvre with a stop condition
+            the time after which it has failed.
+        step: time step of the logs; null for the step of the model, or 0.05 s without a model.
+        substeps: number of simulation steps of the vessel within one step of the logs.
+        initial: initial states by name; others have the default of the vessel.
         length: of the hull for indices in lengths; that of the vessel if absent.
         reader: of logs that are replayed.
         noise: of the sensors; indices are taken from the motion itself.
@@ -137,9 +137,9 @@ class Programme(Config):
     @model_validator(mode="after")
     def _validate_manoeuvres(self) -> Programme:
         if self.vessel is None and self.model is None:
-            raise ValueError("nothing flies: give vessel, model or both")
+            raise ValueError("no vessel: give vessel, model or both")
         if not self.manoeuvres and not self.families:
-            raise ValueError("nothing is flown: give manoeuvres, families or both")
+            raise ValueError("no manoeuvre: give manoeuvres, families or both")
         manoeuvres = self.sample_manoeuvres()
         for manoeuvre in manoeuvres:
             check_steps(manoeuvre.duration or self.duration, self.step or DEFAULT_TIME_STEP)
@@ -154,7 +154,7 @@ class Programme(Config):
         return self
 
     def sample_manoeuvres(self) -> list[Manoeuvre]:
-        """Return the manoeuvres: those given, then those drawn."""
+        """Return the listed manoeuvres, then those drawn from families."""
         generator = np.random.default_rng([self.seed, 1])
         families = [family.sample_all(generator, self.duration) for family in self.families]
         return [
@@ -164,7 +164,7 @@ class Programme(Config):
 
     @cached_property
     def loaded_manoeuvres(self) -> list[Manoeuvre]:
-        """The manoeuvres, with the logs of replays read.
+        """The manoeuvres; the logs of replays are loaded.
 
         Raises:
             ResidnetError: if a log cannot be read.
@@ -177,16 +177,16 @@ class Programme(Config):
 
     @property
     def hull_length(self) -> float | None:
-        """The length of the hull in m; None if it is not known."""
+        """Length of the hull in m; None if unknown."""
         vessel = self.vessel or (self.model.actuators if self.model is not None else None)
         is_length_given = self.length is not None or vessel is None
         return self.length if is_length_given else load_vessel(str(vessel)).length.value
 
     def build_crafts(self) -> list[tuple[SimulatedVessel, TrialEnvironment]]:
-        """Return what flies, each with what surrounds it: the vessel, then the model.
+        """Return the vessel, then the model, each with its environment.
 
         Raises:
-            UsageError: if one of them cannot fly the manoeuvres.
+            UsageError: if one of them cannot perform the manoeuvres.
         """
         model = None if self.model is None else self._build_model_craft(self.model)
         step = self.step or (DEFAULT_TIME_STEP if model is None else model[0].dynamics.dt)
@@ -196,16 +196,16 @@ class Programme(Config):
         return crafts_and_seas if model is None else [*crafts_and_seas, model]
 
     def simulate_all(self, craft: SimulatedVessel, sea: TrialEnvironment) -> list[ManoeuvreRun]:
-        """Fly all manoeuvres in one batch."""
+        """Simulate all manoeuvres in one batch."""
         step = self.step or (craft.dynamics.dt if self.model is not None else DEFAULT_TIME_STEP)
         meta = {"vessel": self.vessel, "craft": craft.name}
         return simulate_manoeuvres(craft, self.loaded_manoeuvres, sea, self.duration, step, meta)
 
     def check(self) -> None:
-        """Build everything that flies, and the source of every manoeuvre.
+        """Build vessel, model and all manoeuvres without a simulation.
 
         Raises:
-            ResidnetError: if that is not possible.
+            ResidnetError: if one of them cannot be built.
         """
         times = torch.arange(2, dtype=torch.float64) * (self.step or DEFAULT_TIME_STEP)
         for craft, _ in self.build_crafts():
@@ -217,7 +217,7 @@ class Programme(Config):
         self, vessel: str, step: float
     ) -> tuple[SimulatedVessel, TrialEnvironment]:
         plant = build_plant(vessel, self.disturbance)
-        # actuators with dead time move by a step of their own
+        # one step checks that the dead times of actuators fit the time step
         inputs = torch.zeros(1, len(plant.input_names), dtype=torch.float64)
         plant.finish_step(plant.make_initial_state(1), inputs, step / self.substeps)
         self.disturbance.check_plant(plant, vessel)
@@ -260,7 +260,7 @@ class Programme(Config):
                 "a model flies with actuators: name a vessel's in programme.model.actuators, or"
                 " give programme.model.inputs"
             )
-        # waves and forces do not reach a learned model
+        # a learned model has no input for wave loads
         wind_only = self.disturbance.model_copy(update={"waves": None})
         actuated = ActuatedDynamics(
             model.double(), spec.signals.input_columns, spec.hold, actuators
@@ -293,12 +293,15 @@ class Programme(Config):
 
 
 class SimulateConfig(ComputingTask):
-    """Simulated trials with their indices and figures; give `programme` or `data`.
+    """Simulated sea trials with manoeuvring indices and figures.
+
+    Give either `programme` or `data`.
 
     Attributes:
-        programme: a list of manoeuvres on a vessel, a learned model, or both: logs/<log>.parquet,
-            those of a model beside a vessel in model_logs.
-        data: trials as the task `fit` draws and splits them: logs/<split>/<log>.parquet.
+        programme: a list of manoeuvres of a vessel, a learned model, or both; logs are written to
+            logs/<log>.parquet, those of a model in addition to a vessel to model_logs.
+        data: trials drawn and split as by the task `fit`; logs are written to
+            logs/<split>/<log>.parquet.
     """
 
     section_module: ClassVar[str] = "residnet.report.sections.manoeuvres"
@@ -311,18 +314,18 @@ class SimulateConfig(ComputingTask):
     def _require_one_source(self) -> SimulateConfig:
         if (self.programme is None) == (self.data is None):
             raise ValueError(
-                "give programme (manoeuvres on a vessel or a model) or data (trials with splits),"
-                " one of the two"
+                "give either programme (manoeuvres of a vessel or a model) or data (trials with"
+                " splits)"
             )
         if self.data is not None:
             self.data.assign_splits(self.data.draw_manoeuvres())
         return self
 
     def check(self) -> None:
-        """Check that models and logs are there and fit the manoeuvres.
+        """Check that models and logs exist and fit the manoeuvres.
 
         Raises:
-            ResidnetError: if they do not.
+            ResidnetError: if one of them is missing or does not fit.
         """
         if self.programme is not None:
             self.programme.check()
@@ -330,7 +333,7 @@ class SimulateConfig(ComputingTask):
             make_dummy_logs(self.data)
 
     def input_files(self) -> list[Path]:
-        """Return the logs that are replayed, and the files of the learned model."""
+        """Return the replayed logs and the files of the learned model."""
         if self.programme is None:
             return []
         files = [m.log for m in self.programme.manoeuvres if isinstance(m, Replay)]
@@ -338,19 +341,19 @@ class SimulateConfig(ComputingTask):
         return files if model is None else [*files, *sorted(model.model_folder.glob("model.*"))]
 
     def provenance_seed(self) -> int:
-        """Return the seed of everything random in the trials."""
+        """Return the seed of the random numbers of the trials."""
         trial_source = self.programme or self.data
         assert trial_source is not None
         return trial_source.seed
 
     def execute(self, folder: RunFolder) -> TaskOutcome:
-        """Fly the manoeuvres, and write logs, indices and figures.
+        """Simulate the manoeuvres, and write logs, indices and figures.
 
-        Flights that were drawn at random may end otherwise than they should; only those that the
-        config lists are a failure.
+        A manoeuvre that does not reach its stop condition is a failure if the config lists it; a
+        randomly drawn one is only reported.
 
         Raises:
-            UsageError: if something cannot fly the manoeuvres.
+            UsageError: if the vessel or model cannot perform the manoeuvres.
         """
         if self.programme is not None:
             flights_by_craft = [

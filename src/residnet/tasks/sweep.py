@@ -1,6 +1,7 @@
-"""Task `sweep`: keys of any config varied by grid, at random or by TPE, trial by trial.
+"""Task `sweep`: search over keys of any config by grid, random or TPE search.
 
-Optuna keeps the trials in a journal that survives any kill; each is a run in a process of its own.
+Optuna records the trials in a journal, so that an interrupted sweep can be resumed. Each trial is a
+run in its own process.
 """
 
 from __future__ import annotations
@@ -36,27 +37,27 @@ if TYPE_CHECKING:
     import optuna
 
 _MAX_TRIALS = 100_000
-"""Most trials of a sweep."""
+"""Maximum number of trials of a sweep."""
 _MAX_LOST_PROCESSES = 3
-"""Times that a trial may lose its process before it has failed: twice is an accident."""
+"""Number of lost processes after which a trial has failed."""
 _LOCK_TIMEOUT = 10
-"""Seconds after which the lock of a killed process is taken away."""
+"""Seconds after which the lock of a killed process is removed."""
 _SEED_STRIDE = 7_919
-"""Keeps the seeds of the trials of neighbouring seeds of a search apart."""
+"""Factor that makes the trial seeds of neighbouring search seeds different."""
 JOURNAL_FILE, BEST_CONFIG_FILE = "journal.log", "best.yaml"
 _STATE_NAMES = {"COMPLETE": "finished", "PRUNED": "ended early", "FAIL": "failed"}
 
 
 class SearchValues(Config):
-    """Values that a key of the base takes: `choices`, or a range from `low` to `high`.
+    """Values of one key of the base: `choices`, or a range from `low` to `high`.
 
     Attributes:
-        choices: any values of the key, lists and mappings included; null for a range.
-        low: least value of a range, in the key's SI unit; with `high` a whole number, the values
-            are whole numbers.
-        high: greatest value of a range.
-        log: the range is covered evenly in its logarithm.
-        points: of the range on a grid, ends included; null for all whole numbers.
+        choices: any values of the key, including lists and mappings; null for a range.
+        low: lower bound of a range, in the SI unit of the key; if `low` and `high` are integers,
+            the values are integers.
+        high: upper bound of a range.
+        log: sample the range on a logarithmic scale.
+        points: number of grid points in the range, including its ends; null for all integers.
     """
 
     choices: tuple[JsonValue, ...] | None = Field(default=None, min_length=1)
@@ -82,7 +83,7 @@ class SearchValues(Config):
 
     @property
     def _choice_texts(self) -> list[str]:
-        """Choices as Optuna knows them."""
+        """JSON texts of the choices, which Optuna stores."""
         return [json.dumps(choice) for choice in self.choices or ()]
 
     @property
@@ -90,7 +91,7 @@ class SearchValues(Config):
         return isinstance(self.low, int) and isinstance(self.high, int)
 
     def to_distribution(self) -> Any:
-        """Return the Optuna distribution; a choice is its JSON text there."""
+        """Return the Optuna distribution; choices are represented by their JSON texts."""
         from optuna import distributions
 
         if self.choices is not None:
@@ -101,10 +102,10 @@ class SearchValues(Config):
         return distribution_type(self.low, self.high, log=self.log)
 
     def grid_values(self) -> list[Any]:
-        """Return all values of a grid, as the distribution knows them.
+        """Return all values of a grid, as represented in the distribution.
 
         Raises:
-            ValueError: for a range without a number of points.
+            ValueError: if a range of real numbers has no `points`.
         """
         if self.choices is not None:
             return list(self._choice_texts)
@@ -117,7 +118,7 @@ class SearchValues(Config):
         points_on_range = (np.geomspace if self.log else np.linspace)(
             self.low, self.high, self.points
         )
-        # the ends themselves, or rounding may leave the range
+        # rounding must not move the ends out of the range
         points_on_range[0], points_on_range[-1] = self.low, self.high
         return (
             sorted({round(value) for value in points_on_range.tolist()})
@@ -126,27 +127,27 @@ class SearchValues(Config):
         )
 
     def boundary_values(self) -> list[Any]:
-        """Return values that a check tries: all choices, or the ends of a range."""
+        """Return the values that a check tests: all choices, or the ends of a range."""
         return self.grid_values() if self.choices is not None else [self.low, self.high]
 
 
 class GridSearch(Config):
-    """Every combination of all values, once.
+    """Grid search: every combination of all values.
 
     Attributes:
-        kind: of the search.
+        kind: kind of the search.
     """
 
     kind: Literal["grid"]
 
 
 class RandomSearch(Config):
-    """Values drawn at random, independently of what other trials found.
+    """Random search: values drawn independently for each trial.
 
     Attributes:
-        kind: of the search.
+        kind: kind of the search.
         trials: number of trials.
-        seed: of the draws.
+        seed: seed of the random numbers.
     """
 
     kind: Literal["random"]
@@ -155,13 +156,13 @@ class RandomSearch(Config):
 
 
 class TpeSearch(RandomSearch):
-    """Values drawn where earlier trials did well: Optuna's tree-structured Parzen estimator.
+    """Bayesian search with Optuna's tree-structured Parzen estimator.
 
-    What a trial draws depends on which trials had ended by then, so that only one worker repeats
-    a search exactly.
+    The values of a trial depend on the trials that ended before, so that a search is reproducible
+    with one worker only.
 
     Attributes:
-        startup: trials that are drawn at random first.
+        startup: number of random trials at the start.
     """
 
     kind: Literal["tpe"]  # type: ignore[assignment]
@@ -169,14 +170,13 @@ class TpeSearch(RandomSearch):
 
 
 class PruningConfig(Config):
-    """Ending a trial early: where its network validates worse than the median of trials by then.
+    """Median pruning: end a trial early if its network is worse than the median of other trials.
 
-    The validation error in free run that the training itself watches is compared, at the same
-    epoch.
+    The validation errors in free run during training are compared at the same epoch.
 
     Attributes:
-        startup: trials that must have ended before any is ended early.
-        warmup: epochs that every trial is given.
+        startup: number of completed trials before any trial is pruned.
+        warmup: number of epochs before a trial may be pruned.
     """
 
     startup: int = Field(default=5, ge=1)
@@ -184,13 +184,13 @@ class PruningConfig(Config):
 
 
 class FreeRunObjective(Config):
-    """The least mean NRMSE in free run over the validation data of a fit.
+    """Mean NRMSE of a fit in free run over its validation data, to be minimised.
 
-    The protocol is the one that the fit itself selects by. Test data have no say.
+    The protocol is that of the model selection. Test data are not used.
 
     Attributes:
-        kind: of the objective.
-        model: whose error counts; `selected` for the one that each fit selects.
+        kind: kind of the objective.
+        model: name of the model; `selected` for the model that each fit selects.
     """
 
     kind: Literal["free_run"] = "free_run"
@@ -200,19 +200,19 @@ class FreeRunObjective(Config):
 
     @property
     def monitored_model(self) -> str | None:
-        """The model whose training may be ended early; None if it is not named."""
+        """Model whose training may be pruned; None for `selected`."""
         return None if self.model == "selected" else self.model
 
     @property
     def description(self) -> str:
-        """What is sought, for tables and axes."""
+        """Label of the objective for tables and axes."""
         return f"validation NRMSE of {self.model} [-]"
 
     def require_valid_task(self, task: Task) -> None:
         """Check that runs of a task have this objective.
 
         Raises:
-            UsageError: if the task is no fit, or has no such model.
+            UsageError: if the task is not a fit, or has no such model.
         """
         if task.task != "fit":
             raise UsageError(
@@ -240,11 +240,11 @@ class FreeRunObjective(Config):
 
 
 class FigureObjective(Config):
-    """A main figure of summary.json.
+    """A main figure of summary.json as objective.
 
     Attributes:
-        kind: of the objective.
-        name: of the figure, for example `cost`.
+        kind: kind of the objective.
+        name: name of the figure, for example `cost`.
         direction: `minimize` or `maximize`.
     """
 
@@ -252,29 +252,29 @@ class FigureObjective(Config):
     name: str
     direction: Literal["minimize", "maximize"] = "minimize"
 
-    # no training shows the figure before a run ends
+    # the figure is known at the end of a run only, so that no trial can be pruned
     monitored_model: ClassVar[None] = None
 
     @property
     def is_minimized(self) -> bool:
-        """Whether a lesser figure is better."""
+        """Whether the figure is minimised."""
         return self.direction == "minimize"
 
     @property
     def description(self) -> str:
-        """What is sought, for tables and axes."""
+        """Label of the objective for tables and axes."""
         return self.name
 
     def require_valid_task(self, task: Task) -> None:
-        """Check that the figure may be sought.
+        """Check that the figure may be optimised.
 
         Raises:
             UsageError: if the task is a fit, whose main figures are errors on test data.
         """
         if task.task == "fit":
             raise UsageError(
-                "objective: the main figures of a fit are errors on test data, which must not"
-                " choose anything; take objective: {kind: free_run}"
+                "objective: the main figures of a fit are errors on test data, which must not be"
+                " used for selection; use objective: {kind: free_run}"
             )
 
     def read_value(self, run: RunFolder) -> float | None:
@@ -293,23 +293,23 @@ class FigureObjective(Config):
 
 
 class ProcessesConfig(Config):
-    """Processes of this machine, in parallel.
+    """Parallel processes on this machine.
 
     Attributes:
-        kind: of the runner.
-        workers: number of processes; null for as many as there are cores. One works without a
-            process of its own.
+        kind: kind of the runner.
+        workers: number of processes; null for the number of cores. A single worker runs in the
+            main process.
     """
 
     kind: Literal["processes"] = "processes"
     workers: int | None = Field(default=None, ge=1, le=1_024)
 
     def require_available(self) -> None:
-        """Check nothing: processes need no package."""
+        """Do nothing: processes need no optional package."""
 
     @property
     def n_parallel(self) -> int:
-        """How many trials run at a time."""
+        """Number of trials that run in parallel."""
         if self.workers is not None:
             return self.workers
         from joblib import cpu_count
@@ -318,7 +318,7 @@ class ProcessesConfig(Config):
 
     @contextmanager
     def open_executor(self) -> Iterator[Executor]:
-        """Hold the processes; an interruption ends them all at once. One worker is this process."""
+        """Open the process pool; an interruption ends all processes. One worker is this process."""
         if self.n_parallel == 1:
             with worker_limit(1):
                 yield InlineExecutor()
@@ -328,22 +328,22 @@ class ProcessesConfig(Config):
 
     @property
     def worker_lost_errors(self) -> tuple[type[Exception], ...]:
-        """Errors with which a trial ends whose process was lost."""
+        """Exceptions of a trial whose process was lost."""
         return (BrokenProcessPool,)
 
 
 class RayConfig(Config):
     """Tasks of a Ray cluster, or of Ray on this machine.
 
-    The run folder must lie where every node sees it under the same path.
+    All nodes must see the run folder under the same path.
 
     Attributes:
-        kind: of the runner.
-        workers: trials at a time.
-        address: of the cluster, for example `auto` on one of its nodes; null starts Ray on this
-            machine.
-        cpus: cores that a trial takes.
-        gpus: share of a GPU that a trial takes.
+        kind: kind of the runner.
+        workers: number of trials that run in parallel.
+        address: address of the cluster, for example `auto` on one of its nodes; null starts Ray on
+            this machine.
+        cpus: number of cores of a trial.
+        gpus: share of a GPU of a trial.
     """
 
     kind: Literal["ray"]
@@ -356,21 +356,21 @@ class RayConfig(Config):
         """Check that Ray is installed.
 
         Raises:
-            MissingPackageError: if it is not.
+            MissingPackageError: if Ray is not installed.
         """
         require_package("ray", "runner.kind: ray", "ray")
 
     @property
     def n_parallel(self) -> int:
-        """How many trials run at a time."""
+        """Number of trials that run in parallel."""
         return self.workers
 
     @contextmanager
     def open_executor(self) -> Iterator[Executor]:
-        """Hold a connection to Ray, whose processes end with this one.
+        """Connect to Ray within the context.
 
         Raises:
-            FitError: if the cluster cannot be reached, or ends a trial that was not lost.
+            FitError: if the cluster cannot be reached, or Ray ends a trial.
         """
         self.require_available()
         import ray
@@ -378,7 +378,7 @@ class RayConfig(Config):
         try:
             ray.init(
                 address=self.address,
-                # a cluster has cores of its own
+                # a cluster knows its number of cores
                 num_cpus=None if self.address else max(round(self.workers * self.cpus), 1),
                 include_dashboard=None if self.address else False,
                 log_to_driver=False,
@@ -398,7 +398,7 @@ class RayConfig(Config):
 
     @property
     def worker_lost_errors(self) -> tuple[type[Exception], ...]:
-        """Errors with which a trial ends whose process, node or memory was lost."""
+        """Exceptions of a trial whose process, node or memory was lost."""
         from ray import exceptions
 
         return (
@@ -410,10 +410,10 @@ class RayConfig(Config):
 
 
 class _RayExecutor(Executor):
-    """An executor whose work runs as Ray tasks."""
+    """Executor that submits functions as Ray tasks."""
 
     def __init__(self, ray: Any, cpus: float, gpus: float) -> None:
-        # the sweep counts what is lost, and begins it again
+        # no retries by Ray: the sweep counts lost processes and repeats their trials
         self._make_remote = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -428,17 +428,17 @@ RunnerConfig = Annotated[ProcessesConfig | RayConfig, Field(discriminator="kind"
 
 @final
 class SweepConfig(Task):
-    """Keys of a config varied over a search space; every trial is a run of its own.
+    """Search over keys of a config; every trial is a separate run.
 
     Attributes:
-        base: config of any task but a sweep, by its path or by the name of one that comes with
-            residnet, such as `quickstart`; paths in it are taken from its own folder.
+        base: config of any task but a sweep: a path, or the name of a config that comes with
+            residnet, such as `quickstart`; paths in it are relative to its own folder.
         common: overrides of the base for all trials.
-        space: values by the key of the base that they are for, such as `heads.mlp.hidden`.
-        search: how the space is searched.
-        objective: what is sought.
-        pruning: ends poor trials early; null lets each come to its end.
-        runner: where trials run.
+        space: values by key of the base, such as `heads.mlp.hidden`.
+        search: search method.
+        objective: optimised quantity.
+        pruning: early end of poor trials; null for none.
+        runner: processes that run the trials.
     """
 
     section_module: ClassVar[str] = "residnet.report.sections.sweep"
@@ -464,26 +464,27 @@ class SweepConfig(Task):
                 raise ValueError(f"space: a grid of {self.n_trials} trials; at most {_MAX_TRIALS}")
         if self.pruning is not None and self.objective.monitored_model is None:
             raise ValueError(
-                "pruning: objective must be of kind free_run and name the network whose training"
-                " is watched in objective.model"
+                "pruning: objective must have the kind free_run, and objective.model must name the"
+                " network whose training is monitored"
             )
         return self
 
     @property
     def n_trials(self) -> int:
-        """Number of trials that the search asks for; of a grid, all its combinations."""
+        """Number of trials of the search; for a grid, the number of combinations."""
         if isinstance(self.search, GridSearch):
             return math.prod(len(values.grid_values()) for values in self.space.values())
         return self.search.trials
 
     def build_trial(self, values: Mapping[str, Any], name: str) -> tuple[Any, list[str]]:
-        """Return the run that values of the space describe, and the overrides of its base.
+        """Return the task of a trial and the overrides of its base.
 
         Args:
-            values: by key, as the distributions know them.
+            values: values by key, as represented in the distributions.
+            name: name of the run.
 
         Raises:
-            ConfigError: if they do not make a valid config.
+            ConfigError: if the config is not valid.
         """
         trial_values = {key: values[key] for key in self.space}
         value_overrides = [
@@ -493,12 +494,12 @@ class SweepConfig(Task):
         return load_config(self.base, overrides, SweepableConfig), overrides
 
     def check(self) -> None:
-        """Check that the base and each value make a valid run, and that all packages are there.
+        """Check the base with each value of the space, the objective and required packages.
 
-        The ends of a range are tried, each with the first values of the other keys.
+        The ends of a range are tested, each with the first values of the other keys.
 
         Raises:
-            ResidnetError: if one does not, or the objective does not fit the task.
+            ResidnetError: if a config is not valid, or the objective does not fit the task.
         """
         require_package("optuna", "task sweep", "sweep")
         self.runner.require_available()
@@ -511,7 +512,7 @@ class SweepConfig(Task):
         task.check()
 
     def input_files(self) -> list[Path]:
-        """Return the base and the files that it reads."""
+        """Return the base and its input files."""
         base = load_config(self.base, self.common, SweepableConfig)
         return [self.base, *base.input_files()]
 
@@ -519,16 +520,16 @@ class SweepConfig(Task):
         return 0 if isinstance(self.search, GridSearch) else self.search.seed
 
     def execute(self, folder: RunFolder) -> TaskOutcome:
-        """Carry out all trials and write what they found; those that are done already are kept.
+        """Run all trials and write their results; finished trials are reused.
 
         Raises:
-            ResidnetError: if the system ends a process, or a journal is damaged.
+            ResidnetError: if a trial cannot be run, or the journal is damaged.
         """
         journal = folder.path / JOURNAL_FILE
         for file in (journal, journal.with_name(f"{JOURNAL_FILE}.lock")):
             folder.manifest.record(file, None)
         if journal.is_file():
-            # a kill may have left the last line without its end
+            # the last line may be incomplete after a kill
             content = journal.read_bytes()
             journal.write_bytes(content[: content.rfind(b"\n") + 1])
         study = open_optuna_study(self, folder.path)
@@ -550,7 +551,7 @@ class SweepConfig(Task):
                 if not trial_by_future:
                     return _write_results(self, study, folder)
                 completed, _ = wait(trial_by_future, return_when=FIRST_COMPLETED)
-                # in the order of their numbers, so that nothing hangs on chance
+                # in the order of the trial numbers, for reproducible results
                 for future in sorted(
                     completed, key=lambda completed_future: trial_by_future[completed_future].number
                 ):
@@ -561,20 +562,20 @@ class SweepConfig(Task):
                         n_lost[trial.number] += 1
                         if n_lost[trial.number] < _MAX_LOST_PROCESSES:
                             log_message(
-                                f"  trial {trial.number}: its process was lost, it goes on anew"
+                                f"  trial {trial.number}: its process was lost, the trial is repeated"
                             )
                             restart_queue.append(trial)
                             continue
                         error_line = str(error).partition("\n")[0]
                         error_message = (
                             f"its process was lost {_MAX_LOST_PROCESSES} times ({error_line});"
-                            " the memory may not be enough, so give fewer runner.workers"
+                            " memory may be insufficient: reduce runner.workers"
                         )
                         queue.record_result(trial, TrialResult(None, False, error_message, 0.0))
 
 
 def open_optuna_study(config: SweepConfig, folder: Path) -> optuna.Study:
-    """Return the study of a sweep, new or as an interrupted sweep left it.
+    """Create the Optuna study of a sweep, or open the study of an interrupted sweep.
 
     Raises:
         UsageError: if the journal is damaged.
@@ -599,13 +600,13 @@ def open_optuna_study(config: SweepConfig, folder: Path) -> optuna.Study:
         )
     except (ValueError, KeyError) as error:
         raise UsageError(
-            f"{path}: is no journal of this sweep ({error}); restore it, or begin anew with"
+            f"{path}: is not a journal of this sweep ({error}); restore it, or restart with"
             " --overwrite"
         ) from error
 
 
 class TrialQueue:
-    """The trials of a sweep that have still to be carried out, in their order."""
+    """Queue of the remaining trials of a sweep."""
 
     def __init__(self, config: SweepConfig, study: optuna.Study) -> None:
         from optuna.trial import TrialState
@@ -613,19 +614,19 @@ class TrialQueue:
         self.config, self.study = config, study
         self.distributions = {key: values.to_distribution() for key, values in config.space.items()}
         existing_trials = study.get_trials(deepcopy=False)
-        # a kill leaves trials without an end: they go on
+        # trials that were interrupted by a kill are continued first
         self._interrupted = [
             trial for trial in existing_trials if trial.state is TrialState.RUNNING
         ]
         self._n_started = sum(trial.state is not TrialState.WAITING for trial in existing_trials)
         if isinstance(config.search, GridSearch):
-            # the last key varies fastest
+            # itertools.product varies the last key fastest
             grid = itertools.product(*(values.grid_values() for values in config.space.values()))
             for values in itertools.islice(grid, len(existing_trials), None):
                 study.enqueue_trial(dict(zip(config.space, values, strict=True)))
 
     def start_next(self) -> optuna.Trial | None:
-        """Return the next trial to be carried out; None if all have begun."""
+        """Return the next trial; None if all trials were started."""
         import optuna
 
         if self._interrupted:
@@ -633,7 +634,7 @@ class TrialQueue:
             trial = optuna.Trial(self.study, self._interrupted.pop(0)._trial_id)
             self.study.sampler = self._make_sampler(number)
             for key, distribution in self.distributions.items():
-                # a kill may have come before all values were written
+                # a kill may have occurred before all values were written
                 trial._suggest(key, distribution)
             return trial
         if self._n_started >= self.config.n_trials:
@@ -643,7 +644,7 @@ class TrialQueue:
         return self.study.ask(self.distributions)
 
     def _make_sampler(self, number: int) -> Any:
-        """Return the sampler of a trial; its seed is that of the trial alone."""
+        """Return the sampler of a trial; its seed depends on the trial number only."""
         from optuna.samplers import RandomSampler, TPESampler
 
         search = self.config.search
@@ -653,7 +654,7 @@ class TrialQueue:
         return RandomSampler(seed=seed)
 
     def record_result(self, trial: optuna.Trial, result: TrialResult) -> None:
-        """Write into the journal how a trial ended, and say so."""
+        """Record the result of a trial in the journal and report it."""
         from optuna.trial import TrialState
 
         trial.set_user_attr("seconds", result.seconds)
@@ -675,13 +676,13 @@ class TrialQueue:
 
 
 class TrialResult(NamedTuple):
-    """How a trial ended.
+    """Result of a trial.
 
     Attributes:
-        value: of the objective; None if there is none.
-        is_pruned: whether it was ended early.
-        error_message: one line where it failed; else empty.
-        seconds: that its run took.
+        value: value of the objective; None if the trial has none.
+        is_pruned: whether the trial was ended early.
+        error_message: error in one line; empty without an error.
+        seconds: duration of the run in s.
     """
 
     value: float | None
@@ -697,10 +698,14 @@ def _trial_folder_path(folder: Path, number: int) -> Path:
 def run_sweep_trial(
     config: SweepConfig, folder: Path, trial_id: int, number: int, values: dict[str, Any]
 ) -> TrialResult:
-    """Carry out a trial unless its run is finished.
+    """Run a trial unless its run is finished.
 
     Args:
-        values: by key, as the distributions know them.
+        config: config of the sweep.
+        folder: folder of the sweep.
+        trial_id: Optuna id of the trial.
+        number: number of the trial.
+        values: values by key, as represented in the distributions.
     """
     import optuna
 
@@ -721,12 +726,12 @@ def run_sweep_trial(
         is_pruned = True
     except ResidnetError as error:
         error_message = str(error)
-    # a complete run whose results fail a check has a value all the same
+    # a complete run whose results failed a check has a value, too
     if run.is_finished and not is_pruned:
         try:
             value, error_message = config.objective.read_value(run), ""
             if value is None or not math.isfinite(value):
-                value, error_message = None, f"{run.path}: what is sought is not finite"
+                value, error_message = None, f"{run.path}: the objective is not finite"
         except ResidnetError as error:
             error_message = str(error)
     has_provenance = run.provenance.is_file()
@@ -737,7 +742,7 @@ def run_sweep_trial(
 def make_pruning_callback(
     config: SweepConfig, folder: Path, number: int
 ) -> Callable[[Progress], None] | None:
-    """Return what hears of a trial's progress; None if no trial is ended early."""
+    """Return the progress callback that prunes a trial; None without pruning."""
     if config.pruning is None:
         return None
     import optuna
@@ -756,7 +761,7 @@ def make_pruning_callback(
 
 
 def _write_results(config: SweepConfig, study: optuna.Study, folder: RunFolder) -> TaskOutcome:
-    """Write sweep.json and best.yaml; returns what the sweep found."""
+    """Write sweep.json and best.yaml; returns the outcome of the sweep."""
     rows = [_trial_row(config, trial) for trial in study.get_trials(deepcopy=False)]
     by_state = {
         state: [row for row in rows if row["state"] == state] for state in _STATE_NAMES.values()
@@ -786,7 +791,7 @@ def _write_results(config: SweepConfig, study: optuna.Study, folder: RunFolder) 
         for state_name, state_rows in by_state.items()
     }
     if best_row is None:
-        first_error = next((row["fault"] for row in rows if row["fault"]), "none came to its end")
+        first_error = next((row["fault"] for row in rows if row["fault"]), "no trial was completed")
         return TaskOutcome(
             ["No trial of the sweep has a value."],
             summary_metrics,
@@ -810,8 +815,8 @@ def _write_results(config: SweepConfig, study: optuna.Study, folder: RunFolder) 
         verdict.append(f"{len(failed_rows)} trials failed; the first: {failed_rows[0]['fault']}.")
     if len(finished_rows) > 1:
         verdict.append(
-            f"The best of {len(finished_rows)} values is lucky as well as good: judge it on data that"
-            " chose nothing, such as the test split of its run."
+            f"The best of {len(finished_rows)} validation errors is biased by the selection: evaluate it"
+            " on other data, such as the test split of its run."
         )
     summary_metrics = {"best": SummaryMetric(best_row["value"]), **summary_metrics}
     return TaskOutcome(verdict, summary_metrics, trials_table(content).to_text())
@@ -830,7 +835,10 @@ def _trial_row(config: SweepConfig, trial: Any) -> dict[str, Any]:
 
 
 def _parameter_importance(study: optuna.Study, n_finished: int) -> dict[str, float]:
-    """Return the share of each key in the variance of the objective; empty for too few trials."""
+    """Return the share of each key in the variance of the objective (fANOVA).
+
+    The result is empty for fewer than four trials.
+    """
     if n_finished < 4:
         return {}
     from optuna.importance import FanovaImportanceEvaluator, get_param_importances
@@ -838,6 +846,6 @@ def _parameter_importance(study: optuna.Study, n_finished: int) -> dict[str, flo
     try:
         importances = get_param_importances(study, evaluator=FanovaImportanceEvaluator(seed=0))
     except (RuntimeError, ValueError):
-        # all values are alike: there is no variance to share
+        # all objective values are equal
         return {}
     return {key: float(share) for key, share in importances.items()}
