@@ -1,4 +1,4 @@
-"""From a recording to a log: one clock, SI, NED and body axes, the vessel's centre."""
+"""Conversion of a recording to a log: one clock, SI units, NED and body axes, vessel's origin."""
 
 from __future__ import annotations
 
@@ -56,28 +56,28 @@ from residnet.preprocessing.motion import Antenna
 
 _STATE_CHANNELS = ("x", "y", "psi", "u", "v", "r", "p", "phi")
 _MOTION_CHANNELS = {*_STATE_CHANNELS, "north_rate", "east_rate"}
-_MAX_GAP_SECONDS, _MAX_GAP_STEPS = 1.0, 3.0
-"""Longest step that is bridged, s, and in usual steps of a topic: two rows may get lost; chosen by
-hand."""
+_MAX_GAP_SECONDS = 1.0
+_MAX_GAP_STEPS = 3.0
+"""Longest step that is interpolated: in s, and in median steps of a topic (two lost rows)."""
 
 
 class RecordingConfig(ConfiguredReader, ABC):
-    """What to take from a recording.
+    """Base class of the readers of recordings.
 
     Attributes:
-        channels: canonical names (or names of your own) -> field of a topic.
+        channels: channel name (canonical or user-defined) -> field of a topic.
         position: source of x and y.
         heading: source of psi.
-        velocity: source of u and v (and r) where they are not channels.
-        standard_messages: standard messages of ROS map themselves to what is not declared, by
-            REP-103 (ENU, forward-left-up).
-        clock: the log's clock.
-        delays: topic -> time in s by which what it says is older than its time says; `estimated`
-            takes, for a topic without header stamps, the usual latency of those that have them.
-        zone: time by which the recorder's clock is ahead of UTC, s; null estimates it where topics
-            have stamps and arrivals.
-        manoeuvre: kind of manoeuvre of every recording, `folder` takes the name of the folder it
-            lies in, null says that it is not known.
+        velocity: source of u and v (and r) if they are not mapped as channels.
+        standard_messages: whether standard messages map automatically to channels that are not
+            declared; ROS messages by REP 103 (ENU; forward, left, up).
+        clock: clock of the log.
+        delays: topic -> delay in s that is subtracted from its times; `estimated` takes the median
+            latency of topics with header stamps for a topic without them.
+        recorder_utc_offset: offset of the recorder's clock from UTC in s, positive if it is ahead;
+            null estimates it from topics with stamps and arrivals.
+        manoeuvre: type of manoeuvre of every recording; `folder` takes the name of its folder; null
+            means unknown.
     """
 
     channels: dict[str, FieldMap] = Field(default_factory=dict)
@@ -87,12 +87,19 @@ class RecordingConfig(ConfiguredReader, ABC):
     standard_messages: bool = True
     clock: ClockConfig = Field(default_factory=TopicClock)
     delays: dict[str, Seconds | Literal["estimated"]] = Field(default_factory=dict)
-    zone: Seconds | None = None
+    recorder_utc_offset: Seconds | None = None
     manoeuvre: str | None = None
     formats: ClassVar[Mapping[str, Callable[[Path, bytes], bool]]] = {}
-    """Name of each format that it reads -> whether a path with these first bytes is of it."""
+    """Name of a format -> test of a path and its first bytes for this format."""
     endings: ClassVar[tuple[str, ...]] = ()
-    """Endings of its files."""
+    """Extensions of the files."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _reject_zone(cls, settings: Any) -> Any:
+        if isinstance(settings, Mapping) and "zone" in settings:
+            raise ValueError("zone: this key is now called recorder_utc_offset; rename it")
+        return settings
 
     @model_validator(mode="after")
     def _validate_sources(self) -> RecordingConfig:
@@ -106,43 +113,47 @@ class RecordingConfig(ConfiguredReader, ABC):
         declared_channels = source_channels(self.position, self.heading, self.velocity)
         if duplicates := ", ".join(name for name in declared_channels if name in self.channels):
             raise ValueError(
-                f"channels: {duplicates} given here and by position, heading or velocity; take one of"
-                " them away"
+                f"channels: {duplicates} given here and by position, heading or velocity; remove"
+                " one of them"
             )
         return self
 
     @abstractmethod
     def load(self, path: Path, field_filter: FieldFilter) -> Recording:
-        """Return the recording in `path`, at least the series that are wanted.
+        """Load a recording.
+
+        Args:
+            path: file or folder.
+            field_filter: filter of topics and fields; a reader may load more.
 
         Raises:
-            ResidnetError: where it cannot be read.
+            ResidnetError: if the recording cannot be read.
         """
 
     def read(self, path: Path) -> Log:
-        """Return the log in `path`.
+        """Read one log; see `LogReader.read`.
 
-        See `LogReader.read`. `meta["findings"]` says what was noticed and mended on the way in.
+        `meta["findings"]` has a remark on each problem and each correction.
         """
         return self.to_log(self.load(path, self._build_field_filter()))
 
     def to_log(self, recording: Recording) -> Log:
-        """Return the log of a recording as it was loaded; see `read`."""
+        """Convert a loaded recording to a log; see `read`."""
         path = recording.path
         delays = {
             topic: None if delay == "estimated" else delay for topic, delay in self.delays.items()
         }
-        recording = align_clocks(recording, delays, self.zone)
+        recording = align_clocks(recording, delays, self.recorder_utc_offset)
         plan = ChannelPlan(self.channels, self.position, self.heading, self.velocity)
         if self.standard_messages:
             plan = extend_with_standard_messages(recording, plan)
         log = build_log(recording, plan, self.clock)
         excluded: set[str] = set()
         if not DegreesOfFreedom.from_channels(log.channels).is_six_dof:
-            # of a vessel that does not dive nobody asked for these
+            # heave and pitch of a surface vessel are no states of its model
             excluded = {*SIX_DOF_LAYOUT.state_names} - {*ROLL_LAYOUT.state_names}
         elif isinstance(plan.velocity, EarthFixedVelocity | CourseSpeedVelocity):
-            # turned by the heading alone they are not along the axes of one that pitches
+            # a rotation by the heading alone gives no body velocities of a pitching vessel
             excluded = {"u", "v"}
         channels = {
             n: values for n, values in log.channels.items() if n not in excluded - {*self.channels}
@@ -154,7 +165,7 @@ class RecordingConfig(ConfiguredReader, ABC):
         return log.replace(name=name, manoeuvre=manoeuvre or "unknown", meta=meta)
 
     def _build_field_filter(self) -> FieldFilter:
-        """Return what the config names; everything where standard messages may add to it."""
+        """Return a filter of the configured fields; of all fields if messages map automatically."""
         if self.standard_messages:
             return ALL_FIELDS
         topic_fields = [(entry.topic, entry.field) for entry in self.channels.values()]
@@ -168,14 +179,14 @@ class RecordingConfig(ConfiguredReader, ABC):
 
 @dataclass(frozen=True)
 class TopicChannels:
-    """Channels of one topic on its own clock: SI and residnet's frames, not yet aligned.
+    """Channels of one topic in SI and residnet's frames, on the clock of the topic.
 
     Attributes:
-        log: the channels; it is named as the topic is.
-        hold_names: those whose last value holds until the next.
-        longest_gap: longest step that is bridged, s.
-        remarks: what was noticed on the way.
-        conversion: which frames were converted, in words.
+        log: log with the channels and the name of the topic.
+        hold_names: channels with zero-order hold.
+        longest_gap: longest step in s that is interpolated.
+        remarks: remarks from reading.
+        conversion: descriptions of converted frames.
     """
 
     log: Log
@@ -186,22 +197,27 @@ class TopicChannels:
 
     @property
     def is_pose(self) -> bool:
-        """Whether this is the position or the heading."""
+        """Whether the channels are position or heading."""
         return "psi" in self.log.channels or {"x", "y"} <= set(self.log.channels)
 
     def resample(self, times: np.ndarray, step: float) -> dict[str, np.ndarray]:
-        """Return the channels at `times` [T], whose usual step is `step`, both s.
+        """Resample the channels.
 
-        NaN in gaps and beyond the ends.
+        Args:
+            times: new sample times [T] in s.
+            step: median step of these times in s.
+
+        Returns:
+            Channel -> values [T], NaN in gaps and outside of the recorded span.
         """
-        # the aligner imports masks, which import the readers
+        # imported here because align imports masks, which import the readers
         from residnet.preprocessing.align import GridConfig, resample_at
 
         if times.size == self.log.t.size and np.array_equal(times, self.log.t):
             return dict(self.log.channels)
         max_gap = max(self.longest_gap, _MAX_GAP_STEPS * _median_step(self.log.t))
         resampled: dict[str, np.ndarray] = {}
-        # one by one: aligning needs several copies of what it aligns
+        # one channel at a time, because resampling needs several copies of its input
         for name, values in self.log.channels.items():
             hold_names = (name,) if name in self.hold_names else ()
             grid = GridConfig(step=step, held=hold_names, longest_gap=max_gap)
@@ -212,16 +228,20 @@ class TopicChannels:
 
 
 def build_log(recording: Recording, plan: ChannelPlan, clock: ClockConfig) -> Log:
-    """Return the log of a recording whose clocks are settled.
+    """Build a log from a recording with aligned clocks.
 
-    Time starts at 0 where the recording has dates (`meta["epoch"]`, Unix time in s), else it is the
-    recording's own. psi starts in [0, 2 pi). Samples at which a state channel has no value are
-    masked as `hard:gap`.
+    If the recording has dates, time starts at 0 and `meta["epoch"]` is the Unix time in s; otherwise
+    time is that of the recording. psi starts in [0, 2 pi). Samples without a value of any state
+    channel have the mask `hard:gap`.
+
+    Args:
+        recording: recording with one clock for all topics.
+        plan: mapping of topics to channels.
+        clock: clock of the log.
 
     Raises:
-        UsageError: where a topic, field or sender is missing, or a quantity that another one needs.
-        DataError: where a topic that is used has no usable time, or the topics share no stretch of
-            time.
+        UsageError: if a topic, field or sender is missing, or a quantity that another one needs.
+        DataError: if a topic has no usable time, or the topics do not overlap in time.
     """
     topics = _extract_all_topics(recording, plan)
     times, step = _compute_sample_times(recording, topics, clock)
@@ -238,7 +258,7 @@ def build_log(recording: Recording, plan: ChannelPlan, clock: ClockConfig) -> Lo
         pose_topics = [topic_channels for topic_channels in topics if topic_channels.is_pose]
         values = _differentiate_pose(pose_topics, derived_velocity, antenna, times, step) | values
     else:
-        _transform_to_vessel_centre(values, plan.velocity, antenna)
+        _transform_to_vessel_origin(values, plan.velocity, antenna)
     units |= {name: CHANNEL_UNITS[name] for name in ("x", "y", "psi", "u", "v", "r")}
     units = {name: units[name] for name in values}
     t = times
@@ -250,8 +270,8 @@ def build_log(recording: Recording, plan: ChannelPlan, clock: ClockConfig) -> Lo
     for name, channel in values.items():
         if not np.isfinite(channel).any():
             raise DataError(
-                f"{recording.path}: channel {name} holds no number on the log's clock; take it out"
-                " of the map, or give its topic's delay"
+                f"{recording.path}: channel {name} has no value on the log's clock; remove it from"
+                " the channel map, or set the delay of its topic"
             )
     states = [values[name] for name in _STATE_CHANNELS if name in values]
     is_missing = np.isnan(np.stack(states)).any(axis=0) if states else np.zeros(len(t), dtype=bool)
@@ -264,6 +284,7 @@ def build_log(recording: Recording, plan: ChannelPlan, clock: ClockConfig) -> Lo
 
 
 def _extract_all_topics(recording: Recording, plan: ChannelPlan) -> list[TopicChannels]:
+    """Return the channels of all topics in a plan, that of the position first."""
     topics = []
     if plan.position is not None:
         topics.append(extract_position(recording, plan.position))
@@ -277,8 +298,8 @@ def _extract_all_topics(recording: Recording, plan: ChannelPlan) -> list[TopicCh
             raise DataError(f"{recording.path}: {entry['text']}")
     if not topics:
         raise UsageError(
-            f"{recording.path}: no channel to read; name them under `channels`, `position`,"
-            f" `heading` (the recording holds {recording.describe_contents})"
+            f"{recording.path}: no channel is mapped; set `channels`, `position` and `heading`"
+            f" (the recording contains {recording.describe_contents})"
         )
     return topics
 
@@ -286,12 +307,16 @@ def _extract_all_topics(recording: Recording, plan: ChannelPlan) -> list[TopicCh
 def _read_field(
     recording: Recording, series: Series, path: str, unit: str | None = None
 ) -> np.ndarray:
-    """Return the numbers [T] of a field, in SI by their unit."""
+    """Return the values [T] of a field, in SI if a unit is given.
+
+    Raises:
+        DataError: if the field has no finite value.
+    """
     values = series[path]
     if not np.isfinite(values).any():
         raise DataError(
-            f"{recording.path}: topic {series.name}: field '{path}' holds no number in any of"
-            f" {values.size} rows; take it out of the map"
+            f"{recording.path}: topic {series.name}: field '{path}' has no number in any of"
+            f" {values.size} rows; remove it from the channel map"
         )
     return values if unit is None else to_si(unit) * values
 
@@ -309,7 +334,7 @@ def _make_topic_channels(
     if len(series) < 2:
         raise DataError(
             f"{recording.path}: topic {series.name} has {len(series)} rows, at least 2 are needed;"
-            " take it out of the map"
+            " remove it from the channel map"
         )
     units = {name: (units or {}).get(name) or CHANNEL_UNITS.get(name, "m/s") for name in values}
     log = Log(series.name, series.clock, values, units)
@@ -321,9 +346,9 @@ def _make_topic_channels(
 def _extract_mapped_channels(
     recording: Recording, channels: Mapping[str, FieldMap]
 ) -> list[TopicChannels]:
-    """Return one part for all channels of a topic that may share one.
+    """Return the mapped channels in groups of the same topic, sender and longest gap.
 
-    A channel with hardly a value has one of its own, of the rows that have any.
+    A channel with values in less than half of the rows is a group by itself, with these rows only.
     """
     groups: dict[tuple[str, str | None, float, str], dict[str, FieldMap]] = {}
 
@@ -342,9 +367,9 @@ def _extract_mapped_channels(
         if not (entry.required or is_available(entry)):
             continue
         series = recording[entry.topic]
-        sparse = np.isnan(series[entry.field]).mean() > 0.5
+        is_sparse = np.isnan(series[entry.field]).mean() > 0.5
         longest_gap = entry.longest_gap or _MAX_GAP_SECONDS
-        group_key = (series.name, entry.sender, longest_gap, name if sparse else "")
+        group_key = (series.name, entry.sender, longest_gap, name if is_sparse else "")
         groups.setdefault(group_key, {})[name] = entry
     topics = []
     for (topic, sender, longest_gap, sparse_name), entries in groups.items():
@@ -375,13 +400,15 @@ def _describe_lever_arm(antenna: Antenna, quantity: str) -> tuple[str, ...]:
     if antenna == Antenna():
         return ()
     return (
-        f"{quantity}: moved to the vessel's centre from ({antenna.x:g}, {antenna.y:g}) m in body axes",
+        f"{quantity}: transformed to the vessel's origin from ({antenna.x:g}, {antenna.y:g}) m in"
+        " body axes",
     )
 
 
 def extract_position(recording: Recording, config: PositionConfig) -> TopicChannels:
-    """Return x and y of the antenna, m."""
-    series, lever_arm_note = recording[config.topic], _describe_lever_arm(config.antenna, "x, y")
+    """Extract x and y of the antenna in m from a recording."""
+    series = recording[config.topic]
+    lever_arm_note = _describe_lever_arm(config.antenna, "x, y")
     first_coordinate, second_coordinate = (
         _read_field(recording, series, name, config.unit) for name in config.fields
     )
@@ -397,11 +424,12 @@ def extract_position(recording: Recording, config: PositionConfig) -> TopicChann
     )
     if origin is None:
         raise DataError(
-            f"{recording.path}: topic {series.name}: '{config.latitude}' holds no latitude in"
+            f"{recording.path}: topic {series.name}: '{config.latitude}' has no latitude in"
             f" {config.unit}; check field and unit"
         )
     text = (
-        f"topic {series.name}: {n_invalid} fixes at latitude 0, longitude 0 are no fixes; left out"
+        f"topic {series.name}: {n_invalid} positions at latitude 0, longitude 0 are no fixes; left"
+        " out"
     )
     remarks = [make_remark("note", "no_fix", text, rows=n_invalid)] if n_invalid else []
     origin_deg = np.degrees(origin)
@@ -414,13 +442,17 @@ def extract_position(recording: Recording, config: PositionConfig) -> TopicChann
 
 
 def extract_heading(recording: Recording, config: HeadingConfig) -> TopicChannels:
-    """Return psi, unwrapped from its first value in [0, 2 pi); phi and theta where wanted."""
+    """Extract psi from a recording, and phi and theta if configured.
+
+    psi is unwrapped and starts in [0, 2 pi).
+    """
     series = recording[config.topic]
     values: dict[str, np.ndarray] = {}
     remarks: list[Remark] = []
     offset = 0.0
     if isinstance(config, AngleHeading):
-        yaw, offset = _read_field(recording, series, config.field, config.unit), config.offset
+        yaw = _read_field(recording, series, config.field, config.unit)
+        offset = config.offset
     else:
         quaternion = normalize_quaternion(
             *(_read_field(recording, series, f"{config.field}.{axis}") for axis in "xyzw")
@@ -429,28 +461,29 @@ def extract_heading(recording: Recording, config: HeadingConfig) -> TopicChannel
         n_empty = int(np.isnan(w).sum())
         if n_empty == w.size:
             raise DataError(
-                f"{recording.path}: topic {series.name}: '{config.field}' holds no orientation, all"
-                " quaternions are empty"
+                f"{recording.path}: topic {series.name}: '{config.field}' has no orientation, all"
+                " quaternions are empty; use another source of the heading"
             )
         if n_flips := int((sum(part[1:] * part[:-1] for part in quaternion) < 0.0).sum()):
             message = (
-                f"topic {series.name}: the quaternion changes sign {n_flips} times (both signs are"
-                " one attitude); the heading is taken through"
+                f"topic {series.name}: the quaternion changes sign {n_flips} times (both signs"
+                " represent one attitude); the heading remains continuous"
             )
             remarks.append(make_remark("note", "quaternion_flips", message, flips=n_flips))
         if n_empty:
-            message = f"topic {series.name}: {n_empty} quaternions are empty; no heading there"
+            message = (
+                f"topic {series.name}: {n_empty} quaternions are empty; the heading is missing"
+            )
             remarks.append(make_remark("note", "empty_quaternions", message, rows=n_empty))
         yaw = quaternion_yaw(*quaternion)
         if config.roll:
-            # roll about the forward axis has one sign in both frames, pitch about the sideways one
-            # has not
+            # roll has the same sign in both frames, pitch has opposite signs
             pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
             values["phi"] = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
             values["theta"] = -pitch if config.frame == "enu" else pitch
     psi = unwrap_angle((np.pi / 2 - yaw if config.frame == "enu" else yaw) + offset)
     if np.isfinite(psi).any():
-        # a heading of zero with rounding stays zero
+        # rounding must not turn a heading of zero into 2 pi
         initial_psi = psi[np.isfinite(psi)][0] + 1e-6
         psi = psi - 2.0 * np.pi * np.floor(initial_psi / (2.0 * np.pi))
     values["psi"] = psi
@@ -462,19 +495,20 @@ def extract_heading(recording: Recording, config: HeadingConfig) -> TopicChannel
 def _extract_velocity(
     recording: Recording, config: EarthFixedVelocity | CourseSpeedVelocity
 ) -> TopicChannels:
+    """Extract the velocity over ground as the channels north_rate and east_rate in m/s."""
     series = recording[config.topic]
     if isinstance(config, CourseSpeedVelocity):
         course = _read_field(recording, series, config.course, config.course_unit)
         speed = _read_field(recording, series, config.speed, config.speed_unit)
-        # receivers give no course at rest
+        # receivers give no course at rest; there any course is right
         is_course_missing = np.isnan(course) & (speed > 0.3)
         north, east = (
-            np.where(is_course_missing, np.nan, speed * turn(np.nan_to_num(course)))
-            for turn in (np.cos, np.sin)
+            np.where(is_course_missing, np.nan, speed * component(np.nan_to_num(course)))
+            for component in (np.cos, np.sin)
         )
     else:
         north, east = (_read_field(recording, series, name, config.unit) for name in config.fields)
-    rotation_note = "u, v: earth-fixed velocity turned into body axes"
+    rotation_note = "u, v: earth-fixed velocity rotated to body axes"
     values = {"north_rate": north, "east_rate": east}
     lever_arm_note = _describe_lever_arm(config.antenna, "u, v")
     return _make_topic_channels(recording, series, values, (rotation_note, *lever_arm_note))
@@ -487,7 +521,11 @@ def _median_step(t: np.ndarray) -> float:
 def _compute_sample_times(
     recording: Recording, parts: Sequence[TopicChannels], clock: ClockConfig
 ) -> tuple[np.ndarray, float]:
-    """Return the times of the log's samples on the recording's clock, and their step, s."""
+    """Return the sample times of the log on the recording's clock and their median step, in s.
+
+    Raises:
+        DataError: if the topics do not overlap in time.
+    """
     if not isinstance(clock, UniformClock):
         times = parts[0].log.t if clock.topic is None else recording[clock.topic].clock
         return times, _median_step(times) if times.size > 1 else 1.0
@@ -496,34 +534,45 @@ def _compute_sample_times(
     interpolated_logs = [
         part.log for part in parts if set(part.log.channels) != set(part.hold_names)
     ]
+    # the span of the motion decides; commands that are held may start later
     span_logs = motion_logs or interpolated_logs or logs
-    start, stop = max(log.t[0] for log in span_logs), min(log.t[-1] for log in span_logs)
+    start = max(log.t[0] for log in span_logs)
+    stop = min(log.t[-1] for log in span_logs)
     if stop - start < clock.step:
         topic_spans = "; ".join(
             f"{log.name} {log.t[0]:.1f} to {log.t[-1]:.1f} s" for log in span_logs
         )
         raise DataError(
-            f"{recording.path}: the topics share no stretch of time ({topic_spans}); check `zone` and"
-            " `delays`"
+            f"{recording.path}: the topics do not overlap in time ({topic_spans}); check"
+            " `recorder_utc_offset` and `delays`"
         )
     first_time = start
     if recording.epoch is not None:
-        # whole multiples of the step in Unix time let logs of one day lie on one grid
+        # multiples of the step in Unix time give all logs of one day the same grid
         grid_offset = recording.epoch % round(clock.step * 1e9) * 1e-9
         first_time = math.ceil((start + grid_offset) / clock.step - 1e-6) * clock.step - grid_offset
     n_samples = math.floor((stop - first_time) / clock.step + 1e-6) + 1
     return first_time + clock.step * np.arange(n_samples), clock.step
 
 
-def _transform_to_vessel_centre(
+def _transform_to_vessel_origin(
     values: dict[str, np.ndarray], velocity: VelocityConfig | None, antenna: Antenna
 ) -> None:
-    """Bring position and velocity to the vessel's centre and into body axes, in place."""
+    """Transform position and velocity to the vessel's origin and body axes, in place.
+
+    Args:
+        values: channel -> values [T].
+        velocity: source of the velocity.
+        antenna: antenna of the position.
+
+    Raises:
+        UsageError: if the heading or the yaw rate is missing.
+    """
     if antenna != Antenna():
         if "psi" not in values:
             raise UsageError(
-                "position.antenna: needs the heading to move the position to the vessel's centre;"
-                " give `heading`"
+                "position.antenna: needs the heading to transform the position to the vessel's"
+                " origin; set `heading`"
             )
         north, east = rotate(antenna.x, antenna.y, values["psi"])
         values["x"], values["y"] = values["x"] - north, values["y"] - east
@@ -531,17 +580,17 @@ def _transform_to_vessel_centre(
         return
     if "psi" not in values:
         raise UsageError(
-            "velocity: needs the heading to turn earth-fixed velocities into body axes; give"
+            "velocity: needs the heading to rotate earth-fixed velocities to body axes; set"
             " `heading`"
         )
     u, v = rotate(values.pop("north_rate"), values.pop("east_rate"), -values["psi"])
     if velocity.antenna != Antenna():
         if "r" not in values:
             raise UsageError(
-                "velocity.antenna: needs the yaw rate to move the velocity to the vessel's centre;"
-                " give channels.r"
+                "velocity.antenna: needs the yaw rate to transform the velocity to the vessel's"
+                " origin; set channels.r"
             )
-        # for a rigid body u_P = u - r y, v_P = v + r x
+        # velocity of a point P of a rigid body: u_P = u - r y, v_P = v + r x
         u, v = u + values["r"] * velocity.antenna.y, v - values["r"] * velocity.antenna.x
     values["u"], values["v"] = u, v
 
@@ -553,19 +602,32 @@ def _differentiate_pose(
     times: np.ndarray,
     step: float,
 ) -> dict[str, np.ndarray]:
-    """Return x, y, psi, u, v, r [T] on a uniform clock, smoothed and differentiated.
+    """Smooth and differentiate position and heading with Savitzky-Golay filters.
 
-    The polynomials run on a grid that divides the log's step until it is as fine as the topics;
-    nothing is smoothed across a gap.
+    The filters run on a grid with an integer fraction of the log's step that is as fine as the
+    topics. They do not extend across gaps.
+
+    Args:
+        pose_topics: topics with position and heading.
+        config: windows and order of the filters.
+        antenna: antenna of the position.
+        times: uniform sample times [T] in s.
+        step: step of these times in s.
+
+    Returns:
+        The channels x, y, psi, u, v, r, [T] each.
+
+    Raises:
+        UsageError: if position or heading is missing.
     """
     pose_channels = {name for part in pose_topics for name in part.log.channels}
     if not {"x", "y", "psi"} <= pose_channels:
         raise UsageError(
-            "velocity: kind 'derived' needs position and heading; give both, or channels u, v, r"
+            "velocity: kind 'derived' needs position and heading; set both, or channels u, v, r"
         )
     oversampling = max(1, round(step / min(_median_step(part.log.t) for part in pose_topics)))
     fine_step = step / oversampling
-    # one window beyond the log's ends where the topics reach further
+    # pad the log by one window at both ends, where the topics may have further samples
     n_padding = int(np.ceil(max(config.window, config.yaw_window or 0.0) / fine_step))
     grid = times[0] + fine_step * np.arange(
         -n_padding, oversampling * (times.size - 1) + n_padding + 1
@@ -598,6 +660,7 @@ def _differentiate_pose(
 def _build_metadata(
     recording: Recording, plan: ChannelPlan, parts: Sequence[TopicChannels], times: np.ndarray
 ) -> dict[str, Any]:
+    """Return the log's meta: remarks, topics, conversions, numbers of rows and start time."""
     remarks: list[Remark] = [*recording.remarks, *plan.remarks]
     topics: dict[str, Any] = {}
     for series in recording.series.values():
@@ -606,7 +669,7 @@ def _build_metadata(
             e.topic == series.name and e.sender is not None for e in plan.channels.values()
         )
         remarks += series.remarks
-        # senders that each have a channel are told apart already
+        # several publishers are no problem if the config maps their senders to channels
         remarks += [
             r
             for r in series_remarks
@@ -620,8 +683,8 @@ def _build_metadata(
     missing_channels = [name for name in plan.channels if name not in present]
     if missing_channels:
         text = (
-            f"channels {', '.join(missing_channels)} are not in the recording or hold no number; the log"
-            " lacks them (they are not required)"
+            f"channels {', '.join(missing_channels)} are not in the recording or have no values;"
+            " the log lacks them (they are not required)"
         )
         remarks.append(
             make_remark("note", "missing_channels", text, channels=len(missing_channels))

@@ -1,4 +1,4 @@
-"""Several files of one trip, each from a recorder of its own, as one log."""
+"""Reader of trips with several files from different recorders, which become one log."""
 
 from __future__ import annotations
 
@@ -29,28 +29,30 @@ from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.preprocessing.statistics import OverlappingBlocks
 
 _MIN_OVERLAP = 0.5
-"""Share of the shorter log that two clocks must have in common while their shift is looked for."""
-_COARSE_STEP, _FINE_STEP = 0.5, 0.05
-"""Steps in s by which the shift is looked for, and then around the best."""
+"""Smallest overlap of two logs while a clock offset is searched, as share of the shorter one."""
+_COARSE_STEP = 0.5
+_FINE_STEP = 0.05
+"""Steps in s of the coarse search of a clock offset, and of the fine search around its optimum."""
 _MIN_VARIANCE_RATIO = 1.5
-"""How much more of the accelerations any shift far from the best one must leave unexplained."""
+"""Smallest ratio of unexplained variances, of the best alternative offset to the optimum."""
 _MIN_ALTERNATIVE_OFFSET = 3.0
-"""Time in s from which on a shift is another one."""
+"""Smallest distance in s of an alternative offset from the optimum."""
 _BLOCK_SECONDS = 2.5
-"""Time in s over which the velocities that are gained are explained: derivatives would be noise."""
+"""Length in s of the blocks whose change of velocity is explained; derivatives are too noisy."""
 _MAX_SAMPLES = 3000
-"""Samples of the motion from which a shift is found."""
+"""Largest number of samples of the motion for the search."""
 
 TableKind = CsvConfig | ParquetConfig | ExcelConfig | JsonLinesConfig
 
 
 class ClockOffset(NamedTuple):
-    """The time in s to add to a clock, and what it explains of what the motion alone leaves.
+    """Estimated offset between two clocks.
 
     Attributes:
-        seconds: to add.
-        explained_share: share of the variance, from 0 to 1.
-        runner_up_share: the same with the best shift that is far from it.
+        seconds: time in s to add to the other clock.
+        explained_share: share (0 to 1) of the residual variance of the motion model that the other
+            log's channels explain with this offset.
+        runner_up_share: the same share for the best offset at a distance from this one.
     """
 
     seconds: float
@@ -60,17 +62,15 @@ class ClockOffset(NamedTuple):
 
 @final
 class JoinedConfig(ConfiguredReader):
-    """Files of one trip whose names differ in one word, such as gnss_1.csv beside motors_1.csv.
+    """Reader of trips whose files differ in one word of their names: gnss_1.csv, motors_1.csv.
 
-    The first part is that of the motion: a log is named by its file and has its clock. What the
-    others hold is brought to this clock, averaged where it comes more often and held where it comes
-    more rarely.
+    The first part has the motion; its file gives the log its name and its clock. Channels of other
+    parts are resampled to this clock: averaged from a higher rate, held from a lower rate.
 
     Attributes:
-        parts: word in the file's name -> reader of such files, that of the motion first.
-        shift: word -> time in s that is added to the clock of that part; parts without one are
-            joined by their dates (Unix time among them), and where they have none by the shift with
-            which their channels explain most of the accelerations.
+        parts: word in the file name -> reader of these files, that of the motion first.
+        shift: word -> time in s to add to the clock of this part. Parts without an entry are joined
+            by their dates or Unix times, otherwise by the estimated clock offset.
     """
 
     kind: Literal["joined"] = "joined"
@@ -82,12 +82,13 @@ class JoinedConfig(ConfiguredReader):
         secondary_parts = list(self.parts)[1:]
         if unknown_parts := set(self.shift) - set(secondary_parts):
             raise ValueError(
-                f"shift: '{min(unknown_parts)}' is no part whose clock can be moved ({', '.join(secondary_parts)})"
+                f"shift: '{min(unknown_parts)}' is no part with a clock offset (expected one of"
+                f" {', '.join(secondary_parts)})"
             )
         return self
 
     def select_logs(self, paths: Sequence[Path]) -> list[Path]:
-        """Return the files of the motion."""
+        """Return the files with the motion, one per trip."""
         main_word, *secondary_words = self.parts
         reader_kind = self.parts[main_word].kind
         return [
@@ -99,36 +100,43 @@ class JoinedConfig(ConfiguredReader):
         ]
 
     def list_member_files(self, path: Path) -> list[Path]:
-        """Return the files of the trip that a file of the motion is of."""
+        """Return all files of a trip, from its file with the motion."""
         return [*self.find_trip_files(path).values()]
 
     def find_trip_files(self, path: Path) -> dict[str, Path]:
-        """Return word -> file of the trip that a file of the motion is of."""
+        """Return word -> file of a trip, from its file with the motion.
+
+        Raises:
+            UsageError: if the file does not exist.
+            DataError: if its name lacks the word, or another file of the trip is missing.
+        """
         require_file(path)
         main_word, *secondary_words = self.parts
         prefix, matched_word, suffix = path.name.rpartition(main_word)
         if not matched_word:
             raise DataError(
-                f"{path}: its name holds no '{main_word}'; give the files of the motion, to which"
-                f" those of {', '.join(secondary_words)} belong"
+                f"{path}: the file name does not contain '{main_word}'; give the files with the"
+                f" motion, the files of {', '.join(secondary_words)} are found from them"
             )
         trip_files = {main_word: path}
         for part_name in secondary_words:
             candidate = path.with_name(f"{prefix}{part_name}{suffix}")
             if not candidate.is_file():
-                raise DataError(f"{path}: {candidate.name} is not beside it; leave the trip out")
+                raise DataError(
+                    f"{path}: {candidate.name} is missing in its folder; leave the trip out"
+                )
             trip_files[part_name] = candidate
         return trip_files
 
     def read(self, path: Path) -> Log:
-        """Return the log of one trip; see `LogReader.read`."""
+        """Read one trip; see `LogReader.read`."""
         files = self.find_trip_files(path)
         logs = {
             part_name: self.parts[part_name].build().read(file) for part_name, file in files.items()
         }
         main_word, *secondary_words = logs
         log = logs[main_word]
-        # what dates join may be what the shift of the others is found by
+        # parts with dates first: their channels help to estimate the offsets of the others
         for part_name in sorted(
             secondary_words, key=lambda word: _offset_from_dates(log, logs[word]) is None
         ):
@@ -138,13 +146,22 @@ class JoinedConfig(ConfiguredReader):
         return log.replace(meta=meta)
 
     def _merge_channels(self, log: Log, other_log: Log, part_name: str) -> Log:
-        """Return a log with the channels of another one, on its own clock."""
+        """Return a log with the additional channels of another log, resampled to its clock.
+
+        Args:
+            log: log with the motion.
+            other_log: log of another part.
+            part_name: name of this part.
+
+        Raises:
+            DataError: if the other log has no new channel, or the clocks do not overlap.
+        """
         new_channels = {
             n: values for n, values in other_log.channels.items() if n not in log.channels
         }
         if not new_channels:
             raise DataError(
-                f"log {log.name}: {part_name} holds {', '.join(other_log.channels)}, which are there"
+                f"log {log.name}: the channels {', '.join(other_log.channels)} of {part_name} exist"
                 " already; leave this part out"
             )
         shift, offset_remark = self._choose_clock_offset(
@@ -155,8 +172,8 @@ class JoinedConfig(ConfiguredReader):
         in_overlap = (log.t >= t[0]) & (log.t <= t[-1])
         if in_overlap.sum() < 2:
             raise DataError(
-                f"log {log.name}: its clock goes from {log.t[0]:.1f} to {log.t[-1]:.1f} s, that of"
-                f" {part_name} from {t[0]:.1f} to {t[-1]:.1f} s; give `shift: {{{part_name}: ...}}`"
+                f"log {log.name}: the times run from {log.t[0]:.1f} to {log.t[-1]:.1f} s, those of"
+                f" {part_name} from {t[0]:.1f} to {t[-1]:.1f} s; set `shift: {{{part_name}: ...}}`"
             )
         hold_names = tuple(new_channels) if float(np.median(np.diff(t))) > step else ()
         resampled = resample_at(
@@ -178,19 +195,24 @@ class JoinedConfig(ConfiguredReader):
     def _choose_clock_offset(
         self, log: Log, other_log: Log, part_name: str
     ) -> tuple[float, Remark]:
-        """Return what is added to the other clock, and how sure that is.
+        """Choose the offset between two clocks: as configured, from dates, or estimated.
 
-        Dates of both join them, unless what the channels explain is sure to say otherwise.
+        Args:
+            log: log with the motion.
+            other_log: log of another part.
+            part_name: name of this part.
+
+        Returns:
+            The time in s to add to the other clock, and a remark, which is a warning if the offset
+            is ambiguous or contradicts the dates.
         """
         configured_shift = self.shift.get(part_name)
         if configured_shift is not None:
             return configured_shift, make_remark(
-                "note", "joined", f"{part_name}: its clock is moved by {configured_shift:g} s"
+                "note", "joined", f"{part_name}: clock offset {configured_shift:g} s (configured)"
             )
-        date_offset, advice = (
-            _offset_from_dates(log, other_log),
-            f"give `shift: {{{part_name}: ...}}`",
-        )
+        date_offset = _offset_from_dates(log, other_log)
+        advice = f"set `shift: {{{part_name}: ...}}`"
         try:
             estimate = estimate_clock_offset(log, other_log)
         except ResidnetError as error:
@@ -198,33 +220,42 @@ class JoinedConfig(ConfiguredReader):
                 return date_offset, make_remark(
                     "note", "joined", f"{part_name}: joined by the dates of both"
                 )
-            text = f"{part_name}: its clock cannot be brought to that of the motion ({error}); both are"
-            text += f" taken to begin together: {advice}"
+            text = (
+                f"{part_name}: the clock offset cannot be estimated ({error}); both files are"
+                f" assumed to start at the same time: {advice}"
+            )
             return float(log.t[0] - other_log.t[0]), make_remark("will mislead", "joined", text)
         offset_figures = estimate._asdict()
         is_unambiguous = 1.0 - estimate.runner_up_share >= _MIN_VARIANCE_RATIO * (
             1.0 - estimate.explained_share
         )
-        explanation = f"with which its channels explain {100 * estimate.explained_share:.0f} % of what the motion"
-        explanation += " alone leaves of the accelerations"
+        explanation = (
+            f"R² {estimate.explained_share:.2f} of the residual accelerations, at most"
+            f" {estimate.runner_up_share:.2f} at other offsets"
+        )
         if date_offset is not None and (
             not is_unambiguous or abs(estimate.seconds - date_offset) < _COARSE_STEP
         ):
             text = f"{part_name}: joined by the dates of both"
             return date_offset, make_remark("note", "joined", text, **offset_figures)
         if date_offset is not None:
-            text = f"{part_name}: joined by the dates of both, which are {date_offset - estimate.seconds:+.2f} s"
-            text += f" from the shift {explanation}: one of the clocks is wrong, {advice}"
+            text = (
+                f"{part_name}: joined by the dates of both, which differ by"
+                f" {date_offset - estimate.seconds:+.2f} s from the estimated offset"
+                f" ({explanation}): one of the clocks is wrong, {advice}"
+            )
             return date_offset, make_remark("will mislead", "joined", text, **offset_figures)
-        text = f"{part_name}: its clock is moved by {estimate.seconds:+.2f} s, {explanation}"
-        text += f" ({100 * estimate.runner_up_share:.0f} % with any shift {_MIN_ALTERNATIVE_OFFSET:g} s from it)"
-        text += "" if is_unambiguous else f"; that is not sure, {advice}"
+        text = f"{part_name}: estimated clock offset {estimate.seconds:+.2f} s ({explanation})"
+        text += "" if is_unambiguous else f"; the offset is ambiguous, {advice}"
         level: Level = "note" if is_unambiguous else "will mislead"
         return estimate.seconds, make_remark(level, "joined", text, **offset_figures)
 
 
 def _offset_from_dates(log: Log, other_log: Log) -> float | None:
-    """Return what brings another clock to that of a log by dates or Unix time that overlap."""
+    """Return the time in s to add to another log's clock by dates or Unix times.
+
+    None if a log has no dates, or the logs do not overlap.
+    """
     first_epoch, second_epoch = (
         item.meta.get("epoch", item.t[0] if detect_unix_unit(item.t) == "s" else None)
         for item in (log, other_log)
@@ -238,14 +269,18 @@ def _offset_from_dates(log: Log, other_log: Log) -> float | None:
 
 
 def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
-    """Return the shift of another log's clock with which its channels explain most accelerations.
+    """Estimate the clock offset of a log from the accelerations that its channels explain.
 
-    For each shift that leaves half of the shorter log, what u and r gain over blocks of time is
-    fitted by integrals of the velocities, and of each channel, its square and its product with the
-    speed. What counts is the share of what the velocities alone leave of all blocks.
+    For each offset with sufficient overlap the changes of u and r over blocks of time are fitted by
+    least squares. The regressors are integrals of velocities and of each channel w: w, w|w| and w u.
+    The offset with the largest explained share of the residual of the velocities alone is returned.
 
     Args:
-        log: of the motion, measured or by position and heading.
+        log: log with the motion, measured or derived from position and heading.
+        other_log: log with the channels that cause the motion, or with velocities.
+
+    Raises:
+        DataError: if the log is too short.
     """
     motion_log = complete_motion(log, MotionConfig())
     stride = max(1, len(motion_log) // _MAX_SAMPLES)
@@ -255,10 +290,10 @@ def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
         t, np.arange(0, len(t) - block_length, max(1, block_length // 4)), block_length
     )
     if not blocks.starts.size:
-        raise DataError(f"log {log.name}: {t[-1] - t[0]:.1f} s are too short to tell")
+        raise DataError(f"log {log.name}: {t[-1] - t[0]:.1f} s are too short for an estimate")
 
     def integrate_columns(*columns: np.ndarray) -> np.ndarray:
-        """Return the integrals of columns [T] over the blocks [B, k]."""
+        """Return the integrals [B, k] of columns [T] over the blocks."""
         return blocks.make_integrator(np.stack(columns, axis=1))(0)
 
     is_finite = {name: np.isfinite(motion_log[name]) for name in ("u", "r")}
@@ -268,7 +303,7 @@ def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
     motion_regressors = integrate_columns(
         np.ones_like(u), u, u * np.abs(u), r, r * np.abs(r), u * r
     )
-    # what the motion explains by itself, which says nothing of the commands
+    # residual of the model without commands
     motion_residual = (
         velocity_change
         - motion_regressors @ np.linalg.lstsq(motion_regressors, velocity_change, rcond=1e-9)[0]
@@ -278,7 +313,7 @@ def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
     input_signals = [
         values for name, values in other_log.channels.items() if name not in STATE_NAMES
     ]
-    # a velocity that the other one measured too gains what this one gains
+    # velocities in the other log change as those of this log do
     velocity_signals = [
         values for name, values in other_log.channels.items() if name in ("u", "v", "r")
     ]
@@ -314,7 +349,7 @@ def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
         regressors, response = np.concatenate(columns, axis=1), velocity_change[in_range]
         regressors = regressors / np.maximum(np.abs(regressors).max(axis=0), 1e-12)
         residual = response - regressors @ np.linalg.lstsq(regressors, response, rcond=1e-9)[0]
-        # blocks that the other log does not reach stay as the motion alone leaves them
+        # blocks outside of the other log count as unexplained
         return float(
             (squared_motion_residual[in_range].sum() - (residual**2).sum()) / total_variance
         )
@@ -338,13 +373,15 @@ def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
 
 
 def group_trip_files(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Path]]:
-    """Return word -> files, where files come in groups whose names differ in that word alone.
+    """Group files whose names differ in one word only, such as gnss_1.csv and motors_1.csv.
 
-    Empty where they do not: files of one group have the same columns, and some trips one of each.
-    Files of trips that lack a part are left out.
+    Files of one group have the same columns. Incomplete trips are left out.
 
     Args:
-        paths: file -> its columns.
+        paths: file -> names of its columns.
+
+    Returns:
+        Word -> files in the order of the trips; empty if the files are no parts of trips.
     """
     groups: dict[tuple[str, ...], list[Path]] = {}
     for path, columns in paths.items():
@@ -355,7 +392,7 @@ def group_trip_files(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Pa
     file_words = [
         [set(re.findall(r"[^\W\d_]+", path.stem)) for path in group] for group in file_groups
     ]
-    # the longest words that the names of all files of a group hold go first
+    # words that occur in all file names of a group, the longest first
     common_words = [
         sorted(set.intersection(*word_sets), key=lambda w: (-len(w), w)) for word_sets in file_words
     ]

@@ -1,7 +1,8 @@
-"""Kinds of message that map themselves to channels: one row of `MESSAGE_KINDS` each.
+"""Automatic mapping of standard messages (ROS, PX4, ArduPilot, NMEA 0183, MOOS) to channels.
 
-A row says by which types (or fields, where a source tells no types) a message is known, and which
-channels it holds. Of rows that hold the same channel the first wins, of topics alike the longest.
+Each entry of `MESSAGE_KINDS` defines a message by its types, or by its fields in sources without
+types, and its channels. If several messages have one channel, the first entry is used; of several
+topics of one entry the one with most rows is used.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from residnet.io.readers.recording import Recording, Series, normalize_field_pat
 
 _ROS_CONVERSION = "REP-103 (ENU, forward-left-up) to NED, forward-starboard-down"
 _NED_CONVERSION = "already in NED and forward-starboard-down"
-_BY_NAME_CONVERSION = "by its names, taken to be in SI, NED and body axes"
+_BY_NAME_CONVERSION = "by channel names, assumed in SI, NED and body axes"
 _WORLD_FRAMES = ("map", "odom", "earth", "world", "enu", "ned")
 _INTEGERS = tuple(f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64))
 _NUMBER_TYPES = ("Float64", "Float32", *_INTEGERS, "Float64Stamped", "Float32Stamped")
@@ -40,14 +41,15 @@ _FIX_FIELDS = ("latitude", "longitude")
 
 @dataclass(frozen=True)
 class MessageKind:
-    """A kind of message.
+    """Definition of a standard message.
 
     Attributes:
-        name: for the log's meta.
-        types: names of the message's type, without its package.
-        plan: series -> channels, position, heading and velocity that it gives.
-        conversion: how its frames become residnet's, for the log's meta.
-        fields: that tell it where the source has no types; none where only a type does.
+        name: name for the log's meta.
+        types: names of its message types without their package.
+        plan: function from a series to its channels, position, heading and velocity.
+        conversion: description of the conversion of frames for the log's meta.
+        fields: fields that identify it in sources without message types; empty if only the type
+            identifies it.
     """
 
     name: str
@@ -57,7 +59,7 @@ class MessageKind:
     fields: tuple[str, ...] = ()
 
     def matches(self, series: Series) -> bool:
-        """Return whether a series holds messages of this kind."""
+        """Return whether a series consists of these messages."""
         if series.message_type:
             return series.message_type.rsplit("/", 1)[-1] in self.types
         if self.name == "Named":
@@ -76,7 +78,10 @@ def _find_prefix(s: Series, prefixes: tuple[str, ...], field: str) -> str:
 
 
 def _map_body_velocities(s: Series, prefix: str) -> dict[str, FieldMap]:
-    """Velocities of a twist that are not zero throughout: a planar source leaves others empty."""
+    """Map the velocities of a twist that are not zero everywhere.
+
+    Sources of planar motion leave the other components zero.
+    """
     field_maps: dict[str, FieldMap] = {}
     paths = {"u": "linear.x", "v": "linear.y", "r": "angular.z", "p": "angular.x"}
     paths |= {"w": "linear.z", "q": "angular.y"}
@@ -89,12 +94,13 @@ def _map_body_velocities(s: Series, prefix: str) -> dict[str, FieldMap]:
 
 
 def _map_depth(s: Series, field: str, **settings: Any) -> dict[str, FieldMap]:
-    """The depth, where it moves: a planar source leaves it at zero."""
+    """Map the depth if it varies; sources of planar motion leave it zero."""
     is_varying = s.has_field(field) and float(np.nanstd(s[field])) > 0.0
     return _map_fields(s, "m", {"z": field}, **settings) if is_varying else {}
 
 
 def _find_orientation(s: Series, path: str) -> QuaternionHeading | None:
+    """Return the heading of a quaternion in ENU, with roll and pitch if they are not zero."""
     if not all(s.has_field(f"{path}.{axis}") for axis in "xyzw"):
         return None
     has_tilt = bool(s[f"{path}.x"].any() or s[f"{path}.y"].any())
@@ -102,7 +108,7 @@ def _find_orientation(s: Series, path: str) -> QuaternionHeading | None:
 
 
 def _plan_navigation(s: Series) -> ChannelPlan:
-    """A pose, a twist, or both."""
+    """Map a pose, a twist, or both."""
     pose_prefix = _find_prefix(s, ("pose.pose.", "pose.", ""), "position.x")
     twist_prefix = _find_prefix(s, ("twist.twist.", "twist.", ""), "linear.x")
     if s.has_field(f"{pose_prefix}position.x"):
@@ -120,15 +126,16 @@ def _plan_navigation(s: Series) -> ChannelPlan:
         and len(s.sender)
         and str(s.sender[0]).strip("/").lower() in _WORLD_FRAMES
     ):
-        # along the axes of the earth, which is left to the config
+        # a twist in earth axes is ambiguous; the config must map it
         return ChannelPlan()
     return ChannelPlan(_map_body_velocities(s, twist_prefix))
 
 
 def _plan_imu(s: Series) -> ChannelPlan:
+    """Map the angular rates of an IMU, and its orientation if it has one."""
     rates = {"r": "angular_velocity.z", "p": "angular_velocity.x"}
     rate_fields = {name: path for name, path in rates.items() if s.has_field(path)}
-    # a driver without orientation says so by -1 in the covariance, or leaves zeros
+    # drivers without orientation set the covariance to -1, or the quaternion to zeros
     covariance = "orientation_covariance.0"
     lacks_orientation = s.has_field(covariance) and bool((s[covariance] == -1.0).all())
     lacks_orientation = (
@@ -139,6 +146,7 @@ def _plan_imu(s: Series) -> ChannelPlan:
 
 
 def _plan_wrench(s: Series) -> ChannelPlan:
+    """Map forces and moment in body axes with zero-order hold."""
     prefix = _find_prefix(s, ("wrench.",), "force.x")
     body_settings: dict[str, Any] = {"frame": "body_fpu", "hold": True}
     forces = _map_fields(
@@ -150,6 +158,7 @@ def _plan_wrench(s: Series) -> ChannelPlan:
 
 
 def _plan_number(s: Series) -> ChannelPlan:
+    """Map a message with one number to the channel that the end of its topic names."""
     if not s.has_field("data"):
         return ChannelPlan()
     name_parts = [part for part in normalize_field_path(s.name).split("_") if part]
@@ -162,19 +171,21 @@ def _plan_number(s: Series) -> ChannelPlan:
 
 
 def _plan_joints(s: Series) -> ChannelPlan:
+    """Map positions, velocities and efforts of joints to channels with the names of the joints."""
     channels: dict[str, FieldMap] = {}
     for path in s.fields:
         quantity, _, joint = path.partition(".")
         unit = {"position": "rad", "velocity": "rad/s", "effort": "N m"}.get(quantity)
         if unit is not None and joint:
             name = joint if quantity == "position" else f"{joint}_{quantity}"
-            # a joint of a known name in another unit is another quantity
+            # a joint with the name of a channel in another unit is another quantity
             name = name if CHANNEL_UNITS.get(name, unit) == unit else f"{name}_{quantity}"
             channels |= _map_fields(s, unit, {name: path})
     return ChannelPlan(channels)
 
 
 def _plan_moos(s: Series) -> ChannelPlan:
+    """Map position and heading of MOOS-IvP's navigation variables."""
     position_source = None
     if s.has_field("NAV_X") and s.has_field("NAV_Y"):
         position_source = LocalPosition(topic=s.name, north="NAV_Y", east="NAV_X")
@@ -187,11 +198,13 @@ def _plan_moos(s: Series) -> ChannelPlan:
 
 
 def _canonical_fields(s: Series) -> list[str]:
+    """Return the non-empty fields with names of canonical channels."""
     canonical_names = (name for name in s.fields if name in CHANNEL_UNITS and name != "t")
     return [name for name in canonical_names if s[name].size and not np.isnan(s[name]).all()]
 
 
 def _plan_canonical_fields(s: Series) -> ChannelPlan:
+    """Map fields with names of canonical channels."""
     names = _canonical_fields(s)
     heading = AngleHeading(topic=s.name, field="psi") if "psi" in names else None
     position_source = (
@@ -206,12 +219,13 @@ def _plan_canonical_fields(s: Series) -> ChannelPlan:
 
 
 def _plan_revolutions(s: Series) -> ChannelPlan:
+    """Map the shaft speeds of NMEA RPM sentences, with one channel for each engine."""
     if not s.has_field("speed"):
         return ChannelPlan()
     senders = [] if s.sender is None else sorted(set(s.sender.tolist()))
     if len(senders) < 2:
         return ChannelPlan(_map_fields(s, "rpm", {"n": "speed"}))
-    # odd numbers are to starboard, even ones to port
+    # NMEA 0183: odd engine numbers are starboard, even ones port
     channel_of_engine = {"1": "n_stbd", "2": "n_port"}
     channels: dict[str, FieldMap] = {}
     for sender in senders:
@@ -254,8 +268,15 @@ def _make_field_plan(
     heading: str = "",
     course_speed_fields: tuple[str, str, str] | None = None,
 ) -> Callable[[Series], ChannelPlan]:
-    """A message by its fields: channels -> fields, latitude and longitude, and a heading in deg,
-    and course in deg, speed and the unit of the speed over ground.
+    """Return a function that maps a message with fixed field names.
+
+    Args:
+        channel_fields: channel -> field.
+        unit: unit of these fields.
+        fix_fields: fields of latitude and longitude in deg.
+        heading: field of the heading in deg; empty if there is none.
+        course_speed_fields: field of the course in deg, field of the speed over ground, and the
+            unit of the speed.
     """
 
     def make_plan(s: Series) -> ChannelPlan:
@@ -392,17 +413,24 @@ MESSAGE_KINDS = (
     MessageKind("Number", _NUMBER_TYPES, _plan_number, _ROS_CONVERSION, ("data",)),
     MessageKind("Named", (), _plan_canonical_fields, _BY_NAME_CONVERSION),
 )
-"""In the order in which they are asked: the one that says most first."""
+"""Standard messages in order of precedence, those with most channels first."""
 
 
 def is_ned_format(series: Series) -> bool:
-    """Return whether a series holds messages whose format fixes their frames as NED."""
+    """Return whether a series has a message type that is defined in NED."""
     return any(m.conversion == _NED_CONVERSION and m.matches(series) for m in MESSAGE_KINDS)
 
 
 def extend_with_standard_messages(recording: Recording, declared: ChannelPlan) -> ChannelPlan:
-    """Return the declared plan with what standard messages add to it."""
-    plan, conversions, remarks = declared, [], []
+    """Add the channels of standard messages to a plan.
+
+    Args:
+        recording: recording with aligned clocks.
+        declared: plan of the config, which has precedence.
+    """
+    plan = declared
+    conversions = []
+    remarks = []
     for message in MESSAGE_KINDS:
         matching_series = [
             s for s in recording.series.values() if len(s) > 1 and message.matches(s)
@@ -410,8 +438,9 @@ def extend_with_standard_messages(recording: Recording, declared: ChannelPlan) -
         pose_tables = [s.name for s in matching_series if {"x", "y", "psi"} <= set(s.fields)]
         if message.name == "Named" and len(pose_tables) > 1:
             text = (
-                f"{len(pose_tables)} tables hold positions and headings ({', '.join(pose_tables[:6])}): several"
-                " experiments? name one with `table`, or map fields"
+                f"{len(pose_tables)} tables have positions and headings"
+                f" ({', '.join(pose_tables[:6])}), probably of several experiments; select one with"
+                " `table`, or map fields"
             )
             remarks.append(
                 make_remark("will mislead", "several_tables", text, tables=len(pose_tables))
@@ -423,7 +452,7 @@ def extend_with_standard_messages(recording: Recording, declared: ChannelPlan) -
                 *source_channels(plan.position, plan.heading, plan.velocity),
             }
             planned_channels |= {"r"} if isinstance(plan.velocity, DerivedVelocity) else set()
-            # a field that is taken under one name is not offered under another
+            # a field that the config maps under one name is not mapped under another
             used_fields = {
                 (entry.topic, entry.field, entry.sender) for entry in plan.channels.values()
             }
@@ -452,7 +481,7 @@ def extend_with_standard_messages(recording: Recording, declared: ChannelPlan) -
                 source_text = f"{', '.join(added_channels)}: {message.name} of {series.name}"
                 conversions.append(f"{source_text}, {message.conversion}")
     if plan.heading is None and "psi" not in plan.channels and declared.velocity is None:
-        # without a heading an earth-fixed velocity has no components in the body
+        # an earth-fixed velocity without a heading cannot be rotated to body axes
         plan = dataclasses.replace(plan, velocity=None)
     return dataclasses.replace(
         plan,

@@ -41,7 +41,9 @@ _MIN_LEVER_ARM = 0.2
 
 
 def align_clocks(
-    recording: Recording, delays: Mapping[str, float | None], zone: float | None = None
+    recording: Recording,
+    delays: Mapping[str, float | None],
+    recorder_utc_offset: float | None = None,
 ) -> Recording:
     """Bring all topics of a recording to one clock and sort their rows.
 
@@ -49,8 +51,8 @@ def align_clocks(
         recording: recording as loaded.
         delays: topic -> delay in s that is subtracted from its times. None subtracts the median
             latency of the topics with stamps and arrivals, if this topic has arrivals only.
-        zone: offset of the recorder's clock from UTC in s; None estimates it from topics with
-            stamps and arrivals.
+        recorder_utc_offset: offset of the recorder's clock from UTC in s; None estimates it from
+            topics with stamps and arrivals.
     """
     series = {name: _drop_constant_stamps(topic) for name, topic in recording.series.items()}
     delays_by_topic = {
@@ -62,7 +64,9 @@ def align_clocks(
     prompt_delays = {
         name: float(np.quantile(delay, _PROMPT_QUANTILE)) for name, delay in delays_by_topic.items()
     }
-    recorder_offset, remarks = _estimate_recorder_offset(list(prompt_delays.values()), zone)
+    recorder_offset, remarks = _estimate_recorder_offset(
+        list(prompt_delays.values()), recorder_utc_offset
+    )
     median_delays = [
         float(np.median(delay)) - recorder_offset for delay in delays_by_topic.values()
     ]

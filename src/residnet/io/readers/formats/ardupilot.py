@@ -1,4 +1,4 @@
-"""ArduPilot's onboard logs (.bin, or the same as text), through the package pymavlink."""
+"""Reader of ArduPilot dataflash logs (binary or text), with the package pymavlink."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from residnet.io.readers.recording import (
 )
 
 _BINARY_MAGIC, _TEXT_MAGIC = b"\xa3\x95\x80", b"FMT,"
-"""How the two kinds of logs begin: with the message that describes messages."""
+"""First bytes of binary and of text logs: the message that defines messages."""
 _CLOCK_FIELDS_NS = {"TimeUS": 1_000, "TimeMS": 1_000_000, "T": 1_000_000}
 """Field of the time since boot -> its unit in ns."""
 _MIN_UNIX_TIME = 100_000_000.0
-"""Unix time in s, of 1973: a clock below it counts from the start, since it had no GPS."""
+"""Unix time in s (in 1973) below which a clock counts from boot, because GPS was missing."""
 
 
 @final
 class ArduPilotConfig(RecordingConfig):
-    """An ArduPilot dataflash log.
+    """Reader of ArduPilot dataflash logs.
 
-    A series is named by its message (`ATT`, `GPS`, the second instance `GPS_1`), fields bear
-    ArduPilot's names.
+    The name of a series is that of the message (`ATT`, `GPS`, the second instance `GPS_1`). The
+    names of fields are those of ArduPilot.
     """
 
     kind: Literal["ardupilot"] = "ardupilot"
@@ -52,17 +52,18 @@ class ArduPilotConfig(RecordingConfig):
     }
 
     def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
-        """Read the wanted messages of a dataflash log, on the boot clock (TimeUS).
+        """Read messages of a dataflash log.
 
-        Dated by the receiver's GPS time where it logged one.
+        Times are those since boot, completed with the date from GPS time if it was logged.
         """
         require_file(path)
         with optional_import("ardupilot", "pymavlink", "an ArduPilot log"):
             from pymavlink.DFReader import DFReader_binary, DFReader_text
         columns: dict[str, MessageBuffer] = {}
         kinds: dict[str, str] = {}
-        n_messages, discarded_output = 0, io.StringIO()
-        # pymavlink fails in its own ways on damaged bytes
+        n_messages = 0
+        discarded_output = io.StringIO()
+        # pymavlink raises many types of exceptions on damaged files
         with (
             wrap_read_errors(path, "an ArduPilot log"),
             reading_progress(path.name, path.stat().st_size, 100.0) as advance,
@@ -71,7 +72,7 @@ class ArduPilotConfig(RecordingConfig):
                 is_text = stream.read(100).lstrip().startswith(_TEXT_MAGIC)
                 reader = (DFReader_text if is_text else DFReader_binary)(str(path))
             while True:
-                # what cannot be parsed is skipped, and printed
+                # pymavlink prints bytes that it cannot parse and skips them
                 with (
                     contextlib.redirect_stdout(discarded_output),
                     contextlib.redirect_stderr(discarded_output),
@@ -83,8 +84,9 @@ class ArduPilotConfig(RecordingConfig):
                 if n_messages % REPORT_INTERVAL == 0:
                     advance(reader.percent)
                 fields = message.get_fieldnames()
-                message_type, instance = message.get_type(), message.fmt.instance_field
-                # logs of 2014 count milliseconds, which a fix of theirs holds at its end
+                message_type = message.get_type()
+                instance = message.fmt.instance_field
+                # logs of 2014 have milliseconds, in GPS messages in the last field T
                 clock_field = fields[0] if fields else ""
                 clock_field = (
                     "T"
@@ -117,9 +119,13 @@ class ArduPilotConfig(RecordingConfig):
         if not columns:
             if kinds:
                 raise UsageError(
-                    f"{path}: none of its messages is wanted (it holds {', '.join(sorted(kinds))})"
+                    f"{path}: has none of the configured messages (it contains"
+                    f" {', '.join(sorted(kinds))})"
                 )
-            raise DataError(f"{path}: holds no message with a time; is it an ArduPilot log?")
+            raise DataError(
+                f"{path}: has no message with a time, an ArduPilot log was expected; leave the file"
+                " out"
+            )
         boot_ns = round(boot_seconds * 1e6) * 1000 if boot_seconds > _MIN_UNIX_TIME else 0
         topics = {
             name: RawSeries(
@@ -134,7 +140,10 @@ class ArduPilotConfig(RecordingConfig):
 
 @contextlib.contextmanager
 def _silence_output() -> Iterator[None]:
-    """Keeps the indexer of pymavlink, which is compiled, from printing every byte that it skips."""
+    """Discard the output of compiled code, which bypasses `sys.stdout`.
+
+    The indexer of pymavlink prints every byte that it skips.
+    """
     sys.stdout.flush()
     sys.stderr.flush()
     saved_descriptors = [(descriptor, os.dup(descriptor)) for descriptor in (1, 2)]

@@ -1,4 +1,4 @@
-"""MATLAB and HDF5 files: vectors in a tree of structs or groups; each with a time is a series."""
+"""Readers of MATLAB and HDF5 files, whose structs or groups with a time vector are series."""
 
 from __future__ import annotations
 
@@ -31,30 +31,31 @@ from residnet.io.readers.timestamps import parse_numbers, parse_texts
 if TYPE_CHECKING:
     import h5py
 
-# MATLAB's day 719529 is 1 January 1970
-_DATENUM_1970, _SECONDS_PER_DAY = 719_529.0, 86_400.0
+# MATLAB's day number of 1 January 1970
+_DATENUM_1970 = 719_529.0
+_SECONDS_PER_DAY = 86_400.0
 _MAX_COLUMNS = 64
-"""Columns of an array that may be channels; chosen by hand: pictures and clouds have more."""
+"""Largest number of columns of a matrix of channels; images and point clouds have more."""
 _MIN_SAMPLES = 20
-"""Fewest samples of a vector that is timed by another group's time."""
+"""Fewest samples of a vector that uses the time vector of another group."""
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _MAX_UNCHECKED_BYTES = 200_000_000
-"""Bytes that any dataset may claim; chosen by hand: so many fit into memory."""
+"""Size of a dataset in bytes up to which its compression ratio is not checked."""
 _MAX_COMPRESSION_RATIO = 1000
-"""Bytes of a dataset for each byte of its file at most; a constant channel has some 900."""
+"""Largest ratio of a dataset's size to that of its file; a constant channel has about 900."""
 
 
 _Vector: TypeAlias = Any
-"""An array that may still lie in its file, with shape, dtype and size; `numpy.asarray` reads it."""
+"""Array in memory or in a file, with shape, dtype and size; `numpy.asarray` loads it."""
 
 
 class TreeTime(Config):
-    """Which vector of a group holds time.
+    """Time vector of a group.
 
     Attributes:
-        column: its name; null looks for the usual ones (t, time, timestamp, ...).
-        unit: its unit, or `datenum` for MATLAB's days since year 0; null reads Unix time in s, ms,
-            us or ns by its size, and anything else as s.
+        column: name of the vector; null searches common names (t, time, timestamp, ...).
+        unit: unit of the vector, or `datenum` for MATLAB's days since year 0; null detects Unix
+            time in s, ms, us or ns by its size and takes smaller numbers as s.
     """
 
     column: str | None = Field(default=None, min_length=1)
@@ -68,45 +69,43 @@ class TreeTime(Config):
         return unit
 
     def parse(self, values: np.ndarray) -> TimeStamps:
-        """Return the times from one vector.
+        """Convert a vector [T] of numbers or texts to time stamps.
 
         Raises:
-            DataError: where a cell is no time.
+            DataError: if a cell is no time.
         """
         if values.dtype.kind not in "biuf":
             return parse_texts(values)
         if self.unit != "datenum":
             return parse_numbers(values, None if self.unit is None else to_si(self.unit))
         days = np.floor(values)
-        whole_days_ns, fraction_ns = (
-            (days - _DATENUM_1970) * _SECONDS_PER_DAY * 1e9,
-            (values - days) * _SECONDS_PER_DAY * 1e9,
-        )
+        # integer and fraction separately: ns since 1970 exceed the 53 bits of a float
+        whole_days_ns = (days - _DATENUM_1970) * _SECONDS_PER_DAY * 1e9
+        fraction_ns = (values - days) * _SECONDS_PER_DAY * 1e9
         return TimeStamps(
             whole_days_ns.astype(np.int64) + np.rint(fraction_ns).astype(np.int64), True
         )
 
 
 class _TreeConfig(RecordingConfig):
-    """What MATLAB and HDF5 files have in common.
+    """Base class of the readers of MATLAB and HDF5 files.
 
     Attributes:
-        time: which vector of a group (or struct, or column of a table) holds time.
-        table: the only group, struct or table that is read, where a file holds several experiments;
-            null reads all.
+        time: time vector of a group, struct or table.
+        table: group, struct or table to read, for files with several experiments; null reads all.
     """
 
     time: TreeTime = Field(default_factory=TreeTime)
     table: str | None = Field(default=None, min_length=1)
 
     def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
-        """Read the wanted groups of a file."""
+        """Read groups of a file."""
         require_file(path)
         field_filter = field_filter if self.table is None else FieldFilter([(self.table, "")])
         if not is_hdf5(path) and isinstance(self, MatConfig):
             from scipy.io import loadmat
 
-            # SciPy's parser fails in its own ways on damaged bytes
+            # SciPy raises many types of exceptions on damaged files
             with wrap_read_errors(path, "a MATLAB file"):
                 content = dict(_iter_arrays(loadmat(path, simplify_cells=True), ""))
             return _build_tree_recording(path, content, self.time, field_filter)
@@ -123,16 +122,16 @@ class _TreeConfig(RecordingConfig):
             file.visititems(visit)
             leaves: dict[str, _Vector] = {}
             for dataset in datasets:
-                name, names = dataset.name.strip("/"), dataset.dtype.names
-                claimed_bytes, file_bytes = (
-                    dataset.size * dataset.dtype.itemsize,
-                    path.stat().st_size,
-                )
+                name = dataset.name.strip("/")
+                names = dataset.dtype.names
+                claimed_bytes = dataset.size * dataset.dtype.itemsize
+                file_bytes = path.stat().st_size
+                # a damaged header may claim any size; do not allocate it
                 if claimed_bytes > max(_MAX_UNCHECKED_BYTES, _MAX_COMPRESSION_RATIO * file_bytes):
-                    # a size is only a number in the file
                     raise DataError(
                         f"{path}: {dataset.name} claims {claimed_bytes / 1e9:.3g} GB in a file of"
-                        f" {file_bytes / 1e6:.3g} MB; the file is damaged, or was made and never filled"
+                        f" {file_bytes / 1e6:.3g} MB; the file is damaged or was never filled, write"
+                        " it again"
                     )
                 if names and dataset.ndim == 1:
                     for column in names:
@@ -148,7 +147,7 @@ class _TreeConfig(RecordingConfig):
 
 @final
 class MatConfig(_TreeConfig):
-    """A MATLAB file, v5 or v7.3: vectors, matrices, structs, Simulink's structures with time.
+    """Reader of MATLAB files (v5 and v7.3) with vectors, matrices, structs or Simulink structures.
 
     Matrices have one row per sample.
     """
@@ -162,7 +161,7 @@ class MatConfig(_TreeConfig):
 
 @final
 class Hdf5Config(_TreeConfig):
-    """HDF5 file: datasets in groups, or tables of named columns."""
+    """Reader of HDF5 files with datasets in groups, or tables with named columns."""
 
     kind: Literal["hdf5"] = "hdf5"
     endings: ClassVar = (".h5", ".hdf5")
@@ -170,7 +169,7 @@ class Hdf5Config(_TreeConfig):
 
 
 def is_hdf5(path: Path) -> bool:
-    """Return whether a file starts as HDF5 does, at once or behind MATLAB's header of 512 bytes."""
+    """Return whether a file has the HDF5 signature, at byte 0 or after MATLAB's 512-byte header."""
     if not path.is_file():
         return False
     with path.open("rb") as stream:
@@ -179,6 +178,7 @@ def is_hdf5(path: Path) -> bool:
 
 
 def _iter_arrays(node: Any, prefix: str) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield path and value of each array in nested structs and cell arrays."""
     if isinstance(node, dict):
         for name, value in node.items():
             if not name.startswith("__"):
@@ -196,11 +196,14 @@ def _iter_arrays(node: Any, prefix: str) -> Iterator[tuple[str, np.ndarray]]:
 
 @final
 class _LazyColumn:
-    """One column of a table, read when it is used."""
+    """Column of an HDF5 table that is loaded on conversion to an array."""
 
     def __init__(self, dataset: h5py.Dataset, name: str) -> None:
-        self._dataset, self._name = dataset, name
-        self.shape, self.size, self.dtype = dataset.shape, dataset.size, dataset.dtype[name]
+        self._dataset = dataset
+        self._name = name
+        self.shape = dataset.shape
+        self.size = dataset.size
+        self.dtype = dataset.dtype[name]
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
         values = _decode_bytes(self._dataset.fields(self._name)[()])
@@ -208,7 +211,7 @@ class _LazyColumn:
 
 
 def _decode_bytes(values: np.ndarray) -> np.ndarray:
-    """Return bytes as text, everything else as it is."""
+    """Convert a vector of bytes to text; return other arrays unchanged."""
     if values.dtype.kind not in "SO" or values.ndim != 1:
         return values
     texts = (v.decode(errors="replace") if isinstance(v, bytes) else str(v) for v in values)
@@ -218,15 +221,21 @@ def _decode_bytes(values: np.ndarray) -> np.ndarray:
 def _build_tree_recording(
     path: Path, leaves: Mapping[str, _Vector], time: TreeTime, field_filter: FieldFilter
 ) -> Recording:
-    """Return the recording of vectors by their path (`trial/u`).
+    """Build a recording from arrays in nested groups.
 
-    Each vector belongs to the nearest group above it whose time has its length, else to the only
-    time of the file that has it.
+    An array uses the time vector of the nearest parent group with the same length, otherwise the
+    only time vector of the file with this length.
 
     Args:
-        leaves: path -> array [T], [T, 1], [1, T] or [T, k] (whose columns become `name.0`,
-            `name.1`, ...).
-        field_filter: whether a group is to be read.
+        path: file, for messages.
+        leaves: path (`trial/u`) -> array [T], [T, 1], [1, T] or [T, k], whose columns become
+            `name.0`, `name.1`, ...
+        time: settings of the time vector.
+        field_filter: filter of groups and fields.
+
+    Raises:
+        UsageError: if there is no time vector, or no accepted group.
+        DataError: if a time vector has invalid cells.
     """
     clocks = _find_clocks(leaves, time)
     if not clocks:
@@ -235,8 +244,8 @@ def _build_tree_recording(
         )
         available = ", ".join(list(leaves)[:12]) or "nothing"
         raise UsageError(
-            f"{path}: no vector {clock_description} in it; name it with time: {{column: ...}} (the file holds"
-            f" {available})"
+            f"{path}: has no vector {clock_description}; set time: {{column: ...}} (the file"
+            f" contains {available})"
         )
     fields: dict[str, dict[str, np.ndarray]] = {group: {} for group in clocks}
     remarks: list[Remark] = []
@@ -258,11 +267,11 @@ def _build_tree_recording(
             if not name.startswith(f"{group}/" if group else ""):
                 assigned_by_length.append(f"{name} by {clock}")
     for code, names, reason in (
-        ("no_time", unassigned, "belong to no time ({}); left out"),
+        ("no_time", unassigned, "have no time vector ({}); left out"),
         (
             "time_of_others",
             assigned_by_length,
-            "without a time beside them are timed by the only one of their length ({})",
+            "without a time vector in their group use the only one of their length ({})",
         ),
     ):
         if names:
@@ -279,7 +288,7 @@ def _build_tree_recording(
     unread_groups = [group or "/" for group in clocks if (group or "/") not in topics]
     if not topics:
         raise UsageError(
-            f"{path}: none of its groups is wanted (it holds {', '.join(unread_groups)})"
+            f"{path}: has none of the configured groups (it contains {', '.join(unread_groups)})"
         )
     return build_recording(path, topics, (path,), remarks, unread_groups)
 
@@ -287,7 +296,7 @@ def _build_tree_recording(
 def _find_clocks(
     leaves: Mapping[str, _Vector], time: TreeTime
 ) -> dict[str, tuple[str, np.ndarray]]:
-    """Return group -> path of its time and the time itself."""
+    """Return group -> path and values of its time vector."""
     clocks = {}
     for clock_name in TIME_VECTOR_NAMES if time.column is None else (time.column,):
         for path, values in leaves.items():
@@ -300,10 +309,15 @@ def _find_clocks(
 def _find_clock_group(
     path: str, values: _Vector, clocks: Mapping[str, tuple[str, np.ndarray]]
 ) -> str | None:
-    """Return the nearest group above whose time has the length of `values`.
+    """Return the group whose time vector belongs to an array, or None.
 
-    Where there is none, and all times of this length in the file are the same, the first of their
-    groups.
+    It is the nearest parent group with a time vector of the same length. Otherwise it is the first
+    group with this length, if all time vectors of this length in the file are equal.
+
+    Args:
+        path: path of the array.
+        values: the array.
+        clocks: group -> path and values of its time vector.
     """
     group = path
     while group:
@@ -321,7 +335,7 @@ def _find_clock_group(
 
 
 def _find_time_axis(values: _Vector, length: int) -> int | None:
-    """Return which axis of an array runs over time; None where none does."""
+    """Return the axis of an array with a given number of samples, or None."""
     if values.dtype.kind not in "biuf":
         return 0 if values.size == length else None
     if len(values.shape) > 2 or values.size > _MAX_COLUMNS * length:
@@ -330,6 +344,7 @@ def _find_time_axis(values: _Vector, length: int) -> int | None:
 
 
 def _split_matrix(name: str, values: _Vector, length: int) -> dict[str, np.ndarray]:
+    """Return the columns of a matrix as `name.0`, `name.1`, ..., and a vector as `name`."""
     if values.dtype.kind not in "biuf":
         return {}
     table = np.moveaxis(np.asarray(values), _find_time_axis(values, length) or 0, 0)

@@ -1,4 +1,4 @@
-"""Mission logs of MOOS-IvP (alog): time, variable, source and value on each line."""
+"""Reader of MOOS-IvP mission logs (alog) with time, variable, source and value on each line."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ _START_LINE = re.compile(rb"^%%\s*LOGSTART\s+(?P<start>\d+(?:\.\d+)?)")
 
 @final
 class MoosConfig(RecordingConfig):
-    """An alog file, as pLogger of MOOS-IvP writes it.
+    """Reader of alog files from pLogger of MOOS-IvP.
 
-    A series is named by its source (`uNav`) and holds the variables that it publishes together;
-    one that comes at times of its own is a series by its own name. NAV_X is east, NAV_Y north, and
-    NAV_HEADING in deg clockwise from north. Variables of text are left out.
+    A series has the variables that one source (`uNav`) publishes at the same times, and the name of
+    the source. A variable with other times is a series with the name of the variable. NAV_X is
+    east, NAV_Y is north, and NAV_HEADING is in deg clockwise from north. Variables of text are
+    ignored.
     """
 
     kind: Literal["moos"] = "moos"
@@ -37,7 +38,7 @@ class MoosConfig(RecordingConfig):
     }
 
     def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
-        """Read the variables that hold numbers."""
+        """Read the numeric variables."""
         require_file(path)
         times: dict[tuple[str, str], array[float]] = defaultdict(lambda: array("d"))
         values: dict[tuple[str, str], array[float]] = defaultdict(lambda: array("d"))
@@ -63,7 +64,10 @@ class MoosConfig(RecordingConfig):
                 times[source_and_name].append(time)
                 values[source_and_name].append(value)
         if not times:
-            raise DataError(f"{path}: holds no line of time, variable, source and a number")
+            raise DataError(
+                f"{path}: has no line with time, variable, source and number, a MOOS alog was"
+                " expected; leave the file out"
+            )
         series: dict[str, Series] = {}
         for (source, name), clock in times.items():
             stamp, samples = np.array(clock), np.array(values[source, name])

@@ -1,4 +1,4 @@
-"""NMEA 0183 sentences in text files, through the package pynmea2."""
+"""Reader of NMEA 0183 sentences in text files, with the package pynmea2."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from residnet.io.readers.text_tables import detect_encoding_of_head, open_as_utf
 from residnet.io.readers.timestamps import parse_texts
 
 _SENTENCE = re.compile(rb"^(?P<before>[^$!]*)(?P<sentence>[$!][A-Z]{2}[A-Z0-9]{2,4},[\x20-\x7e]*)")
-# a sentence, to its checksum where it has one, at the start of a line or behind a time
+# a sentence with or without a checksum, at the start of a line or after a time
 _SENTENCE_LINE = re.compile(rb"(?m)^[^$!\n]{0,40}[$!][A-Z]{2}[A-Z]{3},[\x20-\x7e]*\s*$")
-# a date with a time, a time of day or Unix time, among what else a recorder writes
+# a date with a time, a time of day or Unix time in the text before a sentence
 _TIME_PREFIX = re.compile(
     r"\d{1,4}[-./]\d{1,2}[-./]\d{1,4}[T ,_]+\d{1,2}:\d\d[\d:.,]*(?:Z|[-+]\d\d:?\d\d)?"
     r"|\d{1,2}:\d\d:\d\d[\d.,]*|\d{9,}(?:\.\d+)?"
@@ -44,22 +44,22 @@ _TIME_PREFIX = re.compile(
 _UNIT_FACTORS = {"rate_of_turn": 1.0 / 60.0}
 _DAY_NS = 86_400 * 10**9
 _HEAD_BYTES = 1024
-"""Bytes that tell the encoding: a dozen sentences."""
+"""Number of bytes from which the encoding is detected (a dozen sentences)."""
 
 
 def _contains_sentence(path: Path, head: bytes) -> bool:
+    """Return whether the first bytes of a file contain a sentence."""
     text = head.decode(detect_encoding_of_head(head), errors="replace").encode("utf-8")
     return _SENTENCE_LINE.search(text) is not None
 
 
 @final
 class NmeaConfig(RecordingConfig):
-    """NMEA 0183 text, one sentence per line, with or without a time in front of it.
+    """Reader of NMEA 0183 text with one sentence per line, with or without a time before it.
 
-    A series is named by its sentence (`RMC`, `HDT`).
-
-    Fields bear the names of pynmea2; `latitude` and `longitude` are in signed degrees,
-    `rate_of_turn` is in deg/s (the sentence has deg/min).
+    The name of a series is that of the sentence (`RMC`, `HDT`). The names of fields are those of
+    pynmea2; `latitude` and `longitude` are signed degrees, `rate_of_turn` is in deg/s (deg/min in
+    the sentence).
     """
 
     kind: Literal["nmea"] = "nmea"
@@ -67,18 +67,19 @@ class NmeaConfig(RecordingConfig):
     formats: ClassVar = {"NMEA 0183": _contains_sentence}
 
     def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
-        """Read the wanted sentences of a text file.
+        """Read sentences of a text file.
 
-        Sentences with a time of day are dated by the last RMC or ZDA; those without a time lie
-        between the ones around them in the order of the lines, unless every line begins with a time
-        of its own.
+        Times of day are completed with the date of the last RMC or ZDA sentence. Times of sentences
+        without a time are interpolated between the neighbouring lines, unless every line begins
+        with a time.
         """
         require_file(path)
         with optional_import("nmea", "pynmea2", "a file of NMEA 0183 sentences"):
             import pynmea2
         collector = _SentenceCollector()
-        size, bytes_read, n_invalid = path.stat().st_size, 0, 0
-        # a shell of Windows may have written them as UTF-16
+        size = path.stat().st_size
+        bytes_read = n_invalid = 0
+        # redirected output of a Windows shell is UTF-16
         with path.open("rb") as stream:
             encoding = detect_encoding_of_head(stream.read(_HEAD_BYTES))
         with (
@@ -104,27 +105,31 @@ class NmeaConfig(RecordingConfig):
                     n_invalid += 1
         if not collector.buffers:
             raise DataError(
-                f"{path}: holds no NMEA 0183 sentence ({n_invalid} lines are none, or fail their"
-                " checksum)"
+                f"{path}: has no NMEA 0183 sentence ({n_invalid} lines are no sentences, or have a"
+                " wrong checksum)"
             )
         return collector.to_recording(path, n_invalid)
 
 
 @final
 class _SentenceBuffer:
-    """The sentences of one kind: their numbers and times.
+    """Sentences of one type.
 
-    A time is the sentence's own or -1; beside it stands how many timed sentences went before.
+    Attributes:
+        buffer: times in ns (-1 for sentences without a time) and numbers.
+        preceding_tick: index of the last time in the file before each sentence.
+        prefixes: text before each sentence.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
-        self.buffer, self.preceding_tick = MessageBuffer(names), array("q")
+        self.buffer = MessageBuffer(names)
+        self.preceding_tick = array("q")
         self.prefixes: list[str] = []
 
 
 @final
 class _SentenceCollector:
-    """All sentences of a file, and its clock: the times that sentences tell."""
+    """Sentences of a file by type, and the times in these sentences."""
 
     def __init__(self) -> None:
         self.buffers: dict[str, _SentenceBuffer] = {}
@@ -133,9 +138,14 @@ class _SentenceCollector:
         self._has_date = False
 
     def add_sentence(self, message: Any, prefix: str, field_filter: FieldFilter) -> None:
-        """Take one more sentence with the text before it."""
+        """Append a sentence.
+
+        Args:
+            message: parsed sentence.
+            prefix: text before the sentence.
+            field_filter: filter of sentence types.
+        """
         time_ns = self._parse_time(message)
-        # positions in signed degrees, NaN where the receiver says that there is no fix
         values: dict[str, float] = {}
         names = [str(entry[1]) for entry in message.fields]
         for name, cell in zip(names, message.data, strict=False):
@@ -146,6 +156,7 @@ class _SentenceCollector:
             except ValueError:
                 if not cell:
                     values[name] = float("nan")
+        # positions in signed degrees, NaN without a fix
         if {"lat", "lon"} <= set(names):
             has_fix = bool(message.lat and message.lon) and getattr(message, "status", "A") != "V"
             has_fix = has_fix and str(getattr(message, "gps_qual", "1")) != "0"
@@ -163,7 +174,7 @@ class _SentenceCollector:
         buffer.prefixes.append(prefix)
 
     def _parse_time(self, message: Any) -> int | None:
-        """Return the time of a sentence in ns (Unix time once a date is known), else None."""
+        """Return the time of a sentence in ns, or None; Unix time after the first date."""
         try:
             time_of_day, date = message.timestamp, _sentence_date(message)
         except (AttributeError, ValueError, TypeError):
@@ -176,52 +187,59 @@ class _SentenceCollector:
             self._day_ns, self._has_date = (date - datetime.date(1970, 1, 1)).days * _DAY_NS, True
         day = self._day_ns or 0
         if self._ticks and date is None and day + ns < self._ticks[-1] - _DAY_NS // 2:
-            # past midnight, and the date has not come yet
+            # midnight before the next sentence with a date
             day = self._day_ns = day + _DAY_NS
         if not self._ticks or day + ns != self._ticks[-1]:
             self._ticks.append(day + ns)
         return day + ns
 
     def to_recording(self, path: Path, n_invalid: int) -> Recording:
-        """Return the recording of what was added."""
+        """Build a recording of all sentences.
+
+        Args:
+            path: file.
+            n_invalid: number of lines that are no valid sentences.
+
+        Raises:
+            DataError: if no sentence and not every line has a time.
+        """
         ticks = np.frombuffer(self._ticks, dtype=np.int64)
         has_prefix_times = all(all(buffer.prefixes) for buffer in self.buffers.values())
         if not ticks.size and not has_prefix_times:
             raise DataError(
-                f"{path}: no sentence tells the time (RMC, GGA, ZDA, ...), and the lines do not"
-                " begin with one"
+                f"{path}: no sentence contains a time (RMC, GGA, ZDA, ...), and the lines do not"
+                " begin with one; record one of these sentences"
             )
         remarks: list[Remark] = []
         if n_invalid:
-            text = f"{n_invalid} lines are no NMEA sentence or fail their checksum; left out"
+            text = f"{n_invalid} lines are no NMEA sentence or have a wrong checksum; left out"
             remarks.append(make_remark("note", "bad_lines", text, lines=n_invalid))
         arrivals = {
             name: parse_texts(np.array(buffer.prefixes, dtype=object))
             for name, buffer in self.buffers.items()
             if has_prefix_times
         }
-        prefix_starts, day_offset = (
-            [int(buffer.ns.min()) for buffer in arrivals.values() if buffer.is_absolute],
-            0,
-        )
+        prefix_starts = [int(stamps.ns.min()) for stamps in arrivals.values() if stamps.is_absolute]
+        day_offset = 0
         if ticks.size and not self._has_date:
             if prefix_starts:
-                # the times before the lines tell the day that the sentences do not
+                # take the date from the times before the sentences
                 day_offset = round((min(prefix_starts) - int(ticks[0])) / _DAY_NS) * _DAY_NS
             else:
-                text = "no sentence tells the date; time counts from midnight"
+                text = "no sentence contains a date; time counts from midnight"
                 remarks.append(make_remark("note", "undated", text))
         topics = {}
         for name, buffer in sorted(self.buffers.items()):
-            times, time_remarks = buffer.buffer.times, tuple[Remark, ...]()
+            times = buffer.buffer.times
+            time_remarks: tuple[Remark, ...] = ()
             is_timed = bool((times >= 0).all())
             if not is_timed and not has_prefix_times:
                 times = _interpolate_times(
                     np.frombuffer(buffer.preceding_tick, dtype=np.int64), ticks
                 )
                 text = (
-                    f"topic {name}: its sentences tell no time; they are spread between the timed"
-                    " ones before and after"
+                    f"topic {name}: its sentences have no time; it is interpolated between the"
+                    " sentences before and after"
                 )
                 time_remarks = (make_remark("note", "estimated_times", text, rows=times.size),)
             stamp = (
@@ -238,7 +256,7 @@ class _SentenceCollector:
 
 
 def _engine_numbers(fields: dict[str, np.ndarray]) -> np.ndarray | None:
-    """Return the number of the engine that each row [T] is about; None where there is none."""
+    """Return the engine number of each row [T] as text; None if the sentence has none."""
     number = fields.get("engine_no")
     if number is None or not np.isfinite(number).all():
         return None
@@ -246,9 +264,14 @@ def _engine_numbers(fields: dict[str, np.ndarray]) -> np.ndarray | None:
 
 
 def _interpolate_times(tick_index: np.ndarray, ticks: np.ndarray) -> np.ndarray:
-    """Return the times [T] of sentences without a time, evenly between the timed ones.
+    """Interpolate the times of sentences without a time.
 
-    `tick_index` says after which timed sentence each came.
+    Args:
+        tick_index: index of the last time before each sentence [T].
+        ticks: times in the file [K] in ns.
+
+    Returns:
+        Times [T] in ns, evenly spaced between the times before and after.
     """
     tick_index = np.clip(tick_index, 0, ticks.size - 1)
     order_in_group = np.arange(tick_index.size) - find_run_bounds(tick_index)[0]
@@ -262,6 +285,7 @@ def _interpolate_times(tick_index: np.ndarray, ticks: np.ndarray) -> np.ndarray:
 
 
 def _sentence_date(message: Any) -> datetime.date | None:
+    """Return the date of an RMC or ZDA sentence, or None."""
     if message.sentence_type == "RMC":
         day = message.datestamp
         return day if isinstance(day, datetime.date) else None

@@ -1,4 +1,4 @@
-"""ROS 1 bags, ROS 2 bags (SQLite, MCAP) and MCAP files, through rosbags; no ROS is needed."""
+"""Reader of ROS 1 bags, ROS 2 bags (SQLite, MCAP) and MCAP files with rosbags, without ROS."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.interfaces import Connection
 
-# arrays of more elements are pictures, clouds and 6 x 6 covariances, no channels
+# longer arrays are images, point clouds and 6 x 6 covariances, not channels
 _MAX_ARRAY_SIZE = 16
 
 
 @final
 class RosbagConfig(RecordingConfig):
-    """A ROS 1 bag, a ROS 2 bag (a folder with metadata.yaml), or an .mcap or .db3 file."""
+    """Reader of a ROS 1 bag, a ROS 2 bag (a folder with metadata.yaml), or an .mcap or .db3 file."""
 
     kind: Literal["rosbag"] = "rosbag"
     endings: ClassVar = (".mcap", ".db3", ".bag")
@@ -57,9 +57,9 @@ class RosbagConfig(RecordingConfig):
     }
 
     def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
-        """Read the wanted topics of a bag, message by message.
+        """Read topics of a bag message by message.
 
-        Memory grows with the numbers kept, not with the file.
+        Memory depends on the number of loaded values, not on the size of the file.
         """
         with optional_import("ros", "rosbags", "a ROS bag or MCAP file"):
             from rosbags.highlevel import AnyReader
@@ -67,14 +67,18 @@ class RosbagConfig(RecordingConfig):
         if not path.is_dir():
             require_file(path)
         elif not (path / "metadata.yaml").is_file():
-            raise UsageError(f"{path}: is a folder without metadata.yaml, a ROS 2 bag has one")
+            raise UsageError(
+                f"{path}: is a folder without metadata.yaml, a ROS 2 bag was expected; give the"
+                " folder of the bag"
+            )
         store = None if path.suffix == ".bag" else get_typestore(Stores.LATEST)
-        # a damaged bag fails in many ways inside rosbags and SQLite, no fault of residnet
+        # on a damaged bag rosbags and SQLite raise many types of exceptions
         with wrap_read_errors(path, "a bag"), AnyReader([path], default_typestore=store) as reader:
             return _read_bag(path, reader, field_filter)
 
 
 def _read_bag(path: Path, reader: AnyReader, field_filter: FieldFilter) -> Recording:
+    """Read the accepted topics of an open bag; topics that fail to decode become remarks."""
     selected = [
         bag_connection
         for bag_connection in reader.connections
@@ -86,17 +90,20 @@ def _read_bag(path: Path, reader: AnyReader, field_filter: FieldFilter) -> Recor
     )
     if not selected:
         raise UsageError(
-            f"{path}: none of its topics is wanted (it holds {', '.join(unread_topics) or 'none'})"
+            f"{path}: has none of the configured topics (it contains"
+            f" {', '.join(unread_topics) or 'none'})"
         )
     columns: dict[str, _TopicBuffer] = {}
     errors: dict[str, str] = {}
     files = tuple(list_files(path))
-    start_ns, duration_ns = reader.start_time, max(1, reader.end_time - reader.start_time)
+    start_ns = reader.start_time
+    duration_ns = max(1, reader.end_time - reader.start_time)
     with reading_progress(path.name, sum_file_sizes(files), 1.0) as advance:
         for count, (connection, arrival, raw) in enumerate(reader.messages(connections=selected)):
             if count % REPORT_INTERVAL == 0:
                 advance((arrival - start_ns) / duration_ns)
-            name, message_type = connection.topic, connection.msgtype
+            name = connection.topic
+            message_type = connection.msgtype
             if name in errors:
                 continue
             try:
@@ -120,7 +127,7 @@ def _read_bag(path: Path, reader: AnyReader, field_filter: FieldFilter) -> Recor
         text = f"topic {name}: message {rows + 1} cannot be read ({reason}); the topic is left out"
         remarks.append(make_remark("will mislead", "unreadable", text, rows=rows))
     for name in sorted(set(topics) - set(columns) - set(errors)):
-        remarks.append(make_remark("note", "empty_topic", f"topic {name}: holds no messages"))
+        remarks.append(make_remark("note", "empty_topic", f"topic {name}: has no messages"))
     raw_series = {
         name: bag_connection.to_raw_series() for name, bag_connection in sorted(columns.items())
     }
@@ -129,7 +136,16 @@ def _read_bag(path: Path, reader: AnyReader, field_filter: FieldFilter) -> Recor
 
 @final
 class _TopicBuffer:
-    """Messages of one topic as they come: times as whole ns, numbers row by row."""
+    """Growing buffer of the messages of one topic: arrival and stamp in ns, sender, and numbers.
+
+    Args:
+        name: name of the topic.
+        message_type: message type.
+        first_message: message that determines the fields.
+        field_filter: filter of fields.
+        has_several_connections: whether several publishers share the topic; the sender is then the
+            connection instead of the frame id.
+    """
 
     def __init__(
         self,
@@ -140,24 +156,21 @@ class _TopicBuffer:
         *,
         has_several_connections: bool,
     ) -> None:
-        self._name, self._message_type, self._has_several_connections = (
-            name,
-            message_type,
-            has_several_connections,
-        )
+        self._name = name
+        self._message_type = message_type
+        self._has_several_connections = has_several_connections
         self._numeric_fields = _NumericFields(
             first_message, lambda path: field_filter.accepts_field(name, path)
         )
         self.buffer = MessageBuffer(self._numeric_fields.names)
-        self._stamp, self._sender = array("q"), array("H")
+        self._stamp = array("q")
+        self._sender = array("H")
         self._senders: dict[str, int] = {}
 
     def add(self, message: Any, arrival: int, connection: Connection) -> None:
-        """Append one message."""
-        field_values, header = (
-            self._numeric_fields.extract_numbers(message),
-            getattr(message, "header", None),
-        )
+        """Append one message with its arrival in ns."""
+        field_values = self._numeric_fields.extract_numbers(message)
+        header = getattr(message, "header", None)
         stamp = getattr(header, "stamp", None)
         self._stamp.append(0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec)
         sender = getattr(header, "frame_id", "")
@@ -167,7 +180,7 @@ class _TopicBuffer:
         self.buffer.add(arrival, field_values)
 
     def to_raw_series(self) -> RawSeries:
-        """Return the topic."""
+        """Return the series of the topic."""
         stamps = np.frombuffer(self._stamp, dtype=np.int64)
         sender = None
         if len(self._senders) > 1 or next(iter(self._senders), ""):
@@ -177,8 +190,8 @@ class _TopicBuffer:
         n_zero_stamps = int((stamps == 0).sum())
         if 0 < n_zero_stamps < stamps.size:
             text = (
-                f"topic {self._name}: {n_zero_stamps} of {stamps.size} header stamps are zero; arrival"
-                " times are used"
+                f"topic {self._name}: {n_zero_stamps} of {stamps.size} header stamps are zero;"
+                " arrival times are used"
             )
             remarks = (make_remark("will mislead", "empty_stamps", text, rows=n_zero_stamps),)
         stamp = None if n_zero_stamps else TimeStamps(stamps, True)
@@ -188,7 +201,12 @@ class _TopicBuffer:
 
 @final
 class _NumericFields:
-    """The numbers in a message, by their paths; the first message of a topic decides."""
+    """Numeric fields of a message type.
+
+    Args:
+        message: message that determines the lengths of arrays.
+        accepts_field: filter of paths.
+    """
 
     def __init__(self, message: Any, accepts_field: Callable[[str], bool]) -> None:
         scalars: list[str] = []
@@ -214,7 +232,7 @@ class _NumericFields:
         self._arrays = [(attrgetter(path), size) for path, size in arrays]
 
     def extract_numbers(self, message: Any) -> list[float]:
-        """Return the numbers of a message, in the order of the paths."""
+        """Return the numbers of a message in the order of `names`; shorter arrays are NaN-padded."""
         extracted: list[float] = []
         if self._scalars is not None:
             extracted = (
@@ -229,7 +247,7 @@ class _NumericFields:
 
 
 def _iter_leaves(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
-    """Return the paths and values of a message's leaves, the stamp aside."""
+    """Yield path and value of each leaf of a message without its header."""
     for entry in dataclasses.fields(message):
         if entry.name == "__msgtype__" or (not prefix and entry.name == "header"):
             continue

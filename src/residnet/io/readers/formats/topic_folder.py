@@ -1,4 +1,4 @@
-"""A folder that holds one csv file per topic, as tools export ROS bags."""
+"""Reader of folders with one csv file per topic, as tools export ROS bags."""
 
 from __future__ import annotations
 
@@ -46,20 +46,21 @@ if TYPE_CHECKING:
 
 _ENDINGS = (".csv", ".tsv", ".txt")
 _CLOCK_WITH_UNIT = re.compile(r"(?:time|timestamp)s?\s*[\[(]", re.IGNORECASE)
-"""A time whose unit stands behind it."""
+"""Column of time with its unit in brackets."""
 _MAX_MULTIPLEXED = 16
-"""Most actuators whose values stand in one column, told apart by another one."""
+"""Largest number of actuators whose values share one column, with an index in another one."""
 _MAX_START_SPREAD = 60.0
-"""Seconds within which the topics of a recording begin, those too that come once a minute."""
-# last parts of the names of a header stamp's two columns, in ROS 1 and ROS 2
-_SECONDS, _NANOSECONDS = ("secs", "sec"), ("nsecs", "nanosec")
+"""Largest difference in s between the first times of the topics in one recording."""
+# names of the columns of a header stamp in ROS 1 and ROS 2
+_SECONDS = ("secs", "sec")
+_NANOSECONDS = ("nsecs", "nanosec")
 
 
 def is_topic_folder(path: Path) -> bool:
-    """Return whether a folder's csv files are topics of one recording, and not logs.
+    """Return whether the csv files in a folder are topics of one recording, not separate logs.
 
-    Topics have stamped headers, or headers that differ, and times of one kind; the parts of several
-    trips are no topics.
+    Topics have columns of header stamps, or different columns and times in one unit. Files of
+    several trips are no topics.
     """
     if not path.is_dir():
         return False
@@ -80,7 +81,7 @@ def is_topic_folder(path: Path) -> bool:
     units = {detect_unix_unit(np.array([start_time])) for start_time in start_times.values()}
     if any(len(files) > 1 for files in trips.values()) or len(units) > 1:
         return False
-    # a clock of any other name tells a log too: dates that begin together are of one recording
+    # other names of clocks occur in logs too, unless all files start at nearly the same date
     has_common_date = units == {"s"} and np.ptp([*start_times.values()]) < _MAX_START_SPREAD
     timed_headers = [
         head
@@ -97,12 +98,13 @@ def is_topic_folder(path: Path) -> bool:
 
 
 def _list_table_files(folder: Path) -> list[Path]:
+    """Return the csv files below a folder in sorted order."""
     folder_contents = sorted(folder.rglob("*"))
     return [file for file in folder_contents if file.suffix.lower() in _ENDINGS and file.is_file()]
 
 
 def _is_complete_log(columns: list[str]) -> bool:
-    """Return whether a header names the motion of a vessel, as a log by itself does."""
+    """Return whether columns contain the complete motion of a vessel, as in a log."""
     channels = {match_state_channel(parse_name(column)) for column in columns}
     complete_sets = ({"x", "y", "psi"}, {"latitude", "longitude", "psi"}, {"u", "v", "r"})
     return any(complete_set <= channels for complete_set in complete_sets)
@@ -110,13 +112,13 @@ def _is_complete_log(columns: list[str]) -> bool:
 
 @final
 class TopicFolderConfig(RecordingConfig):
-    """A folder of csv files, one per topic, each with its own clock; or one such csv file.
+    """Reader of a folder of csv files, one per topic with its own clock, or of one such file.
 
-    A topic is named by its path below the folder, without the ending.
+    The name of a topic is the path of its file in the folder without extension.
 
     Attributes:
-        time: columns that may hold the arrival time, in order; every file is searched for them.
-        delimiter: between cells.
+        time: possible names of the column of arrival times, in order of precedence.
+        delimiter: separator of cells.
     """
 
     kind: Literal["csv_topics"] = "csv_topics"
@@ -125,24 +127,25 @@ class TopicFolderConfig(RecordingConfig):
     formats: ClassVar = {"folder of csv files": lambda path, head: is_topic_folder(path)}
 
     def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
-        """Read the wanted topics of a folder.
+        """Read topics of a folder.
 
-        Unwanted topics of a small folder are read too, so that what is wrong with them is reported.
+        In a small folder all topics are read, so that their faults are reported too.
         """
         if not path.is_dir():
             require_file(path)
         files, root = (_list_table_files(path), path) if path.is_dir() else ([path], path.parent)
         if not files:
-            raise DataError(f"{path}: holds no csv file")
-        size, bytes_read = sum_file_sizes(files), 0
+            raise DataError(f"{path}: has no csv file; give a folder with one csv file per topic")
+        size = sum_file_sizes(files)
+        bytes_read = 0
         topics: dict[str, RawSeries] = {}
         remarks: list[Remark] = []
         unread_topics: list[str] = []
-        # what is wrong with other topics too is worth a look where that costs little
+        # in small folders read all topics to report their faults
         active_filter = ALL_FIELDS if size < LARGE_FOLDER_BYTES else field_filter
         topic_names = [file.relative_to(root).with_suffix("").as_posix() for file in files]
         topic_names = _strip_uninformative_folder(topic_names)
-        # ulog2csv begins each name with that of the recording
+        # ulog2csv starts each file name with the name of the recording
         common_prefix = f"{root.name}_"
         common_prefix = (
             common_prefix if all(name.startswith(common_prefix) for name in topic_names) else ""
@@ -168,14 +171,21 @@ class TopicFolderConfig(RecordingConfig):
                 advance(bytes_read)
         if not topics:
             raise DataError(
-                f"{path}: none of {len(files)} csv files holds a topic ({remarks[0]['text']})"
+                f"{path}: none of {len(files)} csv files is a topic ({remarks[0]['text']})"
             )
         return build_recording(path, topics, tuple(files), remarks, unread_topics)
 
     def _read_topic(
         self, file: Path, name: str, field_filter: FieldFilter, unit: str
     ) -> RawSeries | Remark:
-        """Return one topic; a remark where the file holds none."""
+        """Read one topic; return a remark instead if the file is no topic.
+
+        Args:
+            file: csv file in UTF-8.
+            name: name of the topic.
+            field_filter: filter of fields.
+            unit: unit of times that are no Unix times.
+        """
         import pandas as pd
 
         delimiter = "\t" if file.suffix.lower() == ".tsv" else self.delimiter
@@ -190,7 +200,7 @@ class TopicFolderConfig(RecordingConfig):
             stamp_columns = _find_stamp_columns(header)
             if clock_column is None and stamp_columns is None:
                 text = (
-                    f"topic {name}: no column for time (looked for {', '.join(self.time)} and a"
+                    f"topic {name}: no column of time (expected one of {', '.join(self.time)}, or a"
                     " header stamp); the file is left out"
                 )
                 return make_remark("note", "no_time", text)
@@ -232,7 +242,7 @@ class TopicFolderConfig(RecordingConfig):
 
 
 def _strip_uninformative_folder(topic_names: list[str]) -> list[str]:
-    """Return topics without the folder that holds all of them, where its name tells of nothing."""
+    """Return topic names without a common folder that names no known quantity."""
     folders = {name.partition("/")[0] for name in topic_names if "/" in name}
     has_single_folder = len(folders) == 1 and all("/" in name for name in topic_names)
     if not has_single_folder or parse_name(*folders).concepts:
@@ -241,7 +251,7 @@ def _strip_uninformative_folder(topic_names: list[str]) -> list[str]:
 
 
 def _read_head_cells(file: Path) -> list[list[str]]:
-    """Return the cells of a topic's first lines, the last of which may be cut short."""
+    """Return the cells of a topic's first lines, of which the last may be incomplete."""
     with file.open("rb") as stream:
         head = stream.read(10_000)
     lines = (
@@ -253,13 +263,18 @@ def _read_head_cells(file: Path) -> list[list[str]]:
 
 
 def _find_clock_column(header: Sequence[str], clocks: Sequence[str]) -> str | None:
-    """Return the column of the arrival time: the first of the names given, else called a time."""
+    """Return the column of arrival times, or None.
+
+    Args:
+        header: column names.
+        clocks: names of clocks in order of precedence, before `time [unit]`.
+    """
     matching_names = (name for name in header if _CLOCK_WITH_UNIT.match(name))
     return next((name for name in clocks if name in header), next(matching_names, None))
 
 
 def _estimate_time_step(file: Path, clocks: Sequence[str]) -> float:
-    """Return the usual step of the first times of a topic, in its own unit; 0 for none."""
+    """Return the median step of the first times of a topic in its own unit; 0 if unknown."""
     names, *rows = _read_head_cells(file)[:-1] or [[""]]
     name = _find_clock_column(names, clocks)
     clock_index = len(names) if name is None else names.index(name)
@@ -275,7 +290,7 @@ def _is_sender_column(column: str) -> bool:
 
 
 def _find_stamp_columns(header: list[str]) -> tuple[str, str] | None:
-    """Return the columns of a header stamp's seconds and nanoseconds."""
+    """Return the columns with seconds and nanoseconds of a header stamp, or None."""
     column_by_key = {normalize_field_path(column): column for column in header}
     for seconds, nanoseconds in zip(_SECONDS, _NANOSECONDS, strict=True):
         for prefix in ("header_stamp_", "stamp_"):
@@ -291,7 +306,18 @@ def _parse_topic(
     unit: str,
     stamp_columns: tuple[str, str] | None,
 ) -> RawSeries:
-    """Return one topic: times as whole ns, fields as float64, text left out but for senders."""
+    """Convert the columns of a topic to a series; columns of text other than senders are ignored.
+
+    Args:
+        name: name of the topic.
+        columns: column -> cells.
+        clock_column: column of arrival times.
+        unit: unit of times that are no Unix times.
+        stamp_columns: columns with seconds and nanoseconds of the header stamp.
+
+    Raises:
+        DataError: if the column of arrival times has other cells.
+    """
     import pandas as pd
 
     arrival = sender = header_stamps = None
@@ -308,20 +334,20 @@ def _parse_topic(
                 raise
             columns = {column: cells.iloc[:-1] for column, cells in columns.items()}
             arrival = parse_texts(columns[clock_column], unit=unit)
-            add_remark("note", "cut_short", "the last row is cut short; left out", rows=1.0)
+            add_remark("note", "cut_short", "the last row is incomplete; left out", rows=1.0)
     numeric_columns: dict[str, np.ndarray] = {}
     for column, cells in columns.items():
         if column == clock_column:
             continue
         if pd.api.types.is_numeric_dtype(cells.dtype):
-            # whole stamps keep every bit
+            # int64 stamps in ns exceed the 53 bits of a float
             numeric_columns[column] = cells.to_numpy(
                 dtype=None if cells.dtype.kind in "iu" else np.float64
             )
             continue
         if _is_sender_column(column):
             if sender is None:
-                # one object per name, not per row
+                # one string object per name instead of one per row
                 names = cells.fillna("").astype(str).astype("category")
                 sender = np.array(names.cat.categories, dtype=object)[names.cat.codes.to_numpy()]
             continue
@@ -335,15 +361,16 @@ def _parse_topic(
         if 2 * n_not_numbers >= int(is_filled.sum()):
             example = str(cells[is_not_number].iloc[0])
             content_description = "structures" if example.startswith(("{", "[", "(")) else "text"
-            text = f"column '{column}' holds {content_description} ('{truncate(example, 40)}'), not numbers; it is"
-            add_remark("note", "not_numbers", f"{text} left out", rows=float(len(cells)))
+            text = (
+                f"column '{column}' contains {content_description} ('{truncate(example, 40)}'), not"
+                " numbers; it is left out"
+            )
+            add_remark("note", "not_numbers", text, rows=float(len(cells)))
             continue
         numeric_columns[column] = numeric_values
         if n_not_numbers:
-            text = (
-                f"column '{column}' holds {n_not_numbers} cells that are not numbers; they count as"
-            )
-            add_remark("will mislead", "not_numbers", f"{text} missing", cells=n_not_numbers)
+            text = f"column '{column}' has {n_not_numbers} cells that are not numbers; missing"
+            add_remark("will mislead", "not_numbers", text, cells=n_not_numbers)
     if stamp_columns is not None and {*stamp_columns} <= numeric_columns.keys():
         seconds, nanoseconds = (numeric_columns[column] for column in stamp_columns)
         if np.isfinite(seconds).all() and np.isfinite(nanoseconds).all() and seconds.any():
@@ -361,9 +388,14 @@ def _parse_topic(
 
 
 def _demultiplex(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return `value[0]` and `value[1]` of values [T] in turns, where a column numbers them.
+    """Split multiplexed columns, whose rows belong to the actuator in an index column.
 
-    Each holds in the rows of the others, and is NaN before its first.
+    Args:
+        fields: field -> values [T].
+
+    Returns:
+        `value[0]`, `value[1]`, ... with zero-order hold, NaN before the first row of an actuator;
+        the unchanged fields if no index column alternates.
     """
     for name, index_values in fields.items():
         indices = np.unique(index_values)

@@ -1,4 +1,4 @@
-"""PX4 flight logs (ULog), through the package pyulog."""
+"""Reader of PX4 flight logs (ULog), with the package pyulog."""
 
 from __future__ import annotations
 
@@ -25,13 +25,12 @@ from residnet.io.readers.recording import (
 
 @final
 class UlogConfig(RecordingConfig):
-    """A PX4 ULog file.
+    """Reader of PX4 ULog files.
 
-    A series is named by its message (`vehicle_local_position`, the second instance
-    `vehicle_gps_position_1`).
-
-    Fields bear PX4's names; the parts of a quaternion `q[0]` to `q[3]` are `q.w`, `q.x`, `q.y`,
-    `q.z` too, whole-number latitudes in 1e-7 deg become degrees.
+    The name of a series is that of the message (`vehicle_local_position`, the second instance
+    `vehicle_gps_position_1`). The names of fields are those of PX4. The parts `q[0]` to `q[3]` of a
+    quaternion are also called `q.w`, `q.x`, `q.y`, `q.z`. Integer latitudes and longitudes in
+    1e-7 deg become degrees.
     """
 
     kind: Literal["ulog"] = "ulog"
@@ -39,14 +38,14 @@ class UlogConfig(RecordingConfig):
     formats: ClassVar = {"PX4 ULog": lambda path, head: head.startswith(b"ULog\x01\x12\x35")}
 
     def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
-        """Read the wanted messages of a ULog, on the boot clock.
+        """Read messages of a ULog file.
 
-        Dated by the receiver's UTC where it logged one.
+        Times are those since boot, completed with the date of the receiver if it was logged.
         """
         require_file(path)
         with optional_import("px4", "pyulog", "a PX4 flight log"):
             from pyulog import ULog
-        # pyulog prints what it finds damaged, which the remarks say below
+        # pyulog prints messages on damaged parts; the remarks below report them
         with wrap_read_errors(path, "a ULog file"), contextlib.redirect_stdout(io.StringIO()):
             log = ULog(str(path), None, disable_str_exceptions=True)
         data = {
@@ -60,7 +59,7 @@ class UlogConfig(RecordingConfig):
         }
         if not selected:
             raise UsageError(
-                f"{path}: none of its messages is wanted (it holds"
+                f"{path}: has none of the configured messages (it contains"
                 f" {', '.join(sorted(data)) or 'none'})"
             )
         boot_ns = _find_boot_time([dataset.data for dataset in log.data_list])
@@ -76,14 +75,12 @@ class UlogConfig(RecordingConfig):
             topics[name] = RawSeries(message_type, fields, TimeStamps(ns, boot_ns is not None))
         remarks: list[Remark] = []
         if log.file_corruption:
-            text = "the file is damaged in places; messages there are lost"
+            text = "parts of the file are damaged; their messages are lost"
             remarks.append(make_remark("will mislead", "damaged", text))
         if log.dropouts:
-            lost_seconds, count = (
-                sum(dataset.duration for dataset in log.dropouts) * 1e-3,
-                len(log.dropouts),
-            )
-            text = f"the logger dropped data {count} times, {lost_seconds:.3g} s in all; gaps stay gaps"
+            lost_seconds = sum(dataset.duration for dataset in log.dropouts) * 1e-3
+            count = len(log.dropouts)
+            text = f"the logger dropped data {count} times, {lost_seconds:.3g} s in total"
             remarks.append(
                 make_remark("note", "dropouts", text, dropouts=count, seconds=lost_seconds)
             )
@@ -91,7 +88,7 @@ class UlogConfig(RecordingConfig):
 
 
 def _find_boot_time(messages: list[dict[str, np.ndarray]]) -> int | None:
-    """Return Unix time of the boot in ns, from the first fix that has UTC."""
+    """Return the Unix time of the boot in ns from the first fix with UTC, or None."""
     for fields in messages:
         utc = fields.get("time_utc_usec")
         valid_rows = np.flatnonzero(utc) if utc is not None else np.zeros(0, dtype=int)
@@ -101,6 +98,7 @@ def _find_boot_time(messages: list[dict[str, np.ndarray]]) -> int | None:
 
 
 def _convert_fields(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Convert fields to float64, integer positions to degrees, and name the parts of quaternions."""
     fields = {}
     for name, values in data.items():
         if name != "timestamp":
