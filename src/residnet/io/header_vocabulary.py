@@ -1,7 +1,8 @@
-"""What columns are called: English, German, French, Spanish, Dutch, Norwegian, Japanese and others.
+"""Recognition of channels and units by column names in many languages.
 
-A name is read for what it is about (a rudder, a speed, the wind) and then for the channel that
-these make together, so that compounds and orders of words need no list of their own.
+A name is first parsed into concepts (rudder, speed, wind), whose words are in
+`header_vocabulary.yaml`. Rules then map combinations of concepts to channels. Therefore compounds
+and different orders of words need no entries.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from residnet.core.units import canonical_unit, is_unit, si_unit
 
 _IN_BRACKETS = re.compile(r"[\[({]([^\])}]*)[\])}]")
 _FULL_RUDDER_DEG = 35.0
-"""Angle in deg of a rudder that is hard over, as most are built."""
+"""Usual angle of a rudder hard over in deg."""
 
 
 def _load_vocabulary() -> dict[str, Any]:
@@ -81,10 +82,11 @@ _ACTUATOR_WORDS = frozenset(
 
 
 def parse_header_unit(column: str, expected: str | None) -> str | None:
-    """Return the unit that a column's name holds, in brackets or at its end; None for none.
+    """Return the unit in a column name, in brackets or at the end, or None.
 
     Args:
-        expected: SI unit of the dimension; None takes any, in brackets only.
+        column: name of the column.
+        expected: SI unit of the required dimension; None accepts any dimension, in brackets only.
     """
     texts = [text.strip() for text in _IN_BRACKETS.findall(column)]
     if expected is not None:
@@ -102,7 +104,7 @@ def parse_header_unit(column: str, expected: str | None) -> str | None:
     for text in texts:
         unit = _UNIT_NAMES.get(text.casefold(), text)
         if len(unit) == 1 and unit.isalpha() and text not in _IN_BRACKETS.findall(column):
-            # a letter at the end is rather a name
+            # a single letter at the end is part of the name
             continue
         try:
             return canonical_unit(unit, expected)
@@ -112,9 +114,14 @@ def parse_header_unit(column: str, expected: str | None) -> str | None:
 
 
 def find_mismatched_unit(column: str, expected: str) -> str | None:
-    """Return the unit in the brackets of a name where it measures something else; None for none."""
+    """Return the unit in the brackets of a name if it has another dimension, else None.
+
+    Args:
+        column: name of the column.
+        expected: SI unit of the required dimension.
+    """
     for text in map(str.strip, _IN_BRACKETS.findall(column)):
-        # (T) and (M) tell a true and a magnetic heading
+        # (T) and (M) mark true and magnetic headings
         if is_unit(text) and not (expected == "rad" and text in ("T", "M")):
             unit = canonical_unit(text)
             if si_unit(unit) != expected:
@@ -123,11 +130,14 @@ def find_mismatched_unit(column: str, expected: str) -> str | None:
 
 
 def guess_unit_from_size(channel: str, values: np.ndarray) -> tuple[str, str]:
-    """Return the unit of a channel by the size of its values, and why.
+    """Guess the unit of a channel from the 99 % quantile of its absolute values.
 
     Args:
-        channel: canonical name, or a name of one's own.
-        values: of the column [T], of all logs together.
+        channel: canonical or user-defined name.
+        values: values of the column [T] in all logs.
+
+    Returns:
+        The unit, and the reason as text.
     """
     magnitudes = np.abs(values[np.isfinite(values)])
     upper_quantile = float(np.quantile(magnitudes, 0.99)) if magnitudes.size else 0.0
@@ -136,7 +146,7 @@ def guess_unit_from_size(channel: str, values: np.ndarray) -> tuple[str, str]:
         threshold = 7.0 if channel in ("psi", "wind_dir") or "azimuth" in channel else 1.6
         unit = "deg" if upper_quantile > threshold else "rad"
     elif expected == "rad/s":
-        # a turn round in two seconds
+        # pi rad/s is a full turn in two seconds
         unit = "deg/s" if upper_quantile > np.pi else "rad/s"
     elif expected == "1/s":
         unit = "rpm" if upper_quantile > 60.0 else "1/s"
@@ -146,11 +156,11 @@ def guess_unit_from_size(channel: str, values: np.ndarray) -> tuple[str, str]:
 
 
 class Scaling(NamedTuple):
-    """How the numbers of a column become the values of its channel.
+    """Conversion of a column to its channel.
 
     Attributes:
-        settings: unit, and offset and scale where they are needed, of a channel map.
-        reason: why these are guessed; empty where the column's name says them.
+        settings: `unit`, and `offset` and `scale` if needed, of a channel map.
+        reason: reason for a guess; empty if the column name contains the unit.
     """
 
     settings: dict[str, Any]
@@ -158,18 +168,24 @@ class Scaling(NamedTuple):
 
 
 def infer_unit(channel: str, column: str, values: np.ndarray) -> Scaling:
-    """Return the unit of a column by its name, else by the size of its values [T]."""
-    unit, reason = parse_header_unit(column, get_si_unit(channel)), ""
+    """Return the unit of a column from its name, otherwise from its values [T]."""
+    unit = parse_header_unit(column, get_si_unit(channel))
+    reason = ""
     if unit is None:
         unit, reason = guess_unit_from_size(channel, values)
     return Scaling({"unit": unit}, reason)
 
 
 def guess_scaling(channel: str, column: str, values: np.ndarray) -> Scaling | None:
-    """Return how pulses, per cent or shares become a channel; None where its unit is a plain one.
+    """Guess the conversion of servo pulses, per cent or relative values to a channel.
 
     Args:
-        values: of the column [T], of all logs together.
+        channel: name of the channel.
+        column: name of the column.
+        values: values of the column [T] in all logs.
+
+    Returns:
+        The conversion; None if the column has a physical unit.
     """
     is_rudder = channel.removeprefix("cmd_").startswith("delta")
     if is_rudder and parse_header_unit(column, "rad") is not None:
@@ -179,24 +195,24 @@ def guess_scaling(channel: str, column: str, values: np.ndarray) -> Scaling | No
     )
     if is_pulse(channel, values):
         settings = {"unit": unit, "offset": 1500, "scale": full_value / 500.0}
-        reason = "pulses of a servo; 1500 us are taken as neutral, 500 us as all the way"
+        reason = "servo pulses; 1500 us are assumed neutral, 500 us full scale"
         return Scaling(settings, reason + full_text)
     if not is_rudder or not (full_count := _full_scale(column, values)):
         return None
-    reason = f"{full_count:g} is taken as all the way{full_text}"
+    reason = f"{full_count:g} is assumed full scale{full_text}"
     return Scaling({"unit": unit, "scale": full_value / full_count}, reason)
 
 
 def _full_scale(column: str, values: np.ndarray) -> float:
-    """Return the number that stands for a rudder that is hard over; 0 where it is an angle."""
+    """Return the number for a rudder hard over; 0 if the column has angles."""
     header_unit = parse_header_unit(column, "-")
     if header_unit is not None:
         return 100.0 if header_unit == "%" else 1.0
     max_abs = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
     if max_abs > 180.0:
-        # no angle of a rudder: counts of a lever, to the power of ten above them
+        # counts of a lever, assumed to end at the next power of ten
         return float(10.0 ** np.ceil(np.log10(max_abs)))
-    # numbers that end at a round one are rather shares than angles
+    # a maximum of exactly 1 or 100 indicates a relative value, not an angle
     return next(
         (full_value for full_value in (1.0, 100.0) if 0.995 * full_value <= max_abs <= full_value),
         0.0,
@@ -204,7 +220,7 @@ def _full_scale(column: str, values: np.ndarray) -> float:
 
 
 def is_pulse(channel: str, values: np.ndarray) -> bool:
-    """Return whether values are pulses of a servo, in us; revolutions may be as large."""
+    """Return whether values [T] are servo pulses in us; shaft speeds may have the same size."""
     finite_values = values[np.isfinite(values)]
     if not finite_values.size or re.match(r"(cmd_)?n(_|$)", channel):
         return False
@@ -225,18 +241,18 @@ MOTION_CHANNELS = (
     "wind_dir",
     *BOW_WIND_CHANNELS,
 )
-"""Channels of the motion and of the wind."""
+"""Channels of motion and wind."""
 PLANE_PATTERN = re.compile(r"(cmd_)?delta_s(_|$)")
-"""How channels of planes begin, which turn a vessel down and not to a side."""
+"""Start of the names of channels with dive planes, which pitch a vessel."""
 
 
 class ParsedName(NamedTuple):
-    """What a column's name is about.
+    """Parsed column name.
 
     Attributes:
-        text: the name without units and punctuation, in lower case and plain letters.
-        concepts: what it is about.
-        number: the number behind it, of several alike; None where there is none.
+        text: name in lower case without accents, units and punctuation.
+        concepts: concepts that the name mentions, keys of `concepts` in the vocabulary.
+        number: number in the name that distinguishes several columns; None if there is none.
     """
 
     text: str
@@ -244,11 +260,11 @@ class ParsedName(NamedTuple):
     number: int | None
 
     def has_all(self, *names: str) -> bool:
-        """Return whether the name is about all of these."""
+        """Return whether the name mentions all these concepts."""
         return self.concepts.issuperset(names)
 
     def has_none(self, *names: str) -> bool:
-        """Return whether the name is about none of these."""
+        """Return whether the name mentions none of these concepts."""
         return self.concepts.isdisjoint(names)
 
 
@@ -257,16 +273,16 @@ _LETTER_MAP = str.maketrans(_VOCABULARY["letters"])
 
 @lru_cache(maxsize=4096)
 def normalize_name(name: str) -> str:
-    """Return a name in lower case and plain letters, its words apart, its units left out."""
+    """Return a name in lower case without accents and units, with blanks between its words."""
     text = _IN_BRACKETS.sub(" ", name)
     for sign, replacement in _VOCABULARY["greek_letters"].items():
         text = re.sub(rf"(?<![^\W_]){sign}(?![^\W_\d])", replacement, text)
-    # StB is one word
+    # `StB` (starboard) is one word, unlike other changes of case
     text = re.sub(r"(?<![^\W_])[A-Z][a-z][A-Z](?![^\W_])", lambda word: word[0].lower(), text)
     text = re.sub(r"([a-z])([A-Z])", r"\1 \2", text)
     text = text.translate(_LETTER_MAP)
     decomposed = unicodedata.normalize("NFKD", text)
-    # voicing marks of kana are letters, not accents
+    # the voicing marks of kana distinguish letters and are not removed
     letters = "".join(c for c in decomposed if not unicodedata.combining(c) or c in "\u3099\u309a")
     normalized = unicodedata.normalize("NFC", letters).lower()
     return " ".join(re.split(r"[\W_]+", normalized)).strip()
@@ -274,16 +290,17 @@ def normalize_name(name: str) -> str:
 
 @lru_cache(maxsize=4096)
 def parse_name(name: str) -> ParsedName:
-    """Return what a column's name is about."""
+    """Parse a column name into concepts."""
     tokens = [part for token in normalize_name(name).split() for part in _split_side(token)]
     text = " ".join(tokens)
     if len(tokens) > 1 and re.search(r"[\s_][VAW]$", _IN_BRACKETS.sub(" ", name).strip()):
-        # volts, amperes and watts are no names of channels
-        tokens, text = tokens[:-1], text[:-2]
+        # a last V, A or W is the unit volt, ampere or watt
+        tokens = tokens[:-1]
+        text = text[:-2]
     number = next((int(token) for token in reversed(tokens) if token.isdigit()), None)
     tokens_without_digits = [re.sub(r"\d+$", "", token) for token in tokens if not token.isdigit()]
     if number is None:
-        # `servo3_raw` counts as `servo_raw_3` does
+        # `servo3_raw` equals `servo_raw_3`
         trailing_numbers = (re.search(r"[a-z](\d+)$", token) for token in reversed(tokens))
         number = next(
             (int(number_match.group(1)) for number_match in trailing_numbers if number_match), None
@@ -298,7 +315,7 @@ def parse_name(name: str) -> ParsedName:
 
 
 def _split_side(token: str) -> tuple[str, ...]:
-    """Return an actuator and its side, of `deltal` or `rpmr`; other tokens as they are."""
+    """Split an actuator from the letter of its side, as in `deltal` or `rpmr`."""
     is_glued = (
         token[-1:] in ("l", "r") and token not in _ASCII_WORDS and token[:-1] in _ACTUATOR_WORDS
     )
@@ -306,9 +323,11 @@ def _split_side(token: str) -> tuple[str, ...]:
 
 
 def _split_compound(token: str) -> tuple[str, ...]:
-    """Return the two words that a compound is made of, `ost` and `position`; none for others."""
+    """Split a compound into two known words, as `ostposition`; empty for other tokens."""
     for split_position in range(3, len(token) - 2):
-        first_word, second_word = token[:split_position], token[split_position:].removeprefix("s")
+        first_word = token[:split_position]
+        # German compounds may have an s between their words
+        second_word = token[split_position:].removeprefix("s")
         is_known = any(
             second_word.startswith(vocabulary_entry)
             for vocabulary_entry in _COMPOUND_WORDS
@@ -339,24 +358,25 @@ def _mentions_concept(concept: str, text: str, tokens: list[str]) -> bool:
 
 
 class _ChannelRule:
-    """A channel, and what a name is about that stands for it.
+    """Rule that maps a combination of concepts to a channel.
 
     Args:
-        channel: its name; None where it is none.
-        required: things, of each of which one must be among them (`rate|speed`).
-        excluded: things that must not be.
-        pattern: pattern that the name must hold.
+        channel: name of the channel; None for quantities without a channel.
+        required: required concepts, separated by blanks; alternatives are `rate|speed`.
+        excluded: concepts that exclude the channel, separated by blanks.
+        pattern: regular expression that the normalized name must contain.
     """
 
     def __init__(
         self, channel: str | None, required: str, excluded: str = "", pattern: str = ""
     ) -> None:
-        self.channel, self._pattern = channel, re.compile(pattern)
+        self.channel = channel
+        self._pattern = re.compile(pattern)
         self._required = [frozenset(alternatives.split("|")) for alternatives in required.split()]
         self._excluded = frozenset(excluded.split())
 
     def matches(self, parsed_name: ParsedName) -> bool:
-        """Return whether a name stands for the channel."""
+        """Return whether the rule applies to a name."""
         if not self._excluded.isdisjoint(parsed_name.concepts) or any(
             map(parsed_name.concepts.isdisjoint, self._required)
         ):
@@ -376,12 +396,13 @@ _AXIS_RULES = (
     _ChannelRule("u", "", "", _TWIST_PATTERN.format("x")),
     _ChannelRule("v", "", "", _TWIST_PATTERN.format("y")),
 )
-# what no channel of the motion is about, and what none is but a position along north, whose N
-# may be one of revolutions
+# concepts that exclude all channels of motion
 _NON_MOTION_CONCEPTS = (
     *("command", "acceleration", "rudder", "planes", "propeller", "current", "depth", "age"),
     "heave",
 )
+# concepts that exclude channels of motion except the northward position N, which is also a symbol
+# of shaft speed
 _DRIVE_CONCEPTS = ("engine", "revolutions", "throttle", "azimuth", "servo", "thrust", "torque")
 _EARTH_AXIS_CONCEPTS = "north east angular voltage"
 _STATE_RULES = (
@@ -393,23 +414,27 @@ _STATE_RULES = (
     _ChannelRule("r", "heading|turn rate"),
     _ChannelRule("r", "", "", "^r( mid)?$"),
     _ChannelRule("r", "angular", "", r" [zr](?: (?:dps|degps|radps|rps|deg s|rad s))?$"),
-    # of an axis that is not told: what turns is the vessel
+    # an angular rate without an axis is that of the heading
     _ChannelRule("r", "angular rate", "x y pitch"),
     *_AXIS_RULES,
     _ChannelRule("psi", "heading", "ground"),
     _ChannelRule("psi", "", "", "^(gyro|gyro ?compass|compass)$"),
-    # some write 0 for what is fixed to the earth
+    # x0 and y0 are earth-fixed coordinates in some notations
     *(
         _ChannelRule(axis, about, "speed angle force", text)
-        for axis, way in (("x", "north"), ("y", "east"))
-        for about, text in ((way, ""), (f"{axis} position", ""), (axis, r"^[xy](?: ?0)?(?: m)?$"))
+        for axis, direction in (("x", "north"), ("y", "east"))
+        for about, text in (
+            (direction, ""),
+            (f"{axis} position", ""),
+            (axis, r"^[xy](?: ?0)?(?: m)?$"),
+        )
     ),
     _ChannelRule("v", "sway", _EARTH_AXIS_CONCEPTS),
     _ChannelRule("u", "surge|longitude", _EARTH_AXIS_CONCEPTS),
     _ChannelRule("v", "speed port|starboard", _EARTH_AXIS_CONCEPTS),
     _ChannelRule("speed", "speed", _EARTH_AXIS_CONCEPTS),
 )
-"""In the order in which they are asked."""
+"""Rules for channels of motion in order of precedence."""
 _DEPTH_RULES = (
     _ChannelRule("q", "pitch rate|speed|angular", "propeller heave"),
     _ChannelRule("theta", "pitch", "propeller heave"),
@@ -421,27 +446,28 @@ _DEPTH_RULES = (
 _VELOCITY_UNIT_SUFFIX = re.compile(
     r"(?<=\b[pqr]) (?:dps|degps|degs|radps|rads|rps|deg s|rad s)$|(?<=\b[uvw]) (?:mps|ms|kn|m s)$"
 )
-"""What stands behind the letter of a velocity."""
+"""Unit behind the symbol of a velocity."""
 
 
 @lru_cache(maxsize=4096)
 def match_state_channel(parsed_name: ParsedName) -> str | None:
-    """Return the channel of the motion or of the wind that a name stands for; None for none.
+    """Return the channel of motion or wind for a name, or None.
 
-    It is `speed` where only the size of a velocity is meant.
+    The result is `speed` for the magnitude of a velocity.
     """
-    parsed, normalized = parsed_name, parsed_name.text.replace(" ", "_")
+    parsed = parsed_name
+    normalized = parsed.text.replace(" ", "_")
     if normalized in MOTION_CHANNELS:
         return normalized
     if re.fullmatch(r"[pqr] rps", parsed.text):
-        # rad/s of a rate, not revolutions
+        # rps is rad/s here, not revolutions per second
         return parsed.text[0] if parsed.text[0] != "q" else None
     last_word = _VELOCITY_UNIT_SUFFIX.sub("", parsed.text).rpartition(" ")[2]
     if (
         last_word in ("psi", "u", "v", "r", "phi", "p")
         and parsed.concepts <= parse_name(last_word).concepts
     ):
-        # what stands before it, as in `body.r`, says nothing
+        # a prefix as in `body.r` has no meaning of its own
         return last_word
     if parsed.has_all("machinery") and parsed.has_none("speed", "surge"):
         return None
@@ -463,9 +489,9 @@ def match_state_channel(parsed_name: ParsedName) -> str | None:
 
 
 def match_depth_channel(parsed_name: ParsedName) -> str | None:
-    """Return w, q, z or theta of a vessel under water that a name stands for; None for others."""
+    """Return the channel w, q, z or theta of an underwater vessel for a name, or None."""
     bare_text = _VELOCITY_UNIT_SUFFIX.sub("", parsed_name.text)
-    # a last w without a unit may be a quaternion's
+    # a last w without a unit may be part of a quaternion
     bare_text = (
         bare_text
         if bare_text == parsed_name.text or parsed_name.concepts
@@ -482,14 +508,14 @@ def match_depth_channel(parsed_name: ParsedName) -> str | None:
 
 
 def match_axis_velocity(parsed_name: ParsedName) -> str | None:
-    """Return u or v of a velocity along an axis x or y, of whatever frame; None for others."""
+    """Return u or v for a velocity along an axis x or y of an unknown frame, or None."""
     return _match_rules(_AXIS_RULES, parsed_name)
 
 
 _EARTH_VELOCITY_PATTERN = re.compile(r"\bvel\w* (?:n|e|d|north|east|down)\b")
-"""A velocity along north, east or down: its N is no propeller."""
+"""Velocity along north, east or down, whose N is no shaft speed."""
 _SIDE_LETTER_PATTERN = re.compile(r"(?<=\w) ([lr])(?= |$)")
-"""The side behind the name of an actuator."""
+"""Letter of the side behind the name of an actuator."""
 
 
 _INPUT_RULES = (
@@ -506,13 +532,14 @@ _INPUT_RULES = (
     _ChannelRule("servo{side}", "servo"),
     _ChannelRule("throttle{side}", "throttle"),
 )
-"""In the order in which they are asked."""
+"""Rules for channels of actuators in order of precedence."""
 
 
 @lru_cache(maxsize=4096)
 def match_input_channel(parsed_name: ParsedName) -> str | None:
-    """Return the channel of an actuator that a name stands for; None where it names none."""
-    parsed, normalized = parsed_name, parsed_name.text.replace(" ", "_")
+    """Return the channel of an actuator for a name, or None."""
+    parsed = parsed_name
+    normalized = parsed.text.replace(" ", "_")
     if normalized in CHANNEL_UNITS and normalized not in (
         *MOTION_CHANNELS,
         "t",
@@ -547,7 +574,7 @@ _ACTUATOR_QUALIFIERS = frozenset({"port", "starboard", "command", "measured"})
 
 
 def _match_force_channel(parsed_name: ParsedName) -> str | None:
-    """Return the name of a force or moment in body axes, with what tells it from others alike."""
+    """Return the channel of a force or moment in body axes with a qualifier, or None."""
     axis = next((axis for axis in ("x", "y", "n", "z") if axis in parsed_name.text.split()), None)
     is_moment = parsed_name.has_all("torque")
     if axis is None or not parsed_name.text.startswith("tau") or (is_moment and axis in "xy"):

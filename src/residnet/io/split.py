@@ -1,7 +1,7 @@
-"""Which logs, and which stretches of them, are for training, validation and test.
+"""Assignment of logs, or intervals of logs, to training, validation and test.
 
-Files are named by patterns; a log may be cut in time. Where nobody said which is which they are
-divided here, and no two splits may share measurements.
+The config selects files by patterns and intervals by times, or residnet divides the logs. Two
+splits must not share measurements.
 """
 
 from __future__ import annotations
@@ -30,28 +30,30 @@ if TYPE_CHECKING:
 
 SPLITS = ("train", "validation", "test")
 _MIN_LOGS_FOR_WHOLE_SPLITS = 5
-"""Logs from which whole ones are taken for each split."""
-_MIN_TEST_LOGS, _MIN_LOGS_FOR_TEST_LOGS = 3, 8
-"""Test logs without which no verdict is passed, and logs of which so many can be spared."""
+"""Smallest number of logs for splits of complete logs."""
+_MIN_TEST_LOGS = 3
+"""Number of test logs that a verdict needs."""
+_MIN_LOGS_FOR_TEST_LOGS = 8
+"""Smallest number of logs of which so many become test logs."""
 _SPLIT_SHARES = (
     ("train", 0.0, 0.3),
     ("validation", 0.3, 0.5),
     ("train", 0.5, 0.8),
     ("test", 0.8, 1.0),
 )
-"""Stretches of each log where there are fewer."""
+"""Split, start and end (share of the duration) of the intervals of each log if logs are few."""
 _MAX_SHARED_ROWS = 100
-"""Rows that two logs may share before one is a copy of part of the other."""
+"""Largest number of equal rows in two logs; with more, one is a partial copy of the other."""
 
 
 class LogPart(Config):
-    """Logs, or a stretch of one, that belong to a split.
+    """Logs, or an interval of logs, for a split.
 
     Attributes:
         log: path or pattern of files, folders and bags, relative to `root`.
-        from: time in s on the log's own clock at which the stretch begins; null for its start.
-        to: time in s at which it ends; null for the log's end.
-        manoeuvre: only logs of this kind of manoeuvre; null for all.
+        from: start of the interval in s on the log's clock; null for the start of the log.
+        to: end of the interval in s; null for the end of the log.
+        manoeuvre: type of manoeuvre that logs must have; null accepts all.
     """
 
     log: str
@@ -63,28 +65,30 @@ class LogPart(Config):
     def check_order(self) -> LogPart:
         if self.start is not None and self.stop is not None and self.stop <= self.start:
             raise ValueError(
-                f"a stretch from {self.start:.10g} s to {self.stop:.10g} s holds nothing"
+                f"the interval from {self.start:.10g} s to {self.stop:.10g} s is empty; `to` must"
+                " be later than `from`"
             )
         return self
 
     @property
     def path(self) -> Path:
-        """The file or folder, where it names one (`resolve_log_parts`)."""
+        """Path of the file or folder, if `log` is no pattern."""
         return Path(self.log)
 
     @property
     def is_whole_log(self) -> bool:
-        """Whether it is the log from end to end."""
+        """Whether the part is the complete log."""
         return self.start is None and self.stop is None
 
     @property
     def time_range(self) -> tuple[float, float]:
-        """Times at which it begins and ends, s; infinite for those of the log."""
-        start, stop = self.start, self.stop
-        return -np.inf if start is None else start, np.inf if stop is None else stop
+        """Start and end in s; infinite for the start and end of the log."""
+        start = -np.inf if self.start is None else self.start
+        stop = np.inf if self.stop is None else self.stop
+        return start, stop
 
     def overlaps(self, other: LogPart) -> bool:
-        """Return whether two parts of one log share a stretch of time, whatever its kind."""
+        """Return whether two parts of one log share a time interval and may share a manoeuvre."""
         is_other_manoeuvre = self.manoeuvre != other.manoeuvre and None not in (
             self.manoeuvre,
             other.manoeuvre,
@@ -94,10 +98,10 @@ class LogPart(Config):
         )
 
     def extract(self, log: Log) -> Log | None:
-        """Return this part of a log; None where the log is of another manoeuvre.
+        """Extract this part from a log; None if the log has another manoeuvre.
 
         Raises:
-            DataError: where the stretch holds fewer than two samples.
+            DataError: if the interval has fewer than two samples.
         """
         if self.manoeuvre not in (None, log.manoeuvre):
             return None
@@ -105,7 +109,16 @@ class LogPart(Config):
 
 
 def extract_segment(log: Log, start_time: float, stop_time: float) -> Log:
-    """Return the samples of a log with start <= t < stop, under a name of their own."""
+    """Return the samples of a log with start <= t < stop as a log with a new name.
+
+    Args:
+        log: the log.
+        start_time: start in s; -inf for the start of the log.
+        stop_time: end in s; inf for the end of the log.
+
+    Raises:
+        DataError: if the interval has fewer than two samples.
+    """
     is_inside = (log.t >= start_time - 1e-9) & (log.t < stop_time - 1e-9)
     first_time, last_time = float(log.t[0]), float(log.t[-1])
     time_range = [
@@ -115,13 +128,14 @@ def extract_segment(log: Log, start_time: float, stop_time: float) -> Log:
     if is_inside.sum() < 2:
         raise DataError(
             f"log {log.name}: {int(is_inside.sum())} samples from {time_range[0]:.10g} s to"
-            f" {time_range[1]:.10g} s; the log runs from {first_time:.10g} s to {last_time:.10g} s"
+            f" {time_range[1]:.10g} s, at least 2 are needed; the log runs from {first_time:.10g} s"
+            f" to {last_time:.10g} s"
         )
     name = "_".join(
         [log.name, *(f"{time_limit:.13g}s".replace(".", "p") for time_limit in time_range)]
     )
     first_index = int(np.argmax(is_inside))
-    # a slice, and no copy
+    # a slice is a view without a copy
     segment = log.select_rows(slice(first_index, first_index + int(is_inside.sum()))).replace(
         name=name, meta={**log.meta, "stretch": time_range}
     )
@@ -131,7 +145,16 @@ def extract_segment(log: Log, start_time: float, stop_time: float) -> Log:
 def resolve_log_parts(
     root: Path, entries: Sequence[str | LogPart], error_prefix: str
 ) -> list[LogPart]:
-    """Return the parts of single logs that a split's entries name, each once."""
+    """Resolve patterns of a split to parts of single logs without duplicates.
+
+    Args:
+        root: folder of relative patterns.
+        entries: patterns, or parts with patterns.
+        error_prefix: start of messages.
+
+    Raises:
+        ConfigError: if a pattern matches nothing.
+    """
     log_parts: dict[LogPart, None] = {}
     for entry in entries:
         log_part = entry if isinstance(entry, LogPart) else LogPart(log=entry)
@@ -141,7 +164,7 @@ def resolve_log_parts(
 
 
 class SplitFile(Config):
-    """Logs of the three splits in a YAML file of their own, as in `SplitConfig`."""
+    """Separate YAML file with the logs of the three splits; see `SplitConfig`."""
 
     train: tuple[str | LogPart, ...] = Field(min_length=1)
     validation: tuple[str | LogPart, ...] = Field(min_length=1)
@@ -149,21 +172,22 @@ class SplitFile(Config):
 
 
 class SplitConfig(Config):
-    """Logs of the three splits: from a YAML file, from patterns, or divided by residnet.
+    """Logs of the three splits: from a YAML file, from patterns, or divided automatically.
 
     Attributes:
         file: YAML file with the keys train, validation and test, each a list of paths or patterns
             relative to `root`.
-        root: folder that paths and patterns start from; by default the folder of `file`, else the
+        root: folder of relative paths and patterns; by default the folder of `file`, otherwise the
             current folder.
-        auto: patterns of logs that are divided by residnet: of each five logs, in the order of
-            their manoeuvres, the third is for validation and the fifth for the test; fewer are cut
-            in time. Copies are left out.
-        train: files, folders, bags or patterns such as `turning/*.csv` (`**` for any depth), where
-            there is no `file`; or stretches of time and logs of a manoeuvre, such as `{log:
-            trip.mcap, from: 120 s, to: 300 s}` and `{log: "*.csv", manoeuvre: zigzag}`.
-        validation: the same for the logs that models are chosen on.
-        test: the same for the logs that nothing is chosen on.
+        auto: patterns of logs that residnet divides. Of each five logs, sorted by manoeuvre, the
+            third is for validation and the fifth for the test. Fewer than five logs are divided in
+            time. Copies of logs are left out.
+        train: training logs, if there is no `file`: files, folders, bags or patterns such as
+            `turning/*.csv` (`**` for any depth), time intervals such as `{log: trip.mcap,
+            from: 120 s, to: 300 s}`, or logs of a manoeuvre such as `{log: "*.csv", manoeuvre:
+            zigzag}`.
+        validation: validation logs, on which models are selected.
+        test: test logs, which no selection uses.
     """
 
     file: ConfigPath | None = None
@@ -185,28 +209,30 @@ class SplitConfig(Config):
             return self
         if self.file is not None and named_splits:
             raise ValueError(
-                f"give either `file` or patterns, not both (given: file and {', '.join(named_splits)})"
+                "give either `file` or patterns, not both (given: file and"
+                f" {', '.join(named_splits)})"
             )
         if self.file is None and len(named_splits) < len(SPLITS):
             missing_splits = [name for name in SPLITS if name not in named_splits]
             raise ValueError(
-                f"no files for {', '.join(missing_splits)}; give patterns for train, validation and test,"
-                " one `file` that names them, or `auto` with patterns of all logs"
+                f"no files for {', '.join(missing_splits)}; give patterns for train, validation and"
+                " test, one `file` with these lists, or `auto` with patterns of all logs"
             )
         return self
 
     def resolve_parts(self) -> dict[str, list[LogPart]]:
-        """Return what each split consists of, in the order of its patterns; nothing of `auto`.
+        """Return split -> parts of logs in the order of its patterns; empty for `auto`.
 
         The matches of a pattern are sorted.
 
         Raises:
-            ConfigError: where a split is empty, a pattern matches nothing, or a stretch stands in
+            ConfigError: if a split is empty, a pattern matches nothing, or an interval belongs to
                 two splits.
         """
         if self.auto:
             return {}
-        root, error_prefix = self._find_root(), "split" if self.file is None else str(self.file)
+        root = self._find_root()
+        error_prefix = "split" if self.file is None else str(self.file)
         split_settings = (
             self
             if self.file is None
@@ -228,18 +254,18 @@ class SplitConfig(Config):
                     and other_split != split
                     and log_part.overlaps(other_part)
                 ):
-                    subject = "" if log_part.is_whole_log else "the same stretch of "
+                    subject = "" if log_part.is_whole_log else "an interval of "
                     raise ConfigError(
-                        f"{error_prefix}: {subject}{log_part.path} stands in {other_split} and in {split}; a"
-                        f" {'file' if log_part.is_whole_log else 'stretch'} belongs to one split"
+                        f"{error_prefix}: {subject}{log_part.path} belongs to {other_split} and to"
+                        f" {split}; assign it to one split"
                     )
         return parts_by_split
 
     def list_files(self) -> list[Path]:
-        """Return all logs, each once.
+        """Return the paths of all logs without duplicates.
 
         Raises:
-            ConfigError: as `parts`.
+            ConfigError: see `resolve_parts`.
         """
         if self.auto:
             return match_patterns(self._find_root(), self.auto, "split: auto")
@@ -248,10 +274,10 @@ class SplitConfig(Config):
         )
 
     def resolve_paths(self) -> dict[str, list[Path]]:
-        """Return the logs of each split; nothing where `auto` divides them.
+        """Return split -> paths of its logs; empty for `auto`.
 
         Raises:
-            ConfigError: as `parts`.
+            ConfigError: see `resolve_parts`.
         """
         return {
             split: list(dict.fromkeys(part.path for part in parts))
@@ -266,20 +292,21 @@ class SplitConfig(Config):
 
 
 def split_logs(logs: Sequence[Log]) -> dict[str, list[Log]]:
-    """Return the logs by split (train, validation, test); copies are left out.
+    """Divide logs into train, validation and test, without copies of logs.
 
-    Of each five logs, in the order of their manoeuvres, the third is for validation and the fifth
-    for the test; of eight or more three at least, fewer cannot tell how good a model is. Where
-    there are fewer than five, each is cut in time: its first three tenths and those from the middle
-    on are for training, the rest for validation and test. Where folders or files are called train
-    and test (and validation), that is the split.
+    - If folders or files are called train and test (and validation), these are the splits.
+    - Of each five logs, sorted by manoeuvre, the third is for validation and the fifth for the
+      test. Of eight or more logs at least three are for the test, which a verdict needs.
+    - Fewer than five logs are divided in time: 0 to 30 % and 50 to 80 % of the duration are for
+      training, 30 to 50 % for validation, 80 to 100 % for the test.
 
     Raises:
-        DataError: where a log is too short to be cut.
+        DataError: if a log is too short to be divided.
     """
     distinct_logs = remove_copies(logs)
     logs_by_split: dict[str, list[Log]] = {split: [] for split in SPLITS}
-    split_names, n_logs = splits_from_names(distinct_logs), len(distinct_logs)
+    split_names = splits_from_names(distinct_logs)
+    n_logs = len(distinct_logs)
     if not split_names and n_logs >= _MIN_LOGS_FOR_WHOLE_SPLITS:
         logs_per_test_log = (
             n_logs / _MIN_TEST_LOGS
@@ -309,26 +336,26 @@ def split_logs(logs: Sequence[Log]) -> dict[str, list[Log]]:
             ]
         return logs_by_split
     for log in distinct_logs:
-        elapsed, duration = remove_pauses(log.t), float(log.t[-1] - log.t[0])
-        # whole numbers read better, where the log is long enough for them
+        elapsed = remove_pauses(log.t)
+        duration = float(log.t[-1] - log.t[0])
+        # round times to three significant digits of the duration
         n_digits = max(0, 2 - int(np.log10(max(duration, 1e-9))))
         for split, *share_limits in _SPLIT_SHARES:
             start_time, stop_time = (
                 round(float(np.interp(share * elapsed[-1], elapsed, log.t)), n_digits)
                 for share in share_limits
             )
-            segment_start, segment_stop = (
-                start_time if share_limits[0] else -np.inf,
-                stop_time if share_limits[1] < 1.0 else np.inf,
-            )
+            segment_start = start_time if share_limits[0] else -np.inf
+            segment_stop = stop_time if share_limits[1] < 1.0 else np.inf
             logs_by_split[split].append(extract_segment(log, segment_start, segment_stop))
     return logs_by_split
 
 
 def splits_from_names(logs: Sequence[Log]) -> list[str]:
-    """Return for each log the split that its folder or file is called after; empty for no split.
+    """Return the split of each log from the name of its file or folder.
 
-    All must be called so, two of them for training and one for the test at least.
+    The list is empty unless all names contain a split, with at least two logs for training and
+    validation and one log for the test.
     """
     split_names = []
     for log in logs:
@@ -348,7 +375,7 @@ def splits_from_names(logs: Sequence[Log]) -> list[str]:
 
 
 def remove_copies(logs: Sequence[Log]) -> list[Log]:
-    """Return the logs without those whose rows another one holds; the longest stay."""
+    """Return the logs without those that share more than 100 rows with a longer log."""
     common_channels = sorted(set.intersection(*(set(log.channels) for log in logs))) if logs else []
     if len(logs) < 2 or not common_channels:
         return [*logs]
@@ -366,7 +393,11 @@ def remove_copies(logs: Sequence[Log]) -> list[Log]:
 
 
 def _count_shared_rows(hashes: Sequence[np.ndarray]) -> csr_array:
-    """Return how many distinct rows logs have in common [L, L], by those that two of them hold."""
+    """Return the numbers of distinct rows that pairs of logs share, sparse [L, L].
+
+    Args:
+        hashes: unique hashes of the rows of each log.
+    """
     from scipy.sparse import coo_array, csr_array
 
     log_indices = np.repeat(np.arange(len(hashes)), [log_hashes.size for log_hashes in hashes])
@@ -386,18 +417,18 @@ def _count_shared_rows(hashes: Sequence[np.ndarray]) -> csr_array:
 def check_leaks(
     logs_by_split: Mapping[str, Sequence[Log]], max_shared_rows: int = _MAX_SHARED_ROWS
 ) -> None:
-    """Stop where two logs of different splits hold the same measurements.
+    """Raise an error if two logs of different splits share measurements.
 
-    Compared are rows of all channels that the logs have in common, without time and with angles
-    modulo a full circle, so that a copied stretch is found wherever its clock and heading start.
-    Equal rows within one log (a vessel at rest) count once.
+    Rows of the common channels are compared without time and with angles modulo a full circle, so
+    that copies with another clock or another start of the heading are detected. Equal rows within
+    one log (a vessel at rest) count once.
 
     Args:
-        logs_by_split: split -> its logs.
-        max_shared_rows: most distinct rows that two logs may share.
+        logs_by_split: split -> logs.
+        max_shared_rows: largest number of distinct rows that two logs may share.
 
     Raises:
-        DataError: naming the two logs that share most rows.
+        DataError: if two logs share more rows; the message names the worst pair.
     """
     splits_and_logs = [
         (split, log) for split, logs_of_split in logs_by_split.items() for log in logs_of_split
@@ -407,17 +438,14 @@ def check_leaks(
         if splits_and_logs
         else []
     )
-    row_sampling_interval_ = row_sampling_interval([log for _, log in splits_and_logs])
+    # of very many rows a sample is compared; equal rows have equal hashes and are sampled together
+    interval = row_sampling_interval([log for _, log in splits_and_logs])
     hashes = [
         hash_measured_rows(log, common_channels) for _, log in splits_and_logs if common_channels
     ]
-    hashes = [
-        np.unique(log_hashes[log_hashes % np.uint64(row_sampling_interval_) == 0])
-        for log_hashes in hashes
-    ]
-    if len({split for split, _ in splits_and_logs}) < 2 or not any(
-        log_hashes_.size for log_hashes_ in hashes
-    ):
+    hashes = [np.unique(log_hashes[log_hashes % np.uint64(interval) == 0]) for log_hashes in hashes]
+    has_hashes = any(log_hashes.size for log_hashes in hashes)
+    if len({split for split, _ in splits_and_logs}) < 2 or not has_hashes:
         return
     shared_counts = _count_shared_rows(hashes).tocoo()
     split_indices = np.unique([split for split, _ in splits_and_logs], return_inverse=True)[1]
@@ -439,14 +467,14 @@ def check_leaks(
     ).size
     if n_identical > max_shared_rows:
         raise DataError(
-            f"logs {first_log.name} ({first_split}) and {second_log.name} ({second_split}) share {n_identical} identical rows, at"
-            f" most {max_shared_rows} are allowed; one is a copy of part of the other: leave one out, or put"
-            " both into one split"
+            f"logs {first_log.name} ({first_split}) and {second_log.name} ({second_split}) share"
+            f" {n_identical} identical rows, at most {max_shared_rows} are allowed; one is a partial"
+            " copy of the other: leave one out, or assign both to one split"
         )
 
 
 def row_sampling_interval(logs: Sequence[Log]) -> int:
-    """Return of how many rows one is compared between logs: more than one of very many."""
+    """Return k if one of k rows is compared between logs, to limit memory with many samples."""
     return -(-sum(len(log) for log in logs) // MAX_SAMPLES_IN_MEMORY)
 
 
@@ -454,10 +482,9 @@ _MOTION_CHANNELS = (*STATE_NAMES, "phi", "p")
 
 
 def hash_measured_rows(log: Log, channels: Sequence[str]) -> np.ndarray:
-    """Return the hashes of the rows that hold half of the motion at least, uint64 [K].
+    """Return hashes of the rows with at least half of the motion channels, uint64 [K].
 
-    Where channels come at several rates, a row between two fixes holds commands alone, and tells
-    nothing of the run that it is from.
+    In logs with several sampling rates other rows have commands only, which may be equal by chance.
     """
     motion_channels = [name for name in channels if name in _MOTION_CHANNELS] or channels
     n_measured = np.isfinite(log.stack(tuple(motion_channels))).sum(axis=1)
@@ -465,13 +492,13 @@ def hash_measured_rows(log: Log, channels: Sequence[str]) -> np.ndarray:
 
 
 def hash_rows(log: Log, channels: Sequence[str]) -> np.ndarray:
-    """Return the hash of each row of some channels, uint64 [T]."""
+    """Return a hash of the given channels for each row, uint64 [T]."""
     import pandas as pd
 
     columns = {}
     for name in channels:
         values = log[name]
-        # unwrapping a copied stretch from another start leaves rounding in the heading
+        # a copy that was unwrapped from another start differs by rounding errors in the heading
         columns[name] = (
             np.round(np.remainder(values, 2.0 * np.pi), 9)
             if log.units[name] == "rad"
@@ -483,8 +510,10 @@ def hash_rows(log: Log, channels: Sequence[str]) -> np.ndarray:
 
 
 def find_logs(folder: Path) -> list[Path]:
-    """Return the recordings and files of logs in a folder, in order; a recording is one log."""
-    # endings of one's own are looked into where there are no others
+    """Return the logs below a folder in sorted order: recordings (folders) and files.
+
+    Files with unknown extensions are tested by content if there are no others.
+    """
     return _find_logs_recursively(
         folder, lambda path: path.suffix.lower() in LOG_ENDINGS
     ) or _find_logs_recursively(
@@ -507,7 +536,7 @@ def _find_logs_recursively(folder: Path, is_log: Callable[[Path], bool]) -> list
 
 
 def _contains_recordings(folder: Path) -> bool:
-    """Return whether the folders in a folder hold files of the same names, as recordings do."""
+    """Return whether several subfolders contain files of the same names, as recordings do."""
     subfolders = [path for path in folder.iterdir() if path.is_dir()]
     file_name_sets = [
         frozenset(f.relative_to(path) for f in list_files(path)) for path in subfolders
@@ -519,14 +548,14 @@ def _contains_recordings(folder: Path) -> bool:
 
 
 def assign_log_names(paths: Iterable[Path]) -> dict[Path, str]:
-    """Return the name of each log: that of its file without the ending, or of its folder.
+    """Return a unique name for each log.
 
-    Where several files or folders have one name, as with a folder for each trial, the folders above
-    come before it as far as they are needed to tell the logs apart; of files in one folder the
-    ending comes behind it.
+    It is the name of the file without extension, or of the folder. Equal names are preceded by the
+    names of parent folders until they are unique. Files in one folder that differ in their
+    extension are named with it.
 
     Args:
-        paths: files and recordings; one that is given twice is one log.
+        paths: files and recordings; duplicates are one log.
     """
     distinct_paths = list(dict.fromkeys(paths))
     resolved_paths = {path: path.resolve() for path in distinct_paths}
@@ -560,20 +589,32 @@ def assign_log_names(paths: Iterable[Path]) -> dict[Path, str]:
 def _make_log_name(
     path: Path, resolved_path: Path, n_parent_names: int, n_by_stem: Mapping[tuple[Path, str], int]
 ) -> str:
-    is_unique = path.is_dir() or n_by_stem[resolved_path.parent, path.stem] == 1
-    own_name = (
-        (path.name if path.is_dir() else path.stem) if is_unique else path.name.replace(".", "_")
-    )
+    """Return the name of a log with a number of parent folders before it."""
+    if path.is_dir():
+        base_name = path.name
+    elif n_by_stem[resolved_path.parent, path.stem] == 1:
+        base_name = path.stem
+    else:
+        base_name = path.name.replace(".", "_")
     return "_".join(
-        [*(parent.name for parent in reversed(resolved_path.parents[:n_parent_names])), own_name]
+        [*(parent.name for parent in reversed(resolved_path.parents[:n_parent_names])), base_name]
     )
 
 
 def match_patterns(root: Path, patterns: Sequence[str], error_prefix: str) -> list[Path]:
-    """Return logs of all patterns, each once: files, recordings, and what lies below folders."""
+    """Return the logs that match patterns, without duplicates, including all logs in folders.
+
+    Args:
+        root: folder of relative patterns.
+        patterns: paths or glob patterns.
+        error_prefix: start of messages.
+
+    Raises:
+        ConfigError: if a pattern matches no log.
+    """
     log_paths: dict[Path, None] = {}
     for pattern in patterns:
-        # a plain path may hold characters that a pattern would read otherwise
+        # an existing path may contain characters with a meaning in patterns
         path = root / pattern
         matched_paths = [path] if path.exists() else _glob(root, pattern, error_prefix)
         matched_logs = [
@@ -594,7 +635,7 @@ def match_patterns(root: Path, patterns: Sequence[str], error_prefix: str) -> li
 
 
 def _glob(root: Path, pattern: str, error_prefix: str) -> list[Path]:
-    """Return files and recordings below `root` that a pattern matches, in order."""
+    """Return the files, otherwise the recordings, that match a pattern, in sorted order."""
     reason_text = "it is an absolute path" if Path(pattern).is_absolute() else ""
     try:
         if not reason_text:
@@ -606,5 +647,6 @@ def _glob(root: Path, pattern: str, error_prefix: str) -> list[Path]:
     except ValueError as error:
         reason_text = str(error)
     raise ConfigError(
-        f"{error_prefix}: '{pattern}' is not a pattern relative to {root} ({reason_text}); set `root` instead"
+        f"{error_prefix}: '{pattern}' is not a pattern relative to {root} ({reason_text}); set"
+        " `root` instead"
     )

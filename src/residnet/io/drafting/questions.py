@@ -1,4 +1,4 @@
-"""What a draft cannot know: questions with a reason and a default, and the marks they leave."""
+"""Questions, guesses and notes of a drafted config, and their output as YAML comments."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ Key = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Question:
-    """One thing that files do not say.
+    """Question to the user about a setting that the files do not determine.
 
     Attributes:
-        key: of the config that the answer decides.
+        key: key of the config.
         text: the question.
-        default: the answer that is taken where nobody answers.
-        reason: why this is the default.
-        options: answers that there are; empty where anything goes.
+        default: answer without a user.
+        reason: reason for the default.
+        options: possible answers; empty if any answer is possible.
     """
 
     key: Key
@@ -33,18 +33,22 @@ class Question:
 
 
 _LINE_WIDTH = 96
-"""Columns of a drafted config."""
+"""Largest width of lines in a drafted config, in characters."""
 CommentLookup = Callable[[tuple[str, ...]], list[str]]
-"""Path of a key -> lines about it."""
+"""Function from the path of a key to its comment lines."""
 AnswerCallback = Callable[[Question], str]
 
 
 @final
 class DraftNotes:
-    """The marks of a draft: what was guessed, what was found out, and what was left out.
+    """Guesses and notes on the keys of a drafted config.
 
     Args:
-        answer: asks somebody; None takes every default.
+        answer: function that asks the user; None takes every default.
+
+    Attributes:
+        guessed_values: key and reason of each value that may be wrong.
+        notes: key and text of each fact from the files.
     """
 
     def __init__(self, answer: AnswerCallback | None = None) -> None:
@@ -55,7 +59,15 @@ class DraftNotes:
     def ask_question(
         self, key: Key, text: str, default: str, reason: str, options: tuple[str, ...] = ()
     ) -> str:
-        """Return the answer to a question; the default, marked as a guess, where nobody answers."""
+        """Ask the user; without a user return the default and note it as a guess.
+
+        Args:
+            key: key of the config.
+            text: the question.
+            default: answer without a user.
+            reason: reason for the default.
+            options: possible answers; empty if any answer is possible.
+        """
         if self._answer_question is None:
             self.add_guess(key, reason)
             return default
@@ -63,24 +75,24 @@ class DraftNotes:
         if user_answer == default:
             self.add_note(key, f"confirmed: {reason}")
         else:
-            self.add_note(key, f"answered '{user_answer}' in place of '{default}'")
+            self.add_note(key, f"answered '{user_answer}' instead of '{default}'")
         return user_answer
 
     def add_guess(self, key: Key, reason: str) -> None:
-        """Mark a value that may be wrong."""
+        """Record that a value may be wrong, with the reason for it."""
         self.guessed_values.append((key, reason))
 
     def add_note(self, key: Key, text: str) -> None:
-        """Write down what the files show."""
+        """Record a fact from the files."""
         self.notes.append((key, text))
 
     def extend(self, other_notes: DraftNotes) -> None:
-        """Add the marks of another draft."""
+        """Append the guesses and notes of another draft."""
         self.guessed_values += other_notes.guessed_values
         self.notes += other_notes.notes
 
     def move_key(self, old_key: Key, new_key: Key) -> None:
-        """Move the marks of one key, and of those below it, to another."""
+        """Move the guesses and notes of a key and its children to another key."""
         depth = len(old_key)
         self.guessed_values, self.notes = (
             [
@@ -91,7 +103,12 @@ class DraftNotes:
         )
 
     def rename_keys(self, parent: Key, names: Mapping[str, str]) -> None:
-        """Move what stands at keys below another one to new names; others there are forgotten."""
+        """Rename the children of a key in guesses and notes, and drop those of other children.
+
+        Args:
+            parent: key of a mapping.
+            names: child -> new name.
+        """
 
         def rename_entries(entries: list[tuple[Key, str]]) -> list[tuple[Key, str]]:
             renamed = []
@@ -109,7 +126,7 @@ class DraftNotes:
         )
 
     def comments_at(self, key: Key) -> list[str]:
-        """Return the comments that stand at a key of the config, guesses first."""
+        """Return the comments on a key of the config, guesses first."""
         return [f"guess: {text}" for noted_key, text in self.guessed_values if noted_key == key] + [
             text for noted_key, text in self.notes if noted_key == key
         ]
@@ -118,11 +135,12 @@ class DraftNotes:
 def dump_commented_yaml(
     content: Mapping[str, Any], comments: CommentLookup, head_lines: Sequence[str] = ()
 ) -> str:
-    """Return a mapping as YAML, with comments above its keys.
+    """Format a mapping as YAML with comments above its keys.
 
     Args:
-        comments: path of a key -> lines about it.
-        head_lines: lines at the top.
+        content: the mapping.
+        comments: function from the path of a key to its comment lines.
+        head_lines: comment lines at the top.
     """
     lines = [line for text in head_lines for line in _wrap_comment(text, "")]
     return "\n".join([*lines, *_format_entries(content, (), comments)]) + "\n"
@@ -131,9 +149,12 @@ def dump_commented_yaml(
 def _format_entries(
     content: Mapping[str, Any], parent_path: tuple[str, ...], comments: CommentLookup
 ) -> list[str]:
-    lines, indent = [], "  " * len(parent_path)
+    """Return the YAML lines of a mapping; short values are written in flow style on one line."""
+    lines = []
+    indent = "  " * len(parent_path)
     for key, value in content.items():
-        path, flow_text = (*parent_path, str(key)), _format_flow(value)
+        path = (*parent_path, str(key))
+        flow_text = _format_flow(value)
         lines += [line for text in comments(path) for line in _wrap_comment(text, indent)]
         fits_on_line = len(indent) + len(str(key)) + 2 + len(flow_text) <= _LINE_WIDTH
         if isinstance(value, Mapping) and value:

@@ -272,8 +272,8 @@ def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
     """Estimate the clock offset of a log from the accelerations that its channels explain.
 
     For each offset with sufficient overlap the changes of u and r over blocks of time are fitted by
-    least squares. The regressors are integrals of velocities and of each channel w: w, w|w| and w u.
-    The offset with the largest explained share of the residual of the velocities alone is returned.
+    least squares. The regressors are integrals of velocities, and of w, w|w| and w u of each
+    channel w. The result maximises the explained share of the residual of the velocities alone.
 
     Args:
         log: log with the motion, measured or derived from position and heading.

@@ -169,8 +169,9 @@ class Recording:
     def describe_contents(self) -> str:
         """Text with the name of each series and its message type, or its fields without a type."""
         descriptions = [
-            f"{name} ({series.message_type.rsplit('/', 1)[-1] or ', '.join(list(series.fields)[:6])})"
+            f"{name} ({short_type or ', '.join(list(series.fields)[:6])})"
             for name, series in self.series.items()
+            for short_type in [series.message_type.rsplit("/", 1)[-1]]
         ]
         n_more = len(descriptions) - _MAX_LISTED_SERIES
         return (
@@ -201,9 +202,8 @@ class Recording:
             )
         name = match_topic(topic, self.series)
         if name is None:
-            raise UsageError(
-                f"{self.path}: no topic '{topic}'{suggest_name(topic, (*self.series, *self.unread_series))}"
-            )
+            hint = suggest_name(topic, (*self.series, *self.unread_series))
+            raise UsageError(f"{self.path}: no topic '{topic}'{hint}")
         return self.series[name]
 
 

@@ -269,8 +269,8 @@ class TableConfig(ConfiguredReader, ABC):
             n_interpolated = int((np.isfinite(raw_channel) & ~np.isfinite(channels[name])).sum())
             if name == "psi" and n_interpolated:
                 text = (
-                    f"{n_interpolated} headings were interpolated by the recorder from 359 deg over"
-                    " 180 deg to 1 deg; they count as missing"
+                    f"{n_interpolated} headings were interpolated by the recorder from 359 deg"
+                    " over 180 deg to 1 deg; they count as missing"
                 )
                 findings.append(make_remark("note", "heading_interpolated", text))
         channels, new_findings = _to_local_plane(path, channels, channel_maps)

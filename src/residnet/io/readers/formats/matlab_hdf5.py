@@ -130,8 +130,8 @@ class _TreeConfig(RecordingConfig):
                 if claimed_bytes > max(_MAX_UNCHECKED_BYTES, _MAX_COMPRESSION_RATIO * file_bytes):
                     raise DataError(
                         f"{path}: {dataset.name} claims {claimed_bytes / 1e9:.3g} GB in a file of"
-                        f" {file_bytes / 1e6:.3g} MB; the file is damaged or was never filled, write"
-                        " it again"
+                        f" {file_bytes / 1e6:.3g} MB; the file is damaged or was never filled,"
+                        " write it again"
                     )
                 if names and dataset.ndim == 1:
                     for column in names:

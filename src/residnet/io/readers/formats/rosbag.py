@@ -43,7 +43,7 @@ _MAX_ARRAY_SIZE = 16
 
 @final
 class RosbagConfig(RecordingConfig):
-    """Reader of a ROS 1 bag, a ROS 2 bag (a folder with metadata.yaml), or an .mcap or .db3 file."""
+    """Reader of a ROS 1 bag, a ROS 2 bag (folder with metadata.yaml), or an .mcap or .db3 file."""
 
     kind: Literal["rosbag"] = "rosbag"
     endings: ClassVar = (".mcap", ".db3", ".bag")
@@ -232,7 +232,7 @@ class _NumericFields:
         self._arrays = [(attrgetter(path), size) for path, size in arrays]
 
     def extract_numbers(self, message: Any) -> list[float]:
-        """Return the numbers of a message in the order of `names`; shorter arrays are NaN-padded."""
+        """Return the numbers of a message in the order of `names`, NaN for missing elements."""
         extracted: list[float] = []
         if self._scalars is not None:
             extracted = (

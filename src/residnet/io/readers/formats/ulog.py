@@ -98,7 +98,7 @@ def _find_boot_time(messages: list[dict[str, np.ndarray]]) -> int | None:
 
 
 def _convert_fields(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Convert fields to float64, integer positions to degrees, and name the parts of quaternions."""
+    """Convert fields to float64 and integer positions to degrees, and name quaternion parts."""
     fields = {}
     for name, values in data.items():
         if name != "timestamp":
