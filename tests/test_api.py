@@ -269,7 +269,7 @@ WRONG = [
     ("read_logs(pd.DataFrame())", "expected a path, given a DataFrame"),
     ("read_logs('nowhere.csv')", "no such file"),
     ("read_logs('no*where.csv')", "matches no file"),
-    ("read_logs(folder / 'empty')", "holds no log"),
+    ("read_logs(folder / 'empty')", "has no log"),
     (
         "read_logs(folder, channels={'u': 'surge'})",
         r"channels: u: give the column and its unit, for example \('surge', 'm/s'\)",

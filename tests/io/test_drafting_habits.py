@@ -88,8 +88,8 @@ class Habit:
 
 
 PLACE = "north [m] = x, east [m] = y"
-PORT = "roll angles say that it is positive to port"
-VESSELS = "hold a position each"
+PORT = "positive to port by roll angles"
+VESSELS = "have a position each"
 ROLLS = "heading [rad] = psi, roll [rad] = phi"
 ONE = ", ".join(f"{{0}}_{n}" for n in ("x = x", "y = y", "psi_deg = hdg", "delta_deg = rudder"))
 STILL = ", ".join(f"{{0}}_{n} = 0 * t" for n in ("u", "x", "y", "psi_deg", "delta_deg"))
@@ -117,7 +117,7 @@ def ros(stem: str, frame: str) -> str:
 HABITS: dict[str, Habit] = {
     "along the axes of the boat": Habit(f"{POSE}, vx = u, vy = v", "x y psi u v", "u"),
     "along those of the ground": Habit(
-        f"{POSE}, vx = vn, vy = ve", "x y psi", sure="u", absent="u v", told="along north and east"
+        f"{POSE}, vx = vn, vy = ve", "x y psi", sure="u", absent="u v", told="velocities in earth axes"
     ),
     "whole numbers of an autopilot": Habit(
         "lat = 1e7 * lat // 1, lon = 1e7 * lon // 1, hdg = 100 * hdg // 1",
@@ -164,7 +164,7 @@ HABITS: dict[str, Habit] = {
         guessed="r",
     ),
     "N beside E is north": Habit(
-        "N [m] = x, E [m] = y, heading [deg] = hdg, X [kN] = n", "x y psi n", "x", told="but holds"
+        "N [m] = x, E [m] = y, heading [deg] = hdg, X [kN] = n", "x y psi n", "x", told="but the unit"
     ),
     "N_m beside E_m is north": Habit("N_m = x, E_m = y, heading [deg] = hdg", "x y psi n", "x"),
     "what was ordered beside what was": Habit(
@@ -187,7 +187,7 @@ HABITS: dict[str, Habit] = {
         f"{ROLLS}, ROT = {-60 * DEGREE} * r, rollrate = {-60 * DEGREE} * p", "r p", told=PORT
     ),
     **{
-        f"a {name}": Habit(f"{PLACE}, {name} = hdg", "x y psi", told="minus the declination")
+        f"a {name}": Habit(f"{PLACE}, {name} = hdg", "x y psi", told="minus the magnetic declination")
         for name in ("magnetic heading [deg]", "Compass [deg]", "heading_mag [deg]")
     },
     "a true heading": Habit(f"{PLACE}, heading [deg] = hdg", "psi", never="declination"),

@@ -164,10 +164,10 @@ def test_missing_file_names_the_nearest(tmp_path: Path) -> None:
         ({"u": {"column": "a", "unit": "fathom"}}, "unknown unit 'fathom'"),
         (
             {"x": {"column": "a", "unit": "m", "frame": "enu"}},
-            "frame 'enu' says nothing about it (frames that do: ned)",
+            "frame 'enu' does not define it (frames that do: ned)",
         ),
         ({"delta": {"column": "a", "unit": "rad", "frame": "body_fpu"}}, "frames that do: none"),
-        ({"t": {"column": "a", "unit": "s"}}, "cannot name a channel"),
+        ({"t": {"column": "a", "unit": "s"}}, "'t' is no name of a channel"),
         ({"u": {"column": "a", "unit": "m/s", "sign": 0}}, "sign"),
         ({key: {"column": "a", "unit": "-"} for key in ("qx", "qw")}, "add qy, qz"),
         ({}, "channels"),

@@ -171,7 +171,7 @@ def test_folders_hold_tables_recordings_or_other_logs(tmp_path: Path) -> None:
     box = written_logs.mcap(log, boxes)
     shutil.rmtree(boxes / "whole")
     assert find_log_files([boxes]) == [box]
-    with pytest.raises(UsageError, match="holds no log of a format"):
+    with pytest.raises(UsageError, match="has no log of a known format"):
         find_log_files([tmp_path / "empty"])
 
 

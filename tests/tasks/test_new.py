@@ -131,7 +131,7 @@ def test_answers_are_taken(logs: list[Log], tmp_path: Path) -> None:
         file.write_text(file.read_text().replace("[°/min]", "[deg/s]"))
     draft = residnet.draft_config(tmp_path, folder=tmp_path, answer=lambda asked: asked.options[-1])
     assert draft.config["data"]["reader"]["channels"]["r"]["unit"] == "deg/s"
-    assert "answered 'deg/s' in place of 'deg/min'" in draft.text
+    assert "answered 'deg/s' instead of 'deg/min'" in draft.text
 
 
 def test_what_cannot_be_drafted(logs: list[Log], tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_what_cannot_be_drafted(logs: list[Log], tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     for name, said in (
         ("nowhere", "no such file or folder"),
-        ("empty", "holds no log of a format"),
+        ("empty", "has no log of a known format"),
         ("lost", "no channel psi"),
     ):
         with pytest.raises((UsageError, DataError), match=said):

@@ -468,8 +468,8 @@ def check_leaks(
     if n_identical > max_shared_rows:
         raise DataError(
             f"logs {first_log.name} ({first_split}) and {second_log.name} ({second_split}) share"
-            f" {n_identical} identical rows, at most {max_shared_rows} are allowed; one is a partial"
-            " copy of the other: leave one out, or assign both to one split"
+            f" {n_identical} identical rows, at most {max_shared_rows} are allowed; one is a"
+            " partial copy of the other: leave one out, or assign both to one split"
         )
 
 

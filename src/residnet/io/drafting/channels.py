@@ -1,7 +1,7 @@
-"""The entries of a channel map: units, signs and frames by headers, values and physics.
+"""Entries of a channel map: units, signs and frames from headers, values and physics.
 
-A vessel moves where it points, more or less, and turns as its heading changes. From that follow the
-factor and the sign between a column and the quantity that it stands for, whatever its header says.
+A vessel moves approximately in the direction of its heading, and its yaw rate is the derivative of
+the heading. Columns are regressed on these quantities to determine their factors and signs.
 """
 
 from __future__ import annotations
@@ -40,21 +40,21 @@ from residnet.preprocessing.derivatives import fit_local_polynomials
 from residnet.preprocessing.motion import remove_pauses
 
 _MIN_WINDOW_SECONDS = 1.0
-"""Shortest time in s over which positions are differentiated."""
+"""Shortest window in s in which positions are differentiated."""
 _MAX_UNIT_RATIO = 1.35
-"""Largest ratio between a measured factor and that of the unit that it stands for."""
+"""Largest ratio between an estimated factor and that of its unit."""
 MIN_STANDARD_ERRORS = 4.0
-"""Standard errors from which a side is told."""
+"""Smallest estimate, in standard errors, from which a sign is determined."""
 _MIN_CORRELATION = 0.6
-"""Least correlation that says anything."""
+"""Smallest significant correlation."""
 
 
 class PoseFrame(NamedTuple):
-    """How columns called x, y, psi become north, east and a heading clockwise from north.
+    """Frame of columns called x, y, psi.
 
     Attributes:
-        is_swapped: x is the east and y the north.
-        is_from_east: psi counts counter-clockwise from east.
+        is_swapped: whether x is east and y is north.
+        is_from_east: whether psi is counter-clockwise from east.
     """
 
     is_swapped: bool
@@ -62,18 +62,18 @@ class PoseFrame(NamedTuple):
 
 
 POSE_FRAMES = (PoseFrame(False, False), PoseFrame(True, False), PoseFrame(False, True))
-"""Frames that can be told apart; both changes together are a mirror image that fits as well."""
+"""Distinguishable frames; both changes together give a mirror image with equal consistency."""
 ROS_POSE_FRAMES = (PoseFrame(True, True), PoseFrame(True, False))
-"""Frames of a pose of ROS, by REP 103 first: x east, y north, headings from east."""
+"""Frames of a ROS pose, first that of REP 103: x east, y north, heading from east."""
 
 
 @dataclass(frozen=True)
 class RawTable:
-    """Columns of one log as they stand in its file.
+    """Columns of one log before any conversion.
 
     Attributes:
         t: times [T] in s.
-        columns: channel -> values [T] in whatever unit.
+        columns: channel -> values [T] in the unit of the file.
     """
 
     t: np.ndarray
@@ -81,11 +81,11 @@ class RawTable:
 
 
 class ScaleFit(NamedTuple):
-    """How a column follows the quantity that it may stand for.
+    """Regression of a quantity in SI on a column.
 
     Attributes:
-        factor: that brings the column to SI; negative where it points the other way.
-        correlation: between both, without sign.
+        factor: factor from the column to SI; negative for the opposite direction.
+        correlation: absolute value of the correlation.
     """
 
     factor: float
@@ -93,13 +93,17 @@ class ScaleFit(NamedTuple):
 
     @property
     def is_significant(self) -> bool:
-        """Whether both follow each other."""
+        """Whether the correlation is significant."""
         return (
             self.correlation >= _MIN_CORRELATION and np.isfinite(self.factor) and self.factor != 0.0
         )
 
     def matching_unit(self, expected: str) -> str | None:
-        """Return the unit whose factor this is; None where no unit comes near."""
+        """Return the unit with nearly this factor, or None.
+
+        Args:
+            expected: SI unit of the dimension.
+        """
         excluded_units = ("rad/min", "m/min", "cm/s")
         candidate_units = [
             n for n in unit_names() if si_unit(n) == expected and n not in excluded_units
@@ -112,13 +116,13 @@ class ScaleFit(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """The motion of one log by its positions and headings, on a uniform grid.
+    """Motion of one log from its positions and headings, on a uniform grid.
 
     Attributes:
-        t: times [T].
-        surge_velocity: speed along the heading [T].
-        sway_velocity: speed to starboard [T].
-        yaw_rate: rate of the heading [T].
+        t: times [T] in s.
+        surge_velocity: velocity along the heading [T] in m/s.
+        sway_velocity: velocity to starboard [T] in m/s.
+        yaw_rate: derivative of the heading [T] in rad/s.
     """
 
     t: np.ndarray
@@ -128,17 +132,21 @@ class Motion(NamedTuple):
 
 
 def convert_heading(table: RawTable, unit: str, frame: PoseFrame) -> np.ndarray:
-    """Return the heading [T] in rad, unwrapped over its known samples."""
+    """Return the heading of a table clockwise from north [T] in rad, unwrapped."""
     psi = table.columns["psi"] * to_si(unit, "rad")
     return unwrap_angle(np.pi / 2 - psi if frame.is_from_east else psi)
 
 
 def estimate_motion(table: RawTable, unit: str, frame: PoseFrame) -> Motion | None:
-    """Return the motion by position and heading; None where there are too few of either.
+    """Estimate the motion from position and heading by local polynomials.
 
     Args:
-        table: with the columns x, y, psi.
-        frame: that is tried.
+        table: table with the columns x, y, psi.
+        unit: assumed unit of psi.
+        frame: assumed frame.
+
+    Returns:
+        The motion; None if positions or headings are too few.
     """
     psi = convert_heading(table, unit, frame)
     north, east = ("y", "x") if frame.is_swapped else ("x", "y")
@@ -175,7 +183,10 @@ def estimate_motion(table: RawTable, unit: str, frame: PoseFrame) -> Motion | No
 
 
 def forward_alignment(motions: Sequence[Motion | None]) -> float:
-    """Return how far vessels moved where they pointed, from -1 (astern) over 0 (anywhere) to 1."""
+    """Return the mean alignment of velocity and heading, weighted by the squared speed.
+
+    It is 1 for motion ahead, 0 for random directions, and -1 for motion astern.
+    """
     estimated_motions = [motion for motion in motions if motion is not None]
     forward_sum = sum(
         float((m.surge_velocity * np.hypot(m.surge_velocity, m.sway_velocity)).sum())
@@ -190,12 +201,12 @@ def forward_alignment(motions: Sequence[Motion | None]) -> float:
 def fit_to_motion(
     logs: Sequence[RawTable], motions: Sequence[Motion | None], channel: str
 ) -> ScaleFit:
-    """Return how a column follows the motion, over all logs that hold it.
+    """Regress a velocity of the motion on a column, over all logs with this column.
 
     Args:
-        logs: with the column.
-        motions: of the same logs.
-        channel: `u`, `rudder_angles` or `rate_values`.
+        logs: tables.
+        motions: motions of the same tables.
+        channel: `u`, `v` or `r`.
     """
     component_index = {"u": 1, "v": 2, "r": 3}[channel]
     covariance_sum = correlation_sum = column_sum = motion_sum = 0.0
@@ -208,11 +219,12 @@ def fit_to_motion(
             continue
         column_values = np.interp(log_motion.t, table.t[is_finite], values[is_finite])
         motion_values = log_motion[component_index]
-        # positions and headings jump at times, which is no motion
+        # exclude jumps of positions and headings
         is_plausible = (
             np.abs(motion_values) <= 5.0 * float(np.quantile(np.abs(motion_values), 0.95)) + 1e-12
         )
-        # about their means: a bias is no factor, and a steady speed tells one all the same
+        # v and r are centred, so that a bias has no effect; u is not, because a steady speed
+        # determines its factor
         column_mean = 0.0 if channel == "u" else float(column_values[is_plausible].mean())
         motion_mean = 0.0 if channel == "u" else float(motion_values[is_plausible].mean())
         column_centred, motion_centred = (
@@ -220,7 +232,7 @@ def fit_to_motion(
             motion_values[is_plausible] - motion_mean,
         )
         covariance_sum += float(column_centred @ motion_centred)
-        # a gyro that was turned over between logs follows in each of them; no frame is told by it
+        # the sign of r may differ between logs, if a gyro was turned over
         correlation_sum += (
             abs(float(column_centred @ motion_centred))
             if channel == "r"
@@ -230,7 +242,7 @@ def fit_to_motion(
         motion_sum += float(motion_centred @ motion_centred)
     if min(column_sum, motion_sum) <= 0.0:
         return ScaleFit(0.0, 0.0)
-    # of two noisy quantities neither explains the other: the factor lies between both regressions
+    # both quantities are noisy: geometric mean of the factors of both regressions
     correlation = correlation_sum / np.sqrt(column_sum * motion_sum)
     return ScaleFit(
         float(np.sign(covariance_sum) * np.sqrt(motion_sum / column_sum)), abs(float(correlation))
@@ -243,16 +255,19 @@ def estimate_rudder_gain(
     rates: Mapping[int, np.ndarray],
     angle_column: str | None = None,
 ) -> tuple[float, float]:
-    """Return how a rudder's angle turns the vessel, and the standard error of that.
+    """Estimate the effect of a rudder on the yaw rate, or of planes on the pitch rate.
 
-    The growth of the yaw rate over two seconds is explained by the rudder's mean angle over them
-    and by the yaw rate itself. Of planes it is the pitch rate, which weight and buoyancy change by
-    the pitch, too.
+    The change of the rate over two seconds is regressed on the mean rudder angle, on the initial
+    rate, and for planes on the pitch angle, which gives the restoring moment.
 
     Args:
-        logs: with the column.
-        rates: yaw or pitch rate [T] of each log by its number, rad/s.
-        angle_column: column of the angle that the vessel is righted by; None for none.
+        logs: tables.
+        channel: column of the rudder or the planes.
+        rates: index of a table -> yaw or pitch rate [T] in rad/s.
+        angle_column: column of the pitch angle; None for rudders.
+
+    Returns:
+        The coefficient of the rudder angle and its standard error.
     """
     rows, rate_changes = [], []
     for log_index, table in enumerate(logs):
@@ -303,7 +318,7 @@ def estimate_rudder_gain(
     scale = np.maximum(np.abs(regressors).max(axis=0), 1e-12)
     solution, *_ = np.linalg.lstsq(regressors / scale, response, rcond=1e-9)
     residual = response - (regressors / scale) @ solution
-    # neighbouring rows overlap: a quarter of them counts
+    # rows overlap by three quarters, so that a quarter of them is independent
     variance = 4.0 * float(residual @ residual) / max(response.size - 3, 1)
     standard_error = float(
         np.sqrt(variance * np.linalg.pinv((regressors / scale).T @ (regressors / scale))[0, 0])
@@ -314,17 +329,17 @@ def estimate_rudder_gain(
 READER_KEY = ("data", "reader")
 CHANNELS_KEY = (*READER_KEY, "channels")
 _OVERRULING_CORRELATION = 0.9
-"""Correlation from which a measured factor overrules a header."""
+"""Smallest correlation for which an estimated factor overrules the header."""
 _MAX_WIND_SPREAD_RATIO = 0.8
-"""Spread of the true wind, in that of what its name says, from which it is told another way.
+"""Largest ratio of true-wind standard deviations for a reference other than that of the name.
 
-Of 120 winds of boats that turn, drawn at random, all are told right, and none from north is
-misread; of boats that turn by less than a radian a third is taken as its name says.
+In 120 simulated logs with turns the reference was right in all. With turns of less than one radian
+the reference of the name was used in a third of the logs.
 """
 _MIN_WIND_SAMPLES = 50
-"""Samples of a wind that tell nothing yet."""
+"""Smallest number of samples of a wind for a decision."""
 _DEPTH_CHANNELS = ("w", "q", "z", "theta")
-"""What a vessel under water is told by, beside the channels of a roll."""
+"""Channels of underwater vessels, in addition to those of roll."""
 STATE_NAMES = (
     *("x", "y", "psi", "u", "v", "r", "phi", "p", *_DEPTH_CHANNELS, "wind_speed", "wind_dir"),
     *BOW_WIND_CHANNELS,
@@ -345,23 +360,25 @@ _QUATERNION_CHANNELS = {
     "k": "qz",
 }
 _QUATERNION_ORDERS = (("qw", "qx", "qy", "qz"), QUATERNION)
-"""What counted parts may be: most write the scalar part first, some last."""
+"""Orders of numbered parts: the scalar part is usually first, sometimes last."""
 _ROS_POSE_PATTERNS = {
     **{"x": r"position\W*x", "y": r"position\W*y"},
     **{"qw": r"orientation\W*w", "psi": r"orientation\W*yaw"},
 }
-"""How the columns of a message geometry_msgs/Pose end, and of its yaw in PlotJuggler."""
+"""Ends of column names of geometry_msgs/Pose, and of its yaw in PlotJuggler."""
 _NED_PATTERN = re.compile(r"(?:^|[\W_])(?:ned|frd)(?:$|[\W_])", re.IGNORECASE)
 
 
 def find_quaternions(columns: Sequence[str]) -> list[dict[str, str]]:
-    """Return for each quaternion channel -> column, by what the columns are called.
+    """Find quaternions by the names of their columns.
 
-    Parts that are counted 0 to 3 stand twice, with the scalar part first and last.
+    Returns:
+        For each quaternion: channel (qx, qy, qz, qw) -> column. A quaternion with numbered parts
+        occurs twice, with the scalar part first and last.
     """
     parts_by_stem: dict[str, dict[str, str]] = {}
     for column in columns:
-        # units in brackets do not belong to the name
+        # remove units in brackets from the name
         match = _QUATERNION_PATTERN.fullmatch(
             re.sub(r"\s*\[\D*\]$|\s*\(\D*\)$", "", column.strip())
         )
@@ -379,12 +396,13 @@ def find_quaternions(columns: Sequence[str]) -> list[dict[str, str]]:
 
 
 def find_depth_channels(columns: Sequence[str], known_channels: Collection[str]) -> dict[str, str]:
-    """Return heave, pitch rate, depth and pitch -> column, of vessels that may dive alone.
+    """Return the channels w, q, z, theta -> columns if the table is that of an underwater vessel.
 
-    They do with depth, pitch and roll, and where nothing turns them.
+    Such a table has depth, pitch and roll, or motion in the vertical plane only.
 
     Args:
-        known_channels: channels that are known already.
+        columns: names of the columns.
+        known_channels: channels that are mapped already.
     """
     depth_channels = {column: match_depth_channel(parse_name(column)) for column in columns}
     column_by_channel = {name: column for column, name in reversed(depth_channels.items()) if name}
@@ -403,13 +421,14 @@ def find_depth_channels(columns: Sequence[str], known_channels: Collection[str])
 def choose_quaternion_order(
     attitudes: Sequence[dict[str, str]], tables: Sequence[Mapping[str, np.ndarray]]
 ) -> dict[str, str]:
-    """Return the first of quaternions, in the order of its parts that leaves a vessel level.
-
-    Empty where its squares do not add up to one.
+    """Choose the order of the parts of the first quaternion that gives the smallest tilt.
 
     Args:
-        attitudes: channel -> column of each, as `find_quaternions` gave them.
+        attitudes: result of `find_quaternions`.
         tables: column -> values of each table.
+
+    Returns:
+        Channel -> column; empty if the columns are no unit quaternion.
     """
     if not attitudes:
         return {}
@@ -437,9 +456,13 @@ def choose_quaternion_order(
 def _choose_candidate_frames(
     names: Mapping[str, str], texts: Iterable[str]
 ) -> tuple[PoseFrame, ...]:
-    """Return the frames that a position and a heading may have, by what they are called.
+    """Return possible frames of position and heading from their names, the most probable first.
 
-    A pose of ROS counts from east, as REP 103 asks, unless something is called NED.
+    A ROS pose has a heading from east (REP 103), unless a text contains NED.
+
+    Args:
+        names: channel -> column.
+        texts: names of all columns, and cells.
     """
     is_ros_pose = all(
         re.search(rf"(?:^|[\W_]){pattern}$", names[name].strip(), re.IGNORECASE)
@@ -464,11 +487,14 @@ _SIN_COS_PATTERN = re.compile(
 def find_sin_cos_pairs(
     columns: Sequence[str], tables: Sequence[Mapping[str, np.ndarray]]
 ) -> dict[str, tuple[str, str]]:
-    """Return stem -> columns of an angle's cosine and sine: their squares add up to one.
+    """Find pairs of columns with the cosine and the sine of an angle, whose squares sum to one.
 
     Args:
         columns: names, such as `psi_cos` and `psi_sin`, or `alpha_x` and `alpha_y`.
         tables: column -> values of each table.
+
+    Returns:
+        Common part of the names -> columns of cosine and sine.
     """
     parts_by_stem: dict[str, dict[str, str]] = {}
     for column in columns:
@@ -503,16 +529,23 @@ def draft_channel_map(
     draft_notes: DraftNotes,
     texts: Iterable[str] = (),
 ) -> dict[str, dict[str, Any]]:
-    """Return channel -> entry of a channel map.
+    """Draft a channel map.
 
     Args:
         names: channel -> column.
-        texts: names of columns and cells that may tell a frame.
+        logs: tables with the columns under the names of their channels.
+        draft_notes: receives guesses and notes.
+        texts: names of all columns, and cells, which may contain the name of a frame.
+
+    Returns:
+        Channel -> entry.
     """
     quaternion_columns = {name: column for name, column in names.items() if name in QUATERNION}
     candidate_frames = _choose_candidate_frames(names, texts)
     channel_columns = {name: column for name, column in names.items() if name not in QUATERNION}
-    angle_columns, derived_angles = {}, dict[str, tuple[str, ...]]()
+    # replace sines and cosines, and quaternions, by their angles while frames are determined
+    angle_columns = {}
+    derived_angles: dict[str, tuple[str, ...]] = {}
     for name in [
         item.removesuffix(COSINE_SUFFIX) for item in names if item.endswith(COSINE_SUFFIX)
     ]:
@@ -530,10 +563,12 @@ def draft_channel_map(
     ).draft_entries()
     if degrees_per_count:
         entries = {_FIX_OF_AXIS.get(name, name): entry for name, entry in entries.items()}
+    # convert the entries of these angles to entries of their columns
     for name in [item for item, entry in entries.items() if entry["column"] in angle_columns]:
         entry = entries.pop(name)
         cosine, sine = angle_columns[entry["column"]]
         if entry.pop("frame", ""):
+            # an angle from east exchanges cosine and sine
             cosine, sine = sine, cosine
         sign_settings = {"sign": entry["sign"]} if "sign" in entry else {}
         entries[name + COSINE_SUFFIX] = {"column": cosine, "unit": "-"}
@@ -545,19 +580,26 @@ def draft_channel_map(
     entries |= {name: {"column": quaternion_columns[name], "unit": "-"} for name in QUATERNION}
     entries["qw"] |= {"frame": psi["frame"]} if "frame" in psi else {}
     draft_notes.move_key((*CHANNELS_KEY, "psi"), (*CHANNELS_KEY, "qw"))
-    direction = "anticlockwise from east" if "frame" in psi else "clockwise from north"
-    text = f"no position tells the frame; the heading is taken to count {direction}"
+    direction = "counter-clockwise from east" if "frame" in psi else "clockwise from north"
+    text = f"no position determines the frame; the heading is assumed {direction}"
     if {"x", "y"} <= set(channel_columns):
-        text = f"position and heading fit together best where the heading counts {direction}"
+        text = f"position and heading are most consistent with a heading {direction}"
     draft_notes.add_guess((*CHANNELS_KEY, "qw"), text)
     if re.search(r"\d\W*$", quaternion_columns["qw"]):
-        text = f"'{quaternion_columns['qw']}' is taken as the scalar part, which leaves the vessel level"
+        text = (
+            f"'{quaternion_columns['qw']}' is assumed the scalar part: it gives the smallest tilt"
+        )
         draft_notes.add_guess((*CHANNELS_KEY, "qw"), text)
     return entries
 
 
 def _add_derived_angles(table: RawTable, derived_angles: Mapping[str, tuple[str, ...]]) -> RawTable:
-    """Return a log with angles in rad that cosine and sine, or the parts of a quaternion, tell."""
+    """Return a table with additional angles in rad from cosines and sines or quaternions.
+
+    Args:
+        table: the table.
+        derived_angles: angle -> columns of cosine and sine, or of the parts of a quaternion.
+    """
     columns = dict(table.columns)
     for name, parts in derived_angles.items():
         if columns.keys() >= {*parts}:
@@ -574,16 +616,22 @@ def _add_derived_angles(table: RawTable, derived_angles: Mapping[str, tuple[str,
 def _project_fixes(
     names: Mapping[str, str], logs: Sequence[RawTable], draft_notes: DraftNotes
 ) -> tuple[dict[str, str], list[RawTable], float]:
-    """Return channel -> column, the logs, and how many degrees one count of x and y is, or 0.
+    """Project latitude and longitude of all logs to x and y in m from the first fix of each log.
 
-    Where they are latitude and longitude, x, y of the logs are metres north and east of the first
-    fix of each.
+    Args:
+        names: channel -> column.
+        logs: tables.
+        draft_notes: receives guesses and notes.
+
+    Returns:
+        Channel -> column with x and y for latitude and longitude; the tables; the unit of the
+        columns in deg (1, or 1e-7 for integers), or 0 without latitude and longitude.
     """
     fix_channels = set(_FIX_OF_AXIS.values())
     other_names = {name: column for name, column in names.items() if name not in fix_channels}
     if set(_FIX_OF_AXIS) <= set(names) and len(other_names) < len(names):
         columns = ", ".join(names[name] for name in sorted(fix_channels & set(names)))
-        draft_notes.add_note(CHANNELS_KEY, f"x and y stand beside it; left out: {columns}")
+        draft_notes.add_note(CHANNELS_KEY, f"x and y exist too; left out: {columns}")
         return other_names, list(logs), 0.0
     if not fix_channels <= set(names) or set(_FIX_OF_AXIS) & set(names):
         return dict(names), list(logs), 0.0
@@ -594,18 +642,18 @@ def _project_fixes(
     }
     finite_values = {name: values[np.isfinite(values)] for name, values in fix_values.items()}
     max_latitude = float(np.abs(finite_values["latitude"]).max(initial=0.0))
-    # autopilots count ten millionths of a degree in whole numbers
+    # autopilots log latitude and longitude as integers in 1e-7 deg
     are_integers = all(
         bool((values == np.round(values)).all()) for values in finite_values.values()
     )
     degrees_per_count = 1e-7 if 1e6 < max_latitude <= 90e7 and are_integers else 1.0
     if not fix_tables or max_latitude * degrees_per_count > 90.0:
         columns = ", ".join(names[name] for name in _FIX_OF_AXIS.values())
-        draft_notes.add_note(CHANNELS_KEY, f"{columns} are no degrees with decimals; left out")
+        draft_notes.add_note(CHANNELS_KEY, f"{columns} are no decimal degrees; left out")
         return other_names, list(logs), 0.0
     if degrees_per_count < 1.0:
         for name in _FIX_OF_AXIS.values():
-            text = "whole numbers of this size are ten millionths of a degree"
+            text = "integers of this size are assumed 1e-7 deg"
             draft_notes.add_guess((*CHANNELS_KEY, name), text)
     projected = []
     for raw in logs:
@@ -626,7 +674,7 @@ def _project_fixes(
 
 @final
 class ChannelMapper:
-    """The entries of a channel map, from names, headers, values and physics."""
+    """Builder of the entries of a channel map from names, headers, values and physics."""
 
     def __init__(
         self,
@@ -636,15 +684,20 @@ class ChannelMapper:
         degrees_per_count: float,
         candidate_frames: Sequence[PoseFrame] = POSE_FRAMES,
     ) -> None:
-        """From channel -> column, logs, and degrees in one count of x and y, 0 for metres.
+        """Create a builder.
 
-        The frames are those that are tried, the likeliest first.
+        Args:
+            names: channel -> column.
+            logs: tables.
+            draft_notes: receives guesses and notes.
+            degrees_per_count: unit of the columns x and y in deg; 0 if they are lengths.
+            candidate_frames: frames to test, the most probable first.
         """
-        self._degrees_per_count, self._candidate_frames = (
-            float(degrees_per_count),
-            tuple(candidate_frames),
-        )
-        self._names, self._logs, self._draft_notes = dict(names), list(logs), draft_notes
+        self._degrees_per_count = float(degrees_per_count)
+        self._candidate_frames = tuple(candidate_frames)
+        self._names = dict(names)
+        self._logs = list(logs)
+        self._draft_notes = draft_notes
         self._pose_frame = self._candidate_frames[0]
         self._motions: list[Motion | None] = [None] * len(logs)
         self._psi_unit = "rad"
@@ -665,7 +718,7 @@ class ChannelMapper:
         return {name: self._make_entry(name) for name in self._names}
 
     def _drop_inconsistent_velocity(self, name: str) -> None:
-        """Leave out what does not move, or is far larger than the motion and does not follow it."""
+        """Leave out a velocity that is constant, or uncorrelated and larger than the motion."""
         motions = [motion for motion in self._motions if motion is not None]
         if not motions:
             return
@@ -673,7 +726,7 @@ class ChannelMapper:
         motion_values = np.concatenate([motion[component_index] for motion in motions])
         factor = to_si(self._infer_unit(name, should_note=False), CHANNEL_UNITS[name])
         column_values = factor * self._concatenate_values(name)
-        # a vessel that only drifts has nearly no motion of one of its axes
+        # compare u and v with the speed, because one of them may be nearly zero
         reference_speed = (
             motion_values
             if name == "r"
@@ -681,20 +734,20 @@ class ChannelMapper:
         )
         problem = ""
         if float(np.nanstd(column_values)) < NEGLIGIBLE_MOTION_SHARE * float(np.std(motion_values)):
-            problem = "does not move, while position and heading do"
+            problem = "does not move, but position and heading do"
         elif (
             float(np.nanmedian(np.abs(column_values))) > float(reference_speed.max())
             and not fit_to_motion(self._logs, self._motions, name).is_significant
         ):
-            problem = "is larger than all motion by position and heading, and does not follow it"
+            problem = "exceeds all velocities from position and heading, and is uncorrelated"
         if problem:
             column = self._names.pop(name)
-            text = f"'{column}' {problem}; left out: {name} follows from them"
+            text = f"'{column}' {problem}; left out: {name} is derived from them"
             self._draft_notes.add_note(CHANNELS_KEY, text)
 
     @property
     def _is_ros_pose(self) -> bool:
-        """Whether position and heading are called as those of a pose of ROS."""
+        """Whether position and heading have the names of a ROS pose."""
         return self._candidate_frames == ROS_POSE_FRAMES
 
     def _concatenate_values(self, name: str) -> np.ndarray:
@@ -702,11 +755,10 @@ class ChannelMapper:
         return np.concatenate(parts) if parts else np.zeros(0)
 
     def _choose_heading_frame(self) -> None:
-        """Find the unit and frame of the heading under which the vessel moves where it points."""
+        """Choose unit and frame of the heading that are most consistent with the motion."""
         header_unit = parse_header_unit(self._names["psi"], "rad")
         unit_from_size, _ = guess_unit_from_size("psi", self._concatenate_values("psi"))
-        # a heading that is not wrapped is large in radians too: its size decides only where the
-        # motion does not
+        # an unwrapped heading in rad may be large, so that its size decides only without motion
         alternative_unit = "rad" if unit_from_size == "deg" else "deg"
         candidate_units = [header_unit] if header_unit else [unit_from_size, alternative_unit]
         if (
@@ -726,7 +778,7 @@ class ChannelMapper:
                     self._motions = motions
         score, self._psi_unit, self._pose_frame = best_candidate
         if header_unit is None:
-            reason = f"position and heading fit together best in {self._psi_unit}"
+            reason = f"position and heading are most consistent in {self._psi_unit}"
             self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), f"the header has no unit; {reason}")
         x, y = parse_name(self._names["x"]), parse_name(self._names["y"])
         is_named_north_east = (
@@ -740,40 +792,40 @@ class ChannelMapper:
             self._motions = [
                 estimate_motion(table, self._psi_unit, self._pose_frame) for table in self._logs
             ]
-            text = "seen in a mirror the motion fits as well, but thrust to port turns it to port"
+            text = "the mirrored motion is as consistent, but more thrust on port turns it to port"
             self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), text)
         if self._pose_frame.is_swapped and not is_named_north_east:
             self._names["x"], self._names["y"] = self._names["y"], self._names["x"]
-            text = "the vessel moves where it points only if the column called y is the north"
+            text = "the motion is consistent with the heading only if the column called y is north"
             if self._is_ros_pose and self._pose_frame.is_from_east:
-                text = "x is taken as east and y as north, as in a pose of ROS (REP 103)"
+                text = "x is assumed east and y north, as in a pose of ROS (REP 103)"
             self._draft_notes.add_guess((*CHANNELS_KEY, "x"), text)
         elif self._pose_frame.is_swapped:
-            # named north and east, yet turned about: the heading counts from east
+            # columns named north and east are not exchanged: the heading is from east instead
             self._pose_frame = PoseFrame(False, True)
             self._motions = [
                 estimate_motion(table, self._psi_unit, self._pose_frame) for table in self._logs
             ]
         elif not is_named_north_east and not self._pose_frame.is_from_east:
-            text = f"x is taken as north and y as east: with them the heading fits ({score:.2f})"
+            text = f"x is assumed north and y east: consistent with the heading ({score:.2f} of 1)"
             self._draft_notes.add_guess((*CHANNELS_KEY, "x"), text)
         if self._pose_frame.is_from_east:
-            text = "the vessel moves where it points only if the heading counts from east"
+            text = "the motion is consistent with the heading only if the heading is from east"
             if self._is_ros_pose:
-                text = "the heading is taken to count from east, as in a pose of ROS (REP 103)"
+                text = "the heading is assumed from east, as in a pose of ROS (REP 103)"
             self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), text)
         if score < 0.5:
-            text = f"position, heading and velocities fit together badly ({score:.2f} of 1)"
+            text = f"position, heading and velocities are inconsistent ({score:.2f} of 1)"
             self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), f"{text}: check units and axes")
         self._pose_frame = PoseFrame(False, self._pose_frame.is_from_east)
 
     def _is_mirrored(self) -> bool:
-        """Return whether more of a thruster on the port side turns the vessel to port."""
+        """Return whether more thrust on the port side turns the vessel to port."""
         for port, stbd in port_starboard_pairs(self._names).items():
             if re.match(r"(cmd_)?(delta|azimuth)", port):
                 continue
             thruster_differences = [
-                (RawTable(table.t, {"more": table.columns[port] - table.columns[stbd]}), motion)
+                (RawTable(table.t, {"port": table.columns[port] - table.columns[stbd]}), motion)
                 for table, motion in zip(self._logs, self._motions, strict=True)
                 if motion is not None and {port, stbd} <= table.columns.keys()
             ]
@@ -782,15 +834,15 @@ class ChannelMapper:
                 for k, (table, m) in enumerate(thruster_differences)
             }
             gain, standard_error = estimate_rudder_gain(
-                [table for table, _ in thruster_differences], "more", rates
+                [table for table, _ in thruster_differences], "port", rates
             )
             return gain < -MIN_STANDARD_ERRORS * standard_error
         return False
 
     def _drop_earth_fixed_velocities(self) -> None:
-        """Leave out velocities along x and y that count along north and east, not along the hull.
+        """Leave out velocities vx and vy that are in earth axes instead of body axes.
 
-        Names such as vx and vy do not say which; position and heading do, without them.
+        The names are ambiguous. The motion from position and heading alone decides.
         """
         axis_velocities = [
             name
@@ -848,22 +900,20 @@ class ChannelMapper:
             and best_correlation > mean_correlation(reference_mapper._motions, direct) + 0.05
         ):
             columns = ", ".join(self._names.pop(name) for name in axis_velocities)
-            text = f"{columns} follow the motion along north and east, and not along the vessel's"
-            self._draft_notes.add_note(
-                CHANNELS_KEY, f"{text} axes; left out, for u and v follow from positions"
-            )
+            text = f"{columns} are velocities in earth axes, not in body axes; left out"
+            self._draft_notes.add_note(CHANNELS_KEY, f"{text}: u and v are derived from positions")
             return
         for name in axis_velocities:
-            text = "taken along the vessel's own axes, which position and heading do not contradict"
+            text = "assumed in body axes, consistent with position and heading"
             self._draft_notes.add_guess((*CHANNELS_KEY, name), text)
 
     def _score_consistency(self, motions: Sequence[Motion | None]) -> float:
-        """Return how well position, heading and velocities fit together, at most 1."""
+        """Return the consistency of position, heading and velocities, at most 1."""
         velocity_fits = [
             fit_to_motion(self._logs, motions, name) for name in ("u", "v") if name in self._names
         ]
         if len(velocity_fits) == 2:
-            # only the forward component tells how the heading lies; both count
+            # the sign counts for the surge velocity only
             return (
                 sum(fit.correlation * (fit.factor > 0 or i) for i, fit in enumerate(velocity_fits))
                 / 2
@@ -871,15 +921,19 @@ class ChannelMapper:
         return forward_alignment(motions)
 
     def _choose_wind_reference(self) -> None:
-        """Find whether the wind is told from north or from the bow; one without its half goes."""
+        """Choose the reference of the wind direction: north or bow, true or apparent wind.
+
+        A wind with speed or direction only is left out.
+        """
         for name_pair in (BOW_WIND_CHANNELS[1:], ("wind_speed", "wind_dir")):
             if len(present := {*name_pair} & {*self._names}) == 1:
                 column = self._names.pop(present.pop())
-                self._draft_notes.add_note(CHANNELS_KEY, f"'{column}' alone is no wind; left out")
+                text = f"'{column}' is left out: a wind needs speed and direction"
+                self._draft_notes.add_note(CHANNELS_KEY, text)
         if "wind_dir" in self._names and BOW_WIND_CHANNELS[2] in self._names:
             columns = ", ".join(self._names.pop(name) for name in BOW_WIND_CHANNELS[1:])
             self._draft_notes.add_note(
-                CHANNELS_KEY, f"the true wind stands beside it; left out: {columns}"
+                CHANNELS_KEY, f"the true wind exists too; left out: {columns}"
             )
         current_names = (
             BOW_WIND_CHANNELS[1:]
@@ -899,8 +953,8 @@ class ChannelMapper:
         ):
             best_hypothesis = hypotheses[0]
         if best_hypothesis == "north":
-            text = "the direction is taken as that which the true wind comes from, clockwise from"
-            self._draft_notes.add_guess((*CHANNELS_KEY, "wind_dir"), f"{text} north")
+            text = "assumed the direction from which the true wind blows, clockwise from north"
+            self._draft_notes.add_guess((*CHANNELS_KEY, "wind_dir"), text)
             return
         is_apparent = best_hypothesis.startswith("felt")
         side_text = " to port" if best_hypothesis.endswith("port") else ""
@@ -915,16 +969,22 @@ class ChannelMapper:
         ]
         self._sign_flipped |= {new_names[1]} if side_text else set()
         wind = "apparent" if is_apparent else "true"
-        text = f"taken from the bow{side_text}, where the {wind} wind comes from:"
         ratio = spreads.get(best_hypothesis, 1.0) / max(spreads.get("north", 1.0), 1e-9)
-        text += f" so the true wind is steadiest ({ratio:.2f} of its spread if told from north)"
+        text = (
+            f"assumed the direction of the {wind} wind from the bow{side_text}: so the true wind is"
+            f" steadiest ({ratio:.2f} of its standard deviation with a direction from north)"
+        )
         self._draft_notes.add_guess((*CHANNELS_KEY, new_names[1]), text)
 
     def _wind_spreads(self, speed: str, angle: str) -> dict[str, float]:
-        """Return how a wind may be told -> spread in m/s of the true wind within a log.
+        """Return the standard deviation of the true wind in m/s for each possible reference.
 
-        It may be told from north, or from the bow, clockwise or to port, and that which the moving
-        vessel feels has its own velocity in it.
+        The references are north, bow (clockwise), bow to port, and the last two for the apparent
+        wind (`felt`), which includes the velocity of the vessel.
+
+        Args:
+            speed: channel of the wind speed.
+            angle: channel of the wind direction.
         """
         factors = [
             to_si(self._infer_unit(n, should_note=False), CHANNEL_UNITS[n]) for n in (speed, angle)
@@ -950,7 +1010,7 @@ class ChannelMapper:
         return {name: float(np.sqrt(np.mean(parts))) for name, parts in variances.items()}
 
     def _vessel_velocity(self, table: RawTable, motion: Motion | None) -> np.ndarray | None:
-        """Return the velocity [T] ahead and to starboard as a complex number; None without."""
+        """Return u + iv [T] in m/s from the log or from its motion, or None."""
         if {"u", "v"} <= self._names.keys() & table.columns.keys():
             u, v = (
                 table.columns[n] * to_si(self._infer_unit(n, should_note=False), "m/s")
@@ -963,7 +1023,7 @@ class ChannelMapper:
         return np.asarray(u + 1j * v)
 
     def _log_heading(self, table: RawTable) -> np.ndarray | None:
-        """Return the heading [T] in rad of a log, from any zero where only a rate tells it."""
+        """Return the heading [T] of a log in rad, or the integral of its yaw rate, or None."""
         if {"psi"} <= self._names.keys() & table.columns.keys():
             return convert_heading(table, self._psi_unit, self._pose_frame)
         if {"r"} <= self._names.keys() & table.columns.keys():
@@ -973,13 +1033,14 @@ class ChannelMapper:
         return None
 
     def _infer_unit(self, name: str, *, should_note: bool = True) -> str:
-        """Return the unit of a channel from its header or its size."""
+        """Return the unit of a channel from its header or its values, noting a guess."""
         scaling = infer_unit(name, self._names[name], self._concatenate_values(name))
         if should_note and scaling.reason:
             self._draft_notes.add_guess((*CHANNELS_KEY, name), scaling.reason)
         return str(scaling.settings["unit"])
 
     def _make_entry(self, name: str) -> dict[str, Any]:
+        """Return the entry of a channel."""
         column = self._names[name]
         entry: dict[str, Any] = {"column": column}
         if self._degrees_per_count and name in ("x", "y"):
@@ -990,10 +1051,11 @@ class ChannelMapper:
             )
         if name == "psi":
             if MAGNETIC_PATTERN.search(column):
-                text = f"'{column}' is magnetic by its name, and is taken as true: give `offset`,"
-                self._draft_notes.add_guess(
-                    (*CHANNELS_KEY, name), f"{text} minus the declination at that place"
+                text = (
+                    f"'{column}' is magnetic by its name, and is assumed true: set `offset` to"
+                    " minus the magnetic declination"
                 )
+                self._draft_notes.add_guess((*CHANNELS_KEY, name), text)
             entry["unit"] = self._psi_unit
             return entry | ({"frame": "enu"} if self._pose_frame.is_from_east else {})
         if name in ("u", "v", "r") and {"x", "y", "psi"} <= set(self._names):
@@ -1017,15 +1079,21 @@ class ChannelMapper:
         return entry | {"unit": self._infer_unit(name)} | ({"sign": sign} if sign < 0 else {})
 
     def _conventional_sign(self, name: str) -> int:
-        """Return -1 for v and r beside a pose of ROS, which count to port by REP 103, else 1."""
+        """Return -1 for v and r of tables with a ROS pose (positive to port, REP 103), else 1."""
         if not self._is_ros_pose or name not in ("v", "r"):
             return 1
-        text = "taken as positive to port, as beside a pose of ROS (REP 103)"
+        text = "assumed positive to port, as for a pose of ROS (REP 103)"
         self._draft_notes.add_guess((*CHANNELS_KEY, name), text)
         return -1
 
     def _fit_rate_to_angle(self, angle: str, unit: str, name: str) -> ScaleFit:
-        """Return how a rate follows its angle, which is taken for a heading."""
+        """Regress the derivative of an angle on the column of its rate.
+
+        Args:
+            angle: channel of the angle, `psi` or `phi`.
+            unit: unit of the angle.
+            name: channel of the rate.
+        """
         tables_with_both = [table for table in self._logs if {angle, name} <= set(table.columns)]
         angles = [
             RawTable(table.t, dict.fromkeys(("x", "y", "psi"), table.columns[angle]))
@@ -1040,24 +1108,29 @@ class ChannelMapper:
         )
 
     def _settle_rate(self, name: str, fit: ScaleFit, reference: str) -> dict[str, Any]:
-        """Return unit and sign of a velocity, checked against what it is the rate of.
+        """Return unit and sign of a velocity from its header and a regression.
 
         Args:
-            reference: what that is, for a reader.
+            name: channel of the velocity.
+            fit: regression of the derivative of the reference on the column.
+            reference: name of the reference, for messages.
         """
-        key, column, expected_unit = (*CHANNELS_KEY, name), self._names[name], CHANNEL_UNITS[name]
-        header_unit, measured_unit = (
-            parse_header_unit(column, expected_unit),
-            fit.matching_unit(expected_unit) if fit.is_significant else None,
-        )
+        key = (*CHANNELS_KEY, name)
+        column = self._names[name]
+        expected_unit = CHANNEL_UNITS[name]
+        header_unit = parse_header_unit(column, expected_unit)
+        measured_unit = fit.matching_unit(expected_unit) if fit.is_significant else None
         unit = header_unit or measured_unit or self._infer_unit(name)
         if header_unit is None and measured_unit is not None:
-            text = f"the header has no unit; {reference} say {measured_unit}"
+            text = f"the header has no unit; {reference} give {measured_unit}"
             self._draft_notes.add_guess(key, f"{text} (correlation {fit.correlation:.2f})")
         elif header_unit and measured_unit and fit.correlation >= _OVERRULING_CORRELATION:
             ratio = abs(fit.factor) / to_si(header_unit, expected_unit)
             if to_si(measured_unit) != to_si(header_unit, expected_unit) and not 0.6 < ratio < 1.6:
-                text = f"the header says {header_unit}, {reference} say {measured_unit} (factor {ratio:.3g})"
+                text = (
+                    f"the header has {header_unit}, {reference} give {measured_unit} (factor"
+                    f" {ratio:.3g})"
+                )
                 question = f"unit of '{column}'"
                 unit = self._draft_notes.ask_question(
                     key, question, measured_unit, text, (measured_unit, header_unit)
@@ -1066,10 +1139,10 @@ class ChannelMapper:
         if fit.is_significant and fit.factor < 0.0:
             entry["sign"] = -1
             direction = {"u": "astern", "v": "port", "r": "port", "p": "port"}[name]
-            text = f"{reference} say that it is positive to {direction} (correlation"
-            self._draft_notes.add_guess(key, f"{text} {fit.correlation:.2f})")
+            text = f"positive to {direction} by {reference} (correlation {fit.correlation:.2f})"
+            self._draft_notes.add_guess(key, text)
         elif not fit.is_significant and self._conventional_sign(name) < 0:
             entry["sign"] = -1
         if not fit.is_significant and header_unit is None:
-            self._draft_notes.add_guess(key, f"{reference} do not tell whether {unit} is right")
+            self._draft_notes.add_guess(key, f"{reference} do not confirm the unit {unit}")
         return entry

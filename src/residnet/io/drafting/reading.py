@@ -1,7 +1,7 @@
-"""Logs of any format read without a config: their reader is drafted, and read them.
+"""Drafting of readers for logs without a config, and reading of these logs.
 
-`inspect`, `read_logs`, `fit`, `new` and `draft` come through here, so that each has the same map.
-What recordings say of themselves is taken, checked, and completed by names.
+The commands `inspect`, `fit`, `new` and `draft` and `residnet.read_logs` use the same drafts.
+Recordings map their standard messages; the result is checked and completed by names of fields.
 """
 
 from __future__ import annotations
@@ -76,25 +76,26 @@ from residnet.io.readers.topics import align_clocks
 from residnet.io.split import assign_log_names, find_logs
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 
-# how well position, heading and velocities of a recording that is taken as it is fit together, of 1
+# smallest consistency (0 to 1) of position, heading and velocities for an unchanged mapping
 _MIN_CONSISTENCY = 0.7
-# interval in s from which a pose is looked for that comes more often
+# median step in s above which a pose with a higher rate is searched
 _MAX_POSE_INTERVAL = 0.6
-# rows of a topic of the motion, and of one of inputs
-_MIN_MOTION_ROWS, _MIN_INPUT_ROWS = 50, 20
+# fewest rows of a topic with motion, and of a topic with inputs
+_MIN_MOTION_ROWS = 50
+_MIN_INPUT_ROWS = 20
 _MAX_POSE_CANDIDATES = 12
-"""Positions, and headings, that are tried with each other; chosen by hand: 144 poses take long."""
+"""Largest number of positions and of headings whose combinations are tested."""
 _AXIS_PAIRS = (("x", "y"), ("north", "east"), ("east", "north"))
 
 
 @dataclass(frozen=True)
 class _MotionSources:
-    """Where the motion comes from.
+    """Sources of the motion in a recording.
 
     Attributes:
-        settings: position, heading, channels and what else goes with them in a reader's settings.
-        used_fields: topics and fields that it takes.
-        step: the shorter of the usual steps of position and heading, s.
+        settings: reader settings with position, heading and channels.
+        used_fields: topic and field of each quantity.
+        step: smaller one of the median steps of position and heading in s.
     """
 
     settings: dict[str, Any]
@@ -105,17 +106,24 @@ class _MotionSources:
 def draft_recordings(
     paths: Sequence[Path], draft_notes: DraftNotes
 ) -> tuple[dict[str, Any], dict[Path, Recording]]:
-    """Return the settings of a reader of recordings of one format, and those that were loaded.
+    """Draft a reader for recordings of one format.
 
-    Standard messages map themselves. Where position, heading and velocities do not fit together by
-    them, or the pose comes rarely, other topics and frames are tried, unless the format fixes its
-    frames. Inputs are found by names.
+    Standard messages map automatically. If their position, heading and velocities are inconsistent,
+    or the rate of the pose is low, other topics and frames are tested unless the format defines its
+    frames. Inputs are found by their names.
+
+    Args:
+        paths: recordings.
+        draft_notes: receives guesses and notes.
+
+    Returns:
+        The settings of the reader, and the recordings that were loaded.
 
     Raises:
-        UsageError: where the first one cannot be read.
-        DataError: where it holds nothing that can be used.
+        UsageError: if the first recording cannot be read.
+        DataError: if it has no usable contents.
     """
-    # what stands still in one recording may move in another: three are looked at
+    # three recordings are loaded, because a constant signal of one may vary in another
     stride = max(1, (len(paths) - 1) // 2)
     auto = AutoConfig()
     recordings = {path: auto.load(path, ALL_FIELDS) for path in (paths[0], *paths[::stride])}
@@ -151,19 +159,19 @@ def draft_recordings(
                 aligned[0], draft_notes, _MIN_CONSISTENCY if has_pose else 0.0
             )
         if pose_sources_found is None and has_pose:
-            text = "position, heading and velocities fit together badly: check the frames"
+            text = "position, heading and velocities are inconsistent: check the frames"
             draft_notes.add_guess(READER_KEY, text)
         sources = pose_sources_found or sources
     elif sources.step > _MAX_POSE_INTERVAL and not is_frame_fixed:
         candidate_notes = DraftNotes()
         pose_sources_found = _find_best_pose(aligned[0], candidate_notes, _MIN_CONSISTENCY)
-        # the same pose again would lose the velocities that stand beside it
+        # with the same pose the velocities of its messages would be lost
         if pose_sources_found is not None and pose_sources_found.step < 0.9 * sources.step:
             draft_notes.extend(candidate_notes)
             sources = pose_sources_found
     settings |= sources.settings
     settings["clock"] = {"kind": "uniform", "step": f"{float(f'{sources.step:.2g}'):g} s"}
-    draft_notes.add_note((*READER_KEY, "clock"), "as often as the heading or the position comes")
+    draft_notes.add_note((*READER_KEY, "clock"), "rate of the heading or of the position")
     uses_standard_messages = "standard_messages" not in settings
     known_channels = set(log.channels) if log is not None and uses_standard_messages else set()
     channels = dict(settings.pop("channels", {}))
@@ -187,7 +195,10 @@ def _median_series_step(series: Series) -> float:
 
 
 def _is_consistent(log: Log, draft_notes: DraftNotes) -> bool:
-    """Return whether position, heading and velocities fit together as they are."""
+    """Return whether position, heading and velocities of a log are consistent.
+
+    A guess is noted if they are inconsistent and no other frame is better.
+    """
     table = RawTable(log.t, log.channels)
     motions = [estimate_motion(table, "rad", frame) for frame in POSE_FRAMES]
     if None in motions:
@@ -203,9 +214,9 @@ def _is_consistent(log: Log, draft_notes: DraftNotes) -> bool:
         return False
     if scores[0] < 0.3:
         if forward_alignment(motions[:1]) > _MIN_CONSISTENCY:
-            # the pose is right, and the velocities are not those of the body
+            # the pose is consistent in itself: the velocities are not in body axes
             return False
-        text = f"position, heading and velocities fit together badly ({scores[0]:.2f} of 1)"
+        text = f"position, heading and velocities are inconsistent ({scores[0]:.2f} of 1)"
         draft_notes.add_guess(READER_KEY, f"{text}: check the frames")
     return True
 
@@ -213,10 +224,17 @@ def _is_consistent(log: Log, draft_notes: DraftNotes) -> bool:
 def _find_named_table(
     recordings: Sequence[Recording], draft_notes: DraftNotes
 ) -> _MotionSources | None:
-    """Return the motion and inputs of the only table whose fields are named as columns are.
+    """Return the motion and inputs of a series without message type, or None.
 
-    MATLAB structs and HDF5 groups are such; units, signs and frames are settled as those of a
-    table. None where no series without a message type holds position and heading.
+    Such series are MATLAB structs and HDF5 groups. Their fields have names like columns of a table,
+    and units, signs and frames are determined in the same way.
+
+    Args:
+        recordings: recordings with aligned clocks.
+        draft_notes: receives guesses and notes.
+
+    Raises:
+        DataError: if several series have the same columns.
     """
     candidates = []
     for series in recordings[0].series.values():
@@ -232,17 +250,16 @@ def _find_named_table(
     if len({frozenset(series.fields) for series in candidates}) < len(candidates):
         table_names = ", ".join(series.name for series in candidates)
         raise DataError(
-            f"{recordings[0].path}: holds {len(candidates)} tables of the same columns ({table_names[:120]}),"
-            " each a log of its own; write each to a file, in Python"
+            f"{recordings[0].path}: contains {len(candidates)} tables of the same columns"
+            f" ({table_names[:120]}), each a separate log; write each to a file, in Python"
             " pandas.DataFrame({name: column for name, column in table.items()}).to_csv(...)"
         )
     if len(candidates) != 1:
         return None
     series = candidates[0]
-    topic, same_series = (
-        series.name,
-        [r.series[series.name] for r in recordings if series.name in r.series],
-    )
+    topic = series.name
+    same_series = [r.series[topic] for r in recordings if topic in r.series]
+    # fields with values in all recordings, without clocks
     fields = [
         name
         for name in series.fields
@@ -261,7 +278,7 @@ def _find_named_table(
     unused_fields = [name for name in fields if name not in names.values()]
     if unused_fields:
         draft_notes.add_note(
-            CHANNELS_KEY, f"fields that no channel takes: {', '.join(unused_fields[:20])}"
+            CHANNELS_KEY, f"fields without a channel: {', '.join(unused_fields[:20])}"
         )
     settings: dict[str, Any] = {"standard_messages": False}
     for position_kind, channel_pair, keys in (
@@ -296,14 +313,18 @@ def _find_named_table(
 def _find_best_pose(
     recording: Recording, draft_notes: DraftNotes, min_score: float
 ) -> _MotionSources | None:
-    """Return the position and heading that fit together best and come most often.
+    """Return the most consistent pair of position and heading, with preference for high rates.
 
-    None where there is no pair of both that fits at least as well as asked, of 1.
+    Args:
+        recording: recording with aligned clocks.
+        draft_notes: receives guesses and notes.
+        min_score: smallest consistency, at most 1.
+
+    Returns:
+        The sources; None if no pair reaches the smallest consistency.
     """
-    positions, headings = (
-        list(_iter_position_sources(recording)),
-        list(_iter_heading_sources(recording)),
-    )
+    positions = list(_iter_position_sources(recording))
+    headings = list(_iter_heading_sources(recording))
     velocities = list(_iter_velocity_fields(recording))
     best_candidate: tuple[float, Any] = (-np.inf, None)
     for position in positions[:_MAX_POSE_CANDIDATES]:
@@ -315,7 +336,7 @@ def _find_best_pose(
             source_steps = [
                 _median_series_step(recording[source.topic]) for source in (position, heading)
             ]
-            # a pose that comes once a second is worth less than one that comes ten times
+            # a tenth of the rate costs .3 of the score
             rated_score = score - 0.3 * float(np.log10(max(max(source_steps), 0.05) / 0.05))
             if rated_score > best_candidate[0]:
                 best_candidate = (
@@ -325,14 +346,14 @@ def _find_best_pose(
     if best_candidate[1] is None or best_candidate[1][2] < min_score:
         return None
     position, heading, score, velocity, step = best_candidate[1]
-    text = f"of {len(positions)} positions and {len(headings)} headings these fit together and come"
-    draft_notes.add_guess((*READER_KEY, "position"), f"{text} most often (fit {score:.2f} of 1)")
+    text = f"most consistent pair of {len(positions)} positions and {len(headings)} headings"
+    draft_notes.add_guess((*READER_KEY, "position"), f"{text} (consistency {score:.2f} of 1)")
     draft_notes.add_guess(
-        (*READER_KEY, "heading"), f"frame {heading.frame}: with it the motion fits"
+        (*READER_KEY, "heading"), f"frame {heading.frame}: consistent with the motion"
     )
     if velocity is not None:
         draft_notes.add_note(
-            READER_KEY, f"velocities in {velocity} served to check the frames only"
+            READER_KEY, f"velocities in {velocity} were used to check the frames only"
         )
     settings: dict[str, Any] = {"standard_messages": False}
     for name, source in (("position", position), ("heading", heading)):
@@ -345,7 +366,7 @@ def _find_best_pose(
 
 
 def _iter_measured_series(recording: Recording) -> Iterator[Series]:
-    """Yield the topics with enough rows that are no references that somebody asks for."""
+    """Yield the series with sufficient rows that are no setpoints."""
     for series in recording.series.values():
         parsed_name = parse_name(series.name)
         if (
@@ -357,7 +378,7 @@ def _iter_measured_series(recording: Recording) -> Iterator[Series]:
 
 
 def _iter_position_sources(recording: Recording) -> Iterator[PositionConfig]:
-    """Yield the positions that a recording may hold, in both orders of their axes."""
+    """Yield possible positions of a recording, local ones in both orders of their axes."""
     for series in _iter_measured_series(recording):
         if series.has_field("latitude") and series.has_field("longitude"):
             yield GeodeticPosition(topic=series.name)
@@ -387,6 +408,7 @@ def _iter_position_sources(recording: Recording) -> Iterator[PositionConfig]:
 
 
 def _iter_heading_sources(recording: Recording) -> Iterator[HeadingConfig]:
+    """Yield possible headings of a recording: quaternions and angles, in both frames."""
     for series in _iter_measured_series(recording):
         frames: tuple[Literal["ned", "enu"], ...] = (
             ("ned",) if is_ned_format(series) else ("ned", "enu")
@@ -410,7 +432,7 @@ def _iter_heading_sources(recording: Recording) -> Iterator[HeadingConfig]:
 
 
 def _iter_velocity_fields(recording: Recording) -> Iterator[tuple[Series, str, str]]:
-    """Yield pairs of fields that may be the velocities forward and sideways."""
+    """Yield series and fields of possible velocities forward and sideways."""
     for series in _iter_measured_series(recording):
         prefixes = ("twist.twist.linear.", "twist.linear.", "linear.")
         prefix = next(
@@ -423,14 +445,17 @@ def _iter_velocity_fields(recording: Recording) -> Iterator[tuple[Series, str, s
 def _extract_pose(
     recording: Recording, position: PositionConfig, heading: HeadingConfig
 ) -> RawTable | None:
-    """Return north, east and heading at the times of the positions; None where they cannot be."""
+    """Return north, east and heading at the times of the positions, or None.
+
+    None means that a source cannot be read, the clocks do not overlap, or the heading is constant.
+    """
     try:
         position_log = extract_position(recording, position).log
         heading_log = extract_heading(recording, heading).log
     except ResidnetError:
         return None
     is_finite = np.isfinite(heading_log["psi"])
-    # a heading that stands still fits a velocity over ground as well as one through the water
+    # with a constant heading, velocities in body axes and in earth axes are equally consistent
     if is_finite.sum() < _MIN_MOTION_ROWS or float(np.ptp(heading_log["psi"][is_finite])) < 0.3:
         return None
     if heading_log.t[-1] < position_log.t[0] or heading_log.t[0] > position_log.t[-1]:
@@ -451,7 +476,14 @@ def _extract_pose(
 def _score_pose(
     pose: RawTable, velocities: list[tuple[Series, str, str]]
 ) -> tuple[float, str | None]:
-    """Return how well a pose fits the velocities, and the topic of these; itself without any."""
+    """Return the consistency of a pose, at most 1, and the topic of the velocities used for it.
+
+    Without suitable velocities the consistency is the forward alignment of the motion.
+
+    Args:
+        pose: table with x, y, psi.
+        velocities: series and fields of possible velocities forward and sideways.
+    """
     motion = estimate_motion(pose, "rad", POSE_FRAMES[0])
     if motion is None:
         return -1.0, None
@@ -468,7 +500,7 @@ def _score_pose(
             if earth_fixed_motion
             else [0.0]
         )
-        # along north and east it says nothing of the heading
+        # velocities in earth axes do not depend on the heading
         if max(earth_fixed_scores) <= 0.85:
             scored_topics.append(
                 (
@@ -483,7 +515,7 @@ def _score_pose(
 def _mean_velocity_correlation(
     pose: RawTable, motion: Motion, series: Series, forward_field: str, sideways_field: str
 ) -> float:
-    """Return the mean correlation of forward and sideways velocity with a pair of fields."""
+    """Return the mean correlation of surge and sway velocity with a pair of fields."""
     velocity_fits: list[ScaleFit] = []
     for name, field in (("u", forward_field), ("v", sideways_field)):
         is_finite = np.isfinite(series[field])
@@ -494,7 +526,7 @@ def _mean_velocity_correlation(
             fit_to_motion([RawTable(pose.t, {**pose.columns, name: interpolated})], [motion], name)
         )
     forward_fit, sideways_fit = velocity_fits
-    # the speed itself must agree: a heading that is turned by a right angle swaps the two
+    # the sign of the forward factor counts: a heading that is off by 90 deg exchanges both
     return float(
         0.5 * (forward_fit.correlation * np.sign(forward_fit.factor) + sideways_fit.correlation)
     )
@@ -503,15 +535,17 @@ def _mean_velocity_correlation(
 def _name_bare_numbers(
     recording: Recording, standard: Mapping[str, FieldMap]
 ) -> Iterator[tuple[str, tuple[str, str]]]:
-    """Yield channel, topic and field of plain numbers whose topic or joint names an actuator.
+    """Yield channel, topic and field of numbers without a unit whose topic names an actuator.
 
-    A message that holds a bare number says neither what it measures nor its unit.
+    Args:
+        recording: recording with aligned clocks.
+        standard: channels of standard messages.
     """
     for name, entry in standard.items():
         topic, field = entry.topic or "", entry.field
         if name in CHANNEL_UNITS or entry.unit not in ("-", "rad") or topic not in recording.series:
             continue
-        # the last part of a topic says more than the folders that it lies in
+        # the last part of a topic's name is the most specific one
         names = (topic.rsplit("/", 1)[-1], name) if field == "data" else (name,)
         channels = (
             match_input_channel(parse_name(candidate.removesuffix("_position")))
@@ -522,7 +556,7 @@ def _name_bare_numbers(
 
 
 def _concatenate_field(recordings: Sequence[Recording], topic: str, field: str) -> np.ndarray:
-    """Return the values of a field in all recordings that hold it."""
+    """Return the values of a field in all recordings with this field."""
     series_with_topic = [r.series[topic] for r in recordings if topic in r.series]
     return np.concatenate(
         [series[field] for series in series_with_topic if series.has_field(field)]
@@ -532,10 +566,14 @@ def _concatenate_field(recordings: Sequence[Recording], topic: str, field: str) 
 def _find_actuator_fields(
     recordings: Sequence[Recording], used_fields: set[tuple[str, str]]
 ) -> Iterator[tuple[str, tuple[str, str]]]:
-    """Yield channel, topic and field of those that are named as actuators are.
+    """Yield channel, topic and field of fields with names of actuators.
 
-    Several actuators of one topic are told apart by a number alone, `control[0]` and `control[1]`:
-    each is taken. Of other fields that stand for one channel the first one is.
+    Fields that differ in a number only (`control[0]`, `control[1]`) become several channels.
+    Otherwise the first field of a channel is used.
+
+    Args:
+        recordings: recordings with aligned clocks.
+        used_fields: topics and fields that are mapped already.
     """
     fields_by_channel: dict[str, list[tuple[str, str]]] = {}
     for topic, series in recordings[0].series.items():
@@ -559,30 +597,30 @@ def _find_actuator_fields(
 
 
 INPUTS_KEY = ("signals", "inputs")
-"""Key of a config's inputs."""
+"""Key of the inputs in a config."""
 _TABLE_SUFFIXES = (".csv", ".parquet")
 
 
 def find_log_files(paths: Sequence[Path]) -> list[Path]:
-    """Return the files, and the logs below folders, in order; each once.
+    """Return all logs in files and folders without duplicates, in sorted order.
 
-    A folder may itself be a log, as a ROS 2 bag is, and where a folder holds neither such nor
-    tables, logs of any other format are taken.
+    A folder may itself be a log, such as a ROS 2 bag. In a folder without bags, csv and Parquet
+    files, logs of other formats are used.
 
     Raises:
-        UsageError: where a path does not exist or a folder holds no log.
+        UsageError: if a path does not exist or a folder has no log.
     """
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
             nested_logs = find_logs(path)
-            # notes and settings often lie beside tables
+            # other files next to tables are often notes and settings
             preferred_logs = [
                 p for p in nested_logs if p.is_dir() or p.suffix in _TABLE_SUFFIXES
             ] or nested_logs
             if not preferred_logs:
                 raise UsageError(
-                    f"{path}: holds no log of a format that is known{describe_other_files(path)}"
+                    f"{path}: has no log of a known format{describe_other_files(path)}"
                 )
             files += preferred_logs
         elif path.is_file():
@@ -596,7 +634,7 @@ def find_log_files(paths: Sequence[Path]) -> list[Path]:
 
 
 def describe_other_files(folder: Path) -> str:
-    """Return what a folder without logs holds, and how it can become logs; empty for nothing."""
+    """Return a text with the types of files in a folder and how to convert them; may be empty."""
     endings = Counter(path.suffix.lower() for path in folder.rglob("*") if path.is_file())
     counts_text = ", ".join(
         f"{n} file{'s' * (n > 1)} {suffix or 'without ending'}" for suffix, n in endings.items()
@@ -607,13 +645,13 @@ def describe_other_files(folder: Path) -> str:
 
 @dataclass
 class DraftResult:
-    """Logs that one drafted reader reads.
+    """Drafted reader and its logs.
 
     Attributes:
-        reader: `data.reader` of a config.
-        logs: path -> log, in SI, as the reader gives it.
-        errors: path -> why it cannot be read.
-        draft_notes: what of the reader is not sure.
+        reader: settings of the reader, `data.reader` of a config.
+        draft_notes: guesses and notes on these settings.
+        logs: path -> log in SI.
+        errors: path -> error of a log that cannot be read.
     """
 
     reader: dict[str, Any]
@@ -625,25 +663,31 @@ class DraftResult:
 def read_drafted(
     paths: Sequence[Path], draft_notes: DraftNotes, *, is_gridded: bool = True
 ) -> DraftResult:
-    """Return the logs in files of one format, by a reader that is drafted from them.
+    """Draft a reader for files of one format and read them.
 
     Args:
-        is_gridded: recordings come on a uniform clock, and else on that of their positions.
+        paths: files.
+        draft_notes: receives guesses and notes.
+        is_gridded: whether recordings get a uniform clock; otherwise that of their positions.
 
     Raises:
-        UsageError: where the files are of several formats.
-        DataError: where none can be used.
+        UsageError: if the files have several formats.
+        DataError: if no file can be read.
     """
     kind_by_path = {path: detect_log_kind(path) for path in paths}
     if len(set(kind_by_path.values())) > 1:
+        names_by_kind: dict[str, list[str]] = {}
+        for path, kind in sorted(kind_by_path.items(), key=lambda item: item[1]):
+            names_by_kind.setdefault(kind, []).append(path.name)
         kinds_text = "; ".join(
-            f"{log_kind}: {', '.join(path.name for path in paths if kind_by_path[path] == log_kind)[:120]}"
-            for log_kind in sorted(set(kind_by_path.values()))
+            f"{kind}: {', '.join(file_names)[:120]}" for kind, file_names in names_by_kind.items()
         )
         raise UsageError(
-            f"the logs are of several formats, and a fit reads one ({kinds_text}); give those of one"
+            f"the logs have several formats, one was expected ({kinds_text}); give logs of one"
+            " format"
         )
-    log_kind, result = kind_by_path[paths[0]], DraftResult({"kind": "canonical"}, draft_notes)
+    log_kind = kind_by_path[paths[0]]
+    result = DraftResult({"kind": "canonical"}, draft_notes)
     recordings: dict[Path, Recording] = {}
     if log_kind == "table" and (trip_files := group_by_trip(paths)):
         unpaired_paths = set(paths).difference(*trip_files.values())
@@ -661,8 +705,9 @@ def read_drafted(
             part_settings, key=lambda word: -len(_motion_channels(part_settings[word]["channels"]))
         )
         text = (
-            f"files whose names differ in {' and '.join(part_order)} alone are taken as one trip; where"
-            " both have no dates, their clocks are brought together by what the commands explain"
+            f"files whose names differ only in {' and '.join(part_order)} are joined as one trip;"
+            " without dates in both, the clock offset is estimated from the motion that the"
+            " commands explain"
         )
         draft_notes.add_guess((*READER_KEY, "parts"), text)
         reader = {
@@ -671,7 +716,7 @@ def read_drafted(
         }
         result.reader, paths, result.errors = reader, [*trip_files[part_order[0]]], errors
         result.errors |= {
-            path: DataError(f"{path}: no other file of its trip is beside it; leave it out")
+            path: DataError(f"{path}: another file of its trip is missing; leave it out")
             for path in sorted(unpaired_paths)
         }
     elif log_kind == "table":
@@ -679,15 +724,13 @@ def read_drafted(
     elif log_kind != "canonical":
         result.reader, recordings = draft_recordings(paths, draft_notes)
     settings = {key: value for key, value in result.reader.items() if is_gridded or key != "clock"}
-    reader, names = (
-        validate_config(settings, ReaderConfig, "draft").build(),
-        assign_log_names(paths),
-    )
+    reader = validate_config(settings, ReaderConfig, "draft").build()
+    names = assign_log_names(paths)
     for number, path in enumerate(paths):
         report_progress("reading logs", number, len(paths))
         try:
             if path not in result.errors:
-                # a recording that was drafted from is not loaded again
+                # recordings from which the reader was drafted are loaded already
                 recording = recordings.pop(path, None)
                 log = reader.read(path) if recording is None else reader.to_log(recording)
                 result.logs[path] = log.replace(name=names[path])
@@ -701,13 +744,16 @@ def read_drafted(
 
 
 def group_by_trip(paths: Sequence[Path]) -> dict[str, list[Path]]:
-    """Return word -> tables, where those that differ in one word of their names are parts of trips.
+    """Group tables that are parts of trips by the word in which their names differ.
 
-    Empty where they are not. Two files with a position or a speed each are of two vessels, or of
-    two recorders that each are a log; a compass may be in both.
+    Two files that both have a position or a speed are separate logs, of two vessels or of two
+    recorders. A heading may be in both.
+
+    Returns:
+        Word -> tables in the order of the trips; empty if the tables are separate logs.
     """
     columns = {path: read_column_names(path) for path in paths}
-    # lists of names and notes lie beside logs
+    # tables without channels next to logs are notes
     paths_by_columns: dict[tuple[str, ...], list[Path]] = {}
     for path, names in columns.items():
         paths_by_columns.setdefault(names, []).append(path)
@@ -729,7 +775,7 @@ def group_by_trip(paths: Sequence[Path]) -> dict[str, list[Path]]:
 
 
 def _channels_from_headers(files: Sequence[Path]) -> Iterable[str]:
-    """Return the channels that the names of columns tell, of the first table that can be read."""
+    """Return the channels of the column names of the first readable table; may be empty."""
     for path in files:
         with contextlib.suppress(ResidnetError):
             if channels := match_channels([*preview_table(path, 50).numeric_columns], DraftNotes()):
@@ -738,15 +784,15 @@ def _channels_from_headers(files: Sequence[Path]) -> Iterable[str]:
 
 
 def _motion_channels(channels: Iterable[str]) -> set[str]:
-    """Return what channels tell of the motion: position, heading, velocities and roll by name."""
+    """Return the channels of position, heading, velocities and roll under canonical names."""
     equivalent_channels = {"latitude": "x", "longitude": "y", **dict.fromkeys(QUATERNION, "psi")}
     return {equivalent_channels.get(name, name) for name in channels} & {*STATE_NAMES, "phi", "p"}
 
 
 def read_mixed_formats(paths: Sequence[Path]) -> list[DraftResult]:
-    """Return logs of any formats, those with the same columns together.
+    """Read logs of any formats with one drafted reader per format and set of columns.
 
-    Where none of those alike can be read, all of them are left out.
+    A group of logs without a readable one has the error in its result.
     """
     groups: dict[tuple[str, ...], list[Path]] = {}
     columns_by_path = {
@@ -759,17 +805,21 @@ def read_mixed_formats(paths: Sequence[Path]) -> list[DraftResult]:
         groups.setdefault((log_kind, *names), []).append(path)
     results = []
     for group in groups.values():
-        marks = DraftNotes()
+        draft_notes = DraftNotes()
         try:
-            results.append(read_drafted(group, marks, is_gridded=False))
+            results.append(read_drafted(group, draft_notes, is_gridded=False))
         except ResidnetError as error:
-            results.append(DraftResult({}, marks, errors=dict.fromkeys(group, error)))
+            results.append(DraftResult({}, draft_notes, errors=dict.fromkeys(group, error)))
     return results
 
 
 def _correct_rudder_signs(result: DraftResult) -> None:
-    """Turn the sign of rudders whose positive angles turn the vessel to port, of planes those that
-    turn it up.
+    """Reverse the sign of rudders that turn the vessel to port, and of planes that pitch it up.
+
+    The signs of the drafted reader and of the logs are changed in place.
+
+    Args:
+        result: drafted reader and its logs.
     """
     part_settings: dict[Key, Mapping[str, Any]] = {
         (*READER_KEY, "parts", part_name): part
@@ -804,12 +854,15 @@ def _correct_rudder_signs(result: DraftResult) -> None:
         key = entry_keys.get(name, INPUTS_KEY)
         if abs(gain) < MIN_STANDARD_ERRORS * standard_error:
             result.draft_notes.add_guess(
-                key, f"the logs do not tell which way {name} turns the vessel"
+                key, f"the logs do not determine in which direction {name} turns the vessel"
             )
         elif gain < 0.0 and name in channels:
             channels[name]["sign"] = -1 * int(channels[name].get("sign", 1))
-            text = f"positive values turned the vessel {opposite_direction} in the logs ({-gain / standard_error:.0f}"
-            result.draft_notes.add_guess(key, f"{text} standard errors): the sign is turned")
+            text = (
+                f"positive values turned the vessel {opposite_direction} in the logs"
+                f" ({-gain / standard_error:.0f} standard errors): the sign is reversed"
+            )
+            result.draft_notes.add_guess(key, text)
             for path, log in result.logs.items():
                 if name in log.channels:
                     negated_channels = {**log.channels, name: -log[name]}
@@ -820,7 +873,7 @@ def _correct_rudder_signs(result: DraftResult) -> None:
 
 
 def _complete_turn_rates(log: Log) -> Log | None:
-    """Return a log with its yaw rate and, where it dives, its pitch rate; None without."""
+    """Return a log with yaw rate, and pitch rate for underwater vessels; None if impossible."""
     try:
         dof = DegreesOfFreedom.from_channels(log.channels)
         rates = {"r", "q"} if dof.is_six_dof else {"r"}

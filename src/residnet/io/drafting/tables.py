@@ -1,4 +1,4 @@
-"""The channel map of tables that nobody described, with what is not sure about it."""
+"""Drafting of channel maps for tables from names, units, values and physics."""
 
 from __future__ import annotations
 
@@ -72,33 +72,35 @@ _OPENING_BRACKET = re.compile(r"[\[(]")
 _NAME_OVER_UNIT = re.compile(r"(?P<name>.*\S)\s+/\s+(?P<unit>\S.*)")
 _DRIVE_PATTERN = re.compile(r"^(?:cmd_)?(?:n(?=_|$)|thrust)")
 _PULSE_RANGE = (900.0, 2100.0)
-"""Pulses in us that servos and speed controllers take."""
+"""Range of the pulses of servos and speed controllers in us."""
 _DATE_PATTERN = r"\d\s*[-./年]\s*\w{1,9}\s*[-./月]"
 _DOTTED_TIME_PATTERN = r"^\d\d?\.\d\d\.\d\d[.,]"
-"""How a time of day begins that has points between its parts."""
+"""Start of a time of day with points between its parts."""
 _ANGLE_FORMS: tuple[AngleForm, ...] = ("number", "ddmm")
 _MAX_ANGLE = {"latitude": 90.0, "longitude": 180.0}
 _HEMISPHERES = {"latitude": {"N", "S"}, "longitude": {"E", "W", "O"}}
 ColumnSettings = Mapping[str, Mapping[str, Any]]
-"""Column -> what its entry in a channel map says beside column and unit."""
+"""Column -> further settings of its entry in a channel map."""
 _MAX_FULL_PREVIEWS = 24
-"""Tables whose values are looked at; of the others only the header is."""
+"""Number of tables whose values are loaded; of other tables only the first rows are."""
 
 
 def draft_tables(
     files: Sequence[Path], draft_notes: DraftNotes, *, has_heading: bool = False
 ) -> tuple[dict[str, Any], dict[Path, ResidnetError]]:
-    """Return the settings of a reader of tables, and file -> why it is not read.
-
-    They come from names, units in the headers, values and physics.
+    """Draft a reader for tables from names, units in headers, values and physics.
 
     Args:
         files: at least one table.
-        has_heading: whether other files may tell the heading.
+        draft_notes: receives guesses and notes.
+        has_heading: whether other files may have the heading.
+
+    Returns:
+        The settings of the reader, and the error of each table that cannot be read.
 
     Raises:
-        UsageError: where the tables have nothing in common.
-        DataError: where none can be read, or none has a time.
+        UsageError: if the tables have no common column of time.
+        DataError: if no table can be read, or none has a time.
     """
     previews, errors = _preview_tables(files)
     main_preview, column_settings = convert_positions_to_degrees(previews[0], draft_notes)
@@ -124,9 +126,10 @@ def draft_tables(
             sheet.path.name for sheet in previews if sheet.column_names == main_preview.column_names
         ]
         raise UsageError(
-            f"{main_preview.path}: its time '{clock.columns[0]}' is not in every file, so that these are"
-            f" tables of several kinds; give those of one, here {', '.join(same_table_names)[:120]} (parts of"
-            " one trip are files whose names differ in one word, each with other quantities)"
+            f"{main_preview.path}: the column of time '{clock.columns[0]}' is missing elsewhere,"
+            " these are tables of several kinds; give those of one kind, here"
+            f" {', '.join(same_table_names)[:120]} (parts of one trip are files whose names differ"
+            " in one word, each with other quantities)"
         )
     if clock.guess:
         draft_notes.add_guess((*READER_KEY, "time"), clock.guess)
@@ -142,8 +145,8 @@ def draft_tables(
     ]
     if minute_columns:
         raise DataError(
-            f"{main_preview.path}: '{minute_columns[0]}' holds minutes whose degrees stand in another column;"
-            " write degrees + minutes / 60 into one column each for latitude and longitude"
+            f"{main_preview.path}: '{minute_columns[0]}' has minutes whose degrees are in another"
+            " column; write degrees + minutes / 60 to one column each for latitude and longitude"
         )
     attitudes = find_quaternions(common_numeric)
     compound_columns = {column for attitude in attitudes for column in attitude.values()}
@@ -163,7 +166,7 @@ def draft_tables(
     )
     column_by_channel = _rename_pulsed_drives(column_by_channel, previews)
     column_by_channel = _add_sin_cos_channels(column_by_channel, sin_cos_pairs)
-    # a vessel without roll is modelled too, so that no log is lost for it
+    # roll is optional: leave it out rather than the logs without it
     roll_channels = [name for name in ("phi", "p") if name in column_by_channel]
     for name in [
         preview
@@ -186,9 +189,9 @@ def draft_tables(
     ):
         example = main_preview.text_columns[position_texts[0]].dropna().iloc[0]
         raise DataError(
-            f"{main_preview.path}: column '{position_texts[0]}' holds '{truncate(str(example))}', which is no latitude or"
-            " longitude beside its other column; forms that are read are 59.90535, 59°54.321'N,"
-            " 59 54 19.3 N and 5954.321"
+            f"{main_preview.path}: column '{position_texts[0]}' contains"
+            f" '{truncate(str(example))}', which is no latitude or longitude; accepted are"
+            " 59.90535, 59°54.321'N, 59 54 19.3 N and 5954.321"
         )
     if "psi" not in column_by_channel:
         column_by_channel |= choose_quaternion_order(
@@ -196,8 +199,9 @@ def draft_tables(
         )
     if not column_by_channel:
         raise DataError(
-            f"{main_preview.path}: none of its columns is called as a channel is"
-            f" ({', '.join(common_numeric[:12])}); {_suggest_table_fix(main_preview, clock, common_numeric)}"
+            f"{main_preview.path}: no column has the name of a channel"
+            f" ({', '.join(common_numeric[:12])});"
+            f" {_suggest_table_fix(main_preview, clock, common_numeric)}"
         )
     logs = _build_raw_tables(previews, column_by_channel, errors)
     cells = [
@@ -209,7 +213,7 @@ def draft_tables(
     for channel, entry in channels.items():
         if _is_recorded_on_change(channel, logs):
             entry["hold"] = True
-            text = "recorded when it changes: the last value holds until the next"
+            text = "recorded when it changes: zero-order hold between the values"
             draft_notes.add_guess((*CHANNELS_KEY, channel), text)
         settings = column_settings.get(entry["column"], {})
         entry |= {"column": main_preview.original_name(entry["column"]), **settings}
@@ -226,9 +230,9 @@ def draft_tables(
 def _suggest_table_fix(
     preview: TablePreview, clock: TableClock, numeric_columns: Sequence[str]
 ) -> str:
-    """Return what to do with a table whose columns name no channel."""
+    """Return an instruction for a table without channels."""
     if not numeric_columns:
-        return "the files have no column of numbers in common: give those of one kind"
+        return "the files have no common column of numbers: give files of one kind"
     category_columns = [
         name
         for name, cells in preview.text_columns.items()
@@ -237,33 +241,42 @@ def _suggest_table_fix(
     category_columns = [name for name in category_columns if name not in clock.columns]
     if len(numeric_columns) == 1 and category_columns:
         return (
-            f"'{category_columns[0]}' says what each row holds: make columns of it, in Python"
+            f"'{category_columns[0]}' names the quantity of each row: make columns of it, in Python"
             f" pandas.read_csv(file).pivot_table({numeric_columns[0]!r}, {clock.columns[0]!r},"
             f" {category_columns[0]!r}).to_csv('log.csv')"
         )
     if len(numeric_columns) == 1:
         return (
-            "where each file holds one quantity, make one table of them, in Python"
+            "if each file has one quantity, join them to one table, in Python"
             " pandas.concat({file.stem: pandas.read_csv(file, index_col=0).iloc[:, 0] for file in"
             " files}, axis=1).sort_index().to_csv('log.csv')"
         )
     if all(_parse_unit_cell(re.sub(r"\.\d+$", "", name)) for name in numeric_columns):
-        return "these are units: write each column's name in one cell above its unit, or before it"
-    return "name them in a channel map (--config)"
+        return "these are units: write each column's name in a cell above its unit, or before it"
+    return "map them in a channel map (--config)"
 
 
 def draft_manoeuvre_setting(files: Sequence[Path], draft_notes: DraftNotes) -> dict[str, str]:
-    """Return the setting of files in several folders, whose names tell the manoeuvres."""
+    """Return the setting `manoeuvre: folder` for files in several folders, else no setting."""
     if len({path.resolve().parent for path in files}) < 2:
         return {}
     draft_notes.add_guess(
-        (*READER_KEY, "manoeuvre"), "the kind of manoeuvre is taken from the folder's name"
+        (*READER_KEY, "manoeuvre"), "the type of manoeuvre is taken from the name of the folder"
     )
     return {"manoeuvre": "folder"}
 
 
 def _preview_tables(files: Sequence[Path]) -> tuple[list[TablePreview], dict[Path, ResidnetError]]:
-    """Return the first rows of the tables, those of some with all that is looked at."""
+    """Load the first rows of tables, 20,000 rows of up to 48 tables and 50 of the others.
+
+    Returns:
+        The previews, first one with the settings of most tables, and the error of each table that
+        cannot be read.
+
+    Raises:
+        UsageError: if the tables have several formats.
+        DataError: if no table can be read.
+    """
     stride = max(1, len(files) // _MAX_FULL_PREVIEWS)
     previews: list[TablePreview] = []
     errors: dict[Path, ResidnetError] = {}
@@ -284,12 +297,12 @@ def _preview_tables(files: Sequence[Path]) -> tuple[list[TablePreview], dict[Pat
     if not reader_settings:
         path, names = previews[0].path, ", ".join(previews[0].column_names[:12])
         raise DataError(
-            f"{path}: fewer than two of its columns hold numbers (columns: {names}); check how the"
-            " table was exported"
+            f"{path}: fewer than two columns contain numbers (columns: {names}); check the"
+            " export of the table"
         )
     if len({dict(settings_items)["kind"] for settings_items in reader_settings}) > 1:
-        raise UsageError("the tables are of several formats; give those of one format at a time")
-    # the form that most of them have: a table of whole numbers shows no decimal sign
+        raise UsageError("the tables have several formats, one was expected; give those of one")
+    # the most detailed settings: a table of integers, for example, has no decimal sign
     common_settings = max(
         reader_settings,
         key=lambda kind: (len(kind), sum(s.reader_settings == dict(kind) for s in previews)),
@@ -309,10 +322,20 @@ def _select_one_vessel(
     *,
     has_heading: bool,
 ) -> dict[str, str]:
-    """Return channel -> column; of `boat1_x` and `boat2_x`, side by side, those of the first.
+    """Match columns to channels, using one vessel of tables with several.
 
-    The same words stand behind the word of each vessel or sensor, a place and an input among them.
-    What rests or is commanded is not taken for a vessel.
+    The columns of several vessels or sensors have the same suffixes behind different prefixes, as
+    in `boat1_x` and `boat2_x`, including a position and an input. Prefixes of commands and constant
+    positions are excluded.
+
+    Args:
+        columns: names of the columns.
+        numeric_columns: column -> values.
+        draft_notes: receives guesses and notes.
+        has_heading: whether another source may have the heading.
+
+    Returns:
+        Channel -> column.
     """
     columns_by_prefix: dict[str, dict[str, str]] = {}
     for column in columns:
@@ -340,8 +363,8 @@ def _select_one_vessel(
                 for name in position_pair
             ):
                 text = (
-                    f"the columns of {', '.join(same_suffix_groups)} hold a position each; of these vessels or"
-                    f" sensors {prefix} is read; write the others into tables of their own"
+                    f"the columns of {', '.join(same_suffix_groups)} have a position each; of these"
+                    f" vessels or sensors {prefix} is read; write the others to separate tables"
                 )
                 draft_notes.add_guess(CHANNELS_KEY, text)
                 return {
@@ -354,12 +377,17 @@ def _select_one_vessel(
 def match_channels(
     columns: Sequence[str], draft_notes: DraftNotes, *, has_heading: bool = True
 ) -> dict[str, str]:
-    """Return channel -> column, by what the columns are called.
+    """Match columns to channels by their names.
 
-    A speed is that forward where no position and heading tell it.
+    A speed without a direction is the surge velocity u if position and heading do not determine it.
 
     Args:
-        has_heading: whether something else may tell the heading.
+        columns: names of the columns.
+        draft_notes: receives guesses and notes.
+        has_heading: whether another source may have the heading.
+
+    Returns:
+        Channel -> column.
     """
     column_by_bare_name = {
         re.sub(r"\W*[\[(].*|_m$", "", column).strip().lower(): column for column in columns
@@ -373,9 +401,9 @@ def match_channels(
             has_heading=has_heading,
         )
         if not {"x", "y", "latitude", "longitude"} & set(other_channels):
-            # beside E, N counts no revolutions
+            # next to a column E, N is no shaft speed
             draft_notes.extend(other_notes)
-            text = f"'{north_east['x']}' and '{north_east['y']}' side by side are taken as north and east"
+            text = f"'{north_east['x']}' and '{north_east['y']}' are assumed north and east"
             draft_notes.add_guess((*CHANNELS_KEY, "x"), text)
             return {**north_east, **other_channels}
     names: dict[str, str] = {}
@@ -383,7 +411,7 @@ def match_channels(
     speeds: list[str] = []
     parsed_names = {column: parse_name(column) for column in columns}
     copy_suffix = re.compile(r"\.\d+$")
-    # of one vessel only what drives it has a speed to either side
+    # speeds of port and starboard are those of shafts
     shaft_of_side = {"port": "n_port", "starboard": "n_stbd"}
     side_velocities = {
         column: shaft_channel
@@ -405,8 +433,8 @@ def match_channels(
             len(parsed_names[column].concepts),
         )
 
-    # true headings first, then a channel's own name, `u` before `vx`, then shorter names: `heading`
-    # before `heading of the second compass`
+    # precedence: true before magnetic headings, then canonical names (`u` before `vx`), then names
+    # with fewer concepts (`heading` before `heading of the second compass`)
     for column in sorted(columns, key=sort_key):
         channel = (
             side_velocities.get(column)
@@ -418,7 +446,7 @@ def match_channels(
             and parsed_names[column].has_all("pitch")
             and parse_header_unit(column, "-") == "%"
         ):
-            # no angle, but that of a propeller's blades
+            # a pitch in per cent is that of a propeller's blades
             channel = match_input_channel(parse_name(f"propeller {column}"))
         expected_unit = get_si_unit(channel) if channel else None
         header_unit_mismatch = (
@@ -427,19 +455,19 @@ def match_channels(
         if channel == "n" and header_unit_mismatch == "m":
             channel = "x"
         elif channel and "thrust" in channel and parse_header_unit(column, "1/s"):
-            # a thruster that turns, and no force
+            # a thruster in rpm is a shaft speed, not a force
             channel = channel.replace("thrust", "n")
         elif (
             channel
             and _DRIVE_PATTERN.match(channel)
             and (header_unit_mismatch in ("-", "us") or parse_header_unit(column, "-") == "%")
         ):
-            # no revolutions and no force: the share of the throttle, or pulses to it
+            # per cent and pulses are a throttle, neither a shaft speed nor a force
             channel = _DRIVE_PATTERN.sub("throttle", channel)
         elif channel in STATE_NAMES and header_unit_mismatch:
             draft_notes.add_note(
                 CHANNELS_KEY,
-                f"'{column}' is called as {channel} is, but holds {header_unit_mismatch}",
+                f"'{column}' has the name of {channel}, but the unit {header_unit_mismatch}",
             )
             continue
         if channel == "speed":
@@ -449,7 +477,7 @@ def match_channels(
         elif channel is not None and copy_suffix.sub("", column) == copy_suffix.sub(
             "", names[channel]
         ):
-            text = f"the header names it more than once; '{names[channel]}' is the first of them"
+            text = f"the header has it more than once; '{names[channel]}' is the first one"
             draft_notes.add_guess((*CHANNELS_KEY, channel), text)
         elif channel is not None:
             duplicates.setdefault(channel, [names[channel]]).append(column)
@@ -459,19 +487,19 @@ def match_channels(
             for k, duplicate in enumerate(sorted(duplicate_columns, key=columns.index), 1)
         }
         if "thrust" not in channel or names.keys() & numbered.keys():
-            # of a rudder or a shaft that is told twice, one is an indicator
+            # the second column of a rudder or a shaft is usually an indicator
             for column in duplicate_columns[1:]:
                 draft_notes.add_note(
                     CHANNELS_KEY,
-                    f"'{column}' may be {channel} as well as '{duplicate_columns[0]}' is",
+                    f"'{column}' may be {channel} instead of '{duplicate_columns[0]}'",
                 )
             continue
-        # thrusters that no number tells apart
+        # several thrusters without numbers in their names
         del names[channel]
         names |= numbered
         draft_notes.add_guess(
             (*CHANNELS_KEY, f"{channel}_1"),
-            f"{', '.join(duplicate_columns)} are taken for one each",
+            f"{', '.join(duplicate_columns)} are assumed one thruster each",
         )
     has_position = bool({"x", "y", "latitude", "longitude"} & names.keys())
     theta = next(
@@ -480,16 +508,16 @@ def match_channels(
     if has_position and theta is not None and not {"psi", "phi"} & names.keys():
         names["psi"] = theta
         draft_notes.add_guess(
-            (*CHANNELS_KEY, "psi"), f"'{theta}' is taken as the heading, for no other is there"
+            (*CHANNELS_KEY, "psi"), f"'{theta}' is assumed the heading, because there is no other"
         )
     for port, stbd in (("delta_port", "delta_stbd"), ("cmd_delta_port", "cmd_delta_stbd")):
         if (port in names) != (stbd in names):
-            # one rudder: the side says where positive angles turn it
+            # a single rudder: the side is the direction of positive angles
             sided_channel = port if port in names else stbd
             rudder, column = sided_channel.rpartition("_")[0], names.pop(sided_channel)
             if names.setdefault(rudder, column) != column:
                 draft_notes.add_note(
-                    CHANNELS_KEY, f"'{column}' may be {rudder} as well as '{names[rudder]}' is"
+                    CHANNELS_KEY, f"'{column}' may be {rudder} instead of '{names[rudder]}'"
                 )
     has_heading = (
         has_heading
@@ -499,7 +527,7 @@ def match_channels(
     if "u" not in names and speeds and ("v" in names or not (has_position and has_heading)):
         names["u"] = speeds[0]
         draft_notes.add_guess(
-            (*CHANNELS_KEY, "u"), f"'{speeds[0]}' is taken as the speed forward, not its size"
+            (*CHANNELS_KEY, "u"), f"'{speeds[0]}' is assumed the surge velocity, not the speed"
         )
     ordered_channels = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]
     return {name: names[name] for name in ordered_channels if name in names}
@@ -508,9 +536,9 @@ def match_channels(
 def _add_sin_cos_channels(
     names: dict[str, str], sin_cos_pairs: Mapping[str, tuple[str, str]]
 ) -> dict[str, str]:
-    """Return channel -> column with angles that are told by a cosine and a sine.
+    """Add channels of the cosine and sine of angles to a mapping from channel to column.
 
-    A direction of nothing known is that of the wind, where its speed stands alone.
+    An angle with an unknown name is the wind direction if there is a wind speed without one.
     """
     known_channels = {*names}
     for stem, cos_sin in sin_cos_pairs.items():
@@ -532,10 +560,10 @@ def _add_sin_cos_channels(
 def _rename_pulsed_drives(
     names: Mapping[str, str], sheets: Sequence[TablePreview]
 ) -> dict[str, str]:
-    """Return channel -> column, where pulses to a motor are its throttle, and no revolutions.
+    """Rename shaft speeds and thrusts whose values are servo pulses or relative to throttle.
 
-    Pulses are whole microseconds between 900 and 2,100, and a share of a motor's or thruster's all
-    is one at most; revolutions say in their name what they are, or are zero at rest.
+    Pulses are integers between 900 and 2,100 us; relative values of a motor or thruster are at most
+    1 and no integers. Columns with a word for revolutions in their names are not renamed.
     """
     renamed = {}
     for channel, column in names.items():
@@ -563,6 +591,7 @@ def _rename_pulsed_drives(
 def _build_raw_tables(
     sheets: Sequence[TablePreview], names: Mapping[str, str], errors: dict[Path, ResidnetError]
 ) -> list[RawTable]:
+    """Return the mapped columns of each table on its clock, sorted by time and without copies."""
     logs = []
     for preview in sheets:
         try:
@@ -575,7 +604,7 @@ def _build_raw_tables(
             for channel, column in names.items()
             if column in preview.numeric_columns
         }
-        # the newest first
+        # tables in reverse order of time are reversed
         direction = -1 if (np.diff(clock.seconds[np.isfinite(clock.seconds)]) < 0.0).all() else 1
         columns = {channel: values[::direction] for channel, values in columns.items()}
         t = clock.seconds[::direction]
@@ -587,8 +616,9 @@ def _build_raw_tables(
 
 
 def _is_recorded_on_change(channel: str, logs: Sequence[RawTable]) -> bool:
-    """Return whether a channel that drives the vessel has values at fewer than half of the samples,
-    and no interval between them that is usual.
+    """Return whether an input is recorded when it changes.
+
+    Such a channel has values in less than half of the rows, at irregular intervals.
     """
     if channel in (*STATE_NAMES, *QUATERNION, *_MAX_ANGLE):
         return False
@@ -616,7 +646,7 @@ def _note_unused_columns(
     unused_columns = [name for name in preview.numeric_columns if name not in used_columns]
     if unused_columns:
         draft_notes.add_note(
-            CHANNELS_KEY, f"columns that no channel takes: {', '.join(unused_columns[:20])}"
+            CHANNELS_KEY, f"columns without a channel: {', '.join(unused_columns[:20])}"
         )
     texts = [
         f"{name} ('{truncate(str(cells.dropna().iloc[0]), 20)}')"
@@ -630,23 +660,26 @@ def _note_unused_columns(
             CHANNELS_KEY, f"empty columns: {', '.join(preview.empty_columns[:12])}"
         )
     if preview.other_sheets:
-        text = f"sheets that are not read: {', '.join(preview.other_sheets)}; write what belongs together"
-        draft_notes.add_note(CHANNELS_KEY, f"{text} into one sheet, or each into a file of its own")
+        text = (
+            f"sheets that are not read: {', '.join(preview.other_sheets)}; write the columns of one"
+            " log to one sheet, or each log to a separate file"
+        )
+        draft_notes.add_note(CHANNELS_KEY, text)
 
 
 @dataclass(frozen=True)
 class TablePreview:
-    """The first rows of one table.
+    """First rows of one table.
 
     Attributes:
-        path: of the file.
-        reader_settings: settings of its reader beside time and channels: kind, delimiter, decimal.
-        column_names: names of all columns.
-        numeric_columns: values [T] of the columns that hold numbers.
-        text_columns: columns that hold text, dates among them.
-        empty_columns: columns that hold nothing.
-        original_names: what the file calls a column, where its name here has a unit that stands below.
-        other_sheets: sheets beside it that hold numbers too.
+        path: path of the file.
+        reader_settings: settings `kind`, `delimiter`, `decimal` and `sheet` of its reader.
+        column_names: names of all columns, with a unit from the row below in brackets.
+        numeric_columns: column -> numbers [T].
+        text_columns: column -> texts [T], including dates.
+        empty_columns: names of columns without values.
+        original_names: column -> name in the file, if they differ.
+        other_sheets: further sheets of the file with numbers.
     """
 
     path: Path
@@ -659,12 +692,16 @@ class TablePreview:
     other_sheets: tuple[str, ...] = ()
 
     def original_name(self, name: str) -> str:
-        """Return what the file calls a column."""
+        """Return the name of a column in the file."""
         return self.original_names.get(name, name)
 
 
 def preview_table(path: Path, rows: int = 20_000) -> TablePreview:
-    """Return the first rows of a table, 20,000 where `unit_rows` does not say otherwise."""
+    """Load the first rows of a table.
+
+    Raises:
+        DataError: if the table has no rows or cannot be read.
+    """
     import pandas as pd
 
     require_file(path)
@@ -675,11 +712,13 @@ def preview_table(path: Path, rows: int = 20_000) -> TablePreview:
         table, reader_settings = (
             _preview_excel(path, rows) if table_kind == "excel" else read_table_head(path, rows)
         )
-    columns, other_sheets = _append_units(table), table.attrs.get("other_sheets", ())
-    # pandas copies all that is told of a table for each of its columns
-    table.columns, table.attrs = pd.Index(list(columns)), {}
+    columns = _append_units(table)
+    other_sheets = table.attrs.get("other_sheets", ())
+    table.columns = pd.Index(list(columns))
+    # pandas would copy the attrs of a table to each of its columns
+    table.attrs = {}
     if table.empty:
-        raise DataError(f"{path}: holds a header and no rows; leave it out")
+        raise DataError(f"{path}: has a header and no rows; leave the file out")
     numeric_columns: dict[str, np.ndarray] = {}
     text_columns: dict[str, pd.Series] = {}
     empty_columns = []
@@ -709,7 +748,7 @@ def preview_table(path: Path, rows: int = 20_000) -> TablePreview:
 
 
 def _append_units(table: pd.DataFrame) -> dict[str, str]:
-    """Return the names of columns with the units beneath them or in cells -> their names alone."""
+    """Return the column names with units from the row below or from cells -> original names."""
     cell_units = table.attrs.get("units", ())
     names = [str(name).strip() for name in table.columns]
     unit_rows = [
@@ -720,7 +759,7 @@ def _append_units(table: pd.DataFrame) -> dict[str, str]:
     units = cell_units if any(cell_units) else units
     original_names = {}
     for name, unit_below in zip(names, [*units, *[""] * len(names)], strict=False):
-        # physicists write a quantity by its unit, `u / m/s`
+        # notation of physics: a quantity divided by its unit, `u / m/s`
         match = _NAME_OVER_UNIT.fullmatch(name)
         bare_name, unit = (
             (match["name"], _parse_unit_cell(match["unit"])) if match else (name, unit_below)
@@ -732,13 +771,13 @@ def _append_units(table: pd.DataFrame) -> dict[str, str]:
 
 
 def _parse_unit_cell(cell: str) -> str:
-    """Return the unit that a cell beneath a name holds; empty where it holds none."""
+    """Return the unit in a cell below a column name, or an empty string."""
     unit = cell.strip(" []()")
     return unit if is_unit(unit) else ""
 
 
 def _preview_excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
-    """Return the first sheet with two columns of numbers, else the first, and its settings."""
+    """Load the first sheet with two or more columns of numbers, otherwise the first sheet."""
     names = list_sheet_names(path)
     tables = {name: read_excel_sheet(path, name, rows) for name in names}
     numeric_sheets = [
@@ -752,13 +791,13 @@ def _preview_excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]
 
 @dataclass(frozen=True)
 class TableClock:
-    """The time of a table.
+    """Clock of a table.
 
     Attributes:
-        settings: `time` of a table's reader.
-        seconds: times [T] of the first rows.
-        guess: what is not sure about it; empty where all is.
-        columns: that it takes.
+        settings: `time` of the reader.
+        seconds: times of the first rows [T] in s.
+        guess: reason for a guess; empty if there is none.
+        columns: names of the columns of time and date.
     """
 
     settings: dict[str, Any]
@@ -768,7 +807,13 @@ class TableClock:
 
 
 def detect_clock(preview: TablePreview) -> TableClock:
-    """Return the time of a table."""
+    """Detect the column of time and its unit.
+
+    It is a column of dates, else a column with a word for time, else one that increases regularly.
+
+    Raises:
+        DataError: if the table has no clock, or its parts are in several columns.
+    """
     time_columns = [name for name in preview.column_names if parse_name(name).has_all("time")]
     part_columns = [
         name for name in preview.numeric_columns if normalize_name(name) in DATE_PART_NAMES
@@ -779,8 +824,8 @@ def detect_clock(preview: TablePreview) -> TableClock:
     )
     if len(part_columns) > 1 and not has_time_text:
         raise DataError(
-            f"{preview.path}: its time stands in parts ({', '.join(part_columns)}); write it as one column,"
-            " such as 2025-06-17 08:30:00.25"
+            f"{preview.path}: date and time are in several columns ({', '.join(part_columns)});"
+            " write them to one column, for example 2025-06-17 08:30:00.25"
         )
     date_columns = {
         name: cells for name, cells in preview.text_columns.items() if is_date_column(cells)
@@ -791,7 +836,7 @@ def detect_clock(preview: TablePreview) -> TableClock:
     def is_increasing(name: str) -> bool:
         values = preview.numeric_columns[name]
         finite_values = values[np.isfinite(values)]
-        # pandas writes the number of each row under no name, or the time
+        # a column without a name may be the index of pandas: row numbers or the time
         return (
             values.size > 1
             and bool((np.diff(repair_clock(finite_values, [finite_values], 1.0)[0]) > 0.0).all())
@@ -799,7 +844,7 @@ def detect_clock(preview: TablePreview) -> TableClock:
         )
 
     numeric_time_columns = [name for name in time_columns if name in preview.numeric_columns]
-    # one that is called time and does not increase is refused where it is read; a counter is none
+    # only without a column called time, others are searched; counters are excluded
     increasing_columns = [
         name
         for name in (preview.numeric_columns if not numeric_time_columns else ())
@@ -815,14 +860,14 @@ def detect_clock(preview: TablePreview) -> TableClock:
     if clock_column is None:
         if not time_columns:
             raise DataError(
-                f"{preview.path}: no column is called time or increases as time does; name it in a"
-                " channel map (--config)"
+                f"{preview.path}: no column has a name of time or increases like a clock; set it in"
+                " a channel map (--config)"
             )
         cells = [
             str(cell) for cell in preview.text_columns.get(time_columns[0], ()) if cell == cell
         ]
         unparsed_cells = [cell for cell in cells if not re.fullmatch(r"[-\d.,]+", cell)]
-        advice = "write it as numbers, or such as 2025-06-17 08:30:00.25"
+        advice = "write numbers, or dates such as 2025-06-17 08:30:00.25"
         advice = (
             advice
             if 2 * len(unparsed_cells) >= len(cells)
@@ -830,7 +875,8 @@ def detect_clock(preview: TablePreview) -> TableClock:
         )
         example = f", such as '{truncate(unparsed_cells[-1])}'" if unparsed_cells else ""
         raise DataError(
-            f"{preview.path}: column '{time_columns[0]}' holds no times that can be read{example}; {advice}"
+            f"{preview.path}: column '{time_columns[0]}' has times in an unknown notation{example};"
+            f" {advice}"
         )
     values = preview.numeric_columns[clock_column]
     unit = parse_header_unit(clock_column, "s")
@@ -838,13 +884,13 @@ def detect_clock(preview: TablePreview) -> TableClock:
     if unit is None:
         unit, guess = _guess_time_unit(values)
     if clock_column not in time_columns:
-        guess = f"no column is called time; this one increases as time does. {guess}".strip()
+        guess = f"no column has a name of time; this one increases like a clock. {guess}".strip()
     seconds = _repair_preview_clock(preview, values * to_si(unit), to_si(unit))
     return TableClock({"column": clock_column, "unit": unit}, seconds, guess, (clock_column,))
 
 
 def _relative_step_spread(values: np.ndarray) -> float:
-    """Return the spread of steps, as a share of the usual one and without the last digit."""
+    """Return the standard deviation of the steps divided by their median, with two decimals."""
     time_steps = np.diff(values[np.isfinite(values)])
     return round(float(np.std(time_steps) / np.median(time_steps)), 2)
 
@@ -852,7 +898,7 @@ def _relative_step_spread(values: np.ndarray) -> float:
 def _repair_preview_clock(
     preview: TablePreview, t: np.ndarray, clock_resolution: float | None = None
 ) -> np.ndarray:
-    """Return the times of a sheet as its reader will mend them."""
+    """Return the times [T] in s of a table with the corrections that its reader will apply."""
     is_finite = np.isfinite(t)
     if is_finite.sum() > 1 and preview.numeric_columns:
         t = t.copy()
@@ -862,7 +908,11 @@ def _repair_preview_clock(
 
 
 def _detect_date_clock(preview: TablePreview, date_columns: dict[str, pd.Series]) -> TableClock:
-    """Return the time from one column of dates with times, or from two."""
+    """Return the clock from one column of dates with times of day, or from two columns.
+
+    Raises:
+        DataError: if the dates have no time of day.
+    """
 
     def all_match(name: str, pattern: str) -> bool:
         return bool(date_columns[name].dropna().astype("string").str.contains(pattern).all())
@@ -875,7 +925,8 @@ def _detect_date_clock(preview: TablePreview, date_columns: dict[str, pd.Series]
     date_only_columns = [name for name in date_columns if name not in time_columns]
     if not time_columns:
         raise DataError(
-            f"{preview.path}: column '{date_only_columns[0]}' holds dates without a time of day"
+            f"{preview.path}: column '{date_only_columns[0]}' has dates without a time of day; add"
+            " a column with the time"
         )
     complete_columns = [
         name
@@ -891,7 +942,7 @@ def _detect_date_clock(preview: TablePreview, date_columns: dict[str, pd.Series]
     order = detect_date_order(texts)
     if order is None and (complete_columns or date_only_columns):
         order = "dmy"
-        guess = "day and month of the dates can be told apart nowhere in the first rows"
+        guess = "day and month of the dates are ambiguous in the first rows"
     settings |= {"order": order} if order in ("dmy", "mdy") else {}
     stamps = parse_texts(texts, has_only_dates=True)
     seconds = _repair_preview_clock(preview, stamps.seconds_since(int(stamps.ns[0])))
@@ -901,16 +952,14 @@ def _detect_date_clock(preview: TablePreview, date_columns: dict[str, pd.Series]
 
 
 def _guess_time_unit(values: np.ndarray) -> tuple[str, str]:
-    """Return the unit of times without one, and why it is a guess."""
+    """Guess the unit of times [T] from their size and step; return the unit and the reason."""
     finite_values = values[np.isfinite(values)]
-    step, median_size = (
-        float(np.median(np.diff(finite_values))),
-        float(np.median(np.abs(finite_values))),
-    )
-    if unix_unit_found := detect_unix_unit(finite_values):
-        return unix_unit_found, f"times of this size are Unix time in {unix_unit_found}"
+    step = float(np.median(np.diff(finite_values)))
+    median_size = float(np.median(np.abs(finite_values)))
+    if unix_unit := detect_unix_unit(finite_values):
+        return unix_unit, f"numbers of this size are Unix time in {unix_unit}"
     if step < 1e-3 and (2e4 < median_size < 7e4 or 6.5e5 < median_size < 8e5):
-        return "day", "times of this size are days as Excel and MATLAB count them"
+        return "day", "numbers of this size are the days of Excel or MATLAB"
     unit = infer_time_unit(step)
     return unit, f"the header has no unit; steps of {step:g} would be {unit}"
 
@@ -918,9 +967,15 @@ def _guess_time_unit(values: np.ndarray) -> tuple[str, str]:
 def convert_positions_to_degrees(
     preview: TablePreview, draft_notes: DraftNotes
 ) -> tuple[TablePreview, ColumnSettings]:
-    """Return a sheet with its positions as numbers of degrees, and how their columns are read.
+    """Convert columns of latitude and longitude to degrees.
 
-    Columns that hold nothing that can be read so stay what they are.
+    Args:
+        preview: first rows of a table.
+        draft_notes: receives guesses.
+
+    Returns:
+        The table with degrees, and the settings `form`, `hemisphere` and `letter_o` of its columns.
+        Tables without both columns in a known notation are unchanged.
     """
     import pandas as pd
 
@@ -955,7 +1010,7 @@ def convert_positions_to_degrees(
     if form == "ddmm":
         for entry in settings.values():
             entry["form"] = form
-        text = "numbers beyond 90 are taken as degrees and minutes in one, 5954.321 for 59° 54.321'"
+        text = "numbers above 90 are assumed degrees and minutes in one, 5954.321 for 59° 54.321'"
         draft_notes.add_guess((*CHANNELS_KEY, "latitude"), text)
     for name, hemisphere_column in hemisphere_columns.items():
         if hemisphere_column is not None:
@@ -988,10 +1043,13 @@ def convert_positions_to_degrees(
 
 
 def _guess_letter_o(preview: TablePreview, column: str) -> tuple[LetterO | None, str]:
-    """Return what O means as a hemisphere, and why; None where no longitude has it.
+    """Guess the meaning of the letter O as a hemisphere.
 
-    Beside W it is the east, and beside E the west. Alone it is as the names of columns have it:
-    the east in German and Dutch, the west in Spanish, French, Italian and Portuguese.
+    With W in other cells it means east, with E west. Otherwise the language of the column names
+    decides: east in German and Dutch, west in Spanish, French, Italian and Portuguese.
+
+    Returns:
+        The meaning and the reason; None if no longitude has the letter O.
     """
     cells = preview.text_columns.get(column)
     if cells is None:
@@ -1007,16 +1065,17 @@ def _guess_letter_o(preview: TablePreview, column: str) -> tuple[LetterO | None,
     if "O" not in letters:
         return None, ""
     if len(letters) > 1:
-        return ("east" if "W" in letters else "west"), f"O stands beside {min(letters - {'O'})}"
+        other_letter = min(letters - {"O"})
+        return ("east" if "W" in letters else "west"), f"other cells have {other_letter}"
     is_germanic = any(
         GERMANIC_PATTERN.search(normalize_name(name)) for name in preview.column_names
     )
     meaning: LetterO = "east" if is_germanic else "west"
-    return meaning, f"the letter O is taken as {meaning}, by the language of the columns' names"
+    return meaning, f"the letter O is assumed {meaning}, by the language of the column names"
 
 
 def _find_hemisphere_column(preview: TablePreview, name: str) -> str | None:
-    """Return the column that holds the letters of a channel's hemispheres; None for none."""
+    """Return the column with the hemispheres of latitude or longitude, or None."""
     for column, cells in preview.text_columns.items():
         letters = set(cells.dropna().astype("string").str.strip().str.upper()) - {""}
         if letters and letters <= _HEMISPHERES[name]:

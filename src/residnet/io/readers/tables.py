@@ -283,8 +283,8 @@ class TableConfig(ConfiguredReader, ABC):
             if not np.isfinite(yaw).any():
                 columns = [channel_maps[name].column for name in QUATERNION]
                 raise DataError(
-                    f"{path}: {', '.join(columns)} contain no quaternion, all rows are empty; remove"
-                    " them from the channel map"
+                    f"{path}: {', '.join(columns)} contain no quaternion, all rows are empty;"
+                    " remove them from the channel map"
                 )
             channels["psi"] = unwrap_angle(
                 np.pi / 2.0 - yaw if channel_maps["qw"].frame == "enu" else yaw
