@@ -120,7 +120,8 @@ def extract_segment(log: Log, start_time: float, stop_time: float) -> Log:
         DataError: if the interval has fewer than two samples.
     """
     is_inside = (log.t >= start_time - 1e-9) & (log.t < stop_time - 1e-9)
-    first_time, last_time = float(log.t[0]), float(log.t[-1])
+    first_time = float(log.t[0])
+    last_time = float(log.t[-1])
     time_range = [
         start_time if np.isfinite(start_time) else first_time,
         stop_time if np.isfinite(stop_time) else last_time,
@@ -457,10 +458,8 @@ def check_leaks(
     if not cross_split_counts.any():
         return
     largest_index = int(np.argmax(cross_split_counts))
-    (first_split, first_log), (second_split, second_log) = (
-        splits_and_logs[shared_counts.row[largest_index]],
-        splits_and_logs[shared_counts.col[largest_index]],
-    )
+    (first_split, first_log) = splits_and_logs[shared_counts.row[largest_index]]
+    (second_split, second_log) = splits_and_logs[shared_counts.col[largest_index]]
     n_identical = np.intersect1d(
         hash_measured_rows(first_log, common_channels),
         hash_measured_rows(second_log, common_channels),
@@ -552,7 +551,7 @@ def assign_log_names(paths: Iterable[Path]) -> dict[Path, str]:
 
     It is the name of the file without extension, or of the folder. Equal names are preceded by the
     names of parent folders until they are unique. Files in one folder that differ in their
-    extension are named with it.
+    extension include the extension in their names.
 
     Args:
         paths: files and recordings; duplicates are one log.

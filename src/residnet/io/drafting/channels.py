@@ -227,10 +227,8 @@ def fit_to_motion(
         # determines its factor
         column_mean = 0.0 if channel == "u" else float(column_values[is_plausible].mean())
         motion_mean = 0.0 if channel == "u" else float(motion_values[is_plausible].mean())
-        column_centred, motion_centred = (
-            column_values[is_plausible] - column_mean,
-            motion_values[is_plausible] - motion_mean,
-        )
+        column_centred = column_values[is_plausible] - column_mean
+        motion_centred = motion_values[is_plausible] - motion_mean
         covariance_sum += float(column_centred @ motion_centred)
         # the sign of r may differ between logs, if a gyro was turned over
         correlation_sum += (
@@ -269,9 +267,11 @@ def estimate_rudder_gain(
     Returns:
         The coefficient of the rudder angle and its standard error.
     """
-    rows, rate_changes = [], []
+    rows = []
+    rate_changes = []
     for log_index, table in enumerate(logs):
-        values, rate_values = table.columns.get(channel), rates.get(log_index)
+        values = table.columns.get(channel)
+        rate_values = rates.get(log_index)
         if values is None or rate_values is None:
             continue
         restoring_angle = (
@@ -285,19 +285,15 @@ def estimate_rudder_gain(
         )
         if is_finite.sum() < 50:
             continue
-        t, rudder_angles, rates_finite = (
-            remove_pauses(table.t[is_finite]),
-            values[is_finite],
-            rate_values[is_finite],
-        )
+        t = remove_pauses(table.t[is_finite])
+        rudder_angles = values[is_finite]
+        rates_finite = rate_values[is_finite]
         horizon = max(2.0, 3.0 * float(np.median(np.diff(t))))
         start_times = np.arange(t[0], t[-1] - horizon, horizon / 4)
         if start_times.size < 10:
             continue
-        initial_rate, final_rate = (
-            np.interp(start_times, t, rates_finite),
-            np.interp(start_times + horizon, t, rates_finite),
-        )
+        initial_rate = np.interp(start_times, t, rates_finite)
+        final_rate = np.interp(start_times + horizon, t, rates_finite)
         mean_rudder_angle = np.mean(
             [
                 np.interp(start_times + share * horizon, t, rudder_angles)
@@ -314,7 +310,8 @@ def estimate_rudder_gain(
         rate_changes.append(final_rate - initial_rate)
     if not rows:
         return 0.0, 1.0
-    regressors, response = np.concatenate(rows), np.concatenate(rate_changes)
+    regressors = np.concatenate(rows)
+    response = np.concatenate(rate_changes)
     scale = np.maximum(np.abs(regressors).max(axis=0), 1e-12)
     solution, *_ = np.linalg.lstsq(regressors / scale, response, rcond=1e-9)
     residual = response - (regressors / scale) @ solution
@@ -890,7 +887,8 @@ class ChannelMapper:
                 )
             )
 
-        direct, exchanged = {"u": "u", "v": "v"}, {"u": "v", "v": "u"}
+        direct = {"u": "u", "v": "v"}
+        exchanged = {"u": "v", "v": "u"}
         best_correlation = max(
             mean_correlation(earth_fixed_motions, direct),
             mean_correlation(earth_fixed_motions, exchanged),
@@ -997,7 +995,8 @@ class ChannelMapper:
             wind_speed, wind_angle = (
                 table.columns[n] * f for n, f in zip((speed, angle), factors, strict=True)
             )
-            vessel_velocity, bow_direction = self._vessel_velocity(table, motion), np.exp(1j * psi)
+            vessel_velocity = self._vessel_velocity(table, motion)
+            bow_direction = np.exp(1j * psi)
             winds = {"north": wind_speed * np.exp(1j * wind_angle)}
             for suffix, sign in (("", 1.0), (" to port", -1.0)):
                 winds[f"bow{suffix}"] = wind_speed * np.exp(1j * sign * wind_angle) * bow_direction

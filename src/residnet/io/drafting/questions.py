@@ -120,10 +120,8 @@ class DraftNotes:
                 renamed.append((key, text))
             return renamed
 
-        self.guessed_values, self.notes = (
-            rename_entries(self.guessed_values),
-            rename_entries(self.notes),
-        )
+        self.guessed_values = rename_entries(self.guessed_values)
+        self.notes = rename_entries(self.notes)
 
     def comments_at(self, key: Key) -> list[str]:
         """Return the comments on a key of the config, guesses first."""

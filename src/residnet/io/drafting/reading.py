@@ -542,7 +542,8 @@ def _name_bare_numbers(
         standard: channels of standard messages.
     """
     for name, entry in standard.items():
-        topic, field = entry.topic or "", entry.field
+        topic = entry.topic or ""
+        field = entry.field
         if name in CHANNEL_UNITS or entry.unit not in ("-", "rad") or topic not in recording.series:
             continue
         # the last part of a topic's name is the most specific one
@@ -668,7 +669,7 @@ def read_drafted(
     Args:
         paths: files.
         draft_notes: receives guesses and notes.
-        is_gridded: whether recordings get a uniform clock; otherwise that of their positions.
+        is_gridded: whether recordings get a uniform clock; otherwise the clock of their positions.
 
     Raises:
         UsageError: if the files have several formats.
@@ -714,7 +715,9 @@ def read_drafted(
             "kind": "joined",
             "parts": {part_name: part_settings[part_name] for part_name in part_order},
         }
-        result.reader, paths, result.errors = reader, [*trip_files[part_order[0]]], errors
+        result.reader = reader
+        paths = [*trip_files[part_order[0]]]
+        result.errors = errors
         result.errors |= {
             path: DataError(f"{path}: another file of its trip is missing; leave it out")
             for path in sorted(unpaired_paths)

@@ -295,7 +295,8 @@ def _preview_tables(files: Sequence[Path]) -> tuple[list[TablePreview], dict[Pat
         if len(sheet.numeric_columns) > 1
     }
     if not reader_settings:
-        path, names = previews[0].path, ", ".join(previews[0].column_names[:12])
+        path = previews[0].path
+        names = ", ".join(previews[0].column_names[:12])
         raise DataError(
             f"{path}: fewer than two columns contain numbers (columns: {names}); check the"
             " export of the table"
@@ -514,7 +515,8 @@ def match_channels(
         if (port in names) != (stbd in names):
             # a single rudder: the side is the direction of positive angles
             sided_channel = port if port in names else stbd
-            rudder, column = sided_channel.rpartition("_")[0], names.pop(sided_channel)
+            rudder = sided_channel.rpartition("_")[0]
+            column = names.pop(sided_channel)
             if names.setdefault(rudder, column) != column:
                 draft_notes.add_note(
                     CHANNELS_KEY, f"'{column}' may be {rudder} instead of '{names[rudder]}'"
@@ -707,7 +709,8 @@ def preview_table(path: Path, rows: int = 20_000) -> TablePreview:
     require_file(path)
     table_kind = TABLE_KINDS.get(path.suffix.lower(), "csv")
     if table_kind in _HEAD_READERS:
-        table, reader_settings = _HEAD_READERS[table_kind](path, rows), {"kind": table_kind}
+        table = _HEAD_READERS[table_kind](path, rows)
+        reader_settings = {"kind": table_kind}
     else:
         table, reader_settings = (
             _preview_excel(path, rows) if table_kind == "excel" else read_table_head(path, rows)
@@ -935,7 +938,8 @@ def _detect_date_clock(preview: TablePreview, date_columns: dict[str, pd.Series]
     ]
     column = (complete_columns or time_columns)[0]
     settings: dict[str, Any] = {"column": column, "unit": "date"}
-    texts, guess = date_columns[column], ""
+    texts = date_columns[column]
+    guess = ""
     if not complete_columns and date_only_columns:
         settings["date"] = date_only_columns[0]
         texts = date_columns[date_only_columns[0]].astype("string") + " " + texts.astype("string")

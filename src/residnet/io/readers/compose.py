@@ -231,7 +231,7 @@ def build_log(recording: Recording, plan: ChannelPlan, clock: ClockConfig) -> Lo
     """Build a log from a recording with aligned clocks.
 
     If the recording has dates, time starts at 0 and `meta["epoch"]` is the Unix time in s;
-    otherwise time is that of the recording. psi starts in [0, 2 pi). Samples without a value of any
+    otherwise the log has the time of the recording. psi starts in [0, 2 pi). Samples without a value of any
     state channel have the mask `hard:gap`.
 
     Args:
@@ -284,7 +284,7 @@ def build_log(recording: Recording, plan: ChannelPlan, clock: ClockConfig) -> Lo
 
 
 def _extract_all_topics(recording: Recording, plan: ChannelPlan) -> list[TopicChannels]:
-    """Return the channels of all topics in a plan, that of the position first."""
+    """Return the channels of all topics in a plan, the position first."""
     topics = []
     if plan.position is not None:
         topics.append(extract_position(recording, plan.position))
@@ -575,7 +575,8 @@ def _transform_to_vessel_origin(
                 " origin; set `heading`"
             )
         north, east = rotate(antenna.x, antenna.y, values["psi"])
-        values["x"], values["y"] = values["x"] - north, values["y"] - east
+        values["x"] = values["x"] - north
+        values["y"] = values["y"] - east
     if not isinstance(velocity, EarthFixedVelocity | CourseSpeedVelocity):
         return
     if "psi" not in values:
@@ -592,7 +593,8 @@ def _transform_to_vessel_origin(
             )
         # velocity of a point P of a rigid body: u_P = u - r y, v_P = v + r x
         u, v = u + values["r"] * velocity.antenna.y, v - values["r"] * velocity.antenna.x
-    values["u"], values["v"] = u, v
+    values["u"] = u
+    values["v"] = v
 
 
 def _differentiate_pose(

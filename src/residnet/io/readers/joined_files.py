@@ -68,7 +68,7 @@ class JoinedConfig(ConfiguredReader):
     parts are resampled to this clock: averaged from a higher rate, held from a lower rate.
 
     Attributes:
-        parts: word in the file name -> reader of these files, that of the motion first.
+        parts: word in the file name -> reader of these files, the motion first.
         shift: word -> time in s to add to the clock of this part. Parts without an entry are joined
             by their dates or Unix times, otherwise by the estimated clock offset.
     """
@@ -321,10 +321,8 @@ def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
 
     def explained_share(shift: float) -> float:
         shifted_times = t - shift
-        block_start, block_end = (
-            shifted_times[blocks.starts],
-            shifted_times[blocks.starts + block_length],
-        )
+        block_start = shifted_times[blocks.starts]
+        block_end = shifted_times[blocks.starts + block_length]
         in_range = (block_start >= other_log.t[0]) & (block_end <= other_log.t[-1])
         if (
             in_range.sum()
@@ -346,7 +344,8 @@ def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
             integrate_columns(w, w * np.abs(w), w * u)[in_range]
             for w in map(interpolate_signal, input_signals)
         ]
-        regressors, response = np.concatenate(columns, axis=1), velocity_change[in_range]
+        regressors = np.concatenate(columns, axis=1)
+        response = velocity_change[in_range]
         regressors = regressors / np.maximum(np.abs(regressors).max(axis=0), 1e-12)
         residual = response - regressors @ np.linalg.lstsq(regressors, response, rcond=1e-9)[0]
         # blocks outside of the other log count as unexplained
@@ -354,10 +353,8 @@ def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
             (squared_motion_residual[in_range].sum() - (residual**2).sum()) / total_variance
         )
 
-    lower_shift, upper_shift = (
-        t[0] - other_log.t[-1] + min_overlap,
-        t[-1] - other_log.t[0] - min_overlap,
-    )
+    lower_shift = t[0] - other_log.t[-1] + min_overlap
+    upper_shift = t[-1] - other_log.t[0] - min_overlap
     coarse_shifts = np.arange(
         lower_shift, max(upper_shift, lower_shift + _COARSE_STEP), _COARSE_STEP
     )

@@ -29,7 +29,8 @@ _EAST_TO_NORTH = (-1.0, math.pi / 2.0)
 _EARTH_CHANNELS = ("x", "y", "z", "psi", "wind_dir", "current_north", "current_east")
 QUATERNION = ("qx", "qy", "qz", "qw")
 """Channels with the parts of a quaternion, from which tables without a heading derive it."""
-COSINE_SUFFIX, SINE_SUFFIX = "_cos", "_sin"
+COSINE_SUFFIX = "_cos"
+SINE_SUFFIX = "_sin"
 """Suffixes of channels with the cosine and the sine of an angle."""
 _FORWARD_CHANNELS = ("u", "p", "phi", "u_dot", "tau_x")
 _STARBOARD_OR_DOWN_CHANNELS = ("v", "r", "w", "q", "theta", "v_dot", "r_dot", "tau_y", "tau_n")
@@ -486,8 +487,8 @@ class TopicClock(Config):
     """Clock with the samples of one topic, which need not be uniform.
 
     Attributes:
-        topic: topic; null takes that of the position, else of the heading, else of the first
-            channel.
+        topic: topic; null takes the topic of the position, else of the heading, else of the
+            first channel.
     """
 
     kind: Literal["topic"] = "topic"

@@ -361,7 +361,8 @@ def read_table_head(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]
         )
         decimal = "," if n_decimal_commas > n_decimal_points else "."
         names = make_names_unique(cells[header_row])
-        comments, n_rows_seen = [], 0
+        comments = []
+        n_rows_seen = 0
         for line, block, _ in _iter_line_blocks(file):
             skipped_lines = _find_comment_lines(
                 block, delimiter, cells[header_row], n_lines_above - line
@@ -584,7 +585,7 @@ def _has_repeated_cells(row: Sequence[str]) -> bool:
 
 
 def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tuple[bool, list[int]]:
-    """Check that every line has as many cells as the header.
+    """Check that every line has the same number of cells as the header.
 
     pandas fills short lines with NaN and shifts cells silently. Blank lines are accepted, and so is
     an additional or a missing delimiter at the end of all lines.

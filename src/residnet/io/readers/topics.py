@@ -218,7 +218,8 @@ def _repair_order(topic: Series, n_backward: int, max_backward_step: float) -> S
         n_backward <= max(1.0, _MAX_UNORDERED_SHARE * len(topic))
         and max_backward_step <= _MAX_BACKWARD_STEP
     )
-    arrival, stamp = topic.arrival, topic.stamp
+    arrival = topic.arrival
+    stamp = topic.stamp
     if (
         stamp is not None
         and arrival is not None
@@ -256,7 +257,8 @@ def topic_statistics(series: Series) -> list[Remark]:
     if len(series) < 3:
         return remarks
     step = np.diff(series.clock)
-    median_step, max_step = float(np.median(step)), float(step.max())
+    median_step = float(np.median(step))
+    max_step = float(step.max())
     rate = (len(series) - 1) / float(series.clock[-1] - series.clock[0])
     text = (
         f"topic {series.name}: {len(series)} rows, {rate:.3g} Hz, median step {median_step:.3g} s,"

@@ -29,7 +29,8 @@ from residnet.io.readers.recording import (
     build_recording,
 )
 
-_BINARY_MAGIC, _TEXT_MAGIC = b"\xa3\x95\x80", b"FMT,"
+_BINARY_MAGIC = b"\xa3\x95\x80"
+_TEXT_MAGIC = b"FMT,"
 """First bytes of binary and of text logs: the message that defines messages."""
 _CLOCK_FIELDS_NS = {"TimeUS": 1_000, "TimeMS": 1_000_000, "T": 1_000_000}
 """Field of the time since boot -> its unit in ns."""
@@ -41,8 +42,8 @@ _MIN_UNIX_TIME = 100_000_000.0
 class ArduPilotConfig(RecordingConfig):
     """Reader of ArduPilot dataflash logs.
 
-    The name of a series is that of the message (`ATT`, `GPS`, the second instance `GPS_1`). The
-    names of fields are those of ArduPilot.
+    A series has the name of its message (`ATT`, `GPS`, the second instance `GPS_1`). Fields have the
+    names of ArduPilot.
     """
 
     kind: Literal["ardupilot"] = "ardupilot"

@@ -249,7 +249,8 @@ def _build_tree_recording(
         )
     fields: dict[str, dict[str, np.ndarray]] = {group: {} for group in clocks}
     remarks: list[Remark] = []
-    unassigned, assigned_by_length = [], []
+    unassigned = []
+    assigned_by_length = []
     for name, values in leaves.items():
         group = _find_clock_group(name, values, clocks)
         if group is None:

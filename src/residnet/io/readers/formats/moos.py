@@ -42,7 +42,9 @@ class MoosConfig(RecordingConfig):
         require_file(path)
         times: dict[tuple[str, str], array[float]] = defaultdict(lambda: array("d"))
         values: dict[tuple[str, str], array[float]] = defaultdict(lambda: array("d"))
-        epoch, bytes_read, size = None, 0, path.stat().st_size
+        epoch = None
+        bytes_read = 0
+        size = path.stat().st_size
         with path.open("rb") as stream, reading_progress(path.name, size, size) as advance:
             for count, line in enumerate(stream):
                 bytes_read += len(line)
@@ -54,7 +56,8 @@ class MoosConfig(RecordingConfig):
                 if match is None:
                     continue
                 try:
-                    time, value = float(match["time"]), float(match["value"])
+                    time = float(match["time"])
+                    value = float(match["value"])
                 except ValueError:
                     continue
                 source_and_name = (
@@ -70,7 +73,8 @@ class MoosConfig(RecordingConfig):
             )
         series: dict[str, Series] = {}
         for (source, name), clock in times.items():
-            stamp, samples = np.array(clock), np.array(values[source, name])
+            stamp = np.array(clock)
+            samples = np.array(values[source, name])
             same_source = series.get(source)
             if same_source is None or np.array_equal(same_source.clock, stamp):
                 fields = {**(same_source.fields if same_source else {}), name: samples}

@@ -57,8 +57,7 @@ def _contains_sentence(path: Path, head: bytes) -> bool:
 class NmeaConfig(RecordingConfig):
     """Reader of NMEA 0183 text with one sentence per line, with or without a time before it.
 
-    The name of a series is that of the sentence (`RMC`, `HDT`). The names of fields are those of
-    pynmea2; `latitude` and `longitude` are signed degrees, `rate_of_turn` is in deg/s (deg/min in
+    A series has the name of its sentence (`RMC`, `HDT`). Fields have the names of pynmea2; `latitude` and `longitude` are signed degrees, `rate_of_turn` is in deg/s (deg/min in
     the sentence).
     """
 
@@ -176,7 +175,8 @@ class _SentenceCollector:
     def _parse_time(self, message: Any) -> int | None:
         """Return the time of a sentence in ns, or None; Unix time after the first date."""
         try:
-            time_of_day, date = message.timestamp, _sentence_date(message)
+            time_of_day = message.timestamp
+            date = _sentence_date(message)
         except (AttributeError, ValueError, TypeError):
             return None
         if not isinstance(time_of_day, datetime.time):
@@ -184,7 +184,8 @@ class _SentenceCollector:
         seconds = (time_of_day.hour * 60 + time_of_day.minute) * 60 + time_of_day.second
         ns = seconds * 10**9 + time_of_day.microsecond * 1000
         if date is not None:
-            self._day_ns, self._has_date = (date - datetime.date(1970, 1, 1)).days * _DAY_NS, True
+            self._day_ns = (date - datetime.date(1970, 1, 1)).days * _DAY_NS
+            self._has_date = True
         day = self._day_ns or 0
         if self._ticks and date is None and day + ns < self._ticks[-1] - _DAY_NS // 2:
             # midnight before the next sentence with a date

@@ -27,8 +27,8 @@ from residnet.io.readers.recording import (
 class UlogConfig(RecordingConfig):
     """Reader of PX4 ULog files.
 
-    The name of a series is that of the message (`vehicle_local_position`, the second instance
-    `vehicle_gps_position_1`). The names of fields are those of PX4. The parts `q[0]` to `q[3]` of a
+    A series has the name of its message (`vehicle_local_position`, the second instance
+    `vehicle_gps_position_1`). Fields have the names of PX4. The parts `q[0]` to `q[3]` of a
     quaternion are also called `q.w`, `q.x`, `q.y`, `q.z`. Integer latitudes and longitudes in
     1e-7 deg become degrees.
     """
