@@ -81,7 +81,8 @@ def repair_clock(
 
     - Numbers of the form hhmmss (83059.8 for 8:30:59.8) become seconds.
     - A counter that overflows restarts at zero; its range is added from there on.
-    - The hour by which a clock of dates is set back in autumn is added, the hour in spring is subtracted.
+    - The hour by which a clock of dates is set back in autumn is added, the hour in spring is
+      subtracted.
     - Rows with one stamp are spread over the time to the next stamp if the clock is coarser than
       the rows; copies of rows are not spread.
 

@@ -231,8 +231,8 @@ def build_log(recording: Recording, plan: ChannelPlan, clock: ClockConfig) -> Lo
     """Build a log from a recording with aligned clocks.
 
     If the recording has dates, time starts at 0 and `meta["epoch"]` is the Unix time in s;
-    otherwise the log has the time of the recording. psi starts in [0, 2 pi). Samples without a value of any
-    state channel have the mask `hard:gap`.
+    otherwise the log has the time of the recording. psi starts in [0, 2 pi). Samples without a
+    value of any state channel have the mask `hard:gap`.
 
     Args:
         recording: recording with one clock for all topics.

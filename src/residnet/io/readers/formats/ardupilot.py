@@ -42,8 +42,8 @@ _MIN_UNIX_TIME = 100_000_000.0
 class ArduPilotConfig(RecordingConfig):
     """Reader of ArduPilot dataflash logs.
 
-    A series has the name of its message (`ATT`, `GPS`, the second instance `GPS_1`). Fields have the
-    names of ArduPilot.
+    A series has the name of its message (`ATT`, `GPS`, the second instance `GPS_1`). Fields have
+    the names of ArduPilot.
     """
 
     kind: Literal["ardupilot"] = "ardupilot"

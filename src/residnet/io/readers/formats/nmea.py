@@ -57,8 +57,9 @@ def _contains_sentence(path: Path, head: bytes) -> bool:
 class NmeaConfig(RecordingConfig):
     """Reader of NMEA 0183 text with one sentence per line, with or without a time before it.
 
-    A series has the name of its sentence (`RMC`, `HDT`). Fields have the names of pynmea2; `latitude` and `longitude` are signed degrees, `rate_of_turn` is in deg/s (deg/min in
-    the sentence).
+    A series has the name of its sentence (`RMC`, `HDT`). Fields have the names of pynmea2;
+    `latitude` and `longitude` are signed degrees, `rate_of_turn` is in deg/s (deg/min in the
+    sentence).
     """
 
     kind: Literal["nmea"] = "nmea"
