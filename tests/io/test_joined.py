@@ -99,13 +99,13 @@ def test_what_is_no_trip_or_cannot_be_joined_is_told(ship_logs: list[Log], tmp_p
         wrong["board [s]"] = acts["board [s]"]
         _, told, _ = found(tmp_path / name, gnss=fixes, motors=wrong)
         assert told[0].startswith("will mislead: "), name
-        assert told[0].endswith("give `shift: {motors: ...}`"), name
+        assert told[0].endswith("set `shift: {motors: ...}`"), name
     _, told, _ = found(tmp_path / "short", gnss=fixes[:10], motors=acts[:30])
-    assert "too short to tell); both are taken to begin together" in told[0]
+    assert "too short for an estimate); both files are assumed to start at the same time" in told[0]
     # a board whose clock is three seconds wrong, by dates
     dated = acts.assign(**{"board [s]": 1.75e9 - 3.0 + ship_logs[0].t})
     _, told, _ = found(tmp_path / "dated", gnss=fixes, motors=dated)
-    assert "will mislead: motors: joined by the dates of both, which are -" in told[0]
+    assert "will mislead: motors: joined by the dates of both, which differ by -" in told[0]
     dated["board [s]"] += 3.0
     _, told, _ = found(tmp_path / "clock", gnss=fixes, motors=dated)
     assert told == ["note: motors: joined by the dates of both"]

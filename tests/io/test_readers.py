@@ -115,7 +115,7 @@ ROWS = "t,u,v\n0,1,2\n1,1,2\n"
         ("t,u,w\n0,1,2\n1,1,2\n", UsageError, ["no column 'v'"]),
         ("t,u,v2\n0,1,2\n1,1,2\n", UsageError, ["no column 'v'", "did you mean 'v2'?"]),
         ("t;u;v\n0;1;2\n", UsageError, ["no column 't'", "delimiter"]),
-        ("t,u,u,v\n0,1,1,2\n1,1,1,2\n", DataError, ["column 'u' stands 2 times"]),
+        ("t,u,u,v\n0,1,1,2\n1,1,1,2\n", DataError, ["column 'u' 2 times"]),
         ("t,u,v\n0,1,2\n1,1.2x,2\n", DataError, ["line 3, column 'u'", "'1.2x'"]),
         ("t,u,v\n0,1,2\n1,inf,2\n", DataError, ["line 3, column 'u'", "finite"]),
         ("t,u,v\n0,,2\n1,,2\n", DataError, ["column 'u' (channel u) holds no number"]),

@@ -225,7 +225,7 @@ def test_chunks_of_a_topic_give_the_whole(tmp_path: Path, monkeypatch: pytest.Mo
         gyro={"time": printed(ns, "unpadded"), "data": cells, "header_frame_id": ["bow"] * 2000},
     )
     whole = read(place, channels={"r": field("gyro", "rad/s")})
-    monkeypatch.setattr("residnet.io.readers.formats.topic_folder.LARGE", 0)
+    monkeypatch.setattr("residnet.io.readers.formats.topic_folder.LARGE_FOLDER_BYTES", 0)
     pieces = read(place, channels={"r": field("gyro", "rad/s")})
     np.testing.assert_array_equal(pieces.t, whole.t)
     np.testing.assert_array_equal(pieces["r"], whole["r"])
