@@ -28,7 +28,7 @@ class Assessment:
     split: Mapping[str, Sequence[str]] | None = None
 
     def content(self) -> dict[str, Any]:
-        """Return the entries of the card; null stands for what is not known."""
+        """Return the entries of the card; null means unknown."""
         split: dict[str, list[str]] | None = None
         if self.split is not None:
             split = {"identification": [], "validation": [], "test": []}

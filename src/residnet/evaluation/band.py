@@ -25,18 +25,17 @@ def band_channels(states: np.ndarray, position_radius: np.ndarray) -> np.ndarray
 
 
 class BandsConfig(Config):
-    """Settings of the bands of free runs.
+    """Settings of the prediction intervals of free runs.
 
-    A band is calibrated on logs that its model was not fitted on: on the training logs, fold by
-    fold, by models that leave the fold out, and on the validation logs by the model itself. Only
-    what is fitted in closed form is fitted again; a refit through rollouts takes one step of
-    Gauss-Newton for each fold.
+    Intervals are calibrated on logs that the model was not fitted to: on the training logs by
+    K-fold cross-validation, and on the validation logs by the model itself. Only closed-form models
+    are fitted again; a refit through rollouts takes one Gauss-Newton step per fold.
 
     Attributes:
-        level: share of the samples that the bands are to hold.
-        folds: number of groups that the training logs are left out by.
-        every: time between the starts of the runs that calibrate protocols of windows, in s.
-        seed: of the division into folds.
+        level: nominal coverage by sample.
+        folds: number of folds of the training logs.
+        every: time between the starts of the calibration runs of window protocols, in s.
+        seed: seed of the division into folds.
     """
 
     level: float = Field(default=0.9, gt=0.5, lt=1)
@@ -52,13 +51,13 @@ _MAX_STANDARD_SCORE = 2.5
 
 
 def running_mean_squares(states: np.ndarray, step: float) -> np.ndarray:
-    """Return the mean squares so far of what moves, then of its rates [L, 2 n].
+    """Return running mean squares of the velocities and their derivatives [L, 2 n].
 
-    They tell how lively a run is.
+    They measure the intensity of the motion.
 
     Args:
-        states: predicted [L + 1, 3 + n], from the initial state on.
-        step: in s.
+        states: predicted states [L + 1, 3 + n], including the initial state.
+        step: time step in s.
     """
     nu = states[:, DYNAMIC_STATES]
     velocities_and_rates = np.concatenate((nu[1:], np.diff(nu, axis=0) / step), axis=1)
@@ -121,9 +120,10 @@ _MAX_SCORES_PER_LOG = 5.0
 
 
 def compute_run_weights(log_names: Sequence[str]) -> np.ndarray:
-    """Return the weight of each run [W]; those of a log weigh the root of their number together.
+    """Return the weight of each run [W].
 
-    Long logs would otherwise speak for the short ones, whose manoeuvres are often the livelier.
+    The runs of a log share a total weight of the square root of their number. Otherwise long logs
+    would dominate short ones, which often hold stronger manoeuvres.
     """
     _, log_indices, runs_per_log = np.unique(log_names, return_inverse=True, return_counts=True)
     weights = 1.0 / np.sqrt(runs_per_log[log_indices])
@@ -158,7 +158,8 @@ def effective_sample_size(
     """Return how many independent scores the runs hold, from how logs differ in their coverage.
 
     Args:
-        coverage: share of each run's samples that a quantile holds [W]; NaN where nothing is scored.
+        coverage: share of each run's samples that a quantile holds [W]; NaN where nothing is
+            scored.
         weights: of each run [W].
     """
     _, log_indices = np.unique(log_names, return_inverse=True)
@@ -198,27 +199,28 @@ _MAX_LOG_FACTOR = 2.0
 
 @dataclass(frozen=True)
 class Band:
-    """Half widths of the errors of a model's free runs, by channel [c].
+    """Prediction intervals of the errors of a model's free runs, by channel [c].
 
-    A half width at horizon k is `width[k]` times a factor by how lively the run has been so far.
+    The half width at horizon k is `width[k]` times a factor that depends on the intensity of the
+    motion up to k.
 
     Attributes:
-        level: share of the samples that it is to hold.
-        step: in s.
-        steps: horizons of the tables, numbers of steps [G], ascending.
-        half_width: half widths of a run of usual liveliness [G, c], SI and rad.
-        unconditional_width: half widths that take every run for the same [G, c].
-        simultaneous_factor: factors [c] by which a band grows that is to hold a whole run.
-        constant_width: half widths [c] that are the same at all horizons, for comparison.
-        score_unit: root mean square errors of `constant_velocity` [c], which scores are given in.
-        intensity: measures of liveliness; None where the band knows none.
-        slope: logarithm of the factor by each measure [2 n, c].
-        n_logs: number of logs that calibrated it.
-        n_scores: of independent scores among them.
-        cautions: whole sentences about what the band does not promise.
-        typical_spread: root mean square [G, c] over the runs that calibrated it of how far unlike models lie
-            apart; None where there are none.
-        channels: their names.
+        level: nominal coverage by sample.
+        step: time step in s.
+        steps: horizons of the tables in time steps [G], ascending.
+        half_width: half widths of a run of typical intensity [G, c], SI and rad.
+        unconditional_width: half widths that ignore the intensity [G, c].
+        simultaneous_factor: factors [c] on the half widths so that they cover whole runs.
+        constant_width: half widths [c] that are constant over the horizon, for comparison.
+        score_unit: root mean square constant-velocity errors [c], the unit of interval scores.
+        intensity: statistics of the intensity measures; None if the widths ignore it.
+        slope: log factor per standardised intensity measure [2 n, c].
+        n_logs: number of logs that calibrated the intervals.
+        n_scores: equivalent number of independent calibration scores.
+        cautions: sentences on the limits of the intervals.
+        typical_spread: root mean square standard deviation between ensemble members [G, c] over the
+            calibration runs; None without an ensemble.
+        channels: names of the channels.
     """
 
     level: float
@@ -240,11 +242,11 @@ class Band:
     def half_widths(self, states: np.ndarray, spread: np.ndarray | None = None) -> np.ndarray:
         """Return half widths [L, c] along a run with predicted states [L + 1, 3 + n].
 
-        Beyond the longest calibrated horizon they grow in proportion to time. By what unlike models
-        lie farther apart than they usually do, a prediction errs besides: variances add up.
+        Beyond the longest calibrated horizon they grow in proportion to time. A disagreement of the
+        ensemble members above its typical value adds to the variance.
 
         Args:
-            spread: standard deviation between unlike models [L, c]; None where there are none.
+            spread: standard deviation between ensemble members [L, c]; None without an ensemble.
         """
         intensities = self.intensity.standardize_run(states, self.step)
         half_widths = self.interpolate(self.half_width, len(intensities)) * width_factors(
@@ -346,12 +348,12 @@ class Band:
 def excess_disagreement(
     spread: np.ndarray, typical_spread: np.ndarray, level: float, channels: Sequence[str]
 ) -> np.ndarray:
-    """Return the squared half widths [..., c] of what a spread [..., c] has beyond the usual one.
+    """Return the squared half widths [..., c] due to a spread [..., c] above the typical one.
 
     Args:
-        spread: standard deviations between unlike models; that of the position is per axis.
-        typical_spread: their root mean square over runs.
-        level: share of normal errors that the widths are to hold.
+        spread: standard deviations between ensemble members; per axis for the position.
+        typical_spread: their root mean square over the calibration runs.
+        level: nominal coverage of normal errors.
     """
     is_radial = np.array([name == "position" for name in channels])
     normal_quantile = NormalDist().inv_cdf(0.5 + level / 2.0)

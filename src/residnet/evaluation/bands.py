@@ -44,15 +44,15 @@ _MASKED_CHANNELS = tuple(PLANAR_LAYOUT.band_channels.index(name) for name in ("u
 
 @dataclass(frozen=True)
 class RunErrors:
-    """What a free run of L samples after the first got wrong, and how it moved.
+    """Errors and motion of a free run of L steps.
 
     Attributes:
         log: name of the log.
-        manoeuvre: its kind.
-        error: absolute errors [L, c] by channel, NaN where they are not scored.
-        states: predicted [L + 1, 3 + n], from the initial state on.
-        spread: standard deviation between unlike models [L, c]; None where there are none.
-        dof: what moves, by which channels are.
+        manoeuvre: kind of manoeuvre.
+        error: absolute errors [L, c] by channel, NaN for samples that are not scored.
+        states: predicted states [L + 1, 3 + n], including the initial state.
+        spread: standard deviation between ensemble members [L, c]; None without an ensemble.
+        dof: degrees of freedom, which determine the channels.
     """
 
     log: str
@@ -176,12 +176,12 @@ def count_coverage(runs: Sequence[RunErrors], band: Band) -> BandCounts:
 def band_limits(states: np.ndarray, half_width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower and upper limits [L + 1, 3 + n] of predicted states.
 
-    The initial state is given, and has no width. Limits of x and y are those of the box about the
-    circle that holds the position.
+    The initial state is given and has zero width. The limits of x and y bound the circle of the
+    position interval.
 
     Args:
-        states: predicted [L + 1, 3 + n], from the initial state on.
-        half_width: half widths [L, c] after it.
+        states: predicted states [L + 1, 3 + n], including the initial state.
+        half_width: half widths [L, c] of the later samples.
     """
     half_widths_of_states = np.zeros_like(states)
     half_widths_of_states[1:, VELOCITIES] = half_width[:, :3]
@@ -192,7 +192,7 @@ def band_limits(states: np.ndarray, half_width: np.ndarray) -> tuple[np.ndarray,
 
 
 MIN_LOGS = 9
-"""Logs below which no band can promise 90 % whatever errors are distributed like."""
+"""Smallest number of logs that can guarantee 90 % coverage for any error distribution."""
 _MAX_HORIZONS = 100
 """Horizons that half widths are kept at."""
 _SMOOTHING_SHARE = 0.11
@@ -202,7 +202,7 @@ _SLOPE_RIDGE = 0.02
 _ALTERNATIONS = 2
 """Turns of shape and slopes, each given the other; chosen by hand."""
 _SCALE_FOLDS = 5
-"""Groups of logs whose errors are scaled by what the others say."""
+"""Number of folds of the cross-fitted error scales."""
 _HORIZON_STRIDE = 3
 """Of so many horizons one says how liveliness acts."""
 _NEWTON_STEPS = 8
@@ -363,9 +363,9 @@ def _fit_scale(runs: _CalibrationRuns) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cross_fitted_scales(runs: _CalibrationRuns) -> np.ndarray:
-    """Return the scale [W, G, c] of every run's errors as the runs of other logs have it.
+    """Return cross-fitted error scales [W, G, c], each estimated from the runs of other logs.
 
-    A scale that has seen a run would take its errors for smaller than those of runs to come.
+    A scale estimated from the run itself would understate the errors of new runs.
     """
     _, log_indices = np.unique(runs.names, return_inverse=True)
     fold_indices = log_indices % _SCALE_FOLDS
@@ -421,7 +421,7 @@ def _normalized_quantiles(runs: _CalibrationRuns, scale: np.ndarray, level: floa
 
 
 def _smooth_over_horizons(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Return moving means [G, c] over neighbouring horizons; gaps are filled from beside them."""
+    """Return moving means [G, c] over neighbouring horizons; gaps take the values of neighbours."""
     half_window = 0.5 * _SMOOTHING_SHARE * steps[-1]
     # the first steps, where errors begin, are smoothed over what lies as near as the start itself
     half_windows = np.minimum(half_window, steps - 1 + 0.5)

@@ -26,25 +26,25 @@ _FROUDE_EXPONENTS = {"m": 1.0, "s": 0.5, "m/s": 0.5, "rad/s": -0.5, "rad": 0.0, 
 
 
 class BookletConfig(Config):
-    """A manoeuvring booklet by one of the fit's refitted baselines.
+    """Settings of a manoeuvring booklet, simulated with one refitted baseline.
 
-    Parameters are drawn from what the refit leaves open; every draw flies every manoeuvre, and the
-    intervals are those of the indices. They know the model's form to be right and speak of nothing
-    else, so that they are short where the form is wrong.
+    Parameters are drawn from their posterior distribution. Every draw performs every manoeuvre,
+    which gives prediction intervals of the indices. The intervals assume a correct model structure;
+    they are too narrow if it is wrong.
 
     Attributes:
         model: name of the baseline.
-        length: of the hull, in the scale of the logs.
-        scale: of the ship to what was measured (Froude's law); 1 for the ship itself.
-        inputs: of the model, by their share in drive and steer, with limits and rates.
-        initial: states (by name) that manoeuvres start from.
+        length: length of the hull in the scale of the logs, m.
+        scale: scale of the ship over that of the logs (Froude's law); 1 for full-scale logs.
+        inputs: inputs of the model with their shares of drive and steer, limits and rates.
+        initial: initial states by name.
         manoeuvres: standard manoeuvres.
-        duration: of manoeuvres that give none, or the time after which one has failed.
-        repeat: splits whose measured zigzags the model repeats in closed loop, with the rudder
-            angles and reversals of each.
-        draws: of the parameters.
-        level: of the intervals.
-        seed: of the draws.
+        duration: duration of manoeuvres without an own one, and time limit of the others.
+        repeat: splits whose measured zigzags are repeated in closed loop with the measured rudder
+            angles and reversals.
+        draws: number of parameter draws.
+        level: level of the prediction intervals.
+        seed: seed of the draws.
     """
 
     model: str
@@ -85,17 +85,17 @@ class BookletConfig(Config):
 
 @dataclass(frozen=True)
 class BookletPage:
-    """A page of the booklet, for one manoeuvre.
+    """Results of one manoeuvre.
 
     Attributes:
-        name: of it.
-        manoeuvre: what was flown.
-        runs: with the fitted parameters, then with drawn ones.
-        indices: of each flight; empty where it had a fault or diverged.
-        limits: of IMO, for the ship.
-        measured_log: the log that was repeated; None for a standard manoeuvre.
-        split: of that log.
-        measured_indices: its indices.
+        name: name of the page.
+        manoeuvre: the simulated manoeuvre.
+        runs: simulation with the estimated parameters, then with drawn ones.
+        indices: indices of each run; empty for a failed or diverged run.
+        limits: limits of IMO for the ship.
+        measured_log: measured log that was repeated; None for a standard manoeuvre.
+        split: split of that log.
+        measured_indices: indices of that log.
     """
 
     name: str
@@ -111,12 +111,12 @@ class BookletPage:
 def build_booklet(
     model: str, length: float, scale: float, draws: int, level: float, pages: Sequence[BookletPage]
 ) -> BookletFile:
-    """Return the contents of booklet.json, SI and rad, in the scale of the logs.
+    """Return the contents of booklet.json in SI units and rad, in the scale of the logs.
 
-    `ship` beside an index is its value for the ship.
+    The `ship` value of an index is in the scale of the ship.
 
     Args:
-        length: of the hull in the scale of the logs, m.
+        length: length of the hull in the scale of the logs, m.
     """
     rows = [_page_row(page, length, scale, level) for page in pages]
     index_names = sorted({name for row in rows for name in row["indices"]})
@@ -152,8 +152,9 @@ def _page_row(page: BookletPage, length: float, scale: float, level: float) -> d
 def _index_summary(
     page: BookletPage, name: str, length: float, scale: float, level: float
 ) -> dict[str, Any]:
-    """`value` of the fitted parameters, `interval` over draws, and what there is of `lengths`,
-    `measured_log`, `difference`, `limit`, `kept`.
+    """Return one index: `value`, `interval` over draws and, if available, the optional fields.
+
+    The optional fields are `lengths`, `measured`, `difference`, `limit` and `kept`.
     """
     value = float(page.indices[0][name])
     draws = np.array(

@@ -29,11 +29,11 @@ from residnet.evaluation.protocol import Window
 from residnet.preprocessing.prepare import PreparedLog
 
 _MAX_LENGTH_RATIO = 4
-"""Times its own length that a window may be kept going beside longer ones."""
+"""Largest ratio of window lengths in one batch; shorter windows run on in vain."""
 _MAX_BATCH_NUMBERS = 30_000_000
 """Numbers that the windows of a batch may hold."""
 _MEASURED_SPEED_MARGIN = 2.0
-"""Times what the vessel itself did in a window that a prediction may reach."""
+"""Factor on the measured maximum of a window below which no run has diverged."""
 
 
 @dataclass(frozen=True)
@@ -41,22 +41,19 @@ class Candidate:
     """A model to evaluate.
 
     Attributes:
-        name: unique in a run.
+        name: unique name in a run.
         model_kind: constant_velocity, baseline, head, plant or ensemble.
-        model: the dynamics; float64 parameters are run in float64.
-        state_names: names of the columns of the model's state; those of the prepared logs where empty.
-            What is not among these (actuators) starts from the log's channel.
-        input_names: channels of the log that make w; None for the prepared inputs.
-        n_zero_inputs: inputs after those that are held at zero (disturbances that the model is not told
-            about).
-        reference: name of the model that this one is compared with, window by window; None for
-            none.
-        training_ranges: smallest and largest training value of each velocity and input; empty where they
-            are not known.
-        bands: of its free runs by protocol; empty where there are none.
-        members: models beside it whose free runs it is the mean of; empty for none.
-        spread_members: models beside it that lie apart where the logs of the fit do not tell the motion;
-            empty for none.
+        model: the dynamics; a model with float64 parameters runs in float64.
+        state_names: names of the model's states; empty for the states of the prepared logs. Further
+            states (actuators) start from the log's channels.
+        input_names: channels of the log that form w; None for the prepared inputs.
+        n_zero_inputs: number of further inputs that are zero (unmeasured disturbances).
+        reference: name of the model of the paired comparison; None for none.
+        training_ranges: smallest and largest training value of each velocity and input; empty if
+            unknown.
+        bands: prediction intervals by protocol; may be empty.
+        members: members of an ensemble of trajectories; empty for a single model.
+        spread_members: models whose disagreement measures extrapolation; empty for none.
     """
 
     name: str
@@ -74,11 +71,11 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Prediction:
-    """A prediction of one model for one window.
+    """Prediction of one model for one window.
 
-    States [L, 3 + n] hold what moves in the model and the pose integrated from it; `has_diverged`
-    says whether the free run ran away. `spread` [L - 1, c] is the standard deviation between unlike
-    models by channel of a band, from the first step on; None where there are none.
+    States [L, 3 + n] hold the velocities of the model and the integrated pose. `has_diverged` flags
+    a diverged free run. `spread` [L - 1, c] is the standard deviation between ensemble members by
+    channel from the first step on; None without an ensemble.
     """
 
     states: np.ndarray
@@ -101,17 +98,17 @@ class FreeRun:
 
 @dataclass(frozen=True)
 class FreeRunErrors:
-    """Errors of one model's free runs, the samples of all W windows one after the other.
+    """Errors of one model's free runs, the samples of all W windows concatenated.
 
-    u, v and the position are scored over usable samples; r, the heading and the roll, which no
-    position sensor disturbs, over all.
+    u, v and the position are scored over usable samples. r, heading and roll do not depend on the
+    position sensor and are scored over all samples.
 
     Attributes:
-        error: predicted minus measured states [N, 3 + n]; psi within half a turn.
-        is_usable: which samples are [N].
-        window_lengths: samples of each window [W].
-        dof: velocities that the logs tell; others are zero, and no error counts.
-        attitude_error: angle of the rotation between the attitudes [N]; None on the surface.
+        error: predicted minus measured states [N, 3 + n]; psi is wrapped to half a turn.
+        is_usable: usable samples [N].
+        window_lengths: number of samples of each window [W].
+        dof: measured velocities; errors of the others are ignored.
+        attitude_error: rotation angle between the attitudes [N]; None for surface vessels.
     """
 
     error: np.ndarray
@@ -220,9 +217,9 @@ def run_free_runs(
 ) -> dict[str, list[Prediction]]:
     """Free-run every candidate over every window.
 
-    A window whose prediction is not finite, or whose velocities exceed both `velocity_limits` [n] and twice
-    what the vessel itself did in it, has diverged and holds the prediction of `constant_velocity`, velocities
-    held, instead. Beyond a negative limit everything has diverged.
+    A free run has diverged if it is not finite, or if a velocity exceeds both `velocity_limits` [n]
+    and twice the measured maximum of the window. The constant-velocity prediction replaces it. A
+    negative limit marks every run as diverged.
     """
     names = {candidate.name for candidate in candidates}
     ensembles = [entry for entry in candidates if entry.members and set(entry.members) <= names]
@@ -288,7 +285,7 @@ def run_free_runs(
 def standard_deviation_between_models(states: Sequence[np.ndarray]) -> np.ndarray:
     """Return the standard deviation [L, c] between models' states [L + 1, 3 + n] after the first.
 
-    Its columns are the channels of a band; that of the position is per axis, mean over both.
+    Columns are the channels of a prediction interval; the position is per axis, averaged over both.
     """
     spread = np.stack([model_states[1:] for model_states in states]).std(axis=0, ddof=1)
     return band_channels(spread, np.sqrt(0.5 * (spread[:, POSITION] ** 2).sum(axis=1)))

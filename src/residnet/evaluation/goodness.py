@@ -20,15 +20,16 @@ from residnet.preprocessing.prepare import PreparedLog
 
 _COMMAND_TOLERANCE, _START_TOLERANCE, _SEARCH_INTERVAL = 0.05, 0.25, 0.5
 """How much two runs of a pair differ at most: in commands, share of their range, and at the start,
-in scales. Starts are tried every `_SEARCH_INTERVAL` seconds. Chosen by hand: closer ones leave few pairs.
+in scales. Starts are tried every `_SEARCH_INTERVAL` seconds. Chosen by hand: closer ones leave few
+pairs.
 """
 
 
 @dataclass(frozen=True)
 class RepeatedPair:
-    """A pair of repeated runs: a window, and the stretch of a log that repeats it.
+    """A window and the segment of another log that repeats it.
 
-    `mismatch` is that of the commands, as a share of their range.
+    `mismatch` is the command difference as a share of the command range.
     """
 
     window: Window
@@ -46,23 +47,22 @@ def assess_repeatability(
 ) -> dict[str, Any]:
     """Return the part of limits.json about repeated manoeuvres.
 
-    Every window of the protocol is compared with every stretch of equal length of the logs after
-    its own, and of its own after the window, at starts every 0.5 s. A stretch repeats a window
-    where the root mean square difference of every command stays below 5 % of the command's range
-    over all logs, and each initial velocity differs by less than a quarter of its scale; the best
-    stretch of a log counts.
+    Every window of the protocol is compared with every segment of equal length in later logs, and
+    later in its own log, at starts every 0.5 s. A segment repeats a window if the root mean square
+    difference of every command is below 5 % of the command's range over all logs, and each initial
+    velocity differs by less than a quarter of its scale. The best segment of a log counts.
 
     Args:
-        logs: on one grid.
-        n_commands: number of columns of the inputs that are commanded.
-        dt: of the grid in s.
+        logs: logs on one time grid.
+        n_commands: number of input columns that are commands.
+        dt: time step in s.
 
     Returns:
-        tolerances; pairs, logs (how many take part); where there are pairs, means over them of the
-        root mean square differences of what moves (SI), of position and heading at the end (m,
-        rad; seen from the start of each run), `nrmse` (mean over these of difference / scale), and
-        the same by kind of manoeuvre. Two independent runs differ by sqrt(2) times what each is off
-        their expectation.
+        Tolerances; pairs, logs (number of logs involved). With pairs also means over them: root
+        mean square differences of the velocities (SI), differences of position and heading at the
+        end (m, rad, relative to the start of each run), `nrmse` (mean of difference / scale), and
+        the same by kind of manoeuvre. Two independent runs differ by sqrt(2) times their standard
+        deviation.
     """
     dynamic_states = logs[0].dof.dynamic_states
     state_scales = np.array([scales.get(name, 1.0) for name in dynamic_states])
@@ -104,10 +104,10 @@ def find_pairs(
     state_scales: np.ndarray,
     dt: float,
 ) -> Iterator[RepeatedPair]:
-    """Return pairs of repeated runs; scales [n] are of what moves.
+    """Return pairs of repeated runs; `scales` [n] belong to the velocities.
 
-    Each window of the protocol with at most one stretch of each log from its own on. Without
-    commands nothing says that two runs were to be the same, and there are none.
+    Each window of the protocol is paired with at most one segment per log, from its own log on.
+    Repetitions are undefined without commands; the result is then empty.
     """
     if n_commands == 0:
         return
@@ -186,8 +186,10 @@ def mismatch(reference_commands: np.ndarray, series: np.ndarray) -> np.ndarray:
 
 
 def _pair_differences(pair: RepeatedPair, logs: Sequence[PreparedLog]) -> list[float]:
-    """Differences of two runs: root mean square of u, v (samples usable in both) and the rest of
-    what moves, then position and heading at the end.
+    """Return differences of two runs.
+
+    Root mean squares of u, v (samples usable in both) and the other velocities, then position and
+    heading at the end.
     """
     reference_log, repeat_log = logs[pair.window.log_index], logs[pair.repeat_log]
     reference_slice = slice(pair.window.start, pair.window.stop)
@@ -347,12 +349,10 @@ def estimate_serial_dependence(segments: Segments) -> SerialDependence:
 def block_bootstrap_interval(segments: Segments) -> BlockBootstrapInterval:
     """Return the mean of all samples with its 95 % interval by a moving-block bootstrap.
 
-    The block length is that of `estimate_serial_dependence`.
-
-    Percentiles about the mean, at levels widened for few blocks as Student's t is (see
-    `residnet.evaluation.metrics`), and by what blocks of finite length miss: the ratio of the standard
-    error from the long-run variance to that of the bootstrap, where it is above one (at most 1.5).
-    The interval speaks for more data of the same kind, not for other kinds of manoeuvre.
+    `estimate_serial_dependence` gives the block length. Percentiles about the mean are widened by
+    Student's t for few blocks (see `residnet.evaluation.metrics`) and by the ratio of the long-run
+    standard error to the bootstrap standard error, between 1 and 1.5. The interval is valid for
+    further data of the same kind, not for other manoeuvres.
     """
     dependence = estimate_serial_dependence(segments)
     n = sum(len(segment) for segment in segments)
@@ -426,10 +426,9 @@ def independent_confidence_interval(values: np.ndarray) -> tuple[float, float]:
 
 
 def ljung_box_test(segments: Segments, n_lags: int) -> tuple[float, float]:
-    """Return the statistic of Ljung and Box (1978) and its chance in white noise.
+    """Return the statistic of Ljung and Box (1978) and its p-value under white noise.
 
-    The statistic is n (n + 2) sum rho_k^2 / (n - k) over lags 1 .. `lags`; the chance is that of a
-    larger one.
+    The statistic is n (n + 2) sum rho_k^2 / (n - k) over lags 1 .. `lags`.
     """
     n = sum(len(segment) for segment in segments)
     covariance = compute_autocovariance(segments, n_lags)
@@ -447,14 +446,14 @@ N_LAGS = 20
 
 @dataclass(frozen=True)
 class OneStepResiduals:
-    """Predicted beside measured accelerations along measured states, stretch by stretch.
+    """One-step residuals of the accelerations along measured states, by segment.
 
     Attributes:
-        model_name: its name.
+        model_name: name of the model.
         model_kind: constant_velocity, baseline, head or ensemble.
         n_parameters: number of fitted parameters of each axis.
-        residuals: measured minus predicted acceleration, [T, n] of each piece.
-        reference_name: name of the model that it is compared with; None for none.
+        residuals: measured minus predicted acceleration, [T, n] for each segment.
+        reference_name: name of the reference model; None for none.
     """
 
     model_name: str
@@ -469,17 +468,17 @@ def goodness_of_fit_measures(
 ) -> dict[str, float | None]:
     """Return RMSE (9.11), R^2 (9.15), adjusted R^2 (9.16), C_p (9.12), AIC (9.13), BIC (9.14).
 
-    Sums of squares stand in the place of means.
+    Equations of document 000, with sums of squares in place of means.
 
     Args:
         residuals: measured minus predicted, [m].
-        measured: measured, [m].
-        noise_variance: of the noise, sigma^2, by `estimate_noise_variance` of the richest model that is compared:
-            from each model's own the criteria tell nothing apart.
+        measured: measured values, [m].
+        noise_variance: sigma^2 by `estimate_noise_variance` of the richest compared model. With the
+            noise variance of each model itself the criteria do not discriminate.
 
     Returns:
-        rmse, r2, r2_adjusted, cp, aic, bic; None where the target does not vary, the noise
-        vanishes, or m does not exceed d + 1.
+        rmse, r2, r2_adjusted, cp, aic, bic; None if the target is constant, the noise is zero, or m
+        does not exceed d + 1.
     """
     n_samples, rss = len(residuals), float(residuals @ residuals)
     total_sum_of_squares = float(((measured - measured.mean()) ** 2).sum())
@@ -507,7 +506,7 @@ def goodness_of_fit_measures(
 def estimate_noise_variance(residuals: np.ndarray, n_parameters: float) -> float:
     """Return sigma^2 = RSS / (m - d - 1) (9.17, correction E1).
 
-    Infinite where there are no more samples than that.
+    Infinite if m does not exceed d + 1.
     """
     degrees_of_freedom = len(residuals) - n_parameters - 1
     return float(residuals @ residuals) / degrees_of_freedom if degrees_of_freedom > 0 else math.inf
@@ -568,7 +567,7 @@ def build_goodness_table(
 
 
 def _residual_statistics(segments: Sequence[np.ndarray], dt: float) -> dict[str, Any]:
-    """Mean absolute residual with both intervals, and what the residuals remember."""
+    """Return the mean absolute residual with both intervals, and serial-correlation statistics."""
     absolute_residuals = [np.abs(segment) for segment in segments]
     mae_interval = block_bootstrap_interval(absolute_residuals)
     n_lags = min(N_LAGS, max(sum(map(len, segments)) // 5, 1))

@@ -33,20 +33,20 @@ CONFIDENCE_LEVEL = 0.95
 _N_RESAMPLES = 10_000
 """Of the blocks: their 2.5 % tail then holds 250."""
 MIN_LOGS_AS_BLOCKS, TARGET_BLOCKS, _MIN_BLOCKS = 5, 8, 5
-"""Logs from which on each is a block; blocks that fewer are cut into, and need at least.
+"""Logs from which each log is a block; target and smallest number of blocks for fewer logs.
 
-Chosen by hand: to resample fewer blocks tells little, and smaller ones are alike.
+Chosen by hand: fewer blocks estimate the variance poorly, and smaller ones are correlated.
 """
 
 
 @dataclass(frozen=True)
 class ResamplingBlocks:
-    """What is drawn together.
+    """Blocks of windows for a bootstrap.
 
     Attributes:
-        block_indices: number of each window's block, [W], from 0 on.
-        block_kind: `logs` if a block is all windows of a log, else `windows`: consecutive windows of
-            one log.
+        block_indices: block of each window, [W], from 0 on.
+        block_kind: `logs` if a block is all windows of a log, else `windows`: consecutive windows
+            of one log.
         n_blocks: number of blocks.
     """
 
@@ -55,20 +55,20 @@ class ResamplingBlocks:
     n_blocks: int
 
     def to_row(self) -> dict[str, Any]:
-        """Return the blocks as they stand in metrics.json."""
+        """Return the entry `ci95_blocks` of metrics.json."""
         return {"of": self.block_kind, "count": self.n_blocks}
 
 
 def make_resampling_blocks(log_indices: Sequence[int] | np.ndarray) -> ResamplingBlocks | None:
-    """Return blocks of windows from the number of the log that each comes from.
+    """Return bootstrap blocks of windows, given the log index of each window.
 
     Windows of a log are in time order.
 
-    From five logs on a block is a log: the interval then speaks for other logs, whatever the
-    windows of one have in common. Of three or four logs the mean cannot be resampled so; each is
-    cut into as few equal runs of consecutive windows as make at least eight blocks, and the
-    interval holds only as far as what lies between logs is small against what lies between such
-    runs. None, and so no interval, where there are fewer than three logs or five blocks.
+    With five or more logs a block is a log, so that the interval holds for new logs. Three or four
+    logs are cut into the smallest number of equal runs of consecutive windows that gives at least
+    eight blocks; the interval is then valid only if the variance between logs is small against the
+    variance between such runs. Returns None, and thus no interval, for fewer than three logs or
+    five blocks.
     """
     log_numbers = np.asarray(log_indices, dtype=int)
     unique_logs, windows_per_log = np.unique(log_numbers, return_counts=True)
@@ -96,13 +96,13 @@ def make_resampling_blocks(log_indices: Sequence[int] | np.ndarray) -> Resamplin
 def bootstrap_intervals(
     values: np.ndarray, resampling_blocks: ResamplingBlocks | None
 ) -> list[list[float] | None]:
-    """Return 95 % intervals of the means of columns [W, C] over windows, [low, high] of each.
+    """Return 95 % confidence intervals [low, high] of the means of columns [W, C] over windows.
 
-    None where there are no blocks.
+    Intervals are None without blocks.
 
-    Percentile bootstrap over blocks drawn with replacement, with a fixed seed, at levels widened
-    for few blocks as Student's t is against the normal distribution (Hesterberg 2015, The American
-    Statistician 69, 371-386, section 5.3): plain percentiles cover some 83 % with five blocks.
+    Percentile bootstrap over blocks drawn with replacement, with a fixed seed. The percentile
+    levels are widened by Student's t for few blocks (Hesterberg 2015, The American Statistician 69,
+    371-386, section 5.3): plain percentiles cover some 83 % with five blocks.
     """
     if resampling_blocks is None:
         return [None] * values.shape[1]
@@ -130,22 +130,22 @@ def bootstrap_intervals(
 def prediction_intervals(
     window_errors: np.ndarray, log_indices: np.ndarray
 ) -> list[list[float] | None]:
-    """Return 95 % intervals of the means of columns [W, C] over as many new logs, [low, high].
+    """Return 95 % prediction intervals [low, high] of the means of columns [W, C] over new logs.
 
-    The windows of a log have its manoeuvre, weather and speed in common, so that the means of logs
-    are what scatters. Errors are positive and their size is drawn: Student's t holds for the
-    logarithm of the mean over logs, twice over, for the logs seen and the new ones. It scatters as
-    the logs do beside their mean, so that a log in which next to nothing goes wrong widens nothing.
-    By how much logs differ is estimated from all columns, since the few logs of one alone tell too
-    little by chance, and what looks best has too narrow an interval then. Columns hang together:
-    they count as two.
+    The number of new logs equals the number of logs in the data. Windows of a log share manoeuvre,
+    weather and speed, so the spread of the means of logs counts. Errors are positive with a random
+    scale: the interval is Student's t for the logarithm of the mean over logs, with the variance of
+    the observed and of the new logs. The variance refers to the mean over logs, so that a log with
+    nearly no error does not widen the interval. It is pooled over all columns, since a few logs
+    estimate it poorly and the best column would get too narrow an interval. Correlated columns
+    count as two.
 
     Args:
-        window_errors: errors of windows, none negative; a column is a model's error of one kind.
-        log_indices: number [W] of the log that each window is of.
+        window_errors: non-negative errors of windows; a column is one kind of error of one model.
+        log_indices: log index [W] of each window.
 
     Returns:
-        An interval for each column; None where there are fewer than three logs.
+        An interval for each column; None for fewer than three logs.
     """
     unique_logs, log_positions = np.unique(log_indices, return_inverse=True)
     n_logs = len(unique_logs)
@@ -199,16 +199,12 @@ def paired_difference(
 ) -> dict[str, Any]:
     """Return the paired difference of two models' mean errors, as in metrics.json.
 
-    Both are over the same windows.
-
     Args:
         model_errors: error of each window, [W].
         reference_errors: error of the reference model over the same windows, [W].
 
     Returns:
-        to; nrmse_mean, the mean of model minus reference (negative where the model is better), with
-        its interval ci95 (None where there is none) and excludes_zero; ratio of the means (None
-        where the reference has no error) and worse, a ratio above 1.05.
+        The fields of `records.PairedDifference`.
     """
     differences = model_errors - reference_errors
     (confidence_interval,) = bootstrap_intervals(differences[:, None], resampling_blocks)
@@ -228,18 +224,18 @@ def paired_difference(
 SCHEMA = "residnet.metrics/1"
 LIMITS_SCHEMA = "residnet.limits/1"
 _N_WORST_WINDOWS, _N_SPEED_CLASSES, _MIN_CLASS_WINDOWS = 3, 3, 3
-"""Worst windows that are told, bands of speed, and windows that a band needs; chosen by hand."""
+"""Reported worst windows, classes of speed, windows needed per class; chosen by hand."""
 _WIND_CHANNEL = "wind_speed"
 _HORIZONS = (10.0, 30.0, 100.0)
-"""Times in s after which errors of the pose are told."""
+"""Horizons in s of the reported pose errors."""
 
 
 class ProtocolEvaluation:
-    """The errors of all models over the W windows of one protocol, and what is read off them.
+    """Errors of all models over the W windows of one protocol, and statistics of them.
 
     Args:
         free_run: free runs of all models.
-        scales: of what moves, which nrmse divides by.
+        scales: denominators of the nrmse.
     """
 
     def __init__(
@@ -274,9 +270,9 @@ class ProtocolEvaluation:
         window_mask: np.ndarray,
         errors_by_model: Mapping[str, np.ndarray] | None = None,
     ) -> dict[str, Any] | None:
-        """Return the paired difference of two models over chosen windows [W] bool.
+        """Return the paired difference of two models over selected windows [W] bool.
 
-        None where the other is not among the models. `values` [W] by model stand for the nrmse.
+        None if the reference model was not evaluated. `errors_by_model` [W] replaces the nrmse.
         """
         errors_by_model = self.nrmse_by_window if errors_by_model is None else errors_by_model
         if reference_name is None or reference_name not in errors_by_model:
@@ -292,9 +288,9 @@ class ProtocolEvaluation:
     def build_rows(self, groups: Mapping[str, Sequence[str]]) -> list[dict[str, Any]]:
         """Return the rows of metrics.json.
 
-        Every model, over all windows, every kind of manoeuvre and every named group of kinds.
-        `difference` compares a model with its reference (`Candidate.reference`); None where it has
-        none. Models with a band have its coverage and interval score, too.
+        One row per model for all windows, every kind of manoeuvre and every named group of kinds.
+        `difference` compares a model with its reference (`Candidate.reference`); None without one.
+        Rows of models with prediction intervals also have coverage and interval score.
         """
         manoeuvre_kinds = [log.log.manoeuvre for log, _ in self.log_slices]
         kinds_by_group: dict[str, Sequence[str]] = {"all": manoeuvre_kinds}
@@ -395,14 +391,12 @@ class ProtocolEvaluation:
         }
 
     def evaluate_horizons(self, dt: float) -> list[dict[str, Any]]:
-        """Return how far models are off after some times that matter, in metres and radians.
+        """Return position and attitude errors of all models after 10, 30 and 100 s and at the end.
 
         Returns:
-            One entry for 10, 30 and 100 s, as far as the windows go, and for the end of the longest
-            window: `seconds`; `windows` and `logs` that last so long, `slowest` and `fastest` of
-            them (mean speeds, m/s) and the mean way `sailed` in m; `floor`: what integrated
-            measured velocities are off in each of `Live.ends`; and by model the mean of each over
-            the windows, with `intervals` for as many new logs, see `prediction_intervals`.
+            The fields of `records.HorizonRow`: one entry for each horizon below the length of the
+            longest window and one for its end. `intervals` are prediction intervals, see
+            `prediction_intervals`.
         """
         from residnet.evaluation.freerun import compute_integration_errors
 
@@ -451,14 +445,14 @@ class ProtocolEvaluation:
         return entries
 
     def evaluate_kinematics(self, dt: float) -> dict[str, float]:
-        """Return how far integrated measured velocities end from the measured pose.
+        """Return pose errors of the integrated measured velocities (noise floor).
 
-        They are integrated over each window from its measured pose, as predictions are.
+        The measured velocities are integrated over each window from its measured pose. A model with
+        exact velocities would have these errors.
 
         Returns:
-            windows; mean and root mean square of each of `Live.ends` at the ends of windows, as
-            position_mean and position_rms. A model that predicted the measured velocities exactly
-            would have these errors. Empty where only some velocities were recorded.
+            Number of windows; mean and root mean square of each pose error at the ends of windows,
+            for example position_mean and position_rms. Empty if some velocities were not measured.
         """
         if self.dof.fixed_states:
             return {}
@@ -491,12 +485,10 @@ class ProtocolEvaluation:
         )
 
     def evaluate_by_class(self) -> list[dict[str, Any]]:
-        """Return errors by thirds of the windows in mean speed and in mean true wind speed.
+        """Return errors by thirds of the windows in mean speed and mean true wind speed.
 
-        The wind only where every log has it. A band of fewer than three windows is left out, and
-        so is a quantity of which one band remains. Each entry: `by` (speed or wind), `low` and
-        `high` in m/s (extremes of the windows' means), `windows`, and by model `nrmse_mean` and
-        `difference` as in metrics.json.
+        Wind speed only if every log has it. A class of fewer than three windows is omitted, and so
+        is a quantity with a single class. Entries have the fields of `records.ClassRow`.
         """
         values_by_quantity = {"speed": self._mean_speeds()}
         if all(_WIND_CHANNEL in log.log.channels for log, _ in self.log_slices):
@@ -541,8 +533,8 @@ class ProtocolEvaluation:
     def list_worst_windows(self, model_name: str) -> list[dict[str, Any]]:
         """Return the three windows with the largest nrmse of a model.
 
-        Each with log, manoeuvre, t (start, the log's clock, s), nrmse, rmse, position_error_end
-        (heading_error_end where no velocity moves the position).
+        Entries have the fields of `records.WorstWindow`; the pose error is the first one that the
+        velocities of the model determine.
         """
         errors, nrmse, pose_error_name = (
             self.errors[model_name],
@@ -566,7 +558,7 @@ class ProtocolEvaluation:
         ]
 
     def compare_with_references(self) -> dict[str, dict[str, Any]]:
-        """Return by model its paired differences to `constant_velocity` and to the first baseline."""
+        """Return paired differences of each model to constant velocity and to the first baseline."""
         all_windows = np.ones(len(self.log_indices), dtype=bool)
         reference_names = [CONSTANT_VELOCITY] if CONSTANT_VELOCITY in self.errors else []
         reference_names += [
@@ -582,12 +574,12 @@ class ProtocolEvaluation:
         }
 
     def share_outside_training_range(self) -> dict[str, Any]:
-        """Return how much of the windows lies outside the range of the training data.
+        """Return the share of samples outside the range of the training data.
 
         Returns:
             `share` of the usable samples with a velocity or an input outside its range, and
-            `channels`: the share of each channel that is; empty where no model says its ranges. A
-            depth, which drives nothing, does not count.
+            `channels`: the same for each channel; empty if the ranges are unknown. Depth has no
+            effect on the motion and is ignored.
         """
         ranges = next(
             (
@@ -672,10 +664,13 @@ def build_metrics_file(
     """Return the contents of metrics.json.
 
     Args:
+        run: name of the run.
+        units: unit of each state.
+        scales: denominators of the nrmse.
         selected: name of the single model that the validation data chose.
-        selected_ensemble: name of the best ensemble; None where there is none.
-        predictor: name of the model that is reported first and exported where none is named.
-        rows: of all splits, without `selected`.
+        selected_ensemble: name of the best ensemble; None without ensembles.
+        predictor: name of the model that is reported first and exported by default.
+        rows: rows of all splits, without `selected`.
     """
     marked_rows = [{**row, "selected": row["model"] == selected} for row in rows]
     return MetricsFile.model_validate(
@@ -702,8 +697,8 @@ def build_metrics_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         Columns model, kind, split, protocol, manoeuvre (and selected where the rows have it),
         windows, diverged, n, then rmse_u, rmse_v, rmse_r (m/s, m/s, rad/s), the same for mae and
         nrmse with nrmse_mean, note (such as "2/12 diverged", where such windows count with the
-        error of `constant_velocity`), and position_error_end (m), heading_error_end (rad), or depth_error_end
-        (m) and attitude_error_end (rad) where the vessel dives.
+        error of `constant_velocity`), and position_error_end (m), heading_error_end (rad), or
+        depth_error_end (m) and attitude_error_end (rad) where the vessel dives.
     """
     import pandas as pd
 
@@ -720,11 +715,11 @@ def _flatten_row(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 INPUT_PREFIX = "input_"
-"""Stands before the name of an input among the columns."""
+"""Prefix of the column names of inputs."""
 
 
 def state_column_names(dof: DegreesOfFreedom) -> tuple[str, ...]:
-    """Return the names of the columns of states: u, v, r, heading and position, then the rest."""
+    """Return column names of states: u, v, r, heading and position, then roll or dive states."""
     planar, non_planar_states = (
         dof.dynamic_states[: PLANAR_LAYOUT.n_dof],
         dof.dynamic_states[PLANAR_LAYOUT.n_dof :],
@@ -738,16 +733,16 @@ def iterate_rollout_columns(
     inputs: Sequence[str] = (),
     bands: BandsByModel | None = None,
 ) -> Iterator[tuple[PreparedLog, dict[str, np.ndarray]]]:
-    """Yield each log that has a window, with a row for each step of each model's free runs.
+    """Yield each log with windows, with a row for each step of each model's free runs.
 
     Columns: protocol, model, window, t (s, the log's clock), usable, diverged, then u, v, r, psi,
-    x, y (and p and phi of a roll) as measured and with `_hat` as predicted (SI, rad), and the
-    inputs that are held over the step after each sample with `input_` before their names. Where
-    there are bands, `_low` and `_high` are their pointwise limits; those of x and y are the box
-    about the circle that holds the position, and a model without a band has NaN.
+    x, y (and p and phi with roll) as measured and with `_hat` as predicted (SI, rad), and the
+    inputs held over the step after each sample with the prefix `input_`. With prediction intervals,
+    `_low` and `_high` are their pointwise limits; for x and y the box about the position circle.
+    They are NaN for models without intervals.
 
     Args:
-        inputs: names of the inputs, in the order of their columns.
+        inputs: names of the inputs, in column order.
         bands: by model and protocol; None for none.
     """
     bands_by_model = bands or {}

@@ -63,10 +63,10 @@ class WindowProtocol(Config):
     def make_overlapping_windows(
         self, log: PreparedLog, log_index: int, dt: float, interval: float | None = None
     ) -> list[Window]:
-        """Return windows of the same length that start every so often, in s.
+        """Return windows of the same length with starts every `every` seconds.
 
-        Every quarter of a length where not given, for choices among models: back-to-back windows of
-        a few logs are few; what is left of a log behind the last one tells nothing.
+        The default is a quarter of the length. A choice between models needs more windows than the
+        back-to-back windows of a few logs; the incomplete window at the end of a log is dropped.
         """
         interval = self.length / 4 if interval is None else min(interval, self.length)
         return self._place_windows(log, log_index, dt, interval)
@@ -249,14 +249,14 @@ class EvaluationConfig(Config):
     """Settings of the evaluation: protocols and scales.
 
     Attributes:
-        protocols: by name; the name stands in metrics.json.
-        selection: the protocol whose mean nrmse over the validation windows chooses between models
-            and stops training early.
-        scales: what nrmse divides by.
-        groups: named sets of manoeuvre kinds that get rows of their own.
-        divergence: a free run diverges where a velocity exceeds this many times its largest
+        protocols: by name, as in metrics.json.
+        selection: the protocol whose mean nrmse over the validation windows selects models and
+            stops training early.
+        scales: denominators of the nrmse.
+        groups: named sets of manoeuvre kinds with rows of their own.
+        divergence: a free run has diverged if a velocity exceeds this multiple of its largest
             training value.
-        splits: which splits are evaluated.
+        splits: splits to evaluate.
     """
 
     protocols: dict[str, ProtocolConfig] = Field(min_length=1)

@@ -42,7 +42,7 @@ class PairedDifference(Record):
         nrmse_mean: model minus reference; negative if the model is better.
         ci95: 95 % confidence interval; None if there are too few logs.
         excludes_zero: whether the interval excludes zero.
-        ratio: error of the model over that of the reference; None if the latter is zero.
+        ratio: error of the model over the error of the reference; None if the latter is zero.
         worse: whether the ratio is above 1.05.
     """
 
@@ -59,7 +59,7 @@ class MetricsRow(Record):
 
     Attributes:
         model: name of the model.
-        kind: what the model is.
+        kind: kind of model.
         split: train, validation, test or external.
         protocol: name of the protocol, for example `T100`.
         manoeuvre: `all`, one kind, or a group of kinds that the config names.
@@ -70,7 +70,7 @@ class MetricsRow(Record):
         mae: the same of the mean absolute error.
         nrmse: `rmse` over the scales of the config, and its `mean` over the velocities.
         rmse_ci95: bootstrap 95 % confidence intervals of `rmse`; None if there are too few windows.
-        nrmse_mean_ci95: that of the mean of `nrmse`.
+        nrmse_mean_ci95: interval of the mean of `nrmse`.
         ci95_blocks: the blocks that were resampled.
         position_error_end: distance in m at the end of a window, mean over the windows.
         heading_error_end: heading error in rad at the end of a window, mean over the windows.
@@ -78,9 +78,9 @@ class MetricsRow(Record):
         attitude_error_end: attitude error in rad, of a vessel that dives.
         difference: paired difference to the reference model of this model.
         band_coverage: share of the samples within the prediction interval by channel, their `mean`,
-            and `whole`: the share of windows that stay within the interval of whole runs.
+            and `whole`: the share of windows inside the interval of whole runs.
         band_score: mean interval score in units of the constant-velocity error.
-        band_score_constant: that of an interval of constant width.
+        band_score_constant: interval score of an interval of constant width.
         selected: whether validation data chose this single model.
     """
 
@@ -121,7 +121,7 @@ class MetricsFile(FileRecord):
         channels: unit of each state.
         scales: scale of each velocity, the denominators of `nrmse`.
         selected: name of the single model that validation data chose.
-        selected_ensemble: name of the best ensemble; None if there is none.
+        selected_ensemble: name of the best ensemble; None without ensembles.
         predictor: name of the model that is reported first and exported by default.
         rows: errors by model, split, protocol and kind of manoeuvre.
     """
@@ -144,14 +144,14 @@ class SelectionRow(Record):
 
     Attributes:
         model: name of the model.
-        family: its complexity class, see `evaluation.selection.MODEL_FAMILIES`.
+        family: complexity class, see `evaluation.selection.MODEL_FAMILIES`.
         parameters: number of parameters.
         nrmse_mean: mean validation error.
-        ratio: geometric mean over the blocks of its error over that of the selected model.
-        standard_error: that of the logarithm of `ratio`.
+        ratio: geometric mean over the blocks of the error ratio to the selected model.
+        standard_error: standard error of the logarithm of `ratio`.
         diverged: number of diverged validation windows.
-        sound: whether it passed all checks.
-        faults: what the checks object to.
+        sound: whether the model passed all checks.
+        faults: failed checks.
     """
 
     model: str
@@ -170,7 +170,7 @@ class SelectionFile(FileRecord):
 
     Attributes:
         selected: name of the chosen single model.
-        selected_ensemble: name of the best ensemble; None if there is none.
+        selected_ensemble: name of the best ensemble; None without ensembles.
         predictor: name of the model that is reported first.
         reason: one sentence on the choice of the single model.
         blocks: blocks of validation data over which errors were paired.
@@ -190,7 +190,7 @@ class SelectionFile(FileRecord):
 
 
 class PoseErrors(Record):
-    """Mean errors of the pose at a horizon, with 95 % prediction intervals for as many new logs."""
+    """Mean pose errors at a horizon, with 95 % prediction intervals of the mean over new logs."""
 
     position: float | None = None
     heading: float | None = None
@@ -335,7 +335,7 @@ class BandRow(Record):
         horizon: longest calibrated horizon in s.
         logs: number of logs that calibrated the intervals.
         independent_scores: equivalent number of independent calibration scores.
-        cautions: sentences on what the intervals do not cover.
+        cautions: sentences on the limits of the intervals.
         steps: horizons in time steps; the tables below have one value for each.
         half_width: half widths for a run of typical motion.
         half_width_of_any_run: half widths that do not depend on the motion of the run.
@@ -388,7 +388,7 @@ class GoodnessRow(Record):
 
     Attributes:
         model: name of the model.
-        kind: what the model is.
+        kind: kind of model.
         axis: name of the acceleration.
         samples: number of samples.
         parameters: number of fitted parameters of this axis.
@@ -518,7 +518,7 @@ class BookletFile(FileRecord):
     Attributes:
         model: name of the model.
         length: length of the hull in m in the scale of the logs.
-        scale: scale of the ship over that of the logs.
+        scale: scale of the ship over the scale of the logs.
         draws: number of parameter draws.
         level: level of the intervals.
         units: unit of each index.

@@ -1,8 +1,8 @@
-"""The choice of one model among fitted ones: the simplest that is as good as the best.
+"""Selection of one model: the simplest whose error is not significantly above the smallest.
 
-Models are compared by the ratio of their errors, block by block: the logarithms of errors are
-averaged. In a mean of the errors themselves one bad stretch outweighs all others, and its standard
-error grows with it, so that few logs would tell nothing.
+Models are compared by the ratio of their errors, block by block, as means of log errors. A single
+bad stretch would dominate a mean of the errors themselves, and its standard error would be too
+large for few logs.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ MODEL_FAMILIES = (
 """What a model is, the simplest first."""
 
 _EQUIVALENCE_STANDARD_ERRORS = {"logs": 1.0, "stretches": 0.5}
-"""Standard errors within which models are alike. Stretches of a few logs resemble each other."""
+"""Standard errors within which models are equally good; segments of few logs are correlated."""
 _ERROR_OFFSET_SHARE = 0.1
-"""Share of the least mean error below which the error of a block hardly counts."""
+"""Share of the smallest mean error that is added to the error of every block."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class SelectionCandidate:
         family: one of `MODEL_FAMILIES`.
         n_parameters: number of its fitted parameters.
         mean_nrmse: its mean NRMSE over the validation windows.
-        block_scores: what each block of the validation data contributes to the mean logarithm of its
-            error, [B]; see `block_log_errors`.
+        block_scores: what each block of the validation data contributes to the mean logarithm of
+            its error, [B]; see `block_log_errors`.
         n_diverged: number of its validation windows that diverged, over all protocols.
         faults: sentences on what makes it unsound, divergences among them; empty for a sound model.
     """
@@ -62,12 +62,12 @@ class SelectionCandidate:
 
     @property
     def mean_log_error(self) -> float:
-        """The mean logarithm of its error over the blocks."""
+        """The mean log error over the blocks."""
         return float(self.block_scores.sum())
 
     @property
     def is_sound(self) -> bool:
-        """Whether nothing speaks against its use."""
+        """Whether the model passed all checks."""
         return not self.faults
 
     @property
@@ -95,17 +95,15 @@ class SelectionBlocks:
 
     @property
     def equivalence_standard_errors(self) -> float:
-        """Number of standard errors within which two models are alike."""
+        """Number of standard errors within which two models count as equally good."""
         return _EQUIVALENCE_STANDARD_ERRORS[self.block_kind]
 
     def standard_error(self, contributions: np.ndarray, other_contributions: np.ndarray) -> float:
-        """Return the standard error of the difference of two means.
-
-        A single block adds nothing, since it does not tell of the spread.
+        """Return the standard error of the difference of two means; zero for a single block.
 
         Args:
-            contributions: what each block contributes to the first mean, [B].
-            other_contributions: the same of the second, [B].
+            contributions: contribution of each block to the first mean, [B].
+            other_contributions: contribution of each block to the second mean, [B].
         """
         if self.n_blocks < 2:
             return 0.0
@@ -127,15 +125,15 @@ def log_error_ratio(
 
 @dataclass(frozen=True)
 class Selection:
-    """The chosen models, and why.
+    """The selected models and the reason.
 
     Attributes:
-        selected: name of the chosen single model.
-        selected_ensemble: name of the best ensemble; None where there is none.
-        reason: one sentence on why the single model was chosen.
-        candidates: all models, in the order that they were given.
-        blocks: over which errors were paired.
-        default_ensemble: name of a mean that is reported first whatever was chosen; None for none.
+        selected: name of the selected single model.
+        selected_ensemble: name of the best ensemble; None without ensembles.
+        reason: one sentence on the choice of the single model.
+        candidates: all models, in their given order.
+        blocks: blocks over which errors are paired.
+        default_ensemble: name of an ensemble that is always reported first; None for none.
     """
 
     selected: str
@@ -147,7 +145,7 @@ class Selection:
 
     @property
     def default_model(self) -> str:
-        """Name of the model that is reported first and exported where none is named."""
+        """Name of the model that is reported first and exported by default."""
         return self.selected if self.default_ensemble is None else self.default_ensemble
 
     def to_record(self) -> SelectionFile:
@@ -187,17 +185,17 @@ class Selection:
 
 
 def select_models(candidates: Iterable[SelectionCandidate], blocks: SelectionBlocks) -> Selection:
-    """Choose a single model and an ensemble.
+    """Select a single model and an ensemble.
 
-    Among the models that never diverged, those are alike whose error is within one standard error
-    of the least (Breiman and others 1984, Classification and Regression Trees, section 3.4.3;
-    paired here, since all models run over the same windows). Of fewer than five logs half a
-    standard error is taken: their stretches resemble each other, and a whole one took lines for
-    hulls. Of those that are alike a sound one comes before an unsound one, and then the simplest
-    is chosen: what speaks against a model costs it as much error as the logs can tell, no more.
+    One-standard-error rule (Breiman and others 1984, Classification and Regression Trees, section
+    3.4.3), paired over blocks because all models run over the same windows. Among the models
+    without divergence, those within one standard error of the smallest error are equally good. With
+    fewer than five logs half a standard error is used, since segments of a log are correlated.
+    Among equally good models sound ones come first, then the simplest. A failed check can therefore
+    cost no more accuracy than the data can resolve.
 
     Args:
-        candidates: `constant_velocity` and at least one other.
+        candidates: `constant_velocity` and at least one other model.
     """
     all_candidates = tuple(candidates)
     selected_model, reason = _simplest_equivalent(
@@ -260,13 +258,13 @@ def _simplest_equivalent(
 
 
 def make_selection_blocks(free_run: FreeRun) -> tuple[SelectionBlocks, list[np.ndarray]]:
-    """Return the blocks of validation windows, and the number of the block of each sample.
+    """Return the blocks of validation windows, and the block index of each sample.
 
-    From five logs on a block is a log, so that what is chosen holds for other logs. Fewer logs are
-    cut into contiguous stretches of equal length, about eight in all.
+    With five or more logs a block is a log, so that the selection holds for new logs. Fewer logs
+    are cut into contiguous segments of equal length, about eight in all.
 
     Returns:
-        The blocks, and for each window [L] of block numbers.
+        The blocks, and block indices [L] for each window.
     """
     log_indices = np.array([window.log_index for window in free_run.windows])
     window_lengths = np.array([window.stop - window.start for window in free_run.windows])
@@ -310,14 +308,18 @@ def block_error_shares(
     block_numbers: Sequence[np.ndarray],
     n_blocks: int,
 ) -> np.ndarray:
-    """Return what each block contributes to a model's mean NRMSE, [count].
+    """Return the contribution of each block to a model's mean NRMSE, [n_blocks].
 
-    A window's root mean square error is shared out in proportion to the squares, so that the sum
-    is the mean NRMSE of the rows of metrics.json.
+    A window's root mean square error is distributed in proportion to the squared errors, so that
+    the sum is the mean NRMSE of the rows of metrics.json.
 
     Args:
         free_run: free runs over the windows.
-        block_numbers: number of the block of each sample of each window.
+        model_name: name of the model.
+        logs: logs of the windows.
+        scales: denominators of the nrmse.
+        block_numbers: block index of each sample of each window.
+        n_blocks: number of blocks.
     """
     errors = FreeRunErrors.from_predictions(
         free_run.windows, free_run.predictions[model_name], logs

@@ -1,14 +1,13 @@
-"""Whether a model behaves like a vessel: damping, stability, symmetry, and motion within bounds.
+"""Physical checks of a model: damping, stability, symmetry, bounded motion.
 
-What a model does where its logs have been, at recorded states and inputs, can make it unsound, so
-that a sound one that is as good is selected. What it does elsewhere is reported, and speaks against
-no choice.
+Faults at recorded states and inputs make a model unsound, so that an equally good sound model is
+selected instead. Faults elsewhere are reported and do not affect the selection.
 
-A full hull may be unstable on a course in truth, so that instability is a fault only where the
-vessel, its inputs held, settled from a disturbance such as the entry of a turn, and stayed so for
-several times as long as the model's disturbances take to grow. A straight run that nothing disturbs
-proves nothing. Disturbances have the size that they had in the log: a model of logs whose wind
-nobody measured may swing a little in a steady turn, as the vessel did.
+Some full hulls are unstable on a straight course. Instability is therefore a fault only if the
+vessel itself, with constant inputs, settled after a disturbance such as the entry of a turn, and
+remained settled for several growth times of the model's disturbances. An undisturbed straight run
+is no evidence. Disturbances have the size observed in the log, so that a model of logs with
+unmeasured wind may oscillate slightly in a steady turn, as the vessel did.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ SCHEMA = "residnet.sanity/1"
 DAMPING, STABILITY, SYMMETRY, BOUNDEDNESS = CHECKS = ("damping", "stability", "symmetry", "bounded")
 
 _N_CHECK_POINTS = 90
-"""Recorded states that are looked at, besides those of extreme inputs; chosen by hand."""
+"""Number of recorded states to check, without those of extreme inputs; chosen by hand."""
 _NEGLIGIBLE_SLOPE_SHARE = 0.05
 """Share of a slope's size elsewhere below which a positive one is no wrong sign."""
 _MAX_DOUBLING_TIME = 300.0
@@ -87,17 +86,17 @@ class SanityFinding:
 
 @dataclass(frozen=True)
 class SteadyRun:
-    """A stretch of a log with held inputs.
+    """A segment of a log with constant inputs.
 
     Attributes:
         log: name of the log.
-        duration: that it lasts, its settling left out.
+        duration: its duration without the settling time, s.
         mean_state: mean state [3 + n] with the pose at zero.
         mean_inputs: mean inputs [m].
-        decay: how many times farther the lateral velocities lie from their last mean when the
-            stretch begins than in the end.
-        growth: how many times farther the lateral velocities lie from their first third's mean in
-            the last third than in the first.
+        decay: distance of the lateral velocities from their final mean at the start of the segment,
+            over that at its end.
+        growth: distance of the lateral velocities from the mean of the first third in the last
+            third, over that in the first third.
         scatter: standard deviations of the lateral velocities [2].
     """
 
@@ -128,7 +127,7 @@ class TrainingPoints:
 
     @classmethod
     def from_logs(cls, logs: Sequence[PreparedLog], dt: float) -> TrainingPoints:
-        """Return points spread evenly over the speeds, those of extreme inputs, and steady runs."""
+        """Return samples at evenly spaced speeds, samples of extreme inputs, and steady runs."""
         # all states of large data would fill the memory: only those of the points are put together
         usable_indices = [np.flatnonzero(log.usable) for log in logs]
         logs_and_indices = list(zip(logs, usable_indices, strict=True))
@@ -240,9 +239,9 @@ def find_steady_runs(logs: Sequence[PreparedLog], dt: float) -> list[SteadyRun]:
 def _constant_input_runs(
     log: PreparedLog, tolerance: np.ndarray, min_length: int
 ) -> Iterator[tuple[int, int]]:
-    """First sample and end of each stretch whose inputs stay within a tolerance [m] of its first.
+    """Return first sample and end of each segment with constant inputs.
 
-    Stretches follow each other and do not overlap.
+    Inputs differ from the first sample by at most a tolerance [m]. Segments do not overlap.
     """
     for segment_start, segment_end in zip(*find_runs(log.segment), strict=True):
         start = int(segment_start)
@@ -262,13 +261,13 @@ def check_model(
     training_points: TrainingPoints,
     divergence_factor: float = 3.0,
 ) -> list[SanityFinding]:
-    """Return all checks of one model, in the order of `CHECKS`.
+    """Return the results of all checks of one model, in the order of `CHECKS`.
 
     Args:
-        spec: its description; the training ranges are taken from it.
-        model: with its numbers filled in; it stays as it is.
-        training_points: states, inputs and steady runs of the logs that fitted it.
-        divergence_factor: a velocity beyond this many times its largest training value has run away.
+        spec: description of the model; it holds the training ranges.
+        model: the model, which is not modified.
+        training_points: states, inputs and steady runs of the training logs.
+        divergence_factor: multiple of the largest training velocity above which a run has diverged.
     """
     # a copy: the checks run in float64, and must not round what others hold
     model = copy.deepcopy(model).to(torch.float64).eval()
@@ -309,10 +308,10 @@ def settle_memory(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
 
 
 def settled_acceleration(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
-    """Return nu_dot [B, n] of baseline and head together, the head's memory settled.
+    """Return nu_dot [B, n] of baseline and head together, with the head's memory settled.
 
-    To a model that looks for what was predicted wrong, states that are held would tell of a force
-    that holds them: it has no past.
+    The memory of a head with innovation input is zero: constant states would appear to it as the
+    effect of an external force.
     """
     memory = model.initial_state(len(x)).to(x) if model.has_innovation else settle_memory(model, x, w)
     return model.acceleration(x, w, memory)
@@ -321,10 +320,10 @@ def settled_acceleration(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
 def check_damping(
     spec: ModelSpec, model: HybridDynamics, training_points: TrainingPoints
 ) -> SanityFinding:
-    """Check that each velocity decays by itself: d u_dot/du, d v_dot/dv and so on, by autograd.
+    """Check that each velocity decays by itself: d u_dot/du < 0 and so on, by automatic differentiation.
 
-    None may be positive at more than half of the recorded points, unless it is negligible beside
-    what it is elsewhere.
+    No derivative may be positive at more than half of the recorded points, unless it is negligible
+    against its values at the other points.
     """
     x, dof = training_points.x.clone().requires_grad_(), spec.signals.dof
     # a model may depend on no velocity at all
@@ -370,11 +369,11 @@ class OperatingPoint:
 
 
 def find_operating_points(spec: ModelSpec, model: HybridDynamics) -> list[OperatingPoint]:
-    """Return points of straight running from rest to half as fast again as the training data.
+    """Return operating points of straight motion from zero to 1.5 times the training speed.
 
-    Each is under the drive that nearly holds the speed. Drives are all inputs that do not steer,
-    moved together from the low to the high end of their ranges; rudders are amidships and the air
-    is calm, as far as the ranges allow.
+    The drive of each point holds its speed approximately. All inputs that do not steer move
+    together from the lower to the upper end of their ranges; rudders are amidships and there is no
+    wind, as far as the ranges allow.
     """
     input_names = spec.signals.input_columns
     dof = spec.signals.dof
@@ -501,12 +500,13 @@ def compute_growth_rate(model: HybridDynamics, x: Tensor, w: Tensor) -> float:
 
 
 def find_contradicting_steady_run(model: HybridDynamics, steady_runs: Sequence[SteadyRun]) -> str:
-    """Return in a few words how logs contradict an unstable model; empty where they do not.
+    """Return a short text on logs that contradict an unstable model; empty if none do.
 
     A disturbance of the model, linearised about the mean of a steady run, would have grown
-    twentyfold over it; the vessel had settled from three times its deviations at the end, and these
-    did not even grow threefold. The model itself, begun with the vessel's deviations, ends farther
-    than three of them from where the vessel stayed. The twenty longest of such runs are looked at.
+    twentyfold during the run, whereas the vessel settled to a third of its initial deviation, and
+    its deviation did not grow threefold. The model itself, started with the observed deviations,
+    ends at more than three times the observed deviation. The twenty longest runs of this kind are
+    checked.
     """
     informative_runs = [
         run
@@ -637,10 +637,10 @@ def check_boundedness(
     training_points: TrainingPoints,
     divergence_factor: float,
 ) -> SanityFinding:
-    """Check that the motion stays bounded with held inputs.
+    """Check that the motion with constant inputs is bounded.
 
-    It starts from the recorded points with their inputs, and from rest with inputs at the edges of
-    their ranges; each is held for 300 s, or as long as the longest log where that is longer.
+    Runs start at the recorded points with their inputs, and at zero velocity with inputs at the
+    ends of their ranges. They last 300 s, or as long as the longest log.
     """
     max_velocities = spec.signals.dof.range_limits(np.array(spec.low), np.array(spec.high))
     velocity_limits = torch.from_numpy(max_velocities).clamp(min=1e-9)
@@ -721,7 +721,7 @@ def build_sanity_file(findings: Mapping[str, Sequence[SanityFinding]]) -> Sanity
 
 
 def read_sanity_findings(run_folder: Path) -> list[SanityFinding]:
-    """Return the findings in a run folder's sanity.json; none where there is no such file.
+    """Return the results in a run folder's sanity.json; empty without the file.
 
     Raises:
         UsageError: if the file is not readable as JSON.

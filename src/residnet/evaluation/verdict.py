@@ -1,4 +1,4 @@
-"""The verdict on the selected model of a fit in words, from what the run folder's files hold."""
+"""Verdict on the selected model of a fit in sentences, from the files of the run folder."""
 
 from __future__ import annotations
 
@@ -45,19 +45,19 @@ def order_protocols(rows: Sequence[JsonObject], split: str, selection_protocol: 
 
 @dataclass(frozen=True)
 class VerdictEvidence:
-    """What a verdict is passed on.
+    """Data of a verdict.
 
     Attributes:
         selected: name of the selected model.
-        split: whose free runs count.
-        rows_by_model: of metrics.json under one protocol over all manoeuvres of that split, by model.
-        baseline: name of the first baseline; empty where there is none.
-        selection: contents of selection.json; empty where a run has none.
-        limits_by_protocol: contents of limits.json for that split by protocol; empty where a run has none.
-        data_quality_text: one sentence on what the data doctor found; empty where nobody looked.
-        protocol: by which those runs were made.
-        one_sided_text: what the doctor said of logs that turn to one side, or to none; free runs on such
-            logs cannot tell how the model turns.
+        split: split of the free runs.
+        rows_by_model: rows of metrics.json under one protocol over all manoeuvres of the split.
+        baseline: name of the first baseline; empty for none.
+        selection: contents of selection.json; may be empty.
+        limits_by_protocol: contents of limits.json for the split by protocol; may be empty.
+        data_quality_text: one sentence on the data checks; empty without them.
+        protocol: protocol of the rows.
+        one_sided_text: finding of the data checks on logs without turns to both sides; free runs on
+            such logs cannot validate the turning motion.
     """
 
     selected: str
@@ -77,31 +77,34 @@ LEVEL_TEXTS = {
     "do not use": "✗ Do not use",
     "too few windows": "? Too few windows to say",
 }
-"""How far the selected model may be used, and the words for it, the best first; the last says that
-nobody can know. What they look like stands in the page's styles."""
+"""Levels of use of the selected model with their labels, the best first.
+
+The last level means that there are too few data. Styles of the page define their appearance.
+"""
 GOOD_LEVEL, LIMITED_LEVEL, DO_NOT_USE, TOO_FEW_WINDOWS = LEVEL_TEXTS
 _MIN_WINDOWS = 5
 """Windows below which nothing is said of how good a model is."""
 MIN_LOGS_FOR_INTERVAL = 3
 """Logs below which there is no interval, and so nothing is said either."""
 _MAX_DISTANCE_SHARE, _MAX_ANGLE_ERROR = 0.10, math.radians(10.0)
-"""What a good model is off at most: this share of the way sailed and so many radians of heading,
-at the upper end of the interval, or twice the noise floor. It is residnet's choice, and stands in
-the verdict, so that a reader with other needs can choose another."""
+"""Largest errors of a good model: share of the distance travelled, and heading error in rad.
+
+They apply to the upper limit of the prediction interval; twice the noise floor is allowed in any
+case. The values are a convention of residnet, and the verdict states them.
+"""
 _POSE_ERROR_SUFFIXES = {"depth": " of depth", "attitude": " of attitude"}
-"""What stands behind an error of the pose that is no distance over ground and no heading."""
+"""Suffixes of pose errors other than horizontal position and heading."""
 _MAX_RATIO_TO_BEST = 1.5
-"""A good model errs at most so many times as much as the best one of the run, floor aside."""
+"""Largest ratio of the error of a good model to that of the best model of the run."""
 
 
 def write_verdict(evidence: VerdictEvidence) -> list[str]:
     """Return the verdict sentence by sentence, the most important first.
 
-    It says how far off the selected model is in metres and degrees after the times that matter,
-    what the doctor found in the data, how it fares beside `constant_velocity_row`, the baseline and the noise floor,
-    for how many windows and which speeds that holds, how its velocities compare, what speaks
-    against it and why it was selected, and how much of the data lies outside the training range.
-    What the files do not hold is left out.
+    Position and heading errors of the selected model at the horizons, findings of the data checks,
+    comparison with constant velocity, baseline and noise floor, number of windows and range of
+    speeds, velocity errors, failed checks, reason of the selection, and the share of data outside
+    the training range. Sentences without data are omitted.
     """
     lead_sentence, *horizon_sentences = (
         [compare_velocity_errors(evidence)] if is_useless(evidence) else describe_horizons(evidence)
@@ -136,10 +139,10 @@ def rate_model(evidence: VerdictEvidence) -> str:
 
 
 def known_horizons(evidence: VerdictEvidence) -> list[JsonObject]:
-    """Return the horizons at which the errors of the selected model are known, the nearest first.
+    """Return the horizons with known errors of the selected model, in ascending order.
 
-    They are those of the protocol of the rows, each by the protocol of which most windows last so
-    long, named as its `protocol`.
+    Each horizon is evaluated by the protocol, under its key `protocol`, with most windows of that
+    length.
     """
     entry_by_time: dict[float, dict[str, Any]] = {}
     for protocol in sorted(evidence.limits_by_protocol, key=lambda name: name != evidence.protocol):
@@ -217,7 +220,7 @@ def longest_good_horizon(evidence: VerdictEvidence) -> float:
 
 
 def describe_horizons(evidence: VerdictEvidence) -> list[str]:
-    """Return how far off the selected model is after the times that matter, beside others."""
+    """Return sentences on pose errors of the selected model and of the reference models."""
     horizon_entries = known_horizons(evidence)
     if not horizon_entries:
         return [compare_velocity_errors(evidence)]
@@ -343,9 +346,9 @@ def _format_errors_with_intervals(
 
 
 def list_model_objections(evidence: VerdictEvidence) -> list[str]:
-    """Return what speaks against using the model at all, as `residnet.export.base.released` asks.
+    """Return objections to any use of the model, for `residnet.export.base.require_releasable`.
 
-    A model is to be better than `constant_velocity_row`, and than the model that it was built on.
+    A model has to be better than constant velocity and than its own baseline.
     """
     selected_row = evidence.rows_by_model.get(evidence.selected)
     if selected_row is None:
@@ -378,7 +381,7 @@ def is_useless(evidence: VerdictEvidence) -> bool:
 
 
 def compare_velocity_errors(evidence: VerdictEvidence) -> str:
-    """Return how the velocities of the selected model compare with `constant_velocity_row` and the baseline."""
+    """Return a sentence that compares the velocity errors with constant velocity and the baseline."""
     model_name, split = evidence.selected, evidence.split
     if model_name == CONSTANT_VELOCITY:
         return (
@@ -428,7 +431,7 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
 
 
 def describe_soundness(evidence: VerdictEvidence) -> str:
-    """Return whether the selected model is sound, empty where nobody looked."""
+    """Return the result of the physical checks of the selected model; empty without checks."""
     selection_rows = {
         selected_row["model"]: selected_row for selected_row in evidence.selection.get("models", [])
     }
@@ -448,7 +451,7 @@ def describe_soundness(evidence: VerdictEvidence) -> str:
 
 
 def describe_extrapolation(evidence: VerdictEvidence) -> str:
-    """Return how much of the data lies outside the training range, empty where nobody looked."""
+    """Return the share of data outside the training range; empty if unknown."""
     range_summary = _protocol_limits(evidence).get("outside") or {}
     if not range_summary:
         return ""
@@ -466,7 +469,7 @@ def describe_extrapolation(evidence: VerdictEvidence) -> str:
 
 
 def describe_divergence(metrics_row: JsonObject) -> str:
-    """Return what stands beside the score of a row with divergences, else an empty text."""
+    """Return the count of diverged windows of a row, for display next to its error; may be empty."""
     return (
         f"{metrics_row['diverged']}/{metrics_row['windows']} diverged"
         if metrics_row.get("diverged")
@@ -504,7 +507,7 @@ def _is_indistinguishable(evidence: VerdictEvidence, reference_name: str) -> boo
 
 
 def _format_paired_interval(evidence: VerdictEvidence, reference_name: str) -> str:
-    """The paired interval of the difference to another model in brackets, where there is one."""
+    """Return the paired confidence interval of the difference to another model in brackets."""
     paired_difference = _difference_to(evidence, reference_name)
     if not paired_difference:
         return ""
