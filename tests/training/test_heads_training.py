@@ -384,9 +384,9 @@ def test_batches_hold_their_share_of_beginnings(logs: Sequence[PreparedLog]) -> 
     for epochs, lead in ((0, 0), (2, 3)):
         module.history = [{}] * epochs
         anywhere, begun = zip(*data.train_dataloader(), strict=True)
-        assert [len(part.depth) for part in anywhere] == [6, 6, 6]
-        assert all(part.depth.tolist() == [lead, lead] for part in begun)
-        assert any(bool((part.depth != lead).any()) for part in anywhere)
+        assert [len(part.n_elapsed) for part in anywhere] == [6, 6, 6]
+        assert all(part.n_elapsed.tolist() == [lead, lead] for part in begun)
+        assert any(bool((part.n_elapsed != lead).any()) for part in anywhere)
         again, _ = zip(*data.train_dataloader(), strict=True)
         assert all(torch.equal(one.y, two.y) for one, two in zip(anywhere, again, strict=True)), (
             "seed and epoch decide alone"
@@ -507,7 +507,7 @@ def test_no_tensor_of_a_training_step_is_made_without_a_device(
     with torch.device("meta"), pytest.raises((RuntimeError, NotImplementedError)):
         (torch.ones(2, device="cpu") + torch.zeros(2)).sum().item()
     # free runs in C are those of the CPU, and are there where an earlier test compiled the step
-    monkeypatch.setattr("residnet.training.heads.compiled", lambda rollout, steps: rollout)
+    monkeypatch.setattr("residnet.training.heads.compile_rollout", lambda rollout, steps: rollout)
     module, data = untrained(trials(), HEADS[name], **SETTINGS)
     for epochs in (0, 1):
         module.history = [{}] * epochs

@@ -36,7 +36,7 @@ from residnet.physics.signals import SignalsConfig
 from residnet.preprocessing.prepare import PreparedLog, make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.training import refit as module
-from residnet.training.left_out import without_logs
+from residnet.training.left_out import estimate_leave_one_out
 from residnet.training.refit import Problem, RefitConfig, refit, sensitivities
 
 
@@ -316,7 +316,7 @@ def test_one_step_goes_where_a_refit_without_the_logs_goes() -> None:
     assert isinstance(model.baseline, ParametricBaseline)
     whole = model.baseline.theta.detach().clone()
     fold = torch.tensor([i % 2 for i in range(len(logs))])
-    found = without_logs(model, known, store, config, SCALES, fold)
+    found = estimate_leave_one_out(model, known, store, config, SCALES, fold)
     assert len(found) == 2
     torch.testing.assert_close(model.baseline.theta.detach(), whole)
     apart, moved = 0.0, 0.0

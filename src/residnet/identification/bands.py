@@ -48,7 +48,7 @@ from residnet.identification.identified import (
 from residnet.preprocessing.prepare import PreparedLog, make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.regression.estimator import Solution
-from residnet.training.left_out import without_logs
+from residnet.training.left_out import estimate_leave_one_out
 from residnet.training.refit import parametric
 
 
@@ -136,7 +136,7 @@ class LeaveFoldOutModels:
                     model.baseline, config.fit_solutions(model.baseline, fold_samples), fitted_model
                 )
             return fold_models
-        parameters_by_fold = without_logs(
+        parameters_by_fold = estimate_leave_one_out(
             full_model,
             self.training_samples,
             WindowStore.from_logs(self.identified.training_logs, torch.float64),

@@ -155,7 +155,7 @@ class Mirror:
         return windows._replace(
             **{
                 name: seen(values, values * state)
-                for name in ("y", "smooth", "past_y")
+                for name in ("y", "smoothed", "past_y")
                 if (values := getattr(windows, name)) is not None
             },
             **{
@@ -195,25 +195,26 @@ class HeadTraining(EpochTraining):
             DataError: where no log is long enough for a stage.
         """
         if self.stages[0] is not None:
-            store = replace(store, precomputed=self._told(store))
+            store = replace(store, precomputed=self._precompute(store))
         # methods, which other processes can be given
         return WindowsDataModule(
             store, self.stages, self.settings.steps, self.seed, self.stage_of, self.present_epoch
         )
 
-    def _told(self, store: WindowStore) -> Tensor:
-        """Return channels, what the baseline says and accelerations of all samples [N, nz + 2 n].
+    def _precompute(self, store: WindowStore) -> Tensor:
+        """Return channels, baseline and measured accelerations of all samples [N, nz + 2 n].
 
-        Epochs go through each of them many times, and neither channels nor baseline change.
+        They do not change during the training, whose epochs use each sample many times.
         """
-        width, n = len(self.model.signals.names), self.model.dof
-        told = paged.allocate_rows(len(store.y), width + 2 * n, dtype=store.y.dtype)
+        n_columns = len(self.model.signals.names) + 2 * self.model.dof
+        precomputed = paged.allocate_rows(len(store.y), n_columns, dtype=store.y.dtype)
         with torch.no_grad():
-            for rows in paged.iterate_row_chunks(len(told)):
+            for rows in paged.iterate_row_chunks(len(precomputed)):
                 z = self.model.compute_channels(store.smoothed[rows], store.rate_inputs[rows])
-                told[rows] = torch.cat((z, self.model.baseline_acceleration(z), store.nu_dot[rows]), dim=-1)
+                baseline = self.model.baseline_acceleration(z)
+                precomputed[rows] = torch.cat((z, baseline, store.nu_dot[rows]), dim=-1)
                 paged.release_pages()
-        return told
+        return precomputed
 
     def stage_of(self, epoch: int) -> int:
         """Return the number of the stage that an epoch belongs to."""
@@ -261,19 +262,21 @@ class HeadTraining(EpochTraining):
         return total / self.world
 
     def _one_step(self, windows: Sequence[WindowBatch]) -> Tensor:
-        told, good, depth = (
-            torch.cat([getattr(part, name) for part in windows])
-            for name in ("told", "good", "depth")
-        )
+        precomputed = torch.cat([batch.precomputed for batch in windows])
+        trainable = torch.cat([batch.trainable for batch in windows])
+        n_elapsed = torch.cat([batch.n_elapsed for batch in windows])
         n = self.model.dof
-        z, known, nu_dot = told.split([told.shape[-1] - 2 * n, n, n], dim=-1)
-        washout = torch.full_like(depth, round(self.settings.one_step.washout / self.model.dt))
+        n_channels = precomputed.shape[-1] - 2 * n
+        z, baseline, nu_dot = precomputed.split([n_channels, n, n], dim=-1)
+        n_washout = round(self.settings.one_step.washout / self.model.dt)
+        washout = torch.full_like(n_elapsed, n_washout)
         if self.settings.beginnings is not None:
-            washout[depth == 0] = 0
-        samples = torch.arange(z.shape[1], device=z.device)
-        counted = good & (samples >= washout[:, None])
-        spread = self.model.head.residual_scale().to(z.dtype)
-        return one_step_loss(self.model, z, known, nu_dot, counted, spread, self.shared)
+            # windows at the start of a segment begin with an empty memory, as a free run does
+            washout[n_elapsed == 0] = 0
+        index = torch.arange(z.shape[1], device=z.device)
+        is_counted = trainable & (index >= washout[:, None])
+        scale = self.model.head.residual_scale().to(z.dtype)
+        return one_step_loss(self.model, z, baseline, nu_dot, is_counted, scale, self.shared)
 
     def _multi_step(self, windows: Sequence[WindowBatch], stage: int) -> Tensor:
         begins, memories = [], []

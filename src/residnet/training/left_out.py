@@ -41,15 +41,15 @@ class LeftOpen(NamedTuple):
     square: float
 
 
-def left_open(
+def estimate_refit_covariance(
     model: HybridDynamics,
     samples: Samples,
     store: WindowStore,
     config: RefitConfig,
     scales: Tensor,
-    still: Sequence[int],
+    fixed: Sequence[int],
 ) -> LeftOpen:
-    """Return the covariance that a refit ends with, from one pass over its free runs.
+    """Estimate the covariance of a refit's parameters from one pass over its free runs.
 
     Args:
         model: a baseline without a head, after its refit.
@@ -57,123 +57,138 @@ def left_open(
         store: training windows of the refit, float64.
         config: of the refit.
         scales: of what moves, [n].
-        still: numbers of the free parameters that the refit has left at zero.
+        fixed: indices of the free parameters that the refit has fixed at zero.
     """
-    problem = problem_of(model, samples, store, config, scales).fixing(still)
+    problem = problem_of(model, samples, store, config, scales).fixing(fixed)
     problem = estimate_initial_states(model, problem)
-    level, states = simulate(model, problem)
-    hessian, _ = normal_equations(model, problem, level, states)
-    covariance = problem.cost_per_nat(level) * problem.inverse(hessian)
-    return LeftOpen(covariance, float(level.square() - config.robust**2))
+    cost, states = simulate(model, problem)
+    hessian, _ = normal_equations(model, problem, cost, states)
+    covariance = problem.cost_per_nat(cost) * problem.inverse(hessian)
+    return LeftOpen(covariance, float(cost.square() - config.robust**2))
 
 
-_HALVINGS = 4
-"""Times that a step which does not gain is halved."""
+_MAX_HALVINGS = 4
+"""Largest number of times that a step without a gain is halved."""
 
 
-def without_logs(
+def estimate_leave_one_out(
     model: HybridDynamics,
     samples: Samples,
     store: WindowStore,
     config: RefitConfig,
     scales: Tensor,
     fold: Tensor,
-    still: Sequence[int] = (),
+    fixed: Sequence[int] = (),
 ) -> list[Tensor]:
-    """Return theta of the model's baseline as each fold of logs, left out of the refit, leaves it.
+    """Estimate the parameters of refits that leave out one fold of logs each.
+
+    Each is one Gauss-Newton step from the refitted parameters (infinitesimal jackknife).
 
     Args:
-        model: a baseline without a head, after its refit; it is handed back as it was.
+        model: a baseline without a head, after its refit; it is not changed.
         samples: of the refit.
         store: training windows of the refit, float64.
         config: of the refit.
         scales: of what moves, [n].
         fold: number of the fold of each log [L], from 0 on.
-        still: numbers of the free parameters that the refit has left at zero.
+        fixed: indices of the free parameters that the refit has fixed at zero.
 
     Returns:
         One theta for each fold; the refitted one where a fold holds no window, or where no part of
         the step keeps the free runs of the other logs finite and no worse.
     """
     baseline = parametric(model)
-    problem = problem_of(model, samples, store, config, scales).fixing(still)
+    problem = problem_of(model, samples, store, config, scales).fixing(fixed)
     problem = estimate_initial_states(model, problem)
-    level, states = simulate(model, problem)
-    fitted, parameters = baseline.theta.detach().clone(), baseline.get_free()
-    of_window = fold[problem.log]
-    folds = int(fold.max()) + 1
-    count = torch.bincount(of_window, minlength=folds).to(parameters.dtype)
-    parts = [
-        _part(model, _rows(problem, of_window == k), states[of_window == k], level)
-        for k in range(folds)
+    cost, states = simulate(model, problem)
+    refitted_theta, parameters = baseline.theta.detach().clone(), baseline.get_free()
+    fold_of_window = fold[problem.log]
+    n_folds = int(fold.max()) + 1
+    n_windows = torch.bincount(fold_of_window, minlength=n_folds).to(parameters.dtype)
+    equations_by_fold = [
+        _normal_equations_of_windows(
+            model, _select_windows(problem, fold_of_window == k), states[fold_of_window == k], cost
+        )
+        for k in range(n_folds)
     ]
-    # at the minimum all logs together pull as hard as the prior holds
-    together = sum(
-        (share * own for share, (_, own) in zip(count / count.sum(), parts, strict=True)),
+    # at the minimum the gradient of all logs and that of the prior cancel
+    total_gradient = sum(
+        (
+            share * equations
+            for share, (_, equations) in zip(
+                n_windows / n_windows.sum(), equations_by_fold, strict=True
+            )
+        ),
         torch.zeros_like(parameters),
     )
-    out = []
-    for k in range(folds):
-        left = float(count.sum() - count[k])
-        if count[k] == 0 or left == 0:
-            out.append(fitted.clone())
+    thetas = []
+    for k in range(n_folds):
+        n_remaining = float(n_windows.sum() - n_windows[k])
+        if n_windows[k] == 0 or n_remaining == 0:
+            thetas.append(refitted_theta.clone())
             continue
         hessian = (
             problem.precision
             + problem.symmetry
-            + torch.diag(problem.cost_per_nat(level) * problem.belief_precision)
+            + torch.diag(problem.cost_per_nat(cost) * problem.belief_precision)
         )
-        for j, (own, _) in enumerate(parts):
+        for j, (equations, _) in enumerate(equations_by_fold):
             if j != k:
-                hessian = hessian + count[j] / left * own
-        slope = count[k] / left * (parts[k][1] - together)
-        step = torch.linalg.lstsq(hessian, slope.unsqueeze(1), driver="gelsd").solution.squeeze(1)
+                hessian = hessian + n_windows[j] / n_remaining * equations
+        gradient_change = n_windows[k] / n_remaining * (equations_by_fold[k][1] - total_gradient)
+        step = torch.linalg.lstsq(
+            hessian, gradient_change.unsqueeze(1), driver="gelsd"
+        ).solution.squeeze(1)
         step[problem.fixed] = 0.0
-        others = _rows(problem, of_window != k)
-        baseline.set_free(_best_share(model, others, parameters, step))
-        out.append(baseline.theta.detach().clone())
+        remaining = _select_windows(problem, fold_of_window != k)
+        baseline.set_free(_largest_improving_step(model, remaining, parameters, step))
+        thetas.append(baseline.theta.detach().clone())
         baseline.set_free(parameters)
-    return out
+    return thetas
 
 
-def _best_share(model: HybridDynamics, others: Problem, parameters: Tensor, step: Tensor) -> Tensor:
-    """Return the parameters after the largest share of the step that the other logs agree to."""
-    baseline, (before, _) = parametric(model), simulate(model, others)
-    for halving in range(_HALVINGS):
+def _largest_improving_step(
+    model: HybridDynamics, remaining: Problem, parameters: Tensor, step: Tensor
+) -> Tensor:
+    """Return the parameters after the largest fraction of the step that lowers the cost."""
+    baseline, (initial_cost, _) = parametric(model), simulate(model, remaining)
+    for halving in range(_MAX_HALVINGS):
         trial = parameters + 0.5**halving * step
         baseline.set_free(trial)
-        after, _ = simulate(model, others)
+        trial_cost, _ = simulate(model, remaining)
         baseline.set_free(parameters)
-        if torch.isfinite(after) and after <= before:
+        if torch.isfinite(trial_cost) and trial_cost <= initial_cost:
             return trial
     return parameters
 
 
-def _rows(problem: Problem, chosen: Tensor) -> Problem:
-    """Return the problem of some of its windows, whose starts are as they are."""
+def _select_windows(problem: Problem, is_selected: Tensor) -> Problem:
+    """Return the problem of some of its windows, with their present initial states."""
     return replace(
         problem,
-        x0=problem.x0[chosen],
-        inputs=problem.inputs[chosen],
-        measured=problem.measured[chosen],
-        weight=problem.weight[chosen],
-        log=problem.log[chosen],
+        x0=problem.x0[is_selected],
+        inputs=problem.inputs[is_selected],
+        measured=problem.measured[is_selected],
+        weight=problem.weight[is_selected],
+        log=problem.log[is_selected],
         initial=None,
     )
 
 
-def _part(
-    model: HybridDynamics, part: Problem, states: Tensor, level: Tensor
+def _normal_equations_of_windows(
+    model: HybridDynamics, problem: Problem, states: Tensor, cost: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return Hessian [P, P] and half the gradient [P] of the mean cost of some windows alone."""
-    size = int(part.free.numel())
-    if len(part.x0) == 0:
-        return torch.zeros(size, size, dtype=states.dtype), torch.zeros(size, dtype=states.dtype)
-    nothing = replace(
-        part,
-        precision=torch.zeros_like(part.precision),
-        symmetry=torch.zeros_like(part.symmetry),
-        belief_precision=torch.zeros_like(part.belief_precision),
+    n_parameters = int(problem.free.numel())
+    if len(problem.x0) == 0:
+        return torch.zeros(n_parameters, n_parameters, dtype=states.dtype), torch.zeros(
+            n_parameters, dtype=states.dtype
+        )
+    without_prior = replace(
+        problem,
+        precision=torch.zeros_like(problem.precision),
+        symmetry=torch.zeros_like(problem.symmetry),
+        belief_precision=torch.zeros_like(problem.belief_precision),
         prior_mean=parametric(model).get_free(),
     )
-    return normal_equations(model, nothing, level, states)
+    return normal_equations(model, without_prior, cost, states)

@@ -26,7 +26,7 @@ from residnet.manoeuvres.open_loop import ConstantInput
 from residnet.physics.signals import SignalsConfig
 from residnet.preprocessing.prepare import compute_training_ranges, make_samples
 from residnet.preprocessing.windows import WindowStore
-from residnet.training.left_out import LeftOpen, left_open
+from residnet.training.left_out import LeftOpen, estimate_refit_covariance
 from residnet.training.refit import RefitConfig, refit
 
 CONFIG = RefitConfig(horizon=4.0, every=4.0, iterations=3)
@@ -51,7 +51,7 @@ def known() -> tuple[FittedModel, LeftOpen, torch.Tensor]:
         low=tuple(low.tolist()),
         high=tuple(high.tolist()),
     )
-    open_ = left_open(model, given, store, CONFIG, SCALES, refitted.notes["at_rest"])
+    open_ = estimate_refit_covariance(model, given, store, CONFIG, SCALES, refitted.notes["at_rest"])
     return FittedModel(spec, model, {}), open_, refitted.covariance
 
 

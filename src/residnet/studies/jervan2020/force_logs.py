@@ -234,7 +234,7 @@ def read_force_logs(
         masked[name] = {reason: share for reason, share in shares.items() if share}
     smooth, nu_dot, measured, usable = (
         torch.from_numpy(np.concatenate([getattr(log, attribute) for log in logs]))
-        for attribute in ("smooth", "nu_dot", "recorded", "good")
+        for attribute in ("smoothed", "nu_dot", "rate_inputs", "trainable")
     )
     fold = torch.cat(segments)
     accelerations: dict[str, Tensor] = {}

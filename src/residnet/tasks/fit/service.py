@@ -72,7 +72,7 @@ from residnet.tasks.fit.outcome import (
     read_external_logs,
     write_evaluation,
 )
-from residnet.training.left_out import left_open
+from residnet.training.left_out import estimate_refit_covariance
 
 if TYPE_CHECKING:
     from residnet.tasks.fit.config import FitConfig
@@ -593,7 +593,7 @@ def plan_next_trials(
     )
     refit = refit.with_prior(float(fitted_model.notes.get("prior", refit.prior)))
     scales = config.evaluation.scales.to_array()
-    open_directions = left_open(
+    open_directions = estimate_refit_covariance(
         fitted_model.model.double(),
         make_samples(training_logs, config.signals.build()),
         WindowStore.from_logs(training_logs, torch.float64),
