@@ -298,11 +298,11 @@ class _CurrentProblem:
         current_of_sample = current[fit.group]
         columns_of_jacobian = []
         for direction in torch.eye(2, dtype=torch.float64):
-            _, derivative = torch.func.jvp(
+            derivative = torch.func.jvp(
                 lambda c: self.residuals(c, fit.theta),
                 (current_of_sample,),
                 (direction.expand_as(current_of_sample),),
-            )
+            )[1]
             columns_of_jacobian.append(derivative)
         jacobian = torch.stack(columns_of_jacobian, dim=2)
         hessian = self.precision * torch.eye(2 * n_logs, dtype=torch.float64)
