@@ -370,7 +370,9 @@ def test_free_runs_are_offered_joint_settings_then_single_steps_around_the_best(
     head = calibrated(KernelConfig(kernel=RbfConfig(sigma=(3.0, 30.0)), penalties=penalties))
     found = head.fit_solutions(SAMPLES)
     joint = [([s] * 3, [p] * 3) for s in (3.0, 30.0) for p in penalties]
-    assert [(s.hyperparameters["sigma"], s.hyperparameters["penalty"]) for s in found[1:-1]] == joint
+    assert [
+        (s.hyperparameters["sigma"], s.hyperparameters["penalty"]) for s in found[1:-1]
+    ] == joint
     head.load_state_dict(found[-1].state, strict=False)
     assert found[-1].hyperparameters == {"penalty": []}
     assert np.abs(answer(head, NEW)).max() == 0.0
@@ -465,7 +467,10 @@ def test_no_format_exports_it() -> None:
         (["sklearn.datasets.load_iris"], "is not among the classes"),
         ([{"sklearn.svm.SVR": {"C": "much"}}], "The 'C' parameter of SVR must be a float"),
         (["sklearn.svm.SVR", "sklearn.svm.SVR"], "SVR is not a transformer"),
-        ([{"sklearn.svm.SVR": {"kernel": {"os.system": {}}}}], "kernel: expected a number, a string"),
+        (
+            [{"sklearn.svm.SVR": {"kernel": {"os.system": {}}}}],
+            "kernel: expected a number, a string",
+        ),
         ([{"sklearn.svm.SVR": {"D": 1}}], "unexpected keyword argument 'D'"),
         (["sklearn.preprocessing.StandardScaler"], "is not a regressor"),
         ([], "at least 1"),

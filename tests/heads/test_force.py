@@ -85,7 +85,9 @@ def model() -> Any:
 def test_the_mass_and_the_accelerations_are_the_true_ferrys(model: Any) -> None:
     of = samples()
     with torch.no_grad():
-        torch.testing.assert_close(model.one_step_accelerations(of.z[None])[0], of.target, rtol=0, atol=1e-5)
+        torch.testing.assert_close(
+            model.one_step_accelerations(of.z[None])[0], of.target, rtol=0, atol=1e-5
+        )
     torch.testing.assert_close(
         torch.linalg.inv(model.head.inverse), hull("milliampere_half").mass, rtol=1e-4, atol=1e-2
     )
@@ -100,7 +102,9 @@ def test_the_thirty_basis_functions_hold_it_too(config: Any) -> None:
     assert model.head.inner.library.n_terms == 30
     of = samples()
     with torch.no_grad():
-        torch.testing.assert_close(model.one_step_accelerations(of.z[None])[0], of.target, rtol=0, atol=1e-3)
+        torch.testing.assert_close(
+            model.one_step_accelerations(of.z[None])[0], of.target, rtol=0, atol=1e-3
+        )
 
 
 def test_a_free_run_is_the_true_ferrys(model: Any) -> None:
@@ -138,7 +142,9 @@ def test_a_mean_is_that_of_its_members(model: Any) -> None:
     with torch.no_grad():
         other = fitted(PlsrConfig(space="force", order=2, choose="one_step"), samples())
         mean = mean_of([model, other])
-        expected = (model.one_step_accelerations(of.z[None]) + other.one_step_accelerations(of.z[None])) / 2
+        expected = (
+            model.one_step_accelerations(of.z[None]) + other.one_step_accelerations(of.z[None])
+        ) / 2
         torch.testing.assert_close(mean.one_step_accelerations(of.z[None]), expected)
         stepped = mean.step(x, w, x[:, :0])[0]
         torch.testing.assert_close(Rollout(mean)(x, w[:, None], x[:, :0])[0][:, 1], stepped)
@@ -152,7 +158,7 @@ def test_a_mean_is_that_of_its_members(model: Any) -> None:
     ],
 )
 def test_a_mass_that_cannot_be_inverted_safely_fails_the_fit(config: Any) -> None:
-    with pytest.raises(FitError, match=r"eigenvalues .* cannot run forward"):
+    with pytest.raises(FitError, match=r"eigenvalues .* cannot be solved"):
         fitted(config, samples(mass_sign=-1.0))
 
 
@@ -165,7 +171,9 @@ def test_only_the_solutions_that_run_forward_are_offered() -> None:
     with torch.no_grad():
         residual = model.head.residual_samples(of, model.baseline(of.z))
     model.head.calibrate(residual)
-    offered = [solution.hyperparameters["penalty"] for solution in model.head.fit_solutions(residual)]
+    offered = [
+        solution.hyperparameters["penalty"] for solution in model.head.fit_solutions(residual)
+    ]
     assert offered == [[100.0] * 3, []]
 
 
@@ -173,7 +181,7 @@ def force(**settings: Any) -> Any:
     return RidgeConfig(space="force", **settings).build(NAMES)
 
 
-ALONE, ONLY = "names accelerations only by themselves", "only a residual in force space"
+ALONE, ONLY = "only be a term by itself", "only heads in force space"
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,9 @@ def test_saved_and_loaded_with_functions_of_sums(tmp_path: Path) -> None:
     again: Any = load_model(tmp_path / "m")[1]
     z = make_example_samples().z[:50]
     with torch.no_grad():
-        assert torch.equal(again.head.teacher_forced_residuals(z), model.head.teacher_forced_residuals(z))
+        assert torch.equal(
+            again.head.teacher_forced_residuals(z), model.head.teacher_forced_residuals(z)
+        )
     assert again.head.names() == model.head.names()
 
 

@@ -219,7 +219,7 @@ def test_limits_of_a_servo() -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"dead_time": 0.2}, "belong together"),
+        ({"dead_time": 0.2}, "given together"),
         ({"dead_time": 0.2, "delay_step": 0.03}, "1 to 1000 times"),
         ({"dead_time": "-1 s"}, "dead_time"),
         (

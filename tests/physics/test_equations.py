@@ -103,7 +103,9 @@ def test_jets_thrust_as_printed_saturate_and_turn_to_the_side_that_is_asked_for(
     torch.testing.assert_close(
         actuators.force(nu[:, :0], beyond, nu), actuators.force(nu[:, :0], limits, nu)
     )
-    command = actuators.commands_for_demand(*torch.tensor([[0.5, 0.5], [0.3, -0.3]], dtype=torch.float64))
+    command = actuators.commands_for_demand(
+        *torch.tensor([[0.5, 0.5], [0.3, -0.3]], dtype=torch.float64)
+    )
     tau = actuators.force(nu[:, :0], command, nu)
     assert float(tau[0, 2]) > 0 > float(tau[1, 2])
     torch.testing.assert_close(tau[:, 2], -3.82 * tau[:, 1])

@@ -101,7 +101,7 @@ def test_a_chain_adds_up_and_leaves_what_its_corrections_do_not_explain() -> Non
 @pytest.mark.parametrize(
     ("term", "value", "error", "message"),
     [
-        ("u_dot", -2400.0, FitError, "cannot run forward"),
+        ("u_dot", -2400.0, FitError, "cannot be solved"),
         ("u_dot", -2389.65, FitError, "condition"),
         ("u_dot u", 0.0, ConfigError, "only by themselves"),
         ("u_dot^2", 0.0, ConfigError, "only by themselves"),

@@ -102,7 +102,7 @@ def test_a_resolved_config_needs_no_vessel_file() -> None:
         ({"exogenous": ["wind_sped", "wind_dir"]}, "did you mean 'wind_speed'"),
         ({"exogenous": ["wind_speed"]}, "needs both wind_speed and wind_dir"),
         ({"inputs": ["n", "n"]}, r"\['n'\] are named twice"),
-        ({"inputs": ["n", "delta", "m"], "forces": "wam_v_cal"}, "made by two thrusters"),
+        ({"inputs": ["n", "delta", "m"], "forces": "wam_v_cal"}, "inputs of two thrusters"),
         ({"inputs": ["n", "u"]}, "input 'u' is a channel that the model has"),
         (
             {"inputs": ["tau_x", "tau_n"], "forces": "wam_v_cal"},

@@ -36,8 +36,8 @@ WRONG = [
     ("wam_v_cal", "damping.N.|u|v|v|={value: 1, unit: kg, source: made}", "kg s/m"),
     ("wam_v_cal", "actuators.curve_range=[-1500 rpm, 2400 rpm]", "does not reach n_max"),
     ("wam_v_cal", "added_mass.X_udot.value=400", "wam_v_cal.*mass matrix is not positive definite"),
-    ("odin_forces", "terms.u.u.unit=1/m", "its unit must be 1/s"),
-    ("odin_forces", "gains.n.unit=1/kg", "its unit must be 1/kg/m\\^2"),
+    ("odin_forces", "terms.u.u.unit=1/m", "expected the unit 1/s"),
+    ("odin_forces", "gains.n.unit=1/kg", "expected the unit 1/kg/m\\^2"),
     ("milliampere_azimuth", "actuators.shaft.n_max=5400 rpm", "curve_range"),
     ("milliampere_azimuth", "actuators.shaft.n_max=5300 rpm", "thrust falls"),
     (
@@ -47,12 +47,12 @@ WRONG = [
     ),
     ("milliampere_azimuth", "actuators.places=[{name: bow, x: 1.8}]", "give two places"),
     ("patrol_p06", "hydrostatics.GM.value=-0.2", "hydrostatics.*must be positive"),
-    ("patrol_p06", "forces.K.p.unit=kg m^2", "K.p: its unit must be kg m\\^2/s"),
+    ("patrol_p06", "forces.K.p.unit=kg m^2", "K.p: expected the unit kg m\\^2/s"),
     ("patrol_p06", "forces.K.phi^2={value: 1, unit: N, source: made}", "kg m\\^2/s\\^2"),
     ("patrol_p06", "forces.N.sin(phi)={value: 1, unit: N m, source: made}", "no function 'sin'"),
     ("patrol_p06", "base=wam_v_clean", "no vessel 'wam_v_clean'"),
     ("mariner", "coefficients.Y.v^-1=1", "divides"),
-    ("mariner", "coefficients.X.dn=1", "belong together"),
+    ("mariner", "coefficients.X.dn=1", "given together"),
     ("mariner", "delta_sign=1", "check delta_sign"),
     ("example_rudder_boat", "actuators.rudder.area=0.1 m", "m\\^2"),
     (
@@ -63,9 +63,9 @@ WRONG = [
     ("example_rudder_boat", "actuators.kind=rudder", "rudder_propeller"),
     ("example_rudder_boat", "kind=fosen", "did you mean 'fossen'"),
     ("nomoto_oceanos", "T.value=0", "T must not be zero"),
-    ("nomoto_oceanos", "K.value=-1", "turns to starboard"),
+    ("nomoto_oceanos", "K.value=-1", "to starboard"),
     ("nomoto_mariner", "T_v.value=18.530161", "T_v must differ from T3"),
-    ("nomoto_mariner_yaw", "T2.value=-7", "turns to starboard"),
+    ("nomoto_mariner_yaw", "T2.value=-7", "to starboard"),
 ]
 
 
@@ -137,7 +137,7 @@ def test_a_base_by_path(tmp_path: Path) -> None:
         -393e3,
     )
     (tmp_path / "first.yaml").write_text(heavy.format(name="first", base="second.yaml", m=400))
-    with pytest.raises(ConfigError, match="name each other in a circle") as caught:
+    with pytest.raises(ConfigError, match="refer to each other in a cycle") as caught:
         load_vessel(str(tmp_path / "second.yaml"))
     assert "\n" not in str(caught.value)
     (tmp_path / "first.yaml").write_text("kind: [patrol\n")

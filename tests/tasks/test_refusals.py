@@ -82,7 +82,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("training.mlp.one_step.window=99.0", "no training log holds a window of 990 samples"),
     ],
     "ferry": [
-        ("'baseline={kind: regressors, terms: [u, tau_x]}'", "a baseline that knows its mass"),
+        ("'baseline={kind: regressors, terms: [u, tau_x]}'", "space: force needs a baseline"),
         ("'heads.mlp={kind: mlp, features: [u_dot]}'", "only a residual in force space knows it"),
     ],
     "ship": [

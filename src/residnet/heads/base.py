@@ -244,8 +244,8 @@ class FeatureConfig(Config):
         for name in self.features:
             if name in ACCELERATION_NAMES and name not in names:
                 raise ConfigError(
-                    f"head feature '{name}' is an acceleration: only a residual in force space"
-                    " knows it (plsr or ridge, space: force)"
+                    f"head feature '{name}' is an acceleration, which only heads in force space"
+                    " support (plsr or ridge, space: force)"
                 )
             if name not in names:
                 raise ConfigError(

@@ -57,9 +57,8 @@ class BasisConfig(FeatureConfig, ABC):
         ]
         if self.space == "acceleration" and acceleration_terms:
             raise ValueError(
-                f"terms: '{acceleration_terms[0]}' names an acceleration, which only a residual in"
-                f" force space"
-                " may (space: force)"
+                f"terms: '{acceleration_terms[0]}' contains an acceleration, which only heads in"
+                " force space support (space: force)"
             )
         return self
 

@@ -52,8 +52,7 @@ class ForceHead(ClosedFormHead):
     def set_inertia(self, mass: Tensor | None) -> None:
         if mass is None:
             raise ConfigError(
-                "space: force needs a baseline that knows its mass and the forces on it; set its"
-                " kind to 'believed'"
+                "space: force needs a baseline with a mass matrix; set its kind to 'believed'"
             )
         self.mass.copy_(mass)
         self.inverse.copy_(torch.linalg.inv(mass))

@@ -89,7 +89,7 @@ class TermFeatures(nn.Module):
         ):
             if is_constant:
                 raise FitError(
-                    f"feature '{term}' is constant over the training samples; leave it out of"
+                    f"feature '{term}' is constant over the training samples; remove it from"
                     " `terms`"
                 )
         self.mean.copy_(values.mean(0))

@@ -57,11 +57,11 @@ class LstmConfig(FeatureConfig):
                 raise ValueError("axis_features needs per_axis: true")
             if set(self.axis_features) != {"u", "v", "r"}:
                 raise ValueError(
-                    f"axis_features needs all of u, v, r; given {sorted(self.axis_features)}"
+                    f"axis_features: expected all of u, v, r, got {sorted(self.axis_features)}"
                 )
         if self.memory and not self.readout:
             raise ValueError(
-                "memory needs a readout layer, or the other features are never seen; set readout"
+                "memory needs a readout layer, which receives the other features; set readout"
             )
         return self
 
@@ -76,8 +76,7 @@ class LstmConfig(FeatureConfig):
             return [(self.select_features(names), get_dof(names).n_dynamic)]
         if get_dof(names).has_roll:
             raise ConfigError(
-                "per_axis: there is one network for each of surge, sway and yaw, and none for the"
-                " roll of this model; leave per_axis out"
+                "per_axis: supports surge, sway and yaw, but the model has roll; remove per_axis"
             )
         if self.axis_features is None:
             return [(self.select_features(names), 1)] * get_dof(names).n_dynamic

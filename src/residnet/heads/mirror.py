@@ -55,9 +55,8 @@ class MirroredHead(ResidualHead):
         mirror = mirror_channels(names)
         if mirror is None:
             raise ConfigError(
-                f"mirror: it is not known how all of the channels {', '.join(names)} change in the"
-                " mirror (the torque of a lone propeller heels a vessel that rolls); leave `mirror`"
-                " out"
+                f"mirror: the mirror image of some of the channels {', '.join(names)} is unknown"
+                " (the torque of a single propeller heels a vessel with roll); remove `mirror`"
             )
         self.inner_head = inner
         self.inner_state_size = inner.n_state

@@ -119,15 +119,12 @@ class AbkowitzConfig(VesselFile):
         if any(factor.name == "dn" for *_, factors in parsed_terms for factor in factors) != (
             self.shaft is not None
         ):
-            raise ValueError(
-                "terms in dn and the section 'shaft' belong together: the series needs both or"
-                " neither"
-            )
+            raise ValueError("terms in dn and the section 'shaft' must be given together")
         turning_derivative = self.delta_sign * self.coefficients["N"].get("delta", 0.0)
         if turning_derivative < 0:
             raise ValueError(
-                "N.delta times delta_sign must be positive: a rudder to starboard turns to"
-                " starboard; check delta_sign"
+                "N.delta times delta_sign must be positive, so that a starboard rudder turns the"
+                " vessel to starboard; check delta_sign"
             )
         return self
 

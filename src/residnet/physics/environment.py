@@ -111,17 +111,15 @@ class TabulatedWindConfig(WindLoadConfig):
                 raise ValueError(f"{name} has {len(values)} values for {len(self.angle)} angles")
         if max(self.C_Y) > 0:
             raise ValueError(
-                "C_Y must not be positive: wind from starboard pushes to port (body y points to"
-                " starboard)"
+                "C_Y must not be positive: wind from starboard acts to port (body y points"
+                " to starboard)"
             )
         if self.C_X[0] > 0:
             raise ValueError(
-                "C_X must not be positive in head wind: it pushes aft (body x points forward)"
+                "C_X must not be positive in head wind: the force is aft (body x points forward)"
             )
         if any(abs(values[i]) > 1e-9 for values in (self.C_Y, self.C_N) for i in (0, -1)):
-            raise ValueError(
-                "C_Y and C_N must be zero at 0 and 180 deg: port and starboard mirror each other"
-            )
+            raise ValueError("C_Y and C_N must be zero at 0 and 180 deg by symmetry")
         return self
 
     @cached_property

@@ -72,8 +72,8 @@ def weighted_column_std(terms: Sequence[str], x: Tensor) -> Tensor:
     is_constant = std <= 1e-9 * x.abs().amax(0).clamp(min=1e-300)
     if bool(is_constant.any()):
         raise FitError(
-            f"basis function '{terms[int(is_constant.nonzero()[0, 0])]}' is constant over the samples;"
-            " leave it out or give data that excite it"
+            f"basis function '{terms[int(is_constant.nonzero()[0, 0])]}' is constant over the"
+            " samples; remove it or give data that excite it"
         )
     return std * torch.tensor([term_order(term) for term in terms], dtype=x.dtype)
 
@@ -194,8 +194,8 @@ def find_acceleration_terms(
             or acceleration_factors[0].function
         ):
             raise ConfigError(
-                f"term '{term}': a force-space model that runs forward names accelerations only by"
-                " themselves (u_dot, v_dot, r_dot)"
+                f"term '{term}': in force space an acceleration may only be a term by itself"
+                " (u_dot, v_dot, r_dot); change the term"
             )
         axis_of_term[j] = ACCELERATION_NAMES.index(acceleration_factors[0].name)
     return axis_of_term
@@ -227,8 +227,8 @@ def augment_mass(
     if bool((eigenvalues <= 0).any()) or not condition < _MAX_CONDITION:
         raise FitError(
             f"{subject}: its mass matrix with the fitted accelerations has eigenvalues"
-            f" {[round(float(v), 1) for v in eigenvalues]} and condition {condition:.1e}, it cannot run"
-            " forward; give data with more acceleration, fewer terms, or a higher penalty or lower"
-            " order"
+            f" {[round(float(v), 1) for v in eigenvalues]} and condition"
+            f" number {condition:.1e}, so that it cannot be solved for the acceleration; give data"
+            " with more acceleration, fewer terms, a higher penalty or a lower order"
         )
     return augmented_mass, other_terms

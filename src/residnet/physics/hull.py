@@ -101,8 +101,8 @@ def _axis_terms_validator(
             unit = axis_terms[axis][term].unit
             if parse_dimension(unit, mass_power) != (metre_power, second_power):
                 raise ValueError(
-                    f"{axis}.{term}: its unit must be {format_unit(metre_power, second_power, mass_power)}, given"
-                    f" '{unit}'"
+                    f"{axis}.{term}: expected the unit"
+                    f" {format_unit(metre_power, second_power, mass_power)}, got '{unit}'"
                 )
         return {axis: axis_terms.get(axis, {}) for axis in axes}
 

@@ -69,8 +69,8 @@ class NomotoVesselConfig(VesselFile, ABC):
             gain_ratio /= time_constant
         if gain_ratio <= 0:
             raise ValueError(
-                "K over the time constants must be positive: a rudder to starboard turns to"
-                " starboard (an unstable ship has K and a T negative)"
+                "K divided by the time constants must be positive, so that a starboard rudder turns"
+                " the vessel to starboard (an unstable ship has negative K and a negative T)"
             )
         return self
 
@@ -146,7 +146,8 @@ class SideslipNomotoConfig(SecondOrderSteeringConfig):
     """Second-order model in yaw and sway, given by its transfer functions.
 
     M nu_dot + N(u) nu = b delta with nu = (v, r) (document 004 eq. (5.1)) has the transfer
-    functions (5.3) and v/delta = K_v (1 + T_v s) / ((1 + T1 s)(1 + T2 s)), (5.4) with correction G12.
+    functions (5.3) and v/delta = K_v (1 + T_v s) / ((1 + T1 s)(1 + T2 s)), (5.4) with
+    correction G12.
 
     Attributes:
         K_v: steady sway velocity per rudder angle in m/s per rad.
@@ -161,8 +162,8 @@ class SideslipNomotoConfig(SecondOrderSteeringConfig):
     def _validate_distinct_zeros(self) -> SideslipNomotoConfig:
         if self.K_v.value == 0 or self.T_v.value == self.T3.value:
             raise ValueError(
-                "K_v must not be zero and T_v must differ from T3: sway would be no state of its"
-                " own; use kind nomoto_second_order"
+                "K_v must not be zero and T_v must differ from T3, otherwise sway is not an"
+                " independent state; use kind nomoto_second_order"
             )
         return self
 

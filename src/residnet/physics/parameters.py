@@ -103,7 +103,7 @@ def require_dimension(mass: int, metres: int, seconds: int) -> Callable[[Paramet
     def check(parameter: Parameter) -> Parameter:
         if parse_dimension(parameter.unit, mass) != (metres, seconds):
             raise ValueError(
-                f"its unit must be {format_unit(metres, seconds, mass)}, given '{parameter.unit}'"
+                f"expected the unit {format_unit(metres, seconds, mass)}, got '{parameter.unit}'"
             )
         return parameter
 

@@ -69,15 +69,15 @@ class SignalsConfig(Config):
         for name in self.exogenous:
             if name not in WIND_INPUTS:
                 raise ValueError(
-                    f"exogenous channel '{name}' is not understood{suggest_name(name, WIND_INPUTS)}"
+                    f"exogenous channel '{name}' is unknown{suggest_name(name, WIND_INPUTS)}"
                 )
         if self.exogenous and set(self.exogenous) != set(WIND_INPUTS):
             raise ValueError(
-                f"true wind needs both {' and '.join(WIND_INPUTS)}; given {list(self.exogenous)}"
+                f"exogenous: expected both {' and '.join(WIND_INPUTS)}, got {list(self.exogenous)}"
             )
         if self.with_thrusters().forces is not None and len(self.inputs) != 2:
             raise ValueError(
-                f"forces are made by two thrusters, but inputs are {list(self.inputs)}"
+                f"forces: expected the inputs of two thrusters, got {list(self.inputs)}"
             )
         if self.dof.is_six_dof:
             vertical_plane = tuple(
@@ -85,27 +85,26 @@ class SignalsConfig(Config):
             )
             if self.velocities not in (SIX_DOF_LAYOUT.velocities, vertical_plane):
                 raise ValueError(
-                    "velocities: heave and pitch go with surge alone (u, w, q and what of these"
-                    " moves) or need all six, u, v, r, w, p, q, in this order; given"
-                    f" {', '.join(self.velocities)}"
+                    "velocities: heave and pitch need a subset of u, w, q, or u, v, r, w, p, q in"
+                    f" this order; got {', '.join(self.velocities)}"
                 )
             if self.exogenous or self.forces:
                 raise ValueError(
-                    "velocities: a model of six degrees of freedom knows neither wind nor forces"
-                    " of two thrusters; leave exogenous and forces out"
+                    "velocities: a model in six degrees of freedom supports neither wind nor forces"
+                    " of two thrusters; remove exogenous and forces"
                 )
         elif list(self.velocities) != [
             velocity for velocity in ROLL_LAYOUT.velocities if velocity in self.velocities
         ]:
             raise ValueError(
-                f"velocities are named once each, in the order u, v, r, p; given {self.velocities}"
+                f"velocities: expected a subset of u, v, r, p in this order, got {self.velocities}"
             )
         if not self.dof.is_six_dof and not set(self.velocities) & set(PLANAR_LAYOUT.velocities):
-            raise ValueError("velocities: a model moves at least one of u, v, r; [p] has none")
+            raise ValueError("velocities: expected at least one of u, v, r, got [p]")
         if self.exogenous and self.dof.fixed_states:
             raise ValueError(
-                "exogenous: the loads of a wind need u, v and r and a heading; leave it out, or"
-                " give logs with all of these"
+                "exogenous: wind needs u, v, r and a heading; remove it, or give logs with all of"
+                " these"
             )
         duplicates = {
             name for name in self.inputs if name in self.exogenous or self.inputs.count(name) > 1
@@ -159,7 +158,7 @@ class SignalsConfig(Config):
         if not isinstance(actuators, DifferentialThrustConfig):
             raise ValueError(
                 f"forces: the actuators of '{self.forces}' are not two thrusters"
-                " (differential_thrust); leave forces out"
+                " (differential_thrust); remove forces"
             )
         return self.model_copy(update={"forces": actuators})
 

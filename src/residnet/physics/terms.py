@@ -76,7 +76,7 @@ def parse_term(term: str, names: Sequence[str], *, functions: bool = True) -> tu
         match = _FACTOR.match(term, position)
         if match is None or match.end() == position:
             raise ConfigError(
-                f"term '{term}': cannot read it from '{term[position:]}'; write a product such as"
+                f"term '{term}': invalid from '{term[position:]}'; write a product such as"
                 " 'u|u|', 'v r' or 'n^2 delta'"
             )
         position = match.end()

@@ -51,7 +51,7 @@ def load_vessel(name: str) -> AnyVessel:
         if path.suffix not in {".yaml", ".yml"}:
             raise ConfigError(
                 f"no vessel '{name}'{suggest_name(name, files)};"
-                " or give the path of a vessel's yaml file"
+                " give a name or the path of a YAML file"
             )
     vessel: AnyVessel = load_config(path, [], VesselConfig)
     return vessel

@@ -61,7 +61,7 @@ def merge_with_base(data: Any, folder: Path | None) -> Any:
         path = _resolve_base_path(layers[-1]["base"], folder)
         if path in visited:
             raise ValueError(
-                f"base: {' and '.join(p.name for p in visited)} name each other in a circle"
+                f"base: {' and '.join(p.name for p in visited)} refer to each other in a cycle"
             )
         visited.append(path)
         folder = path.parent

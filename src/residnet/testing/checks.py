@@ -624,7 +624,7 @@ def _check_indices(indices: dict[str, Any], subject: str) -> None:
         assert_true(
             index_values.dtype.kind in "fiub"
             and bool(np.isfinite(index_values.astype(float)).all()),
-            f"{subject}: its index '{name}' is {value!r}, not finite numbers; omit the index instead",
+            f"{subject}: its index '{name}' is {value!r}, not finite; omit it instead",
         )
 
 

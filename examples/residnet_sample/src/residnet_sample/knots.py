@@ -24,7 +24,7 @@ _KNOT = 1852.0 / 3600.0
 
 @final
 class KnotsConfig(ConfiguredReader):
-    """Tables without a header: t [s], x [m], y [m], heading [deg], u [kn], v [kn], yaw rate [deg/s].
+    """Tables without a header: t [s], x [m], y [m], heading [deg], u [kn], v [kn], r [deg/s].
 
     Columns after the seventh are the revolutions of the propellers in 1/s.
 

@@ -31,7 +31,7 @@ class SlowWaterConfig(BaseHeadConfig):
 
 @final
 class SlowWaterHead(ResidualHead):
-    """Head with the residual rho = std * W [f, s], where s is the low-pass filtered features f."""
+    """Head with the residual rho = std * W [f, s], where s are filtered features f."""
 
     def __init__(self, config: SlowWaterConfig, names: Sequence[str]) -> None:
         super().__init__(names)

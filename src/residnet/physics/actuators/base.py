@@ -120,8 +120,8 @@ class ServoConfig(Config):
     def _validate_delay(self) -> ServoConfig:
         if (self.dead_time > 0) != (self.delay_step is not None):
             raise ValueError(
-                "dead_time and delay_step belong together: delay_step is the step of the plant"
-                " (data.step over data.substeps)"
+                "dead_time and delay_step must be given together; delay_step is the time step of"
+                " the plant (data.step divided by data.substeps)"
             )
         if self.delay_step is not None:
             taps = self.dead_time / self.delay_step
@@ -235,8 +235,8 @@ class Servo(nn.Module):
         if abs(dt - self.delay_step) > 1e-9:
             raise ConfigError(
                 f"actuator with dead time: its delay_step is {self.delay_step:g} s, but the plant"
-                f" steps by {dt:g} s; set delay_step to the step of the plant (data.step over"
-                " data.substeps)"
+                f" steps by {dt:g} s; set delay_step to the time step of the plant (data.step"
+                " divided by data.substeps)"
             )
         newest_command = command.clamp(-self.limit, self.limit)
         return torch.cat(

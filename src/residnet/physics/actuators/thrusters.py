@@ -237,16 +237,16 @@ class AzimuthThrustersConfig(ActuatorConfig):
         decreasing = n[np.polynomial.Polynomial(self.thrust).deriv()(n) <= 0]
         if len(decreasing):
             raise ValueError(
-                f"thrust falls with the revolutions at {decreasing[0] * 60:.0f} rpm: a force has no"
-                " one speed there; lower n_max"
+                f"thrust decreases with the revolutions at {decreasing[0] * 60:.0f} rpm, so that"
+                " its inverse is not unique; lower n_max"
             )
         if (
             len({(thruster_position.x, thruster_position.y) for thruster_position in self.places})
             == 1
         ):
             raise ValueError(
-                "thrusters at one place cannot make surge, sway and yaw independently; give two"
-                " places"
+                "thrusters at one position cannot produce surge, sway and yaw independently; give"
+                " two positions"
             )
         return self
 
