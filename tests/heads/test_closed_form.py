@@ -167,7 +167,7 @@ def test_few_manoeuvres_make_fewer_folds_unless_they_are_named(kind: Any) -> Non
         head.fit_preferred(few)
     for name, value in three.state_dict().items():
         torch.testing.assert_close(usual.state_dict()[name], value, rtol=0, atol=0)
-    with pytest.raises(FitError, match="5 folds need .* have 3; lower `folds`"):
+    with pytest.raises(FitError, match=r"5 folds need .* have 3; lower `folds`"):
         five.fit_preferred(few)
 
 

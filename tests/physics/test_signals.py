@@ -100,13 +100,13 @@ def test_a_resolved_config_needs_no_vessel_file() -> None:
     ("changes", "message"),
     [
         ({"exogenous": ["wind_sped", "wind_dir"]}, "did you mean 'wind_speed'"),
-        ({"exogenous": ["wind_speed"]}, "needs both wind_speed and wind_dir"),
+        ({"exogenous": ["wind_speed"]}, "expected both wind_speed and wind_dir"),
         ({"inputs": ["n", "n"]}, r"\['n'\] are named twice"),
         ({"inputs": ["n", "delta", "m"], "forces": "wam_v_cal"}, "inputs of two thrusters"),
-        ({"inputs": ["n", "u"]}, "input 'u' is a channel that the model has"),
+        ({"inputs": ["n", "u"]}, "input 'u' is a state or a computed"),
         (
             {"inputs": ["tau_x", "tau_n"], "forces": "wam_v_cal"},
-            "input 'tau_x' is a channel that the model has",
+            "input 'tau_x' is a state or a computed",
         ),
         ({"forces": "wam_v_kal"}, "did you mean 'wam_v_cal'"),
     ],
