@@ -28,7 +28,7 @@ from residnet.identification.planning import (
     PredictionGoal,
     TrialLimits,
     compute_expected_uncertainty,
-    moments,
+    sensitivity_information,
     plan_trials,
     propose_manoeuvres,
 )
@@ -125,7 +125,9 @@ def drawn(vessel: str, seed: int, times: int) -> tuple[float, float, np.ndarray]
     ]
     steps = round(refit.horizon / STEP)
     # squared sensitivities [P, P] of velocities over the booklet's manoeuvres
-    goal = moments(fitted.model.double(), runs, steps, torch.from_numpy(scales)).sum(dim=0)
+    goal = sensitivity_information(
+        fitted.model.double(), runs, steps, torch.from_numpy(scales)
+    ).sum(dim=0)
     before = compute_expected_uncertainty(open_.covariance, goal)
 
     def shrinks(covariance: Tensor) -> float:

@@ -35,7 +35,7 @@ class BookletConfig(Config):
     Attributes:
         model: name of the baseline.
         length: length of the hull in the scale of the logs, m.
-        scale: scale of the ship over that of the logs (Froude's law); 1 for full-scale logs.
+        scale: scale ratio of ship and logs (Froude's law); 1 for full-scale logs.
         inputs: inputs of the model with their shares of drive and steer, limits and rates.
         initial: initial states by name.
         manoeuvres: standard manoeuvres.

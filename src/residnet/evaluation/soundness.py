@@ -313,7 +313,9 @@ def settled_acceleration(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
     The memory of a head with innovation input is zero: constant states would appear to it as the
     effect of an external force.
     """
-    memory = model.initial_state(len(x)).to(x) if model.has_innovation else settle_memory(model, x, w)
+    memory = (
+        model.initial_state(len(x)).to(x) if model.has_innovation else settle_memory(model, x, w)
+    )
     return model.acceleration(x, w, memory)
 
 

@@ -276,7 +276,9 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
     ]
     # a pose that was integrated from the velocities has no floor but rounding
     has_noise_floor = any(main_entry["floor"][error_name] > 1e-9 for error_name in error_names)
-    noise_floor_text = f"noise floor (measured velocities, integrated) {_format_pose_errors(main_entry['floor'])}"
+    noise_floor_text = (
+        f"noise floor (measured velocities, integrated) {_format_pose_errors(main_entry['floor'])}"
+    )
     other_horizons = [
         f"{_format_pose_errors(horizon_entry['models'][evidence.selected])} after {horizon_entry['seconds']:.4g} s"
         for horizon_entry in horizon_entries

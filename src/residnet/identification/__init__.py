@@ -1,1 +1,1 @@
-"""Identification: from logs and settings to fitted and judged models, without a run folder."""
+"""Identification of models from prepared logs, change detection, and design of trials."""

@@ -53,10 +53,10 @@ from residnet.training.refit import parametric
 
 
 def assign_logs_to_folds(manoeuvre_kinds: Sequence[str], max_folds: int, seed: int) -> np.ndarray:
-    """Return the number of the fold of each log [L]; logs of a kind are spread over the folds.
+    """Return the fold of each log [L]; logs of one kind are spread over the folds.
 
     Args:
-        max_folds: at most; fewer where there are fewer logs.
+        max_folds: largest number of folds; no more than the number of logs.
     """
     generator = np.random.default_rng([seed, 3])
     shuffled_indices = [
@@ -188,12 +188,12 @@ _MAX_CALIBRATION_SAMPLES = 1_000_000
 def calibrate_bands(
     identified: IdentifiedModels, validation: Sequence[PreparedLog], config: BandsConfig
 ) -> dict[str, FittedModel]:
-    """Return the models of a fit with their bands under all protocols.
+    """Return the models of a fit with prediction intervals under all protocols.
 
-    Training logs are predicted by models that leave them out, validation logs by the models
-    themselves. A model that is not fitted again without logs takes the form of its reference's
-    band, with the level that its own errors on the validation logs ask for. Where these were fitted
-    too, means take the band of their reference as it is, and networks have none.
+    Training logs are predicted by models fitted without them, validation logs by the models
+    themselves. A model that is not refitted without logs takes the shape of its reference's
+    intervals, scaled to its errors on the validation logs. If the fit used the validation logs too,
+    ensembles take the intervals of their reference unchanged, and networks have none.
     """
     begin_stage("calibrating bands")
     fold_of_log = assign_logs_to_folds(

@@ -32,22 +32,22 @@ _DAMPING_PROBE_SHARES = {"u": 0.1}
 
 @dataclass(frozen=True)
 class SystemChange:
-    """A change of a vessel, of its commands, of its surroundings or of a sensor.
+    """A change of a vessel, its commands, its environment or a sensor.
 
     Attributes:
-        name: short, for tables.
-        description: what it is, completing "the logs look as if ...".
-        unit: of its size.
-        size: of the change; a small one, where its effect is to be computed.
-        inertia_share: share of the size that is added to the inertia of all axes.
-        damping: velocity whose damping changes by the size, a share of what the model has; empty
-            for none.
-        damped_by: what damps it: itself where empty, or an angle that holds it back.
-        push_direction: shares of the size that push to north and east.
-        gain_input: number of the input whose gain changes by the size; None for none.
-        offset_input: number of the input that the size is added to; None for none.
-        sensor: what a sensor adds: `gyro_scale`, `gyro_offset`, `speed_scale`, `lag`, or
-            `current_north`, `current_east` for water that moves; empty for none.
+        name: short name for tables.
+        description: the change in words, completing "the logs look as if ...".
+        unit: unit of the size.
+        size: size of the change; small, where sensitivities are computed.
+        inertia_share: share of the size that adds to the inertia of all axes.
+        damping: velocity whose damping changes, with the size as a share; empty for none.
+        damped_by: state that causes the damping: the velocity if empty, or an angle with a
+            restoring moment.
+        push_direction: north and east components of a force, in units of the size.
+        gain_input: index of the input whose gain changes by the size; None for none.
+        offset_input: index of the input whose offset is the size; None for none.
+        sensor: sensor fault: `gyro_scale`, `gyro_offset`, `speed_scale`, `lag`, or `current_north`,
+            `current_east` for a moving water mass; empty for none.
     """
 
     name: str
@@ -219,7 +219,9 @@ class PerturbedDynamics(Dynamics):
         changed_next_state = nominal_next_state.clone()
         if self.model.spatial:
             changed_velocities = torch.where(
-                self.model.equation_mask > 0.0, changed_velocities, nominal_next_state[:, DYNAMIC_STATES]
+                self.model.equation_mask > 0.0,
+                changed_velocities,
+                nominal_next_state[:, DYNAMIC_STATES],
             )
             changed_next_state[:, DYNAMIC_STATES] = changed_velocities
             rotation_vector = torch.zeros_like(nominal_next_state)
@@ -247,10 +249,10 @@ class PerturbedDynamics(Dynamics):
     def _damping_perturbation(
         self, x: Tensor, w: Tensor, s: Tensor, velocity_increment: Tensor
     ) -> Tensor:
-        """Return what changed damping takes from the velocities gained over a step [B, n].
+        """Return the effect of changed damping on the velocities after a step [B, n].
 
-        What damps a velocity is what the step lacks without it; of surge only a part is taken away,
-        for models that hold near a service speed alone.
+        Damping is the difference of the step with and without the velocity; for surge only a part
+        of the speed is removed, since models may hold near a service speed only.
         """
         damped_rows, damped_columns, probe_shares = (
             self.damped_rows,

@@ -46,15 +46,17 @@ take 13 s, and a process that imports all that it needs 4.5 s of a processor.
 def fit_models(
     logs: Logs, settings: FitSettings, *, store: FitStore | None = None
 ) -> IdentifiedModels:
-    """Fit the baselines, then heads on what each leaves, then ensembles.
+    """Fit the baselines, then heads on their residuals, then ensembles.
 
     Args:
-        logs: prepared logs by split; `train` is fitted, `validation` chooses and stops early.
-        store: keeps every model as it is done and hands finished heads back; None to keep none.
+        logs: prepared logs by split; `train` is fitted, `validation` selects and stops early.
+        settings: settings of the identification.
+        store: saves every finished model and returns finished heads of an interrupted fit; None for
+            none.
 
     Raises:
-        FitError: where the data do not determine a part, or a training never ran freely.
-        DataError: where a split holds no sample or no window.
+        FitError: if the data do not determine a part, or no training gave a finite free run.
+        DataError: if a split has no sample or no window.
     """
     store = store or FitStore()
     fitter = Fitter(logs, settings, store)
@@ -75,9 +77,9 @@ def fit_models(
 
 
 def should_include_validation(settings: FitSettings, train: Sequence[PreparedLog]) -> bool:
-    """Return whether a fit uses the validation logs too: the recipe's does, of short logs.
+    """Return whether a fit also uses the validation logs, as the recipe does for short logs.
 
-    A quarter of five minutes tells networks more than it tells a choice.
+    With a few minutes of logs a network gains more from these data than a model selection does.
     """
     training_duration = sum(len(log) for log in train) * settings.prepare.grid.step
     return settings.recipe is not None and training_duration < LONG_TRAINING_DURATION
@@ -120,9 +122,9 @@ def _fit_all_parts(fitter: Fitter, logs: Logs) -> IdentifiedModels:
 
 @contextmanager
 def _skip_if_optional(settings: FitSettings, name: str) -> Iterator[None]:
-    """Leave a model out that the recipe can do without, or whose optional package is not installed.
+    """Skip a model that is optional in the recipe, or whose optional package is not installed.
 
-    The recipe does without what the logs do not determine, except its first model. A head of kind
+    The recipe skips models that the logs do not determine, except the first one. Heads of kind
     `genetic` can be `optional`.
     """
     head = settings.heads.get(name)

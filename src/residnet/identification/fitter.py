@@ -1,5 +1,6 @@
-"""Fitted models, who keeps them, and the single steps of a fit: constant velocity, a baseline, a head on a
-baseline, the mean of models.
+"""Fitted models, their storage, and the single steps of a fit.
+
+The steps are the constant-velocity model, baselines, heads on a baseline, and ensembles.
 """
 
 from __future__ import annotations
@@ -48,12 +49,12 @@ class FittedModel:
     """A model with the notes of its fit.
 
     Attributes:
-        spec: everything that determines the model but its numbers.
-        model: with its numbers filled in.
-        notes: about the fit, as JSON takes them: coefficients, validation error, seconds, ...
-        covariance: of the coefficients of a baseline that was refitted through rollouts, [P, P];
-            None where there was no refit.
-        bands: of its free runs by protocol; empty where none were calibrated.
+        spec: description of the model without its parameter values.
+        model: the model with its parameter values.
+        notes: JSON-serialisable notes of the fit: coefficients, validation error, seconds, ...
+        covariance: covariance of the coefficients of a baseline refitted through rollouts, [P, P];
+            None without a refit.
+        bands: prediction intervals by protocol; may be empty.
     """
 
     spec: ModelSpec
@@ -69,9 +70,9 @@ class FittedModel:
 
 
 class FitStore:
-    """Where the models of a fit are kept as they are done, so that a broken fit can go on.
+    """Storage of finished models, from which an interrupted fit can resume.
 
-    This one keeps no model.
+    The base class stores nothing.
 
     Args:
         training_folder: for checkpoints and the TensorBoard log; None for neither.
@@ -94,9 +95,8 @@ _FIRST_BASELINE = "baseline"
 def find_reference_names(models: Iterable[FittedModel]) -> dict[str, str]:
     """Return the name of each model's reference.
 
-    A head is compared with the baseline that it was fitted on; an ensemble, which stands on none,
-    with the baseline of the run that does best on the validation data; any other model with the
-    run's first baseline, which itself has no reference.
+    The reference of a head is its baseline. The reference of an ensemble is the baseline with the
+    smallest validation error. Any other model refers to the first baseline, which has no reference.
     """
     models_by_name = {model.name: model for model in models}
     # a baseline that diverged is the worse one, whatever its error
@@ -124,14 +124,14 @@ def find_reference_names(models: Iterable[FittedModel]) -> dict[str, str]:
 
 
 def compute_residual_samples(model: HybridDynamics, samples: Samples) -> Samples:
-    """Return samples whose target is what the model's baseline leaves.
+    """Return samples whose target is the residual of the model's baseline.
 
-    That is an acceleration (document 003 (19)) or a force (document 002 (3.20)), as the model's
-    head wants it.
+    The residual is an acceleration (document 003 (19)) or a force (document 002 (3.20)), depending
+    on the head.
 
     Args:
-        model: with its baseline filled in.
-        samples: samples whose target is the measured acceleration.
+        model: model with a fitted baseline.
+        samples: samples with the measured acceleration as target.
     """
     with torch.no_grad():
         baseline_accelerations = paged.allocate_rows(len(samples), samples.target.shape[1])
@@ -142,16 +142,16 @@ def compute_residual_samples(model: HybridDynamics, samples: Samples) -> Samples
 
 
 class ValidationScorer:
-    """The free-run score of a model on the validation logs; the windows are laid out once.
+    """Free-run scores of models on the windows of the validation logs.
 
     Args:
-        config: its `selection` protocol and scales are used.
-        dt: of the grid in s.
-        velocity_limits: size of what moves [n] beyond which a free run has diverged.
-        use_overlapping_windows: windows overlap, so that few logs tell more.
+        config: evaluation settings with the `selection` protocol and the scales.
+        dt: time step in s.
+        velocity_limits: magnitude of the velocities [n] above which a free run has diverged.
+        use_overlapping_windows: overlapping windows, which use few logs better.
 
     Raises:
-        DataError: where no log holds a window of the protocol.
+        DataError: if no log is as long as a window of the protocol.
     """
 
     def __init__(
@@ -200,10 +200,11 @@ class ValidationScorer:
 
 
 def find_harmful_member(members: Sequence[FittedModel]) -> FittedModel | None:
-    """Return the member that errs most, where it harms the mean even if errors are independent.
+    """Return the member with the largest error, if it degrades a mean of independent errors.
 
-    The variance of a mean of K is the sum of theirs over K**2: to leave out the largest lowers it
-    where that is larger than (2 K - 1) / (K - 1)**2 times the sum of the others'.
+    The error variance of a mean of K members is the sum of their variances over K**2. Removing the
+    largest one reduces it if that is larger than (2 K - 1) / (K - 1)**2 times the sum of the
+    others.
     """
     if len(members) < 2:
         return None
@@ -222,18 +223,17 @@ def select_by_free_run(
     solutions: Sequence[Solution],
     score_model: Callable[[HybridDynamics], Score],
 ) -> tuple[Solution, dict[str, Any]]:
-    """Fill a part of the model with the solution whose free run is best.
+    """Set a part of the model to the solution with the best free run.
 
-    What lies around the best is tried for as long as it gains.
+    Neighbours of the best solution are evaluated as long as the error decreases.
 
     Args:
-        module: its baseline or head, which the solutions belong to.
-        solutions: at least one; a single one is taken as it is.
-        score_model: of a model's free runs on validation data; fewer divergences come before less error.
+        module: baseline or head that the solutions belong to.
+        solutions: at least one; a single one is used without evaluation.
+        score_model: free-run score on validation data; fewer divergences precede a smaller error.
 
     Returns:
-        The solution, and for fit.json the free-run error of each; empty where there was nothing to
-        choose.
+        The solution, and the free-run error of each for fit.json; empty for a single solution.
     """
     scored_solutions: list[tuple[Solution, Score]] = []
 
@@ -275,8 +275,9 @@ def select_by_free_run(
 def _find_best_with_neighbours(
     scored_solutions: Sequence[tuple[Solution, Score]],
 ) -> tuple[Solution, Score] | None:
-    """The best of those that have neighbours; one that has none, such as no residual at all, does
-    not end the search.
+    """Return the best of the solutions with neighbours.
+
+    A solution without neighbours, such as a zero residual, does not end the search.
     """
     return min(
         (
@@ -293,10 +294,11 @@ class Fitter:
     """The single steps of a fit on one set of logs.
 
     Args:
-        logs: prepared logs by split; `training_logs` and `validation` are used.
-        store: keeps every model as it is done.
-        resolve_recipe: whether the recipe's parts are yet to follow from the logs.
-        validation_in_training: the validation logs are among those of training, and judge nothing.
+        logs: prepared logs by split; `train` and `validation` are used.
+        store: storage of finished models.
+        resolve_recipe: whether the recipe's parts are still to be derived from the logs.
+        validation_in_training: whether training uses the validation logs, which then select
+            nothing.
     """
 
     def __init__(
@@ -418,13 +420,14 @@ class Fitter:
         return baseline.refresh_table(coefficients, refitted.standard_errors), refitted.covariance
 
     def fit_head(self, name: str, baseline: FittedModel) -> FittedModel:
-        """Fit one head on top of a baseline, or take it from the store where it is finished there.
+        """Fit one head on a baseline, or load it from the store of an interrupted fit.
 
         Args:
-            baseline: the fitted model that the head stands on.
+            name: name of the head.
+            baseline: fitted baseline of the head.
 
         Raises:
-            FitError: where the data do not determine the head.
+            FitError: if the data do not determine the head.
         """
         finished_model = self.store.load_finished(name)
         if finished_model is not None:
@@ -484,14 +487,14 @@ class Fitter:
         return self._save_and_reload(self._build_ensemble(name, members, "accelerations"))
 
     def build_trajectory_ensemble(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
-        """Return the mean of what fitted models predict, each running by itself.
+        """Return the ensemble of fitted models: the mean of their trajectories.
 
-        Members that diverge on a validation window are left out, and so is one that errs so much
-        more than the others that it harms a mean even where their errors are independent, unless
-        the mean of the others errs more. Logs that the members have seen tell nothing of that.
+        Members that diverge on a validation window are removed. A member with so large an error
+        that it degrades the mean even of independent errors is removed if the mean of the others
+        has a smaller validation error. Logs used in training do not count as evidence.
 
         Raises:
-            FitError: where less than two are left.
+            FitError: if fewer than two members remain.
         """
         retained_members = [
             member for member in members if not member.notes.get("validation_diverged")
@@ -557,9 +560,10 @@ class Fitter:
         return {"validation": score.error, "validation_diverged": score.diverged}
 
     def _save_and_reload(self, fitted_model: FittedModel) -> FittedModel:
-        """Keep a model and return it as a load gives it back.
+        """Store a model and return the reloaded one.
 
-        What is judged is then bit for bit what is stored, and a resumed fit judges the same.
+        The evaluated model is then bit for bit the stored one, and a resumed fit gives the same
+        results.
         """
         reloaded = replace(fitted_model, model=rebuilt(fitted_model.spec, fitted_model.model))
         self.store.save(reloaded)

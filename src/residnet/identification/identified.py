@@ -1,4 +1,4 @@
-"""The judged fit: free runs of all models, the choice among them, what they leave of the logs."""
+"""Results of a fit: free runs of all models, model selection, residual analysis."""
 
 from __future__ import annotations
 
@@ -133,7 +133,8 @@ def make_candidates(
     """Return the models to judge, each with the one that it is compared with.
 
     Args:
-        data: where the logs came from; simulated trials add the plant that made them as `plant_candidate`.
+        data: where the logs came from; simulated trials add the plant that made them as
+            `plant_candidate`.
     """
     models_by_name = {fitted_model.name: fitted_model for fitted_model in fitted_models}
     reference_names = find_reference_names(models_by_name.values())
@@ -165,10 +166,10 @@ def trajectory_member_names(fitted_model: FittedModel) -> tuple[str, ...]:
 
 
 def spread_member_names(fitted_models: Iterable[FittedModel]) -> tuple[str, ...]:
-    """Return the models whose distance tells where logs did not determine the motion.
+    """Return the models whose disagreement measures extrapolation.
 
-    They are those that can quickly be fitted again without some of the logs: baselines and heads of
-    closed form. Bands know of each how far they lie apart in free runs over logs left out.
+    These are baselines and closed-form heads, which are quickly refitted without some of the logs.
+    The prediction intervals use their typical disagreement in free runs over those logs.
     """
     return tuple(
         fitted_model.name
@@ -199,7 +200,7 @@ def _make_plant_candidate(data: SimulatedTrials) -> Candidate | None:
 
 
 _DIVERGENCE_CHECKED_SPLITS = ("train", "validation")
-"""Splits whose windows may not diverge; what the test data show comes too late for a choice."""
+"""Splits whose divergences exclude a model from the selection; test data must not."""
 
 
 def model_family(fitted_model: FittedModel) -> str:
@@ -247,11 +248,11 @@ class IdentifiedModels(Mapping[str, FittedModel]):
         splits: Mapping[str, Sequence[PreparedLog]],
         data: MeasuredLogs | SimulatedTrials | None = None,
     ) -> dict[str, SplitEvaluation]:
-        """Free-run all models over the logs of several splits, side by side.
+        """Free-run all models over the logs of several splits.
 
         Args:
             splits: logs by split, prepared as those of the fit.
-            data: where the logs came from; simulated trials add the plant as `plant_candidate`.
+            data: source of the logs; simulated trials add the plant as a candidate.
         """
         settings = self.settings
         return evaluate_splits(
@@ -264,7 +265,7 @@ class IdentifiedModels(Mapping[str, FittedModel]):
 
     @cached_property
     def sanity_findings(self) -> dict[str, list[SanityFinding]]:
-        """What the checks for physical sanity find, by model; `constant_velocity` is left out."""
+        """Results of the physical checks by model, without `constant_velocity`."""
         fitted_models = list(self.values())
         settings = self.settings
         training_points = TrainingPoints.from_logs(self.training_logs, settings.prepare.grid.step)
@@ -286,8 +287,8 @@ class IdentifiedModels(Mapping[str, FittedModel]):
         model, unless it diverged in a window, and its mean the ensemble.
 
         Args:
-            evaluations: what `evaluate_splits` returned, by split; `validation` is needed, and divergences on
-                `training_logs` count where it is there.
+            evaluations: what `evaluate_splits` returned, by split; `validation` is needed, and
+                divergences on `training_logs` count where it is there.
 
         Raises:
             UsageError: where the validation logs have not been judged.
@@ -397,11 +398,11 @@ class TeacherForcedRun:
 
 
 def run_teacher_forced(model: HybridDynamics, log: PreparedLog) -> TeacherForcedRun:
-    """Run a model along a log without letting it move the vessel.
+    """Evaluate a model along the measured states of a log.
 
     Args:
-        model: brought to float64.
-        log: gaps are filled with 0; what is predicted there means nothing.
+        model: the model, in float64.
+        log: prepared log; gaps are filled with 0, and predictions there are meaningless.
     """
     model = model.to(torch.float64)
     z = compute_channels(log, model.signals)
@@ -414,16 +415,16 @@ def run_teacher_forced(model: HybridDynamics, log: PreparedLog) -> TeacherForced
 def build_residual_table(
     fitted_models: Iterable[FittedModel], logs: Sequence[PreparedLog], max_samples: int = 1500
 ) -> pd.DataFrame:
-    """Return residual targets against what each head predicts along the measured states.
+    """Return residual targets and head predictions along the measured states.
 
     Every head runs teacher-forced over each log.
 
     Args:
-        fitted_models: models; those without a head are left out.
-        max_samples: about how many samples of each model and axis are kept, evenly spaced.
+        fitted_models: models; those without a head are skipped.
+        max_samples: approximate number of evenly spaced samples per model and axis.
 
     Returns:
-        Columns model, axis, target, predicted (accelerations, SI); no row where there is no head.
+        Columns model, axis, target, predicted (accelerations, SI); empty without heads.
     """
     rows: list[tuple[Any, ...]] = []
     for fitted_model in fitted_models:
@@ -450,15 +451,15 @@ def build_residual_table(
 def build_term_table(
     fitted_models: Iterable[FittedModel], logs: Sequence[PreparedLog]
 ) -> pd.DataFrame:
-    """Return the terms of every head that is an equation along the longest log.
+    """Return the terms of every head in equation form along the longest log.
 
     Args:
-        fitted_models: models; heads that are no equation are left out.
-        logs: of one split, at least one.
+        fitted_models: models; heads that are not equations are skipped.
+        logs: logs of one split, at least one.
 
     Returns:
         Columns model, log, axis, term, t (s), value (the term times its coefficient). The term
-        `baseline_residual` is what the baseline leaves of the measured acceleration, NaN where there is none.
+        `baseline_residual` is the measured acceleration minus the baseline, NaN in gaps.
     """
     log = max(logs, key=len)
     time = log.log.t - log.log.t[0]
@@ -492,7 +493,7 @@ def _concatenate_table(column_names: list[str], rows: list[tuple[Any, ...]]) -> 
 
 
 def _identified_accelerations(logs: Sequence[PreparedLog]) -> list[tuple[int, str]]:
-    """Return number and name of each acceleration that logs tell."""
+    """Return index and name of each measured acceleration."""
     dof = logs[0].dof
     return [(axis_index, dof.derivative_names[axis_index]) for axis_index in dof.regressed_indices]
 
@@ -503,13 +504,13 @@ GOODNESS_SPLITS = ("train", "test")
 def build_goodness_rows(
     fitted_models: Iterable[FittedModel], logs: Mapping[str, Sequence[PreparedLog]], dt: float
 ) -> dict[str, list[dict[str, Any]]]:
-    """Return statistics of what each model leaves of the measured accelerations, by split.
+    """Return statistics of the one-step residuals of each model, by split.
 
-    Of very many logs as many are taken, evenly spread, as have 200,000 samples.
+    Large data sets are thinned to evenly spaced logs with 200,000 samples.
 
     Args:
         logs: by split; training and test logs are used.
-        dt: of the grid in s.
+        dt: time step in s.
     """
     models_by_name = {fitted_model.name: fitted_model for fitted_model in fitted_models}
     reference_names = find_reference_names(models_by_name.values())

@@ -1,11 +1,10 @@
-"""The monitor: score tests on the innovations of short free runs, against those of clean logs.
+"""Change detection by score tests on the innovations of short free runs.
 
-Windows are free-run as a whole and in parts, each from its measured start. What the model has
-always got wrong is taken out of their innovations, which are then whitened by their covariance over
-clean logs. For each cause the score test asks whether a small change of that kind explains the last
-minutes, once wind and current have taken what they can. How much clean logs differ in the sizes
-that they ask for sets its scale. The scores of all causes together say how well each alone explains
-them.
+Windows are free-run as a whole and in parts, each from its measured start. The bias of the model on
+clean logs is subtracted from the innovations, which are whitened by their covariance over clean
+logs. For each possible change the score test evaluates whether a small change of this kind explains
+the recent windows, after wind and current are marginalised. The variation of clean logs sets the
+scale of the scores. The joint scores of all changes rank the explanations.
 """
 
 from __future__ import annotations
@@ -135,7 +134,7 @@ def compute_innovations(
 
 
 def split_window(window: MeasuredWindow, n_parts: int) -> list[MeasuredWindow]:
-    """Return the equal parts of a window, each with what went before it; a rest is left out."""
+    """Return equal parts of a window, each with its measured past; a remainder is dropped."""
     n_warmup, steps_per_part = len(window.past_y), len(window.w) // n_parts
     y = np.concatenate((window.past_y, window.y))
     w = np.concatenate((window.past_w, window.w))
@@ -156,11 +155,11 @@ def _flatten_innovations(states: Tensor, columns: Sequence[int]) -> Tensor:
 
 
 def make_measured_windows(log: PreparedLog, n_steps: int, n_warmup: int) -> list[MeasuredWindow]:
-    """Return the windows of a log, back to back, whose samples can all be trusted.
+    """Return back-to-back windows of a log whose samples are all usable.
 
     Args:
         log: prepared as those of the fit.
-        n_warmup: samples before a window that warm a memory up; the first windows go without.
+        n_warmup: samples before a window for the warm-up of a memory; the first windows have none.
     """
     windows, window_start = [], n_warmup
     while window_start + n_steps < len(log):
@@ -216,15 +215,16 @@ def compute_robust_score_sums(
     whitening_matrices: Sequence[np.ndarray],
     prior_precision: np.ndarray,
 ) -> ScoreSums:
-    """Return the sums over windows that were looked at as a whole, then in parts.
+    """Return sums over windows of scores and information, from whole windows and from parts.
 
-    A window that no change of a size thought possible explains tells of a manoeuvre that the model
-    does not know. It counts by the inverse of what it leaves unexplained.
+    A window that no plausible change explains holds a manoeuvre outside the model. It is weighted
+    by the inverse of its unexplained residual.
 
     Args:
-        innovations_and_effects: innovations [B, parts n] and effects [B, C, parts n] for each look.
-        whitening_matrices: matrix [n, n] of each look.
-        prior_precision: precision of the sizes of the changes [C, C].
+        innovations_and_effects: innovations [B, parts n] and effects [B, C, parts n] of each
+            division.
+        whitening_matrices: matrix [n, n] of each division.
+        prior_precision: prior precision of the sizes of the changes [C, C].
     """
     sums_by_look, n_innovations = [], 0
     for (innovation, effects), whitening_matrix in zip(
@@ -263,13 +263,13 @@ def compute_robust_score_sums(
 def marginalise(
     score: np.ndarray, information: np.ndarray, n_target_changes: int, prior_precision: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return scores [..., Q] and information [..., Q, Q] once others have taken what they can.
+    """Return scores [..., Q] and information [..., Q, Q] with nuisance parameters marginalised.
 
     Args:
-        score: of Q changes, then of what surrounds the vessel [..., Q + n].
-        information: about them [..., Q + n, Q + n].
+        score: scores of Q changes, then of n environment parameters [..., Q + n].
+        information: their information [..., Q + n, Q + n].
         n_target_changes: Q.
-        prior_precision: precision of the sizes of what surrounds the vessel [n, n].
+        prior_precision: prior precision of the environment parameters [n, n].
     """
     target_information, cross_information = (
         information[..., :n_target_changes, :n_target_changes],
@@ -338,20 +338,20 @@ def compute_whitening_matrix(innovations: np.ndarray, n_parts: int) -> np.ndarra
 
 
 _NOISE_VARIANCE_GRID = np.geomspace(1.0, 30.0, 25)
-"""Variances of the noise, in those of white innovations, that are tried."""
+"""Grid of noise variances, relative to white innovations."""
 _SIZE_VARIANCE_GRID = np.concatenate(([0.0], np.geomspace(1e-4, 1e3, 40)))
-"""Variances of sizes, in what a group of middling information tells, that are tried."""
+"""Grid of size variances, relative to the median information of a group."""
 _MAX_DEVIANCE_DIFFERENCE = 1.0
 """Twice the logarithm of the likelihood by which a larger scatter may fall short of the likeliest.
 
 That is one standard error: clean logs have fitted the model too, and look better than others.
 """
 _TINY_INFORMATION = 1e-12
-"""Keeps quotients of information defined where there is none."""
+"""Avoids division by zero information."""
 _HUBER_CONSTANT = 1.345
-"""Standard deviations by which a log may differ from the others before it counts for less.
+"""Tuning constant of the Huber weights in standard deviations; the usual value.
 
-It is the usual constant: where errors are normal, 95 % of what they say is kept.
+It has 95 % efficiency for normal errors.
 """
 _HUBER_ITERATIONS = 8
 """Of reweighting."""
@@ -359,12 +359,12 @@ _HUBER_ITERATIONS = 8
 
 @dataclass(frozen=True)
 class GroupScores:
-    """Scores of G groups of windows, what surrounds the vessel taken out.
+    """Scores of G groups of windows, with the environment marginalised.
 
     Attributes:
-        log_index: number of the log that each is of [G].
-        score: of each cause [G, Q]; [G, F, Q] where there are several readings of it.
-        information: about them [G, Q, Q].
+        log_index: log of each group [G].
+        score: score of each change [G, Q]; [G, F, Q] with F cross-fitted values.
+        information: their information [G, Q, Q].
     """
 
     log_index: np.ndarray
@@ -395,16 +395,16 @@ class GroupScores:
 
 @dataclass(frozen=True)
 class ScoreDistribution:
-    """What clean groups say about the scatter of scores.
+    """Distribution of the scores of clean groups.
 
     Attributes:
         noise_factor: variance of each score in units of its information [Q].
-        size_variance: variance of the sizes that groups ask for [Q].
+        size_variance: variance of the apparent sizes of groups [Q].
         shared_size_variance: part of it that is common to the groups of one log [Q].
-        mean_size_variance: variance of the mean size of all clean logs [Q].
-        correlation: of the scores of different causes [Q, Q].
-        n_groups: of the groups that told all this.
-        inflation_factor: how many times as far scores of clean stretches lie as all this says.
+        mean_size_variance: variance of the mean size over all clean logs [Q].
+        correlation: correlation of the scores of different changes [Q, Q].
+        n_groups: number of clean groups.
+        inflation_factor: ratio of the scatter of long clean segments to the scatter in this model.
     """
 
     noise_factor: np.ndarray
@@ -423,10 +423,10 @@ class ScoreDistribution:
 
     @property
     def wishart_inflation(self) -> float:
-        """How much larger variances are than they seem, their matrix being an estimate itself.
+        """Factor on variances because their covariance matrix is itself an estimate.
 
-        Weights from few groups are not the best ones, and flatter what they weigh (R. N. Kackar and
-        D. A. Harville, 1984, for the effect; the factors are those of Wishart matrices).
+        Optimal weights from few groups underestimate the variance (R. N. Kackar and D. A. Harville,
+        1984); the factors are those of the Wishart distribution.
         """
         n_causes = len(self.noise_factor)
         degrees_of_freedom = max(self.n_groups - n_causes - 1, 1)
@@ -437,7 +437,7 @@ class ScoreDistribution:
         )
 
     def select_causes(self, cause_indices: Sequence[int]) -> ScoreDistribution:
-        """Return what is known of some causes alone, by their numbers."""
+        """Return the distribution of selected changes, by index."""
         indices = list(cause_indices)
         selected_fields = {
             name: getattr(self, name)[indices] for name in ("noise", "apart", "shared", "known")
@@ -470,12 +470,12 @@ class ScoreDistribution:
         )
 
     def estimate_sizes(self, groups: GroupScores) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the size of each cause alone [Q], its error, and how much it explains.
+        """Return the size of each change alone [Q], its standard error, and the explained square.
 
-        The scores of all causes tell better than each for itself which it is, and that there is
-        one. What a cause explains is the square that it takes off all scores. All causes are
-        compared on the same scores: neither how well logs agree on the size of one, nor how surely
-        clean logs asked for none of it, says that another one is more likely.
+        All scores are used jointly for each change. The explained square is the reduction of the
+        joint score statistic. All changes are compared on the same scores: agreement between logs
+        on the size of one change, or its small variance on clean logs, is no evidence for another
+        one.
         """
         weighted_scores, weighted_information, redundancy = self.weigh_by_log(groups)
         weighted_scores, weights = (
@@ -555,16 +555,18 @@ def fit_score_distribution(groups: GroupScores) -> ScoreDistribution:
     )
 
 
-def wider(groups: GroupScores, fold_of_group: np.ndarray, groups_per_stretch: int) -> float:
-    """Return how many times as far scores of clean stretches lie as other clean logs say.
+def estimate_score_inflation(
+    groups: GroupScores, fold_of_group: np.ndarray, groups_per_stretch: int
+) -> float:
+    """Return the ratio of the scatter of clean segments to the scatter expected from other clean logs.
 
-    Wind, waves and what a model does not know differ from log to log and last for minutes, so what
-    groups say of a whole stretch is put to the test on logs that were left out.
+    Wind, waves and model errors differ between logs and persist for minutes. The expected scatter
+    of a whole segment is therefore tested by cross-validation over logs.
 
     Args:
-        groups: of clean windows in the order of time.
-        fold_of_group: number of each; those of a number are left out together [G].
-        groups_per_stretch: groups of a stretch.
+        groups: groups of clean windows in time order.
+        fold_of_group: fold of each group [G].
+        groups_per_stretch: number of groups per segment.
     """
     standardized_sizes = []
     for held_out_fold in np.unique(fold_of_group):
@@ -602,7 +604,7 @@ def _fit_variance_components(
 _LOOKS_PER_STRETCH = 3.0
 """Independent looks that a sliding stretch gives while it slides by its own length."""
 _N_FOLDS = 5
-"""Parts of the clean windows whose scores are scaled by what the others say."""
+"""Number of folds of clean windows for cross-fitted scales."""
 _MIN_GROUPS = 5
 """Groups of clean windows below which nothing can be said about false alarms."""
 _N_WINDOW_PARTS = 5
@@ -639,7 +641,8 @@ class FaultHypothesis:
 
     Attributes:
         change: the cause.
-        test_statistic: of its test by the scores of all causes, in standard deviations of clean logs.
+        test_statistic: of its test by the scores of all causes, in standard deviations of clean
+            logs.
         estimated_size: of the change, in its unit.
         standard_error: standard error of the size.
         explained_square: square that it alone takes off the scores of all causes.
@@ -657,11 +660,12 @@ class MonitorVerdict:
     """What a monitor says after a window.
 
     Attributes:
-        is_alarm: whether the largest score exceeds the threshold; of a watcher also where it has not
-            fallen clearly below it since it did.
+        is_alarm: whether the largest score exceeds the threshold; of a watcher also where it has
+            not fallen clearly below it since it did.
         threshold: of the scores.
         hypotheses: causes, the one that explains most first.
-        innovation_rms: root mean square of the whitened innovations of each channel; 1 on clean logs.
+        innovation_rms: root mean square of the whitened innovations of each channel; 1 on clean
+            logs.
     """
 
     is_alarm: bool
@@ -679,13 +683,13 @@ _InnovationsAndEffects = tuple[np.ndarray, np.ndarray]
 
 
 class ChangeDetector:
-    """What is known of clean logs, and the tests against it.
+    """Statistics of clean logs, and score tests against them.
 
     Args:
-        clean_windows: windows of clean logs, those of one log together; all of one length.
+        clean_windows: windows of clean logs, ordered by log; all of one length.
 
     Raises:
-        DataError: where the clean logs are too few.
+        DataError: if there are too few clean logs.
     """
 
     def __init__(
@@ -809,7 +813,7 @@ class ChangeDetector:
         groups_per_stretch = max(round(config.stretch / config.group), 1)
         self.score_distribution = replace(
             fit_score_distribution(cross_validated_groups),
-            inflation_factor=wider(
+            inflation_factor=estimate_score_inflation(
                 cross_validated_groups, np.sort(fold_of_group), groups_per_stretch
             ),
         )
@@ -819,7 +823,7 @@ class ChangeDetector:
     def _estimate_bias(
         self, innovations_by_group: Sequence[Sequence[_InnovationsAndEffects]]
     ) -> list[np.ndarray]:
-        """Return what the model has always got wrong, by innovations of groups of clean windows."""
+        """Return the mean innovations of the model, from groups of clean windows."""
         bias_by_look = []
         for innovations_of_look in zip(*innovations_by_group, strict=True):
             innovation, effects = map(np.concatenate, zip(*innovations_of_look, strict=True))
@@ -838,7 +842,7 @@ class ChangeDetector:
         clean_logs: Sequence[PreparedLog],
         config: MonitorConfig,
     ) -> ChangeDetector:
-        """Return the watch over a model by its clean logs, prepared as those of the fit."""
+        """Return the change detector of a model from clean logs, prepared as those of the fit."""
         n_steps, n_warmup = round(config.window / spec.dt), count_warmup_samples(model)
         return cls(
             spec,
@@ -875,7 +879,7 @@ class ChangeDetector:
         ]
 
     def with_model(self, model: HybridDynamics) -> ChangeDetector:
-        """Return the same watch over another model, judged by what clean logs were of this one."""
+        """Return the detector for another model, with the clean-log statistics of this one."""
         detector = copy.copy(self)
         detector.model = model
         return detector
@@ -921,10 +925,10 @@ class ChangeDetector:
         return innovation, effects
 
     def expected_innovations(self, effects: np.ndarray, model_bias: np.ndarray) -> np.ndarray:
-        """Return what innovations [B, n] are of clean logs, by their effects [B, C, n].
+        """Return the expected innovations [B, n] of clean logs, given their effects [B, C, n].
 
         Args:
-            model_bias: what the model has always got wrong in this look [Q, 4].
+            model_bias: mean sizes on clean logs for this division of windows [Q, 4].
         """
         bias_by_column = np.tile(model_bias, effects.shape[2] // len(self.innovation_columns_))
         return np.asarray((effects[:, : len(self.hypotheses)] * bias_by_column).sum(axis=1))
@@ -997,13 +1001,12 @@ _ALARM_HYSTERESIS = 1.0
 
 
 class OnlineChangeDetector:
-    """A watch that goes along with measurements, sample by sample.
+    """Sample-by-sample change detector.
 
-    A score that wavers about the threshold is one alarm: it ends where all scores lie clearly below
-    the threshold.
+    Alarms have hysteresis: an alarm ends when all scores are clearly below the threshold.
 
     Args:
-        detector: what is known of clean logs.
+        detector: statistics of clean logs.
     """
 
     def __init__(self, watch: ChangeDetector) -> None:

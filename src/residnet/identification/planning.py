@@ -1,4 +1,4 @@
-"""Which manoeuvre to run next: what each would tell about the parameters of a refitted baseline."""
+"""Optimal design of the next manoeuvre for the parameters of a refitted baseline."""
 
 from __future__ import annotations
 
@@ -43,19 +43,19 @@ from residnet.training.refit import RefitConfig, parametric, sensitivities
 
 
 @torch.no_grad()
-def moments(
+def sensitivity_information(
     model: HybridDynamics, runs: Sequence[tuple[Tensor, Tensor]], horizon: int, scales: Tensor
 ) -> Tensor:
-    """Return the sums over each run's samples of squared sensitivities of what moves, [R, P, P].
+    """Return the Fisher information of each run about the parameters, [R, P, P].
 
-    They are in scales. Each run is cut into free runs of `horizon` steps, each from its own
-    measured state, as a refit takes it; what is left at the end does not count.
+    Sums over samples of squared scaled sensitivities of the velocities. Each run is divided into
+    free runs of `horizon` steps from measured states, as in a refit; a remainder is dropped.
 
     Args:
         model: a baseline without a head.
         runs: states [T + 1, 3 + n] and inputs held over each step [T, m] of R runs.
         horizon: steps of the free runs of a refit.
-        scales: of what moves [n].
+        scales: scales of the velocities [n].
     """
     window_starts = [
         (run, window_index * horizon)
@@ -78,9 +78,9 @@ def moments(
 
 
 def update_covariance(covariance: Tensor, information: Tensor) -> Tensor:
-    """Return the covariance [P, P] once data of some information [P, P] are in.
+    """Return the covariance [P, P] after data with some information [P, P].
 
-    Parameters that have no covariance stay as they are.
+    Parameters without a covariance are unchanged.
     """
     identity = torch.eye(len(covariance), dtype=covariance.dtype)
     posterior: Tensor = covariance @ torch.linalg.inv(identity + information @ covariance)
@@ -189,10 +189,10 @@ def propose_manoeuvres(
 
 
 def infer_input_shares(spec: ModelSpec) -> Mapping[str, InputShare]:
-    """Return how the inputs of a model follow drive and steer, within what its data have seen.
+    """Return shares of drive and steer of the inputs, within their training ranges.
 
     Raises:
-        UsageError: where no input can be told to steer.
+        UsageError: if no input steers.
     """
     units, ranges, shares = spec.signals.channel_units(), spec.ranges, {}
     for name in spec.signals.inputs:
@@ -223,12 +223,12 @@ def infer_input_shares(spec: ModelSpec) -> Mapping[str, InputShare]:
 
 @dataclass(frozen=True)
 class PredictionGoal:
-    """Manoeuvres whose prediction is to become surer, such as those of a booklet.
+    """Manoeuvres whose prediction intervals are to be reduced, such as those of a booklet.
 
     Attributes:
-        manoeuvres: of them.
-        duration: of those that give none, in s.
-        initial: states by name that they start from.
+        manoeuvres: the manoeuvres.
+        duration: duration of manoeuvres without an own one, s.
+        initial: initial states by name.
     """
 
     manoeuvres: Sequence[Manoeuvre]
@@ -244,7 +244,8 @@ class CandidateTrial:
         simulated_run: of the model.
         information: summed squares of its sensitivities [P, P].
         duration_minutes: that it lasts.
-        volume_gain_per_minute: logarithm by which it shrinks the ellipsoid of the parameters, per minute.
+        volume_gain_per_minute: logarithm by which it shrinks the ellipsoid of the parameters, per
+            minute.
         uncertainty_reduction: share by which it narrows the intervals of predictions.
         max_distance: largest distance from the start in m.
     """
@@ -282,20 +283,20 @@ def plan_trials(
     trial_limits: TrialLimits,
     goal_manoeuvres: PredictionGoal | None = None,
 ) -> TrialPlan:
-    """Return the trials that narrow the intervals of predictions most per minute.
+    """Return the trials that reduce the prediction intervals most per minute.
 
-    Predictions are those of the velocities over the manoeuvres of `goal_manoeuvres`. Trials are chosen one
-    after the other, each given those before it.
+    Predictions are the velocities over the manoeuvres of `goal_manoeuvres`. Trials are selected
+    greedily, each given the previous ones.
 
     Args:
-        unidentified: what its refit has left open.
-        state_scales_array: of what moves [n].
-        input_shares: of the inputs in drive and steer.
-        velocity_limits: of what moves [n] beyond which a flight has diverged.
-        goal_manoeuvres: what is to be predicted; None for all candidates alike.
+        unidentified: parameters that the refit did not determine.
+        state_scales_array: scales of the velocities [n].
+        input_shares: shares of the inputs in drive and steer.
+        velocity_limits: velocities [n] above which a simulation has diverged.
+        goal_manoeuvres: manoeuvres to predict; None for all candidates.
 
     Raises:
-        DataError: where no candidate stays within the limits, or nothing is open.
+        DataError: if no candidate is within the limits, or all parameters are determined.
     """
     spec, model = fitted_model.spec, fitted_model.model.double()
     spec.signals.dof.require_on_surface("the plan of a trial")
@@ -322,7 +323,7 @@ def plan_trials(
             f"none of {len(simulated_trajectories)} candidates stays within the limits; allow more area, speed or"
             " rudder, or less time"
         )
-    grams = moments(
+    grams = sensitivity_information(
         model, [(states, w) for _, states, w in allowed_trajectories], horizon, state_scales
     )
     # so many samples hang together that they count as one
@@ -333,7 +334,9 @@ def plan_trials(
             _to_trajectory(item, spec.signals)
             for item in _simulate_manoeuvres(fitted_model, input_shares, goal_manoeuvres)
         ]
-        goal_weights = moments(model, goal_trajectories, horizon, state_scales).sum(dim=0)
+        goal_weights = sensitivity_information(model, goal_trajectories, horizon, state_scales).sum(
+            dim=0
+        )
     initial_uncertainty = compute_expected_uncertainty(unidentified.covariance, goal_weights)
     if not (np.isfinite(initial_uncertainty) and initial_uncertainty > 0.0):
         raise DataError(
@@ -447,7 +450,7 @@ def _distance_from_start(states: Tensor) -> float:
 def _is_within_limits(
     states: Tensor, velocity_limits: np.ndarray, trial_limits: TrialLimits
 ) -> bool:
-    """Whether a flight stays sound and within the limits."""
+    """Return whether a simulated run is finite and within the limits."""
     max_velocities = states[:, DYNAMIC_STATES].abs().amax(0).numpy()
     max_speed = float(torch.hypot(states[:, SURGE], states[:, SWAY]).max())
     return bool(

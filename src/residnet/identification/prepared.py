@@ -113,7 +113,7 @@ def prepare_splits(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -
 
 
 def split_long_log(log: Log) -> list[Log]:
-    """Return a log as it is, or its parts one after the other where it is very long."""
+    """Return a log, divided into consecutive parts if it is very long."""
     if len(log) <= _MAX_SAMPLES:
         return [log]
     n_parts = -(-len(log) // _MAX_SAMPLES)

@@ -30,7 +30,7 @@ from residnet.preprocessing.motion import remove_pauses
 from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, prepare_log
 
 _MIN_RELATIVE_SPREAD = 1e-3
-"""Spread of a channel, as a share of its size, below which it tells nothing."""
+"""Smallest spread of a varying channel, as a share of its magnitude."""
 _MIN_ASTERN_SHARE = 0.01
 """Share of the samples from which a propeller that turns astern counts."""
 _MAX_SEGMENT_SHARE = 0.6
@@ -41,18 +41,19 @@ _DEFAULT_FREE_RUN_LENGTH = 60.0
 
 @dataclass(frozen=True)
 class TrainingDataSummary:
-    """What the portfolio of a fit depends on.
+    """Properties of the training logs that determine the portfolio of the recipe.
 
     Attributes:
-        channel_names: channels that models see.
+        channel_names: channels of the models.
         varying_channels: inputs, forces and wind channels that vary in the training logs.
-        reversing_inputs: inputs that take both signs there.
-        dt: of the grid, s.
-        free_run_length: of the free runs that choose between models, s.
-        history: measured past that a free run may look back on, s.
-        median_segment_duration: half of the training samples lie in uninterrupted stretches at least so long, s.
-        n_samples: of the training logs.
-        roll_time_per_radian: time in s in which a roll turns by a radian of its period; infinite without one.
+        reversing_inputs: inputs with both signs.
+        dt: time step, s.
+        free_run_length: length of the free runs that select models, s.
+        history: measured past available to a free run, s.
+        median_segment_duration: half of the training samples are in gap-free segments of at least
+            this duration, s.
+        n_samples: number of training samples.
+        roll_time_per_radian: natural period of roll over 2 pi, s; infinite without roll.
     """
 
     channel_names: tuple[str, ...]
@@ -166,17 +167,17 @@ _LONG_LOG_TERMS = ("u^2 v", "u^2 r", "v^2", "r^2")
 LONG_TRAINING_DURATION = 1200.0
 """Length of the training logs in s from which they are taken in."""
 _MIN_PROPELLERS_WITHOUT_RACE = 3
-"""Propellers from which a rudder is not told by the race of each."""
+"""Number of propellers from which rudders get no propeller-race terms."""
 
 
 def make_hull_terms(data_summary: TrainingDataSummary) -> list[str] | dict[str, list[str]]:
     """Return the terms of a manoeuvring model: hull, propellers, rudders and wind.
 
-    A rudder is known by its name. Every other input is taken for a propeller: a force that is
-    linear and quadratic in it and falls with the inflow. Forces act as they are.
+    Rudders are recognised by name. Every other input is treated as a propeller with a force that is
+    linear and quadratic in it and decreases with the inflow. Forces enter directly.
 
-    Short logs give each axis the terms that a mirror-symmetric vessel has there, and what a lone
-    propeller adds to them: half as many coefficients as all terms in all axes.
+    For short logs each axis has only the terms of a mirror-symmetric vessel and the asymmetry of a
+    single propeller: half as many coefficients as all terms in all axes.
     """
     terms = _all_terms(data_summary)
     if has_long_logs(data_summary):
@@ -281,9 +282,9 @@ def _propeller_terms(name: str, is_reversing: bool) -> list[str]:
 def _rudder_terms(
     name: str, propellers: Sequence[str], data_summary: TrainingDataSummary
 ) -> list[str]:
-    """Return the lift of a rudder in the inflow from speed and propellers.
+    """Return the lift of a rudder in the inflow due to speed and propellers.
 
-    Where no log tells the speed it is that of a usual one.
+    Without a measured speed a typical speed is assumed.
     """
     if "u" in get_dof(data_summary.channel_names).fixed_states:
         return [name, f"{name}|{name}|", *(f"{n}|{n}| {name}" for n in propellers)]
@@ -385,9 +386,9 @@ def round_to_three_digits(value: float) -> float:
 
 
 def compute_network_step(data_summary: TrainingDataSummary) -> float:
-    """Return the step of the networks in s: a free run is trained through in so many.
+    """Return the time step of the networks in s: a fixed number of steps per free run.
 
-    A roll takes at least twelve a period, or what it does between them is lost.
+    Roll gets at least twelve steps per period, to avoid aliasing.
     """
     n_grid_steps = (
         min(
@@ -407,23 +408,24 @@ def count_networks(data_summary: TrainingDataSummary) -> int:
 PART_KEYS = (
     "baseline", "baselines", "refit", "heads", "base_of", "ensembles", "means", "training",
 )  # fmt: skip
-"""Keys of a fit that the recipe stands in place of."""
+"""Config keys of a fit that the recipe sets."""
 SINGLE_MODEL_NAME = "hull"
 """Name of the model that is taken where one single is needed."""
 _HEAD_BASELINES = {"hull_network": SINGLE_MODEL_NAME, "network": CONSTANT_VELOCITY}
-"""What the networks stand on."""
+"""Baselines of the networks."""
 
 
 def make_portfolio(data_summary: TrainingDataSummary, effort: float = 1.0) -> dict[str, Any]:
-    """Return baselines, refits, heads and trainings by the names that the recipe gives them.
+    """Return baselines, refits, heads and trainings of the recipe by name.
 
     `baseline` is linear and `hull` nonlinear in velocities and inputs, both refitted; long logs
-    determine a hull of more terms. Several networks stand on the hull, and as many alone where logs
-    are long. The mean of the trajectories of hull and networks is the predictor.
+    allow more terms of the hull. `hull_network` holds recurrent networks on the hull, and for long
+    logs `network` the same number of black-box networks. The ensemble of hull and networks is the
+    predictor.
 
     Args:
-        data_summary: of the logs; `Facts.supposed` before they are read.
-        effort: how long networks are trained, 1 for usual.
+        data_summary: properties of the logs; assumed values before they are read.
+        effort: training duration, 1 for the usual one.
     """
     network_config = {
         "kind": "recurrent",
@@ -472,22 +474,23 @@ _WINDOW_LENGTHS = (100.0, 60.0, 40.0, 30.0, 20.0, 10.0, 5.0, 2.0, 1.0)
 _MIN_LENGTH_RATIO = 1.15
 """Times of a free run that a log lasts so that it starts somewhere in it."""
 _N_PROBED_SAMPLES = 40_000
-"""First samples of a long log that mostly tell how long its stretches are."""
+"""Number of first samples of a long log that are searched for segments."""
 
 
 @dataclass(frozen=True)
 class PreparationPlan:
-    """How logs are prepared for a fit, by what they hold.
+    """Preparation settings that follow from the logs.
 
     Attributes:
-        sample_interval: usual step of the logs, s.
-        correlation_time: time after which `rate` is another, s.
-        grid_step: of the grid, s.
-        derivative_window: of the derivative, s.
-        held_inputs: inputs that rest at one value most of the time, as commands do.
-        input_hold: whether an input over a step is the sample at its `start` or the `mean` of its ends.
-        wind_channels: channels of the true wind, where every log holds them.
-        correlated_quantity: what the memory is that of: the yaw rate, or the speed where no log tells that.
+        sample_interval: typical sample interval of the logs, s.
+        correlation_time: correlation time of `correlated_quantity`, s.
+        grid_step: time step of the grid, s.
+        derivative_window: window of the derivative filter, s.
+        held_inputs: inputs that are constant most of the time, as commands are.
+        input_hold: whether the input of a step is the sample at its `start` or the `mean` of its
+            ends.
+        wind_channels: channels of the true wind, if every log has them.
+        correlated_quantity: quantity of the correlation time: yaw rate, or speed without yaw rates.
         has_roll: whether the vessel rolls.
     """
 
@@ -555,7 +558,7 @@ class PreparationPlan:
 
     @property
     def reason(self) -> str:
-        """What the numbers of time follow from."""
+        """The reason of the time constants, for the drafted config."""
         return (
             f"logs have a sample each {self.sample_interval:.3g} s, and a {self.correlated_quantity} that stays alike"
             f" for {self.correlation_time:.3g} s"
@@ -580,11 +583,11 @@ def _is_held(logs: Sequence[Log], name: str) -> bool:
 
 
 def choose_integrator(dof: DegreesOfFreedom) -> Integrator:
-    """Return how a drafted model steps.
+    """Return the integration scheme of a drafted model.
 
-    A vessel in six degrees of freedom swings in few steps of its logs, which a scheme of first
-    order takes for a damping of its own: the hull of a BlueROV2 erred 2.0 to 2.8 times as much as
-    the vessel itself with `semi_implicit_euler`, and 1.1 to 1.4 times with `rk4`.
+    A vessel in six degrees of freedom oscillates within few steps, and a first-order scheme adds
+    numerical damping: the hull of a BlueROV2 had 2.0 to 2.8 times the error of the plant with
+    `semi_implicit_euler`, and 1.1 to 1.4 times with `rk4`.
     """
     return "rk4" if dof.is_six_dof else "semi_implicit_euler"
 
@@ -592,17 +595,17 @@ def choose_integrator(dof: DegreesOfFreedom) -> Integrator:
 def longest_usable_duration(
     log: Log, input_names: Sequence[str], config: PrepareConfig, dof: DegreesOfFreedom
 ) -> float:
-    """Return the longest time in s without a gap that preparing leaves of a log.
+    """Return the duration in s of the longest gap-free segment of a prepared log.
 
-    It is 0 where nothing is left to learn from. Of a long log its first part tells, unless that
-    holds no free run of the longest kind.
+    It is 0 without usable samples. Of a long log the first part is searched, and all of it if this
+    part holds no free run of the longest kind.
 
     Args:
-        log: as its reader gives it.
+        log: log as read.
         input_names: inputs of the model.
 
     Raises:
-        DataError: where no sample is usable.
+        DataError: if no sample is usable.
     """
     longest_duration = 0.0
     for log_part in (log.select_rows(slice(_N_PROBED_SAMPLES)), log)[
@@ -624,13 +627,13 @@ def make_evaluation_settings(
 ) -> dict[str, Any]:
     """Return protocols, selection and scales of a config, for logs by split.
 
-    The test logs take part in no choice: where they are shorter than the free runs that choose,
-    they are judged over shorter ones besides.
+    Test logs do not influence the selection protocol: if they are shorter than its free runs, a
+    shorter protocol is added for them.
 
     Args:
         splits: `train`, `validation` and `test`.
-        usable_durations: the longest time in s without a gap that preparing leaves of each of their logs.
-        correlation_time: how long the vessel remembers, s.
+        usable_durations: duration of the longest gap-free segment of each log, s.
+        correlation_time: correlation time of the motion, s.
     """
     window_duration = choose_window_length(
         usable_durations["validation"] or usable_durations["train"], correlation_time
@@ -657,10 +660,10 @@ def make_evaluation_settings(
 
 
 def _correlation_time(log: Log, names: Sequence[str] = ("r", "u", "v")) -> float:
-    """Return the time in s after which the yaw rate is correlated by 1/e only.
+    """Return the time in s at which the autocorrelation of the yaw rate falls below 1/e.
 
-    Where it holds noise alone that of the speed is taken; so with other names, the first that
-    remembers a sample.
+    If the yaw rate is white noise, the speed is used; in general the first named channel with a
+    correlation beyond one sample.
     """
     for name in names:
         values = log[name] if name in log.channels else log.t[:0]
@@ -683,8 +686,8 @@ def choose_window_length(usable_durations: Sequence[float], correlation_time: fl
     """Return the length in s of free runs that most of the logs hold.
 
     Args:
-        usable_durations: the longest time in s without a gap of each log to be judged on; none ask for half
-            a second.
+        usable_durations: the longest time in s without a gap of each log to be judged on; none ask
+            for half a second.
         correlation_time: how long the vessel remembers, s.
     """
     sorted_durations = sorted(usable_durations) or [1.0]

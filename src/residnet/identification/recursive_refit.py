@@ -1,10 +1,10 @@
 """Recursive refit: after an alarm, the sizes of a few changes are estimated log by log.
 
-A change that the monitor names moves all parameters of the baseline together, along one direction:
-more mass scales every acceleration, a weaker propeller all of its terms. The directions are found
-by least squares from what each change does to the accelerations of the new logs. Their sizes are
-then estimated by an extended information filter, which takes one log after the other, free-runs its
-windows with the model as it is by then, and adds what they say to what was known.
+A change named by the monitor moves all parameters of the baseline along one direction: more mass
+scales every acceleration, a weaker propeller all of its terms. Least squares on the accelerations
+of the new logs gives the directions. An extended information filter then estimates the sizes: it
+processes one log after the other, free-runs its windows with the current model, and adds their
+scores and information.
 """
 
 from __future__ import annotations
@@ -69,14 +69,14 @@ class IdentifiedChange:
 
 @dataclass(frozen=True)
 class RecursiveRefit:
-    """What a recursive refit found.
+    """Result of a recursive refit.
 
     Attributes:
-        model: with the changes put into its baseline; as it was where there are none.
-        identified_changes: the changes, in the order in which the monitor named them.
+        model: the model with the changes in its baseline; unchanged without changes.
+        identified_changes: the changes, in the order of detection.
         verdict_before: verdict on the logs with the old model.
-        verdict_after: with the new one.
-        stopping_reason: why no further change was taken, in words.
+        verdict_after: verdict with the new model.
+        stopping_reason: reason in words why no further change was estimated.
     """
 
     model: HybridDynamics
@@ -89,14 +89,14 @@ class RecursiveRefit:
 def refit_recursively(
     detector: ChangeDetector, windows_by_log: Sequence[Sequence[MeasuredWindow]]
 ) -> RecursiveRefit:
-    """Put the changes that a monitor names into a copy of its model, until it names none.
+    """Estimate the changes named by a monitor in a copy of its model, until none is detected.
 
     Args:
-        detector: over the model, which stays as it is.
-        windows_by_log: windows of the new logs, in the order of time.
+        detector: detector of the model, which is not modified.
+        windows_by_log: windows of the new logs, in time order.
 
     Raises:
-        UsageError: where the model's baseline has no parameters that could move.
+        UsageError: if the model's baseline has no adjustable parameters.
     """
     baseline = detector.model.baseline
     if not isinstance(baseline, ParametricBaseline):
@@ -135,9 +135,9 @@ def refit_recursively(
 
 
 def make_refitted_model(fitted_model: FittedModel, refit: RecursiveRefit) -> FittedModel:
-    """Return the refitted model under a name of its own, with notes on what was put into it.
+    """Return the refitted model under a new name, with notes on the changes.
 
-    Bands that were calibrated for the old model are left out.
+    The prediction intervals of the old model are dropped.
     """
     baseline = parametric(refit.model)
     values_by_parameter = dict(
@@ -222,7 +222,9 @@ def _parameter_direction(
             short_step_model.dt * change.size
         )
         sensitivities = (
-            parametric(model).parameter_jacobian(model.compute_channels(states, inputs)).flatten(0, 1)
+            parametric(model)
+            .parameter_jacobian(model.compute_channels(states, inputs))
+            .flatten(0, 1)
         )
         # axes count alike, though an acceleration in yaw is no acceleration in surge
         axis_weights = added_increment[:, DYNAMIC_STATES].square().mean(0)
@@ -263,10 +265,9 @@ class _InformationFilter:
     def run_filter(
         self, indexed_groups: Sequence[tuple[int, Sequence[MeasuredWindow]]]
     ) -> list[IdentifiedChange]:
-        """Take the logs one after the other, twice, and return what has become of the sizes.
+        """Process the logs twice in sequence and return the estimated sizes.
 
-        The second time the logs are free-run with the sizes that the first time ended with, and
-        the directions are those of changes so large.
+        The second pass linearises at the result of the first one.
         """
         for is_second_pass in (False, True):
             linearisation_sizes = np.where(
@@ -309,9 +310,9 @@ class _InformationFilter:
         *,
         use_initial_sizes: bool,
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-        """Take the logs one after the other: sizes after each, their covariance, sizes by fold.
+        """Process the logs in sequence: sizes after each, their covariance, sizes by fold.
 
-        Free runs have the sizes known by then, or, where these are `use_initial_sizes`, those of the start.
+        Free runs use the current sizes, or the initial sizes with `use_initial_sizes`.
         """
         precision = np.diag((PRIOR_STD * self.small_sizes) ** -2.0)
         weighted_sizes, sizes = (
@@ -358,7 +359,7 @@ class _InformationFilter:
     def _process_group(self, windows: Sequence[MeasuredWindow]) -> tuple[np.ndarray, np.ndarray]:
         """Return scores and information about further changes of the sizes, from a few windows.
 
-        Scores [1 + F, Q] are by what all clean logs say is always wrong, then without each fold.
+        Scores [1 + F, Q] use the bias of all clean logs first, then the bias without each fold.
         """
         detector = self.detector
         innovations_by_fold: list[list[tuple[np.ndarray, np.ndarray]]] = [

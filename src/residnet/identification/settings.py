@@ -33,18 +33,17 @@ class ModelPartsConfig(Config):
     """The models of a fit.
 
     Attributes:
-        baseline: the known part; a fit without a recipe needs one.
-        baselines: further baselines by name; free-run beside the first, and heads may stand on
-            them.
-        refit: baselines (by name, `baseline` for the first) whose coefficients are moved through
+        baseline: the known part; required without a recipe.
+        baselines: further baselines by name, which heads may use.
+        refit: baselines (by name, `baseline` for the first) whose coefficients are refitted through
             rollouts after least squares.
         heads: residual heads by name.
-        base_of: the baseline that a head stands on, by the head's name; `baseline` where absent,
-            `constant_velocity` for a head that is the whole model.
-        ensembles: models whose mean acceleration makes another model, by its name.
-        means: models by name that are the mean of what several others predict, each running by
-            itself; members that diverge on a validation window are left out.
-        training: of network heads by the name of the head; the defaults where absent.
+        base_of: baseline of each head by the head's name; `baseline` by default,
+            `constant_velocity` for a black-box head.
+        ensembles: models by name that average the accelerations of their members.
+        means: models by name that average the trajectories of their members; members that diverge
+            on a validation window are removed.
+        training: training settings by head; defaults otherwise.
     """
 
     baseline: BaselineConfig = ZeroBaselineConfig()
@@ -63,19 +62,20 @@ class FitSettings(ModelPartsConfig):
     """Settings of an identification.
 
     Attributes:
-        seed: of weights and batches.
+        seed: seed of weights and batches.
         prepare: grid, masks, derivatives.
         signals: inputs of the models.
-        integrator: of the models; their step is the grid's.
-        current: training and validation logs ran in constant currents that are estimated first;
-            null for water at rest.
+        integrator: integration scheme; the models use the step of the grid.
+        current: estimation of constant currents of training and validation logs; null for still
+            water.
         evaluation: protocols and scales.
-        bands: how far free runs may be off, calibrated over logs that were left out; null for none.
-        recipe: `standard` stands in place of the parts: a line, a hull, networks on the hull,
-            of long logs networks alone, and the mean of hull and networks, named `ensemble`, which is
-            reported first and exported where no model is named. Terms, sizes and trainings follow
-            from the logs. Null for parts of your own.
-        effort: how long the recipe trains its networks: 1 for usual, less for a quick look.
+        bands: calibration of prediction intervals by cross-validation over logs; null for none.
+        recipe: `standard` sets the parts: a linear baseline, a hull, networks on the hull, for long
+            logs also black-box networks, and `ensemble`, the mean of the trajectories of hull and
+            networks, which is reported first and exported by default. Terms, sizes and trainings
+            follow from the logs. Null for explicit parts.
+        effort: training duration of the recipe's networks: 1 for the usual one, less for a quick
+            look.
     """
 
     seed: int = Field(default=0, ge=0)
@@ -90,7 +90,7 @@ class FitSettings(ModelPartsConfig):
 
     @model_validator(mode="after")
     def apply_recipe(self) -> FitSettings:
-        """Put the portfolio in the place of the parts, as it is before any log is read."""
+        """Set the parts to the portfolio of the recipe, before any log is read."""
         specified_parts = [key for key in PART_KEYS if key in self.model_fields_set]
         if self.recipe is None:
             if "baseline" not in specified_parts:
@@ -103,7 +103,7 @@ class FitSettings(ModelPartsConfig):
         return self.with_parts(TrainingDataSummary.from_channel_names(self.signals.build().names))
 
     def with_parts(self, data_summary: TrainingDataSummary) -> Self:
-        """Return the settings with the parts of the recipe for what is known of the logs."""
+        """Return the settings with the parts of the recipe for the given logs."""
         parts = validate_config(
             make_portfolio(data_summary, self.effort), ModelPartsConfig, "recipe"
         )
@@ -113,7 +113,7 @@ class FitSettings(ModelPartsConfig):
     def serialize_without_recipe_parts(
         self, default_serializer: SerializerFunctionWrapHandler
     ) -> dict[str, Any]:
-        """Leave out what the recipe stands in place of."""
+        """Omit the parts that the recipe sets."""
         content: dict[str, Any] = default_serializer(self)
         if self.recipe is not None:
             content = {key: value for key, value in content.items() if key not in PART_KEYS}
@@ -219,11 +219,11 @@ class FitSettings(ModelPartsConfig):
         return (*self.all_baselines, *self.heads, *self.ensembles, *self.means)
 
     def get_baseline_name(self, head_name: str) -> str:
-        """Return the name of the baseline that a head stands on."""
+        """Return the name of the baseline of a head."""
         return self.base_of.get(head_name, "baseline")
 
     def get_baseline_config(self, head_name: str) -> BaselineConfig:
-        """Return the settings of the baseline that a head stands on."""
+        """Return the settings of the baseline of a head."""
         name = self.get_baseline_name(head_name)
         return ZeroBaselineConfig() if name == CONSTANT_VELOCITY else self.all_baselines[name]
 
