@@ -160,7 +160,7 @@ def failure(load: Callable[..., Fit], tmp_path: Path) -> Failure:
         (quantity_type("-"), "5 %", 0.05),
     ],
 )
-def test_quantity_is_si(kind: Any, value: object, expected: float) -> None:
+def test_quantity_converts_to_si(kind: Any, value: object, expected: float) -> None:
     result = TypeAdapter(kind).validate_python(value)
     assert type(result) is float
     assert result == pytest.approx(expected, rel=1e-15)
@@ -181,7 +181,7 @@ def test_quantity_is_si(kind: Any, value: object, expected: float) -> None:
         (Annotated[Seconds, Field(gt=0)], "-1 s", "greater than 0"),
     ],
 )
-def test_quantity_refuses(kind: Any, value: object, told: str) -> None:
+def test_quantity_refuses_invalid_values(kind: Any, value: object, told: str) -> None:
     with pytest.raises(ValidationError, match=told):
         TypeAdapter(kind).validate_python(value)
 
@@ -195,7 +195,7 @@ class Wrong(Config):
     dt: Seconds = Field(default=-1.0, gt=0)
 
 
-def test_config_is_frozen_and_closed_and_its_defaults_are_checked() -> None:
+def test_config_is_immutable_closed_and_validates_defaults() -> None:
     with pytest.raises(ValidationError, match="frozen"):
         Lstm(hidden_size=3).hidden_size = 4
     with pytest.raises(ValidationError, match="Extra inputs"):
@@ -204,7 +204,7 @@ def test_config_is_frozen_and_closed_and_its_defaults_are_checked() -> None:
         Wrong()
 
 
-def test_path_is_taken_from_the_configs_folder_first(
+def test_config_path_is_searched_in_the_config_folder_first(
     load: Callable[..., Fit], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here = tmp_path / "here"
@@ -223,7 +223,7 @@ def test_path_is_taken_from_the_configs_folder_first(
     assert load("out: ~/b\n").out == tmp_path / "b"
 
 
-def test_dump_loads_back_to_an_equal_config(
+def test_dump_config_loads_to_an_equal_config(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -258,7 +258,7 @@ def test_dump_loads_back_to_an_equal_config(
     assert f"out: {tmp_path}/runs/a\n" in text
 
 
-def test_a_key_is_taken_away(load: Callable[..., Fit]) -> None:
+def test_override_removes_a_key(load: Callable[..., Fit]) -> None:
     text = "rates: {a: [1], b: [2]}\nepochs: 5\n"
     assert load(text, "~rates.a").rates == {"b": (2.0,)}
     assert load(text, "~epochs").epochs == 1
@@ -275,7 +275,7 @@ class Swept(Config):
     base: BaseConfig
 
 
-def test_a_base_is_a_file_or_a_shipped_config(tmp_path: Path) -> None:
+def test_base_config_accepts_a_file_or_a_shipped_config(tmp_path: Path) -> None:
     own = tmp_path / "own.yaml"
     own.write_text("task: fit\n")
     assert Swept.model_validate({"base": str(own)}).base == own
@@ -335,8 +335,10 @@ def test_a_base_is_a_file_or_a_shipped_config(tmp_path: Path) -> None:
         ("dt: -50 ms", "2: dt: must be greater than 0 s (given -0.05)"),
         (
             "rates:\n  gnss: [1 Hz, 2 kn]",
-            "3: rates.gnss.1: unit 'kn' does not measure [1/s]; units that do: Hz, 1/s, 1/min, rps,"
-            " rpm (given '2 kn')",
+            (
+                "3: rates.gnss.1: unit 'kn' does not measure [1/s]; units that do: Hz, 1/s, 1/min,"
+                " rps, rpm (given '2 kn')"
+            ),
         ),
         # paths
         (
@@ -374,11 +376,11 @@ def test_a_base_is_a_file_or_a_shipped_config(tmp_path: Path) -> None:
         ("epochs: x\nname: 1\nresume: 2", "3: name: expected text (given 1) (and 2 more)"),
     ],
 )
-def test_one_line(failure: Failure, text: str, expected: str) -> None:
+def test_load_config_reports_faults_in_one_line(failure: Failure, text: str, expected: str) -> None:
     assert failure(text + "\n") == f"run.yaml:{expected}"
 
 
-def test_long_values_are_cut(failure: Failure) -> None:
+def test_load_config_truncates_long_values(failure: Failure) -> None:
     message = failure(f"epochs: {'x' * 500}\n")
     assert message.endswith("xxx...)")
     assert len(message) < 150
@@ -386,7 +388,7 @@ def test_long_values_are_cut(failure: Failure) -> None:
     assert failure(f"logs: [{'x' * 400}]\n").startswith(told)
 
 
-def test_quantity_or_word_and_a_variable_that_is_not_set(
+def test_load_config_with_quantity_unions_and_unset_variables(
     failure: Failure, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "unknown value 'atuo'; did you mean 'auto'?" in failure("window: atuo\n")
@@ -398,7 +400,7 @@ def test_quantity_or_word_and_a_variable_that_is_not_set(
 
 
 @pytest.mark.parametrize("number", ["1234567890123456789012", "1e200", "-1e31", "1e-200"])
-def test_numbers_that_no_vessel_has_are_refused(failure: Failure, number: str) -> None:
+def test_load_config_refuses_implausible_numbers(failure: Failure, number: str) -> None:
     assert failure(f"dt: {number}\n").startswith("run.yaml:2: dt: expected a number of usual size")
 
 
@@ -411,7 +413,7 @@ def test_numbers_that_no_vessel_has_are_refused(failure: Failure, number: str) -
         ("~task", "override '~task': task: missing; valid: fit, simulate"),
     ],
 )
-def test_root_may_be_a_union(
+def test_load_config_accepts_a_union(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, override: str, expected: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -423,7 +425,7 @@ def test_root_may_be_a_union(
     assert str(caught.value).startswith(expected)
 
 
-def test_validate_names_its_source_and_takes_a_union(tmp_path: Path) -> None:
+def test_validate_config_names_its_source(tmp_path: Path) -> None:
     assert validate_config({"kind": "mlp", "hidden": [4]}, Head, "card.json") == Mlp(hidden=(4,))
     assert validate_config({"hidden_size": 4, "washout": "20 s"}, Lstm, "card.json").washout == 20.0
     for given, told in (
@@ -438,7 +440,7 @@ def test_validate_names_its_source_and_takes_a_union(tmp_path: Path) -> None:
     assert found.logs == (tmp_path / "a.csv",)
 
 
-def test_overrides_set_values(load: Callable[..., Fit]) -> None:
+def test_load_config_applies_overrides(load: Callable[..., Fit]) -> None:
     text = (
         "heads:\n  a: {kind: lstm, hidden_size: 3}\npolicy:\nepochs: x\nstages:\n- kind: mlp\n"
         "- kind: lstm\n  hidden_size: 1\n"
@@ -488,7 +490,9 @@ OVERRIDDEN = (
         ("~name.x", "there is no 'name.x' to remove"),
     ],
 )
-def test_faults_are_attributed_to_an_override(failure: Failure, override: str, told: str) -> None:
+def test_load_config_attributes_faults_to_an_override(
+    failure: Failure, override: str, told: str
+) -> None:
     assert failure(OVERRIDDEN, override) == f"override '{override}': {told}"
 
 
@@ -505,7 +509,7 @@ def test_faults_are_attributed_to_an_override(failure: Failure, override: str, t
         ),
     ],
 )
-def test_a_fault_is_of_what_set_the_value(
+def test_load_config_names_the_origin_of_a_value(
     failure: Failure, overrides: list[str], expected: str
 ) -> None:
     assert failure(OVERRIDDEN, *overrides).startswith(expected)
@@ -539,7 +543,7 @@ def test_config_error_has_a_code(data: dict[str, Any], code: str) -> None:
     assert caught.value.code == code
 
 
-def test_scalars_follow_yaml_1_2(tmp_path: Path) -> None:
+def test_load_mapping_follows_yaml_1_2(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     # a byte order mark is skipped
     path.write_text(
@@ -553,7 +557,7 @@ def test_scalars_follow_yaml_1_2(tmp_path: Path) -> None:
     assert type(mapping["c"]) is int
 
 
-def test_merge_keys_are_not_duplicates_and_are_not_shared(load: Callable[..., Fit]) -> None:
+def test_load_config_copies_merged_and_aliased_values(load: Callable[..., Fit]) -> None:
     text = "heads:\n  a: &a {kind: lstm, hidden_size: 3}\n  b: *a\n  c: {<<: *a, hidden_size: 5}\n"
     heads = load(text, "heads.a.hidden_size=4").heads
     assert [heads[name].model_dump()["hidden_size"] for name in "abc"] == [4, 3, 5]
@@ -581,7 +585,9 @@ def test_merge_keys_are_not_duplicates_and_are_not_shared(load: Callable[..., Fi
         (b"l:\n- {k: 1, k: 2}\n", ":2: duplicate key 'k', first on line 2"),
     ],
 )
-def test_unreadable_files(tmp_path: Path, content: bytes, expected: str) -> None:
+def test_load_config_refuses_unreadable_files(
+    tmp_path: Path, content: bytes, expected: str
+) -> None:
     path = tmp_path / "a.yaml"
     path.write_bytes(content)
     with pytest.raises(ConfigError) as caught:
@@ -598,7 +604,9 @@ def test_unreadable_files(tmp_path: Path, content: bytes, expected: str) -> None
         ("/dev/zero", "/dev/zero: is longer than 2 MB"),
     ],
 )
-def test_what_is_no_file_of_a_config(tmp_path: Path, name: str, told: str) -> None:
+def test_load_mapping_refuses_missing_files_folders_and_devices(
+    tmp_path: Path, name: str, told: str
+) -> None:
     with pytest.raises(ConfigError, match=told):
         load_mapping(tmp_path / name)
 
@@ -626,7 +634,7 @@ _MERGES = "\n".join(
     ],
     ids=["aliases", "merges", "brackets", "dashes", "digits", "hex"],
 )
-def test_what_would_take_minutes_is_one_line_at_once(text: str, told: str) -> None:
+def test_parse_yaml_limits_size_depth_and_digits(text: str, told: str) -> None:
     started = time.process_time()
     with pytest.raises(ConfigError, match=told) as caught:
         parse_yaml(text, "x.yaml")

@@ -10,7 +10,7 @@ from residnet.core.errors import UsageError
 from residnet.core.files import atomic_write, make_file_stem
 
 
-def test_a_file_takes_its_place_when_it_is_complete(tmp_path: Path) -> None:
+def test_atomic_write_replaces_a_complete_file(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "values.json"
     with atomic_write(path) as file:
         file.write_text("new")
@@ -20,7 +20,9 @@ def test_a_file_takes_its_place_when_it_is_complete(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [ValueError("wrong"), KeyboardInterrupt(), SystemExit(1)])
-def test_what_breaks_off_leaves_the_old_file(tmp_path: Path, error: BaseException) -> None:
+def test_atomic_write_keeps_the_old_file_after_an_error(
+    tmp_path: Path, error: BaseException
+) -> None:
     path = tmp_path / "values.json"
     path.write_text("old")
 
@@ -36,7 +38,7 @@ def test_what_breaks_off_leaves_the_old_file(tmp_path: Path, error: BaseExceptio
 
 
 @pytest.mark.parametrize("name", ["x" * 300, "file/values.json"])
-def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path, name: str) -> None:
+def test_unwritable_places_raise_usage_errors(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").write_text("no folder")
     path = tmp_path / name
     with pytest.raises(UsageError, match="cannot be written") as caught, atomic_write(path) as file:
@@ -58,7 +60,7 @@ def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path, name: str) -
         "船" * 90,
     ],
 )
-def test_a_name_becomes_one_file_of_one_folder(name: str, tmp_path: Path) -> None:
+def test_make_file_stem_gives_safe_unique_names(name: str, tmp_path: Path) -> None:
     stem = make_file_stem(name)
     (tmp_path / f"{stem}.txt").write_text("here")
     assert [path.name for path in tmp_path.iterdir()] == [f"{stem}.txt"]

@@ -25,7 +25,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only the GNU C library is set")
-def test_arrays_find_the_memory_of_freed_ones_again() -> None:
+def test_retain_freed_memory_reduces_page_faults() -> None:
     kept, usual = (
         int(subprocess.check_output([sys.executable, "-c", _FAULTS, word])) for word in ("keep", "")
     )

@@ -30,7 +30,7 @@ def log() -> Log:
     )
 
 
-def test_what_is_written_comes_back_bit_by_bit(log: Log, tmp_path: Path) -> None:
+def test_log_save_and_load_are_lossless(log: Log, tmp_path: Path) -> None:
     for one in (log, Log("empty", np.zeros(0), {}, meta={"vessel": None})):
         one.save(tmp_path / "log.parquet")
         again = Log.load(tmp_path / "log.parquet")
@@ -47,14 +47,14 @@ def test_what_is_written_comes_back_bit_by_bit(log: Log, tmp_path: Path) -> None
             np.testing.assert_array_equal(again.masks[reason], mask)
 
 
-def test_usable_is_what_no_mask_excludes(log: Log) -> None:
+def test_log_usable_excludes_all_masks(log: Log) -> None:
     assert np.flatnonzero(~log.usable).tolist() == [0, 1, 2, 3, 4, 40]
     assert Log("x", np.zeros(3), {}).usable.all()
     assert log.units == {"fuel": "kg", "u": "m/s", "psi": "rad"}
     assert Log("x", np.zeros(1), {"odd": np.zeros(1)}).units == {"odd": "-"}
 
 
-def test_access(log: Log) -> None:
+def test_log_access(log: Log) -> None:
     np.testing.assert_array_equal(
         log.stack(["psi", "fuel"]), np.column_stack([log["psi"], log["fuel"]])
     )
@@ -80,7 +80,7 @@ def test_access(log: Log) -> None:
     ],
     ids=str,
 )
-def test_other_files_are_refused_by_name(log: Log, tmp_path: Path, content: Any, told: str) -> None:
+def test_log_load_refuses_other_files(log: Log, tmp_path: Path, content: Any, told: str) -> None:
     path = tmp_path / "log.parquet"
     if isinstance(content, dict):
         pq.write_table(pa.table({"t": [0.0, 1.0]}).replace_schema_metadata(content), path)
@@ -94,7 +94,7 @@ def test_other_files_are_refused_by_name(log: Log, tmp_path: Path, content: Any,
     assert "\n" not in str(caught.value)
 
 
-def test_a_log_is_shown_in_one_line() -> None:
+def test_log_repr_is_one_line() -> None:
     log = Log("run 1", 0.1 * np.arange(901), {"u": np.zeros(901), "psi": np.zeros(901)})
     assert repr(log) == "Log('run 1', unknown, 901 samples over 90.0 s: u [m/s], psi [rad])"
     assert "0 samples over 0.0 s" in repr(Log("none", np.zeros(0), {}))

@@ -19,12 +19,12 @@ from residnet.core.names import CHANNEL_UNITS, si_unit, suggest_name, to_si, uni
         ("g", "m/s^2", 9.80665),
     ],
 )
-def test_factor(unit: str, si: str, factor: float) -> None:
+def test_to_si_factor(unit: str, si: str, factor: float) -> None:
     assert si_unit(unit) == si
     assert to_si(unit) == to_si(unit, si) == pytest.approx(factor, rel=1e-15)
 
 
-def test_si_units_and_those_of_channels_convert_to_themselves() -> None:
+def test_to_si_of_si_units_is_one() -> None:
     for unit in (*map(si_unit, unit_names()), *CHANNEL_UNITS.values()):
         assert si_unit(unit) == unit
         assert to_si(unit) == 1.0
@@ -39,12 +39,12 @@ def test_si_units_and_those_of_channels_convert_to_themselves() -> None:
         (("kn", "cd"), "units that do: none$"),
     ],
 )
-def test_a_wrong_unit_names_those_that_fit(given: tuple[str, ...], told: str) -> None:
+def test_to_si_with_a_wrong_unit_suggests_valid_ones(given: tuple[str, ...], told: str) -> None:
     with pytest.raises(UsageError, match=told):
         to_si(*given)
 
 
-def test_nearest() -> None:
+def test_suggest_name() -> None:
     assert suggest_name("hiden", ["hidden", "kind"]) == "; did you mean 'hidden'?"
     assert suggest_name("zzz", ["b", "a", "b"]) == "; valid: a, b"
     many = suggest_name("zzz", [f"key{i:02d}" for i in range(30)])

@@ -45,7 +45,7 @@ def declare(site: Path, group: str, **points: str) -> None:
 
 
 @pytest.mark.usefixtures("installed")
-def test_parts_are_found_by_name() -> None:
+def test_load_kinds_finds_parts_of_packages() -> None:
     head = validate_config({"kind": "slow_water", "time_constant": "3 s"}, HeadConfig, "here")
     assert type(head).__module__ == "residnet_sample.slow_water"
     assert head.time_constant == 3.0
@@ -62,7 +62,7 @@ def test_parts_are_found_by_name() -> None:
 
 
 @pytest.mark.usefixtures("installed")
-def test_a_broken_part_says_so_where_it_is_used_and_disturbs_nothing_else() -> None:
+def test_broken_part_raises_only_where_it_is_used() -> None:
     with pytest.raises(ConfigError, match=r"residnet-sample 0\.1\.0 cannot be used: ModuleNotF"):
         validate_config({"kind": "absent", "anything": 1}, HeadConfig, "here")
     listed = dict(list_catalogue("heads"))
@@ -83,7 +83,7 @@ def test_a_broken_part_says_so_where_it_is_used_and_disturbs_nothing_else() -> N
         ("os", "not a subclass"),
     ],
 )
-def test_faults_of_kinds(installed: Path, target: str, fault: str) -> None:
+def test_entry_points_of_kinds_with_faults(installed: Path, target: str, fault: str) -> None:
     declare(
         installed / "site",
         "residnet.heads",
@@ -105,7 +105,7 @@ def test_faults_of_kinds(installed: Path, target: str, fault: str) -> None:
         ("class Stop(BaseException): pass\nraise Stop('two\\nlines')", "Stop: two"),
     ],
 )
-def test_a_package_that_ends_the_process_is_skipped_and_reported(
+def test_entry_point_that_exits_is_skipped_and_reported(
     installed: Path, statement: str, fault: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (installed / "site" / "made_package.py").write_text(statement + "\n")
@@ -121,14 +121,14 @@ def test_a_package_that_ends_the_process_is_skipped_and_reported(
     ]
 
 
-def test_an_interruption_while_a_package_is_loaded_is_not_swallowed(installed: Path) -> None:
+def test_entry_point_interruption_is_propagated(installed: Path) -> None:
     (installed / "site" / "made_stop.py").write_text("raise KeyboardInterrupt\n")
     declare(installed / "site", "residnet.heads", boom="made_stop:Head")
     with pytest.raises(KeyboardInterrupt):
         list_catalogue("heads")
 
 
-def test_faults_of_formats_and_vessels(installed: Path) -> None:
+def test_entry_points_of_formats_and_vessels_with_faults(installed: Path) -> None:
     declare(installed / "site", "residnet.exporters", odd="residnet_sample.knots:KnotsReader")
     assert isinstance(EXPORT_FORMATS.find_kind("odd"), registry.EntryPointPart)
     with pytest.raises(ConfigError, match=r"format 'odd' of the package made 1\.0 cannot be"):
@@ -137,7 +137,7 @@ def test_faults_of_formats_and_vessels(installed: Path) -> None:
         get_exporter("gguf")
 
 
-def test_a_vessel_package_without_files(installed: Path) -> None:
+def test_vessel_entry_point_without_files(installed: Path) -> None:
     declare(installed / "site", "residnet.vessels", odd="residnet_sample.pulse:Pulse")
     assert "not a package with data files" in dict(list_catalogue("vessels"))["odd"]
     assert "sample package" in dict(list_catalogue("vessels"))["sample_ferry"]

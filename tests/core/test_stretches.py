@@ -11,7 +11,7 @@ from residnet.core.stretches import find_run_bounds, find_runs, number_runs
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_stretches_are_found_sample_by_sample(seed: int) -> None:
+def test_find_runs_equals_a_reference_loop(seed: int) -> None:
     random = np.random.default_rng(seed)
     labels = np.repeat(random.integers(-1, 3, size=12), random.integers(1, 4, size=12))
     expected, place = [], 0
@@ -31,7 +31,7 @@ def test_stretches_are_found_sample_by_sample(seed: int) -> None:
             assert (begins[place], ends[place]) == (begin, end)
 
 
-def test_flags_are_stretches_of_true_samples() -> None:
+def test_find_runs_of_flags_returns_true_samples() -> None:
     flags = np.array([True, True, False, True, False, False, True])
     assert [part.tolist() for part in find_runs(flags)] == [[0, 3, 6], [2, 4, 7]]
     assert number_runs(flags).tolist() == [0, 0, -1, 1, -1, -1, 2]

@@ -22,7 +22,7 @@ def gridded(
     return align_to_grid(log, GridConfig(step=step, held=held, longest_gap=gap))
 
 
-def test_a_log_on_the_grid_keeps_its_times_and_samples_exactly() -> None:
+def test_align_to_grid_leaves_a_gridded_log_unchanged() -> None:
     rng = np.random.default_rng(0)
     t: np.ndarray = 1176.1 + 0.1 * np.arange(500) + rng.uniform(-4e-5, 4e-5, 500)
     log = Log("a", t, {"u": rng.normal(size=500)}, masks={"frozen": rng.random(500) < 0.1})
@@ -35,7 +35,7 @@ def test_a_log_on_the_grid_keeps_its_times_and_samples_exactly() -> None:
     np.testing.assert_allclose(shaken["u"], 3.0 * (0.1 * np.arange(100)) - 1.0, atol=1e-12)
 
 
-def test_lines_survive_irregular_clocks_and_far_origins() -> None:
+def test_align_to_grid_is_exact_for_lines() -> None:
     t = np.sort(np.random.default_rng(3).uniform(0.0, 60.0, 900))
     for step in (0.05, 0.5):
         out = gridded(t, step, gap=2.0, x=7e6 + 2.0 * t, psi=0.3 * t)
@@ -45,7 +45,7 @@ def test_lines_survive_irregular_clocks_and_far_origins() -> None:
         np.testing.assert_allclose(np.diff(out.t), step)
 
 
-def test_averaging_has_the_gain_of_a_boxcar_and_no_delay() -> None:
+def test_align_to_grid_averages_with_boxcar_gain_and_zero_phase() -> None:
     t, inner = 0.01 * np.arange(20001), slice(2, -2)
     for frequency in (0.2, 0.9, 2.0):
         out = gridded(t, 0.5, u=np.sin(2.0 * np.pi * frequency * t + 0.7))
@@ -54,14 +54,14 @@ def test_averaging_has_the_gain_of_a_boxcar_and_no_delay() -> None:
         np.testing.assert_allclose(out["u"][inner], np.sinc(0.5 * frequency) * wave, atol=2e-4)
 
 
-def test_held_inputs_take_the_value_before_and_states_the_line_between() -> None:
+def test_align_to_grid_holds_inputs_and_interpolates_states() -> None:
     out = gridded([0, 0.3, 0.6, 0.9], 0.2, ("delta",), delta=[1, 2, 3, 4], u=[0, 3, 6, 9])
     np.testing.assert_allclose(out.t, [0.0, 0.2, 0.4, 0.6, 0.8])
     np.testing.assert_allclose(out["delta"], [1.0, 1.0, 2.0, 3.0, 3.0])
     np.testing.assert_allclose(out["u"], [0.0, 2.0, 4.0, 6.0, 8.0])
 
 
-def test_wrapping_angles_go_the_short_way_and_stay_in_their_range() -> None:
+def test_align_to_grid_interpolates_wrapped_angles() -> None:
     for wind, expected in (
         ([350.0, 10.0, 20.0], [350.0, 0.0, 10.0, 15.0, 20.0]),
         ([170.0, -170.0, -160.0], [170.0, -180.0, -170.0, -165.0, -160.0]),
@@ -88,7 +88,7 @@ HOLED = np.where(np.arange(LONG.size) == 20, NAN, 1.0)
         (LONG, HOLED, 1.0, 0.3, [2, 5, 6]),
     ],
 )
-def test_points_in_gaps_and_beside_missing_samples_are_masked(
+def test_align_to_grid_masks_gaps_and_missing_samples(
     t: Any, u: Any, step: float, gap: float | None, masked: list[int]
 ) -> None:
     out = gridded(t, step, gap=gap, u=u)
@@ -96,7 +96,7 @@ def test_points_in_gaps_and_beside_missing_samples_are_masked(
     assert np.flatnonzero(np.isnan(out["u"])).tolist() == masked
 
 
-def test_masks_cover_every_point_that_a_masked_sample_enters() -> None:
+def test_align_to_grid_extends_masks() -> None:
     mask = np.arange(7) == 3
     log = Log("a", 0.2 * np.arange(7), {"u": np.arange(7.0)}, masks={"frozen": mask})
     assert np.flatnonzero(align_to_grid(log, GridConfig(step=0.1)).masks["frozen"]).tolist() == [
@@ -114,6 +114,8 @@ def test_masks_cover_every_point_that_a_masked_sample_enters() -> None:
         ([0.0, 1.0, 1.7e9], (), DataError, "check the unit of time"),
     ],
 )
-def test_faults(t: list[float], held: tuple[str, ...], error: type, words: str) -> None:
+def test_align_to_grid_refuses_invalid_logs(
+    t: list[float], held: tuple[str, ...], error: type, words: str
+) -> None:
     with pytest.raises(error, match=words):
         gridded(t, 0.1, held, u=np.ones(len(t)))

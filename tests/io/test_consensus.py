@@ -30,14 +30,14 @@ def find_contradictions(logs: list[Log], fleet: Fleet) -> list[Finding]:
     return [finding for finding in findings if finding.code.startswith("contradicts")]
 
 
-def test_clean_fleets_hold_no_contradiction(fleets: list[Fleet]) -> None:
+def test_find_consensus_on_clean_fleets_flags_no_log(fleets: list[Fleet]) -> None:
     assert [
         one.text for fleet in fleets[:2] for one in find_contradictions(fleet.logs, fleet)
     ] == []
 
 
 @pytest.mark.parametrize("what", CONTRADICTIONS)
-def test_a_contradiction_is_named_with_its_cause(fleets: list[Fleet], what: str) -> None:
+def test_rank_hypotheses_names_the_planted_cause(fleets: list[Fleet], what: str) -> None:
     hits = 0
     for number, fleet in enumerate(fleets):
         random = np.random.default_rng([_SEED, number])
@@ -52,7 +52,7 @@ def test_a_contradiction_is_named_with_its_cause(fleets: list[Fleet], what: str)
     pytest.fail(f"{hits} of {_COUNT} named")
 
 
-def test_a_sign_an_offset_and_a_scale_are_told_apart(fleets: list[Fleet]) -> None:
+def test_rank_hypotheses_distinguishes_sign_offset_and_scale(fleets: list[Fleet]) -> None:
     fleet = fleets[0]
     name = fleet.steering
     changes = {
@@ -70,7 +70,7 @@ def test_a_sign_an_offset_and_a_scale_are_told_apart(fleets: list[Fleet]) -> Non
         assert words in one.text
 
 
-def test_no_log_of_the_quickstart_is_accused() -> None:
+def test_find_consensus_on_quickstart_flags_no_log() -> None:
     """Its constant inputs reach farther than most of its logs, which agree best without them."""
     task = load_task(Path("quickstart"))
     assert isinstance(task, FitConfig)
@@ -100,7 +100,7 @@ def _askew(log: Log) -> dict[str, np.ndarray]:
         ("boat", _askew, "heading", ("psi", "u", "v", "r")),
     ],
 )
-def test_logs_with_one_fault_do_not_hide_each_other(
+def test_find_consensus_with_a_shared_fault_flags_all_logs_with_it(
     kind: str,
     change: Callable[[Log], dict[str, np.ndarray]],
     cause: str,
@@ -129,7 +129,7 @@ def _hand_on_the_wheel(fleet: Fleet) -> tuple[list[Log], slice]:
     return [log.replace(channels=channels), *fleet.logs[1:]], rows
 
 
-def test_motion_without_a_command_is_found_where_it_is(fleets: list[Fleet]) -> None:
+def test_find_unexplained_idle_returns_the_planted_stretch(fleets: list[Fleet]) -> None:
     fleet = fleets[0]
     records = [LogStatistics(log, fleet.inputs) for log in fleet.logs]
     assert find_unexplained_idle(records, [], fleet.inputs) == {}
@@ -145,7 +145,7 @@ def test_motion_without_a_command_is_found_where_it_is(fleets: list[Fleet]) -> N
     assert told.text.startswith(logs[0].name)
 
 
-def test_two_logs_that_contradict_each_other_are_named() -> None:
+def test_find_consensus_without_majority_says_so() -> None:
     (fleet,) = drawn("boat", _SEED, 1)
     log = fleet.logs[1]
     channels = {**log.channels, fleet.steering: -log[fleet.steering]}
@@ -154,7 +154,7 @@ def test_two_logs_that_contradict_each_other_are_named() -> None:
     assert "no more than half of the logs agree" in one.text
 
 
-def test_logs_of_a_surge_alone_are_looked_at_too() -> None:
+def test_find_consensus_with_surge_only_flags_a_weak_propeller() -> None:
     random = np.random.default_rng(3)
     t = np.arange(0.0, 120.0, 0.2)
 
@@ -173,7 +173,7 @@ def test_logs_of_a_surge_alone_are_looked_at_too() -> None:
     assert one.text.startswith("run_6")
 
 
-def test_twin_rudders_have_one_fault() -> None:
+def test_rank_hypotheses_with_linked_rudders_names_both() -> None:
     fleet, logs = drawn("boat", _SEED, _COUNT)[0], []
     for number, log in enumerate(fleet.logs):
         rudders = dict.fromkeys(
@@ -187,7 +187,7 @@ def test_twin_rudders_have_one_fault() -> None:
 
 
 @pytest.mark.parametrize("name", ["azimuth", "delta"])
-def test_what_no_other_log_has_run_accuses_none(name: str) -> None:
+def test_is_only_extrapolating_with_new_inputs_gives_a_note(name: str) -> None:
     """A thruster turns round once where it had not; a rudder stalls at angles not held before."""
     random, t = np.random.default_rng(4), np.arange(0.0, 240.0, 0.5)
     logs = []
@@ -211,7 +211,7 @@ def test_what_no_other_log_has_run_accuses_none(name: str) -> None:
     assert [one.level for one in beyond.find_by_code("beyond_others")] == ["note"]
 
 
-def test_gusts_on_straight_runs_are_no_dead_rudder(fleets: list[Fleet]) -> None:
+def test_find_dead_steering_in_gusts_reports_nothing(fleets: list[Fleet]) -> None:
     fleet = fleets[0]
     random, logs = np.random.default_rng(5), []
     for log in fleet.logs:
@@ -226,7 +226,7 @@ def test_gusts_on_straight_runs_are_no_dead_rudder(fleets: list[Fleet]) -> None:
     ] == []
 
 
-def test_a_log_of_one_sample_is_passed_over(fleets: list[Fleet]) -> None:
+def test_find_consensus_ignores_a_log_of_one_sample(fleets: list[Fleet]) -> None:
     fleet = fleets[0]
     short = fleet.logs[0].select_rows(slice(1)).replace(name="short")
     assert find_contradictions([short, *fleet.logs], fleet) == find_contradictions(
@@ -235,7 +235,7 @@ def test_a_log_of_one_sample_is_passed_over(fleets: list[Fleet]) -> None:
 
 
 @pytest.mark.parametrize(("size", "speed"), [(2, 1.0), (10, 1.0), (400, 0.0)])
-def test_short_logs_and_vessels_at_rest_are_passed_over(size: int, speed: float) -> None:
+def test_find_consensus_ignores_short_logs_and_vessels_at_rest(size: int, speed: float) -> None:
     random = np.random.default_rng(0)
     t = 0.2 * np.arange(size)
 

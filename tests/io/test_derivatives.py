@@ -34,7 +34,7 @@ RULES: list[tuple[DerivativeRule, int, np.ndarray, np.ndarray, list[int]]] = [
 
 
 @pytest.mark.parametrize(("rule", "shortest", "smooth", "rate", "invalid"), RULES)
-def test_values_rates_and_pieces(
+def test_derivative_rules_return_expected_values(
     rule: DerivativeRule, shortest: int, smooth: np.ndarray, rate: np.ndarray, invalid: list[int]
 ) -> None:
     found = rule.derive(NOISE, STEP, ONE)
@@ -61,7 +61,7 @@ def test_values_rates_and_pieces(
     assert not rule.derive(NOISE[: shortest - 1], STEP, ONE[: shortest - 1])[2].any()
 
 
-def test_savitzky_golay_is_exact_for_polynomials_up_to_the_edges() -> None:
+def test_savitzky_golay_is_exact_for_polynomials() -> None:
     values = np.stack([1.0 + 2.0 * T - 0.3 * T**2, T**2], axis=1)
     pieces = np.repeat([0, -1, 1], [90, 20, 90])
     smooth, rate, valid = SavitzkyGolay(window=2.05, order=2).derive(values, STEP, pieces)
@@ -81,7 +81,7 @@ def test_savitzky_golay_is_exact_for_polynomials_up_to_the_edges() -> None:
         ({"kind": "central"}, "central"),
     ],
 )
-def test_faulty_rules(config: dict[str, Any], words: str) -> None:
+def test_derivative_config_refuses_invalid_values(config: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         validate_config(config, DerivativeConfig, "test").derive(NOISE, STEP, ONE)
     assert SavitzkyGolay(window=0.5, order=3).derive(NOISE, STEP, ONE)[2].all()

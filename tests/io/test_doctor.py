@@ -65,7 +65,7 @@ def held(*names: str) -> dict[str, np.ndarray]:
     return {n: np.where((at > 500) & (at < 520), LOG[n][500], LOG[n]) for n in names}
 
 
-def test_a_healthy_log_has_nothing_but_information() -> None:
+def test_inspect_log_of_a_valid_log_gives_notes_only() -> None:
     report = inspect_log(LOG)
     assert [finding.text for finding in report.findings if finding.level != "note"] == []
     assert one(report, "clock").figures["rate"] == pytest.approx(10.0)
@@ -178,7 +178,7 @@ TOLD: list[tuple[Log, str, str, str, dict[str, float]]] = [
 
 
 @pytest.mark.parametrize(("log", "code", "level", "words", "figures"), TOLD)
-def test_what_is_wrong_is_named_and_measured(
+def test_inspect_log_reports_a_planted_fault_with_figures(
     log: Log, code: str, level: str, words: str, figures: dict[str, float]
 ) -> None:
     found = [f for f in inspect_log(log).findings if f.code == code and words in f.text]
@@ -190,7 +190,7 @@ def test_what_is_wrong_is_named_and_measured(
         assert found[0].sample_mask.shape == log.t.shape
 
 
-def test_every_check_above_a_note_has_a_fault() -> None:
+def test_every_check_above_a_note_is_tested() -> None:
     # groups of causes are named one by one
     named = {"follows", "position_causes", "yaw_causes", "contradicts", "extrapolation"}
     named |= {code for fault in FAULTS for code in fault.codes} | {row[1] for row in TOLD}
@@ -199,7 +199,7 @@ def test_every_check_above_a_note_has_a_fault() -> None:
 
 
 @pytest.mark.parametrize("lag", [-0.5, 0.63])
-def test_lags_are_measured_in_seconds(lag: float) -> None:
+def test_estimate_position_causes_measures_lags_in_seconds(lag: float) -> None:
     report = inspect_log(wavy(lag=lag))
     for name in "uvr":
         finding = one(report, f"follows_{name}")
@@ -207,12 +207,12 @@ def test_lags_are_measured_in_seconds(lag: float) -> None:
         assert finding.figures["lag"] == pytest.approx(lag, abs=0.05)
 
 
-def test_a_wind_that_does_not_turn_is_true() -> None:
+def test_check_relative_wind_accepts_a_true_wind() -> None:
     gusts = 0.3 * np.sin(0.17 * T) + 0.2 * np.sin(0.71 * T)
     assert not inspect_log(changed(wind_dir=1.0 + gusts)).find_by_code("relative_wind")
 
 
-def test_a_jump_behind_a_gap_is_told_at_its_samples() -> None:
+def test_inspect_log_locates_a_jump_after_a_gap() -> None:
     log = rows(changed(x=stepped(LOG["x"], 1200, 1.0)), np.r_[0:500, 560:2000])
     at = one(inspect_log(log), "position_jump").sample_mask
     assert at is not None
@@ -221,7 +221,7 @@ def test_a_jump_behind_a_gap_is_told_at_its_samples() -> None:
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("way", ["zero", "constant", "half unknown", "rare", "moored"])
-def test_channels_without_content_are_told_and_stop_nothing(way: str) -> None:
+def test_inspect_log_with_constant_channels_completes(way: str) -> None:
     ways = {
         "zero": lambda v: 0.0 * v,
         "constant": lambda v: np.full_like(v, v[20]),
@@ -240,7 +240,7 @@ def test_channels_without_content_are_told_and_stop_nothing(way: str) -> None:
 
 
 @pytest.mark.parametrize("size", [2, 3, 20, 60])
-def test_short_logs_are_examined_as_far_as_they_go(size: int) -> None:
+def test_inspect_log_of_short_logs_completes(size: int) -> None:
     report = inspect_log(rows(LOG, slice(size)))
     assert f"7 channels, {size} samples" in one(report, "channels").text
     assert one(report, "clock").figures["span"] == pytest.approx(0.1 * (size - 1))
@@ -261,12 +261,12 @@ def test_short_logs_are_examined_as_far_as_they_go(size: int) -> None:
         (LOG, ["rudder"], UsageError, "no channel 'rudder'"),
     ],
 )
-def test_what_cannot_be_examined(log: Log, inputs: Any, error: type, words: str) -> None:
+def test_inspect_log_refuses_unusable_logs(log: Log, inputs: Any, error: type, words: str) -> None:
     with pytest.raises(error, match=words):
         inspect_log(log, inputs)
 
 
-def test_what_a_reader_noticed_is_told_and_masked_samples_excuse() -> None:
+def test_inspect_log_includes_remarks_and_downgrades_masked_samples() -> None:
     noted = {"level": "will mislead", "code": "latency", "text": "late", "figures": {"s": 0.9}}
     sick = changed(**held("x", "y")).replace(meta={"findings": [noted]})
     plain, masked = inspect_log(sick), inspect_log(sick, masks=[FrozenMask()])
@@ -277,7 +277,7 @@ def test_what_a_reader_noticed_is_told_and_masked_samples_excuse() -> None:
 
 
 @pytest.mark.parametrize("hull", [True, False])
-def test_rates_of_a_vessel_that_heels_may_be_the_hulls_or_the_headings(*, hull: bool) -> None:
+def test_horizontal_motion_accepts_both_yaw_rate_conventions(*, hull: bool) -> None:
     phi = 0.4 - 1.2 * LOG["r"]
     level = np.cos(phi) if hull else 1.0
     log = changed(phi=phi, p=np.gradient(phi, T), r=LOG["r"] / level, v=LOG["v"] / level)
@@ -285,7 +285,7 @@ def test_rates_of_a_vessel_that_heels_may_be_the_hulls_or_the_headings(*, hull: 
     assert [finding.text for finding in found if finding.level != "note"] == []
 
 
-def test_a_slow_gear_with_a_noisy_sensor_is_not_stuck() -> None:
+def test_check_stuck_actuators_accepts_a_slow_gear() -> None:
     demand = np.radians(20.0) * np.sign(np.sin(0.4 * T))
     angle = [0.0]
     for wanted in demand[1:]:
@@ -296,7 +296,7 @@ def test_a_slow_gear_with_a_noisy_sensor_is_not_stuck() -> None:
     assert inspect_log(changed(cmd_delta=demand, delta=rests)).find_by_code("stuck")
 
 
-def test_an_effect_on_a_fit_is_measured() -> None:
+def test_finding_effects_measure_the_change_of_a_fit() -> None:
     jump = one(inspect_log(changed(u=stepped(LOG["u"], 1500, 0.5))), "jump")
     assert jump.effect is not None
     assert 0.04 < jump.effect < 1.0
@@ -317,7 +317,7 @@ def answering(delta: np.ndarray, late: float, gain: float = 0.3, time: float = 1
 STEPS = np.repeat(np.random.default_rng(3).uniform(-0.4, 0.4, 40), 20)
 
 
-def test_the_side_and_the_time_of_an_answer() -> None:
+def test_check_rudder_sign_and_delay_of_the_response() -> None:
     fine = one(inspect_log(answering(STEPS, 0.0)), "rudder_sign")
     assert fine.level == "note"
     # yaw acceleration per rad of rudder is gain over time
@@ -337,7 +337,7 @@ def test_the_side_and_the_time_of_an_answer() -> None:
         assert late.figures["lag"] == pytest.approx(-early, abs=0.25)
 
 
-def test_a_row_that_repeats_by_chance_is_logged_once() -> None:
+def test_check_repeated_rows_accepts_chance_repeats() -> None:
     u = RANDOM.standard_normal(2000).round(4)
     u[501] = u[500]
     assert not inspect_log(Log("one", T, {"u": u, "delta": np.ones(2000)})).find_by_code(
@@ -346,7 +346,7 @@ def test_a_row_that_repeats_by_chance_is_logged_once() -> None:
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_a_turning_circle_that_loses_its_speed_is_no_reversed_rudder(side: float) -> None:
+def test_check_rudder_sign_accepts_a_turning_circle_with_speed_loss(side: float) -> None:
     t, r = np.arange(0.0, 900.0), np.zeros(900)
     delta = side * np.clip((t - 60.0) / 14.0, 0.0, 1.0) * np.radians(35.0)
     speed = np.where(t < 60.0, 14.0, 6.0 + 8.0 * np.exp(-(t - 60.0) / 150.0))
@@ -360,9 +360,7 @@ def test_a_turning_circle_that_loses_its_speed_is_no_reversed_rudder(side: float
 
 
 @pytest.mark.parametrize(("period", "late"), [(5.8, 0.1), (8.4, 0.4), (11.0, 0.4), (11.0, 0.1)])
-def test_a_repeated_manoeuvre_is_not_answered_half_a_period_early(
-    period: float, late: float
-) -> None:
+def test_estimate_delay_of_a_periodic_manoeuvre_is_causal(period: float, late: float) -> None:
     zigzag = 0.35 * np.clip(8.0 * np.sin(0.2 * np.pi * np.arange(800) / period), -1.0, 1.0)
     log = answering(zigzag, late)
     delay = estimate_delay(LogStatistics(log, ["delta"]), ("delta",), "r")
@@ -390,12 +388,12 @@ def twin(port: float, stbd: float, yaw: float, speed: float) -> Log:
         (twin(0.8, 30.0, -0.3, 0.9), []),  # one hardly turns, the other drives
     ],
 )
-def test_two_propellers_steer_by_their_difference(log: Log, said: list[str]) -> None:
+def test_check_rudder_sign_uses_the_difference_of_two_propellers(log: Log, said: list[str]) -> None:
     found = run_checks("actuators", LogStatistics(log, ["n_port", "n_stbd"]))
     assert [finding.code for finding in found] == said
 
 
-def test_noise_of_velocities_is_no_scale_of_theirs() -> None:
+def test_estimate_causes_of_pure_noise_finds_no_gain() -> None:
     # on the spot a lever arm can stand for the steady part, and then noise decides on the scale
     t = 0.05 * np.arange(1200)
     u, v, r = np.outer((0.03, 0.033, -0.19), 1.0 - np.exp(-t / 0.8))
@@ -413,7 +411,7 @@ def test_noise_of_velocities_is_no_scale_of_theirs() -> None:
         assert np.abs(np.concatenate([[0.0], *gains])).max() < 0.3, seed
 
 
-def test_noise_of_v_on_a_slow_straight_course_is_no_drift() -> None:
+def test_check_course_as_heading_ignores_noise_of_v() -> None:
     random, t = np.random.default_rng(1), 0.1 * np.arange(400)
     noise = {"u": 0.005, "v": 0.005, "r": 0.002, "psi": 0.003}
     moving = {"x": 0.05 * t, "y": 0.0 * t, "u": 0.05 + 0.0 * t, "delta": np.sin(t)}
@@ -424,7 +422,7 @@ def test_noise_of_v_on_a_slow_straight_course_is_no_drift() -> None:
     assert not inspect_log(log, ["delta"]).find_by_code("course_as_heading")
 
 
-def test_spikes_are_bridged_and_fill_values_told_from_measurements() -> None:
+def test_find_spikes_and_fill_values() -> None:
     assert find_spikes(LOG) == {}
     assert bridge_spikes(LOG) is LOG
     shown = np.full(len(LOG), 132.0)
@@ -444,7 +442,7 @@ def test_spikes_are_bridged_and_fill_values_told_from_measurements() -> None:
 
 
 @pytest.mark.parametrize("epoch", [True, False])
-def test_a_nominal_clock_is_held_against_the_dates(tmp_path: Path, *, epoch: bool) -> None:
+def test_find_clock_rate_errors_compares_time_with_dates(tmp_path: Path, *, epoch: bool) -> None:
     for rate in (1.095, 1.0):
         seconds = pd.Series(1.6e9 + rate * T)
         texts = pd.to_datetime(seconds, unit="s").dt.strftime("%Y-%m-%d %H:%M:%S.%f")
@@ -501,7 +499,7 @@ TRAIN_TEST = {"whole": "train", "part": "test", "fast": "test", "first": "train"
         ([AHEAD, OTHER_AHEAD], {}, "one_side", "will mislead", "steering cannot be learned"),
     ],
 )
-def test_logs_beside_each_other(
+def test_inspect_log_set_reports_planted_faults(
     logs: list[Log], splits: dict[str, str], code: str, level: str, words: str
 ) -> None:
     found = inspect_log_set(logs, splits=splits).find_by_code(code)
@@ -509,7 +507,7 @@ def test_logs_beside_each_other(
     assert words in found[0].text
 
 
-def test_the_report_has_every_finding_and_names_what_to_fix_first() -> None:
+def test_summarize_inspection_counts_and_ranks_findings() -> None:
     sick = changed(psi=-PSI).replace(name="sick")
     reports = [inspect_log(LOG), inspect_log(sick)]
     content = json.loads(json.dumps(build_inspection(reports, inspect_log_set([LOG]))))
@@ -528,7 +526,7 @@ def test_the_report_has_every_finding_and_names_what_to_fix_first() -> None:
 
 
 @pytest.mark.parametrize("slow", [0.5, 3.0])
-def test_a_rudder_is_told_by_samples_whose_speed_is_known(*, slow: float) -> None:
+def test_check_rudder_sign_uses_samples_with_known_speed(*, slow: float) -> None:
     """Where a speed fails the last one known is none: the rudder may seem to be reversed."""
     t = np.arange(0.0, 180.0, 0.2)
     u, delta, r = np.where(t < 90.0, slow, 2.0), 0.2 * np.sign(np.sin(0.3 * t)), np.zeros(t.size)

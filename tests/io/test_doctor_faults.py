@@ -33,7 +33,7 @@ def told(logs: list[Log], alone: int) -> list[Finding]:
 
 
 @pytest.mark.parametrize("name", HOSTS)
-def test_clean_logs_raise_nothing_above_a_note(name: str) -> None:
+def test_inspect_log_of_clean_simulations_gives_notes_only(name: str) -> None:
     logs = list(host(name)[1])
     said = told(logs, len(logs))
     assert [finding.text for finding in said if finding.level != "note"] == []
@@ -50,7 +50,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("fault", "name"), CASES, ids=lambda of: getattr(of, "name", of))
-def test_planted_faults_are_named(fault: Fault, name: str) -> None:
+def test_inspect_log_reports_faults_planted_in_simulations(fault: Fault, name: str) -> None:
     ship, logs = host(name)
     random = np.random.default_rng([101, FAULTS.index(fault)])
     members = [logs[i] for i in random.permutation(3)]

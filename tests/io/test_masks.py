@@ -88,11 +88,11 @@ HALF_STEP = np.where(np.arange(300) == 40, 0.5, np.repeat([0.0, 1.0], 150))
         (SpikeMask(), log_of(u=np.where(np.arange(4000) == 1000, 90.0, SEEN / 100)), [1000]),
     ],
 )  # fmt: skip
-def test_rules_mark_these_samples(rule: MaskRule, log: Log, marked: list[int]) -> None:
+def test_mask_rules_mark_expected_samples(rule: MaskRule, log: Log, marked: list[int]) -> None:
     assert np.flatnonzero(rule.apply(log)).tolist() == marked
 
 
-def test_normal_noise_is_hardly_an_outlier_and_grouped_ones_hide_from_the_moving_rule() -> None:
+def test_outlier_rules_on_noise_and_grouped_outliers() -> None:
     assert OutlierMask(channels=("u",)).apply(log_of(u=NOISE)).mean() < 0.004
     assert not OutlierMask(channels=("u",)).apply(log_of(u=SPIKED))[BAD].all()
 
@@ -117,7 +117,7 @@ def hampel_by_loop(values: np.ndarray, sigmas: float, samples: int) -> np.ndarra
     return np.asarray(far > sigmas * np.maximum(np.maximum(floor, spreads), abs(medians)))
 
 
-def test_hampel_equals_an_independent_loop_on_random_logs() -> None:
+def test_hampel_mask_equals_a_reference_loop() -> None:
     rng = np.random.default_rng(4)
     for samples in (7, 11):
         for _ in range(10):
@@ -127,7 +127,7 @@ def test_hampel_equals_an_independent_loop_on_random_logs() -> None:
             np.testing.assert_array_equal(found, hampel_by_loop(u, 4.0, samples))
 
 
-def test_reasons_tell_hard_soft_and_rate_masks_apart() -> None:
+def test_mask_reasons_distinguish_hard_soft_and_rate() -> None:
     input_jump = InputJumpMask(channels=("u",), limit=1.0, before=0.0, after=0.2)
     rules = [JumpMask(channel="u", limit=1.0), MissingValues(), input_jump]
     log = apply_masks(log_of(u=LEVELS), rules)
@@ -140,7 +140,7 @@ def test_reasons_tell_hard_soft_and_rate_masks_apart() -> None:
     assert number_log_segments(log_of(u=np.ones(3))).tolist() == [0, 0, 0]
 
 
-def test_rules_of_one_kind_share_a_mask_and_older_masks_stay() -> None:
+def test_apply_masks_merges_rules_of_one_kind() -> None:
     before = {"jump": np.array([True, False, False, False]), "mine": np.ones(4, dtype=bool)}
     log = log_of(u=[0, 9, 9, 9], v=[0, 0, 0, 9]).replace(masks=before)
     log = apply_masks(log, [JumpMask(channel=name, limit=1.0, before=0) for name in "uv"])
@@ -150,7 +150,7 @@ def test_rules_of_one_kind_share_a_mask_and_older_masks_stay() -> None:
         apply_masks(log, [JumpMask(channel="w", limit=1.0)])
 
 
-def test_configs_read_quantities_and_refuse_nonsense() -> None:
+def test_mask_config_validates_quantities() -> None:
     assert validate_config({"kind": "frozen", "after": "500 ms"}, MaskConfig, "test") == FrozenMask(
         after=0.5
     )

@@ -69,7 +69,9 @@ def error(log: Log, name: str) -> float:
         ),
     ],
 )
-def test_velocities_from_position_and_heading(log: Log, config: MotionConfig, most: float) -> None:
+def test_complete_motion_estimates_velocities_from_pose(
+    log: Log, config: MotionConfig, most: float
+) -> None:
     out = complete_motion(log, config)
     assert {name: error(out, name) for name in STATE_NAMES} == {
         name: pytest.approx(0.0, abs=most) for name in STATE_NAMES
@@ -77,7 +79,7 @@ def test_velocities_from_position_and_heading(log: Log, config: MotionConfig, mo
     assert set(out.meta["smoothed"]) >= {"u", "v", "r"}
 
 
-def test_what_is_measured_at_every_sample_stays() -> None:
+def test_complete_motion_leaves_dense_channels_unchanged() -> None:
     out = complete_motion(measured(every=10, kept=("u", "v", "r")), MotionConfig())
     assert all(np.array_equal(out[name], TRUTH[name]) for name in ("psi", "u", "v", "r"))
     assert error(out, "x") < 1e-3
@@ -91,7 +93,7 @@ def test_what_is_measured_at_every_sample_stays() -> None:
     assert (config.antenna, config.delay) == (Antenna(x=0.3), 0.4)
 
 
-def test_nine_measured_quantities_become_one_motion() -> None:
+def test_smooth_measured_motion_combines_nine_quantities() -> None:
     rates = [np.gradient(TRUTH[name], TRUTH.t) for name in "uvr"]
     truth = np.stack([*(TRUTH[name] for name in STATE_NAMES), *rates], axis=1)
     noise = np.array([0.05, 0.05, 0.01, 0.03, 0.03, 0.005, 0.05, 0.05, 0.01])
@@ -105,7 +107,7 @@ def test_nine_measured_quantities_become_one_motion() -> None:
 
 
 @pytest.mark.parametrize("every", [2, 10])
-def test_values_that_a_receiver_repeats_are_made_anew(every: int) -> None:
+def test_complete_motion_replaces_held_values(every: int) -> None:
     slow = ("x", "y", "u", "v")
     last = np.arange(len(TRUTH)) // every * every
     held = TRUTH.replace(
@@ -117,7 +119,7 @@ def test_values_that_a_receiver_repeats_are_made_anew(every: int) -> None:
     assert all(np.array_equal(out[name], TRUTH[name]) for name in ("psi", "r", "delta"))
 
 
-def test_a_long_gap_stays_a_gap() -> None:
+def test_complete_motion_preserves_long_gaps() -> None:
     log = measured(every=10)
     lost = (log.t > 50.0) & (log.t < 60.0)
     x = np.where(lost, np.nan, log["x"])
@@ -126,7 +128,7 @@ def test_a_long_gap_stays_a_gap() -> None:
     assert np.isfinite(out["u"][(log.t < 49.0) | ((log.t > 61.0) & (log.t < 119.0))]).all()
 
 
-def test_a_fit_is_prepared_from_position_and_heading() -> None:
+def test_prepare_log_from_position_and_heading() -> None:
     log = measured(every=10, noise=(0.02, 0.003))
     delta = np.where(np.arange(len(log)) % 2 == 0, log["delta"], np.nan)
     log = log.replace(channels={**log.channels, "delta": delta})
@@ -136,7 +138,7 @@ def test_a_fit_is_prepared_from_position_and_heading() -> None:
     assert float(np.abs(prepared.w[50:-50, 0] - TRUTH["delta"][50:-50]).max()) < 2e-3
 
 
-def test_without_a_heading_there_is_no_motion() -> None:
+def test_complete_motion_without_heading_raises() -> None:
     channels = {name: TRUTH[name] for name in ("x", "y", "delta")}
     with pytest.raises(UsageError, match="no channel psi, u, v, r; give position and heading, or"):
         complete_motion(Log("lost", TRUTH.t, channels), MotionConfig())
@@ -146,7 +148,7 @@ def test_without_a_heading_there_is_no_motion() -> None:
 
 
 @pytest.mark.parametrize("lacking", [("x", "y", "psi"), ("x", "y")])
-def test_velocities_without_a_pose_make_one_from_the_origin(lacking: tuple[str, ...]) -> None:
+def test_complete_motion_integrates_a_missing_pose(lacking: tuple[str, ...]) -> None:
     channels = {name: values for name, values in TRUTH.channels.items() if name not in lacking}
     log = complete_motion(TRUTH.replace(channels=channels), MotionConfig())
     assert log.meta["integrated"] == list(lacking)
@@ -162,7 +164,7 @@ def test_velocities_without_a_pose_make_one_from_the_origin(lacking: tuple[str, 
 
 
 @pytest.mark.parametrize("lost", [("w",), ("p", "q"), ("u", "v", "w", "p", "q", "r")])
-def test_what_was_not_measured_under_water_follows_from_attitude_and_depth(
+def test_complete_motion_derives_six_dof_velocities(
     lost: tuple[str, ...],
 ) -> None:
     t = np.arange(0.0, 60.0, 0.05)
@@ -192,7 +194,7 @@ def test_what_was_not_measured_under_water_follows_from_attitude_and_depth(
     assert any("not measured" in one["text"] for one in whole.meta["findings"])
 
 
-def test_sparse_commands_hold_and_sparse_states_are_interpolated_up_to_three_intervals() -> None:
+def test_fill_sparse_holds_commands_and_interpolates_states() -> None:
     t = np.arange(40.0)
     values = np.where((t % 4 == 2) & ~((t > 15) & (t < 33)), t, np.nan)
     log = Log("log", t, {"u": values, "delta": values})

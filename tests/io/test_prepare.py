@@ -30,14 +30,14 @@ def made(hold: str, *, broken: bool = False) -> PreparedLog:
     return prepare_log(Log("made", t, channels, manoeuvre="made"), "train", ("n",), config)
 
 
-def test_an_input_is_held_from_the_sample_unless_told_otherwise() -> None:
+def test_prepare_log_holds_inputs_from_the_sample_by_default() -> None:
     log = made("start")
     assert np.array_equal(log.w, log.rate_inputs)
     assert np.allclose(log.w[:, 0], (STEP * np.arange(60)) ** 2)
 
 
 @pytest.mark.parametrize("broken", [False, True])
-def test_a_mean_over_the_step_ends_with_the_piece(broken: bool) -> None:
+def test_prepare_log_mean_inputs_end_with_the_segment(broken: bool) -> None:
     log = made("mean", broken=broken)
     for k in range(60):
         if log.segment[k] < 0:
@@ -51,7 +51,7 @@ def test_a_mean_over_the_step_ends_with_the_piece(broken: bool) -> None:
 
 @pytest.mark.parametrize("step", [0.1, 0.25])
 @pytest.mark.parametrize("kind", ["gaps", "dies", "rare", "nothing", "spikes"])
-def test_a_channel_that_nothing_uses_changes_nothing(kind: str, step: float) -> None:
+def test_prepare_log_ignores_unused_channels(kind: str, step: float) -> None:
     random = np.random.default_rng(1)
     t = 0.1 * np.arange(400)
     channels = {name: 0.1 * np.sin(t + k) for k, name in enumerate((*STATE_NAMES, "n"))}
@@ -82,7 +82,7 @@ def test_a_channel_that_nothing_uses_changes_nothing(kind: str, step: float) -> 
 
 
 @pytest.mark.parametrize("kind", ["hampel", "outlier"])
-def test_masked_outliers_reach_neither_fits_nor_scores_nor_the_start_of_a_window(kind: str) -> None:
+def test_masked_outliers_enter_no_fit_score_or_window_start(kind: str) -> None:
     """From the rule to least squares, training windows, free-run windows and errors."""
     t = STEP * np.arange(400)
     u = 2.0 + 0.3 * np.sin(0.4 * t) + 1e-3 * np.random.default_rng(0).standard_normal(400)

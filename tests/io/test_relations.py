@@ -106,7 +106,9 @@ RELATIONS: dict[str, Callable[[Logs, float], Logs]] = {
 @pytest.mark.parametrize("name", RELATIONS)
 @given(vessel=vessels, by=st.floats(-3.0, 3.0))
 @drawn
-def test_what_changes_nothing_of_the_vessel(name: str, vessel: tuple[str, int], by: float) -> None:
+def test_inspection_and_fit_are_invariant_to_equivalent_logs(
+    name: str, vessel: tuple[str, int], by: float
+) -> None:
     logs = logs_of(vessel)
     inputs = inputs_of(logs[0])
     one, other = (prepared(each, inputs) for each in (logs, RELATIONS[name](logs, by)))
@@ -128,9 +130,7 @@ def test_what_changes_nothing_of_the_vessel(name: str, vessel: tuple[str, int], 
 
 @given(vessel=vessels, share=st.floats(0.3, 0.7))
 @drawn
-def test_a_log_in_two_parts_is_the_same_but_for_the_cut(
-    vessel: tuple[str, int], share: float
-) -> None:
+def test_fit_of_a_split_log_equals_that_of_the_log(vessel: tuple[str, int], share: float) -> None:
     """Within half a window of an end, the derivative is that of the last whole window."""
     log = logs_of(vessel)[1]
     inputs, at = inputs_of(log), round(share * len(log))
@@ -145,7 +145,9 @@ def test_a_log_in_two_parts_is_the_same_but_for_the_cut(
 
 @given(vessel=vessels, data=st.data())
 @drawn
-def test_columns_in_any_unit_and_order(vessel: tuple[str, int], data: st.DataObject) -> None:
+def test_readers_are_invariant_to_units_and_column_order(
+    vessel: tuple[str, int], data: st.DataObject
+) -> None:
     log = logs_of(vessel)[2]
     table, channels = {"t": log.t - log.t[0]}, {}
     for name in data.draw(st.permutations([*log.channels])):
@@ -189,7 +191,7 @@ def sailed(rows: int, helm: float) -> Log:
 
 
 @pytest.mark.parametrize(("helm", "gap"), [(0.03, 0), (0.0, 900)])
-def test_a_long_log_tells_by_stretches_what_it_tells_whole(
+def test_inspect_log_of_a_long_log_equals_that_of_its_subsample(
     monkeypatch: pytest.MonkeyPatch, helm: float, gap: int
 ) -> None:
     from residnet.preprocessing import channel_values as channels
@@ -219,7 +221,7 @@ def test_a_long_log_tells_by_stretches_what_it_tells_whole(
         )
 
 
-def test_what_a_repair_of_a_long_log_does_is_measured_within_its_stretches(
+def test_finding_effects_of_a_repair_use_the_subsample(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     from residnet.quality import Finding, statistics

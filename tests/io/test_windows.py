@@ -71,7 +71,7 @@ def expected_starts(length: int) -> list[int]:
 
 
 @pytest.mark.parametrize("length", [1, 2, 7, 20])
-def test_windows_start_where_the_loop_says_and_hold_the_logs_samples(length: int) -> None:
+def test_find_starts_and_take_windows_equal_a_reference_loop(length: int) -> None:
     starts = STORE.find_starts(length)
     assert starts.tolist() == expected_starts(length)
     names = ("y", "smoothed", "nu_dot", "w", "usable", "trainable")
@@ -86,7 +86,7 @@ def test_windows_start_where_the_loop_says_and_hold_the_logs_samples(length: int
             np.testing.assert_array_equal(values[i].numpy(), own)
 
 
-def test_reach_depth_and_beginnings_are_those_of_the_stretch() -> None:
+def test_from_logs_counts_remaining_and_elapsed_samples() -> None:
     for row, (number, k) in enumerate(ROWS):
         first, end = stretch(number, k)
         if LOGS[number].segment[k] >= 0:
@@ -100,7 +100,7 @@ def test_reach_depth_and_beginnings_are_those_of_the_stretch() -> None:
         assert expected
 
 
-def test_history_repeats_the_first_sample_of_a_stretch_that_is_too_short() -> None:
+def test_take_history_repeats_the_first_sample_of_a_short_segment() -> None:
     starts, length, padded = STORE.find_starts(3), 6, 0
     y, w = STORE.take_history(starts, length)
     for i, row in enumerate(starts.tolist()):
@@ -114,7 +114,7 @@ def test_history_repeats_the_first_sample_of_a_stretch_that_is_too_short() -> No
     assert STORE.take_history(starts, 0)[0].shape == (len(starts), 0, 6)
 
 
-def test_too_long_a_window_is_one_line_and_unknown_values_reach_no_tensor() -> None:
+def test_find_starts_with_too_long_windows_raises() -> None:
     for wanted in (lambda: STORE.find_starts(500), lambda: STORE.find_segment_starts(5, 300)):
         with pytest.raises(DataError, match="no training log holds a window of") as caught:
             wanted()
@@ -124,7 +124,7 @@ def test_too_long_a_window_is_one_line_and_unknown_values_reach_no_tensor() -> N
         assert bool(torch.isfinite(getattr(STORE, name)).all())
 
 
-def test_batches_depend_on_seed_and_epoch_alone() -> None:
+def test_draw_epoch_depends_on_seed_and_epoch_only() -> None:
     batches = WindowSampler(torch.arange(100, 190), batch_size=8, n_batches=5)
     first = batches.draw_epoch(3, 7)
     torch.manual_seed(123)
@@ -136,7 +136,7 @@ def test_batches_depend_on_seed_and_epoch_alone() -> None:
     assert not torch.equal(batches.draw_epoch(4, 7), first)
 
 
-def test_batches_draw_without_replacement_as_far_as_the_starts_last() -> None:
+def test_draw_epoch_draws_without_replacement() -> None:
     starts = torch.arange(100, 190)
     drawn = WindowSampler(starts, batch_size=9, n_batches=10).draw_epoch(0, 0)
     assert sorted(drawn.flatten().tolist()) == starts.tolist()
@@ -146,7 +146,7 @@ def test_batches_draw_without_replacement_as_far_as_the_starts_last() -> None:
     assert len(set(twice[:90].tolist())) == len(set(twice[90:180].tolist())) == 90
 
 
-def test_a_data_module_gives_whole_windows_stage_by_stage(
+def test_windows_data_module_yields_windows_of_each_stage(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stages = [
@@ -176,7 +176,7 @@ def test_a_data_module_gives_whole_windows_stage_by_stage(
     assert torch.equal(anywhere.past_w, w_past)
 
 
-def test_every_epoch_goes_through_all_rows_in_an_order_of_its_own() -> None:
+def test_rows_data_module_shuffles_all_rows_in_every_epoch() -> None:
     data = RowsDataModule((torch.arange(10), -torch.arange(10)), 4, seed=3)
     first, second = (list(data.iterate_batches(epoch)) for epoch in (0, 1))
     assert [len(rows) for rows, _ in first] == [4, 4, 2]

@@ -195,7 +195,7 @@ def require_free_space(folder: Path) -> None:
         )
         if not existing_parent.is_dir():
             raise UsageError(
-                f"{existing_parent}: exists already and is no folder; give another place"
+                f"{existing_parent}: exists and is not a folder; choose another folder"
             )
         path = folder.absolute()
         max_path_length = os.pathconf(existing_parent, "PC_PATH_MAX")
@@ -240,7 +240,7 @@ def write_error(path: Path, error: OSError) -> UsageError:
     """Create the error for a file that cannot be written, with the reason of the system."""
     reason = error.strerror or str(error)
     return UsageError(
-        f"{path}: cannot be written ({reason}); make room or give a place that can be written"
+        f"{path}: cannot be written ({reason}); free some space or choose a writable folder"
     )
 
 

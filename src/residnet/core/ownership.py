@@ -371,8 +371,8 @@ class Manifest:
                 file.write(line)
         except OSError as error:
             raise UsageError(
-                f"{self.journal}: cannot be written ({error.strerror}); make room or give a place"
-                " that can be written"
+                f"{self.journal}: cannot be written ({error.strerror}); free some space"
+                " or choose a writable folder"
             ) from error
 
     def _relative_name(self, path: Path) -> str:
@@ -400,7 +400,7 @@ class Manifest:
             reason = "was edited after residnet wrote it"
         else:
             reason = f"exists, and {self.path.name} does not say that residnet wrote it"
-        return UsageError(f"{path}: {reason}; move it away, or give another place to write to")
+        return UsageError(f"{path}: {reason}; move it away, or choose another path")
 
     def _read(self, path: Path) -> str:
         try:

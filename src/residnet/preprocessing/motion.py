@@ -109,7 +109,7 @@ def _complete_states(log: Log, config: MotionConfig, dof: DegreesOfFreedom) -> L
                 f"log {log.name}: {', '.join(missing_states)}"
                 f" {'are' if len(missing_states) > 1 else 'is'} not measured at every sample, which"
                 f" a model of {', '.join(dof.velocities)} needs; name the columns, or let it move"
-                " on the surface alone (signals.velocities: [u, v, r])"
+                " on the surface only (signals.velocities: [u, v, r])"
             )
     log_without_held = mask_held_values(log)
     missing_channels = [name for name in STATE_NAMES if name not in log.channels]
@@ -127,13 +127,13 @@ def _complete_states(log: Log, config: MotionConfig, dof: DegreesOfFreedom) -> L
         dof = DegreesOfFreedom.from_channels(log.channels)
         velocities_text = ", ".join(dof.velocities)
         velocities_text = (
-            f", or let the model be one of {velocities_text} alone (signals.velocities:"
+            f", or use a model with {velocities_text} only (signals.velocities:"
             f" [{velocities_text}])"
         )
         raise UsageError(
-            f"log {log.name}: no channel {', '.join(missing_channels)}; give position and heading,"
-            " or u, v and r without a position: either makes the other where it was not measured;"
-            f" name their columns{'' if dof.is_complete else velocities_text}"
+            f"log {log.name}: no channel {', '.join(missing_channels)}; a model"
+            " needs position and heading, or u, v and r without a position; name their columns"
+            f"{'' if dof.is_complete else velocities_text}"
         )
     made_names |= set(POSE_NAMES) if config.has_position_offset else set()
     smoothed_names = [name for name in STATE_NAMES if name in made_names]

@@ -35,7 +35,7 @@ def report_ranges(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
         if std <= 1e-6 * max(abs(lower), abs(upper)):
             text = (
                 f"{name} is constant at {format_quantity(lower, unit)}: its effect cannot be"
-                " identified from this log alone"
+                " identified from this log only"
             )
             yield make_finding(text, figures, code="constant")
             continue

@@ -264,7 +264,7 @@ def check_frames(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
         )
     elif abs(heading_offset_deg) > 5.0:
         text += "; a compass offset, or velocities through the water in a current"
-        fix = "correct psi, or give the current as an input"
+        fix = "correct psi, or provide the current as an input"
     else:
         level = "note"
         fix = ""
