@@ -140,7 +140,7 @@ def test_prepare_log_from_position_and_heading() -> None:
 
 def test_complete_motion_without_heading_raises() -> None:
     channels = {name: TRUTH[name] for name in ("x", "y", "delta")}
-    with pytest.raises(UsageError, match="no channel psi, u, v, r; give position and heading, or"):
+    with pytest.raises(UsageError, match="no channel psi, u, v, r; a model needs"):
         complete_motion(Log("lost", TRUTH.t, channels), MotionConfig())
     channels["psi"] = np.full(len(TRUTH), np.nan)
     with pytest.raises(DataError, match="1200 positions and 0 headings"):

@@ -299,7 +299,7 @@ class Fleet:
         velocities: channels of the response.
         actuators: inputs without wind and current.
         data: one entry per log.
-        usable: indices of logs with is_sufficient data.
+        usable: indices of logs with sufficient data.
     """
 
     def __init__(self, logs: Sequence[LogStatistics], inputs: Sequence[str]) -> None:
