@@ -67,7 +67,7 @@ def test_broken_part_raises_only_where_it_is_used() -> None:
         validate_config({"kind": "absent", "anything": 1}, HeadConfig, "here")
     listed = dict(list_catalogue("heads"))
     assert listed["absent"].startswith("(cannot be used: ModuleNotFoundError")
-    assert listed["slow_water"] == "A linear map of the channels and of their running means."
+    assert listed["slow_water"].startswith("Linear map")
 
 
 @pytest.mark.parametrize(
