@@ -117,7 +117,11 @@ def ros(stem: str, frame: str) -> str:
 HABITS: dict[str, Habit] = {
     "along the axes of the boat": Habit(f"{POSE}, vx = u, vy = v", "x y psi u v", "u"),
     "along those of the ground": Habit(
-        f"{POSE}, vx = vn, vy = ve", "x y psi", sure="u", absent="u v", told="velocities in earth axes"
+        f"{POSE}, vx = vn, vy = ve",
+        "x y psi",
+        sure="u",
+        absent="u v",
+        told="velocities in earth axes",
     ),
     "whole numbers of an autopilot": Habit(
         "lat = 1e7 * lat // 1, lon = 1e7 * lon // 1, hdg = 100 * hdg // 1",
@@ -164,7 +168,10 @@ HABITS: dict[str, Habit] = {
         guessed="r",
     ),
     "N beside E is north": Habit(
-        "N [m] = x, E [m] = y, heading [deg] = hdg, X [kN] = n", "x y psi n", "x", told="but the unit"
+        "N [m] = x, E [m] = y, heading [deg] = hdg, X [kN] = n",
+        "x y psi n",
+        "x",
+        told="but the unit",
     ),
     "N_m beside E_m is north": Habit("N_m = x, E_m = y, heading [deg] = hdg", "x y psi n", "x"),
     "what was ordered beside what was": Habit(
@@ -187,7 +194,7 @@ HABITS: dict[str, Habit] = {
         f"{ROLLS}, ROT = {-60 * DEGREE} * r, rollrate = {-60 * DEGREE} * p", "r p", told=PORT
     ),
     **{
-        f"a {name}": Habit(f"{PLACE}, {name} = hdg", "x y psi", told="minus the magnetic declination")
+        f"a {name}": Habit(f"{PLACE}, {name} = hdg", "x y psi", told="magnetic declination")
         for name in ("magnetic heading [deg]", "Compass [deg]", "heading_mag [deg]")
     },
     "a true heading": Habit(f"{PLACE}, heading [deg] = hdg", "psi", never="declination"),

@@ -11,8 +11,7 @@ import pytest
 from residnet.core.config import validate_config
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.io.readers import ReaderConfig
-from residnet.io.readers import text_tables
+from residnet.io.readers import ReaderConfig, text_tables
 from residnet.io.readers.base import LogReader
 
 

@@ -219,7 +219,7 @@ def test_what_a_recording_holds_is_told_where_no_channel_is_found() -> None:
         Series("tank", "", {"level": t, "volts": t}, t),
     ]
     whole = Recording(Path("run"), {one.name: one for one in series})
-    assert whole.describe_contents == "/chatter (String), tank (level, volts)"
+    assert whole.contents_description == "/chatter (String), tank (level, volts)"
     many = Recording(Path("run"), {f"s{i}": series[0] for i in range(23)})
-    assert many.describe_contents.endswith("s19 (String), and 3 more")
-    assert Recording(Path("run"), {}).describe_contents == "nothing"
+    assert many.contents_description.endswith("s19 (String), and 3 more")
+    assert Recording(Path("run"), {}).contents_description == "nothing"

@@ -42,7 +42,7 @@ MONTH_NUMBERS: dict[str, int] = {
 }
 """First three letters of a month -> its number, from 1."""
 DATE_PART_NAMES = tuple(_VOCABULARY["date_parts"].split())
-"""Normalized names of columns that hold one part of a date or of a time of day."""
+"""Normalized names of columns with one part of a date or of a time of day."""
 TIME_VECTOR_NAMES = tuple(_VOCABULARY["time_vectors"].split())
 """Names of time vectors in MATLAB and HDF5 files, in order of precedence."""
 ARRIVAL_COLUMN_NAMES = tuple(_VOCABULARY["arrival_columns"].split())
@@ -467,7 +467,7 @@ def match_state_channel(parsed_name: ParsedName) -> str | None:
         last_word in ("psi", "u", "v", "r", "phi", "p")
         and parsed.concepts <= parse_name(last_word).concepts
     ):
-        # a prefix as in `body.r` has no meaning of its own
+        # ignore a prefix as in `body.r`
         return last_word
     if parsed.has_all("machinery") and parsed.has_none("speed", "surge"):
         return None

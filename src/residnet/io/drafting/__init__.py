@@ -1,1 +1,1 @@
-"""A first channel map from files alone: names in several languages, units, values and physics."""
+"""Drafting of channel maps from names in several languages, units, values and physics."""

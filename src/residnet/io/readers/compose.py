@@ -299,7 +299,7 @@ def _extract_all_topics(recording: Recording, plan: ChannelPlan) -> list[TopicCh
     if not topics:
         raise UsageError(
             f"{recording.path}: no channel is mapped; set `channels`, `position` and `heading`"
-            f" (the recording contains {recording.describe_contents})"
+            f" (the recording contains {recording.contents_description})"
         )
     return topics
 

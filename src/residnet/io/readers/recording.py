@@ -166,7 +166,7 @@ class Recording:
     unread_series: tuple[str, ...] = field(default=())
 
     @property
-    def describe_contents(self) -> str:
+    def contents_description(self) -> str:
         """Text with the name of each series and its message type, or its fields without a type."""
         descriptions = [
             f"{name} ({short_type or ', '.join(list(series.fields)[:6])})"

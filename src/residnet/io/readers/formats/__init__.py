@@ -1,1 +1,1 @@
-"""Formats of recordings, one file each: a config that says how it is known and loads it."""
+"""Readers of recording formats, one module per format."""
