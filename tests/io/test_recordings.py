@@ -283,6 +283,6 @@ def test_reading_a_large_recording_reports_its_progress(
 
 
 def test_the_former_key_of_the_recorders_offset_names_the_new_one() -> None:
-    with pytest.raises(ConfigError, match="zone: .*recorder_utc_offset") as caught:
+    with pytest.raises(ConfigError, match=r"zone: .*recorder_utc_offset") as caught:
         validate_config({"kind": "auto", "zone": "2 h"}, ReaderConfig, "here")
     assert "\n" not in str(caught.value)

@@ -170,9 +170,9 @@ def test_stretches_folders_and_manoeuvres(tmp_path: Path) -> None:
         "test": ["zigzag_3"],
     }
     whole = {"train": ["a/zigzag_1.parquet"], "validation": ["a/turn_1.parquet"]}
-    with pytest.raises(DataError, match=r"0 samples from 200 s to 59\.9 s, .*; the log runs from 0 s"):
+    with pytest.raises(DataError, match=r"0 samples from 200 s to 59\.9 s, .*runs from 0 s"):
         splits(tmp_path, **whole, test=[trip | {"from": "200 s"}])
-    with pytest.raises(DataError, match=r"split: test has no log of the requested manoeuvre \(the logs have trip"):
+    with pytest.raises(DataError, match=r"test has no log of the requested .*have trip"):
         splits(tmp_path, **whole, test=[trip | {"manoeuvre": "spiral"}])
 
 

@@ -106,7 +106,7 @@ class AutoConfig(RecordingConfig):
                 f"{path}: the format does not describe its columns; give a channel map with"
                 f" --config (formats that need none: {names}, canonical Parquet)"
             )
-        return recording_format.config().load(path, field_filter)
+        return recording_format.config.model_validate({}).load(path, field_filter)
 
 
 def detect_recording_format(path: Path) -> RecordingFormat | None:
