@@ -25,7 +25,7 @@ FORBIDDEN_METHODS = {
 EXCEPTIONS = {
     ("engine/free_runs.py", "import pickle"): "writes a structure to hash it; nothing is read",
     ("core/processes.py", "from joblib"): "`cpu_count` alone, which counts cores",
-    ("tasks/sweep.py", "from joblib"): "`cpu_count` alone, which counts cores",
+    ("tasks/sweep/config.py", "from joblib"): "`cpu_count` alone, which counts cores",
     ("export/torchscript.py", "torch.jit.load"): "the file that the same call has just written",
     ("__init__.py", "importlib.import_module"): "names of residnet's own modules",
     ("core/registry.py", "importlib.import_module"): "paths in residnet's own tables of parts",

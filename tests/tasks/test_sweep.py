@@ -20,8 +20,9 @@ from tiny import STUDY, SWEEP, TINY, Command, read_json, write_yaml
 from residnet.core.config import load_config
 from residnet.core.processes import IsolatedProcessPool
 from residnet.core.progress import Progress
-from residnet.tasks import sweep as running
-from residnet.tasks.sweep import SweepConfig, TrialQueue, make_pruning_callback, open_optuna_study
+from residnet.tasks.sweep import execute as running
+from residnet.tasks.sweep.config import SweepConfig
+from residnet.tasks.sweep.execute import TrialQueue, make_pruning_callback, open_optuna_study
 
 optuna = pytest.importorskip("optuna")
 

@@ -50,7 +50,7 @@ SINGLE_TASKS = {
     "actuators": "residnet.tasks.actuators:ActuatorsTaskConfig",
 }
 """Tasks of the core but the sweep, which varies any task; wings add their own."""
-_ALL_TASKS = {**SINGLE_TASKS, "sweep": "residnet.tasks.sweep:SweepConfig"}
+_ALL_TASKS = {**SINGLE_TASKS, "sweep": "residnet.tasks.sweep.config:SweepConfig"}
 TaskConfig = Annotated[Task, PluginUnion("residnet.tasks", _TASK_BASE, _ALL_TASKS, key="task")]
 SweepableConfig = Annotated[
     Task, PluginUnion("residnet.tasks", _TASK_BASE, SINGLE_TASKS, key="task")
