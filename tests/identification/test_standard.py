@@ -19,8 +19,9 @@ from residnet.core.layout import SURGE_SWAY_YAW
 from residnet.core.log import Log
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import InnovationFilter
-from residnet.identification.fit import Identified, fit_models
+from residnet.identification.fit import fit_models
 from residnet.identification.fitter import FitStore, Fitter, find_harmful_member
+from residnet.identification.identified import IdentifiedModels
 from residnet.identification.prepared import PreparedSplits, prepare_splits
 from residnet.identification.recipe import (
     PART_KEYS,
@@ -81,13 +82,13 @@ def known(logs: PreparedSplits) -> Samples:
 
 
 @pytest.fixture(scope="module")
-def identified(logs: PreparedSplits) -> Identified:
+def identified(logs: PreparedSplits) -> IdentifiedModels:
     return fit_models(logs, settings())
 
 
 @pytest.mark.long
 def test_the_mean_is_reported_first_and_a_hull_that_does_not_run_away_beside_it(
-    identified: Identified, logs: PreparedSplits
+    identified: IdentifiedModels, logs: PreparedSplits
 ) -> None:
     assert list(identified)[:2] == ["constant_velocity", "baseline"]
     assert set(NAMES) <= set(identified)
@@ -121,7 +122,7 @@ def test_bands_of_short_logs_come_from_fits_without_some_of_them(
 
 @pytest.mark.long
 def test_members_that_run_away_or_harm_the_mean_are_left_out(
-    identified: Identified, logs: PreparedSplits
+    identified: IdentifiedModels, logs: PreparedSplits
 ) -> None:
     fitter = Fitter(logs, settings(), FitStore())
     zero, hull, network = (

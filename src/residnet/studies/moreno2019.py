@@ -161,7 +161,7 @@ def _velocity_column(title: str, axis: int, factor: float, decimals: int) -> Col
 def _squared_errors(model: str, records: Sequence[StoredWindow], axis: int) -> list[np.ndarray]:
     """Return the squared errors [T] of one velocity in each record.
 
-    Errors of u and v are taken at usable samples, those of r at all samples.
+    u and v are scored at usable samples, r at all samples.
     """
     errors = [record.predicted[model][:, axis] - record.measured[:, axis] for record in records]
     return [

@@ -1,4 +1,4 @@
-"""What the studies share: the order of one, its figures, and the document's own numbers."""
+"""Common parts of the studies: execution, figures, and published numbers of the documents."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ StudyResults = Mapping[str, Any]
 
 
 class StudyTask(Task):
-    """An experiment of a document: its results stand in one file, and all that is said in them."""
+    """A computational experiment of a document, with its results in one JSON file."""
 
     results_file: ClassVar[str] = "study.json"
 
@@ -41,11 +41,11 @@ class StudyTask(Task):
 
     @abstractmethod
     def main_figures(self, results: StudyResults) -> dict[str, SummaryMetric]:
-        """Return the numbers that sum the results up, by what they are."""
+        """Return the main results as numbers by name."""
 
     @abstractmethod
     def build_sections(self, results: StudyResults, run: Path) -> list[Section]:
-        """Return the sections of the report, with the document's figures beside ours."""
+        """Return the sections of the report, with published figures next to the computed ones."""
 
     def exports(self, folder: RunFolder) -> ExportWriters:
         """Return what writes each export of the study, by its name: none."""
@@ -73,11 +73,11 @@ class StudyTask(Task):
 
 
 def published_cell(value: float | None, published: float | None, digits: int = 4) -> Cell:
-    """Return a cell with a number of the run, and in small print the document's own number.
+    """Return a table cell with a computed number and, in small print, the published one.
 
     Args:
-        value: number of the run; None where there is none.
-        published: number that the document prints; None where it prints none.
+        value: computed number; None if unavailable.
+        published: published number; None if the document has none.
     """
     # the document's number keeps the digits that it is printed with
     note = "" if published is None else f"published {format_minus_signs(f'{published:.{digits}g}')}"
@@ -87,13 +87,12 @@ def published_cell(value: float | None, published: float | None, digits: int = 4
 def comparison_columns(
     key: str, titles: str | Sequence[str], digits: int = 4, factor: float = 1.0
 ) -> list[Column]:
-    """Return the columns of a row's number, or of each of its numbers, beside the document's own.
+    """Return table columns with computed and published numbers.
 
     Args:
-        key: of the numbers in a row; those of the document stand under it in `published`, a part of
-            the row.
-        titles: of one number, or of each of several.
-        factor: from our number to its unit in the table, in which the document prints its own.
+        key: key of the number or numbers in a row, and in the row's `published` entry.
+        titles: title of each column.
+        factor: factor from SI to the unit of the table, in which the document prints its numbers.
     """
 
     def make_cell(pick: Callable[[Any], float]) -> Callable[[Any], Cell]:
@@ -134,9 +133,9 @@ def format_notes(notes: Mapping[str, Any]) -> str:
 
 
 def find_figures(run: Path, *prefixes: str) -> list[Figure]:
-    """Return the figures of a run whose names begin with one of the given beginnings.
+    """Return the figures of a run by prefixes of their names.
 
-    They stand in the order of the beginnings, then in that of their names.
+    The order is that of the prefixes, then alphabetical.
     """
     stored = read_figures(run / "figures")
     return [figure for prefix in prefixes for figure in stored if figure.name.startswith(prefix)]

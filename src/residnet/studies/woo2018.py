@@ -136,7 +136,7 @@ def error_changes(files: RunFiles, model: str) -> dict[str, float | None]:
 
 
 def steady_state_table(files: RunFiles) -> Table:
-    """Return the constraints (32) of the linear model with intervals, beside Table 1."""
+    """Return the constraints (32) of the linear model with intervals, next to Table 1."""
     constraints, published_constraints = (
         files.fit_notes("baseline")["steady_constraints"],
         load_published("woo2018")["steady"],
@@ -227,10 +227,10 @@ def build_figures(files: RunFiles) -> list[Figure]:
 def find_median_run(
     files: RunFiles, test_windows: Sequence[StoredWindow], manoeuvre_kind: str
 ) -> StoredWindow:
-    """Return the unseen run of a kind with the median error of the LSTM trained in free run.
+    """Return the test run of a kind with the median error of the LSTM trained in free run.
 
     Raises:
-        UsageError: where there is none of the kind.
+        UsageError: if there is no run of this kind.
     """
     runs = [window for window in test_windows if window.manoeuvre == manoeuvre_kind]
     if not runs:
@@ -251,7 +251,7 @@ def _numbered_figure(
     panels_and_traces: Sequence[tuple[Panel, Mapping[str, Curve]]],
     columns: int = 1,
 ) -> Figure:
-    """Return a figure of the document's number, from its panels and what they show."""
+    """Return a figure with the document's figure number, from panels and curves."""
     panels, traces = zip(*panels_and_traces, strict=True)
     title = f"Figure {number} of document 003: {title_text}"
     return Figure(str(number), title, caption, styles, panels, [Case("", traces)], columns=columns)
@@ -293,9 +293,9 @@ def _error_figure(
     channels: Sequence[str],
     models: Sequence[str],
 ) -> Figure:
-    """Return RMSE by model, and beside it the error of each unseen run over the linear model's.
+    """Return a figure of RMSE by model, and of the errors of test runs relative to the linear model.
 
-    A line shows the error of the simulator itself, which is the noise of the sensors.
+    A line shows the error of the plant, which is due to sensor noise.
     """
     styles = {
         "train": GlyphStyle("training data", "#BFBFBF", kind="fill"),

@@ -133,12 +133,12 @@ class StudyAxis(Config):
 
 
 class SearchConfig(Config):
-    """How an equation of the acceleration is searched, and in what.
+    """Symbolic search of an equation for the acceleration.
 
     Attributes:
-        record: record that the equation is searched in.
+        record: record of the search.
         noise: noise on the record.
-        head: how the equation is searched; `final: null` keeps the best individual as it is, as the
+        head: settings of the search; `final: null` uses the best individual unchanged, as the
             document does.
     """
 

@@ -270,16 +270,16 @@ class EquationConfig(Config):
 
 @final
 class SeaTrialTaskConfig(StudyTask, ComputingTask):
-    """Models of Odin fitted and judged by phase, on one simulated trial or several.
+    """Models of Odin fitted and evaluated by phase, on simulated trials.
 
     Attributes:
         task: `sea_trial`.
-        trials: trials by name; published figures stand beside the first one.
-        standard: how the standard model is fitted.
+        trials: trials by name; published figures are compared with the first one.
+        standard: settings of the fit of the standard model.
         equations: equations by name.
-        published: what the document prints by set of samples, model and acceleration: root mean
+        published: published numbers by set of samples, model and acceleration: root mean
             square error (m/s^2, m/s^2, rad/s^2), C_p and adjusted R^2 (Tables 7.3, 7.4), mean
-            absolute residual and the ends of its 95 % interval (Table 7.5).
+            absolute residual and the limits of its 95 % interval (Table 7.5).
     """
 
     task: Literal["sea_trial"]
@@ -435,11 +435,11 @@ class TrialSamples:
 
 
 def simulate_sea_trial_logs(config: SeaTrialConfig) -> list[Log]:
-    """Return the logs of the programme, sailed by the vessel.
+    """Return simulated logs of the trial programme.
 
     Raises:
-        ConfigError: where the vessel cannot feel the disturbance or is of another kind.
-        DataError: where the motion does not stay finite.
+        ConfigError: if the vessel cannot be disturbed or is of another kind.
+        DataError: if the motion does not remain finite.
     """
     name, disturbance = config.vessel, config.disturbance
     vessel, logs = load_odin(name), []
@@ -545,15 +545,15 @@ class FittedAccelerations(NamedTuple):
 
 
 def run_trial(settings: SeaTrialTaskConfig, name: str) -> tuple[dict[str, Any], list[Figure]]:
-    """Simulate one trial, and fit and judge every model on every set of samples.
+    """Simulate one trial, and fit and evaluate every model on every set of samples.
 
-    Returns what was found and its figures: 7.1, 7.2 (one), 7.4 to 7.6 (one) and 7.8 to 7.14.
+    Returns the results and the figures 7.1, 7.2 (one), 7.4 to 7.6 (one) and 7.8 to 7.14.
 
-    Beside the models that are fitted to one set stands for each one that consists of those of the
-    single phases.
+    In addition to the models of one set, each model is also evaluated as a combination of the
+    models of the single phases.
 
     Raises:
-        ResidnetError: where the trial cannot be sailed or a model is not determined.
+        ResidnetError: if the trial cannot be simulated or a model is not determined.
     """
     config, mass = settings.trials[name], settings.standard.mass
     vessel, logs = load_odin(config.vessel), simulate_sea_trial_logs(config)
@@ -657,10 +657,9 @@ def _evaluate_models(
     sets: Mapping[str, np.ndarray],
     models: Mapping[tuple[str, str], FittedAccelerations],
 ) -> dict[str, list[dict[str, Any]]]:
-    """Return the goodness of fit on the validation stretches of each set.
+    """Return the goodness of fit on the validation segments of each set.
 
-    The plant's own equations stand beside the models: they show what the sea and the preparation
-    leave unexplained.
+    The plant's own equations are included as a reference for the effect of sea and preparation.
     """
     z, a = trial.samples.z, trial.samples.target.numpy()
     plant_model = FittedAccelerations(

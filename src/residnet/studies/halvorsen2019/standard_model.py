@@ -48,8 +48,9 @@ PARAMETERS: dict[str, tuple[float, float, float]] = {
     "Y_|v|v": (-1e6, 0.0, 2e3),
     "N_|r|r": (-1e7, 0.0, 3e3),
 }
-"""Lower bound, upper bound and typical size in SI units by name; the values before the fit stand in
-published.yaml.
+"""Lower bound, upper bound and typical size in SI units by name.
+
+Initial values are in published.yaml.
 """
 STANDARD_PARAMETER_NAMES = tuple(PARAMETERS)
 LOWER, UPPER, SCALE = np.array(list(PARAMETERS.values())).T
@@ -146,10 +147,9 @@ def standard_accelerations(
 def fit_standard_model(
     nu: np.ndarray, tau: np.ndarray, nu_dot: np.ndarray, config: StandardFitConfig
 ) -> dict[str, Any]:
-    """Fit the parameters with the least weighted squared error.
+    """Fit the parameters by weighted least squares.
 
-    Their standard errors are those of a sandwich estimator: each axis has noise of its own,
-    correlated in time.
+    Standard errors come from a sandwich estimator: each axis has its own noise, correlated in time.
 
     Args:
         nu: velocities [N, 3].
@@ -157,15 +157,15 @@ def fit_standard_model(
         nu_dot: accelerations [N, 3].
 
     Returns:
-        The fit as study.json holds it. By name `values` and `standard_errors` (None in directions
-        that the data leave open) of the parameters in SI units, and `inertia_sums`, pairs of estimate and
-        standard error of the inertias; names of parameters that are `undetermined` but in
+        The fit as in study.json. By name `values` and `standard_errors` (None in undetermined
+        directions) of the parameters in SI units, and `inertia_sums`, pairs of estimate and
+        standard error of the inertias; names of parameters that are `undetermined` except in
         combinations, or end `at_bound`; `condition`, the condition number of the scaled Jacobian
-        without the open directions; `cost`, half the weighted sum of squared errors of each
-        starting point, least first.
+        without the undetermined directions; `cost`, half the weighted sum of squared errors of each
+        starting point, in ascending order.
 
     Raises:
-        FitError: with fewer samples than parameters, or where no start leads to finite errors.
+        FitError: with fewer samples than parameters, or if no start leads to finite errors.
     """
     from scipy.optimize import least_squares
 

@@ -1,7 +1,7 @@
 """Task `ferry_study`: residual models of a ferry in closed loop (document 002, chapter 4).
 
-A plant that stands for the true ferry flies a course under a controller that believes in a model;
-residual models are identified from the course, and the course is flown again with them.
+The plant follows a course under a controller with a believed model. Residual models are identified
+from this run, and the course is repeated with them as feed-forward.
 """
 
 from __future__ import annotations
@@ -73,26 +73,27 @@ from residnet.studies.study import (
 )
 
 _MAX_RESIDUAL_GROWTH, _MIN_VARIANCE_SHARE, _MIN_SEGMENT_SHARE = 4.0, 0.02, 0.5
-"""A model no longer fits an axis where the mean square residual of a share of the segments, so that
-one gust or one wake is no reason, and of the whole log is so many times what it was, and more than
-a trifle of the force's variance. Chosen by hand.
+"""Criteria of an invalid model on one axis; chosen by hand.
+
+Largest growth of the mean square residual, in the whole log and in a share of its segments (one
+gust or wake is no evidence), and smallest share of the force's variance.
 """
 
 
 def compare_residuals(
     accepted_residual: Tensor, new_residual: Tensor, force: Tensor, fold: Tensor
 ) -> dict[str, Any]:
-    """Return whether a model still fits, by comparing residuals.
+    """Return whether a model is still valid, by comparing residuals.
 
     Args:
-        accepted_residual: residual on data that the model was accepted on [N, 3].
+        accepted_residual: residual on the data of the model's acceptance [N, 3].
         new_residual: residual on new data [M, 3].
-        force: of the new data [M, 3].
+        force: force of the new data [M, 3].
         fold: segment of each new sample [M].
 
     Returns:
-        Whether the model `fits`; by axis `growth` (mean square residual now over then), `worse_share` of
-        the force's variance, and `segments`, the share of those that show a worse fit.
+        Whether the model `fits`; by axis `growth` (ratio of mean square residuals), `worse_share`
+        of the force's variance, and `segments`, the share of segments with a worse fit.
     """
     variance, accepted_mse = force.var(0), accepted_residual.square().mean(0)
     segments = [new_residual[fold == segment].square().mean(0) for segment in torch.unique(fold)]
@@ -130,26 +131,27 @@ _DIVERGENCE_FACTOR = 3.0
 
 
 class PublishedFigures(Config):
-    """Figures that document 002 prints for one model, to stand beside the figures of a run.
+    """Published figures of document 002 for one model.
 
-    The numbers stand as printed, except where a correction of the document says otherwise. A figure
-    that the document does not print is left out (null).
+    Numbers are as printed, unless a correction of the document applies. Null if the document has
+    none.
 
     Attributes:
-        mse: mean square of the residual on the unseen half in N^2, N^2, (N m)^2 (Tables 4.2, 4.5,
+        mse: mean square residual on the test half in N^2, N^2, (N m)^2 (Tables 4.2, 4.5,
             4.7, 4.15); surge, sway and yaw.
         position_mae: mean position error on the course in m (Tables 4.4, 4.10).
         position_mse: mean square position error on the course in m^2 (Tables 4.4, 4.10).
         heading_mae: mean heading error on the course in deg (Tables 4.4, 4.10).
         tau: mean absolute commanded force in N, N, N m (Tables 4.3, 4.9).
-        feedback: mean absolute force of the feedback alone in N, N, N m (Tables 4.3, 4.9).
+        feedback: mean absolute feedback force in N, N, N m (Tables 4.3, 4.9).
         crossing_position_mae: mean position error in the operational crossing in m (Table 4.12).
         crossing_position_mse: mean square position error in the crossing in m^2 (Table 4.12).
         crossing_heading_mae: mean heading error in the crossing in deg (Table 4.12).
         alone: mean square error of u, v, r and of their derivatives against the desired motion
             without feedback, in (m/s)^2, (m/s)^2, (rad/s)^2 and the same per second squared
             (Table 4.8, correction J21).
-        crossing_power: mean power in W that position and heading take in the crossing (Table 4.13).
+        crossing_power: mean power in W for position and heading control in the crossing (Table
+            4.13).
         coefficients: coefficients of the basis functions in surge, sway and yaw in SI units
             (Table 4.11), by basis function.
     """
@@ -178,7 +180,7 @@ _FREE_RUN_TRIALS: Mapping[str, Any] = {
     "identification": {},
     "validation": {},
 }
-"""Manoeuvres of the true ferry beside which the models run forward in time."""
+"""Manoeuvres of the plant for the free runs of the models."""
 
 
 class FerryModelConfig(ResidualModelConfig):
@@ -186,8 +188,8 @@ class FerryModelConfig(ResidualModelConfig):
 
     Attributes:
         smooth: estimate the motion from all noisy measurements together before the fit
-            (`residnet.preprocessing.motion`). Null does so where the noise is known and the model searches
-            its settings.
+            (`residnet.preprocessing.motion`). Null does so where the noise is known and the model
+            searches its settings.
         on: name of the model whose remaining residual this one explains (3.26); empty for the
             believed hull.
         fly: fly the course, and the crossing where there is one, with this model as feed-forward.
@@ -406,19 +408,20 @@ def smooth_for_fit(config: FerryModelConfig, record: ForceRecord) -> ForceRecord
 
 @dataclass(frozen=True)
 class FerryStudy:
-    """Everything that was flown and fitted.
+    """Results of all simulations and fits.
 
     Attributes:
         believed_run: the course with the believed model, from which the models are identified.
-        record: its log, of which one half identifies the models and the other tests them.
-        unmodelled_mse: mean square of the believed model's residual on the test half, by axis in N^2,
+        record: its log; one half identifies the models and the other tests them.
+        unmodelled_mse: mean square residual of the believed model on the test half, by axis in N^2,
             N^2, (N m)^2.
         models: fitted models by name, each from one half of the course.
-        whole_course_models: those that search their settings, fitted to the whole course as they are exported.
+        whole_course_models: models with a hyperparameter search, fitted to the whole course for
+            export.
         runs: by model, `believed` first, of the `course`, the `crossing`, and the course without
-            feedback (`feed_forward_alone`); empty where they were not flown.
-        updates: each model that flies, on the vessel as it is later: whether it still fits, and how
-            the course is followed before and after it was identified again where it does not.
+            feedback (`feed_forward_alone`); empty if not simulated.
+        updates: for each feed-forward model on the changed vessel: whether it is still valid, and
+            the tracking errors before and after a new identification.
     """
 
     believed_run: FerryRun
@@ -431,12 +434,12 @@ class FerryStudy:
 
 
 def build_record(run: FerryRun, interval: float, noise: MotionNoise | None) -> ForceRecord:
-    """Return the log of a course with a fold for each segment; its first half identifies.
+    """Return the log of a course with a fold for each segment; its first half is for training.
 
     Args:
-        run: the course as it was flown.
-        interval: time from one waypoint to the next in s.
-        noise: what is known of the sensors; None for none.
+        run: the simulated course.
+        interval: time between waypoints in s.
+        noise: known sensor noise; None for none.
     """
     return ForceRecord(
         run.t,
@@ -545,15 +548,15 @@ def run_ferry_study(config: FerryStudyConfig) -> FerryStudy:
 def forward_runs(
     config: FerryStudyConfig, models: Mapping[str, HullEquations]
 ) -> dict[str, dict[str, Any]]:
-    """Run models forward in time from the commanded forces of the true ferry's manoeuvres.
+    """Free-run models from the commanded forces of the plant's manoeuvres.
 
     Args:
         config: the study, with its manoeuvres.
-        models: equations of motion by name, beside which stand those of the known hull.
+        models: equations of motion by name; the known hull is added.
 
     Returns:
-        By model, `believed` first: `rmse` of u, v, r in m/s, m/s, rad/s over the runs that did not
-        diverge (None without any), `runs`, and `diverged`, how many of them did.
+        By model, `believed` first: `rmse` of u, v, r in m/s, m/s, rad/s over the runs without
+        divergence (None without any), `runs`, and `diverged`, the number of diverged runs.
     """
     trials = SimulatedTrials(vessel=config.true, **_FREE_RUN_TRIALS)
     logs = [flight.true_log for flight in simulate_trials(trials.draw_manoeuvres(), trials)]
@@ -647,7 +650,7 @@ def write_results(
 
 
 def _exported_model(terms: Sequence[str], study_result: FerryStudy, name: str) -> dict[str, Any]:
-    """Return a model as it is exported, with the range of what it was fitted to."""
+    """Return the model for export, with its training range."""
     record, model = study_result.record, study_result.models[name]
     if name in study_result.whole_course_models:
         record, model = (
@@ -722,10 +725,10 @@ def _run_figures(runs: Mapping[str, FerryRun], run_kind: str) -> list[Figure]:
 
 
 def list_feed_forward_objections(name: str, results: StudyResults) -> list[str]:
-    """Return what speaks against a feed-forward rather than the believed one.
+    """Return objections to a feed-forward instead of the believed one.
 
-    That is what it leaves of the residual force on the unseen half, mean over the axes, and the
-    position error of every flight with it.
+    Criteria are the residual force on the test half, averaged over the axes, and the position error
+    of every run with it.
     """
     shares = results["models"][name]["share_left"]
     reasons = []
@@ -848,7 +851,7 @@ def _tracking_tables(
 
 
 def _free_run_table(rows: Mapping[str, StudyResults]) -> Table:
-    """Return the table of free runs beside manoeuvres of the true ferry (3.22)."""
+    """Return the table of free runs of the plant's manoeuvres (3.22)."""
     free_run_rows = [
         {
             "name": name,

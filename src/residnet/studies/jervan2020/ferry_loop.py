@@ -94,7 +94,7 @@ class LoopConfig(Config):
 
 
 class MotionNoise(Config):
-    """White noise on what is measured, drawn anew at every step (Table 4.14, correction J25).
+    """White measurement noise, drawn at every step (Table 4.14, correction J25).
 
     Attributes:
         position: standard deviation of x and y in m.
@@ -170,8 +170,8 @@ class FerryRun:
         nu_dot: true accelerations [N, 3].
         measured: pose, nu and nu_dot as measured [N, 9].
         command: commanded force tau_c at the samples [N, 3].
-        averaged_command: tau_c averaged over the steps around each sample [N, 3], so that noise between the
-            samples does not alias.
+        averaged_command: tau_c averaged over the steps around each sample [N, 3], so that noise
+            between the samples does not alias.
         feedback: force of the feedback tau_FB [N, 3].
         thruster_force: force of the thrusters [N, 3].
         desired_pose: desired pose eta_d [N, 3].
@@ -192,10 +192,10 @@ class FerryRun:
 
 
 def load_force_vessel(name: str) -> tuple[HullPlant, ForceActuators]:
-    """Return a vessel by name or file, and its actuators, which make all three forces.
+    """Return a vessel by name or file, and its actuators, which produce all three forces.
 
     Raises:
-        ConfigError: where it is no hull, or its actuators do not push in surge, sway and yaw alike.
+        ConfigError: if the vessel has no hull model, or its actuators lack surge, sway or yaw.
     """
     config = load_vessel(name)
     if isinstance(config, HullConfig):
@@ -210,14 +210,14 @@ def load_force_vessel(name: str) -> tuple[HullPlant, ForceActuators]:
 
 @final
 class FerrySimulation:
-    """The true plant, the believed hull and the control loop between them.
+    """Closed loop of plant, believed hull model and controller.
 
     Args:
-        noise: on what is measured; None for none.
-        seed: of the noise.
+        noise: measurement noise; None for none.
+        seed: seed of the noise.
 
     Raises:
-        ConfigError: where a vessel is no hull whose actuators make all three forces.
+        ConfigError: if a vessel has no hull model whose actuators produce all three forces.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Measured logs of force and motion, their folds, and what they say of thrusters and sensors.
+"""Measured logs of force and motion, their cross-validation folds, thruster lag and sensor checks.
 
 Source: document 002, chapter 5.
 """
@@ -62,14 +62,12 @@ class ForceLogsConfig(Config):
 
 
 class ForceChannelsConfig(Config):
-    """Names of the channels of force and acceleration, beside x, y, psi, u, v and r.
+    """Names of the channels of force and acceleration.
 
     Attributes:
-        actual: forces that acted, in N, N, N m, from measured revolutions and angles of the
-            thrusters.
-        commanded: forces that the controller commanded, in N, N, N m.
-        acceleration: measured accelerations of u, v, r in m/s^2, m/s^2, rad/s^2; null where there
-            are none.
+        actual: actual forces in N, N, N m, from measured revolutions and angles of the thrusters.
+        commanded: forces commanded by the controller, in N, N, N m.
+        acceleration: measured accelerations of u, v, r in m/s^2, m/s^2, rad/s^2; null for none.
     """
 
     actual: _ChannelTriple
@@ -78,14 +76,14 @@ class ForceChannelsConfig(Config):
 
 
 class FoldsConfig(Config):
-    """Cross-validation in which no model is fitted to data near what it predicts.
+    """Cross-validation with a gap between training and test data.
 
     Attributes:
-        folds: number of parts that are left out in turn: whole logs where there are at least three,
-            else equal stretches of time of each log.
-        gap: time in s before and after a left-out stretch that is left out of the fit too.
-        segment: length in s of the segments that the inner cross-validation leaves out to choose
-            orders and penalties, and that the intervals resample.
+        folds: number of folds: whole logs if there are at least three, else equal segments of each
+            log.
+        gap: time in s before and after a test segment that is excluded from the training data.
+        segment: length in s of the segments of the inner cross-validation, which selects orders and
+            penalties, and of the bootstrap blocks.
     """
 
     folds: int = Field(default=5, ge=2, le=1_000)
@@ -95,20 +93,20 @@ class FoldsConfig(Config):
 
 @dataclass(frozen=True)
 class MeasuredForceLogs:
-    """All logs one after another, N samples; forces in N, N, N m.
+    """All logs concatenated, N samples; forces in N, N, N m.
 
     Attributes:
         names: names of the logs.
-        record: motion and commanded force, smoothed as `prepare` says; NaN where masked. Its folds
-            are the segments.
+        record: motion and commanded force, smoothed according to `prepare`; NaN where masked. Its
+            folds are the segments.
         forces: `commanded` and `actual` forces [N, 3].
-        usable: samples that models may be fitted to and judged on [N] bool.
-        fold_index: number of the fold of the outer cross-validation [N].
-        fold_unit: what a fold consists of: `logs` or `stretches`.
-        masked_shares: share of the samples that each mask excludes, by log and mask.
-        accelerations: as measured and as derived from the velocities [N, 3], by what they are;
-            empty where none were measured.
-        acceleration_comparison: comparison of the two by axis; empty where no acceleration was measured.
+        usable: samples for fit and evaluation [N] bool.
+        fold_index: fold of the outer cross-validation [N].
+        fold_unit: unit of a fold: `logs` or `stretches`.
+        masked_shares: share of masked samples, by log and mask.
+        accelerations: measured accelerations and derivatives of the velocities [N, 3] by name;
+            empty without measurements.
+        acceleration_comparison: comparison of the two by axis; empty without measurements.
     """
 
     names: tuple[str, ...]
@@ -167,9 +165,9 @@ class MeasuredForceLogs:
         return [segment for segment in segments if len(segment) >= min_length]
 
     def resampling_blocks(self) -> ResamplingBlocks | None:
-        """Return what the intervals resample: logs from five on, segments for fewer.
+        """Return bootstrap blocks: logs if there are five or more, else segments.
 
-        None where there are fewer than five segments.
+        None for fewer than five segments.
         """
         log = torch.repeat_interleave(
             torch.arange(len(self.names)), torch.tensor(self.record.run_lengths)
@@ -181,7 +179,7 @@ class MeasuredForceLogs:
 
 
 def _segment_blocks(count: int) -> ResamplingBlocks | None:
-    """Return segments as blocks of a bootstrap; None where there are too few."""
+    """Return segments as bootstrap blocks; None if there are too few."""
     return ResamplingBlocks(np.arange(count), "segments", count) if count >= _MIN_SEGMENTS else None
 
 
@@ -299,11 +297,11 @@ def compare_accelerations(derived: Tensor, measured: Tensor, segment: Tensor) ->
 
 
 def compare_forces(measured: MeasuredForceLogs) -> dict[str, Any]:
-    """Compare commanded and actual force: the thrusters' lag, and what the command explains.
+    """Compare commanded and actual force: thruster lag and explained variance.
 
     Returns:
-        `lag` (its parameters, or why it is not determined), and by axis the share of the actual
-        force's variance that the command explains, without and with the lag.
+        `lag` (its parameters, or the reason why it is undetermined), and by axis the share of the
+        actual force's variance that the command explains, without and with the lag.
     """
     record, usable = measured.record, measured.usable
     comparison: dict[str, Any] = {}

@@ -1,7 +1,6 @@
 """Task `force_residual`: residual models of measured forces (document 002, chapter 5).
 
-Every model is cross-validated and judged beside two others: no force at all, and the believed hull
-alone.
+Every model is cross-validated and compared with two references: zero force and the believed hull.
 """
 
 from __future__ import annotations
@@ -191,7 +190,7 @@ class ForceResidualConfig(StudyTask, ComputingTask):
         return self.data.find_paths()
 
     def read_logs(self) -> MeasuredForceLogs:
-        """Return what the logs hold."""
+        """Return the contents of the logs."""
         return read_force_logs(self.data, self.channels, self.prepare, self.validation)
 
     def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
@@ -272,11 +271,10 @@ class CrossValidatedModel(NamedTuple):
     """A model that the logs determine.
 
     Attributes:
-        error: residual [N, 3] in N, N, N m that remains on folds that were left out of the fit; NaN
-            where a sample is not used.
-        folds: what the estimator chose in each fold.
-        fit: coefficients fitted to all good samples, to be read and not to be judged.
-        not_forward: why it cannot run forward in time; empty where it can.
+        error: residual [N, 3] in N, N, N m on the test folds; NaN for unused samples.
+        folds: hyperparameters selected in each fold.
+        fit: coefficients fitted to all good samples, for display only.
+        not_forward: reason why it cannot run forward in time; empty if it can.
     """
 
     error: Tensor
@@ -414,11 +412,10 @@ def _evaluation_rows(
     models: Mapping[str, CrossValidatedModel],
     unmodelled: Mapping[str, Tensor],
 ) -> list[dict[str, Any]]:
-    """Return the rows of all models, grouped by the force that judges them.
+    """Return the rows of all models, grouped by the force of the evaluation.
 
-    Every group begins with `zero` (no force at all) and `believed` on the same samples. `reference`
-    is the better of the two on each axis: a believed model may be worse than no force, and what is
-    better than it is then no gain yet.
+    Every group begins with `zero` (zero force) and `believed` on the same samples. `reference` is
+    the better of the two on each axis, since a believed model may be worse than zero force.
     """
     groups: dict[str, list[str]] = {}
     for name in models:
@@ -508,9 +505,9 @@ def _signal_figure(
 
 
 def _score_figure(rows: Sequence[StudyResults]) -> Figure:
-    """Return every model's error less that of the believed model, with intervals.
+    """Return a figure of every model's error minus the error of the believed model, with intervals.
 
-    There is a panel for each force; errors are in % of its mean square.
+    One panel for each force; errors are in % of its mean square.
     """
     styles = {
         "zero": replace(ZERO_LINE_STYLE, kind="upright"),
@@ -572,10 +569,10 @@ def _axes_text(flags: Sequence[bool]) -> str:
 
 
 def _gain_sentences(regression_rows: Sequence[StudyResults]) -> list[str]:
-    """Return what the regressions of one force gain, and what to use on each axis.
+    """Return sentences on the gain of the regressions of one force, and a recommendation by axis.
 
-    A regression is recommended where it is reliably better on that axis; of several, the one with
-    the least error. Otherwise it is the better of no force and the believed model.
+    A regression is recommended if it is significantly better on that axis; of several, the one with
+    the smallest error. Otherwise the better of zero force and the believed model is recommended.
     """
     reference_text = "the better of no force and the believed model on each axis"
     flags_by_model = {

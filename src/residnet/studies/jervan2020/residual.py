@@ -83,11 +83,9 @@ class ForceRegressionData:
         terms: names of the basis functions.
         x: basis functions [N, J], float64.
         y: residual forces [N, 3] in N, N, N m.
-        scale: what the columns are divided by [J].
-        fold: of each sample [N], from 0; samples that belong together (a segment, a run) share a
-            fold.
-        test: samples of the document's own choice of a model, which judges on them; None where a
-            model must not see them.
+        scale: divisors of the columns [J].
+        fold: fold of each sample [N], from 0; samples of one segment or run share a fold.
+        test: samples of the document's own model selection; None to hide them from the models.
     """
 
     terms: tuple[str, ...]
@@ -117,14 +115,13 @@ class RegressionFit:
     """Coefficients of y = intercept + x coefficients.
 
     Attributes:
-        coefficients: Theta_post [J, 3], zero for basis functions that were removed.
-        intercept: of each axis [3].
+        coefficients: Theta_post [J, 3], zero for removed basis functions.
+        intercept: intercept of each axis [3].
         scaled_coefficients: Theta_pre [J, 3], coefficients of the scaled variables (3.11).
-        notes: what was chosen.
-        surface: errors of all models that the choice was made from, where a surface analysis made
-            it.
-        errors_by_order: mean square errors [A, 3] over the order of a PLSR in N^2, N^2, (N m)^2, by the
-            samples that they are of; NaN where there are none.
+        notes: selected hyperparameters.
+        surface: errors of all models of a surface analysis; None for other estimators.
+        errors_by_order: mean square errors [A, 3] by PLSR order in N^2, N^2, (N m)^2, by set of
+            samples; NaN if unavailable.
     """
 
     coefficients: Tensor
@@ -145,7 +142,7 @@ _ESTIMATORS: Mapping[str, Estimator] = {
     "lasso": ElasticNet(),
     "elastic_net": ElasticNet(0.5),
 }
-"""Estimators without settings, by kind; what they choose they choose over left-out folds."""
+"""Estimators without settings, by kind; they select hyperparameters by cross-validation."""
 
 
 @final
@@ -157,9 +154,10 @@ class RegressionConfig(Config):
             surface analysis (document 002 section 4.5.1); `ols`, ordinary least squares; `ridge`,
             `lasso` or `elastic_net`, with the penalty of the least error over left-out folds.
         order: number of latent variables of `plsr`; null takes the least error over left-out folds.
-        choose: how `surface` chooses. `test_errors`, the document's own: the least error on the test half,
-            which then also judges it; `simplest`: cross-validation over the folds of the first half
-            and the one-standard-error rule; `lowest_error`: cross-validation and its bare minimum.
+        choose: how `surface` chooses. `test_errors`, the document's own: the least error on the
+            test half, which then also judges it; `simplest`: cross-validation over the folds of the
+            first half and the one-standard-error rule; `lowest_error`: cross-validation and its
+            bare minimum.
     """
 
     kind: Literal["plsr", "surface", "ols", "ridge", "lasso", "elastic_net"]
@@ -184,12 +182,12 @@ class RegressionConfig(Config):
         return self.kind == "plsr" and self.order is None
 
     def fit(self, data: ForceRegressionData) -> RegressionFit:
-        """Return the coefficients that fit the regression's samples.
+        """Return the coefficients fitted to the regression's samples.
 
-        A PLSR tells its errors over all orders, too (Figures 4.4, 4.22, 4.42, 5.7).
+        A PLSR also returns its errors by order (Figures 4.4, 4.22, 4.42, 5.7).
 
         Raises:
-            FitError: where the data do not determine them.
+            FitError: if the data do not determine the coefficients.
         """
         if self.kind == "surface":
             return _fit_by_surface_analysis(data, self.choose)
@@ -275,15 +273,13 @@ class ResidualModelConfig(Config):
 
     Attributes:
         fit: estimator of the coefficients, with its settings.
-        terms: basis functions, written as products of u_dot, v_dot, r_dot, u, v, r and their
-            absolute values; the 30 of (4.12) unless given.
-        lag: identify the thrusters' lag together with the coefficients, and explain the force that
-            follows the command through it. Null where an estimator searches its order: with lag,
-            without, and no residual at all are then tried too, over the same left-out folds; for
-            other estimators null is without.
-        mirror: what a motion to port shows is taken to hold to starboard too, as for a hull that is
-            alike on both sides. Null tries both ways where `lag` does.
-        earth: also identify a force that is constant in earth axes, such as that of wind.
+        terms: basis functions: products of u_dot, v_dot, r_dot, u, v, r and their absolute values;
+            by default the 30 of (4.12).
+        lag: identify the thrusters' lag together with the coefficients and use the lagged command.
+            Null: an estimator with order selection compares lag, no lag and zero residual by
+            cross-validation; other estimators use no lag.
+        mirror: assume port-starboard symmetry. Null compares both if `lag` is selected.
+        earth: also identify a constant force in earth axes, such as wind.
     """
 
     fit: RegressionConfig
@@ -294,7 +290,7 @@ class ResidualModelConfig(Config):
 
     @property
     def searches_settings(self) -> bool:
-        """Whether lag, mirror and no residual at all are candidates beside the orders."""
+        """Whether lag, symmetry and zero residual are candidates in addition to the orders."""
         return self.lag is None and self.fit.searches_order
 
     def model_post_init(self, context: Any) -> None:
@@ -313,11 +309,12 @@ class ForceRecord:
         nu: measured u, v, r [N, 3] in m/s, m/s, rad/s.
         nu_dot: measured accelerations [N, 3] in m/s^2, m/s^2, rad/s^2.
         command: commanded force at the samples [N, 3] in N, N, N m.
-        averaged_command: commanded force averaged over the controller's steps around a sample [N, 3].
-        fold: number of the segment that a sample belongs to [N].
-        is_training: samples to identify from [N] bool; the others test the model.
+        averaged_command: commanded force averaged over the controller's steps around a sample [N,
+            3].
+        fold: segment of each sample [N].
+        is_training: training samples [N] bool; the others test the model.
         noise: standard deviations of the measured pose, nu and nu_dot, nine numbers.
-        run_lengths: numbers of samples of the runs that stand one after another; empty for one run.
+        run_lengths: number of samples of each concatenated run; empty for one run.
     """
 
     t: Tensor
@@ -361,8 +358,8 @@ class ResidualForceModel(NamedTuple):
 
     Attributes:
         force: F = F_base + correction.
-        lag: of the thrusters; None where it was not fitted.
-        fit: coefficients, and in its notes what was chosen.
+        lag: lag of the thrusters; None if not identified.
+        fit: coefficients, and the selected hyperparameters in its notes.
     """
 
     force: ForceModel
@@ -624,10 +621,10 @@ def derive_forward_equations(believed: str, model: ForceModel, label: str) -> Hu
 
 
 def missing_coefficients(plant_name: str, believed: str) -> dict[str, list[float]]:
-    """Return the true coefficients of a residual by basis function: surge, sway, yaw.
+    """Return the exact coefficients of a residual by basis function: surge, sway, yaw.
 
-    They are those of the true hull less those of the believed one, where document 002 misprints the
-    cross terms (correction J19).
+    They are the plant's coefficients minus the believed ones; document 002 misprints the cross
+    terms (correction J19).
     """
 
     def factors(term: str) -> tuple[Any, ...]:
@@ -674,7 +671,7 @@ def to_baseline_yaml(equations: HullEquations, label: str) -> str:
 
 
 def fit_to_json(terms: Sequence[str], fit: RegressionFit) -> dict[str, Any]:
-    """Return a fitted model as it stands in the results: terms, coefficients and weights."""
+    """Return the JSON entry of a fitted model: terms, coefficients and weights."""
     return {
         "terms": list(terms),
         "coefficients": fit.coefficients.tolist(),
@@ -690,13 +687,13 @@ def model_sections(
     notes_key: str,
     comparisons: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]],
 ) -> list[Section]:
-    """Return what both studies tell of fitted models: refusals, coefficients, and their figures.
+    """Return the report sections on fitted models: rejected models, coefficients, figures.
 
     Args:
         models: entries of the results (`fit_to_json`) by name.
-        run: folder that holds `model_figures`.
-        comparisons: coefficients [3] by basis function to stand beside those of a model, by its name and
-            by what they are, such as `plant_name` and `published`.
+        run: folder of the `model_figures`.
+        comparisons: reference coefficients [3] by basis function, by model and by source, such as
+            `plant_name` and `published`.
     """
     refusal_reasons = [model["not_forward"] for model in models.values() if model["not_forward"]]
     refusal_section = Section("Models that cannot run forward in time", [Bullets(refusal_reasons)])
