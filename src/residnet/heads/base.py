@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import Any, final
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, final
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.layout import PLANAR_LAYOUT
 from residnet.core.names import ACCELERATION_NAMES, suggest_name
+from residnet.core.renamed_state import RenamedStateModule
 from residnet.core.samples import Samples
 from residnet.physics.signals import RestoringAcceleration
 from residnet.physics.symmetry import active_channels, get_dof
@@ -328,8 +329,10 @@ def _index_buffer(indices: Sequence[int]) -> nn.Buffer:
     return nn.Buffer(torch.tensor(indices, dtype=torch.long), persistent=False)
 
 
-class ResidualScale(nn.Module):
+class ResidualScale(RenamedStateModule):
     """Scales network outputs by the standard deviation of the residual on the training samples."""
+
+    renamed_state: ClassVar[Mapping[str, str]] = {"spread": "std"}
 
     def __init__(self, dof: int = PLANAR_LAYOUT.n_dof) -> None:
         super().__init__()

@@ -6,7 +6,8 @@ The residual is affine in nu_dot, so that the model can be solved for nu_dot in 
 
 from __future__ import annotations
 
-from typing import final
+from collections.abc import Mapping
+from typing import ClassVar, final
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +16,7 @@ from residnet.core.columns import zero_acceleration
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.layout import RANGE_VELOCITIES
 from residnet.core.names import ACCELERATION_NAMES
+from residnet.core.renamed_state import RenamedStateModule
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisHead
@@ -27,13 +29,18 @@ _CONSTANT_FORCE_STD = 1e-9
 
 
 @final
-class ForceHead(ClosedFormHead):
+class ForceHead(RenamedStateModule, ClosedFormHead):
     """Force residual eps = A nu_dot + b(z), with basis functions of accelerations and channels.
 
     Every stage of the integrator solves (M + A) nu_dot = tau - C nu - D nu - b. With the
     acceleration nu_dot_0 of the baseline, nu_dot = (M + A)^-1 M nu_dot_0 - (M + A)^-1 b, where b is
     evaluated once per time step.
     """
+
+    renamed_state: ClassVar[Mapping[str, str]] = {
+        "lowest": "lower_velocities",
+        "highest": "upper_velocities",
+    }
 
     def __init__(self, basis_head: BasisHead) -> None:
         super().__init__()
@@ -157,8 +164,10 @@ class ForceHead(ClosedFormHead):
 
 
 @final
-class AugmentedMassBaseline(nn.Module):
+class AugmentedMassBaseline(RenamedStateModule):
     """Baseline with the mass M + A: its acceleration [..., 3] is (M + A)^-1 M nu_dot_0."""
+
+    renamed_state: ClassVar[Mapping[str, str]] = {"gain": "inertia_ratio"}
 
     def __init__(self, baseline: nn.Module, inertia_ratio: Tensor) -> None:
         super().__init__()
@@ -172,5 +181,5 @@ class AugmentedMassBaseline(nn.Module):
 
     def parameter_counts(self) -> list[float]:
         """Return the number of parameters of the baseline."""
-        counts: list[float] = self.baseline.parameter_count()  # type: ignore[operator]
+        counts: list[float] = self.baseline.parameter_counts()  # type: ignore[operator]
         return counts

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Literal, final
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal, final
 
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from residnet.core.errors import ConfigError
+from residnet.core.renamed_state import RenamedStateModule
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
 from residnet.heads.mirror import MirroredHead, Tanh, fast_tanh
 from residnet.physics.signals import RestoringAcceleration
@@ -86,11 +87,16 @@ class LstmConfig(FeatureConfig):
         ]
 
 
-class LSTMCell(nn.Module):
+class LSTMCell(RenamedStateModule):
     """LSTM layer with one bias per gate, evaluated step by step or over sequences.
 
     The memory s [B, 2H] is the concatenation of h and c. The layer has 4 H (F + H + 1) parameters.
     """
+
+    renamed_state: ClassVar[Mapping[str, str]] = {
+        "w_input": "input_weight",
+        "w_hidden": "hidden_weight",
+    }
 
     def __init__(self, n_inputs: int, hidden_size: int, uses_softsign: bool) -> None:
         super().__init__()
@@ -170,8 +176,10 @@ class LSTMCell(nn.Module):
         return torch.stack(outputs, dim=1), s
 
 
-class LstmNetwork(nn.Module):
+class LstmNetwork(RenamedStateModule):
     """Features, LSTM and readout for one or all axes, with `n_outputs` outputs per sample."""
+
+    renamed_state: ClassVar[Mapping[str, str]] = {"core": "cell"}
 
     def __init__(
         self, config: LstmConfig, feature_names: Sequence[str], n_outputs: int, names: Sequence[str]

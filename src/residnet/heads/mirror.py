@@ -6,13 +6,14 @@ symmetry halves the range of states that a network has to learn.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import final
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, final
 
 import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ConfigError
+from residnet.core.renamed_state import RenamedStateModule
 from residnet.core.samples import Samples
 from residnet.heads.base import ResidualHead
 from residnet.physics.symmetry import get_axis_parities, mirror_channels
@@ -43,12 +44,14 @@ class Tanh(nn.Module):
 
 
 @final
-class MirroredHead(ResidualHead):
+class MirroredHead(RenamedStateModule, ResidualHead):
     """Head with the residual rho = (g(z) + M g(M z)) / 2 of an inner head g.
 
     M mirrors port and starboard. Channels and mirror images are evaluated as one batch of twice the
     size, and the memory is the concatenation of both memories.
     """
+
+    renamed_state: ClassVar[Mapping[str, str]] = {"inner": "inner_head"}
 
     def __init__(self, inner: ResidualHead, names: Sequence[str]) -> None:
         super().__init__(names)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Annotated, Literal, final
+from collections.abc import Mapping, Sequence
+from typing import Annotated, ClassVar, Literal, final
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from residnet.core.renamed_state import RenamedStateModule
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
 from residnet.heads.mirror import MirroredHead, Tanh
 
@@ -48,8 +49,10 @@ class MlpConfig(FeatureConfig):
 
 
 @final
-class MlpHead(ResidualHead):
+class MlpHead(RenamedStateModule, ResidualHead):
     """Head with the residual rho = std * network(features)."""
+
+    renamed_state: ClassVar[Mapping[str, str]] = {"net": "network"}
 
     def __init__(self, config: MlpConfig, names: Sequence[str]) -> None:
         super().__init__(names)

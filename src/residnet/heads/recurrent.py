@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Literal, final
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal, final
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.core.config import Seconds
+from residnet.core.renamed_state import RenamedStateModule
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
 from residnet.physics.signals import RestoringAcceleration
 
@@ -51,12 +52,19 @@ class GRUEnsembleConfig(FeatureConfig):
 
 
 @final
-class GRUEnsembleHead(ResidualHead):
+class GRUEnsembleHead(RenamedStateModule, ResidualHead):
     """Ensemble of K recurrent networks whose weights have a leading axis of size K.
 
     Rows of z [K B, nz (+ n)] and s [K B, H] are K consecutive blocks of B rows, one per network.
     The n innovations may be appended to the channels.
     """
+
+    renamed_state: ClassVar[Mapping[str, str]] = {
+        "w_input": "input_weight",
+        "w_hidden": "hidden_weight",
+        "w_out": "output_weight",
+        "w_skip": "skip_weight",
+    }
 
     def __init__(self, config: GRUEnsembleConfig, names: Sequence[str]) -> None:
         super().__init__(names)

@@ -6,7 +6,8 @@ true wind is transformed to wind relative to the vessel with the predicted headi
 
 from __future__ import annotations
 
-from typing import Literal, final
+from collections.abc import Mapping
+from typing import ClassVar, Literal, final
 
 import torch
 from pydantic import Field, model_validator
@@ -24,6 +25,7 @@ from residnet.core.layout import (
     DegreesOfFreedom,
 )
 from residnet.core.names import WIND_INPUTS, get_si_unit, require_plain_name, suggest_name
+from residnet.core.renamed_state import RenamedStateModule
 from residnet.core.samples import Samples
 from residnet.physics.actuators import DifferentialThrustConfig
 from residnet.physics.hull import FossenConfig
@@ -265,7 +267,7 @@ _MIN_RANGE = 1e-9
 
 
 @final
-class RestoringAcceleration(nn.Module):
+class RestoringAcceleration(RenamedStateModule):
     """Restoring acceleration [..., n] on velocities outside their training range, otherwise zero.
 
     A fitted model is not valid outside the training range. Without damping, the clamped
@@ -276,6 +278,8 @@ class RestoringAcceleration(nn.Module):
         n_channels: number of channels, the velocities first, that are clamped to their ranges.
         n_dof: number of velocities n.
     """
+
+    renamed_state: ClassVar[Mapping[str, str]] = {"rate": "restoring_rate"}
 
     def __init__(
         self,

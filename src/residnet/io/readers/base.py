@@ -67,6 +67,8 @@ class ReaderKind(Config, ABC):
 class ConfiguredReader(ReaderKind, LogReader):
     """Config and reader in one class; a subclass needs `kind` and `read` only."""
 
+    kind: str = ""
+
     def build(self) -> Self:
         """Return this object, which is config and reader in one."""
         return self
