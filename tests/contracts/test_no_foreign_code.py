@@ -29,8 +29,9 @@ EXCEPTIONS = {
     ("export/torchscript.py", "torch.jit.load"): "the file that the same call has just written",
     ("__init__.py", "importlib.import_module"): "names of residnet's own modules",
     ("core/registry.py", "importlib.import_module"): "paths in residnet's own tables of parts",
-    ("studies/__init__.py", "importlib.import_module"): "names of residnet's own modules",
-    ("runs/task.py", "importlib.import_module"): "`page` of the task's class",
+    ("autopilot/__init__.py", "importlib.import_module"): "names of residnet's own modules",
+    ("cli.py", "importlib.import_module"): "entry points in files of residnet's own wings",
+    ("runs/task.py", "importlib.import_module"): "page and executor of the task's class",
     ("export/onnx_file.py", "importlib.import_module"): "names of packages in the source",
     ("heads/scikit.py", "importlib.import_module"): "on the allow-list, or with --trust",
 }
