@@ -89,7 +89,7 @@ def test_rows_are_the_policies_of_their_own_constants(vessel: SteeredPlant) -> N
 def test_gradients_of_the_cost_reach_law_line_of_sight_and_network(vessel: SteeredPlant) -> None:
     torch.manual_seed(0)
     described = {
-        "state": vessel.state, **vars(TURNING), "limit": 15 * DEG, "rate": None, "dt": 0.1,
+        "state": vessel.state, **TURNING.to_json(), "limit": 15 * DEG, "rate": None, "dt": 0.1,
         "trained_at": 0.1, "units": 3, "law": LAW,
     }  # fmt: skip
     law: Any = described

@@ -237,7 +237,7 @@ def test_four_corner_course_of_the_ferry(vessel: str) -> None:
     course = FourCorner(control=control)
     assert course.duration_within(10.0) == 720.0
     model, helm = RecordedPlantDynamics(plant, 0.2, 2), Helm.from_plant(plant)
-    craft = SimulatedVessel(vessel, model, helm, plant.commands, plant.approach(1))
+    craft = SimulatedVessel(vessel, model, helm, plant.n_commands, plant.make_initial_state(1))
     (flight,) = simulate_manoeuvres(
         craft, [course], TrialEnvironment(plant, DisturbanceConfig(), SensorsConfig(), 0), 10.0, 0.2
     )

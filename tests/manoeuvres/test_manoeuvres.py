@@ -65,7 +65,7 @@ def drawn(kind: str, seed: int = 0) -> list[Manoeuvre]:
     fields = FAMILIES[kind].model_fields.items()
     required = {name: NEEDS[name] for name, info in fields if info.is_required()}
     family: Any = FAMILIES[kind](**required)
-    return family.draw(np.random.default_rng(seed), DURATION)  # type: ignore[no-any-return]
+    return family.sample_all(np.random.default_rng(seed), DURATION)  # type: ignore[no-any-return]
 
 
 def pair(kind: str, folder: Path) -> list[Manoeuvre]:
@@ -223,7 +223,7 @@ def test_open_loop_patterns() -> None:
         assert min(draw.levels[::2]) > max(draw.levels[1::2], default=0.0) - 0.1
     family: Any = FAMILIES["constant"](drive=(0.2, 0.6), steer=(-0.1, 0.0, 0.1))
     every = [ConstantInput(drive=d, steer=s) for d in (0.2, 0.6) for s in (-0.1, 0.0, 0.1)]
-    assert family.draw(np.random.default_rng(0), 10.0) == every
+    assert family.sample_all(np.random.default_rng(0), 10.0) == every
 
 
 @pytest.mark.parametrize(

@@ -424,7 +424,7 @@ class ObservedPolicy(HeadingPolicy):
         decay = ratio / self.time
         force = decay * self.gain * ratio * self.limit
         effective_disturbance = self.observer.with_restoring(
-            estimate.push, estimate.predicted_heading, ratio
+            estimate.disturbance_rudder, estimate.predicted_heading, ratio
         )
         rudder_share = (rudder + effective_disturbance) / self.limit
         law_share = self.law(
@@ -449,7 +449,7 @@ class ObservedPolicy(HeadingPolicy):
                     error / (30.0 * self.radians_per_degree),
                     1.7 * estimate.predicted_r / max_yaw_rate,
                     torch.tanh(17.0 * estimate.predicted_r / max_yaw_rate),
-                    5.0 * estimate.push / self.limit,
+                    5.0 * estimate.disturbance_rudder / self.limit,
                     (3.0 * noise_scale / self.radians_per_degree) * estimate.heading_innovation,
                     (52.0 * noise_scale) * estimate.r_innovation / max_yaw_rate,
                     last_command / self.limit,
@@ -462,12 +462,12 @@ class ObservedPolicy(HeadingPolicy):
         command = self.limit * unlimited_share.clamp(-1.0, 1.0)
         next_rudder = rudder + (command - rudder).clamp(-self.max_rudder_step, self.max_rudder_step)
         queue = torch.cat((pending, next_rudder), dim=1)
-        effective_disturbance = self.observer.with_restoring(estimate.push, estimate.heading, ratio)
+        effective_disturbance = self.observer.with_restoring(estimate.disturbance_rudder, estimate.heading, ratio)
         heading, yaw_rate = self.observer.predict_step(
             estimate.heading, estimate.r, effective_disturbance, queue[:, 0:1], ratio
         )
         s = torch.cat(
-            (heading, yaw_rate, estimate.push, next_rudder, command, queue[:, 1:], memory), dim=1
+            (heading, yaw_rate, estimate.disturbance_rudder, next_rudder, command, queue[:, 1:], memory), dim=1
         )
         return command, s
 

@@ -268,3 +268,12 @@ class NomotoModel:
     time: float
     speed: float
     restoring: float = 0.0
+
+    def to_json(self) -> dict[str, float]:
+        """Return the numbers under the keys of stored policies and of controllers.json."""
+        return {
+            "gain": self.gain,
+            "time": self.time,
+            "speed": self.speed,
+            "righting": self.restoring,
+        }

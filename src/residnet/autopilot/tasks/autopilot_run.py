@@ -118,7 +118,7 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> TaskOutcome:
                 ablations[f"{name} network off"] = ("network_off", policy.without_network())
     folder.write_json(
         folder.path / "controllers.json",
-        {"schema": "residnet.controllers/1", "turning": vars(nomoto), "controllers": notes},
+        {"schema": "residnet.controllers/1", "turning": nomoto.to_json(), "controllers": notes},
     )
     rows, corner_trajectories, plants = _run_step_tests(controllers, vessel, config)
     if config.conditions is not None:
@@ -227,7 +227,7 @@ def _train_policy_or_resume(
     observed_law = angle_law_of(base_law)
     spec_fields = {
         "state": training_vessel.state,
-        **vars(nomoto),
+        **nomoto.to_json(),
         "limit": steering.limit,
         "rate": training_vessel.rate,
         "dt": steering.dt,
