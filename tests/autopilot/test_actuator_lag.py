@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from residnet.autopilot.actuator_lag import fit_lag, followed
+from residnet.autopilot.actuator_lag import fit_lag, simulate_lagged_force
 from residnet.autopilot.motion import ActuatorLag
 from residnet.core.errors import FitError
 
@@ -34,7 +34,7 @@ def test_followed_is_the_differential_equation(delay: float) -> None:
 
     wanted = solve_ivp(rate, (0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-9, max_step=0.02)
     lag = ActuatorLag(frequency=3.0, damping=0.6, delay=delay)
-    mine = followed(commands(200), lag, DT)[:, 1].numpy()
+    mine = simulate_lagged_force(commands(200), lag, DT)[:, 1].numpy()
     # a delayed polygon has its corners between samples: exact only where the delay is a whole
     # number of them
     np.testing.assert_allclose(mine, wanted.y[0], atol=1e-5 if delay == 0 else 0.5)
@@ -46,7 +46,7 @@ def test_followed_is_the_differential_equation(delay: float) -> None:
 )
 def test_lag_and_regression_together(true: ActuatorLag) -> None:
     command = commands()
-    acting = followed(command, true, DT)
+    acting = simulate_lagged_force(command, true, DT)
     velocity = torch.cumsum(acting, 0) * DT / 1000.0
     basis = torch.cat((velocity, velocity * velocity.abs(), acting / 1000.0), dim=1)
     needed = 2.0 * acting + 30.0 * velocity

@@ -123,7 +123,9 @@ class ReferenceInInputs(Source):
 
     def __init__(self, policy: Policy, inputs: int) -> None:
         super().__init__()
-        self.policy, self.inputs, self.depends_on_step = policy, inputs, False
+        self.policy = policy
+        self.inputs = inputs
+        self.depends_on_step = False
 
     def initial(self, x: Tensor) -> Tensor:
         """Return the controller's memory."""

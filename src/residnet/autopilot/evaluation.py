@@ -118,7 +118,8 @@ def _describe_cheaper_law(
     laws = {name: cost for name, (model_kind, cost) in costs.items() if model_kind == "classical"}
     if model not in costs or not laws:
         return []
-    policy_cost, cheapest_law = costs[model][1], min(laws, key=laws.__getitem__)
+    policy_cost = costs[model][1]
+    cheapest_law = min(laws, key=laws.__getitem__)
     # a policy that learned nothing flies as the law that it began with, but for rounding
     if policy_cost <= laws[cheapest_law] or math.isclose(policy_cost, laws[cheapest_law]):
         return []
@@ -203,7 +204,8 @@ def simulate_steps_in_wind(
         "wind_speed": speed,
         "wind_dir": torch.arange(8) * (torch.pi / 4.0),
     }
-    vessel, heading_steps = SteeredPlant(plant, in_calm_water=False), torch.full((8,), heading_step)
+    vessel = SteeredPlant(plant, in_calm_water=False)
+    heading_steps = torch.full((8,), heading_step)
     return simulate_heading_steps(
         vessel,
         policy,
@@ -225,7 +227,8 @@ def simulate_steps_in_waves(
     seed: int,
 ) -> ClosedLoopTrajectories:
     """Run steps of the reference with the nominal vessel in eight seaways."""
-    disturbance, n_seaways = DisturbanceConfig(waves=waves), 8
+    disturbance = DisturbanceConfig(waves=waves)
+    n_seaways = 8
     return simulate_heading_steps(
         SteeredPlant(plant, in_calm_water=False),
         policy,
@@ -422,11 +425,10 @@ def compute_tracking_metrics(
     # the power of keeping the position and of keeping the heading are told apart (Table 4.13)
     energy = [float(power[:, :2].sum(-1).abs().sum() * dt), float(power[:, 2].abs().sum() * dt)]
     integrated_errors = [float(position_error.sum() * dt), float(heading_error.sum() * dt)]
-    duration, motion_mse = (
-        dt * len(pose),
-        (all_but_pose(desired_motion) - motion).square().mean(0).tolist(),
-    )
-    mean_command, mean_feedback = command.abs().mean(0).tolist(), feedback.abs().mean(0).tolist()
+    duration = dt * len(pose)
+    motion_mse = (all_but_pose(desired_motion) - motion).square().mean(0).tolist()
+    mean_command = command.abs().mean(0).tolist()
+    mean_feedback = feedback.abs().mean(0).tolist()
     return TrackingMetrics(
         float(position_error.mean()),
         float(position_error.square().mean()),
@@ -518,7 +520,8 @@ def build_course_row(
         for passage, buoy in zip(closest_passages, buoys, strict=True)
     ]
     margins = [-distance for distance in boundary_distances] if must_enter else boundary_distances
-    n_cleared, n_on_correct_side = sum(margin >= 0 for margin in margins), len(closest_passages)
+    n_cleared = sum(margin >= 0 for margin in margins)
+    n_on_correct_side = len(closest_passages)
     if must_enter:
         metrics |= {"entered": n_cleared}
     else:

@@ -30,7 +30,8 @@ FallbackCommand = Literal["hold", "amidships"]
 """Command while inputs are wrong: the last one, or rudder amidships."""
 COURSE_MEASUREMENTS = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
 """What a policy along a course sees: north and east, heading, surge and sway velocity, yaw rate."""
-PARITY_STEPS, PARITY_TOLERANCE = 1000, 1e-4
+PARITY_STEPS = 1000
+PARITY_TOLERANCE = 1e-4
 """Steps over which exported commands must agree, and to which share of the rudder's limit.
 
 Of a limit of 35 deg it is 0.0035 deg, which no actuator follows, and float32 rounds less.
@@ -78,7 +79,9 @@ class _GuardedController(nn.Module):
         self.hold_factor = 1.0 if fallback == "hold" else 0.0
         # a large number where the rudder has no rate: infinity times zero would be no number
         self.max_step = min(policy.rate * policy.dt, 2.0 * policy.limit)
-        self.limit, self.dt, self.speed = policy.limit, policy.dt, policy.speed
+        self.limit = policy.limit
+        self.dt = policy.dt
+        self.speed = policy.speed
 
     def initial_state(self, y: Tensor) -> Tensor:
         """Return the memory s [B, n] at the first measurement y [B, k], rudder amidships."""
@@ -163,11 +166,9 @@ class GuardedPolicy(_GuardedController):
         is_valid = self.is_in_range(y) & (reference.abs() <= self.high[0])
         y = torch.where(is_valid, y, torch.zeros_like(y))
         reference = torch.where(is_valid, reference, torch.zeros_like(reference))
-        last_command, has_valid_memory, fresh_memory = (
-            self.last_command(s),
-            self.is_valid_memory(s),
-            self.start_memory(y),
-        )
+        last_command = self.last_command(s)
+        has_valid_memory = self.is_valid_memory(s)
+        fresh_memory = self.start_memory(y)
         s = torch.where(has_valid_memory, s, fresh_memory)
         wanted_command, next_memory = self.policy(y, reference, s[:, :-1])
         return self.finish_step(
@@ -199,7 +200,8 @@ class GuardedCoursePolicy(_GuardedController):
         guidance = copy.deepcopy(guidance).double()
         guidance.x, guidance.y, guidance.psi, guidance.u, guidance.v = range(5)
         position_margin = _POSITION_MARGIN * guidance.lookahead
-        max_yaw_rate, max_speed = 5.0 * policy.gain * policy.limit, 3.0 * policy.speed
+        max_yaw_rate = 5.0 * policy.gain * policy.limit
+        max_speed = 3.0 * policy.speed
         position_limits = [
             (float(positions.min()) - position_margin, float(positions.max()) + position_margin)
             for positions in guidance.table[:, :2].T
@@ -244,11 +246,9 @@ class GuardedCoursePolicy(_GuardedController):
         """Return what `step` returns, of tensors of the right shape and type."""
         is_valid = self.is_in_range(y)
         y = torch.where(is_valid, y, torch.zeros_like(y))
-        last_command, has_valid_memory, fresh_memory = (
-            self.last_command(s),
-            self.is_valid_memory(s),
-            self.start_memory(y),
-        )
+        last_command = self.last_command(s)
+        has_valid_memory = self.is_valid_memory(s)
+        fresh_memory = self.start_memory(y)
         s = torch.where(has_valid_memory, s, fresh_memory)
         reference, guidance_memory = self.guidance(y, 0, s[:, : self.guidance.n_state])
         wanted_command, policy_memory = self.track_keeping(
@@ -274,7 +274,8 @@ class _TracedController(nn.Module):
 
     def __init__(self, inner: GuardedPolicy | GuardedCoursePolicy, sizes: Sequence[int]) -> None:
         super().__init__()
-        self.measured, self.memory = inner.low.numel(), inner.memory_low.numel()
+        self.measured = inner.low.numel()
+        self.memory = inner.memory_low.numel()
         # its type is that of all numbers
         self.low = nn.Buffer(inner.low)
         # two rows: a batch of one would hide where the rows of a batch are confused
@@ -302,7 +303,9 @@ class TracedPolicy(_TracedController):
         require_shape("reference", reference, [rows, 1])
         require_shape("s", s, [rows, self.memory])
         dtype = self.low.dtype
-        y, reference, s = y.to(dtype), reference.to(dtype), s.to(dtype)
+        y = y.to(dtype)
+        reference = reference.to(dtype)
+        s = s.to(dtype)
         answer: tuple[Tensor, Tensor, Tensor] = self.answer(y, reference, s)
         return answer
 
@@ -321,7 +324,8 @@ class TracedCourse(_TracedController):
         rows = get_size(y, 2, 0)
         require_shape("measured", y, [rows, self.measured])
         require_shape("s", s, [rows, self.memory])
-        y, s = y.to(self.low.dtype), s.to(self.low.dtype)
+        y = y.to(self.low.dtype)
+        s = s.to(self.low.dtype)
         answer: tuple[Tensor, Tensor, Tensor, Tensor] = self.answer(y, s)
         return answer
 
@@ -401,9 +405,13 @@ class ExportedController(Exportable):
         description: Mapping[str, Any],
         metrics: Sequence[Mapping[str, Any]],
     ) -> None:
-        self.name, self.policy, self.fallback = name, policy, fallback
+        self.name = name
+        self.policy = policy
+        self.fallback = fallback
         self.label = name if name == self.kind else f"{self.kind} {name}"
-        self.description, self.metrics, self.dt = description, metrics, policy.dt
+        self.description = description
+        self.metrics = metrics
+        self.dt = policy.dt
         self.steering_axis = policy.axis
         n_memory = self.build_controller(self.precisions[-1]).memory_low.numel()
         self.arguments = (
@@ -433,7 +441,8 @@ class ExportedController(Exportable):
         """Return what the card says of this kind of policy."""
 
     def build_module(self, dtype: torch.dtype) -> nn.Module:
-        inner, sizes = self.build_controller(dtype), [count for _, count in self.arguments]
+        inner = self.build_controller(dtype)
+        sizes = [count for _, count in self.arguments]
         traced = TracedCourse if isinstance(inner, GuardedCoursePolicy) else TracedPolicy
         return traced(inner, sizes).eval()
 
@@ -444,7 +453,8 @@ class ExportedController(Exportable):
         return _InitialState(self.build_controller(dtype)).eval()
 
     def card_contents(self) -> dict[str, Any]:
-        module, policy = self.build_controller(self.precisions[0]), self.policy
+        module = self.build_controller(self.precisions[0])
+        policy = self.policy
         measured_ranges = zip(module.low.tolist(), module.high.tolist(), strict=True)
         fallback_text = "held" if self.fallback == "hold" else "amidships"
         reference_text = ", reference" if self._reference_arguments() else ""
@@ -501,7 +511,8 @@ class ExportedController(Exportable):
         loaded_memory = loaded.initial_memory(input_arrays[0][0])
         if loaded_memory is None:
             eager_memory = torch.full_like(eager_memory, torch.nan)
-            loaded_memory, is_bad_input[0] = eager_memory[0].numpy(), True
+            loaded_memory = eager_memory[0].numpy()
+            is_bad_input[0] = True
         max_difference = 0.0
         for k in range(PARITY_STEPS):
             with torch.no_grad():
@@ -548,7 +559,8 @@ class ExportedHeading(ExportedController):
         """
         step_index = torch.arange(PARITY_STEPS, dtype=module.low.dtype)
         max_rate = float(module.high[-1]) / 5.0
-        psi, r = 0.8 * torch.sin(0.01 * step_index), max_rate * torch.cos(0.013 * step_index)
+        psi = 0.8 * torch.sin(0.01 * step_index)
+        r = max_rate * torch.cos(0.013 * step_index)
         measurements = [psi, torch.full_like(psi, module.speed), r]
         if self.steering_axis is DEPTH:
             measurements.insert(2, 0.3 * torch.sin(0.013 * step_index))
@@ -588,7 +600,8 @@ class ExportedCoursePolicy(ExportedController):
         description: Mapping[str, Any],
         metrics: Sequence[Mapping[str, Any]],
     ) -> None:
-        self.guidance, self.course = guidance, course
+        self.guidance = guidance
+        self.course = course
         super().__init__(name, policy, fallback=fallback, description=description, metrics=metrics)
 
     @property
@@ -600,13 +613,12 @@ class ExportedCoursePolicy(ExportedController):
 
     def parity_arguments(self, module: Any) -> Sequence[Tensor]:
         """Return measurements of a vessel beside the course, off its heading, at varying speed."""
-        step_index, course = torch.arange(PARITY_STEPS, dtype=torch.float64), self.course
+        step_index = torch.arange(PARITY_STEPS, dtype=torch.float64)
+        course = self.course
         track_index = (step_index * module.dt * module.speed / course.step).long()
         track_index = track_index.clamp(max=len(course.track) - 1)
-        track, heading = (
-            torch.from_numpy(course.track)[track_index],
-            torch.from_numpy(course.heading)[track_index],
-        )
+        track = torch.from_numpy(course.track)[track_index]
+        heading = torch.from_numpy(course.heading)[track_index]
         lateral_offset = 0.1 * module.guidance.lookahead
         y = (
             track[:, 0] + lateral_offset * torch.sin(0.02 * step_index),
@@ -619,9 +631,11 @@ class ExportedCoursePolicy(ExportedController):
         return (torch.stack(y, dim=-1),)
 
     def describe_for_card(self, module: Any) -> dict[str, Any]:
-        course, n_guidance = self.course, module.guidance.n_state
+        course = self.course
+        n_guidance = module.guidance.n_state
         guidance_names = ("place", "drift_north", "drift_east")[:n_guidance]
-        (north, east), heading = course.track[0].tolist(), float(course.heading[0])
+        (north, east) = course.track[0].tolist()
+        heading = float(course.heading[0])
         return {
             "start": {"north": north, "east": east, "heading": heading},
             "length": course.length,

@@ -94,7 +94,8 @@ class WheelOver(nn.Module):
         table = self.table.to(change.dtype)
         table_position = change.abs() * (float(table.shape[0] - 1) / math.pi)
         lower_index = table_position.floor().clamp(max=float(table.shape[0] - 2))
-        row, fraction = lower_index.long(), table_position - lower_index
+        row = lower_index.long()
+        fraction = table_position - lower_index
         return (1.0 - fraction) * table[row] + fraction * table[row + 1]
 
 
@@ -106,7 +107,8 @@ def _switching_turns(
     The heading changes go from 0 to past pi in rad; a distance is from a turn's beginning to where
     the lines before and after it meet, in m; tracks are ahead and aside, in m.
     """
-    max_yaw_rate, time_constant = nomoto.gain * limit, nomoto.time
+    max_yaw_rate = nomoto.gain * limit
+    time_constant = nomoto.time
     hold_times = np.concatenate(
         (
             [0.0],
@@ -190,9 +192,13 @@ class WaypointGuidance(Reference):
             )
         self.register_buffer("points", torch.tensor(points, dtype=torch.float64), persistent=False)
         self.points: Tensor
-        self.acceptance, self.line_of_sight, self.wheel_over = acceptance, line_of_sight, wheel_over
+        self.acceptance = acceptance
+        self.line_of_sight = line_of_sight
+        self.wheel_over = wheel_over
         self.max_leg_offset = _MAX_LEG_OFFSET * acceptance
-        self.x, self.y, self.psi = state.index("x"), state.index("y"), state.index("psi")
+        self.x = state.index("x")
+        self.y = state.index("y")
+        self.psi = state.index("psi")
         self.n_state = 3 + line_of_sight.n_state
         self.may_finish = True
 
@@ -301,7 +307,9 @@ class DriftEstimate(nn.Module):
                 "integral line of sight: distance, gain and step must be above zero, given"
                 f" {distance:g} m, {gain:g} m/s, {dt:g} s"
             )
-        self.distance, self.gain, self.dt = distance, gain, dt
+        self.distance = distance
+        self.gain = gain
+        self.dt = dt
         self.max_drift = _MAX_DRIFT_TANGENT
 
     def cross_component(self, direction: Tensor, s: Tensor) -> Tensor:
@@ -361,7 +369,8 @@ class LookAheadLineOfSight(LineOfSight):
 
     def __init__(self, distance: float, drift: DriftEstimate | None = None) -> None:
         super().__init__()
-        self.distance, self.drift = distance, drift
+        self.distance = distance
+        self.drift = drift
         self.n_state = 0 if drift is None else 2
 
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -489,9 +498,13 @@ class CourseGuidance(Reference):
             "table", torch.from_numpy(np.stack(columns, axis=-1)), persistent=False
         )
         self.table: Tensor
-        self.table_step, self.length, self.lookahead = course.step, course.length, lookahead
+        self.table_step = course.step
+        self.length = course.length
+        self.lookahead = lookahead
         self.max_arc_length = course.step * (len(course.track) - 1)
-        self.x, self.y, self.psi = state.index("x"), state.index("y"), state.index("psi")
+        self.x = state.index("x")
+        self.y = state.index("y")
+        self.psi = state.index("psi")
         self.u, self.v = state.index("u"), state.index("v")
         self.min_curvature_factor = _MIN_CURVATURE_FACTOR
         self.drift = drift
@@ -532,17 +545,15 @@ class CourseGuidance(Reference):
         ).clamp(max=self.max_arc_length)
         planned = self.plan_at(arc_length)
         _, cross_track_error = self.track_error(x, arc_length)
-        direction, heading = planned[:, 2], planned[:, 3]
-        slope, memory = cross_track_error / self.lookahead, s[:, 1:]
-        cross_drift, along_drift = (
-            torch.zeros_like(cross_track_error),
-            torch.zeros_like(cross_track_error),
-        )
+        direction = planned[:, 2]
+        heading = planned[:, 3]
+        slope = cross_track_error / self.lookahead
+        memory = s[:, 1:]
+        cross_drift = torch.zeros_like(cross_track_error)
+        along_drift = torch.zeros_like(cross_track_error)
         if self.drift is not None:
-            cross_drift, along_drift = (
-                self.drift.cross_component(direction, memory),
-                self.drift.along_component(direction, memory),
-            )
+            cross_drift = self.drift.cross_component(direction, memory)
+            along_drift = self.drift.along_component(direction, memory)
             memory = self.drift(cross_track_error, direction, memory)
         slope = slope + cross_drift
         speed = torch.sqrt(x[:, self.u].square() + x[:, self.v].square())
@@ -599,7 +610,8 @@ class TrackKeeping(Policy):
         self.limit = limit
         self.max_rudder_step = 2.0 * limit if rate is None else min(rate * dt, 2.0 * limit)
         self.n_state = 1 + law.n_state
-        self.psi, self.r = state.index("psi"), state.index("r")
+        self.psi = state.index("psi")
+        self.r = state.index("r")
 
     def initial_state(self, x: Tensor) -> Tensor:
         """Return the rudder amidships, then the law's memory."""
@@ -676,7 +688,9 @@ class Crossing(Reference):
     ) -> None:
         super().__init__()
         self.n_state = 13
-        self.config, self.dt, self.models = config, dt, list(models)
+        self.config = config
+        self.dt = dt
+        self.models = list(models)
         self.filter_config = config.filter_config()
         self.step_matrix = self.filter_config.build(dt).advance[0]
         self.points = torch.tensor(config.points, dtype=torch.float64)
@@ -700,7 +714,8 @@ class Crossing(Reference):
         is_near_end = (self.points[leg + 1] - current_position).norm(dim=-1) < self.config.circle
         has_arrived = is_near_end & (leg == last_leg)
         leg = torch.where(is_near_end & (leg < last_leg), leg + 1, leg)
-        start, end = self.points[leg], self.points[leg + 1]
+        start = self.points[leg]
+        end = self.points[leg + 1]
         leg_direction = (end - start) / (end - start).norm(dim=-1, keepdim=True)
         offset = current_position - start
         distance_along_leg = (offset * leg_direction).sum(-1)

@@ -101,7 +101,8 @@ class Waypoints(Manoeuvre):
         }
 
 
-_RIGHT_ANGLE, _HALF_RIGHT_ANGLE = math.pi / 2, math.pi / 4
+_RIGHT_ANGLE = math.pi / 2
+_HALF_RIGHT_ANGLE = math.pi / 4
 # Table 4.1 prints the twelve twice (correction J12); headings are followed as written (J13)
 SEGMENTS: tuple[Waypoint, ...] = (
     (0.0, -15.0, -_RIGHT_ANGLE), (15.0, -15.0, 0.0), (15.0, 0.0, 0.0), (30.0, 0.0, 0.0), (30.0, -15.0, 0.0),

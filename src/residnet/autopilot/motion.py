@@ -132,11 +132,9 @@ class ReferenceFilter(Reference):
         return self.waypoints[:, min(k // self.steps_per_waypoint, self.n_waypoints - 1)]
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        desired_pose, pose_rate, pose_acceleration = (
-            pose(s),
-            dynamic_states(s),
-            motion_accelerations(s),
-        )
+        desired_pose = pose(s)
+        pose_rate = dynamic_states(s)
+        pose_acceleration = motion_accelerations(s)
         nu, nu_dot = to_body_derivatives(desired_pose[:, 2], pose_rate, pose_acceleration)
         target = self.waypoint_at(k).to(s.dtype)
         error = torch.stack(
@@ -274,7 +272,8 @@ class AllocatedPolicy(Policy):
 
     def __init__(self, policy: Policy, allocate: Callable[[Tensor], Tensor]) -> None:
         super().__init__()
-        self.policy, self.allocate = policy, allocate
+        self.policy = policy
+        self.allocate = allocate
         self.n_state = policy.n_state
 
     def initial_state(self, x: Tensor) -> Tensor:
@@ -344,11 +343,9 @@ def filter_derivatives(
     """
     w = torch.tensor(config.frequency, dtype=memory.dtype)
     d = 2.0 * torch.tensor(config.damping, dtype=memory.dtype) + 1.0
-    pose, rate, acceleration = (
-        columns.pose(memory),
-        columns.dynamic_states(memory),
-        columns.motion_accelerations(memory),
-    )
+    pose = columns.pose(memory)
+    rate = columns.dynamic_states(memory)
+    acceleration = columns.motion_accelerations(memory)
     jerk = w**3 * (target - pose) - d * w**2 * rate - d * w * acceleration
     snap = w**3 * (target_rate - rate) - d * w**2 * acceleration - d * w * jerk
     return PoseDerivatives(pose, rate, acceleration, jerk, snap)
@@ -376,11 +373,9 @@ def required_force(
             (force_now, torch.zeros_like(force_now), torch.zeros_like(force_now)), dim=-1
         )
     lead_time = lag.delay + 0.5 * hold_time
-    force_before, force_now, force_after = (
-        force_at(lead_time - _DIFFERENCE_STEP),
-        force_at(lead_time),
-        force_at(lead_time + _DIFFERENCE_STEP),
-    )
+    force_before = force_at(lead_time - _DIFFERENCE_STEP)
+    force_now = force_at(lead_time)
+    force_after = force_at(lead_time + _DIFFERENCE_STEP)
     return torch.cat(
         (
             force_now,
@@ -483,13 +478,16 @@ def sample_filtered_course(config: ReferenceFilterConfig, dt: float) -> PoseDeri
     give each interval at once.
     """
     reference_filter = config.build(dt)
-    matrix, steps_per_waypoint = reference_filter.advance[0], reference_filter.steps_per_waypoint
+    matrix = reference_filter.advance[0]
+    steps_per_waypoint = reference_filter.steps_per_waypoint
     powers = torch.eye(3, dtype=torch.float64).expand(1, 3, 3, 3)
     step_power = matrix
     while len(powers) <= steps_per_waypoint:
         powers = torch.cat((powers, powers @ step_power))
         step_power = step_power @ step_power
-    memory, memory_parts, targets = torch.zeros(9, dtype=torch.float64), [], []
+    memory = torch.zeros(9, dtype=torch.float64)
+    memory_parts = []
+    targets = []
     for target in reference_filter.waypoints[0]:
         error = torch.stack(
             (

@@ -37,7 +37,8 @@ if TYPE_CHECKING:
         | DepthStepFamily
     )
 else:
-    _OPEN, _CLOSED = "residnet.manoeuvres.open_loop", "residnet.manoeuvres.closed_loop"
+    _OPEN = "residnet.manoeuvres.open_loop"
+    _CLOSED = "residnet.manoeuvres.closed_loop"
     ManoeuvreConfig = Annotated[
         Any,
         PluginUnion(

@@ -63,7 +63,8 @@ class PlantActuators(Actuators):
     def __init__(self, plant: Plant, dt: float, substeps: int = 1) -> None:
         super().__init__()
         self.plant = plant
-        self.inputs, self.commands = plant.input_names, plant.n_commands
+        self.inputs = plant.input_names
+        self.commands = plant.n_commands
         self.columns = [
             i
             for i, name in enumerate(plant.state_names)
@@ -120,7 +121,8 @@ class InputShare(Config):
             ConfigError: where a value has a wrong unit, or nothing moves the input.
         """
         unit = CHANNEL_UNITS.get(name, "-")
-        value, rate = Quantity(unit), Quantity(_RATES[unit]) if unit in _RATES else None
+        value = Quantity(unit)
+        rate = Quantity(_RATES[unit]) if unit in _RATES else None
         fastest = float("inf")
         try:
             drive, steer, centre = map(value.convert, (self.drive, self.steer, self.centre))
@@ -154,7 +156,8 @@ class GivenActuators(Actuators):
         self, shares: Mapping[str, InputShare], exogenous: tuple[str, ...], dt: float
     ) -> None:
         super().__init__()
-        self.inputs, self.commands = (*map(commanded, shares), *exogenous), len(shares)
+        self.inputs = (*map(commanded, shares), *exogenous)
+        self.commands = len(shares)
         rows = [share.numbers(name) for name, share in shares.items()]
         table = torch.tensor(rows, dtype=torch.float64)
         self.shares = table[:, :2].T.contiguous()
@@ -214,8 +217,11 @@ class ActuatedDynamics(Dynamics):
         actuators: Actuators,
     ) -> None:
         super().__init__(model.dt, model.integrator)
-        self.model, self.actuators = model, actuators
-        self.n_state, self.dof, self.has_roll = model.n_state, model.dof, model.has_roll
+        self.model = model
+        self.actuators = actuators
+        self.n_state = model.n_state
+        self.dof = model.dof
+        self.has_roll = model.has_roll
         self.hull = get_dof(model.signals.names).state_names
         self.state = (*self.hull, *actuators.state)
         self.mean = hold == "mean"

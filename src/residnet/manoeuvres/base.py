@@ -202,7 +202,8 @@ class StackedSource(Source):
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the inputs [B, m], each block of rows from its source."""
-        inputs, memories = [], []
+        inputs = []
+        memories = []
         for source, xs, ws, ms in zip(
             self.sources,
             x.split(self.row_counts),

@@ -30,7 +30,8 @@ from residnet.manoeuvres.base import (
     sample_uniform,
 )
 
-_FULL_RUDDER_DEG, _ANGLE_TOLERANCE = 34.9, 0.05
+_FULL_RUDDER_DEG = 34.9
+_ANGLE_TOLERANCE = 0.05
 """Rudder in deg from which IMO's limits of a turning circle hold (35 deg or as much as it goes),
 and the share by which a zigzag may differ from 10/10 or 20/20."""
 
@@ -154,7 +155,8 @@ class ZigzagFamily(SteeringFamily):
 
     def sample_one(self, generator: np.random.Generator, duration: float) -> Manoeuvre:
         heading = float(generator.choice(self.heading))
-        steer, drive = sample_uniform(generator, self.steer), sample_uniform(generator, self.drive)
+        steer = sample_uniform(generator, self.steer)
+        drive = sample_uniform(generator, self.drive)
         first_side: Literal["starboard", "port"] = (
             "starboard" if generator.random() < 0.5 else "port"
         )
@@ -260,7 +262,8 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Hold the helm until the heading has changed, then amidships until the turn is steady."""
-        origin, phase = memory[:, 0], memory[:, 1]
+        origin = memory[:, 0]
+        phase = memory[:, 1]
         steadiness = update_steadiness(motion["r"], parameters, memory[:, 2:])
         is_steering = time >= parameters["start"]
         origin = torch.where(is_steering, origin, motion["psi"])
@@ -297,10 +300,8 @@ class TurningCircleFamily(SteeringFamily):
 
     def sample_one(self, generator: np.random.Generator, duration: float) -> Manoeuvre:
         turn_sign = 1.0 if generator.random() < 0.5 else -1.0
-        steer, drive = (
-            turn_sign * sample_uniform(generator, self.steer),
-            sample_uniform(generator, self.drive),
-        )
+        steer = turn_sign * sample_uniform(generator, self.steer)
+        drive = sample_uniform(generator, self.drive)
         return TurningCircle(steer=steer, drive=drive, start=self.start, until=self.until)
 
 
@@ -493,7 +494,8 @@ class DivingFamily(ManoeuvreFamily, ABC):
     def sample_common(self, generator: np.random.Generator) -> dict[str, Any]:
         """Return drive and start, and the dive to either side."""
         dive_sign = 1.0 if generator.random() < 0.5 else -1.0
-        drive, dive = sample_uniform(generator, self.drive), sample_uniform(generator, self.dive)
+        drive = sample_uniform(generator, self.drive)
+        dive = sample_uniform(generator, self.dive)
         return {"drive": drive, "dive": dive_sign * dive, "start": self.start}
 
 

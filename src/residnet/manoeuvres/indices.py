@@ -209,7 +209,8 @@ def turning(
         track.t <= (track.end_time if steady_end is None else steady_end)
     )
     if is_steady.any():
-        speed, rate = float(track.speed[is_steady].mean()), float(np.abs(track.r[is_steady].mean()))
+        speed = float(track.speed[is_steady].mean())
+        rate = float(np.abs(track.r[is_steady].mean()))
         drift = np.arctan2(-turn_sign * track.v[is_steady], track.u[is_steady])
         indices |= {
             "steady_diameter": 2 * speed / rate,
@@ -247,7 +248,8 @@ def zigzag_indices(
     origin = float(track.heading[0])
     reversals: list[float] = []
     overshoots: list[tuple[float, float]] = []
-    current_time, current_sign = start, turn_sign
+    current_time = start
+    current_sign = turn_sign
     while (
         reversal := track.first_heading_crossing(
             origin + current_sign * heading, current_time, current_sign
@@ -260,7 +262,8 @@ def zigzag_indices(
         if return_time is not None:
             time, value = track.heading_peak(reversal, return_time, current_sign)
             overshoots.append((time, value - current_sign * origin - heading))
-        current_time, current_sign = reversal, -current_sign
+        current_time = reversal
+        current_sign = -current_sign
     indices: dict[str, Any] = {
         "approach_speed": track.approach_speed(start),
         "largest_yaw_rate": float(np.abs(track.r[track.t >= start]).max()),
@@ -340,7 +343,8 @@ def stopping_limits(length: float) -> dict[str, float]:
     return {"track_reach": 15.0 * length}
 
 
-_MOVING_RATE_SHARE, _SIDE_ANGLE_SHARE = 0.1, 0.5
+_MOVING_RATE_SHARE = 0.1
+_SIDE_ANGLE_SHARE = 0.5
 """Share of the largest rudder rate from which the rudder moves, and share of the angle held from
 which it is on a side."""
 
@@ -377,9 +381,11 @@ def identify_zigzag(log: Log, rudder: str) -> SteeredZigzag:
     Raises:
         DataError: where the rudder does not change sides with the heading at least twice.
     """
-    delta, psi = log[rudder], log["psi"] - log["psi"][0]
+    delta = log[rudder]
+    psi = log["psi"] - log["psi"][0]
     lower, upper = (float(level) for level in np.quantile(delta, (0.05, 0.95)))
-    mid_angle, angle = 0.5 * (lower + upper), 0.5 * (upper - lower)
+    mid_angle = 0.5 * (lower + upper)
+    angle = 0.5 * (upper - lower)
     rate = np.abs(np.gradient(delta, log.t))
     is_moving = rate > _MOVING_RATE_SHARE * rate.max()
     # -1, 0 or +1: the side that the rudder is held on, 0 between them

@@ -107,10 +107,8 @@ class AccelerationDecelerationFamily(ManoeuvreFamily):
 
     def sample_one(self, generator: np.random.Generator, duration: float) -> Manoeuvre:
         level_index = np.arange(int(duration / self.hold[0]) + 2)
-        high_level, low_level = (
-            sample_uniform(generator, self.high),
-            sample_uniform(generator, self.low),
-        )
+        high_level = sample_uniform(generator, self.high)
+        low_level = sample_uniform(generator, self.low)
         hold_times = generator.uniform(*self.hold, size=level_index.size)
         times = np.concatenate(([0.0], np.cumsum(hold_times)[:-1]))
         peaks = high_level * np.array([1.0, 0.75, 0.5])[(level_index // 2) % 3]
@@ -274,7 +272,9 @@ class RandomSteps(Excitation):
 
     def _demand_wave(self, t: Tensor, wave_index: int) -> Tensor:
         generator = np.random.default_rng([self.seed, wave_index])
-        duration, times, levels = float(t[-1]), [0.0], [generator.uniform(-1.0, 1.0)]
+        duration = float(t[-1])
+        times = [0.0]
+        levels = [generator.uniform(-1.0, 1.0)]
         while times[-1] <= duration:
             times.append(times[-1] + 0.5 / generator.uniform(*self.band))
             levels.append(generator.uniform(-1.0, 1.0))
@@ -307,12 +307,14 @@ class MultiSine(Excitation):
             0.0, 10.0 / self.band[0], min(0.05 / self.band[1], 0.005 / self.band[0])
         )
         angle = 2.0 * math.pi * trial_times[:, None] * frequencies
-        best_phases, lowest_peak = np.zeros(self.tones), math.inf
+        best_phases = np.zeros(self.tones)
+        lowest_peak = math.inf
         for _ in range(20):
             phases = generator.uniform(0.0, 2.0 * math.pi, self.tones)
             peak = float(np.abs(np.sin(angle + phases).sum(axis=1)).max())
             if peak < lowest_peak:
-                best_phases, lowest_peak = phases, peak
+                best_phases = phases
+                lowest_peak = peak
         frequency_tensor, phase_tensor = (
             torch.from_numpy(part).to(t.dtype) for part in (frequencies, best_phases)
         )

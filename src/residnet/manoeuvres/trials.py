@@ -324,7 +324,8 @@ class SensorsConfig(Config):
                 raise ValueError(f"sensors: no channel '{name}'{suggest_name(name, CHANNEL_UNITS)}")
             unit = Quantity(CHANNEL_UNITS[name])
             try:
-                noise, bias = unit.convert(sensor.noise), unit.convert(sensor.bias)
+                noise = unit.convert(sensor.noise)
+                bias = unit.convert(sensor.bias)
             except ValueError as error:
                 raise ValueError(f"sensors.{name}: {error}") from None
             if noise < 0:
@@ -556,7 +557,8 @@ def simulate_manoeuvres(
             "seed": environment.seed,
         }
         if not is_finite.all():
-            n_valid_steps, log_metadata["diverged"] = int(np.argmin(is_finite)), True
+            n_valid_steps = int(np.argmin(is_finite))
+            log_metadata["diverged"] = True
         elif manoeuvre.end_condition is not None and not has_reached_goal:
             log_metadata["timed_out"] = True
         if n_valid_steps < 2:
@@ -717,10 +719,8 @@ def make_dummy_logs(config: SimulatedTrials) -> list[Log]:
         UsageError: where the vessel lacks what a manoeuvre needs.
     """
     plant = load_vessel(config.vessel).build()
-    vessel, environment = (
-        build_trial_vessel(config),
-        TrialEnvironment(plant, config.disturbance, config.noise, config.seed),
-    )
+    vessel = build_trial_vessel(config)
+    environment = TrialEnvironment(plant, config.disturbance, config.noise, config.seed)
     manoeuvres = config.draw_manoeuvres()
     make_manoeuvre_source(
         manoeuvres, vessel.helm, torch.arange(2, dtype=torch.float64) * config.step

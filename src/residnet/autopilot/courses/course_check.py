@@ -85,7 +85,8 @@ def find_passages(track: Array, buoys: Sequence[BuoyConfig]) -> list[Passage]:
     for distances, buoy in zip(distance, buoys, strict=True):
         first_sample = first_counted_sample(distances, buoy.radius)
         distances[: first_sample if first_sample < len(distances) else 0] = np.inf
-    cumulative_distance, predecessor_tables = distance[0], []
+    cumulative_distance = distance[0]
+    predecessor_tables = []
     sample_index = np.arange(len(track))
     for distances in distance[1:]:
         running_minimum = np.minimum.accumulate(cumulative_distance)

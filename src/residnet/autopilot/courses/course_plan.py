@@ -84,7 +84,8 @@ def _refine_course_turns(
     )
     initial_states = [turn_maker.straight_state] * len(rudder)
     for angle_spacing, trust_radius in _REFINEMENT_SCHEDULE if len(rudder) else ():
-        previous_z, values = solution.z, solution.z * route.units
+        previous_z = solution.z
+        values = solution.z * route.units
         spacing = angle_spacing / (turn_maker.nomoto.gain * np.abs(rudder))
         hold_times = np.maximum(values[2::2], 2.0 * spacing + 0.1 * turn_maker.dt)
         hold_grid = hold_times[:, None] + spacing[:, None] * np.arange(-2, 3)
@@ -251,7 +252,8 @@ def _find_course(
     ):
         report_progress("planning", round_number, 1 + _MAX_CLEARANCE_ROUNDS)
         candidates: list[tuple[RouteProblem, RouteSolution]] = []
-        n_previous_reasons, n_evaluations = len(reasons), 0
+        n_previous_reasons = len(reasons)
+        n_evaluations = 0
         for room_share, radius_multiple, rings in searches:
             if n_evaluations > _MAX_EVALUATIONS:
                 break
@@ -469,7 +471,8 @@ def _outline_of_solution(
     request: CourseRequest, route: Route, z: Array, problem: RouteProblem, sketch: RouteOutline
 ) -> RouteOutline:
     """Return the outline of a fitted route."""
-    lengths, points = z * route.units, route(z).points
+    lengths = z * route.units
+    points = route(z).points
     legs = lengths[1::2].copy()
     passed_on_legs: list[list[int]] = [[] for _ in legs]
     passed_in_turns: list[list[int]] = [[] for _ in sketch.turns]
@@ -501,19 +504,20 @@ def _outline_of_solution(
 def _sample_route(route: Route, z: Array, step: float, extension_length: float) -> Course:
     """Return a route in even steps, with a straight line behind its end."""
     segments = route.to_segments(z)
-    end_point, end_heading = segments[-1][0][-1], float(segments[-1][1][-1])
+    end_point = segments[-1][0][-1]
+    end_heading = float(segments[-1][1][-1])
     track = np.concatenate([part[0] for part in segments])
     last_step = np.diff(track)[np.flatnonzero(np.abs(np.diff(track)) > 1e-9)[-1]]
     extension = np.array([end_point, end_point + extension_length * last_step / abs(last_step)])
     segments.append((extension, np.full(2, end_heading), 0.0))
-    positions, heading, rudder = (
-        np.concatenate([part[0] for part in segments]),
-        np.concatenate([part[1] for part in segments]),
-        np.concatenate([np.full(len(part[0]), part[2]) for part in segments]),
-    )
+    positions = np.concatenate([part[0] for part in segments])
+    heading = np.concatenate([part[1] for part in segments])
+    rudder = np.concatenate([np.full(len(part[0]), part[2]) for part in segments])
     # where parts meet, the rudder of the next one holds
     distinct: NDArray[np.bool_] = np.concatenate((np.abs(np.diff(positions)) > 1e-9, [True]))
-    positions, heading, rudder = positions[distinct], heading[distinct], rudder[distinct]
+    positions = positions[distinct]
+    heading = heading[distinct]
+    rudder = rudder[distinct]
     arc_length = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(positions)))))
     sample_length = step * np.arange(math.floor(arc_length[-1] / step) + 1)
     points = np.stack(

@@ -36,7 +36,8 @@ _PASSING_MARGIN = 0.03
 """Turning radii by which a buoy is farther off on the rest of the course than in its turn."""
 _ABEAM_SINE = 0.3
 """Sine of the angle from ahead or astern below which a buoy is not yet on a side."""
-_OTHER_PART_RANGE, _OWN_PART_RANGE = 2.0, 0.7
+_OTHER_PART_RANGE = 2.0
+_OWN_PART_RANGE = 0.7
 """Turning radii from a circle within which other parts of the course, and the buoy's own turn, are
 kept an eye on.
 """
@@ -75,11 +76,10 @@ class LinearizedProblem(NamedTuple):
         """Return the best step within bounds where all is linear, and the merit it promises."""
         # what cannot become negative within the bounds is left out
         is_active = self.constraints < np.abs(self.constraint_jacobian) @ np.maximum(-lower, upper)
-        jacobian_rows, constraint_values = (
-            self.constraint_jacobian[is_active],
-            self.constraints[is_active],
-        )
-        n_variables, count = len(lower), len(constraint_values)
+        jacobian_rows = self.constraint_jacobian[is_active]
+        constraint_values = self.constraints[is_active]
+        n_variables = len(lower)
+        count = len(constraint_values)
         # its types know no sparse arrays
         solve_program: Any = linprog
         solution = solve_program(
@@ -144,12 +144,10 @@ class RouteProblem:
         is_heading_free: bool,
         max_offset: float = 0.0,
     ) -> None:
-        self.route, self.circles, self.is_heading_free, self.max_offset = (
-            route,
-            circles,
-            is_heading_free,
-            max_offset,
-        )
+        self.route = route
+        self.circles = circles
+        self.is_heading_free = is_heading_free
+        self.max_offset = max_offset
         self.buoy_positions = np.array([circle.centre for circle in circles])
         self.passing_sides = np.array([circle.turn_sign for circle in circles])
         self.length_unit = route.turns.min_radius
@@ -157,7 +155,8 @@ class RouteProblem:
         self.window_edges = np.concatenate(([0], window_boundaries, [-1]))
         self.other_parts: list[tuple[int, int, slice]] = []
         self.passing_margins = [self._passing_margin(circle) for circle in circles]
-        self.soft_penalty, self.n_evaluations = _SOFT_PENALTY, 0
+        self.soft_penalty = _SOFT_PENALTY
+        self.n_evaluations = 0
         self.cached_linearization: tuple[Array, LinearizedProblem] | None = None
         self.trust_region: tuple[Array, float] | None = None
 
@@ -167,7 +166,8 @@ class RouteProblem:
         problem = RouteProblem(
             route, self.circles, passing_indices, self.is_heading_free, self.max_offset
         )
-        problem.window_edges, problem.soft_penalty = self.window_edges, self.soft_penalty
+        problem.window_edges = self.window_edges
+        problem.soft_penalty = self.soft_penalty
         return problem
 
     def _passing_margin(self, circle: Circle) -> float:
@@ -185,7 +185,8 @@ class RouteProblem:
     def select_constraints(self, z: Array) -> None:
         """Choose which pieces of the course must keep clear of which buoys."""
         geometry = self.route(z)
-        points, self.other_parts = geometry.points, []
+        points = geometry.points
+        self.other_parts = []
         # of a whole turn about a buoy, the nearest point jumps from its beginning to its end
         count = len(points)
         part_boundaries = {0, count - 1, *range(LEG, count, LEG + POINTS)}
@@ -210,10 +211,8 @@ class RouteProblem:
         for j, circle in enumerate(self.circles):
             if circle.turn_sign == 0:
                 continue
-            first_counted, distance = (
-                self._first_counted_point(points, circle),
-                np.abs(points - circle.centre),
-            )
+            first_counted = self._first_counted_point(points, circle)
+            distance = np.abs(points - circle.centre)
             self.other_parts += [
                 (j, i, turn_part)
                 for i, turn_part in turn_parts
@@ -235,7 +234,8 @@ class RouteProblem:
 
     def _constrained_parts(self, points: np.ndarray) -> list[tuple[int, slice]]:
         """Return the circles and the parts of the course that keep to them: own turns first."""
-        count, last = len(points), len(self.circles) - 1
+        count = len(points)
+        last = len(self.circles) - 1
         first_counted = [self._first_counted_point(points, circle) for circle in self.circles]
         constrained_parts: list[tuple[int, slice]] = []
         for j, circle in enumerate(self.circles):
@@ -268,15 +268,11 @@ class RouteProblem:
                 for j, index_range in constrained_parts
             ]
         )
-        fraction_at_edge, distance, offsets = (
-            edge_fraction[buoy_index, edge_index][:, None],
-            distances[buoy_index, edge_index],
-            offsets[buoy_index, edge_index],
-        )
-        start_jacobian, end_jacobian = (
-            geometry.point_jacobian(edge_index),
-            geometry.point_jacobian(edge_index + 1),
-        )
+        fraction_at_edge = edge_fraction[buoy_index, edge_index][:, None]
+        distance = distances[buoy_index, edge_index]
+        offsets = offsets[buoy_index, edge_index]
+        start_jacobian = geometry.point_jacobian(edge_index)
+        end_jacobian = geometry.point_jacobian(edge_index + 1)
         point_jacobian = (1.0 - fraction_at_edge) * start_jacobian + fraction_at_edge * end_jacobian
         unit_offset = offsets / np.maximum(distance, 1e-9)
         distance_jacobian = -(point_jacobian * unit_offset.conj()[:, None]).real
@@ -312,11 +308,13 @@ class RouteProblem:
             return self.cached_linearization[1]
         geometry = self.route(z)
         self.n_evaluations += 1
-        last_circle, n_circles = self.circles[-1], len(self.circles)
+        last_circle = self.circles[-1]
+        n_circles = len(self.circles)
         constraints: list[tuple[int, float, Array]] = []
         nearest_points = self._nearest_points(geometry, self._constrained_parts(geometry.points))
         # on the wrong side, distances are negative
-        is_entered, side_column = self.passing_sides == 0, self.passing_sides[:, None]
+        is_entered = self.passing_sides == 0
+        side_column = self.passing_sides[:, None]
         passing_distance = np.where(
             is_entered,
             nearest_points.distance[:n_circles],
@@ -434,7 +432,8 @@ class RouteProblem:
         holds. What is asked may be missed by a step, so that there always is one. Where the problem
         bends too much for a step, it is corrected once for what that step has missed.
         """
-        trust_radius, (lower, upper) = _TRUST_RADII[1], self.bounds()
+        trust_radius = _TRUST_RADII[1]
+        (lower, upper) = self.bounds()
         self.refresh_constraints(z)
         linearized = self.linearize(z)
 
@@ -469,7 +468,8 @@ class RouteProblem:
                     candidate_z, candidate, actual_gain = corrected_step
             step_size = float(np.abs(candidate_z - z).max())
             if actual_gain > _GAIN_RATIOS[0] * predicted_gain:
-                z, linearized = candidate_z, candidate
+                z = candidate_z
+                linearized = candidate
             if actual_gain < _GAIN_RATIOS[1] * predicted_gain:
                 trust_radius = 0.4 * min(trust_radius, step_size)
             elif actual_gain > _GAIN_RATIOS[2] * predicted_gain:

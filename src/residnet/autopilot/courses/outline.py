@@ -83,21 +83,18 @@ def find_paths(
         last_centre = target_positions + 1j * last_side * turn_room.radius * np.exp(
             1j * target_headings
         )
-        centre_distance, bearing = (
-            np.abs(last_centre - first_centre),
-            np.angle(last_centre - first_centre),
-        )
+        centre_distance = np.abs(last_centre - first_centre)
+        bearing = np.angle(last_centre - first_centre)
         if first_side == last_side:
-            straight_length, heading = centre_distance, bearing
+            straight_length = centre_distance
+            heading = bearing
         else:
             straight_length = np.sqrt(
                 np.maximum(centre_distance**2 - 4.0 * turn_room.radius**2, 0.0)
             )
             heading = bearing + first_side * np.arctan2(2.0 * turn_room.radius, straight_length)
-        first_angle, last_angle = (
-            _turn_angles(first_side, headings, heading),
-            _turn_angles(last_side, heading, target_headings),
-        )
+        first_angle = _turn_angles(first_side, headings, heading)
+        last_angle = _turn_angles(last_side, heading, target_headings)
         required_length = turn_room.lead_out * np.minimum(
             first_angle / _FULL_ROOM_ANGLE, 1.0
         ) + turn_room.lead_in * np.minimum(last_angle / _FULL_ROOM_ANGLE, 1.0)
@@ -227,7 +224,9 @@ class _Poses:
     """
 
     def __init__(self, positions: np.ndarray, headings: Array, buoy: int | None) -> None:
-        self.positions, self.headings, self.buoy = positions, headings, buoy
+        self.positions = positions
+        self.headings = headings
+        self.buoy = buoy
         n_poses = len(positions)
         self.cost = np.full(n_poses, np.inf)
         self.predecessors: list[tuple[_Poses, NDArray[np.intp]] | None] = [None] * n_poses
@@ -235,7 +234,9 @@ class _Poses:
         """Group, pose in it, and kind of path that each pose is reached by."""
         self.sources: list[_Poses] = []
         self.arc: slice | None = None
-        self.turn_sign, self.table, self.arc_radius = 0, 0, 0.0
+        self.turn_sign = 0
+        self.table = 0
+        self.arc_radius = 0.0
         # where an arc is left to, the pose where it was joined
         self.arc_entry = np.arange(n_poses)
         self.departure_cost = self.cost
@@ -243,7 +244,9 @@ class _Poses:
     def with_arc(self, turn_sign: int, table: int, arc_radius: float) -> _Poses:
         """Mark the last poses as those of an arc about the buoy."""
         self.arc = slice(len(self.positions) - _ANGLES, len(self.positions))
-        self.turn_sign, self.table, self.arc_radius = turn_sign, table, arc_radius
+        self.turn_sign = turn_sign
+        self.table = table
+        self.arc_radius = arc_radius
         return self
 
     def update_departure_cost(self) -> None:
@@ -294,13 +297,13 @@ class RouteSearch:
         turning_radius: float,
         ring_offsets: Sequence[float] = RINGS,
     ) -> None:
-        self.start, self.heading, self.circles = start, heading, circles
-        self.turn_room, self.turn_rooms, self.turning_radius, self.ring_offsets = (
-            turn_room,
-            turn_rooms,
-            turning_radius,
-            ring_offsets,
-        )
+        self.start = start
+        self.heading = heading
+        self.circles = circles
+        self.turn_room = turn_room
+        self.turn_rooms = turn_rooms
+        self.turning_radius = turning_radius
+        self.ring_offsets = ring_offsets
         self.passed_circles = [circle for circle in circles if circle.turn_sign != 0]
         self.centres = np.array([circle.centre for circle in self.passed_circles])
         self.radii = (
@@ -466,10 +469,8 @@ class RouteSearch:
     ) -> tuple[Array, NDArray[np.intp]]:
         """Return the cost [M] of the cheapest path to each pose that is clear, and its number."""
         flat_cost = cost.reshape(-1, cost.shape[-1])
-        best, path_number = (
-            np.full(flat_cost.shape[1], np.inf),
-            np.zeros(flat_cost.shape[1], dtype=np.intp),
-        )
+        best = np.full(flat_cost.shape[1], np.inf)
+        path_number = np.zeros(flat_cost.shape[1], dtype=np.intp)
         if not len(radii):
             path_number = flat_cost.argmin(axis=0)
             return flat_cost[path_number, np.arange(flat_cost.shape[1])], path_number
@@ -477,9 +478,11 @@ class RouteSearch:
         n_candidates = min(_MAX_CANDIDATE_PATHS, len(flat_cost) - 1)
         order = np.argpartition(flat_cost, n_candidates, axis=0)[: n_candidates + 1]
         column_grid = np.broadcast_to(np.arange(flat_cost.shape[1]), order.shape)
-        rows, columns = order.ravel(), column_grid.ravel()
+        rows = order.ravel()
+        columns = column_grid.ravel()
         finite = np.isfinite(flat_cost[rows, columns])
-        rows, columns = rows[finite], columns[finite]
+        rows = rows[finite]
+        columns = columns[finite]
         path_types, source_poses = np.divmod(rows, n_sources)
         selected_paths = TurnPaths(
             *(value.reshape(-1, flat_cost.shape[1])[rows, columns] for value in candidate_paths)
@@ -495,13 +498,12 @@ class RouteSearch:
             self.centres,
             radii,
         )
-        rows, columns = rows[is_clear], columns[is_clear]
+        rows = rows[is_clear]
+        columns = columns[is_clear]
         values = flat_cost[rows, columns]
         cost_order = np.argsort(-values, kind="stable")
-        best[columns[cost_order]], path_number[columns[cost_order]] = (
-            values[cost_order],
-            rows[cost_order],
-        )
+        best[columns[cost_order]] = values[cost_order]
+        path_number[columns[cost_order]] = rows[cost_order]
         return best, path_number
 
     def _trace_outline(self, last_poses: _Poses) -> RouteOutline:
@@ -556,7 +558,9 @@ class RouteSearch:
             turn_specs.insert(0, TurnSpec(first_side, float(path.first_angle[path_type]), 0))
             legs.insert(0, self.turn_room.lead_in)
             passed_buoys.insert(0, ())
-            group, pose, is_last_group = source, source_pose, False
+            group = source
+            pose = source_pose
+            is_last_group = False
         return RouteOutline(
             float(group.headings[pose]), tuple(legs), tuple(turn_specs), tuple(passed_buoys)
         )

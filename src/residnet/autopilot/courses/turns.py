@@ -87,7 +87,9 @@ class TurnMaker:
     """
 
     def __init__(self, vessel: SteeredVessel, nomoto: NomotoModel, dt: float) -> None:
-        self.vessel, self.nomoto, self.dt = vessel, nomoto, dt
+        self.vessel = vessel
+        self.nomoto = nomoto
+        self.dt = dt
         self.pose_columns = (
             vessel.state_column("x"),
             vessel.state_column("y"),
@@ -154,14 +156,17 @@ class TurnMaker:
         w = self.nominal_inputs.unsqueeze(1).repeat(len(x), 1, 1)
         w[:, 0, 0] = torch.from_numpy(rudder)
         nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(len(x), -1)
-        times, state_parts = [np.zeros(1)], [torch.from_numpy(x).unsqueeze(1)]
-        step_plan, remaining_time = [], max(duration, 3.0 * self.dt)
+        times = [np.zeros(1)]
+        state_parts = [torch.from_numpy(x).unsqueeze(1)]
+        step_plan = []
+        remaining_time = max(duration, 3.0 * self.dt)
         if self.vessel.rate is not None:
             rudder_travel_time = rudder_change / self.vessel.rate
             # the rudder moves between steps, and lags behind by half of one
             short_step = min(self.dt, 4.0 * _STEP_TOLERANCE / (self.nomoto.gain * rudder_change))
             count = math.ceil(min(1.1 * rudder_travel_time, remaining_time) / short_step)
-            step_plan, remaining_time = [(short_step, count)], remaining_time - count * short_step
+            step_plan = [(short_step, count)]
+            remaining_time = remaining_time - count * short_step
         for dt, count in (
             [*step_plan, (self.dt, math.ceil(remaining_time / self.dt))]
             if remaining_time > 0
@@ -184,7 +189,8 @@ class TurnMaker:
 
         The end where it does not.
         """
-        column, stop_times = self.vessel.state_column("r"), []
+        column = self.vessel.state_column("r")
+        stop_times = []
         for row, initial_yaw_rate in enumerate(turn_signs * countered.c[-1, 0, :, column]):
             yaw = PPoly(countered.c[:, :, row, column], countered.x)
             roots = yaw.roots(extrapolate=False) if initial_yaw_rate > 0 else np.zeros(1)
@@ -214,7 +220,8 @@ def choose_time_step(vessel: SteeredVessel, nomoto: NomotoModel, rudder: float) 
     """
     hold_times = nomoto.time * np.array([[0.5, 1.5, 3.0]])
     radius = nomoto.speed / (nomoto.gain * rudder)
-    dt, previous_ends = _STEP_SEARCH[0] * nomoto.time, None
+    dt = _STEP_SEARCH[0] * nomoto.time
+    previous_ends = None
     for _ in range(_STEP_SEARCH[1]):
         turn_maker = TurnMaker(vessel, nomoto, dt)
         (turns,) = turn_maker(
@@ -230,7 +237,8 @@ def choose_time_step(vessel: SteeredVessel, nomoto: NomotoModel, rudder: float) 
             and np.abs(current_ends - previous_ends).max() < _STEP_TOLERANCE
         ):
             return 2.0 * dt
-        previous_ends, dt = current_ends, 0.5 * dt
+        previous_ends = current_ends
+        dt = 0.5 * dt
     return 2.0 * dt
 
 
@@ -321,15 +329,15 @@ class TurnTable:
         leg: CubicSpline | None = None,
     ) -> None:
         rows = np.concatenate((points.real, points.imag, headings, times[:, None]), axis=1)
-        self.rudder, self.max_hold_time = rudder, float(hold_times[-1])
-        self.leg, self.leg_derivative = leg, None if leg is None else leg.derivative()
+        self.rudder = rudder
+        self.max_hold_time = float(hold_times[-1])
+        self.leg = leg
+        self.leg_derivative = None if leg is None else leg.derivative()
         self.spline = CubicSpline(hold_times, rows)
         self.spline_derivative = self.spline.derivative()
-        self.angles, self.hold_times, self.end_positions = (
-            headings[:, -1],
-            hold_times,
-            points[:, -1],
-        )
+        self.angles = headings[:, -1]
+        self.hold_times = hold_times
+        self.end_positions = points[:, -1]
 
     def __call__(self, hold_time: float) -> tuple[np.ndarray, Array, float]:
         """Return the points [POINTS], headings [POINTS] and the time of a turn."""
@@ -345,7 +353,8 @@ class TurnTable:
                 np.ones_like(straight_points), zero_angles, zero_angles
             )
         clipped_lengths = np.minimum(lengths, self.leg.x[-1])
-        leg_rows, leg_slopes = self.leg(clipped_lengths), self.leg_derivative(clipped_lengths)
+        leg_rows = self.leg(clipped_lengths)
+        leg_slopes = self.leg_derivative(clipped_lengths)
         final_direction = np.exp(1j * leg_rows[..., 2])
         is_tabulated = lengths <= self.leg.x[-1]
         positions = (
@@ -370,10 +379,8 @@ class TurnTable:
         Together they lead where the turns lead, by least squares over their angles.
         """
         is_usable = (self.angles > math.radians(20.0)) & (self.angles < math.radians(300.0))
-        turn_rotation, usable_ends = (
-            np.exp(1j * self.angles[is_usable]),
-            self.end_positions[is_usable],
-        )
+        turn_rotation = np.exp(1j * self.angles[is_usable])
+        usable_ends = self.end_positions[is_usable]
         columns = np.stack(
             (1j * (1.0 - turn_rotation), np.ones_like(turn_rotation), turn_rotation), axis=1
         )
@@ -484,7 +491,8 @@ def simulate_turns(turn_maker: TurnMaker, rudder: Array, radius: float) -> TurnT
         hold_grid[:, 1:], rudder, [turn_maker.straight_state] * len(rudder), settling_time
     )
     share = np.linspace(0.0, 1.0, POINTS + 1)[1:]
-    tables, residual_motion = [], 0.0
+    tables = []
+    residual_motion = 0.0
     for angle, table_holds, group in zip(rudder, hold_grid, simulated, strict=True):
         points, headings, times = _sample_turns(group)
         for k, turn in enumerate(group):
@@ -533,7 +541,8 @@ def simulate_following_turns(
     """
     settling_time = 2.0 * _SETTLING_TIME * turn_maker.nomoto.time
     simulated = turn_maker(hold_grid, rudder, initial_states, settling_time)
-    tables, middles = [], []
+    tables = []
+    middles = []
     for angle, table_holds, group in zip(rudder, hold_grid, simulated, strict=True):
         points, headings, times = _sample_turns(group)
         middle_turn = group[len(group) // 2]
@@ -541,7 +550,8 @@ def simulate_following_turns(
         positions = (track - track[0]) @ (1.0, 1j) * np.exp(-1j * course[0])
         leg = np.stack((positions.real, positions.imag, course - course[0]), axis=-1)
         if angle < 0:
-            points, headings = points.conj(), -headings
+            points = points.conj()
+            headings = -headings
             leg[:, 1:] *= -1.0
         distance = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(positions)))))
         tables.append(
@@ -565,7 +575,8 @@ def state_after_turn(turn: Turn, length: float) -> Array:
 def _sample_turns(group: Sequence[Turn]) -> tuple[np.ndarray, Array, Array]:
     """Return points [K, POINTS], headings [K, POINTS] and times [K] of turns, even in time."""
     share = np.linspace(0.0, 1.0, POINTS + 1)[1:]
-    points, headings = np.zeros((len(group), POINTS), dtype=complex), np.zeros((len(group), POINTS))
+    points = np.zeros((len(group), POINTS), dtype=complex)
+    headings = np.zeros((len(group), POINTS))
     for k, turn in enumerate(group):
         track, headings[k] = turn.track_at(share * turn.duration)
         points[k] = track @ (1.0, 1j)
@@ -625,7 +636,8 @@ class RouteOutline:
 
         Bends below `min_angle` rad are left out.
         """
-        sketch, k = self, 0
+        sketch = self
+        k = 0
         while k < len(sketch.turns):
             turn = sketch.turns[k]
             if turn.angle < min_angle:
@@ -654,7 +666,8 @@ class RouteOutline:
 
     def _merge_turns(self, k: int) -> RouteOutline:
         """Return the outline with a bend and the next as one."""
-        first, second = self.turns[k], self.turns[k + 1]
+        first = self.turns[k]
+        second = self.turns[k + 1]
         wider_turn = max(first, second, key=lambda bend: bend.angle)
         merged_turn = replace(
             wider_turn,
@@ -757,7 +770,8 @@ class Route:
     def initial_z(self, sketch: RouteOutline) -> Array:
         """Return the z that an outline stands for; turns need room before and behind them."""
         z = np.zeros(len(self.units))
-        z[0], legs = sketch.heading, np.array(sketch.legs)
+        z[0] = sketch.heading
+        legs = np.array(sketch.legs)
         for k, turn in enumerate(sketch.turns):
             table = self.turns.tables[turn.table]
             _, lead_in, lead_out = table.fitted_arc
@@ -788,7 +802,8 @@ class Route:
         """Return the points [N] at which an outline passes its buoys, in their order."""
         z = self.initial_z(sketch)
         points = self(z).points
-        passing_indices, previous_index = np.zeros(len(buoys), dtype=np.intp), 0
+        passing_indices = np.zeros(len(buoys), dtype=np.intp)
+        previous_index = 0
         point_ranges: list[tuple[int, int, Sequence[int]]] = []
         first_point = 0
         for k, on_leg in enumerate(sketch.passed_on_legs):
@@ -811,12 +826,12 @@ class Route:
     def __call__(self, z: Array) -> RouteGeometry:
         """Return the points of z, the time, and what they change by."""
         z = z * self.units
-        n_variables, n_turns, speed = len(z), len(self.turn_signs), self.turns.speed
-        signs, first_heading, first_length = (
-            np.array(self.turn_signs, dtype=float),
-            float(z[0]),
-            float(z[1]),
-        )
+        n_variables = len(z)
+        n_turns = len(self.turn_signs)
+        speed = self.turns.speed
+        signs = np.array(self.turn_signs, dtype=float)
+        first_heading = float(z[0])
+        first_length = float(z[1])
         shares = np.linspace(0.0, 1.0, LEG + 1)[1:]
         turn_parts, turn_derivatives = self.turns.turns_at(self.table_numbers, z[2::2])
         leg_parts, leg_derivatives = self.turns.legs_after(
@@ -826,12 +841,11 @@ class Route:
             part._replace(points=_mirror_to_side(part.points, signs))
             for part in (turn_parts, turn_derivatives, leg_parts, leg_derivatives)
         )
-        turn_angles, leg_angles = signs * turn_parts.headings, signs * leg_parts.headings
+        turn_angles = signs * turn_parts.headings
+        leg_angles = signs * leg_parts.headings
         headings = first_heading + np.concatenate(([0.0], np.cumsum(turn_angles + leg_angles)))
-        leg_directions, exit_directions = (
-            np.exp(1j * headings),
-            np.exp(1j * (headings[:-1] + turn_angles)),
-        )
+        leg_directions = np.exp(1j * headings)
+        exit_directions = np.exp(1j * (headings[:-1] + turn_angles))
         track = leg_directions[:-1, None] * turn_parts.points
         leg = exit_directions[:, None] * leg_parts.points
         first_corner = self.start + first_length * leg_directions[0]
@@ -855,22 +869,22 @@ class Route:
             ),
             axis=1,
         )
-        d_shift, d_rotation, rotation_pivot = (
-            np.zeros(n_variables, complex),
-            np.zeros(n_variables),
-            np.full(n_variables, self.start),
-        )
-        d_rotation[0], d_shift[1], rotation_pivot[1] = 1.0, leg_directions[0], first_corner
-        d_rotation[2::2], d_rotation[3::2] = (
-            signs * turn_derivatives.headings,
-            signs * leg_derivatives.headings,
-        )
+        d_shift = np.zeros(n_variables, complex)
+        d_rotation = np.zeros(n_variables)
+        rotation_pivot = np.full(n_variables, self.start)
+        d_rotation[0] = 1.0
+        d_shift[1] = leg_directions[0]
+        rotation_pivot[1] = first_corner
+        d_rotation[2::2] = signs * turn_derivatives.headings
+        d_rotation[3::2] = signs * leg_derivatives.headings
         d_shift[2::2] = leg_directions[:-1] * turn_derivatives.points[:, -1]
         d_shift[3::2] = exit_directions * leg_derivatives.points[:, -1]
-        rotation_pivot[2::2], rotation_pivot[3::2] = turn_ends, leg_ends
+        rotation_pivot[2::2] = turn_ends
+        rotation_pivot[3::2] = leg_ends
         lengths = np.array([1, LEG, *(POINTS, LEG) * n_turns])
         d_time = np.zeros(n_variables)
-        d_time[1::2], d_time[2::2] = 1.0 / speed, turn_derivatives.times
+        d_time[1::2] = 1.0 / speed
+        d_time[2::2] = turn_derivatives.times
         return RouteGeometry(
             points,
             float(z[1::2].sum()) / speed + float(turn_parts.times.sum()),
@@ -889,7 +903,8 @@ class Route:
     def to_segments(self, z: Array) -> list[tuple[np.ndarray, Array, float]]:
         """Return the parts of a route: points [K] complex, vessel's headings [K], and rudder."""
         z = z * self.units
-        heading_offset, position = float(z[0]), self.start
+        heading_offset = float(z[0])
+        position = self.start
         direction = cmath.exp(1j * heading_offset)
         segments = [
             (
@@ -902,29 +917,23 @@ class Route:
         for k, (turn_sign, number) in enumerate(
             zip(self.turn_signs, self.table_numbers, strict=True)
         ):
-            hold_time, leg_length, table = (
-                float(z[2 + 2 * k]),
-                float(z[3 + 2 * k]),
-                self.turns.tables[number],
-            )
+            hold_time = float(z[2 + 2 * k])
+            leg_length = float(z[3 + 2 * k])
+            table = self.turns.tables[number]
             track, heading, duration = table(hold_time)
             share = min(hold_time / duration, 1.0) if duration > 0 else 1.0
             switch_index = min(
                 max(round(share * _OVERSAMPLING * POINTS), 1), _OVERSAMPLING * POINTS
             )
-            track, heading = (
-                np.concatenate(([0.0], track if turn_sign > 0 else track.conj())),
-                np.concatenate(([0.0], turn_sign * heading)),
-            )
+            track = np.concatenate(([0.0], track if turn_sign > 0 else track.conj()))
+            heading = np.concatenate(([0.0], turn_sign * heading))
             uniform_grid = np.linspace(0.0, 1.0, POINTS + 1)
             track_spline = CubicSpline(
                 uniform_grid, np.stack((track.real, track.imag, heading.real), axis=-1)
             )
             fine_track = track_spline(np.linspace(0.0, 1.0, _OVERSAMPLING * POINTS + 1))
-            points, heading = (
-                position + direction * (fine_track[:, 0] + 1j * fine_track[:, 1]),
-                fine_track[:, 2],
-            )
+            points = position + direction * (fine_track[:, 0] + 1j * fine_track[:, 1])
+            heading = fine_track[:, 2]
             segments.append(
                 (
                     points[: switch_index + 1],
@@ -940,7 +949,8 @@ class Route:
                 )
             )
             heading_offset += float(heading[-1])
-            direction, position = cmath.exp(1j * heading_offset), complex(points[-1])
+            direction = cmath.exp(1j * heading_offset)
+            position = complex(points[-1])
             leg_part, _ = table.leg_at(leg_length * np.linspace(0.0, 1.0, 100)[:, None] ** 2)
             leg_points = leg_part.points[:, 0] if turn_sign > 0 else leg_part.points[:, 0].conj()
             segments.append(
@@ -951,5 +961,6 @@ class Route:
                 )
             )
             heading_offset += turn_sign * float(leg_part.headings[-1])
-            direction, position = cmath.exp(1j * heading_offset), complex(segments[-1][0][-1])
+            direction = cmath.exp(1j * heading_offset)
+            position = complex(segments[-1][0][-1])
         return segments

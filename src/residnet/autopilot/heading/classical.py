@@ -29,8 +29,11 @@ class HeadingPD(Policy):
         super().__init__()
         if limit <= 0:
             raise ConfigError(f"heading PD: the limit must be positive, given {limit:g}")
-        self.psi, self.r = state.index("psi"), state.index("r")
-        self.kp, self.kd, self.limit = kp, kd, limit
+        self.psi = state.index("psi")
+        self.r = state.index("r")
+        self.kp = kp
+        self.kd = kd
+        self.limit = limit
 
     @classmethod
     def from_pole_placement(
@@ -95,8 +98,11 @@ class BangBangHeading(Policy):
                 f"bang-bang heading: gain, time, limit and layer must be positive, given {gain:g},"
                 f" {time:g}, {limit:g}, {layer:g}"
             )
-        self.psi, self.r = state.index("psi"), state.index("r")
-        self.time, self.limit, self.boundary_layer = time, limit, layer
+        self.psi = state.index("psi")
+        self.r = state.index("r")
+        self.time = time
+        self.limit = limit
+        self.boundary_layer = layer
         self.max_yaw_rate = gain * limit
         self.capture_angle, self.capture_rate = capture
         self.kp, self.kd = kp, time / (2.0 * gain) if kd is None else kd
@@ -167,14 +173,12 @@ class RatedBangBangHeading(Policy):
                 "bang-bang heading: gain, time, limit, rate, step and layer must be positive"
             )
         self.psi, self.r, self.delta = (state.index(name) for name in ("psi", "r", "delta"))
-        self.gain, self.time, self.limit, self.rate, self.dt, self.boundary_layer = (
-            gain,
-            time,
-            limit,
-            rate,
-            dt,
-            layer,
-        )
+        self.gain = gain
+        self.time = time
+        self.limit = limit
+        self.rate = rate
+        self.dt = dt
+        self.boundary_layer = layer
         self.capture_angle, self.capture_rate = capture
 
     def _ramp_rudder(self, r: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
@@ -215,14 +219,13 @@ class RatedBangBangHeading(Policy):
             s: memory [B, 0].
         """
         error = wrap_angle(reference - x[:, self.psi : self.psi + 1])
-        yaw_rate, rudder_angle = x[:, self.r : self.r + 1], x[:, self.delta : self.delta + 1]
+        yaw_rate = x[:, self.r : self.r + 1]
+        rudder_angle = x[:, self.delta : self.delta + 1]
         # this step goes by as it is: the rudder answers at its end
         steady = self.gain * rudder_angle
         next_yaw_rate = steady + (yaw_rate - steady) * math.exp(-self.dt / self.time)
-        error, yaw_rate = (
-            error - steady * self.dt - self.time * (yaw_rate - next_yaw_rate),
-            next_yaw_rate,
-        )
+        error = error - steady * self.dt - self.time * (yaw_rate - next_yaw_rate)
+        yaw_rate = next_yaw_rate
         # the way that the vessel will have turned once the rudder is amidships
         centred_yaw_rate = self._ramp_rudder(
             yaw_rate, rudder_angle, torch.zeros_like(rudder_angle)
@@ -230,7 +233,8 @@ class RatedBangBangHeading(Policy):
         turn_direction = torch.where(
             centred_yaw_rate.abs() > 1e-9, centred_yaw_rate.sign(), error.sign()
         )
-        r, rudder = turn_direction * yaw_rate, turn_direction * rudder_angle
+        r = turn_direction * yaw_rate
+        rudder = turn_direction * rudder_angle
         lower, upper = torch.zeros_like(r), torch.full_like(r, 20.0 * self.limit)
         for _ in range(_N_BISECTIONS):
             trial_effort = 0.5 * (lower + upper)
@@ -435,8 +439,11 @@ class ProximateTimeOptimalLaw(HeadingLaw):
         constants: list[Tensor],
     ) -> Tensor:
         """Return steepness times the heading that is left once the yaw rate is stopped, [B, 1]."""
-        steepness, share, damping_ratio = constants[0], constants[1], constants[2]
-        predicted_error, predicted_rate = error, r
+        steepness = constants[0]
+        share = constants[1]
+        damping_ratio = constants[2]
+        predicted_error = error
+        predicted_rate = r
         if self.swing_time > 0.0:
             # the rudder answers its own angle with a gain above one, within its rate: a gradient
             # through that would grow from step to step and say nothing of the flight

@@ -51,7 +51,8 @@ class DepthStepConfig(Config):
     noise: Metres = Field(default=0.02, ge=0)
 
 
-_DEPTH_UNIT, _DEGREE = 0.1, math.pi / 180.0
+_DEPTH_UNIT = 0.1
+_DEGREE = math.pi / 180.0
 """What stands for a degree of heading where depths are changed: the default bands' ratio, in m."""
 
 
@@ -205,10 +206,8 @@ class ConditionsConfig(Config):
         )
         if self.waves > 0:
             # drawn last, so that all else is the same with waves and without
-            noise_level, period = (
-                sample_uniform(0.0, share * self.waves),
-                sample_uniform(*self.wave_period),
-            )
+            noise_level = sample_uniform(0.0, share * self.waves)
+            period = sample_uniform(*self.wave_period)
             noise += noise_level[:, None, None] * sample_wave_motion(period, steps, dt, generator)
         return changes
 
@@ -219,7 +218,8 @@ class ConditionsConfig(Config):
 
         `fraction` is the part of all departures from the nominal vessel, as in `sample_steps`.
         """
-        variation, delay = changes.vessel_variation.clone(), changes.delay_steps.clone()
+        variation = changes.vessel_variation.clone()
+        delay = changes.delay_steps.clone()
 
         def sample_end(lower: float, upper: float) -> Tensor:
             return torch.where(torch.rand(rows, generator=generator) < 0.5, lower, upper)
@@ -356,8 +356,10 @@ class NoisyDelayedLoop(Source):
         self, policy: Policy, measured_columns: tuple[int, ...], n_inputs: int, max_delay: int
     ) -> None:
         super().__init__()
-        self.policy, self.measured_columns = policy, list(measured_columns)
-        self.n_inputs, self.max_delay = n_inputs, max_delay
+        self.policy = policy
+        self.measured_columns = list(measured_columns)
+        self.n_inputs = n_inputs
+        self.max_delay = max_delay
 
     def initial(self, x: Tensor) -> Tensor:
         """Return the memory at the start: rudder amidships for as long as commands may take."""
@@ -493,7 +495,9 @@ class ClosedLoopTrajectories:
     def step_metrics(self, conditions: ConditionsConfig) -> dict[str, Tensor]:
         """Return each of `QUANTITIES` by flight, [B]; what is no number is left so."""
         band = (conditions.depth or conditions).band
-        absolute_error, overshoot, travel = self.error.abs(), self.overshoot(), self.rudder_travel()
+        absolute_error = self.error.abs()
+        overshoot = self.overshoot()
+        travel = self.rudder_travel()
         time_outside = (self.counted_mask * absolute_error / (absolute_error + band))[:, :-1].sum(
             1
         ) * self.dt
@@ -525,7 +529,8 @@ def simulate_heading_steps(
         weather: exogenous inputs by name, SI, for all rows or [B].
         wrap_source: what adds to the inputs of the closed loop, for example waves.
     """
-    target, variation = target.double(), variation.double()
+    target = target.double()
+    variation = variation.double()
     x, w = vessel.straight_course(torch.ones_like(target))
     for name, value in (weather or {}).items():
         w[:, vessel.inputs.index(name)] = value
@@ -562,9 +567,13 @@ class ClosedLoopSimulation:
         compiler: Compiler | None = None,
         max_delay: int | None = None,
     ) -> None:
-        self.vessel, self.dtype, self.dt = vessel, dtype, dt
+        self.vessel = vessel
+        self.dtype = dtype
+        self.dt = dt
         self.measured_columns = tuple(map(vessel.state_column, vessel.axis.measured))
-        self.policy, self.compiler, self.max_delay = policy, compiler, max_delay
+        self.policy = policy
+        self.compiler = compiler
+        self.max_delay = max_delay
         self._compiled_rollouts: dict[int, FreeRun] = {}
         self.model = PushedSteering(vessel.model(dt, integrator), len(vessel.inputs))
         self.model.to(dtype).requires_grad_(False)
@@ -592,7 +601,8 @@ class ClosedLoopSimulation:
         self, changes: HeadingStepBatch, states: Tensor, inputs: Tensor
     ) -> ClosedLoopTrajectories:
         """Return what a rollout gave: states [B, T+1, nx] and inputs [B, T, m + 2]."""
-        vessel, target = self.vessel, changes.target
+        vessel = self.vessel
+        target = changes.target
         trajectory_fields = (vessel.state, vessel.axis, changes.step_index, changes.n_counted)
         return ClosedLoopTrajectories(
             states, inputs[:, :, -1], target, changes.dt, *trajectory_fields
@@ -634,7 +644,8 @@ def compile_or_fallback(
     return rollout
 
 
-_SETTLED_TIME_FACTOR, _OBSERVED_TIME_FACTOR = 10.0 / 7.0, 5.0 / 7.0
+_SETTLED_TIME_FACTOR = 10.0 / 7.0
+_OBSERVED_TIME_FACTOR = 5.0 / 7.0
 """Multiples of what the cost counts: after that time a flight without noise is looked at for
 swinging, for that long (with 14 s from 20 s on, for 10 s).
 """
@@ -725,7 +736,8 @@ class LimitCycleTest:
     """
 
     def __init__(self, limits: SteadinessLimits, conditions: ConditionsConfig, seed: int) -> None:
-        self.limits, self.settled_time = limits, settled_time(conditions.duration)
+        self.limits = limits
+        self.settled_time = settled_time(conditions.duration)
         self.conditions = noise_free(conditions)
         generator = torch.Generator().manual_seed(seed)
         sampled_steps = self.conditions.sample_steps(
@@ -747,7 +759,8 @@ class LimitCycleTest:
         """Return how many flights swing, or overshoot on the nominal vessel."""
         trajectories = simulation.simulate(self.changes)
         axis_swing, rudder_swing = trajectories.peak_to_peak(self.settled_time)
-        limits, n_varied = self.limits, self.limits.flights
+        limits = self.limits
+        n_varied = self.limits.flights
         max_swing, max_overshoot, _ = limits.limits_for(trajectories.axis)
         overshoots = trajectories.step_metrics(self.conditions)["overshoot"]
         # what is no number is not within its limit
@@ -909,8 +922,11 @@ class CandidateEvaluation:
         steps: HeadingStepBatch,
         compiler: type[CompiledRollout] | None = None,
     ) -> None:
-        self.config, self.task, self.conditions = config, task, conditions
-        self.steps, self.compiler = steps, compiler
+        self.config = config
+        self.task = task
+        self.conditions = conditions
+        self.steps = steps
+        self.compiler = compiler
         self.compiled_rollout: CompiledRollout | None = None
         self.cached_arguments: dict[
             int, tuple[HeadingStepBatch, tuple[Tensor, Tensor, Tensor]]

@@ -105,7 +105,8 @@ class LinearLaw(AnglePolicy):
         filter_factor = 1.0 - torch.exp(-self.dt / self.lag.clamp(min=1e-6))
         heading = s[:, 1:2] + filter_factor * wrap_angle(x[:, self.psi : self.psi + 1] - s[:, 1:2])
         rate = s[:, 2:3] + filter_factor * (x[:, self.r : self.r + 1] - s[:, 2:3])
-        error, integral = wrap_angle(reference - heading), s[:, 0:1]
+        error = wrap_angle(reference - heading)
+        integral = s[:, 0:1]
         unlimited_command = self.kp * error - self.kd * rate + self.ki * integral
         is_winding_up = (unlimited_command.abs() > self.limit) & (unlimited_command * error > 0)
         next_integral = torch.where(is_winding_up, integral, integral + self.dt * error)
@@ -192,7 +193,8 @@ class LinearLawConfig(TunableConfig, ABC):
 
     @final
     def parameter_values(self) -> dict[str, float | None]:
-        parameters, lag = super().parameter_values(), self.filter_time
+        parameters = super().parameter_values()
+        lag = self.filter_time
         has_open_gain = None in [
             value for name, value in parameters.items() if name != "filter_time"
         ]
@@ -288,7 +290,8 @@ class LqrConfig(LinearLawConfig):
     def gains(
         self, parameters: Mapping[str, Tensor], nomoto: NomotoModel
     ) -> tuple[Tensor, Tensor, Tensor]:
-        gain, time = torch.tensor(nomoto.gain), torch.tensor(nomoto.time)
+        gain = torch.tensor(nomoto.gain)
+        time = torch.tensor(nomoto.time)
         kp, kd = regulator_gains(
             parameters["heading_weight"], parameters["rate_weight"], gain, time
         )
@@ -304,7 +307,8 @@ class BangBangConfig(ControllerConfig):
     kind: Literal["bang_bang"] = "bang_bang"
 
     def build(self, task: ControlTask) -> Policy:
-        vessel, nomoto = task.vessel, task.nomoto
+        vessel = task.vessel
+        nomoto = task.nomoto
         if vessel.rate is not None:
             return RatedBangBangHeading(
                 vessel.state,

@@ -32,7 +32,9 @@ class AnglePolicy(Policy, ABC):
 
     def set_state_columns(self, state: Sequence[str]) -> None:
         """Take heading and yaw rate, and the speed, from a state with these names."""
-        self.psi, self.u, self.r = state.index("psi"), state.index("u"), state.index("r")
+        self.psi = state.index("psi")
+        self.u = state.index("u")
+        self.r = state.index("r")
 
     def set_step(self, dt: float) -> None:
         """Take steps of dt seconds from now on."""
@@ -61,7 +63,9 @@ class HeadingPolicy(AnglePolicy, ABC):
     ) -> None:
         super().__init__()
         self.set_state_columns(state)
-        self.gain, self.time, self.speed = nomoto.gain, nomoto.time, nomoto.speed
+        self.gain = nomoto.gain
+        self.time = nomoto.time
+        self.speed = nomoto.speed
         self.limit = limit
         self.rate = math.inf if rate is None else rate
 
@@ -110,7 +114,8 @@ class OddGRUCell(nn.Module):
         nn.init.zeros_(self.gates.bias)
         nn.init.normal_(self.candidate.weight, std=1.0 / math.sqrt(n_joint))
         nn.init.zeros_(self.out.weight)
-        self.units, self.trained_at = units, dt
+        self.units = units
+        self.trained_at = dt
 
     def forward(self, features: Tensor, memory: Tensor, dt: float) -> tuple[Tensor, Tensor]:
         """Return the output [B, 1] and the memory [B, units] after a step of dt seconds."""
@@ -175,16 +180,22 @@ class HeadingObserver(nn.Module):
 
     def __init__(self, nomoto: NomotoModel, limit: float, lag: float, dt: float) -> None:
         super().__init__()
-        self.gain, self.time, self.restoring = nomoto.gain, nomoto.time, nomoto.restoring
-        self.limit, self.lag, self.max_innovation = limit, lag, _MAX_INNOVATION
-        self.dt, self.n_pending = dt, round(lag / dt)
+        self.gain = nomoto.gain
+        self.time = nomoto.time
+        self.restoring = nomoto.restoring
+        self.limit = limit
+        self.lag = lag
+        self.max_innovation = _MAX_INNOVATION
+        self.dt = dt
+        self.n_pending = round(lag / dt)
         self.register_buffer("remaining_lag", torch.zeros(0), persistent=False)
         self.remaining_lag: Tensor
         self.set_step(dt)
 
     def set_step(self, dt: float) -> None:
         """Take steps of dt seconds from now on."""
-        self.dt, self.n_pending = dt, round(self.lag / dt)
+        self.dt = dt
+        self.n_pending = round(self.lag / dt)
         # time in s that is left of the lag when each pending command has acted, the oldest first
         remaining = dt * torch.arange(self.n_pending - 1, -1, -1, dtype=torch.float64)
         self.remaining_lag = remaining.to(self.remaining_lag.dtype)
@@ -209,14 +220,16 @@ class HeadingObserver(nn.Module):
             ratio: speed [B, 1] over that of K and T.
             constants: `OBSERVER_CONSTANTS`, [1] or [B, 1] each.
         """
-        heading_innovation, r_innovation = wrap_angle(psi - heading), r - yaw_rate
+        heading_innovation = wrap_angle(psi - heading)
+        r_innovation = r - yaw_rate
         # no vessel does this within a step: measurements were missing, and the estimate is taken
         # up anew where they come back, with the push as it was
         max_yaw_rate = 3.0 * self.gain * ratio * self.limit
         is_lost = (heading_innovation.abs() > self.max_innovation) | (
             r_innovation.abs() > max_yaw_rate
         )
-        heading, yaw_rate = torch.where(is_lost, psi, heading), torch.where(is_lost, r, yaw_rate)
+        heading = torch.where(is_lost, psi, heading)
+        yaw_rate = torch.where(is_lost, r, yaw_rate)
         zero_innovation = torch.zeros_like(r_innovation)
         heading_innovation = torch.where(is_lost, zero_innovation, heading_innovation)
         r_innovation = torch.where(is_lost, zero_innovation, r_innovation)
@@ -224,15 +237,14 @@ class HeadingObserver(nn.Module):
         rate_correction = (
             filter_gains[1] * r_innovation + self.dt * constants[3] * heading_innovation
         )
-        heading, yaw_rate = (
-            heading + filter_gains[0] * heading_innovation,
-            yaw_rate + rate_correction,
-        )
+        heading = heading + filter_gains[0] * heading_innovation
+        yaw_rate = yaw_rate + rate_correction
         rudder_per_rate = self.time / (self.gain * ratio.square())
         disturbance = (disturbance + constants[2] * rudder_per_rate * rate_correction).clamp(
             -self.limit, self.limit
         )
-        predicted_heading, predicted_r = heading, yaw_rate
+        predicted_heading = heading
+        predicted_r = yaw_rate
         if self.n_pending > 0:
             effective_disturbance = self.with_restoring(disturbance, heading, ratio)
             predicted_heading, predicted_r = self._predict_pending(
@@ -332,7 +344,8 @@ class ObservedPolicy(HeadingPolicy):
         trained_at: float = 0.04,
     ) -> None:
         super().__init__(state, nomoto, limit, rate)
-        self.units, self.radians_per_degree = units, _DEGREE
+        self.units = units
+        self.radians_per_degree = _DEGREE
         self.law = law
         self.observer = HeadingObserver(nomoto, limit, lag, dt)
         self.constant_names = (*law.constants, *OBSERVER_CONSTANTS)
@@ -371,11 +384,9 @@ class ObservedPolicy(HeadingPolicy):
     def memory_ranges(
         self, max_yaw_rate: float, max_rudder: float
     ) -> dict[str, tuple[float, float]]:
-        disturbance, max_pending, half_turn = (
-            1.001 * self.limit,
-            1.001 * max_rudder,
-            1.001 * math.pi,
-        )
+        disturbance = 1.001 * self.limit
+        max_pending = 1.001 * max_rudder
+        half_turn = 1.001 * math.pi
         upper_limits = dict(
             zip(
                 OBSERVER_MEMORY,
@@ -404,8 +415,10 @@ class ObservedPolicy(HeadingPolicy):
         return torch.cat((heading, x[:, self.r : self.r + 1], zero_memory), dim=-1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        n_fixed, n_pending = 5, self.observer.n_pending
-        rudder, last_command = s[:, 3:4], s[:, 4:5]
+        n_fixed = 5
+        n_pending = self.observer.n_pending
+        rudder = s[:, 3:4]
+        last_command = s[:, 4:5]
         pending = s[:, n_fixed : n_fixed + n_pending]
         constants = list(torch.exp(self.constants).split(1, dim=-1))
         ratio = (x[:, self.u : self.u + 1] / self.speed).clamp(0.3, 3.0)
@@ -462,12 +475,23 @@ class ObservedPolicy(HeadingPolicy):
         command = self.limit * unlimited_share.clamp(-1.0, 1.0)
         next_rudder = rudder + (command - rudder).clamp(-self.max_rudder_step, self.max_rudder_step)
         queue = torch.cat((pending, next_rudder), dim=1)
-        effective_disturbance = self.observer.with_restoring(estimate.disturbance_rudder, estimate.heading, ratio)
+        effective_disturbance = self.observer.with_restoring(
+            estimate.disturbance_rudder, estimate.heading, ratio
+        )
         heading, yaw_rate = self.observer.predict_step(
             estimate.heading, estimate.r, effective_disturbance, queue[:, 0:1], ratio
         )
         s = torch.cat(
-            (heading, yaw_rate, estimate.disturbance_rudder, next_rudder, command, queue[:, 1:], memory), dim=1
+            (
+                heading,
+                yaw_rate,
+                estimate.disturbance_rudder,
+                next_rudder,
+                command,
+                queue[:, 1:],
+                memory,
+            ),
+            dim=1,
         )
         return command, s
 
@@ -504,7 +528,9 @@ class NetworkPolicy(HeadingPolicy):
         trained_at: float = 0.04,
     ) -> None:
         super().__init__(state, nomoto, limit, rate)
-        self.units, self.radians_per_degree, self.trained_at = units, _DEGREE, trained_at
+        self.units = units
+        self.radians_per_degree = _DEGREE
+        self.trained_at = trained_at
         self.network = OddGRUCell(8, units, trained_at, hidden=units)
         self.n_state = 2 + units
         self.set_step(dt)
@@ -528,7 +554,9 @@ class NetworkPolicy(HeadingPolicy):
         return {"kind": "network", "units": self.units, "trained_at": self.trained_at}
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        rudder, last_command, memory = s[:, 0:1], s[:, 1:2], s[:, 2:]
+        rudder = s[:, 0:1]
+        last_command = s[:, 1:2]
+        memory = s[:, 2:]
         ratio = (x[:, self.u : self.u + 1] / self.speed).clamp(0.3, 3.0)
         error = wrap_angle(reference - x[:, self.psi : self.psi + 1]) / self.radians_per_degree
         relative_yaw_rate = x[:, self.r : self.r + 1] / (self.gain * ratio * self.limit)
@@ -594,7 +622,9 @@ class DepthPolicy(HeadingPolicy):
         rate: float | None = None,
     ) -> None:
         super().__init__(state, nomoto, limit, rate)
-        self.law, self.steepest, self.max_drift_share = law, steepest, _MAX_DRIFT_SHARE
+        self.law = law
+        self.steepest = steepest
+        self.max_drift_share = _MAX_DRIFT_SHARE
         law.set_state_columns(tuple(HeadingPolicy.measured))
         values = [torch.as_tensor(constants[name], dtype=torch.float32) for name in SIGHT_CONSTANTS]
         self.constants = torch.nn.Parameter(torch.stack(values, dim=-1).log())
@@ -611,7 +641,8 @@ class DepthPolicy(HeadingPolicy):
 
     def without_network(self) -> DepthPolicy:
         """Return a copy whose law has no network."""
-        policy, law = copy.deepcopy(self), self.law
+        policy = copy.deepcopy(self)
+        law = self.law
         assert isinstance(law, ObservedPolicy)
         policy.law = law.without_network()
         return policy

@@ -65,7 +65,8 @@ class SimulatedPredictor(Predictor):
             raise ConfigError(f"the predictor's horizon must be one step or more, given {steps}")
         self.model = model
         self.steps = steps
-        self.psi, self.r = state.index("psi"), state.index("r")
+        self.psi = state.index("psi")
+        self.r = state.index("r")
         self.register_buffer(
             "other_inputs",
             torch.zeros(0) if other_inputs is None else other_inputs,
@@ -74,7 +75,8 @@ class SimulatedPredictor(Predictor):
         self.other_inputs: Tensor
 
     def forward(self, x: Tensor, heading: Tensor, rudder: Tensor) -> tuple[Tensor, Tensor]:
-        n_rows, n_candidates = x.shape[0], rudder.shape[0]
+        n_rows = x.shape[0]
+        n_candidates = rudder.shape[0]
         command = rudder.to(x.dtype).repeat(n_rows).unsqueeze(-1)
         w = torch.cat(
             (command, self.other_inputs.to(x.dtype).expand(n_rows * n_candidates, -1)), dim=-1
@@ -106,7 +108,8 @@ class NetworkPredictor(Predictor):
         self, state: Sequence[str], *, candidates: int, hidden: Sequence[int], linear: bool = False
     ) -> None:
         super().__init__()
-        self.psi, self.r = state.index("psi"), state.index("r")
+        self.psi = state.index("psi")
+        self.r = state.index("r")
         self.input_columns = [
             column for column, name in enumerate(state) if name not in ("x", "y", "psi")
         ]
@@ -204,10 +207,8 @@ class DocumentAutopilot(Policy):
         """
         error, rate = self.predictor(x, reference[:, 0], self.rudder)
         rudder = self.rudder.to(x.dtype)
-        heading_rudder, rate_rudder = (
-            rudder[wrap_angle(error).abs().argmin(-1)],
-            rudder[rate.abs().argmin(-1)],
-        )
+        heading_rudder = rudder[wrap_angle(error).abs().argmin(-1)]
+        rate_rudder = rudder[rate.abs().argmin(-1)]
         return (self.weight * heading_rudder + (1.0 - self.weight) * rate_rudder).unsqueeze(-1), s
 
 

@@ -13,7 +13,9 @@ from scipy.signal import lfilter
 from residnet.core.errors import FitError
 
 Array = NDArray[np.float64]
-_N_TIMES, _N_DELAYS, _N_RATES = 20, 8, 10
+_N_TIMES = 20
+_N_DELAYS = 8
+_N_RATES = 10
 """Values of T, the delay and the rate of the gear that the coarse search tries."""
 _MAX_COARSE_SAMPLES = 4000
 """Samples of a manoeuvre that the first, coarse search looks at."""
@@ -84,7 +86,8 @@ def limit_rudder_rate(command: Array, rate: float, dt: float) -> Array:
     max_change = rate * dt
     if not math.isfinite(max_change):
         return command
-    angle, angles = float(command[0]), []
+    angle = float(command[0])
+    angles = []
     for target in command.tolist():
         angle += min(max(target - angle, -max_change), max_change)
         angles.append(angle)
@@ -184,7 +187,8 @@ def _refine_response(
         x_scale="jac",
         diff_step=np.full(len(initial_point), 1e-4),
     )
-    residuals, estimates = solution.fun, [*solution.x, math.inf][:5]
+    residuals = solution.fun
+    estimates = [*solution.x, math.inf][:5]
     autocorrelation = float(residuals[1:] @ residuals[:-1]) / max(
         float(residuals @ residuals), 1e-30
     )
@@ -194,7 +198,8 @@ def _refine_response(
     jacobian = np.asarray(solution.jac)
     covariance = np.linalg.pinv(jacobian.T @ jacobian) * (sum_of_squares / n_independent)
     standard_errors = np.sqrt(np.diag(covariance).clip(min=0.0))
-    time, rate = math.exp(estimates[1]), math.exp(estimates[4])
+    time = math.exp(estimates[1])
+    rate = math.exp(estimates[4])
     yaw_rates = np.concatenate([record.yaw_rate[record.usable] for record in records])
     return (
         SteeringResponse(
@@ -228,11 +233,9 @@ def _unit_responses(record: ManoeuvreRecord, time: float, delay: float) -> tuple
     responses[1:, 0] = lfilter([1.0 - decay_factor], [1.0, -decay_factor], shifted[:-1])
     initial_response = decay_factor ** np.arange(count)
     responses[:, 1] = 1.0 - initial_response
-    usable_responses, yaw_rate, initial_direction = (
-        responses[record.usable],
-        record.yaw_rate[record.usable],
-        initial_response[record.usable],
-    )
+    usable_responses = responses[record.usable]
+    yaw_rate = record.yaw_rate[record.usable]
+    initial_direction = initial_response[record.usable]
     initial_direction = initial_direction / max(float(np.linalg.norm(initial_direction)), 1e-12)
     return usable_responses - initial_direction[:, None] * (
         initial_direction @ usable_responses
@@ -243,7 +246,9 @@ def _solve_linear_terms(
     records: Sequence[ManoeuvreRecord], time: float, delay: float
 ) -> tuple[float, float, float]:
     """Return the sum of squared errors, K and K bias of the best response with T and a delay."""
-    normal_matrix, normal_rhs, sum_of_squares = np.zeros((2, 2)), np.zeros(2), 0.0
+    normal_matrix = np.zeros((2, 2))
+    normal_rhs = np.zeros(2)
+    sum_of_squares = 0.0
     for record in records:
         responses, yaw_rate = _unit_responses(record, time, delay)
         normal_matrix += responses.T @ responses

@@ -158,7 +158,8 @@ class SteeredVessel(ABC):
                 f"at {angle:.3g} rad of rudder the vessel comes to rest at an angle of {final_angle:.3g}"
                 " rad; it cannot be steered (check the sign of the command that steers)"
             )
-        restoring, first_switch_time = angle / final_angle, 2.0 * self._longest_step(dt)
+        restoring = angle / final_angle
+        first_switch_time = 2.0 * self._longest_step(dt)
         record, headings = self._simulate_zigzag(
             angle, min(abs(angle), 0.5 * abs(final_angle)), first_switch_time, dt
         )
@@ -179,15 +180,15 @@ class SteeredVessel(ABC):
         self, angle: float, duration: float, dt: float
     ) -> tuple[Array, Array, Array]:
         """Return times, yaw rates and headings [N] under a held rudder, in steps that grow."""
-        r, psi, rate_sign = (
-            self.state_column(self.axis.rate),
-            self.state_column(self.axis.angle),
-            self.axis.side,
-        )
+        r = self.state_column(self.axis.rate)
+        psi = self.state_column(self.axis.angle)
+        rate_sign = self.axis.side
         x, w, s = self._straight_state()
         initial_heading = float(x[0, psi])
         w[:, 0] = angle
-        times, rates, headings = [0.0], [0.0], [0.0]
+        times = [0.0]
+        rates = [0.0]
+        headings = [0.0]
         longest_step = self._longest_step(dt)
         with torch.no_grad():
             while times[-1] < duration - 0.5 * dt:
@@ -207,15 +208,19 @@ class SteeredVessel(ABC):
 
         `first_switch_time` is the time in s until its first change of rudder.
         """
-        r, psi = self.state_column(self.axis.rate), self.state_column(self.axis.angle)
+        r = self.state_column(self.axis.rate)
+        psi = self.state_column(self.axis.angle)
         longest_step = self._longest_step(dt)
         dt = (
             dt
             if longest_step <= dt
             else min(max(first_switch_time / _STEPS_TO_FIRST_SWITCH, dt), longest_step)
         )
-        model, (x, w, s) = self.model(dt), self._straight_state()
-        initial_heading, rudder_sign, switches = float(x[0, psi]), float(np.sign(angle)), 0
+        model = self.model(dt)
+        (x, w, s) = self._straight_state()
+        initial_heading = float(x[0, psi])
+        rudder_sign = float(np.sign(angle))
+        switches = 0
         rates: list[float] = []
         rudder: list[float] = []
         headings: list[float] = []
@@ -229,7 +234,8 @@ class SteeredVessel(ABC):
                     )
                 headings.append(self.axis.side * (float(x[0, psi]) - initial_heading))
                 if rudder_sign * headings[-1] > abs(switch_angle):
-                    rudder_sign, switches = -rudder_sign, switches + 1
+                    rudder_sign = -rudder_sign
+                    switches = switches + 1
                 w[:, 0] = rudder_sign * abs(angle)
                 rates.append(self.axis.side * float(x[0, r]))
                 rudder.append(rudder_sign * abs(angle))
@@ -242,7 +248,8 @@ class SteeredVessel(ABC):
 
 def _is_steady(times: Array, rates: Array) -> bool:
     """Return whether a yaw rate is steady over the last half of the time."""
-    last_half, steady = rates[np.searchsorted(times, 0.5 * times[-1]) :], rates[-1]
+    last_half = rates[np.searchsorted(times, 0.5 * times[-1]) :]
+    steady = rates[-1]
     overshoots = np.abs(rates).max() > (1.0 + _STEADY_TOLERANCE) * abs(steady)
     return bool(overshoots or np.abs(last_half - steady).max() <= _STEADY_TOLERANCE * abs(steady))
 
@@ -258,9 +265,11 @@ class SteeredPlant(SteeredVessel):
     def __init__(self, plant: Plant, *, in_calm_water: bool = True, axis: Axis = HEADING) -> None:
         if in_calm_water and isinstance(plant, HullPlant):
             plant = plant.without_environment()
-        self.plant, self.axis = plant, axis
+        self.plant = plant
+        self.axis = axis
         other_inputs = [name for name in plant.input_names if name != axis.command]
-        self.state, self.inputs = plant.state_names, (axis.command, *other_inputs)
+        self.state = plant.state_names
+        self.inputs = (axis.command, *other_inputs)
         self._straight_course_state = plant.make_initial_state(1)
         # a propeller heels what turns about all axes
         if (
@@ -284,8 +293,10 @@ class SteeredPlant(SteeredVessel):
 
     def _simulate_run_up(self) -> Tensor:
         """Return the state [1, nx] of a straight course at the speed of full drive, from rest."""
-        unit_speed, column = torch.ones(1, dtype=torch.float64), self.state_column("u")
-        (x, w), model = self.straight_course(unit_speed), self.model(_RUN_UP_STEPS[0])
+        unit_speed = torch.ones(1, dtype=torch.float64)
+        column = self.state_column("u")
+        (x, w) = self.straight_course(unit_speed)
+        model = self.model(_RUN_UP_STEPS[0])
         with torch.no_grad():
             for k in range(_RUN_UP_STEPS[1]):
                 previous_speed = float(x[0, column])
@@ -316,7 +327,8 @@ def _identify_rudder_gear(plant: Plant, axis: Axis) -> tuple[float | None, float
     """
     if axis.gear not in plant.state_names:
         return None, None
-    column, dt = plant.state_names.index(axis.gear), 1e-3
+    column = plant.state_names.index(axis.gear)
+    dt = 1e-3
     command = plant.input_names.index(axis.command)
     x, w = plant.make_initial_state(1), torch.zeros(1, len(plant.input_names), dtype=torch.float64)
 
@@ -325,11 +337,9 @@ def _identify_rudder_gear(plant: Plant, axis: Axis) -> tuple[float | None, float
         step = float(plant.finish_step(x, w, dt)[0, column] - x[0, column]) / dt
         return step + float(plant.derivative(x, w)[0, column])
 
-    rate_at_large, rate_at_small, rate_at_half_small = (
-        rudder_rate_at(1.0),
-        rudder_rate_at(0.02),
-        rudder_rate_at(0.01),
-    )
+    rate_at_large = rudder_rate_at(1.0)
+    rate_at_small = rudder_rate_at(0.02)
+    rate_at_half_small = rudder_rate_at(0.01)
     if abs(rate_at_large - rudder_rate_at(0.5)) <= 1e-6 * abs(rate_at_large):
         return rate_at_large, None
     # what is at its command within a step has no lag
@@ -362,11 +372,14 @@ class SteeredModel(SteeredVessel):
         vessel: SteeredPlant,
     ) -> None:
         states = get_dof(model.signals.names).state_names
-        self.hull, self.vessel, self.uses_step_mean = model, vessel, input_hold == "mean"
+        self.hull = model
+        self.vessel = vessel
+        self.uses_step_mean = input_hold == "mean"
         self.axis = axis = vessel.axis
         has_gear = vessel.rate is not None or vessel.lag is not None
         self.state = (*states, axis.gear) if has_gear else states
-        self.inputs, self.rate = vessel.inputs, vessel.rate
+        self.inputs = vessel.inputs
+        self.rate = vessel.rate
         if not {axis.gear, axis.command} & set(input_names) or axis.value not in states:
             raise ConfigError(
                 f"{axis.name} control needs a model that tells {axis.value} and is driven by"

@@ -52,11 +52,9 @@ _PANELS = (
 
 
 def _iterate_course_figures(run: RunFiles) -> Iterator[Figure]:
-    tracks, plans, spread_runs = (
-        run.read_parquet(TRACKS_FILE),
-        run.read_parquet(COURSES_FILE),
-        run.read_parquet(SPREAD_FILE),
-    )
+    tracks = run.read_parquet(TRACKS_FILE)
+    plans = run.read_parquet(COURSES_FILE)
+    spread_runs = run.read_parquet(SPREAD_FILE)
     styles = _run_styles(tracks, "controller")
     yield Figure(
         "courses",
@@ -110,7 +108,8 @@ def _run_styles(runs: Any, column: str) -> dict[str, GlyphStyle]:
 
 def _circle_radii(run: RunFiles) -> dict[str, list[float]]:
     """Return the radii in m of the buoys' circles by protocol."""
-    course, min_radius = run.resolved_config["course"], run.metrics["smallest"]["radius"]
+    course = run.resolved_config["course"]
+    min_radius = run.metrics["smallest"]["radius"]
     return {
         protocol: [
             course["acceptance"] if protocol == "enter" else max(buoy["radius"], min_radius)
@@ -336,7 +335,8 @@ def _is_policy_on_course(row: JsonObject) -> bool:
 
 
 def _course_definitions(run: RunFiles) -> list[str]:
-    metrics, steady_turn = run.metrics, run.metrics["smallest"]
+    metrics = run.metrics
+    steady_turn = run.metrics["smallest"]
     tight_buoys = [
         f"buoy {entry['buoy']} ({format_number(entry['radius'], 4)} m)"
         for entry in metrics["feasibility"]
@@ -366,10 +366,8 @@ def _spread_text(run: RunFiles) -> str:
     spread_config = run.resolved_config.get("spread")
     if spread_config is None:
         return ""
-    (lower_effect, upper_effect), (lower_time, upper_time) = (
-        spread_config["effect"],
-        spread_config["time"],
-    )
+    (lower_effect, upper_effect) = spread_config["effect"]
+    (lower_time, upper_time) = spread_config["time"]
     bias = (
         f", a rudder bias of at most {math.degrees(spread_config['bias']):.3g} deg"
         if spread_config["bias"] > 0

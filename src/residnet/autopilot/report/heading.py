@@ -113,7 +113,8 @@ def _response_figure(
     series: pd.DataFrame, kinds: Mapping[str, str], test: JsonObject, name: str
 ) -> Figure:
     """Draw a step of the nominal vessel; of policies, the corners of the spread as shades."""
-    axis_labels, (change, settling_band) = axis_words(test), _step_and_band(test)
+    axis_labels = axis_words(test)
+    (change, settling_band) = _step_and_band(test)
     value, rate = axis_labels.columns
     series = series.assign(error=change - series[value])
     styles = _controller_styles(kinds)
@@ -132,7 +133,8 @@ def _response_figure(
             )
             panel[controller] = (pivoted.index.to_numpy(), pivoted[(1.0, 1.0)].to_numpy())
             if model_kind == "policy" and quantity in (value, "error"):
-                shade_name, color = f"{controller}, corners", styles[controller].color
+                shade_name = f"{controller}, corners"
+                color = styles[controller].color
                 styles[shade_name] = GlyphStyle(
                     shade_name, color, kind="fill", alpha=0.25, z_order=1
                 )
@@ -435,7 +437,8 @@ def effort_table(rows: Sequence[JsonObject], axis_labels: AxisWords) -> Table:
 
 
 def _autopilot_definitions(config: Mapping[str, Any]) -> list[str]:
-    test, axis_labels = config["test"], axis_words(config["test"])
+    test = config["test"]
+    axis_labels = axis_words(config["test"])
     change, band = (axis_labels.scale * value for value in _step_and_band(test))
     return [
         f"One definition holds for all controllers: a step of {change:.3g} {axis_labels.unit} without"
@@ -498,8 +501,10 @@ def cost_sentences(rows: Sequence[JsonObject]) -> list[str]:
     for row in sorted(rows_by_model.values(), key=_mean_cost):
         if row["kind"] not in ("policy", "network"):
             continue
-        name, switched_off = row["model"], rows_by_model.get(f"{row['model']} network off")
-        cost, best_cost = row["cost"]["mean"], best_row["cost"]["mean"]
+        name = row["model"]
+        switched_off = rows_by_model.get(f"{row['model']} network off")
+        cost = row["cost"]["mean"]
+        best_cost = best_row["cost"]["mean"]
         network_text = (
             "; it has no law inside"
             if switched_off is None
@@ -574,7 +579,8 @@ def extrapolation_table(rows: Sequence[JsonObject]) -> Table | None:
 
 def _conditions_text(evaluation: Mapping[str, Any]) -> list[str]:
     conditions = evaluation["stated"]
-    depth, axis_labels = conditions.get("depth"), axis_words(conditions)
+    depth = conditions.get("depth")
+    axis_labels = axis_words(conditions)
     step_range = depth["change"] if depth else conditions["heading"]
     lower, upper, band = (
         axis_labels.scale * value for value in (*step_range, (depth or conditions)["band"])

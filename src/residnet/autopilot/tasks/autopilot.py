@@ -487,7 +487,8 @@ def minimum_turn_time(
     Full rudder is held until full counter-rudder stops the yaw rate on the new heading; each way of
     the rudder to one side takes its time beside that.
     """
-    steady_yaw_rate, time_constant = abs(nomoto.gain) * rudder_limit, nomoto.time
+    steady_yaw_rate = abs(nomoto.gain) * rudder_limit
+    time_constant = nomoto.time
 
     def turn_and_time(first_duration: float) -> tuple[float, float]:
         second_duration = time_constant * math.log1p(

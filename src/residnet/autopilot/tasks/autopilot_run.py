@@ -212,9 +212,11 @@ def _train_policy_or_resume(
 
     `base_law` is the law that its network stands beside; None for none.
     """
-    policy_config, evaluation_conditions = config.policies[name], config.conditions
+    policy_config = config.policies[name]
+    evaluation_conditions = config.conditions
     assert evaluation_conditions is not None
-    training_vessel, nomoto = config.training_vessel(name), steering.nomoto
+    training_vessel = config.training_vessel(name)
+    nomoto = steering.nomoto
     if policy_config.learned is not None:
         nomoto = training_vessel.estimate_nomoto(
             config.rudder, config.turning_time, policy_config.training.dt
@@ -245,8 +247,10 @@ def _train_policy_or_resume(
             "sight": depth_law_settings,
         }
     spec = config.policy_spec_class(name).model_validate(spec_fields)
-    policy, store = spec.build(), RunModelStore(folder)
-    notes, start_times = store.restore_module(name, policy), (time.time(), time.process_time())
+    policy = spec.build()
+    store = RunModelStore(folder)
+    notes = store.restore_module(name, policy)
+    start_times = (time.time(), time.process_time())
     if notes is None:
         begin_stage(f"training {name}")
         compiler = partial(CompiledRollout, max_gradient_ratio=policy_config.training.outlying)
@@ -260,7 +264,8 @@ def _train_policy_or_resume(
             folder.path,
             compiler if policy_config.training.compiled else None,
         )
-        seconds, cpu = time.time() - start_times[0], time.process_time() - start_times[1]
+        seconds = time.time() - start_times[0]
+        cpu = time.process_time() - start_times[1]
         notes |= {"seconds": round(seconds, 1), "cpu_seconds": round(cpu, 1)}
         notes |= {"constants": policy.constant_values()}
         store.save_module(name, spec, policy, notes)
@@ -295,7 +300,8 @@ def _run_step_tests(
     controllers: Controllers, vessel: SteeredPlant, config: AutopilotConfig
 ) -> tuple[list[dict[str, Any]], pd.DataFrame, pd.DataFrame]:
     """Return the rows of metrics.json, and two tables: flights of the corners, random vessels."""
-    test, main_conditions = config.test, _main_conditions(config)
+    test = config.test
+    main_conditions = _main_conditions(config)
     reference_change, settling_band = test.step_and_tolerance
     corner_variations = build_variation_grid(main_conditions.effect, main_conditions.time)
     random_sample = draw_variations(
@@ -306,7 +312,8 @@ def _run_step_tests(
     )
     plant = load_vessel(config.vessel).build()
     rows: list[dict[str, Any]] = []
-    corner_tables, random_tables = [], []
+    corner_tables = []
+    random_tables = []
     for name, (role, policy) in controllers.items():
         run_step_test = partial(
             simulate_steps, vessel, policy, reference_change, test.dt, test.duration
@@ -388,7 +395,8 @@ def _evaluate_under_conditions(
     max_delay = max(
         1, *(int(changes.delay_steps.max()) for _, changes in sampled_conditions.values())
     )
-    rows, tables = [], []
+    rows = []
+    tables = []
     for number, (name, (role, policy)) in enumerate(controllers.items()):
         report_progress("judging", number, len(controllers))
         conditioned_run = ClosedLoopSimulation(
@@ -423,14 +431,13 @@ def _summarize(
     settling_by_model = {
         (row["model"], row["protocol"]): row["settling"] for row in rows if "settling" in row
     }
-    sentences, summary_metrics = cost_sentences(rows), dict[str, SummaryMetric]()
+    sentences = cost_sentences(rows)
+    summary_metrics = dict[str, SummaryMetric]()
     reference_change, _ = config.test.step_and_tolerance
     axis_labels = axis_words(config.test.model_dump())
     for name in config.policies or config.predictive:
-        nominal, slowest = (
-            settling_by_model[name, "nominal"]["max"],
-            settling_by_model[name, "corners"]["max"],
-        )
+        nominal = settling_by_model[name, "nominal"]["max"]
+        slowest = settling_by_model[name, "corners"]["max"]
         summary_metrics[f"{name}_settling_nominal"] = SummaryMetric(nominal, "s")
         summary_metrics[f"{name}_settling_worst"] = SummaryMetric(slowest, "s")
         sentences.append(
@@ -457,7 +464,8 @@ def export_policy(config: AutopilotConfig, request: ExportRequest) -> Path:
         WithheldError: where a classical controller costs less, but for `asked.anyway`.
         ExportError: where the file does not reproduce the policy.
     """
-    name, rows = request.resolve_model_name(config.policies), request.run.read_metrics()["rows"]
+    name = request.resolve_model_name(config.policies)
+    rows = request.run.read_metrics()["rows"]
     scaled_config = config.with_scaled_times()
     card_fields = {
         "vessel": config.vessel,

@@ -70,10 +70,9 @@ class CourseSpreadConfig(Config):
             for limits in (self.effect, self.time, (-self.bias, self.bias))
         )
         current_direction = generator.uniform(-math.pi, math.pi, self.flights)
-        variation, current = (
-            np.stack((effect, time, bias), axis=-1),
-            self.current
-            * np.stack((np.cos(current_direction), np.sin(current_direction)), axis=-1),
+        variation = np.stack((effect, time, bias), axis=-1)
+        current = self.current * np.stack(
+            (np.cos(current_direction), np.sin(current_direction)), axis=-1
         )
         return Vessels(torch.from_numpy(variation), torch.from_numpy(current))
 

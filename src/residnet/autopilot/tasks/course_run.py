@@ -72,7 +72,8 @@ def run_course(config: CourseTaskConfig, folder: RunFolder) -> TaskOutcome:
             source=config.autopilot, output_folder=folder.path / "autopilot", resume=True
         )
     autopilot_run = open_autopilot_run(config, folder)
-    steering, steady_turn = autopilot_run.steering, autopilot_run.steady_turn
+    steering = autopilot_run.steering
+    steady_turn = autopilot_run.steady_turn
     radius_feasibility = buoy_feasibility(config.course.buoys, steady_turn.radius)
     for circle in radius_feasibility:
         if not circle["possible"]:
@@ -141,7 +142,8 @@ def run_course(config: CourseTaskConfig, folder: RunFolder) -> TaskOutcome:
         folder.write_table(
             folder.path / SPREAD_FILE, pd.concat(results.spread_tables, ignore_index=True)
         )
-    verdict, summary_metrics = [], dict[str, SummaryMetric]()
+    verdict = []
+    summary_metrics = dict[str, SummaryMetric]()
     for result_row in results.rows:
         # the policy on the nominal vessel along the plan
         row_key = (result_row["model"], result_row["guidance"], result_row["split"])
@@ -327,10 +329,8 @@ def _build_loop_parts(
         return TrackKeeping(
             policy, vessel.state, limit=steering.limit, dt=steering.dt, rate=vessel.rate
         ), make_course_guidance(config, planned_course, steering)
-    points, acceptance = (
-        [(buoy.north, buoy.east) for buoy in planned_course.buoys],
-        config.course.acceptance,
-    )
+    points = [(buoy.north, buoy.east) for buoy in planned_course.buoys]
+    acceptance = config.course.acceptance
     wheel_over = (
         WheelOver(steering.nomoto, steering.limit, acceptance, rate=vessel.rate)
         if config.legs_change == "wheel_over"
@@ -358,11 +358,9 @@ def simulate_course(
         duration: in s, after which a flight that has not ended is given up.
         vessels: that fly.
     """
-    vessel, n_vessels, steps = (
-        steering.vessel,
-        len(vessels.variation),
-        round(duration / steering.dt),
-    )
+    vessel = steering.vessel
+    n_vessels = len(vessels.variation)
+    steps = round(duration / steering.dt)
     position_columns = [vessel.state_column("x"), vessel.state_column("y")]
     x, w = vessel.straight_course(torch.ones(n_vessels, dtype=torch.float64))
     x[:, position_columns] = torch.from_numpy(planned_course.course.track[0])
@@ -398,7 +396,8 @@ def simulate_course(
 
 def _cross_track_errors(course_guidance: CourseGuidance, states: Tensor) -> Tensor:
     """Return the cross-track errors [B, T] in m of states [B, T, nx]."""
-    guidance_state, errors = course_guidance.initial_state(states[:, 0]), []
+    guidance_state = course_guidance.initial_state(states[:, 0])
+    errors = []
     for k in range(states.shape[1]):
         _, guidance_state = course_guidance(states[:, k], k, guidance_state)
         errors.append(course_guidance.track_error(states[:, k], guidance_state[:, 0])[1])
@@ -458,14 +457,10 @@ def _replan_and_verify(
     config: CourseTaskConfig, autopilot_run: AutopilotRun, run: RunFolder, protocol: Protocol
 ) -> tuple[PlannedCourse, CourseGuidance]:
     planned_course, guidance = plan_with_guidance(config, autopilot_run, protocol)
-    new_plan, recorded_plan = (
-        tabulate_plan(planned_course),
-        pd.read_parquet(run.path / COURSES_FILE),
-    )
-    position_columns, recorded_plan = (
-        ["north", "east"],
-        recorded_plan[recorded_plan["protocol"] == protocol],
-    )
+    new_plan = tabulate_plan(planned_course)
+    recorded_plan = pd.read_parquet(run.path / COURSES_FILE)
+    position_columns = ["north", "east"]
+    recorded_plan = recorded_plan[recorded_plan["protocol"] == protocol]
     if (
         len(new_plan) != len(recorded_plan)
         or not (
@@ -497,11 +492,9 @@ def export_course(
     """
     protocols = {f"{config.policy}_{protocol}": protocol for protocol in config.protocols}
     name = request.resolve_model_name(protocols)
-    autopilot_run, run, protocol = (
-        open_autopilot_run(config, request.run),
-        request.run,
-        protocols[name],
-    )
+    autopilot_run = open_autopilot_run(config, request.run)
+    run = request.run
+    protocol = protocols[name]
     planned_course, guidance = existing_plan or _replan_and_verify(
         config, autopilot_run, run, protocol
     )

@@ -81,10 +81,8 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
     if not logs:
         raise DataError("steering: no logs given")
     records_and_names = [_to_uniform_record(log) for log in logs]
-    records, names = (
-        [record for record, _ in records_and_names],
-        {name for _, name in records_and_names},
-    )
+    records = [record for record, _ in records_and_names]
+    names = {name for _, name in records_and_names}
     max_rudder_std = max(float(np.std(record.rudder)) for record in records)
     if max_rudder_std < _MIN_RUDDER_STD:
         raise DataError(
@@ -150,7 +148,8 @@ _DEFAULT_DELAY = (0.0, 0.4)
 """Delay in s of electronics that nobody has measured, from at once to two cycles at 5 Hz."""
 _DEFAULT_NOISE_DEG = 0.1
 """Noise in deg and deg/s of a magnetic compass and a MEMS gyro, where no log shows it."""
-_DEFAULT_BIAS_DEG, _DEFAULT_PUSH_DEG = 1.0, 0.5
+_DEFAULT_BIAS_DEG = 1.0
+_DEFAULT_PUSH_DEG = 0.5
 """Rudder offset and slow push in deg that are usual, where logs show no more."""
 _TRAINING_SETTINGS = {"epochs": 12, "batch": 192, "quiet": 0.25}
 """Of ten drawn vessels' policies one kept swinging after six epochs and one overshot too far; these
@@ -272,7 +271,8 @@ def _describe_steering(source: Sequence[str | Path]) -> SteeringDescription:
         )  # fmt: skip
     logs, name = _read_source_logs([Path(item) for item in source])
     identified = identify_steering(logs)
-    response, dt = identified.response, identified.dt
+    response = identified.response
+    dt = identified.dt
     log_message(
         f"  {name}: K = {response.gain:.4g} 1/s, T = {response.time:.4g} s, delay"
         f" {response.delay:.2g} s, rudder"

@@ -38,7 +38,8 @@ _LITTLE = 0.6
 """Share of the range of changes of heading that flights without noise are drawn from."""
 _FAR = 1.15
 """Multiple of the start's cost from which an epoch has left the good policies."""
-_SLOWER, _LESS = 0.5, 0.2
+_SLOWER = 0.5
+_LESS = 0.2
 """Factors on the learning rate and on the charge for swinging after every such epoch."""
 _FREE = 0.5
 """Share of what the rudder may swing that costs nothing in training."""
@@ -67,11 +68,13 @@ class PolicyFit(EpochTraining):
         compiler: Compiler | None,
     ) -> None:
         super().__init__(settings, seed)
-        self.policy, self.conditions = policy, conditions
+        self.policy = policy
+        self.conditions = conditions
         duration = conditions.duration if settings.duration is None else settings.duration
         lengths = {"hold": min(settings.hold, conditions.hold), "duration": duration}
         self.drawn = conditions.model_copy(update=lengths)
-        self.vessel, self.compiler = vessel, compiler
+        self.vessel = vessel
+        self.compiler = compiler
         self._loops: dict[float, tuple[ClosedLoopSimulation, FreeRun]] = {}
         self._at(settings.dt)
         random = torch.Generator().manual_seed(seed + 1_000_003)
@@ -132,7 +135,8 @@ class PolicyFit(EpochTraining):
 
     def _spoilt(self, epochs: list[dict[str, float]]) -> int:
         """Return how many of some epochs cost far more than the start in full conditions."""
-        settings, start = self.settings, self.start_score
+        settings = self.settings
+        start = self.start_score
         if start is None or not self.best_state:
             return 0
         first = math.ceil(settings.spread * settings.epochs)
@@ -159,7 +163,8 @@ class PolicyFit(EpochTraining):
 
     def training_step(self, changes: HeadingStepBatch, number: int) -> Tensor:
         """Return the loss of one batch of heading changes."""
-        settings, progress = self.settings, self._progress(number)
+        settings = self.settings
+        progress = self._progress(number)
         cosine = 0.5 * (1.0 + math.cos(math.pi * progress))
         rate = settings.learning_rate * _SLOWER ** self._spoilt(self.history)
         for group in self.trainer.optimizers[0].param_groups:
@@ -180,11 +185,13 @@ class PolicyFit(EpochTraining):
 
     def _unsteady(self, flown: ClosedLoopTrajectories, overshoot: Tensor, quiet: int) -> Tensor:
         """Return what the quiet flights of a batch cost in s for swing and overshoot."""
-        settings, steady = self.settings, self.settings.steady
+        settings = self.settings
+        steady = self.settings.steady
         # the standard deviation of a sine is its movement peak to peak over two roots of two
         free = 0.0 if steady is None else (_FREE * steady.rudder_swing) ** 2 / 8.0
         swing = (flown.late_command_variance(_LATE)[:quiet] - free).clamp(min=0.0)
-        first, last = quiet // 2, quiet // 2 + quiet // 4
+        first = quiet // 2
+        last = quiet // 2 + quiet // 4
         # large changes of the nominal vessel may still be under way
         swing = torch.cat((swing[:first], swing[last:]))
         worst = swing.topk(math.ceil(quiet / 4)).values.mean()
@@ -223,8 +230,10 @@ class PolicyFit(EpochTraining):
         """
         random = torch.Generator().manual_seed(int(torch.randint(2**62, (1,))))
         changes = self.drawn.sample_steps(rows, self.step_size, random, share)
-        changes.noise[:quiet], changes.push[:quiet] = 0.0, 0.0
-        first, number = quiet // 2, quiet // 4
+        changes.noise[:quiet] = 0.0
+        changes.push[:quiet] = 0.0
+        first = quiet // 2
+        number = quiet // 4
         least = self.drawn.step_range[0] * changes.target.sign()
         small = least + _LITTLE * (changes.target - least)
         for some in (slice(0, first), slice(first + number, quiet)):

@@ -157,7 +157,8 @@ def train_predictor(
     Raises:
         FitError: where no epoch gave a finite error.
     """
-    settings, exact_predictor = config.training, config.build_exact_predictor(task)
+    settings = config.training
+    exact_predictor = config.build_exact_predictor(task)
     rudder = config.build_law(predictor, task).rudder
     train, validation_set = (
         simulate_rudder_responses(
@@ -201,7 +202,8 @@ def train_or_resume_controller(
         FitError: where training fails.
     """
     torch.manual_seed(seed)
-    spec, store = config.predictor_spec(task), RunModelStore(folder)
+    spec = config.predictor_spec(task)
+    store = RunModelStore(folder)
     network = spec.build()
     notes = store.restore_module(name, network)
     if notes is None:

@@ -14,7 +14,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.autopilot.actuator_lag import fit_lag, followed
+from residnet.autopilot.actuator_lag import fit_lag, simulate_lagged_force
 from residnet.core.config import Config, ConfigPath, Seconds
 from residnet.core.errors import ConfigError, DataError, FitError
 from residnet.core.layout import ACCELERATIONS, PLANAR_LAYOUT, POSE, VELOCITIES
@@ -315,7 +315,7 @@ def compare_forces(measured: MeasuredForceLogs) -> dict[str, Any]:
             record.run_lengths,
         )
         comparison["lag"] = lag.model_dump()
-        lagged_command = followed(record.command, lag, record.dt, record.run_lengths)
+        lagged_command = simulate_lagged_force(record.command, lag, record.dt, record.run_lengths)
     except FitError as error:
         comparison["lag"], lagged_command = str(error), record.command
     actual, commanded, lagged_force = (

@@ -19,7 +19,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from residnet.autopilot.actuator_lag import fit_lag, followed
+from residnet.autopilot.actuator_lag import fit_lag, simulate_lagged_force
 from residnet.autopilot.evaluation import mean_squares_by_axis
 from residnet.autopilot.motion import ActuatorLag
 from residnet.baselines.given import BelievedConfig, HullEquations
@@ -373,7 +373,7 @@ class ResidualForceModel(NamedTuple):
         """
         force = record.command
         if self.lag is not None:
-            force = followed(record.averaged_command, self.lag, record.dt, record.run_lengths)
+            force = simulate_lagged_force(record.averaged_command, self.lag, record.dt, record.run_lengths)
         return self.force.force_residual(force, record.nu_dot, record.nu, record.pose[:, HEADING])
 
     def test_mse(self, record: ForceRecord) -> list[float]:
@@ -426,7 +426,7 @@ def fit_model(
                 train,
                 record.run_lengths,
             )
-        force = followed(record.averaged_command, lag, record.dt, record.run_lengths)
+        force = simulate_lagged_force(record.averaged_command, lag, record.dt, record.run_lengths)
         notes["lag"] = lag.model_dump()
     y, earth_force = force - base_force, None
     if config.earth:
