@@ -1,6 +1,8 @@
-"""The lengths of a route's legs and turns that make it quickest and keep it right.
+"""Fit the leg lengths and hold times of a route for the shortest time past its buoys.
 
-What is asked of it has exact derivatives; sequential linear programs find the lengths.
+The constraints have exact derivatives. The solver is sequential linear programming with a trust
+region and an exact penalty function (R. Fletcher, Practical Methods of Optimization, 1987,
+chapter 12).
 """
 
 from __future__ import annotations
@@ -19,45 +21,51 @@ from residnet.autopilot.courses.outline import Circle
 from residnet.autopilot.courses.turns import LEG, POINTS, Array, Route, RouteGeometry
 
 _MAX_ITERATIONS = 45
-"""Most steps of a fit; those that settle take far fewer."""
+"""Largest number of iterations of a fit; converged fits need far fewer."""
 _ACTIVE_SET_INTERVAL = 8
-"""Steps after which the problem looks anew what it has to keep to."""
+"""Number of iterations after which the set of constraints is selected again."""
 _MIN_PREDICTED_GAIN = 2e-2
-"""Gain that a step promises below which none is made."""
+"""Predicted decrease of the merit function below which the solver stops."""
 _TRUST_RADII = (5e-4, 0.3, 1.0)
-"""Least, first and largest reach of a step."""
+"""Smallest, initial and largest trust radius."""
 _GAIN_RATIOS = (0.05, 0.3, 0.7)
-"""Shares of the promised gain: from which a step is made, shortened below, lengthened above."""
+"""Ratios of actual to predicted decrease: a step is accepted above the first; the trust radius
+shrinks below the second and grows above the third.
+"""
 _HARD_PENALTY = 40.0
-"""Turning radii that a course may be longer by to miss what is asked by one less."""
+"""Penalty of a violated constraint: increase of the course length per violation, both in turning
+radii.
+"""
 _SOFT_PENALTY = 4.0
-"""The same where a buoy's own turn is not to be the only one that comes as near."""
+"""The same for the constraint that other parts of the course pass a buoy at a larger distance."""
 _PASSING_MARGIN = 0.03
-"""Turning radii by which a buoy is farther off on the rest of the course than in its turn."""
+"""Difference in turning radii between the distance of a buoy from other parts of the course and
+its distance from its own turn.
+"""
 _ABEAM_SINE = 0.3
 """Sine of the angle from ahead or astern below which a buoy is not yet on a side."""
 _OTHER_PART_RANGE = 2.0
 _OWN_PART_RANGE = 0.7
-"""Turning radii from a circle within which other parts of the course, and the buoy's own turn, are
-kept an eye on.
+"""Distances from a circle in turning radii within which other parts of the course, and the buoy's
+own turn, become constraints.
 """
 _PARTS_PER_TURN = 4
-"""Pieces of a turn that keep to circles each for itself."""
+"""Number of pieces of a turn that have separate constraints."""
 MAX_PASSING_DISTANCE = 0.3
-"""How much farther off than its circle a buoy may be passed, in turning radii."""
+"""Largest distance of a passing outside the circle of a buoy, in turning radii."""
 
 
 class LinearizedProblem(NamedTuple):
-    """A route at z as a linear problem, in turning radii and the time that one takes.
+    """The route problem linearised at z, in units of the turning radius and its travel time.
 
     Attributes:
-        cost: the time, to make small.
-        cost_gradient: derivatives [nz] of it.
-        constraints: what must not be negative [m].
-        constraint_jacobian: derivatives [m, nz] of these.
-        penalties: of one that they are negative by [m].
-        buoy_numbers: of the buoys that they are for [m].
-        n_hard: how many of them, the first ones, a right course needs.
+        cost: duration of the route.
+        cost_gradient: derivatives [nz] of the cost.
+        constraints: constraint values [m]; feasible if not negative.
+        constraint_jacobian: derivatives [m, nz] of the constraints.
+        penalties: penalty per unit of violation [m].
+        buoy_numbers: number of the buoy of each constraint [m].
+        n_hard: number of hard constraints, which come first; a valid course meets all of them.
     """
 
     cost: float
@@ -69,11 +77,11 @@ class LinearizedProblem(NamedTuple):
     n_hard: int
 
     def merit_value(self) -> float:
-        """Return the cost, and what is missed at its price."""
+        """Return the merit function: the cost plus the penalties of violated constraints."""
         return self.cost + float((self.penalties * np.maximum(-self.constraints, 0.0)).sum())
 
     def solve_linear_program(self, lower: Array, upper: Array) -> tuple[Array, float]:
-        """Return the best step within bounds where all is linear, and the merit it promises."""
+        """Solve the linear program within bounds; returns the step and the predicted decrease."""
         # what cannot become negative within the bounds is left out
         is_active = self.constraints < np.abs(self.constraint_jacobian) @ np.maximum(-lower, upper)
         jacobian_rows = self.constraint_jacobian[is_active]
@@ -99,7 +107,7 @@ class LinearizedProblem(NamedTuple):
 
 
 class RouteSolution(NamedTuple):
-    """A fitted route: z, the time in s, and by how much it misses what is asked, in m."""
+    """A fitted route: its variables z, its duration in s and its largest violation in m."""
 
     z: Array
     time: float
@@ -108,14 +116,14 @@ class RouteSolution(NamedTuple):
 
 
 class _NearestPoints(NamedTuple):
-    """The nearest points of M parts of a route to a buoy each.
+    """Points of closest approach of M parts of a route to one buoy each.
 
     Attributes:
-        distance: [M] in m.
+        distance: distance [M] from the buoy in m.
         distance_jacobian: derivatives [M, nz] of the distances.
-        abeam_offset: [M] the same, positive to starboard and negative to port. It goes through zero
-            where the buoy comes to lie ahead or astern of the end of a part.
-        abeam_jacobian: derivatives [M, nz] of that.
+        abeam_offset: signed distance [M], positive if the buoy is to starboard. It passes through
+            zero when the buoy is ahead or astern of the end of a part.
+        abeam_jacobian: derivatives [M, nz] of the signed distance.
     """
 
     distance: Array
@@ -126,14 +134,15 @@ class _NearestPoints(NamedTuple):
 
 @final
 class RouteProblem:
-    """A route past circles as a problem of least time.
+    """Minimum-time problem of a route past N circles.
 
     Args:
-        circles: in their order.
-        passing_indices: points of the route [N] at which each is passed.
-        is_heading_free: whether the first heading is free.
-        max_offset: by how much in m the vessel may be displaced from the course; a buoy is farther off
-            by as much on the rest of the course than in its turn.
+        route: route as a function of its variables z.
+        circles: circles in the order of passing.
+        passing_indices: points of the route [N] at which the circles are passed.
+        is_heading_free: whether the first heading is a free variable.
+        max_offset: largest deviation of the vessel from the course in m. Other parts of the course
+            keep this much more distance from a buoy than its own turn.
     """
 
     def __init__(
@@ -161,7 +170,7 @@ class RouteProblem:
         self.trust_region: tuple[Array, float] | None = None
 
     def with_route(self, route: Route) -> RouteProblem:
-        """Return the same problem with other tables of turns."""
+        """Return the same problem for a route with other turn tables."""
         passing_indices = np.zeros(len(self.circles), dtype=np.intp)
         problem = RouteProblem(
             route, self.circles, passing_indices, self.is_heading_free, self.max_offset
@@ -171,19 +180,19 @@ class RouteProblem:
         return problem
 
     def _passing_margin(self, circle: Circle) -> float:
-        """Return by how much farther a buoy is on the rest of the course, as its start allows."""
+        """Return the extra distance in m of other parts of the course that the start permits."""
         start_distance = abs(circle.centre - self.route.start) - circle.radius
         margin = _PASSING_MARGIN * self.length_unit + self.max_offset
         return margin if start_distance < 0 else min(margin, 0.5 * start_distance)
 
     def turn_window(self, number: int, count: int) -> slice:
-        """Return the points of a buoy's turn."""
+        """Return the range of points of the turn at a buoy."""
         first = int(self.window_edges[number])
         stop = count if number == len(self.circles) - 1 else int(self.window_edges[number + 1]) + 1
         return slice(min(first, count - 2), max(stop, min(first, count - 2) + 2))
 
     def select_constraints(self, z: Array) -> None:
-        """Choose which pieces of the course must keep clear of which buoys."""
+        """Select the pairs of route pieces and buoys that become constraints."""
         geometry = self.route(z)
         points = geometry.points
         self.other_parts = []
@@ -225,7 +234,7 @@ class RouteProblem:
             ]
 
     def _first_counted_point(self, points: np.ndarray, circle: Circle) -> int:
-        """Return the point from which a circle counts: `course_check.left_behind`."""
+        """Return the first point that counts for a circle, see `first_counted_sample`."""
         if circle.turn_sign == 0 or abs(circle.centre - points[0]) >= circle.radius:
             return 0
         return min(
@@ -233,7 +242,7 @@ class RouteProblem:
         )
 
     def _constrained_parts(self, points: np.ndarray) -> list[tuple[int, slice]]:
-        """Return the circles and the parts of the course that keep to them: own turns first."""
+        """Return pairs of circle number and range of points; the buoys' own turns come first."""
         count = len(points)
         last = len(self.circles) - 1
         first_counted = [self._first_counted_point(points, circle) for circle in self.circles]
@@ -252,7 +261,7 @@ class RouteProblem:
     def _nearest_points(
         self, geometry: RouteGeometry, constrained_parts: Sequence[tuple[int, slice]]
     ) -> _NearestPoints:
-        """Return the points of parts of the course that are nearest to the middle of circles."""
+        """Compute the closest approach of parts of the course to the centres of circles."""
         edge_vectors = np.diff(geometry.points)
         offsets_to_buoys = self.buoy_positions[:, None] - geometry.points[:-1]
         edge_fraction = (offsets_to_buoys * edge_vectors.conj()).real / np.maximum(
@@ -301,7 +310,7 @@ class RouteProblem:
         )
 
     def linearize(self, z: Array) -> LinearizedProblem:
-        """Return the problem as it is linear at z."""
+        """Linearise cost and constraints at z."""
         if self.cached_linearization is not None and np.array_equal(
             self.cached_linearization[0], z
         ):
@@ -387,7 +396,7 @@ class RouteProblem:
         return linearized
 
     def bounds(self) -> tuple[Array, Array]:
-        """Return the smallest and the largest z."""
+        """Return the lower and upper bounds of z."""
         lower, upper = self.route.lower_bounds(), self.route.upper_bounds()
         if self.trust_region is None:
             return lower, upper
@@ -395,12 +404,12 @@ class RouteProblem:
         return np.maximum(lower, z - trust_radius), np.minimum(upper, z + trust_radius)
 
     def refresh_constraints(self, z: Array) -> None:
-        """Look anew which parts of the course come near which buoys."""
+        """Select the constraints again after a change of the route."""
         self.cached_linearization = None
         self.select_constraints(z)
 
     def max_violation(self, z: Array) -> tuple[float, int]:
-        """Return by how much a route misses what is asked of it, in m, and at which buoy."""
+        """Return the largest violation of a hard constraint in m, and the number of its buoy."""
         linearized = self.linearize(z)
         violations = np.maximum(-linearized.constraints[: linearized.n_hard], 0.0)
         worst_constraint = int(violations.argmax())
@@ -409,12 +418,12 @@ class RouteProblem:
         ]
 
     def solve_with_hard_penalty(self, z: Array, trust_radius: float | None = None) -> RouteSolution:
-        """Return the route that is found where buoys are hardly approached out of their turns."""
+        """Solve with the soft constraints weighted like the hard ones."""
         self.soft_penalty = _HARD_PENALTY
         return self.solve(z, trust_radius)
 
     def solve(self, z: Array, trust_radius: float | None = None) -> RouteSolution:
-        """Return the route that is found from a start, not farther from it than a reach of z."""
+        """Solve from the initial route z, within a trust radius around it if one is given."""
         self.trust_region = None if trust_radius is None else (z, trust_radius)
         z = self._minimize_merit(np.clip(z, *self.bounds()))
         violation, worst_buoy = self.max_violation(z)
@@ -426,11 +435,12 @@ class RouteProblem:
         )
 
     def _minimize_merit(self, z: Array) -> Array:
-        """Return the z of least merit near a start.
+        """Minimise the merit function locally from z by sequential linear programming.
 
-        A step solves the problem as it is linear there, within a reach that follows how well this
-        holds. What is asked may be missed by a step, so that there always is one. Where the problem
-        bends too much for a step, it is corrected once for what that step has missed.
+        Each iteration solves the linearised problem within a trust region, whose radius depends on
+        the ratio of actual to predicted decrease. Constraints are relaxed by penalties, so that
+        every linear program is feasible. A rejected step is followed by one second-order
+        correction.
         """
         trust_radius = _TRUST_RADII[1]
         (lower, upper) = self.bounds()

@@ -1,8 +1,8 @@
-"""Turns as a vessel makes them: rudder held, counter-rudder until the yaw stops, amidships.
+"""Simulated turns of a vessel, and routes that join turns by straight legs.
 
-They begin with any motion. Tables hold those from straight ahead to straight ahead by how long the
-rudder is held, and routes join them by straight legs. Positions in tables are complex, north + i
-east in m.
+A turn has three phases: a constant rudder angle, counter-rudder until the yaw rate is zero, and
+rudder amidships on the leg that follows. A turn table interpolates turns over the hold time, which
+is the duration of the first phase. Positions are complex numbers, north + i east, in m.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from residnet.engine.rollout import Rollout
 
 Array = NDArray[np.float64]
 _COUNTER_RUDDER_TIME = 1.5
-"""Time constants within which counter-rudder stops a turn; T ln 2 by Nomoto's model."""
+"""Simulated duration of the counter-rudder in time constants; Nomoto's model needs T ln 2."""
 _STEP_SEARCH = (0.25, 6)
-"""Longest step of simulated turns in time constants, and how often it is halved at most."""
+"""Largest time step of simulated turns in time constants, and largest number of halvings."""
 _STEP_TOLERANCE = 1e-3
-"""Turning radii, and rad, by which a turn may differ from one simulated with half the step."""
+"""Accepted difference from a simulation with half the step, in turning radii and in rad."""
 
 
 @dataclass(frozen=True)
 class Turn:
-    """A turn from the origin, heading north at first, and the leg behind it.
-
-    The rudder is amidships on the leg.
+    """A simulated turn that starts at the origin with heading north, and the leg after it.
 
     Attributes:
-        rudder: angle held in rad, positive to starboard; then the same to the other side.
-        hold_time: for how long, in s.
-        duration: until the counter-rudder ends and the leg begins, in s.
-        held, countered, leg: states of the vessel [nx] by the time in s since the rudder was laid,
-            since the counter-rudder was, and since the leg began.
-        pose_columns: of north, east and heading in those.
+        rudder: rudder angle of the first phase in rad, positive to starboard; the counter-rudder
+            has the opposite sign.
+        hold_time: duration of the first phase in s.
+        duration: duration of the first phase and the counter-rudder in s.
+        rudder_phase: state [nx] by the time in s since the start of the first phase.
+        counter_rudder_phase: state [nx] by the time in s since the start of the counter-rudder.
+        leg_phase: state [nx] by the time in s since the start of the leg.
+        pose_columns: columns of north, east and heading in the state.
     """
 
     rudder: float
@@ -56,7 +56,7 @@ class Turn:
     pose_columns: tuple[int, int, int]
 
     def track_at(self, times: Array) -> tuple[Array, Array]:
-        """Return the track [M, 2] and heading [M] of the turn at times [M] in s."""
+        """Return positions [M, 2] in m and headings [M] in rad of the turn at times [M] in s."""
         is_holding = (times <= self.hold_time)[:, None]
         counter_rudder_states = self.counter_rudder_phase(np.maximum(times - self.hold_time, 0.0))
         return self._pose_of(
@@ -68,7 +68,7 @@ class Turn:
         )
 
     def leg_at(self, times: Array) -> tuple[Array, Array]:
-        """Return the track [M, 2] and heading [M] of the leg at times [M] in s since it began."""
+        """Return positions [M, 2] and headings [M] of the leg at times [M] in s since its start."""
         return self._pose_of(self.leg_phase(times))
 
     def _pose_of(self, states: Array) -> tuple[Array, Array]:
@@ -77,13 +77,15 @@ class Turn:
 
 @final
 class TurnMaker:
-    """Simulated turns of the nominal vessel: rudder held, counter-rudder, rudder amidships.
+    """Simulate turns of the nominal vessel: constant rudder, counter-rudder, rudder amidships.
 
-    The three follow from simulations that begin where they do, so that what comes of a turn changes
-    smoothly with its time.
+    Each phase is a separate simulation that starts at the end of the previous phase, so that the
+    end of a turn is a smooth function of the hold time.
 
     Args:
-        dt: step of the simulations in s, shorter while a steering gear moves the rudder.
+        vessel: steered vessel.
+        nomoto: K, T and speed of the vessel.
+        dt: time step in s; shorter steps are used while a steering gear moves the rudder.
     """
 
     def __init__(self, vessel: SteeredVessel, nomoto: NomotoModel, dt: float) -> None:
@@ -102,13 +104,14 @@ class TurnMaker:
     def __call__(
         self, hold_times: Array, rudder: Array, initial_states: Sequence[Array], leg_time: float
     ) -> list[list[Turn]]:
-        """Return the turns of n rudder angles, each held for K times.
+        """Simulate the turns of n rudder angles with K hold times each.
 
         Args:
-            hold_times: [n, K] in s.
-            rudder: [n] in rad, positive to starboard.
-            initial_states: state [nx] that each begins with; its place and heading do not matter.
-            leg_time: how much of the leg behind is simulated, in s.
+            hold_times: hold times [n, K] in s.
+            rudder: rudder angles [n] in rad, positive to starboard.
+            initial_states: initial state [nx] for each rudder angle; position and heading are set
+                to zero.
+            leg_time: simulated duration of the leg in s.
         """
         n, k = hold_times.shape
         x = np.stack(initial_states)
@@ -149,9 +152,13 @@ class TurnMaker:
     def _simulate_phase(
         self, x: Array, rudder: Array, duration: float, rudder_change: float
     ) -> CubicSpline:
-        """Return the states [B, nx] by the time from x [B, nx] on, under rudder angles [B].
+        """Simulate the states [B, nx] from initial states x [B, nx] under rudder angles [B] in rad.
 
-        `rudder_change` is what the rudder moves by at most, in rad.
+        Args:
+            x: initial states.
+            rudder: rudder angles.
+            duration: simulated time in s.
+            rudder_change: largest movement of the rudder in rad.
         """
         w = self.nominal_inputs.unsqueeze(1).repeat(len(x), 1, 1)
         w[:, 0, 0] = torch.from_numpy(rudder)
@@ -162,7 +169,7 @@ class TurnMaker:
         remaining_time = max(duration, 3.0 * self.dt)
         if self.vessel.rate is not None:
             rudder_travel_time = rudder_change / self.vessel.rate
-            # the rudder moves between steps, and lags behind by half of one
+            # the rudder is constant within a step and lags by half a step on average
             short_step = min(self.dt, 4.0 * _STEP_TOLERANCE / (self.nomoto.gain * rudder_change))
             count = math.ceil(min(1.1 * rudder_travel_time, remaining_time) / short_step)
             step_plan = [(short_step, count)]
@@ -185,9 +192,11 @@ class TurnMaker:
         )
 
     def _stop_times(self, countered: CubicSpline, turn_signs: Array) -> Array:
-        """Return the times [B] at which the yaw towards a side has stopped.
+        """Return the times [B] in s at which the yaw rate reaches zero, else the end time.
 
-        The end where it does not.
+        Args:
+            countered: states under counter-rudder by the time.
+            turn_signs: +1 [B] for turns to starboard, -1 to port.
         """
         column = self.vessel.state_column("r")
         stop_times = []
@@ -199,7 +208,7 @@ class TurnMaker:
 
 
 def _evaluate_rows(states: CubicSpline, times: Array, rows: NDArray[np.intp]) -> Array:
-    """Return the states [M, nx] of rows [M] at times [M]."""
+    """Evaluate the spline of M rows at one time [M] in s each; returns states [M, nx]."""
     interval = np.clip(np.searchsorted(states.x, times, side="right") - 1, 0, len(states.x) - 2)
     time_in_interval = (times - states.x[interval])[:, None]
     row_states: Array = np.asarray(
@@ -209,14 +218,20 @@ def _evaluate_rows(states: CubicSpline, times: Array, rows: NDArray[np.intp]) ->
 
 
 def _row_spline(states: CubicSpline, row: int) -> PPoly:
-    """Return the states [nx] of one row by the time."""
+    """Return the piecewise polynomial of one row of a spline."""
     return PPoly(states.c[:, :, row], states.x)
 
 
 def choose_time_step(vessel: SteeredVessel, nomoto: NomotoModel, rudder: float) -> float:
-    """Return the longest step in s that simulates turns at a rudder angle [rad] as half of it does.
+    """Choose the largest time step in s at which turns and legs have converged.
 
-    Turns and the legs behind them are compared, at rudder angles held for several times.
+    A step is accepted if half the step changes positions and headings by less than
+    `_STEP_TOLERANCE`, for three hold times.
+
+    Args:
+        vessel: steered vessel.
+        nomoto: K, T and speed of the vessel.
+        rudder: rudder angle in rad.
     """
     hold_times = nomoto.time * np.array([[0.5, 1.5, 3.0]])
     radius = nomoto.speed / (nomoto.gain * rudder)
@@ -244,9 +259,13 @@ def choose_time_step(vessel: SteeredVessel, nomoto: NomotoModel, rudder: float) 
 
 @dataclass(frozen=True)
 class SteadyTurn:
-    """At a held rudder: radius of the track [m], speed [m/s] and yaw rate [rad/s].
+    """A steady turn at a constant rudder angle.
 
-    `step` is what it was simulated with, in s.
+    Attributes:
+        radius: radius of the track in m.
+        speed: in m/s.
+        yaw_rate: in rad/s.
+        step: time step of the simulation in s.
     """
 
     radius: float
@@ -258,9 +277,15 @@ class SteadyTurn:
 def simulate_steady_turn(
     vessel: SteeredVessel, rudder: float, duration: float, dt: float
 ) -> SteadyTurn:
-    """Return the steady turn after `duration` s of a held rudder angle in rad.
+    """Simulate the steady turn at a constant rudder angle.
 
-    At the rudder's limit it is the smallest turn that the vessel makes.
+    At the rudder limit it is the tightest turn of the vessel.
+
+    Args:
+        vessel: steered vessel.
+        rudder: rudder angle in rad.
+        duration: simulated time in s; the last tenth is evaluated.
+        dt: time step in s.
     """
     x, w = vessel.straight_course(torch.ones(1, dtype=torch.float64))
     w[:, 0] = rudder
@@ -270,7 +295,7 @@ def simulate_steady_turn(
         states, _, _ = Rollout(vessel.model(dt))(x, w.unsqueeze(1).expand(-1, steps, -1), variation)
     psi = states[0, :, vessel.state_column("psi")]
     track = states[0, :, [vessel.state_column("x"), vessel.state_column("y")]]
-    # over the last tenth
+    # the last tenth of the simulation is steady
     first_step = steps - max(steps // 10, 1)
     distance = float((track[first_step + 1 :] - track[first_step:-1]).norm(dim=-1).sum())
     heading_change = float((psi[-1] - psi[first_step]).abs())
@@ -282,21 +307,24 @@ def simulate_steady_turn(
 
 
 POINTS = 28
-"""Points of a turn beside its beginning."""
+"""Number of points of a turn, without its start."""
 _MAX_TURN_ANGLE = math.radians(500.0)
 """The largest angle of a turn in a table."""
 _N_HOLD_TIMES = 56
-"""Angles of turns in a table, nine degrees apart."""
+"""Number of turns in a table; their angles differ by about nine degrees."""
 _RESIDUAL_MOTION_TOLERANCE = 2e-3
-"""Below it what a turn leaves does not count: shares of speed and radius, and rad."""
+"""Residual motion after a turn that is neglected, relative to speed and radius, and in rad."""
 _SETTLING_TIME = 4.0
-"""Time constants after which the vessel runs straight behind a turn."""
+"""Number of time constants after which the motion behind a turn has decayed."""
 
 
 class TrackPart(NamedTuple):
-    """Turns, or the legs behind them: points [n, K] complex, last headings [n], and times [n].
+    """Points, final headings and durations of n turns or legs, or the derivatives of these.
 
-    Also their derivatives.
+    Attributes:
+        points: complex positions [n, K] in m.
+        headings: final headings [n] in rad.
+        times: durations [n] in s.
     """
 
     points: np.ndarray
@@ -306,17 +334,18 @@ class TrackPart(NamedTuple):
 
 @final
 class TurnTable:
-    """Turns to starboard at one rudder angle, as smooth functions of the time it is held.
+    """Turns to starboard at one rudder angle, interpolated over the hold time by cubic splines.
 
     Args:
-        hold_times: [K] in s, from 0 on.
-        points: [K, POINTS] complex positions in m in the frame of the beginning; the last one is
-            where the straight leg behind the turn begins.
-        headings: [K, POINTS] of the vessel in rad; the last one is the direction of that leg.
-        times: [K] that the turns take, in s.
-        rudder: the angle that is held, in rad.
-        leg: north, east and heading of the leg behind by its length, in the frame of its beginning;
-            None for a straight one.
+        hold_times: hold times [K] in s, increasing from 0.
+        points: complex positions [K, POINTS] in m in the frame of the start; the last one is the
+            start of the leg.
+        headings: headings [K, POINTS] of the vessel in rad; the last one is the direction of the
+            leg.
+        times: durations [K] of the turns in s.
+        rudder: rudder angle in rad.
+        leg: north, east and heading of the leg by its length, in the frame of its start; None for
+            a straight leg.
     """
 
     def __init__(
@@ -340,12 +369,12 @@ class TurnTable:
         self.end_positions = points[:, -1]
 
     def __call__(self, hold_time: float) -> tuple[np.ndarray, Array, float]:
-        """Return the points [POINTS], headings [POINTS] and the time of a turn."""
+        """Return points [POINTS], headings [POINTS] and duration of the turn with a hold time."""
         row = self.spline(hold_time)
         return row[:POINTS] + 1j * row[POINTS : 2 * POINTS], row[2 * POINTS : -1], float(row[-1])
 
     def leg_at(self, lengths: Array) -> tuple[TrackPart, TrackPart]:
-        """Return the leg behind at lengths [..., K] in m, and what it changes by with each."""
+        """Return the leg at lengths [..., K] in m, and its derivatives by each length."""
         zero_angles = np.zeros(lengths.shape[:-1])
         if self.leg is None or self.leg_derivative is None:
             straight_points = lengths.astype(complex)
@@ -369,14 +398,14 @@ class TurnTable:
         )
 
     def hold_time(self, angle: float) -> float:
-        """Return the time in s that a turn of an angle in rad is held for."""
+        """Return the hold time in s of a turn by `angle` rad."""
         return float(np.interp(angle, self.angles, self.hold_times))
 
     @cached_property
     def fitted_arc(self) -> tuple[float, float, float]:
-        """The radius of an arc, and the straight parts in m before and behind it.
+        """Radius of an arc and lengths of the straight lines before and after it, in m.
 
-        Together they lead where the turns lead, by least squares over their angles.
+        Line, arc and line approximate the end positions of the turns by least squares.
         """
         is_usable = (self.angles > math.radians(20.0)) & (self.angles < math.radians(300.0))
         turn_rotation = np.exp(1j * self.angles[is_usable])
@@ -398,13 +427,13 @@ class TurnTable:
 
 @dataclass(frozen=True)
 class TurnTables:
-    """The tables of a vessel by rudder angle.
+    """Turn tables of a vessel for several rudder angles.
 
     Attributes:
-        tables: of turns, that of the largest rudder angle first.
-        speed: on straight legs, in m/s.
-        min_radius: the smallest of a turn, in m.
-        is_settled: whether turns leave no motion that the turns behind them begin with.
+        tables: turn tables in order of decreasing rudder angle.
+        speed: speed on straight legs in m/s.
+        min_radius: smallest radius of a turn in m.
+        is_settled: whether each turn is assumed to start without motion from the previous one.
     """
 
     tables: tuple[TurnTable, ...]
@@ -415,7 +444,7 @@ class TurnTables:
     def turns_at(
         self, table_numbers: Sequence[int], hold_times: Array
     ) -> tuple[TrackPart, TrackPart]:
-        """Return turns of tables [n] held for [n] in s, to starboard, and their derivatives."""
+        """Return starboard turns of n tables for hold times [n] in s, and their derivatives."""
         rows, slopes = np.zeros((2, len(hold_times), 3 * POINTS + 1))
         for number, turn_indices in _group_by_table(table_numbers):
             rows[turn_indices] = self.tables[number].spline(hold_times[turn_indices])
@@ -431,7 +460,7 @@ class TurnTables:
     def legs_after(
         self, table_numbers: Sequence[int], lengths: Array
     ) -> tuple[TrackPart, TrackPart]:
-        """Return the legs behind such turns at lengths [n, K] in m, and their derivatives."""
+        """Return the legs after turns of n tables at lengths [n, K] in m, and derivatives."""
         count = len(lengths)
         leg_and_derivative = [
             TrackPart(np.zeros(lengths.shape, complex), np.zeros(count), np.zeros(count))
@@ -447,7 +476,7 @@ class TurnTables:
 
 
 def _group_by_table(table_indices: Sequence[int]) -> list[tuple[int, NDArray[np.intp]]]:
-    """Return each table's number and the turns that are of it."""
+    """Return each table's number with the indices of the turns that use it."""
     table_numbers = np.array(table_indices, dtype=np.intp)
     return [
         (int(number), np.flatnonzero(table_numbers == number))
@@ -456,7 +485,7 @@ def _group_by_table(table_indices: Sequence[int]) -> list[tuple[int, NDArray[np.
 
 
 def arc_turns(radii: Array, speed: float) -> TurnTables:
-    """Return the turns of a vessel that yaws at once: arcs of the radii [n] in m."""
+    """Return turn tables of a vessel without yaw inertia: arcs of the radii [n] in m."""
     angles = np.linspace(0.0, _MAX_TURN_ANGLE, _N_HOLD_TIMES)
     headings = angles[:, None] * np.linspace(0.0, 1.0, POINTS + 1)[1:]
     tables = [
@@ -473,14 +502,15 @@ def arc_turns(radii: Array, speed: float) -> TurnTables:
 
 
 def simulate_turns(turn_maker: TurnMaker, rudder: Array, radius: float) -> TurnTables:
-    """Return the turns of a vessel at rudder angles [n] in rad, each from straight ahead.
+    """Simulate turn tables for rudder angles [n], each turn from a straight course.
 
-    Behind a turn the sway dies out. The leg is put where it ends up, and the last part of the turn
-    is bent towards it.
+    The sway velocity decays after a turn. The leg is placed on the final straight track, and the
+    last part of the turn is shifted smoothly towards it.
 
     Args:
-        rudder: angles, the largest first.
-        radius: the vessel's smallest turning radius in m.
+        turn_maker: simulates the turns.
+        rudder: rudder angles in rad, in decreasing order.
+        radius: smallest turning radius of the vessel in m.
     """
     nomoto = turn_maker.nomoto
     hold_grid = np.stack(
@@ -531,13 +561,17 @@ def simulate_following_turns(
     initial_states: Sequence[Array],
     radius: float,
 ) -> tuple[TurnTables, list[Turn]]:
-    """Return tables of n turns, each from a motion of its own, and the middle one of each.
+    """Simulate tables of n consecutive turns, each with its own initial motion.
 
     Args:
-        hold_grid: [n, K] in s, K odd.
-        rudder: [n] in rad, positive to starboard.
-        initial_states: state of the vessel [nx] that each begins with.
-        radius: the vessel's smallest turning radius in m.
+        turn_maker: simulates the turns.
+        hold_grid: hold times [n, K] in s, with K odd.
+        rudder: rudder angles [n] in rad, positive to starboard.
+        initial_states: initial state of the vessel [nx] for each turn.
+        radius: smallest turning radius of the vessel in m.
+
+    Returns:
+        The tables, and the turn at the middle of each table's grid.
     """
     settling_time = 2.0 * _SETTLING_TIME * turn_maker.nomoto.time
     simulated = turn_maker(hold_grid, rudder, initial_states, settling_time)
@@ -564,7 +598,7 @@ def simulate_following_turns(
 
 
 def state_after_turn(turn: Turn, length: float) -> Array:
-    """Return the state of the vessel [nx] after a length in m of the leg behind a turn."""
+    """Return the state of the vessel [nx] after `length` m of the leg that follows a turn."""
     times = np.linspace(0.0, float(turn.leg_phase.x[-1]), 80)
     track, _ = turn.leg_at(times)
     distance = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(track, axis=0).T))))
@@ -573,7 +607,7 @@ def state_after_turn(turn: Turn, length: float) -> Array:
 
 
 def _sample_turns(group: Sequence[Turn]) -> tuple[np.ndarray, Array, Array]:
-    """Return points [K, POINTS], headings [K, POINTS] and times [K] of turns, even in time."""
+    """Sample K turns uniformly in time: points and headings [K, POINTS], and durations [K]."""
     share = np.linspace(0.0, 1.0, POINTS + 1)[1:]
     points = np.zeros((len(group), POINTS), dtype=complex)
     headings = np.zeros((len(group), POINTS))
@@ -584,29 +618,35 @@ def _sample_turns(group: Sequence[Turn]) -> tuple[np.ndarray, Array, Array]:
 
 
 def _hold_times(share: Array, rudder: float, nomoto: NomotoModel) -> Array:
-    """Return the times in s for which the rudder is held, up to the largest angle of a turn.
+    """Return hold times in s for fractions of the largest turn angle.
 
-    By Nomoto's model angles are K d (t1 - t2), t2 = T ln(2 - exp(-t1 / T)).
+    In Nomoto's model a turn with hold time t1 has the angle K d (t1 - t2) with
+    t2 = T ln(2 - exp(-t1 / T)).
+
+    Args:
+        share: fractions of the largest turn angle.
+        rudder: rudder angle d in rad.
+        nomoto: K and T of the vessel.
     """
     max_hold_time = _MAX_TURN_ANGLE / (nomoto.gain * rudder) + math.log(2.0) * nomoto.time
     return share**1.3 * max_hold_time
 
 
 LEG = 12
-"""Points of a leg beside its beginning."""
+"""Number of points of a leg, without its start."""
 _OVERSAMPLING = 8
-"""Times as many points as a turn is searched with describe it in the end."""
+"""Factor by which the final route has more points per turn than the route in the search."""
 
 
 @dataclass(frozen=True)
 class TurnSpec:
-    """A turn of a route before its time is known.
+    """A turn of a route outline, whose hold time is not yet fitted.
 
     Attributes:
         turn_sign: +1 to starboard, -1 to port.
-        angle: in rad.
-        table: number of the table of turns.
-        passed_buoys: buoys that are passed in it.
+        angle: turn angle in rad, positive.
+        table: number of the turn table.
+        passed_buoys: numbers of the buoys that are passed during the turn.
     """
 
     turn_sign: int
@@ -617,13 +657,13 @@ class TurnSpec:
 
 @dataclass(frozen=True)
 class RouteOutline:
-    """A route in outline.
+    """Legs and turns of a route before the fit of their lengths and hold times.
 
     Attributes:
-        heading: of the first leg in rad.
-        legs: [n + 1] lengths in m.
-        turns: [n] between the legs.
-        passed_on_legs: for each leg, the buoys that are passed on it.
+        heading: heading of the first leg in rad.
+        legs: lengths of the n + 1 legs in m.
+        turns: the n turns between the legs.
+        passed_on_legs: for each leg, the numbers of the buoys that are passed on it.
     """
 
     heading: float
@@ -632,9 +672,11 @@ class RouteOutline:
     passed_on_legs: tuple[tuple[int, ...], ...]
 
     def simplify(self, min_leg: float, min_angle: float) -> RouteOutline:
-        """Return the outline with bends joined that turn to one side with a short leg between.
+        """Merge turns to the same side that a short leg separates, and remove small turns.
 
-        Bends below `min_angle` rad are left out.
+        Args:
+            min_leg: length in m below which the leg between two turns is removed.
+            min_angle: angle in rad below which a turn is removed.
         """
         sketch = self
         k = 0
@@ -652,7 +694,7 @@ class RouteOutline:
         return sketch
 
     def _remove_turn(self, k: int) -> RouteOutline:
-        """Return the outline without a bend: both legs beside it are one."""
+        """Return the outline without turn k; the legs before and after it become one leg."""
         legs = (*self.legs[:k], self.legs[k] + self.legs[k + 1], *self.legs[k + 2 :])
         merged_passed = (
             *self.passed_on_legs[k],
@@ -665,7 +707,7 @@ class RouteOutline:
         )
 
     def _merge_turns(self, k: int) -> RouteOutline:
-        """Return the outline with a bend and the next as one."""
+        """Return the outline with turns k and k + 1 merged into one."""
         first = self.turns[k]
         second = self.turns[k + 1]
         wider_turn = max(first, second, key=lambda bend: bend.angle)
@@ -689,22 +731,24 @@ class RouteOutline:
 
 @dataclass(frozen=True)
 class RouteGeometry:
-    """A route's points, its length of time, and what they change by.
+    """Points and duration of a route, with their derivatives by the route variables z.
 
-    A point moves with a length of its own part of the route, and with those of all parts before
-    it: these shift it and turn it about where they end.
+    A point depends on the variable of its own part of the route and on the variables of all earlier
+    parts. An earlier variable translates the point and rotates it about the end of its part.
 
     Attributes:
-        points: [S] complex in m, from the start on.
-        time: in s.
-        heading: of the last leg in rad.
-        d_time: derivatives [nz] of the time.
+        points: complex positions [S] in m.
+        time: duration in s.
+        heading: heading of the last leg in rad.
+        d_time: derivatives [nz] of the duration.
         d_heading: derivatives [nz] of the last heading.
-        d_points: derivatives [S] of the points by the length of their own part.
-        part_index: number in z of that length [S].
-        first_point_after: first point [nz] behind the part of each length.
-        shift, turn, pivot: what each length does to the points behind its part [nz].
-        units: of z [nz].
+        d_points: derivatives [S] of the points by the variable of their own part.
+        part_index: number of that variable in z, [S].
+        first_point_after: first point after the part of each variable, [nz].
+        d_shift: translation of later points by each variable, complex [nz].
+        d_rotation: rotation of later points by each variable [nz] in rad.
+        rotation_pivot: centre of that rotation, complex [nz] in m.
+        units: unit of each variable [nz].
     """
 
     points: np.ndarray
@@ -721,7 +765,7 @@ class RouteGeometry:
     units: Array
 
     def point_jacobian(self, point_numbers: NDArray[np.intp]) -> np.ndarray:
-        """Return the derivatives [P, nz] of points with the numbers [P]."""
+        """Return the derivatives [P, nz] of the points with numbers [P] by z."""
         offsets = self.points[point_numbers][:, None] - self.rotation_pivot
         rows = np.where(
             point_numbers[:, None] >= self.first_point_after,
@@ -736,7 +780,7 @@ class RouteGeometry:
 
 
 def _mirror_to_side(points: np.ndarray, turn_signs: Array) -> np.ndarray:
-    """Return turns [n, K] to starboard as turns to their sides [n]: to port they are mirrored."""
+    """Mirror starboard turns [n, K] where the sign [n] is -1 (port)."""
     result: np.ndarray = points.real + 1j * turn_signs[:, None] * points.imag
     return result
 
@@ -744,16 +788,17 @@ def _mirror_to_side(points: np.ndarray, turn_signs: Array) -> np.ndarray:
 @final
 @dataclass
 class Route:
-    """A route as a function of z = (first heading, leg, hold, leg, hold, ..., leg).
+    """A route as a differentiable function of its variables z.
 
-    Headings are in rad, legs in m and holds in s, each divided by its unit.
+    z is (first heading, leg, hold time, leg, hold time, ..., leg), with headings in rad, legs in m
+    and hold times in s, each divided by its unit.
 
     Attributes:
-        start: complex, in m.
-        turn_signs: [n] of the turns.
-        table_numbers: [n] of their tables.
-        turns: the tables.
-        units: [2 n + 2] of z.
+        start: complex start position in m.
+        turn_signs: +1 (starboard) or -1 (port) for each of the n turns.
+        table_numbers: number of the turn table for each turn.
+        turns: the turn tables.
+        units: units [2 n + 2] of z.
     """
 
     start: complex
@@ -768,7 +813,7 @@ class Route:
         self.units[2::2] = self.turns.min_radius / self.turns.speed
 
     def initial_z(self, sketch: RouteOutline) -> Array:
-        """Return the z that an outline stands for; turns need room before and behind them."""
+        """Convert an outline to z, with legs shortened by the space that the turns need."""
         z = np.zeros(len(self.units))
         z[0] = sketch.heading
         legs = np.array(sketch.legs)
@@ -799,7 +844,7 @@ class Route:
         return result
 
     def passing_points(self, sketch: RouteOutline, buoys: np.ndarray) -> NDArray[np.intp]:
-        """Return the points [N] at which an outline passes its buoys, in their order."""
+        """Return the point indices [N] at which an outline passes its N buoys, in order."""
         z = self.initial_z(sketch)
         points = self(z).points
         passing_indices = np.zeros(len(buoys), dtype=np.intp)
@@ -824,7 +869,7 @@ class Route:
         return passing_indices
 
     def __call__(self, z: Array) -> RouteGeometry:
-        """Return the points of z, the time, and what they change by."""
+        """Compute points and duration of the route z with their derivatives."""
         z = z * self.units
         n_variables = len(z)
         n_turns = len(self.turn_signs)
@@ -901,7 +946,7 @@ class Route:
         )
 
     def to_segments(self, z: Array) -> list[tuple[np.ndarray, Array, float]]:
-        """Return the parts of a route: points [K] complex, vessel's headings [K], and rudder."""
+        """Return each part of a route: complex points [K] in m, headings [K], rudder angle."""
         z = z * self.units
         heading_offset = float(z[0])
         position = self.start

@@ -1,6 +1,8 @@
-"""The conditions that heading controllers are tuned, trained and judged under.
+"""Operating conditions under which heading controllers are tuned, trained and evaluated.
 
-Tuning is by differential evolution.
+A simulation is a step change of the reference with a random vessel, delay and disturbances. The
+cost of a simulation weighs heading error, overshoot and rudder travel. Classical controllers are
+tuned by differential evolution.
 """
 
 from __future__ import annotations
@@ -34,16 +36,16 @@ if TYPE_CHECKING:
 
 Range = Annotated[tuple[float, float], Field(description="low and high multiple")]
 _N_WAVE_COMPONENTS = 12
-"""That a motion with the waves is made of."""
+"""Number of sine components of the simulated wave-frequency motion."""
 
 
 class DepthStepConfig(Config):
-    """Changes of depth, in place of those of heading.
+    """Step changes of the depth reference, which replace the heading changes.
 
     Attributes:
-        change: smallest and largest in m, down or up.
-        band: depth error in m at which half of the cost of a large one is left.
-        noise: standard deviation of white noise on the measured depth in m.
+        change: smallest and largest change in m, in both directions.
+        band: depth error in m whose cost rate is half of the largest one.
+        noise: standard deviation of the white measurement noise of the depth in m.
     """
 
     change: tuple[Metres, Metres] = (1.0, 5.0)
@@ -53,42 +55,45 @@ class DepthStepConfig(Config):
 
 _DEPTH_UNIT = 0.1
 _DEGREE = math.pi / 180.0
-"""What stands for a degree of heading where depths are changed: the default bands' ratio, in m."""
+"""Depth in m that is weighted like one degree of heading; the ratio of the default bands."""
 
 
 class ConditionsConfig(Config):
-    """The conditions of heading changes, and what a change costs.
+    """Random operating conditions of heading changes, and the cost of a change.
 
-    Each flight has a vessel, a delay, disturbances and a change of heading of its own. The vessel
-    holds its course first; the reference jumps at a random time, without prefilter. The cost of a
-    flight counts from the jump on: the integral of |e| / (|e| + band) in s, plus `overshoot_weight`
-    times the overshoot in deg, plus `travel_weight` times the travel of the rudder command in deg;
-    e is the true heading error. With `depth` all this is of the depth, by the stern planes: a
-    decimetre of overshoot stands for a degree, sway and yaw are heave and pitch, and heading and
-    yaw rate that are measured are pitch and pitch rate.
+    Each simulation draws a vessel, a delay, disturbances and a change of heading. The controller
+    first holds the initial course; the reference then steps at a random time, without a prefilter.
+    The cost is computed from the step on: the integral of |e| / (|e| + band) in s, plus
+    `overshoot_weight` times the overshoot in deg, plus `travel_weight` times the travel of the
+    rudder command in deg, where e is the true heading error. With `depth` the stern planes control
+    the depth: 0.1 m of overshoot is weighted like one degree, heave and pitch replace sway and yaw,
+    and pitch and pitch rate replace the measured heading and yaw rate.
 
     Attributes:
-        depth: changes of depth; null for those of heading.
-        effect: of the rudder, as a multiple (K of Nomoto's model).
-        time: constants of sway and yaw, as a multiple (T of Nomoto's model).
+        depth: changes of depth; null for changes of heading.
+        effect: smallest and largest rudder effectiveness as a multiple of the nominal one (K of
+            Nomoto's model).
+        time: smallest and largest time constant of sway and yaw as a multiple of the nominal one (T
+            of Nomoto's model).
         delay: shortest and longest delay in s between a command and the steering gear.
-        bias: largest constant angle in rad that is added to the rudder's.
-        push: standard deviation of a slow yaw moment in rad of rudder, a Gauss-Markov process.
+        bias: largest constant rudder offset in rad.
+        push: standard deviation of a slow yaw moment, as an equivalent rudder angle in rad; a
+            Gauss-Markov process.
         push_time: correlation time of that process in s.
-        noise_psi: standard deviation of white noise on the measured heading in rad.
-        noise_r: standard deviation of white noise on the measured yaw rate in rad/s.
-        heading: smallest and largest change of heading in rad, to either side.
-        hold: longest time in s that the course is held before the change.
-        duration: time in s from the change to the end of what is counted.
-        wind: slowest and fastest wind in m/s from any direction; null for none.
-        current: fastest current in m/s in any direction.
-        waves: largest standard deviation in rad of the heading's motion with the waves, evenly
-            drawn from zero on. Heading and yaw rate are measured with it; the error that is
-            counted is without it, since no rudder is quick enough against it.
-        wave_period: shortest and longest peak period in s of that motion, a JONSWAP spectrum.
-        dt: step of vessel, sensors and controllers in s; with another one, as in training, the
-            noise is scaled so that its spectrum stays the same.
-        band: heading error in rad at which half of the cost of a large one is left.
+        noise_psi: standard deviation of the white measurement noise of the heading in rad.
+        noise_r: standard deviation of the white measurement noise of the yaw rate in rad/s.
+        heading: smallest and largest change of heading in rad, to both sides.
+        hold: longest time in s before the change of the reference.
+        duration: time in s over which the cost is computed, from the change on.
+        wind: smallest and largest wind speed in m/s, from a random direction; null for no wind.
+        current: largest current speed in m/s, in a random direction.
+        waves: largest standard deviation in rad of the wave-frequency heading motion, which is
+            drawn uniformly from zero on. The measurements contain this motion. The error in the
+            cost does not, because no rudder can compensate it.
+        wave_period: shortest and longest peak period in s of that motion (JONSWAP spectrum).
+        dt: time step of vessel, sensors and controllers in s. A simulation with another step, as in
+            training, scales the noise so that its spectral density is the same.
+        band: heading error in rad whose cost rate is half of the largest one.
         overshoot_weight: cost of a degree of overshoot, in s.
         travel_weight: cost of a degree of rudder travel, in s.
     """
@@ -140,7 +145,7 @@ class ConditionsConfig(Config):
 
     @property
     def axis(self) -> Axis:
-        """What is steered: the heading, or the depth."""
+        """The controlled axis: heading or depth."""
         return HEADING if self.depth is None else DEPTH
 
     @property
@@ -150,7 +155,7 @@ class ConditionsConfig(Config):
 
     @property
     def overshoot_unit(self) -> float:
-        """A degree in rad, or a decimetre in m, which `overshoot_weight` is for."""
+        """Unit of overshoot that `overshoot_weight` refers to: one degree in rad, or 0.1 m."""
         return _DEGREE if self.depth is None else _DEPTH_UNIT
 
     @property
@@ -159,7 +164,7 @@ class ConditionsConfig(Config):
         return self.wind is not None or self.current > 0
 
     def required_inputs(self) -> tuple[str, ...]:
-        """Return the inputs that a vessel must have to be flown under these conditions."""
+        """Return the inputs that a vessel needs to be simulated under these conditions."""
         return (
             *(("wind_speed", "wind_dir") if self.wind is not None else ()),
             *(("current_north", "current_east") if self.current > 0 else ()),
@@ -168,12 +173,13 @@ class ConditionsConfig(Config):
     def sample_steps(
         self, rows: int, dt: float, generator: torch.Generator, share: float = 1.0
     ) -> HeadingStepBatch:
-        """Draw heading changes for a number of flights, float32.
+        """Draw random heading changes, float32.
 
         Args:
-            dt: step in s.
-            generator: source of all that is drawn.
-            share: part of all departures from the nominal vessel in calm water, 0 to 1.
+            rows: number of simulations B.
+            dt: time step in s.
+            generator: random generator.
+            share: factor on all deviations from the nominal vessel in calm water, 0 to 1.
         """
 
         def sample_uniform(lower: float, upper: float) -> Tensor:
@@ -214,9 +220,13 @@ class ConditionsConfig(Config):
     def with_corner_rows(
         self, changes: HeadingStepBatch, rows: int, generator: torch.Generator, share: float = 1.0
     ) -> HeadingStepBatch:
-        """Return changes whose first rows have vessels and delays at corners of their ranges.
+        """Replace vessel and delay of the first rows by corners of their ranges.
 
-        `fraction` is the part of all departures from the nominal vessel, as in `sample_steps`.
+        Args:
+            changes: batch of heading changes.
+            rows: number of rows to replace.
+            generator: random generator.
+            share: factor on all deviations from the nominal vessel, as in `sample_steps`.
         """
         variation = changes.vessel_variation.clone()
         delay = changes.delay_steps.clone()
@@ -247,14 +257,16 @@ class ConditionsConfig(Config):
 
 
 def sample_wave_motion(period: Tensor, steps: int, dt: float, generator: torch.Generator) -> Tensor:
-    """Return motions with the waves and their rates [B, T, 2], of unit variance before the rate.
+    """Simulate wave-frequency motions of unit variance with their rates, [B, T, 2].
 
-    Each is a sum of sines of random phase with a JONSWAP spectrum: the wave-frequency motion that
-    is added to the slow one (T. I. Fossen, Handbook of Marine Craft, 2011, section 8.2).
+    Each motion is a sum of sines of random phase with a JONSWAP spectrum. It is superposed on the
+    low-frequency motion (T. I. Fossen, Handbook of Marine Craft, 2011, section 8.2).
 
     Args:
-        period: at the peak in s, [B].
-        dt: step in s.
+        period: peak period in s, [B].
+        steps: number of samples T.
+        dt: time step in s.
+        generator: random generator of the phases.
     """
     band_edges = torch.linspace(0.7, 1.8, _N_WAVE_COMPONENTS + 1)
     # somewhere within its band each, so that the sum does not repeat itself
@@ -272,9 +284,13 @@ def sample_wave_motion(period: Tensor, steps: int, dt: float, generator: torch.G
 
 
 def sample_gauss_markov(rows: int, steps: int, step: float, generator: torch.Generator) -> Tensor:
-    """Return stationary first-order processes [B, T] of unit variance, exact at their samples.
+    """Simulate stationary first-order Gauss-Markov processes [B, T] of unit variance.
 
-    `step` is the time between samples as a multiple of the correlation time.
+    Args:
+        rows: number of processes B.
+        steps: number of samples T.
+        step: sampling interval divided by the correlation time; the discretisation is exact.
+        generator: random generator.
     """
     from scipy.signal import lfilter
 
@@ -286,18 +302,18 @@ def sample_gauss_markov(rows: int, steps: int, step: float, generator: torch.Gen
 
 @dataclass(frozen=True)
 class HeadingStepBatch:
-    """B changes of heading, or of depth, of T steps, as they were drawn.
+    """A batch of B random changes of heading or depth over T time steps.
 
     Attributes:
-        target: change [B] in rad, or in m of depth.
-        step_index: number [B] of the step at which the reference jumps.
-        vessel_variation: of the vessel [B, 3], `dynamics.steering_variation.VARIATION`.
-        delay_steps: of the command [B] in steps.
-        push: angle [B, T] in rad that is added to the rudder's.
-        noise: on what is measured of the axis (`Axis.measured`), [B, T, 2 or 3] in SI units.
-        weather: constant inputs of the vessel [B] by name, SI.
-        dt: step in s.
-        n_counted: number of steps that are counted, from the jump on.
+        target: new reference [B] in rad, or in m of depth.
+        step_index: time step [B] at which the reference changes.
+        vessel_variation: variation of the vessel [B, 3], see `steering_variation.VARIATION`.
+        delay_steps: delay of the command [B] in time steps.
+        push: disturbance [B, T] as a rudder angle in rad.
+        noise: measurement noise of the states in `Axis.measured`, [B, T, 2 or 3], SI.
+        weather: constant environmental inputs of the vessel [B] by name, SI.
+        dt: time step in s.
+        n_counted: number of time steps in the cost, from the change on.
     """
 
     target: Tensor
@@ -316,7 +332,7 @@ class HeadingStepBatch:
         return torch.where(steps >= self.step_index[:, None], self.target[:, None], 0.0)
 
     def repeat(self, times: int) -> HeadingStepBatch:
-        """Return the same flights several times, one block after the other."""
+        """Return the batch repeated `times` times along its rows, block by block."""
 
         def repeat_rows(values: Tensor) -> Tensor:
             return values.repeat(times, *[1] * (values.dim() - 1))
@@ -330,26 +346,26 @@ class HeadingStepBatch:
 
 
 QUANTITIES = {"cost": "s", "time_outside": "s", "overshoot": "rad", "travel": "rad", "iae": "rad s"}
-"""Of a flight, with units: the cost, its three parts, and the integral of the absolute error."""
+"""Metrics of a simulation with their units: cost, its three terms, integral of absolute error."""
 
 Compiler = Callable[[Rollout, Tensor, Tensor, Tensor], FreeRun]
-"""Makes the flights of a closed loop quick, given examples of what they are flown with; it raises
-ExportError where it cannot."""
+"""Compile the free runs of a closed loop for example arguments; raises ExportError if it cannot."""
 
 
 @final
 class NoisyDelayedLoop(Source):
-    """A controller that sees through noisy sensors and whose commands arrive late.
+    """A controller with noisy measurements and delayed commands, as the source of a rollout.
 
-    Given inputs [B, m + 3 + k]: those of the vessel, then push, reference, the delay in steps, and
-    noise on what is measured, heading and yaw rate. It returns [B, m + 2]: the inputs that act, the
-    push, and the command as it was issued. Its memory holds the last commands, then that of the
-    controller.
+    Its inputs [B, m + 3 + k] are the vessel's inputs, the disturbance, the reference, the delay in
+    time steps and the measurement noise. It returns [B, m + 2]: the applied inputs of the vessel,
+    the disturbance and the undelayed command. Its memory is the queue of the last commands,
+    followed by the memory of the controller.
 
     Args:
-        measured_columns: of what is measured in the state, k of them.
+        policy: the controller.
+        measured_columns: columns of the k measured states.
         n_inputs: number m of the vessel's inputs.
-        max_delay: delay in steps that the memory holds.
+        max_delay: largest delay in time steps.
     """
 
     def __init__(
@@ -362,7 +378,7 @@ class NoisyDelayedLoop(Source):
         self.max_delay = max_delay
 
     def initial(self, x: Tensor) -> Tensor:
-        """Return the memory at the start: rudder amidships for as long as commands may take."""
+        """Return the initial memory: the queue of commands is zero (rudder amidships)."""
         pending_commands = torch.zeros(x.shape[0], self.max_delay, dtype=x.dtype)
         return torch.cat((pending_commands, self.policy.initial_state(x)), dim=-1)
 
@@ -381,17 +397,17 @@ class NoisyDelayedLoop(Source):
 
 @dataclass(frozen=True)
 class ClosedLoopTrajectories:
-    """B changes of heading, or of depth, of T steps as they were flown.
+    """Simulated trajectories of B changes of heading or depth over T time steps.
 
     Attributes:
-        states: [B, T+1, nx].
-        command: rudder command [B, T] in rad, as it was issued.
-        target: the new reference [B] in rad, or in m of depth.
-        dt: step in s.
-        names: of the states.
-        axis: that is steered.
-        step_index: number [B] of the step at which the reference jumps.
-        n_counted: number of samples that count, from the jump on.
+        states: states [B, T+1, nx], SI.
+        command: undelayed rudder command [B, T] in rad.
+        target: new reference [B] in rad, or in m of depth.
+        dt: time step in s.
+        names: names of the states.
+        axis: controlled axis.
+        step_index: time step [B] at which the reference changes.
+        n_counted: number of samples in the cost, from the change on.
     """
 
     states: Tensor
@@ -409,24 +425,27 @@ class ClosedLoopTrajectories:
 
     @cached_property
     def error(self) -> Tensor:
-        """New heading less heading [B, T+1] in rad, wrapped, or new depth less depth in m."""
+        """Error [B, T+1]: target minus heading in rad, wrapped, or target minus depth in m."""
         difference = self.target[:, None] - self.state(self.axis.value)
         return wrap_angle(difference) if self.axis.value == self.axis.angle else difference
 
     def is_after_step(self, n_steps: int) -> Tensor:
-        """Return which samples [B, T+1] are so many steps behind the jump, or more."""
+        """Return which samples [B, T+1] lie `n_steps` or more after the change of reference."""
         return torch.arange(self.states.shape[1]) >= self.step_index[:, None] + n_steps
 
     @cached_property
     def counted_mask(self) -> Tensor:
-        """Which samples [B, T+1] count, as ones and zeros."""
+        """Mask [B, T+1] of the samples in the cost, as ones and zeros."""
         return (self.is_after_step(0) & ~self.is_after_step(self.n_counted)).to(self.states.dtype)
 
     def settling_time(self, band: float) -> Tensor:
-        """Return the time [B] in s of the last entry into +-band [rad] about the reference.
+        """Return the settling time [B] in s: the last entry into +-band about the reference.
 
-        It lies between samples along a straight line; it is the flight's length where it ends
-        outside.
+        The time is interpolated linearly between samples. If the error is outside the band at the
+        end, the settling time is the duration.
+
+        Args:
+            band: tolerance in rad, or in m of depth.
         """
         absolute_error = self.error.abs()
         is_outside = ~(absolute_error <= band)
@@ -444,7 +463,7 @@ class ClosedLoopTrajectories:
         return torch.where(is_outside.any(1), last_outside[:, 0] + fraction, 0.0) * self.dt
 
     def overshoot(self) -> Tensor:
-        """Return the largest heading beyond the reference [B] in rad; zero where there is none."""
+        """Return the overshoot beyond the reference [B] in rad or m; zero without overshoot."""
         signed_overshoot = -self.error * self.target.sign()[:, None]
         # plus zero: no negative zero is shown
         return (signed_overshoot * self.counted_mask).amax(1).clamp(min=0.0) + 0.0
@@ -454,7 +473,7 @@ class ClosedLoopTrajectories:
         return (self.error.abs() * self.counted_mask)[:, :-1].sum(1) * self.dt
 
     def rudder_travel(self) -> Tensor:
-        """Return how far the rudder command travels [B] in rad, from amidships on."""
+        """Return the total variation of the rudder command [B] in rad, from amidships on."""
         command_change = torch.diff(
             self.command, dim=1, prepend=torch.zeros_like(self.command[:, :1])
         )
@@ -465,10 +484,14 @@ class ClosedLoopTrajectories:
         return self.command.square().sum(1) * self.dt
 
     def peak_to_peak(self, start_time: float) -> tuple[Tensor, Tensor]:
-        """Return how far heading [rad] or depth [m] and command [rad] move, peak to peak, [B].
+        """Return the peak-to-peak range of heading [rad] or depth [m] and of the command [rad].
 
         Args:
-            start_time: time in s from the change of heading on, up to the flight's end.
+            start_time: start of the evaluated interval in s after the change of reference; it ends
+                with the simulation.
+
+        Returns:
+            Range of the controlled state and of the command, [B] each.
         """
         late_mask = self.is_after_step(round(start_time / self.dt))[:, :-1]
 
@@ -481,9 +504,10 @@ class ClosedLoopTrajectories:
         )
 
     def late_command_variance(self, share: float) -> Tensor:
-        """Return the variance of the rudder command [B] in rad^2 in the last share of what counts.
+        """Return the variance of the rudder command [B] in rad^2 at the end of the cost interval.
 
-        What counts is the time from the change on that the cost is of.
+        Args:
+            share: fraction of the interval, measured from its end.
         """
         late_mask = (self.counted_mask * self.is_after_step(round((1.0 - share) * self.n_counted)))[
             :, :-1
@@ -493,7 +517,7 @@ class ClosedLoopTrajectories:
         return ((self.command - mean).square() * late_mask).sum(1) / n_late[:, 0]
 
     def step_metrics(self, conditions: ConditionsConfig) -> dict[str, Tensor]:
-        """Return each of `QUANTITIES` by flight, [B]; what is no number is left so."""
+        """Return each of `QUANTITIES` [B] by name; NaN of a diverged simulation is not replaced."""
         band = (conditions.depth or conditions).band
         absolute_error = self.error.abs()
         overshoot = self.overshoot()
@@ -521,13 +545,19 @@ def simulate_heading_steps(
     weather: Mapping[str, float | Tensor] | None = None,
     wrap_source: Callable[[Source], Source] | None = None,
 ) -> ClosedLoopTrajectories:
-    """Return the flights of heading changes [B] in rad from straight ahead, without gradients.
+    """Simulate heading changes from a straight course in float64, without gradients.
 
-    The vessels are varied by [B, 3]; all is float64, and counts from the first sample to the last.
+    The whole simulation is part of the cost interval.
 
     Args:
-        weather: exogenous inputs by name, SI, for all rows or [B].
-        wrap_source: what adds to the inputs of the closed loop, for example waves.
+        vessel: vessel in its reference condition.
+        policy: controller of the rudder.
+        target: new headings [B] in rad.
+        variation: variations of the vessel [B, 3].
+        dt: time step in s.
+        duration: in s.
+        weather: environmental inputs by name, SI, for all rows or [B].
+        wrap_source: wraps the closed loop to add to its inputs, for example waves.
     """
     target = target.double()
     variation = variation.double()
@@ -548,13 +578,17 @@ def simulate_heading_steps(
 
 @final
 class ClosedLoopSimulation:
-    """A vessel and a controller ready to fly heading changes at one step.
+    """Closed loop of a vessel and a controller that simulates heading changes with one time step.
 
     Args:
-        dt: step in s.
-        compiler: of flights without gradients; None to fly them as they are, as are those that it
-            cannot compile.
-        max_delay: delay in steps that there is room for; None for that of each call's changes.
+        vessel: simulated vessel.
+        policy: controller of the rudder.
+        dt: time step in s.
+        integrator: integration method of the vessel.
+        dtype: precision of the simulation.
+        compiler: compiles simulations without gradients; None for none. A loop that cannot be
+            compiled is simulated in torch.
+        max_delay: largest delay in time steps; None for the largest delay of each batch.
     """
 
     def __init__(
@@ -579,7 +613,7 @@ class ClosedLoopSimulation:
         self.model.to(dtype).requires_grad_(False)
 
     def rollout(self, max_delay: int) -> Rollout:
-        """Return the closed loop, with room for delays of so many steps."""
+        """Build the closed loop for delays of at most `max_delay` time steps."""
         loop = NoisyDelayedLoop(
             self.policy, self.measured_columns, len(self.vessel.inputs), max_delay
         )
@@ -600,7 +634,7 @@ class ClosedLoopSimulation:
     def to_trajectories(
         self, changes: HeadingStepBatch, states: Tensor, inputs: Tensor
     ) -> ClosedLoopTrajectories:
-        """Return what a rollout gave: states [B, T+1, nx] and inputs [B, T, m + 2]."""
+        """Return the trajectories of a rollout with states [B, T+1, nx], inputs [B, T, m + 2]."""
         vessel = self.vessel
         target = changes.target
         trajectory_fields = (vessel.state, vessel.axis, changes.step_index, changes.n_counted)
@@ -609,7 +643,7 @@ class ClosedLoopSimulation:
         )
 
     def simulate(self, changes: HeadingStepBatch) -> ClosedLoopTrajectories:
-        """Fly heading changes without gradients."""
+        """Simulate heading changes without gradients."""
         max_delay = self.max_delay or max(int(changes.delay_steps.max()), 1)
         arguments = self.rollout_arguments(changes)
         with torch.no_grad():
@@ -629,12 +663,13 @@ def compile_or_fallback(
     example_arguments: tuple[Tensor, Tensor, Tensor],
     on_failure: Callable[[ExportError], None] = lambda error: None,
 ) -> FreeRun:
-    """Return the flights of a closed loop, compiled where a compiler is given and works.
+    """Compile the free runs of a closed loop, or return the loop in torch if that fails.
 
     Args:
-        compiler: None to fly as it is.
-        example_arguments: states, inputs and memory that it is flown with, an example of two rows.
-        on_failure: is told why a loop is not compiled.
+        rollout: closed loop.
+        compiler: None for no compilation.
+        example_arguments: states, inputs and memory, an example with two rows.
+        on_failure: receives the error if the loop cannot be compiled.
     """
     if compiler is not None:
         try:
@@ -646,15 +681,15 @@ def compile_or_fallback(
 
 _SETTLED_TIME_FACTOR = 10.0 / 7.0
 _OBSERVED_TIME_FACTOR = 5.0 / 7.0
-"""Multiples of what the cost counts: after that time a flight without noise is looked at for
-swinging, for that long (with 14 s from 20 s on, for 10 s).
+"""Start and length of the interval that is checked for limit cycles without noise, as multiples of
+the cost interval (for 14 s: from 20 s on, over 10 s).
 """
 _N_NOMINAL = 16
-"""Flights of the nominal vessel beside those under conditions, half to each side."""
+"""Number of additional simulations of the nominal vessel, half of them to each side."""
 
 
 def noise_free(conditions: ConditionsConfig) -> ConditionsConfig:
-    """Return the conditions without noise, waves and slow push, with time enough to settle."""
+    """Return the conditions without noise, waves and slow disturbance, with time to settle."""
     return conditions.model_copy(
         update={
             "noise_psi": 0.0,
@@ -669,20 +704,21 @@ def noise_free(conditions: ConditionsConfig) -> ConditionsConfig:
 
 
 def settled_time(duration: float) -> float:
-    """Return the time in s after a change from which nothing should swing.
+    """Return the time in s after a change from which the closed loop should be at a steady state.
 
-    `duration` is the time in s that the cost counts.
+    Args:
+        duration: length of the cost interval in s.
     """
     return _SETTLED_TIME_FACTOR * duration
 
 
 class DepthLimits(Config):
-    """What a depth policy must keep to beside the planes' swing, in m.
+    """Limits of depth oscillation and overshoot that a depth policy must meet, in m.
 
     Attributes:
-        swing: largest movement of the depth, peak to peak, once a change is long over.
-        overshoot: largest of the nominal vessel without delay and bias.
-        overshoot_p95: that one flight in twenty may exceed under the conditions.
+        swing: largest peak-to-peak range of the depth in the steady state.
+        overshoot: largest overshoot of the nominal vessel without delay and bias.
+        overshoot_p95: largest 95th percentile of the overshoot under the conditions.
     """
 
     swing: Metres = Field(default=0.02, gt=0)
@@ -691,23 +727,23 @@ class DepthLimits(Config):
 
 
 class SteadinessLimits(Config):
-    """What a policy must keep to without noise and slow push, for an epoch of training to be taken.
+    """Limits of oscillation and overshoot that a policy must meet to be accepted in training.
 
-    The defaults are a fifth below 0.2 deg of heading, 1 deg of rudder, 0.15 deg of overshoot, and
-    0.6 deg that one flight in twenty may exceed, since other flights judge the policy than those
-    that choose the epoch.
+    The defaults are 20 % below 0.2 deg of heading, 1 deg of rudder, 0.15 deg of overshoot and a
+    95th percentile of 0.6 deg, because the simulations that select an epoch differ from those that
+    evaluate the policy.
 
     Attributes:
-        heading_swing: largest movement of the heading in rad, peak to peak, once a change is long
-            over: from ten sevenths of the conditions' duration on, 20 s with 14 s.
-        rudder_swing: largest movement of the rudder command in rad then, peak to peak.
+        heading_swing: largest peak-to-peak range of the heading in rad in the steady state without
+            noise: from 10/7 of the conditions' duration on (20 s for 14 s).
+        rudder_swing: largest peak-to-peak range of the rudder command in rad in that interval.
         overshoot: largest overshoot in rad of the nominal vessel without delay and bias, over
             changes of heading of all sizes.
-        overshoot_p95: overshoot in rad that one flight in twenty may exceed under the conditions,
-            noise and slow push included.
-        depth: what stands for those of heading where the depth is changed.
-        flights: under the conditions that are looked at for swinging; half of them at corners of
-            the spread.
+        overshoot_p95: largest 95th percentile of the overshoot in rad under the conditions,
+            including noise and slow disturbance.
+        depth: the corresponding limits for changes of depth.
+        flights: number of simulations without noise; half of them have vessels at corners of the
+            ranges.
     """
 
     depth: DepthLimits = DepthLimits()
@@ -718,7 +754,7 @@ class SteadinessLimits(Config):
     flights: int = Field(default=256, ge=2, le=1_000_000)
 
     def limits_for(self, axis: Axis) -> tuple[float, float, float]:
-        """Return the largest swing, overshoot and 95th percentile of it, in rad or m."""
+        """Return the limits of swing, overshoot and its 95th percentile, in rad or m."""
         if axis is DEPTH:
             return self.depth.swing, self.depth.overshoot, self.depth.overshoot_p95
         return self.heading_swing, self.overshoot, self.overshoot_p95
@@ -726,13 +762,15 @@ class SteadinessLimits(Config):
 
 @final
 class LimitCycleTest:
-    """Counts flights without noise that a policy should not make; no training sees them.
+    """Count noise-free simulations with limit cycles or overshoot; they are not used in training.
 
     Args:
-        conditions: with noise, those of the training.
+        limits: limits that a simulation must meet.
+        conditions: operating conditions of the training, with noise.
+        seed: seed of the random simulations.
 
     Attributes:
-        n_simulations: number of all, those of the nominal vessel included.
+        n_simulations: total number of simulations, including the nominal vessel.
     """
 
     def __init__(self, limits: SteadinessLimits, conditions: ConditionsConfig, seed: int) -> None:
@@ -756,7 +794,7 @@ class LimitCycleTest:
         self.n_simulations = limits.flights + _N_NOMINAL
 
     def count_failures(self, simulation: ClosedLoopSimulation) -> int:
-        """Return how many flights swing, or overshoot on the nominal vessel."""
+        """Return the number of simulations that oscillate, or overshoot on the nominal vessel."""
         trajectories = simulation.simulate(self.changes)
         axis_swing, rudder_swing = trajectories.peak_to_peak(self.settled_time)
         limits = self.limits
@@ -770,10 +808,10 @@ class LimitCycleTest:
 
 
 def count_excess_overshoots(overshoot: Tensor, limit: float) -> int:
-    """Return how many flights more than one in twenty overshoot by more than a limit.
+    """Return the number of overshoots above a limit, minus the accepted 5 % of all simulations.
 
     Args:
-        overshoot: of flights under the conditions in rad, [N]; what is no number is beyond.
+        overshoot: overshoot of N simulations in rad, [N]; NaN counts as above the limit.
         limit: in rad.
     """
     n_beyond = int((~(overshoot <= limit)).sum())
@@ -781,7 +819,7 @@ def count_excess_overshoots(overshoot: Tensor, limit: float) -> int:
 
 
 def with_nominal_rows(changes: HeadingStepBatch, first_row: int, n_rows: int) -> HeadingStepBatch:
-    """Return changes of which some rows fly the nominal vessel in calm water, without delay."""
+    """Replace `n_rows` rows from `first_row` on by the nominal vessel in calm water, undelayed."""
 
     def replace_rows(values: Tensor, nominal_values: Tensor | float) -> Tensor:
         values = values.clone()
@@ -797,19 +835,19 @@ def with_nominal_rows(changes: HeadingStepBatch, first_row: int, n_rows: int) ->
 
 
 _BATCH_SIZE = 4096
-"""Flights that are flown side by side."""
+"""Number of simulations per batch."""
 _DIVERGED_COST = 1e3
-"""Cost in s of a flight that is lost, far above that of any other."""
+"""Cost in s of a diverged simulation, far above all others."""
 
 
 class TuningConfig(Config):
-    """Settings of the search for the parameters of classical controllers.
+    """Settings of the differential evolution that tunes classical controllers.
 
     Attributes:
-        flights: that every candidate flies, the same for all.
-        population: candidates of a generation per parameter.
-        generations: at most.
-        tolerance: the search ends where the costs of a generation differ by less than this share.
+        flights: number of simulations per candidate; all candidates use the same ones.
+        population: candidates per generation and parameter.
+        generations: largest number of generations.
+        tolerance: relative spread of the costs of a generation at which the search ends.
     """
 
     flights: int = Field(default=64, ge=2, le=1_000_000)
@@ -820,7 +858,7 @@ class TuningConfig(Config):
 
 @dataclass(frozen=True)
 class TuningResult:
-    """Tuned parameters, their mean cost [s] over the tuning flights, and the candidates tried."""
+    """Tuned parameters, their mean cost in s over the simulations, and the number of candidates."""
 
     parameters: dict[str, float]
     cost: float
@@ -835,15 +873,21 @@ def tune_parameters(
     seed: int,
     compiler: type[CompiledRollout] | None = None,
 ) -> TuningResult:
-    """Return the missing parameters of least mean cost, by differential evolution.
+    """Tune the missing parameters of a controller for the lowest mean cost.
 
-    What a law may do without is searched with and without it. `compiler` makes the flights of the
-    search quick.
+    The method is differential evolution (R. Storn and K. Price, 1997; scipy's implementation) over
+    the logarithms of the parameters. A parameter that can be disabled is searched with and without.
 
-    Source: R. Storn and K. Price, 1997; scipy's implementation, over the logarithms.
+    Args:
+        config: controller with None for the parameters to tune.
+        task: vessel, rudder limit and time step.
+        conditions: operating conditions and cost.
+        settings: settings of the search.
+        seed: seed of conditions and search.
+        compiler: compiles the simulations; None for none.
 
     Raises:
-        FitError: where no candidate gives a finite cost.
+        FitError: if no candidate has a finite cost.
     """
     # scipy.optimize takes a third of a second to import
     from scipy.optimize import differential_evolution
@@ -906,12 +950,14 @@ def tune_parameters(
 
 @final
 class CandidateEvaluation:
-    """Flights of candidates for the parameters of a controller, all over the same changes.
+    """Simulations of candidate parameters of a controller over the same heading changes.
 
     Args:
-        task: its task, at the step of the changes.
-        conditions: with the cost.
-        compiler: of the flights; None to fly them as they are.
+        config: controller.
+        task: vessel, rudder limit and time step of the changes.
+        conditions: operating conditions with the cost.
+        steps: heading changes, the same for all candidates.
+        compiler: compiles the simulations; None for none.
     """
 
     def __init__(
@@ -933,9 +979,9 @@ class CandidateEvaluation:
         ] = {}
 
     def mean_costs(self, candidates: dict[str, Tensor]) -> Tensor:
-        """Return the mean cost [C] in s of candidates, parameters [C] by name.
+        """Return the mean cost [C] in s of candidates given as parameters [C] by name.
 
-        One that diverges costs a thousand seconds.
+        A diverged simulation costs 1000 s.
         """
         n_simulations = len(self.steps.target)
         n_total = len(next(iter(candidates.values())))
