@@ -1,4 +1,4 @@
-"""Buoy courses as configs: the request, the plan that a vessel can follow, the shortest course."""
+"""Configuration and planning of courses past buoys."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from residnet.core.errors import ConfigError
 
 
 def enlarge_to_turning_radius(buoys: Sequence[BuoyConfig], min_radius: float) -> list[BuoyConfig]:
-    """Return the buoys with radii that the vessel can follow."""
+    """Return the buoys with radii of at least the turning radius of the vessel."""
     return [buoy.model_copy(update={"radius": max(buoy.radius, min_radius)}) for buoy in buoys]
 
 
 def overlapping_pairs(buoys: Sequence[BuoyConfig]) -> list[tuple[int, int]]:
-    """Return the numbers of following buoys that no course passes between, though it has to.
+    """Return the numbers of consecutive buoys that no course can pass between.
 
-    Their circles overlap, and they are left to different sides.
+    Their circles overlap, and they are to be left to different sides.
     """
     return [
         (number, number + 1)
@@ -49,28 +49,31 @@ def overlapping_pairs(buoys: Sequence[BuoyConfig]) -> list[tuple[int, int]]:
 
 
 _LOG_RADIUS_STEP = math.log(1.12)
-"""Between the radii of the turns that a plan uses, logarithmic."""
+"""Logarithmic step between the turning radii of a plan."""
 _MIN_START_CLEARANCE = 0.05
-"""Of a buoy's radius by which a plan comes nearer than where it begins, unless room lacks."""
+"""Decrease of the clearance from a buoy below the start distance, relative to its radius."""
 
 
 class BuoyCourseConfig(Config):
     """A course past buoys.
 
     Attributes:
-        buoys: in their order; sides and radii are for the protocol `sides`, the positions for both.
-        acceptance: radius of the circles that are entered.
-        start: (north, east).
-        heading: at the start; null to start on the first leg.
-        share: of the rudder's limit that turns are planned with; the rest is left to keep to them.
-        reach: share of the circle of acceptance that the plan reaches into from its edge, at least.
-        margin: that the plan keeps from the buoys' circles, as a share of their radius.
-        current: strongest that the plan leaves room for; the vessel is displaced by it until the
-            guidance has corrected.
-        lookahead: of the line-of-sight guidance.
-        planning_dt: step of the simulated turns; null for the longest that simulates them as half
-            of it does, to 0.001 turning radii.
-        turning_time: until a held rudder's turn is steady.
+        buoys: buoys in order; the protocol `enter` uses only their positions.
+        acceptance: radius of the circles of acceptance in m.
+        start: start position (north, east) in m.
+        heading: start heading in rad; null to start on the first leg.
+        share: fraction of the rudder limit that planned turns use; the difference is reserved for
+            path following.
+        reach: smallest depth of the course inside a circle of acceptance, as a fraction of its
+            radius.
+        margin: clearance of the course from the circles of the buoys, as a fraction of their
+            radius.
+        current: largest current speed in m/s; the plan reserves the distance by which it displaces
+            the vessel until the guidance has corrected it.
+        lookahead: look-ahead distance of the line-of-sight guidance in m.
+        planning_dt: time step of the simulated turns in s; null to choose the largest converged
+            step (to 0.001 turning radii).
+        turning_time: time in s until the turn at a constant rudder angle is steady.
     """
 
     buoys: tuple[BuoyConfig, ...] = Field(min_length=2)
@@ -88,14 +91,14 @@ class BuoyCourseConfig(Config):
 
 @dataclass(frozen=True)
 class PlannedCourse:
-    """What is flown, and what it is measured against.
+    """A planned course and the reference that its duration is compared with.
 
     Attributes:
-        protocol: see there.
-        course: the plan.
-        buoys: with radii that the vessel can follow.
-        steady: the vessel's smallest turn.
-        shortest: the same course without margins, for turns of that radius that begin at once.
+        protocol: rule for passing buoys.
+        course: the planned course.
+        buoys: buoys with radii that the vessel can follow.
+        steady: tightest steady turn of the vessel.
+        shortest: shortest course without margins, with arcs of the radius of that turn.
     """
 
     protocol: Protocol
@@ -106,7 +109,7 @@ class PlannedCourse:
 
     @cached_property
     def reference_length(self) -> float:
-        """The length in m of the shortest course found, which times are compared with."""
+        """Length in m of the shortest course, the reference for course times."""
         try:
             shortest_length = find_quickest_course(
                 self.shortest, self.course.step, self.course.step
@@ -119,7 +122,7 @@ class PlannedCourse:
 def smallest_turn(
     config: BuoyCourseConfig, vessel: SteeredVessel, nomoto: NomotoModel, limit: float
 ) -> SteadyTurn:
-    """Return the smallest turn of the nominal vessel, at the rudder's limit in rad."""
+    """Simulate the tightest turn of the nominal vessel, at the rudder limit in rad."""
     step = config.planning_dt or choose_time_step(vessel, nomoto, limit)
     return simulate_steady_turn(vessel, limit, config.turning_time, step)
 
@@ -127,9 +130,9 @@ def smallest_turn(
 def buoy_feasibility(
     buoys: Sequence[BuoyConfig], min_radius: float
 ) -> list[dict[str, float | bool]]:
-    """Return each buoy's radius and the smallest possible one in m, and whether it is possible.
+    """Compare the radius of each buoy with the smallest turning radius in m.
 
-    Both printed courses ask for less than the vessel can do (correction G18).
+    Both courses of document 004 have radii below it (correction G18).
     """
     return [
         {
@@ -150,10 +153,18 @@ def plan_course(
     limit: float,
     steady: SteadyTurn,
 ) -> PlannedCourse:
-    """Return the quickest course found that the nominal vessel can follow, with rudder in reserve.
+    """Plan the quickest course that the nominal vessel can follow with a reserve of rudder.
+
+    Args:
+        config: settings of the course.
+        protocol: rule for passing buoys.
+        vessel: steered vessel.
+        nomoto: K, T and speed of the vessel.
+        limit: rudder limit in rad.
+        steady: tightest steady turn.
 
     Raises:
-        ConfigError: where none is found.
+        ConfigError: if no course is found.
     """
     buoys = tuple(enlarge_to_turning_radius(config.buoys, steady.radius))
     if protocol == "sides" and (pairs := overlapping_pairs(buoys)):
@@ -210,9 +221,9 @@ def _clearance_circles(
     margin: float,
     max_offset: float,
 ) -> tuple[tuple[Circle, ...], np.ndarray]:
-    """Return the circles that a plan keeps to, and the radii in m of the turns that it uses.
+    """Return the circles of a plan with margins, and the turning radii in m that it uses.
 
-    A wide circle is rounded with less rudder.
+    A large circle is rounded with a smaller rudder angle.
     """
     if protocol == "enter":
         depth = max((1.0 - margin) * config.acceptance - max_offset, 0.05 * config.acceptance)
@@ -239,11 +250,11 @@ def _clearance_circles(
 def _clearance_radius(
     buoy: BuoyConfig, start: tuple[float, float], margin: float, max_offset: float
 ) -> float:
-    """Return the radius in m that a plan keeps from a buoy: less where it begins nearer than that.
+    """Return the clearance in m of a plan from a buoy, reduced if the start is nearer.
 
-    The start may lie on the wrong side: then the course passes nearer than it begins, by as much as
-    it may be displaced, or half way between its start and the circle. Where it begins within the
-    buoy's own circle, it leaves that first.
+    The start may be on the wrong side of the buoy. The clearance is then below the start distance
+    by the largest deviation from the course, or half way between start distance and circle. A
+    course that starts inside the circle of the buoy leaves it first.
     """
     radius = (1.0 + margin) * buoy.radius + max_offset
     start_distance = math.hypot(buoy.north - start[0], buoy.east - start[1]) - buoy.radius

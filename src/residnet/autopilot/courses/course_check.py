@@ -1,6 +1,6 @@
-"""A check of courses by their points alone: order, side of the closest approach, clearance.
+"""Check a course from its sampled track alone: order of buoys, passing side and clearance.
 
-It uses nothing of what plans them.
+The check is independent of the planner.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from residnet.core.config import Config, Metres
 
 Array = NDArray[np.float64]
 Protocol = Literal["enter", "sides"]
-"""Buoys are entered: a circle of acceptance about each; or each is passed on its side, outside its
-own circle.
+"""Rule for passing buoys: `enter` the circle of acceptance of each buoy, or pass each buoy on its
+prescribed side outside its circle (`sides`).
 """
 
 
@@ -24,12 +24,12 @@ class BuoyConfig(Config):
     """A buoy with the side to pass it on and the circle to keep out of.
 
     Attributes:
-        north: place in m.
-        east: place in m.
-        leave_to: the side of the vessel that it passes on; rounded to starboard, it is left to
-            starboard. Document 004 plots x to the right and y upwards: its "counter-clockwise" is a
-            turn from x towards y, to starboard with x north and y east.
-        radius: of the circle that the vessel must stay outside of.
+        north: north coordinate in m.
+        east: east coordinate in m.
+        leave_to: side of the vessel on which the buoy is left; a turn to starboard round the buoy
+            leaves it to starboard. Document 004 plots x to the right and y upwards: its
+            "counter-clockwise" is a turn from x towards y, to starboard with x north and y east.
+        radius: radius in m of the circle that the vessel must not enter.
     """
 
     north: Metres
@@ -42,11 +42,11 @@ class Passage(NamedTuple):
     """How a track passes a buoy.
 
     Attributes:
-        sample: sample of the closest approach in the buoy's turn.
-        passing_side: that the buoy lies on there.
-        distance: there, in m.
-        min_distance: smallest distance on the whole track, from `first_counted_sample` on.
-        side_at_min_distance: that the buoy lies on at that distance.
+        sample: index of the closest approach while the buoy is the next one.
+        passing_side: side of the buoy at this sample.
+        distance: distance at this sample in m.
+        min_distance: smallest distance in m on the track from `first_counted_sample` on.
+        side_at_min_distance: side of the buoy at the smallest distance.
     """
 
     sample: int
@@ -57,14 +57,14 @@ class Passage(NamedTuple):
 
 
 def first_counted_sample(distance: Array, radius: float) -> int:
-    """Return the sample from which a buoy counts: 0, or where the circle is left that it begins in.
+    """Return the first sample at which the circle of a buoy is checked.
 
-    It is left once the track is outside and comes nearer again: going away is no approach. It is
-    the number of samples where the track never is.
+    It is 0, unless the track starts inside the circle. Then it is the first sample outside the
+    circle at which the distance decreases again, or N if there is no such sample.
 
     Args:
-        distance: of the samples from the buoy [N] in m.
-        radius: of its circle in m.
+        distance: distances of the samples from the buoy [N] in m.
+        radius: radius of the circle in m.
     """
     if distance[0] >= radius:
         return 0
@@ -77,9 +77,9 @@ def first_counted_sample(distance: Array, radius: float) -> int:
 
 
 def find_passages(track: Array, buoys: Sequence[BuoyConfig]) -> list[Passage]:
-    """Return how a track [N, 2] passes buoys in their order.
+    """Find how a track [N, 2] passes the buoys in order.
 
-    The moments are in the order of the buoys, and the sum of the distances then is least.
+    The passing samples are in the order of the buoys and minimise the sum of the distances.
     """
     distance = np.stack([np.hypot(*(track - (b.north, b.east)).T) for b in buoys])
     for distances, buoy in zip(distance, buoys, strict=True):
@@ -113,7 +113,7 @@ def find_passages(track: Array, buoys: Sequence[BuoyConfig]) -> list[Passage]:
 
 
 def _side_of_buoy(track: Array, sample: int, buoy: BuoyConfig) -> str:
-    """Return the side that a buoy lies on at a sample."""
+    """Return the side of the vessel on which a buoy lies at a sample."""
     step = track[min(sample + 1, len(track) - 1)] - track[max(sample - 1, 0)]
     north, east = buoy.north - track[sample, 0], buoy.east - track[sample, 1]
     return "starboard" if step[0] * east - step[1] * north > 0 else "port"
@@ -126,15 +126,19 @@ def find_first_violation(
     min_turn_radius: float,
     tolerance: float = 0.0,
 ) -> tuple[int, str] | None:
-    """Return the first buoy, from 0, where a track [N, 2] does wrong, and what; None where nowhere.
+    """Find the first buoy at which a track violates the protocol.
 
-    A circle may be entered between the samples: nearer by what `_sampling_error` says.
+    The distance between samples may be smaller than at them, see `_sampling_error`.
 
     Args:
-        track: north, east in m.
-        buoys: in their order.
-        min_turn_radius: least radius of its turns in m.
-        tolerance: by which circles may be missed, in m.
+        track: north and east [N, 2] in m.
+        buoys: buoys in order.
+        protocol: rule for passing buoys.
+        min_turn_radius: smallest radius of the track in m.
+        tolerance: accepted violation of a circle in m.
+
+    Returns:
+        The number of the buoy (from 0) and a description; None if the track is valid.
     """
     step = float(np.hypot(*np.diff(track, axis=0).T).max())
     for number, (passage, buoy) in enumerate(
@@ -161,8 +165,8 @@ def find_first_violation(
 
 
 def _sampling_error(distance: float, step: float, min_turn_radius: float) -> float:
-    """Return how much nearer than its samples a track may come to a point that it passes.
+    """Return the largest difference in m between the closest sample and the closest approach.
 
-    A sample lies at most half a step from the closest approach, along an arc that bends away.
+    The closest sample lies at most half a step from the closest approach on a curved track.
     """
     return min(0.5 * step, step**2 / 8 * (1 / min_turn_radius + 1 / distance)) if distance else 0.0

@@ -1,11 +1,11 @@
-"""Courses that a vessel can follow: its own turns and the straight legs between.
+"""Plan the quickest course past buoys that a vessel can follow: simulated turns and straight legs.
 
-They keep out of circles on given sides or reach into them, in the order given, and are checked.
+A course passes circles on prescribed sides, or enters them, in a prescribed order.
 
-A course of arcs and tangents needs a yaw rate that jumps. A vessel with a yaw time constant T
-runs U T past the point where such an arc begins; here every turn is one that the vessel makes
-(`turns.TurnTable`). An outline is found first (`outline.Outlines`), then how long the rudder
-is held and how long legs are (`fitting.Fit`).
+A course of arcs and tangents needs a discontinuous yaw rate: a vessel with a yaw time constant T
+overshoots the start of such an arc by about U T. Here every turn is a simulated turn of the vessel
+(`turns.TurnTable`). The planner searches an outline (`outline.RouteSearch`), then fits leg lengths
+and hold times (`fitting.RouteProblem`), and checks the course independently (`course_check`).
 """
 
 from __future__ import annotations
@@ -36,20 +36,21 @@ from residnet.core.errors import ConfigError
 from residnet.core.progress import report_progress
 
 _REFINEMENT_SCHEDULE = ((0.1, 0.0), (0.1, 0.5), (0.04, 0.1), (0.02, 0.05), (0.02, 0.03))
-"""Turned angles in rad between the turns that are made anew, and by how much z may then change.
+"""Rounds of the refinement: grid of turn angles in rad, and trust radius of z.
 
-Motions behind turns follow from z, and z is chosen for them: both settle as z changes less.
+The motion after each turn depends on z, and z is fitted to it: both converge as the trust radius
+decreases.
 """
 _STEP_MULTIPLES = (1.0, 5.0)
-"""Multiples of that change that are tried until what is asked is held."""
+"""Multiples of that trust radius that are tried until the constraints are met."""
 _MISS_TOLERANCE = 1e-3
-"""Turning radii that may be missed."""
+"""Accepted violation of a constraint in turning radii."""
 _CONVERGENCE_TOLERANCE = 1e-3
-"""Largest change of z with which turns made anew fit each other."""
+"""Largest change of z at which the refinement has converged."""
 _MAX_REFINED_COURSES = 3
-"""Courses whose turns are made anew, at most."""
+"""Largest number of courses whose turns are refined."""
 _MAX_TIME_RATIO = 1.1
-"""Multiple of the quickest course's time from which on another is not made anew."""
+"""A course is refined only if its duration is below this multiple of the shortest one."""
 
 
 def refine_turns(
@@ -57,11 +58,12 @@ def refine_turns(
     candidates: Sequence[tuple[RouteProblem, RouteSolution]],
     turn_maker: TurnMaker,
 ) -> Iterator[tuple[RouteProblem, RouteSolution]]:
-    """Yield courses with turns that follow each other as the vessel makes them, quickest first.
+    """Yield courses whose turns start with the motion left by the previous turn, quickest first.
 
     Args:
-        turns: that the courses were found with, each from straight ahead.
-        candidates: the courses, quickest first.
+        turns: turn tables of the candidates, with turns from a straight course.
+        candidates: fitted courses, quickest first.
+        turn_maker: simulates the turns.
     """
     if turns.is_settled:
         yield from candidates
@@ -77,7 +79,7 @@ def refine_turns(
 def _refine_course_turns(
     turns: TurnTables, problem: RouteProblem, solution: RouteSolution, turn_maker: TurnMaker
 ) -> tuple[RouteProblem, RouteSolution]:
-    """Return a course whose turns are made anew, and that is fitted to them, round for round."""
+    """Alternate between simulating the turns of a course and fitting the course to them."""
     route = problem.route
     rudder = (
         np.array([turns.tables[number].rudder for number in route.table_numbers]) * route.turn_signs
@@ -113,38 +115,38 @@ def _refine_course_turns(
 
 _INITIAL_SEARCHES = ((1.0, 1.0, 1), (0.5, 1.0, 1), (0.0, 1.0, 1))
 _EXTENDED_SEARCHES = ((1.0, 1.5, 2), (1.0, 1.0, 2), (0.0, 1.0, 2), (0.5, 2.0, 2))
-"""What outlines are looked for with: share of the room before and behind turns, multiple of their
-radius, and how many distances buoys may be passed at.
+"""Settings of further outline searches: fraction of the straight lengths at turns, multiple of
+the turning radius, and number of passing distances.
 """
 _MAX_EVALUATIONS = 600
-"""Times that a route is drawn for fits, beyond which no other outline of a round is fitted."""
+"""Number of route evaluations after which a round fits no further outline."""
 _DISTANCE_TOLERANCE = 2e-3
-"""Of distances, as a share of the vessel's turning radius."""
+"""Tolerance of distances in turning radii."""
 _CLEARANCE_STEP = 0.3
-"""Turning radii by which the next outline keeps farther off a circle that was missed."""
+"""Additional clearance from a violated circle in the next outline, in turning radii."""
 _MAX_CLEARANCE_ROUNDS = 6
-"""How often it does."""
+"""Largest number of rounds with additional clearance."""
 _SIMPLIFY_MISS_TOLERANCE = 0.1
-"""Turning radii by which a fit may miss its circles and still be simplified."""
+"""Violation in turning radii up to which a fitted outline is simplified and fitted again."""
 _REPAIR_STEP = 0.1
-"""Change of z within which a course is mended whose turns fit each other."""
+"""Trust radius of z for the final correction of a converged course."""
 _MIN_TURN_ANGLE = math.radians(1.5)
 _MIN_LEG_LENGTH = 0.3
-"""Turning radii of a leg between two turns to one side that are tried as one."""
+"""Length in turning radii below which a leg between turns to the same side may be removed."""
 
 
 @dataclass(frozen=True)
 class Course:
-    """A course by the distance along it, in even steps.
+    """A course sampled uniformly along its track.
 
     Attributes:
-        step: in m.
-        track: north, east [N, 2] in m.
-        direction: of the track [N] in rad, not wrapped.
-        heading: of the vessel [N] in rad, not wrapped; it differs from the direction by the drift
-            angle.
-        rudder: that the nominal vessel needs [N] in rad.
-        length: where it ends, in m; the points go on beyond it.
+        step: distance between samples in m.
+        track: north and east [N, 2] in m.
+        direction: direction of the track [N] in rad, not wrapped.
+        heading: heading of the vessel [N] in rad, not wrapped; it differs from the direction by the
+            drift angle.
+        rudder: rudder angle of the nominal vessel [N] in rad.
+        length: length of the course in m; the samples extend beyond it.
     """
 
     step: float
@@ -157,16 +159,16 @@ class Course:
 
 @dataclass(frozen=True)
 class CourseRequest:
-    """What a course is planned for.
+    """Requirements that a course is planned for.
 
     Attributes:
-        start: (north, east) in m.
-        heading: at the start in rad; None to start on the first leg.
-        circles: of the buoys in their order, as the plan keeps to them.
-        buoys: what the finished course has to do at each, without margins.
-        protocol: see there.
-        turns: that the vessel makes.
-        max_offset: by how much in m the vessel may be displaced from the course.
+        start: start position (north, east) in m.
+        heading: start heading in rad; None to start on the first leg.
+        circles: circles of the buoys in order, including margins.
+        buoys: buoys without margins, for the check of the finished course.
+        protocol: rule for passing buoys, see `course_check.Protocol`.
+        turns: turn tables of the vessel.
+        max_offset: largest deviation of the vessel from the course in m.
     """
 
     start: tuple[float, float]
@@ -184,18 +186,19 @@ def find_quickest_course(
     extension_length: float,
     turn_maker: TurnMaker | None = None,
 ) -> Course:
-    """Return the quickest course found that passes the check.
+    """Plan the quickest course that passes the check.
 
-    It ends abeam of the last buoy, or in its circle where that is entered.
+    The course ends abeam of the last buoy, or in its circle if circles are entered.
 
     Args:
-        step: between the points of the course in m.
-        extension_length: how far the points go on behind the end, in m.
-        turn_maker: makes each turn of the course found anew, from the motion that the one before it
-            leaves; None where turns leave none.
+        request: requirements.
+        step: distance between samples of the course in m.
+        extension_length: length of the straight extension after the end in m.
+        turn_maker: simulates each turn from the motion that the previous turn leaves; None if
+            turns leave no motion.
 
     Raises:
-        ConfigError: where none is found.
+        ConfigError: if no course is found.
     """
     start_distances = [math.dist(request.start, (buoy.north, buoy.east)) for buoy in request.buoys]
     if request.protocol == "enter" and all(
@@ -224,9 +227,9 @@ def _find_course(
     turn_maker: TurnMaker | None,
     reasons: list[tuple[float, int, str]],
 ) -> Course | None:
-    """Return the quickest course found that passes the check; None, and reasons, where none is.
+    """Search the quickest valid course; returns None and appends to `reasons` if there is none.
 
-    Where the courses of an outline miss a circle, the next outline keeps farther off it.
+    If the courses of an outline violate a circle, the next outline has more clearance from it.
     """
     tried_outlines: set[tuple[object, ...]] = set()
     radius = request.turns.min_radius
@@ -303,9 +306,10 @@ def _find_excluding_buoys(
     turn_maker: TurnMaker | None,
     reasons: Sequence[tuple[float, int, str]],
 ) -> tuple[int, ...]:
-    """Return the numbers of two or three buoys in a row that are refused by themselves, from 1.
+    """Return the numbers (from 1) of two or three consecutive buoys that have no course alone.
 
-    They are begun at the buoy before them, in any direction. Empty where each row has a course.
+    Such a partial course starts at the preceding buoy in any direction. The result is empty if all
+    partial courses exist.
     """
     count = len(request.circles)
     worst = min(reasons)[1] if reasons else 0
@@ -330,7 +334,7 @@ def _find_excluding_buoys(
 
 
 def _simplified_outlines(request: CourseRequest, sketch: RouteOutline) -> list[RouteOutline]:
-    """Return an outline with turns joined that can be, and as it is."""
+    """Return the simplified outline followed by the original one."""
     min_leg_length = _MIN_LEG_LENGTH * request.turns.min_radius
     return [sketch.simplify(min_leg_length, _MIN_TURN_ANGLE), sketch.simplify(0.0, 1e-3)]
 
@@ -342,9 +346,9 @@ def _passes_check(
     step: float,
     reasons: list[tuple[float, int, str]],
 ) -> bool:
-    """Return whether a course passes the check; where it does not, the reason is added.
+    """Return whether a course passes the check, and append the reason to `reasons` if not.
 
-    A reason is what is missed in m, the number of the buoy from 0, and the words for it.
+    A reason is the violation in m, the number of the buoy (from 0) and a description.
     """
     if solution.max_violation > _DISTANCE_TOLERANCE * request.turns.min_radius:
         reasons.append(
@@ -386,7 +390,7 @@ def _no_course_message(
 
 
 def _outline_key(sketch: RouteOutline) -> tuple[object, ...]:
-    """Return what makes two outlines lead to the same course."""
+    """Return a key that is equal for outlines that lead to the same course."""
     return (
         *(
             (
@@ -408,9 +412,14 @@ def _search_outline(
     radius_multiple: float,
     ring_offsets: Sequence[float],
 ) -> RouteOutline | None:
-    """Return the shortest outline for turns that need a share of their room.
+    """Search the shortest outline with modified clearances and turn dimensions.
 
-    It keeps farther off circles, or reaches farther into them, by `extra_clearance` in m.
+    Args:
+        request: requirements.
+        extra_clearance: additional clearance from each circle, or depth inside it, in m.
+        room_share: fraction of the straight lengths before and after turns.
+        radius_multiple: factor on the turning radius.
+        ring_offsets: distances outside its circle at which a buoy may be passed, in turning radii.
     """
 
     def turn_room(number: int) -> TurnRoom:
@@ -437,7 +446,7 @@ def _search_outline(
 def _solve_outline(
     request: CourseRequest, sketch: RouteOutline
 ) -> list[tuple[RouteProblem, RouteSolution]]:
-    """Return the fitted route of an outline, and the one of what is left of it when simplified."""
+    """Fit the route of an outline and, if it has removable turns, of the simplified outline."""
     solutions: list[tuple[RouteProblem, RouteSolution]] = []
     radius = request.turns.min_radius
     for attempt in range(3):
@@ -470,7 +479,7 @@ def _solve_outline(
 def _outline_of_solution(
     request: CourseRequest, route: Route, z: Array, problem: RouteProblem, sketch: RouteOutline
 ) -> RouteOutline:
-    """Return the outline of a fitted route."""
+    """Convert a fitted route back to an outline."""
     lengths = z * route.units
     points = route(z).points
     legs = lengths[1::2].copy()
@@ -502,7 +511,7 @@ def _outline_of_solution(
 
 
 def _sample_route(route: Route, z: Array, step: float, extension_length: float) -> Course:
-    """Return a route in even steps, with a straight line behind its end."""
+    """Sample a route uniformly, with a straight extension after its end."""
     segments = route.to_segments(z)
     end_point = segments[-1][0][-1]
     end_heading = float(segments[-1][1][-1])

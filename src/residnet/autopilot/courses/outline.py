@@ -1,8 +1,8 @@
-"""The outline of a course past buoys: dynamic programming over the poses in which it passes them.
+"""Search the outline of a course past buoys by dynamic programming over passing poses.
 
-Each buoy is passed in its turn, on its side. Between two buoys the course may go round others.
-Paths from pose to pose are of a turn, a straight line and a turn, many at once; positions are
-complex numbers, north + i east in m.
+The buoys are passed in order, each on its prescribed side. Between two buoys the course may go
+round other circles. Paths between poses are turn, straight line, turn (L. E. Dubins, 1957) and are
+computed in batches. Positions are complex numbers, north + i east, in m.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from numpy.typing import NDArray
 from residnet.autopilot.courses.turns import Array, RouteOutline, TurnSpec
 
 _ANGLES = 36
-"""Places about a circle at which it may be touched, ten degrees apart."""
+"""Number of positions on a circle at which a course may touch it, ten degrees apart."""
 RINGS = (0.0, 0.25)
-"""How much farther off than its circle a buoy may be passed, in turning radii."""
+"""Distances outside its circle at which a buoy may be passed, in turning radii."""
 _MAX_CANDIDATE_PATHS = 24
-"""Paths to a pose that are looked at, the shortest first, before all are."""
+"""Number of shortest paths to a pose that are checked first."""
 _CUT_TOLERANCE = 0.05
-"""Turning radii by which the outline may cut a circle; what it leads to is moved out of it."""
+"""Distance in turning radii by which an outline may cut a circle; the fit corrects it."""
 _N_ENTRY_COURSES = 18
-"""Courses, 20 degrees apart, in which a circle may be entered."""
+"""Number of headings, 20 degrees apart, with which a circle may be entered."""
 _FULL_TURN = 2.0 * math.pi
 PATH_SIDES = ((1, 1), (-1, -1), (1, -1), (-1, 1))
-"""To which sides the first and the last turn of each kind of path go."""
+"""Signs of the first and the last turn of each type of path: +1 starboard, -1 port."""
 _FULL_ROOM_ANGLE = 0.6
-"""Angle in rad from which a turn needs all of the straight room before and behind it."""
+"""Turn angle in rad from which the full straight lengths before and after a turn are needed."""
 
 
 class TurnRoom(NamedTuple):
-    """What a turn needs: its radius, and straight parts before and behind it, all in m."""
+    """Radius of a turn, and straight lengths needed before and after it, in m."""
 
     radius: float
     lead_in: float
@@ -43,13 +43,13 @@ class TurnRoom(NamedTuple):
 
 
 class TurnPaths(NamedTuple):
-    """Paths [...] of two turns with a straight line between.
+    """Paths of a turn, a straight line and a turn; all fields have the same shape.
 
     Attributes:
-        first, last: angles in rad.
+        first, last: angles of the two turns in rad.
         straight_length: length of the line in m.
-        heading: of the line in rad.
-        length: in m; infinite where there is no such path.
+        heading: heading of the line in rad.
+        length: total length in m; infinite for an impossible path.
     """
 
     first_angle: Array
@@ -60,7 +60,7 @@ class TurnPaths(NamedTuple):
 
 
 def _turn_angles(turn_sign: int, start_heading: Array, end_heading: Array) -> Array:
-    """Return the angles from one heading to another on a side; no full turn for rounding errors."""
+    """Return turn angles between headings; a rounding error does not become a full turn."""
     angle = (turn_sign * (end_heading - start_heading)) % _FULL_TURN
     result: Array = np.where(angle > _FULL_TURN - 1e-6, 0.0, angle)
     return result
@@ -73,9 +73,10 @@ def find_paths(
     target_headings: Array,
     turn_room: TurnRoom,
 ) -> TurnPaths:
-    """Return the paths [4, ...] of `PATH_SIDES` from poses to poses, which broadcast.
+    """Compute the four types of paths [4, ...] in `PATH_SIDES` between poses.
 
-    The straight line leaves room to come out of the first turn and to go into the last one.
+    Start and target poses are broadcast against each other. The straight line is at least as long
+    as the straight lengths that both turns need.
     """
     path_parts = []
     for first_side, last_side in PATH_SIDES:
@@ -119,15 +120,18 @@ def clear_of_circles(
     centres: np.ndarray,
     radii: Array,
 ) -> NDArray[np.bool_]:
-    """Return which of K paths keep out of all circles.
+    """Return which of K paths do not intersect any of C circles.
 
     Args:
-        positions: of the beginnings [K], as are the following.
-        path_types: numbers in `PATH_SIDES`.
+        positions: start positions [K].
+        headings: start headings [K] in rad.
+        target_positions: end positions [K].
+        target_headings: end headings [K] in rad.
+        path_types: indices in `PATH_SIDES`, [K].
         candidate_paths: the paths, [K] each.
-        radius: of the turns in m.
-        centres: of the circles [C].
-        radii: of the circles [C] in m.
+        radius: turning radius in m.
+        centres: centres of the circles [C].
+        radii: radii of the circles [C] in m.
     """
     turn_signs = np.array(PATH_SIDES)[path_types]
     first_centre = positions + 1j * turn_signs[:, 0] * radius * np.exp(1j * headings)
@@ -203,10 +207,10 @@ class Circle:
     """A circle about a buoy.
 
     Attributes:
-        centre: complex, in m.
+        centre: complex position in m.
         radius: in m.
-        turn_sign: +1 where the buoy is left to starboard, -1 to port, 0 where the circle is entered.
-        table: number of the table of turns that lead round it.
+        turn_sign: +1 if the buoy is left to starboard, -1 to port, 0 if the circle is entered.
+        table: number of the turn table for the turn round it.
     """
 
     centre: complex
@@ -217,10 +221,10 @@ class Circle:
 
 @final
 class _Poses:
-    """Poses [M] that a course may come through, the cost of coming there, and from where.
+    """M candidate poses at a buoy with the lowest cost of reaching them and their predecessors.
 
-    On the arc about a buoy the course may go on, from the pose where it joins the arc to any that
-    follows.
+    On an arc about a buoy a course can follow the arc from the pose where it joins it to any later
+    pose.
     """
 
     def __init__(self, positions: np.ndarray, headings: Array, buoy: int | None) -> None:
@@ -231,7 +235,7 @@ class _Poses:
         self.cost = np.full(n_poses, np.inf)
         self.predecessors: list[tuple[_Poses, NDArray[np.intp]] | None] = [None] * n_poses
         self.origin = np.full((n_poses, 3), -1, dtype=np.intp)
-        """Group, pose in it, and kind of path that each pose is reached by."""
+        """Predecessor of each pose: its group, its index there, and the type of the path."""
         self.sources: list[_Poses] = []
         self.arc: slice | None = None
         self.turn_sign = 0
@@ -242,7 +246,7 @@ class _Poses:
         self.departure_cost = self.cost
 
     def with_arc(self, turn_sign: int, table: int, arc_radius: float) -> _Poses:
-        """Mark the last poses as those of an arc about the buoy."""
+        """Declare the last poses to lie on an arc about the buoy."""
         self.arc = slice(len(self.positions) - _ANGLES, len(self.positions))
         self.turn_sign = turn_sign
         self.table = table
@@ -250,7 +254,7 @@ class _Poses:
         return self
 
     def update_departure_cost(self) -> None:
-        """Fill in the cost of leaving each pose: on an arc it may have been joined before."""
+        """Compute the cost at departure from each pose, including motion along the arc."""
         self.departure_cost = self.cost.copy()
         if self.arc is None:
             return
@@ -264,7 +268,7 @@ class _Poses:
         self.arc_entry[self.arc] = self.arc.start + best_entry
 
     def arc_angle(self, pose: int) -> float:
-        """Return the angle of the arc that is followed before a pose is left."""
+        """Return the angle in rad that the course follows the arc before it leaves at a pose."""
         if self.arc is None or pose < self.arc.start:
             return 0.0
         return (
@@ -277,14 +281,16 @@ class _Poses:
 
 @final
 class RouteSearch:
-    """The search for outlines of a course.
+    """Search for the shortest outline of a course.
 
     Args:
-        start: complex, in m.
-        heading: at the start in rad; None for any.
-        circles: of the buoys in their order.
-        turn_rooms: the same for the turns round each buoy.
-        turning_radius: the turning radius in m.
+        start: complex start position in m.
+        heading: start heading in rad; None for any.
+        circles: circles of the buoys in order.
+        turn_room: space needed by a turn between buoys.
+        turn_rooms: space needed by the turn round each buoy.
+        turning_radius: turning radius in m.
+        ring_offsets: distances outside its circle at which a buoy may be passed, in turning radii.
     """
 
     def __init__(
@@ -312,7 +318,7 @@ class RouteSearch:
         )
 
     def find_outline(self) -> RouteOutline | None:
-        """Return the shortest outline; None where there is none."""
+        """Return the shortest outline; None if no outline exists."""
         headings = (
             np.linspace(-math.pi, math.pi, 2 * _ANGLES, endpoint=False)
             if self.heading is None
@@ -340,7 +346,7 @@ class RouteSearch:
         return self._trace_outline(groups[-1])
 
     def _buoy_poses(self, number: int) -> _Poses:
-        """Return the poses in which a buoy is passed, or in which its circle is entered."""
+        """Return the candidate poses for passing a buoy or entering its circle."""
         circle = self.circles[number]
         if circle.turn_sign != 0:
             return self._poses_around(circle, circle.turn_sign, number, self.ring_offsets)
@@ -353,7 +359,7 @@ class RouteSearch:
     def _poses_around(
         self, circle: Circle, turn_sign: int, number: int | None, ring_offsets: Sequence[float]
     ) -> _Poses:
-        """Return poses along circles about a buoy, the last ones on an arc about it."""
+        """Return candidate poses on rings about a buoy; the last ones lie on an arc about it."""
         angle = 2.0 * math.pi * np.arange(_ANGLES) / _ANGLES
         turn_room = self.turn_rooms[self.circles.index(circle)]
         arc_radius = max(circle.radius, turn_room.radius)
@@ -364,7 +370,7 @@ class RouteSearch:
         return poses.with_arc(turn_sign, circle.table, arc_radius)
 
     def _circles_between(self, number: int) -> list[int]:
-        """Return the circles that lie in the way to a buoy, the nearest first."""
+        """Return the circles between a buoy and its predecessor, the nearest first."""
         start = self.start if number == 0 else self.circles[number - 1].centre
         end = self.circles[number].centre
         line_distances = distance_from_lines(np.array([start]), np.array([end]), self.centres)[0]
@@ -386,9 +392,9 @@ class RouteSearch:
         )
 
     def _path_ends(self, poses: _Poses, is_departure: bool) -> tuple[np.ndarray, Array]:
-        """Return where paths begin behind poses or end before them, and the lengths to there.
+        """Return path starts after poses, or path ends before poses, and the distances to these.
 
-        An arc about a buoy needs room to go into it and to come out of it.
+        An arc about a buoy needs straight lengths before and after it.
         """
         lead_lengths = np.zeros(len(poses.positions))
         if poses.arc is not None:
@@ -400,7 +406,7 @@ class RouteSearch:
         ) * pose_directions, lead_lengths
 
     def _update_costs(self, sources: Sequence[_Poses], target: _Poses, is_first: bool) -> None:
-        """Fill in the cheapest ways to the poses of a target."""
+        """Update cost and predecessor of the target poses from the source poses."""
         arrival_points, arrival_lengths = self._path_ends(target, is_departure=False)
         radii = self.radii
         if is_first and len(radii):
@@ -467,7 +473,7 @@ class RouteSearch:
         target_headings: Array,
         radii: Array,
     ) -> tuple[Array, NDArray[np.intp]]:
-        """Return the cost [M] of the cheapest path to each pose that is clear, and its number."""
+        """Return the lowest cost [M] of a collision-free path to each pose, and its index."""
         flat_cost = cost.reshape(-1, cost.shape[-1])
         best = np.full(flat_cost.shape[1], np.inf)
         path_number = np.zeros(flat_cost.shape[1], dtype=np.intp)
@@ -507,7 +513,7 @@ class RouteSearch:
         return best, path_number
 
     def _trace_outline(self, last_poses: _Poses) -> RouteOutline:
-        """Return the outline that leads to the cheapest of the last poses."""
+        """Trace the outline back from the final pose with the lowest cost."""
         pose = int(last_poses.cost.argmin())
         group = last_poses
         legs: list[float] = [0.0]

@@ -1,4 +1,4 @@
-"""Heading laws with positive constants, and PD and time-optimal controllers of the heading."""
+"""Classical heading control: PD, linear-quadratic and time-optimal laws."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from residnet.core.frames import wrap_angle
 
 @final
 class HeadingPD(Policy):
-    """The law delta = kp e - kd r, saturated, with e the wrapped heading error.
+    """The saturated law delta = kp e - kd r with the wrapped heading error e.
 
     Args:
-        kp: rad of rudder per rad of error.
-        kd: rad of rudder per rad/s of yaw.
-        limit: of the rudder command in rad.
+        state: names of the state.
+        kp: proportional gain in rad of rudder per rad of heading error.
+        kd: derivative gain in rad of rudder per rad/s of yaw rate.
+        limit: rudder limit in rad.
     """
 
     def __init__(self, state: Sequence[str], *, kp: float, kd: float, limit: float) -> None:
@@ -46,9 +47,15 @@ class HeadingPD(Policy):
         damping: float,
         limit: float,
     ) -> HeadingPD:
-        """Return the PD law that gives T r_dot + r = K delta a natural frequency and damping.
+        """Design a PD law for T r_dot + r = K delta by pole placement (document 004 eq. (5.9)).
 
-        The frequency is in rad/s, the damping relative (document 004 eq. (5.9)).
+        Args:
+            state: names of the state.
+            gain: K in 1/s.
+            time: T in s.
+            frequency: natural frequency of the closed loop in rad/s.
+            damping: damping ratio of the closed loop.
+            limit: rudder limit in rad.
         """
         return cls(
             state,
@@ -65,19 +72,20 @@ class HeadingPD(Policy):
 
 @final
 class BangBangHeading(Policy):
-    """Full rudder towards the switching curve of T r_dot + r = K delta (document 004 eq. (5.9)).
+    """Time-optimal bang-bang control of T r_dot + r = K delta (document 004 eq. (5.9)).
 
-    Full counter-rudder stops a yaw rate r within T r - T K d ln(1 + r / (K d)) of heading, d the
-    largest angle; the sign of the heading error less that decides. Within `boundary_layer` of the curve the
-    command is proportional, and where error and yaw rate are inside `capture` the command is kp e -
-    kd r, which brings them to zero.
+    Full counter-rudder d stops a yaw rate r within T r - T K d ln(1 + r / (K d)) of heading. The
+    sign of the heading error minus this angle selects the side of the rudder. In a boundary layer
+    about this switching curve the command is proportional. Near the reference the linear law
+    kp e - kd r drives error and yaw rate to zero.
 
     Args:
+        state: names of the state.
         gain, time: K [1/s] and T [s], both positive.
-        limit: d [rad].
-        boundary_layer: of the heading error about the curve [rad].
+        limit: rudder limit d [rad].
+        layer: half width of the boundary layer in heading error [rad].
         capture: largest heading error [rad] and yaw rate [rad/s] of the linear law.
-        kp, kd: of the linear law; kd is T / (2 K) where none is given.
+        kp, kd: gains of the linear law; None for kd = T / (2 K).
     """
 
     def __init__(
@@ -108,7 +116,7 @@ class BangBangHeading(Policy):
         self.kp, self.kd = kp, time / (2.0 * gain) if kd is None else kd
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rudder command [B, 1] in rad; there is no memory.
+        """Return the rudder command [B, 1] in rad; the policy has no memory.
 
         Args:
             x: state [B, nx].
@@ -129,29 +137,27 @@ class BangBangHeading(Policy):
 
 
 _N_BISECTIONS = 40
-"""Of the range of the effort: 2^-40 of it is less than single precision resolves."""
+"""Bisections of the braking effort; 2^-40 of its range is below the resolution of float32."""
 
 
 @final
 class RatedBangBangHeading(Policy):
-    """Full rudder towards the reference until only the braking programme is left.
+    """Time-optimal control of T r_dot + r = K delta with a rudder rate (document 004 eq. (5.9)).
 
-    The rudder moves at its rate.
-
-    The braking programme takes the rudder to an angle on the other side, holds it where that is the
-    largest one, and brings it amidships, such that T r_dot + r = K delta (document 004 eq. (5.9))
-    ends at rest; how much counter-rudder that takes is found by halving. The heading that is gained
-    on the way, K times the integral of delta plus T r, is compared with the heading error. Within
-    `boundary_layer` of equality the two commands are mixed, and where error, yaw rate and rudder are inside
-    `capture` the command is kp e - kd r.
+    The law applies full rudder towards the reference until braking has to start. Braking moves the
+    rudder to the opposite side, holds it if it reaches the limit, and returns it amidships, so that
+    the yaw rate ends at zero. The required counter-rudder is computed by bisection. The heading
+    change during braking, K times the integral of delta plus T r, is compared with the heading
+    error. In a boundary layer about equality the two commands are interpolated. Near the reference
+    the command is the linear law kp e - kd r.
 
     Args:
-        state: names of the vessel's state, with `delta`.
+        state: names of the state, including `delta`.
         gain, time: K [1/s] and T [s], both positive.
-        limit: largest rudder angle [rad].
-        rate: of the rudder [rad/s].
-        dt: step of the controller [s]: the rudder answers a command one step later.
-        boundary_layer: of the heading error [rad].
+        limit: rudder limit [rad].
+        rate: rudder rate [rad/s].
+        dt: time step [s]; the rudder responds to a command one step later.
+        layer: half width of the boundary layer in heading error [rad].
         capture: largest heading error [rad] and yaw rate [rad/s] of the linear law.
     """
 
@@ -182,7 +188,7 @@ class RatedBangBangHeading(Policy):
         self.capture_angle, self.capture_rate = capture
 
     def _ramp_rudder(self, r: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-        """Return yaw rate and integral of the angle after the rudder has gone to another angle."""
+        """Return yaw rate and integral of the rudder angle after a ramp between two angles."""
         ramp_time = (end - start).abs() / self.rate
         slope = (end - start).sign() * self.rate
         steady = self.gain * (start - slope * self.time)
@@ -193,9 +199,13 @@ class RatedBangBangHeading(Policy):
         )
 
     def _simulate_braking(self, r: Tensor, rudder: Tensor, effort: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the yaw rate after a braking programme, and the heading gained in it.
+        """Return the yaw rate after braking and the heading change during braking.
 
-        The effort is in rad; beyond the rudder's limit it is time held there.
+        Args:
+            r: yaw rate [B, 1] in rad/s.
+            rudder: rudder angle [B, 1] in rad.
+            effort: peak of the counter-rudder in rad; the excess over the rudder limit is the time
+                at the limit, multiplied by the rudder rate.
         """
         held_angle = effort.clamp(max=self.limit)
         rate_after_ramp, first_integral = self._ramp_rudder(r, rudder, -held_angle)
@@ -211,7 +221,7 @@ class RatedBangBangHeading(Policy):
         ) + self.time * (r - final_rate)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rudder command [B, 1] in rad; there is no memory.
+        """Return the rudder command [B, 1] in rad; the policy has no memory.
 
         Args:
             x: state [B, nx].
@@ -267,15 +277,15 @@ class RatedBangBangHeading(Policy):
 def predict_centred_rudder(
     error: Tensor, r: Tensor, rudder_share: Tensor, force: Tensor, decay: Tensor, swing_time: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the error and yaw rate [B, 1] that will be left once the rudder is centred.
+    """Predict heading error and yaw rate [B, 1] for the time when the rudder has been centred.
 
-    The rudder acts with a share of its limit until it has gone to where it does nothing.
+    The rudder returns to its neutral angle at its rate and acts on the vessel meanwhile.
 
     Args:
         error: heading error [B, 1] in rad.
         r: yaw rate [B, 1] in rad/s.
-        rudder_share: rudder [B, 1] as a share of its limit.
-        force: yaw acceleration [B, 1] of full rudder in rad/s^2.
+        rudder_share: rudder angle [B, 1] as a fraction of its limit.
+        force: yaw acceleration [B, 1] at full rudder in rad/s^2.
         decay: 1/T [B, 1] in 1/s.
         swing_time: time in s that the rudder takes from amidships to its limit.
     """
@@ -294,19 +304,19 @@ def braking_distance(
     damping_ratio: Tensor,
     swing_time: float,
 ) -> Tensor:
-    """Return the heading [B, 1] that passes while r_dot = -force - decay r stops the yaw rate.
+    """Return the heading change [B, 1] while r_dot = -force - decay r brakes the yaw rate to zero.
 
-    It is r / nu near zero, with the same slope there.
-
-    The rudder starts from amidships and comes back there: that takes half of its swing more, or a
-    pulse that does not reach the limit. nu is chosen such that e'' + (decay + stiffness / nu) e' +
-    stiffness e = 0 has the relative damping `damping_ratio`.
+    For small yaw rates the result is r / nu, joined with a continuous slope. nu is chosen so that
+    the linear closed loop, d^2 e / dt^2 + (decay + stiffness / nu) de / dt + stiffness e = 0, has
+    the damping ratio `damping_ratio`. The rudder starts and ends amidships: braking takes half a
+    rudder movement longer, or is a pulse that does not reach the limit.
 
     Args:
         r: yaw rate [B, 1] in rad/s.
-        force: yaw acceleration that is counted on, in rad/s^2.
+        force: braking acceleration in rad/s^2.
         decay: 1/T in 1/s.
         stiffness: yaw acceleration per heading error near the reference in 1/s^2.
+        damping_ratio: damping ratio near the reference.
         swing_time: time in s that the rudder takes from amidships to its limit.
     """
     linear_time = ((2.0 * damping_ratio * torch.sqrt(stiffness) - decay) / stiffness).clamp(
@@ -333,9 +343,9 @@ def braking_distance(
 
 
 def _stopping_angle(r: Tensor, force: Tensor, decay: Tensor, swing_time: float) -> Tensor:
-    """Return the heading [B, 1] in which a yaw rate r > 0 is stopped.
+    """Return the heading change [B, 1] until a yaw rate r > 0 is zero.
 
-    It is the integral of r dr / (force + decay r), and what the rudder's swing adds.
+    It is the integral of r dr / (force + decay r) plus the contribution of the rudder movement.
     """
     braking_angle = (r - force / decay * torch.log1p(decay * r / force)) / decay
     if swing_time == 0.0:
@@ -345,7 +355,7 @@ def _stopping_angle(r: Tensor, force: Tensor, decay: Tensor, swing_time: float) 
 
 
 class HeadingLaw(nn.Module, ABC):
-    """The rudder, as a share of its limit, from heading error and yaw rate.
+    """A control law from heading error and yaw rate to the rudder as a fraction of its limit.
 
     Attributes:
         constants: names of the law's constants, all positive.
@@ -363,15 +373,15 @@ class HeadingLaw(nn.Module, ABC):
         decay: Tensor,
         constants: list[Tensor],
     ) -> Tensor:
-        """Return the wanted share [B, 1] of the rudder's limit; it may exceed one.
+        """Return the desired rudder [B, 1] as a fraction of its limit, not yet saturated.
 
         Args:
             error: heading error [B, 1] in rad.
             r: yaw rate [B, 1] in rad/s.
-            rudder_share: rudder angle and push [B, 1] as a share of the limit.
-            force: yaw acceleration [B, 1] of full rudder in rad/s^2.
+            rudder_share: rudder angle plus disturbance [B, 1] as a fraction of the limit.
+            force: yaw acceleration [B, 1] at full rudder in rad/s^2.
             decay: 1/T [B, 1] in 1/s.
-            constants: the law's own, [1] or [B, 1] each.
+            constants: constants of the law, [1] or [B, 1] each.
         """
 
 
@@ -379,8 +389,8 @@ class HeadingLaw(nn.Module, ABC):
 class RegulatorLaw(HeadingLaw):
     """The linear-quadratic regulator kp e - kd r of T r_dot + r = K delta.
 
-    Its weights are those of `LqrConfig`: kp = sqrt(heading_weight), (1 + K kd)^2 = 1 + K^2 T^2
-    rate_weight + 2 K T kp.
+    The weights are defined in `LqrConfig`: kp = sqrt(heading_weight),
+    (1 + K kd)^2 = 1 + K^2 T^2 rate_weight + 2 K T kp.
     """
 
     constants: ClassVar[tuple[str, ...]] = ("heading_weight", "rate_weight")
@@ -407,7 +417,7 @@ class RegulatorLaw(HeadingLaw):
 def regulator_gains(
     heading_weight: Tensor, rate_weight: Tensor, gain: Tensor, time: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return kp [-] and kd [s] of the regulator's weights; K [1/s], T [s], shapes broadcast."""
+    """Return the gains kp [-] and kd [s] for weights, K [1/s] and T [s] of broadcast shapes."""
     kp = heading_weight.sqrt()
     discriminant = 1.0 + (gain * time).square() * rate_weight + 2.0 * gain * time * kp
     return kp, (discriminant.sqrt() - 1.0) / gain
@@ -415,12 +425,15 @@ def regulator_gains(
 
 @final
 class ProximateTimeOptimalLaw(HeadingLaw):
-    """The proximate time-optimal law: full rudder until only the way to stop is left.
+    """Proximate time-optimal law for heading changes.
 
-    steepness (e - g(r)) with g the heading in which counter-rudder stops the yaw rate, a straight
-    line near the reference (M. L. Workman, Adaptive proximate time-optimal servomechanisms, 1987).
-    `mixing_factor` of the rudder's braking is counted on; `damping` is the relative damping near the
-    reference.
+    Source: M. L. Workman, Adaptive proximate time-optimal servomechanisms, 1987. The output is steepness (e - g(r)), where g is the heading change during braking with
+    counter-rudder, linear in r near the reference. The constants are `steepness`, `share` (the
+    fraction of the braking acceleration that the law relies on) and `damping` (damping ratio near
+    the reference).
+
+    Args:
+        swing_time: time in s that the rudder takes from amidships to its limit.
     """
 
     constants: ClassVar[tuple[str, ...]] = ("steepness", "share", "damping")
@@ -438,7 +451,7 @@ class ProximateTimeOptimalLaw(HeadingLaw):
         decay: Tensor,
         constants: list[Tensor],
     ) -> Tensor:
-        """Return steepness times the heading that is left once the yaw rate is stopped, [B, 1]."""
+        """Return steepness times the heading error [B, 1] that remains after braking."""
         steepness = constants[0]
         share = constants[1]
         damping_ratio = constants[2]

@@ -1,4 +1,4 @@
-"""Heading controllers as configs: constants given, or left out to be tuned."""
+"""Configurations of heading and depth controllers; missing parameters (null) are tuned."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from residnet.dynamics.store import Stored, read_spec, read_weights
 
 
 class ControlTask(NamedTuple):
-    """The task of a controller: vessel, K and T, largest rudder angle [rad] and step [s]."""
+    """Vessel, Nomoto model, rudder limit [rad] and time step [s] that a controller is built for."""
 
     vessel: SteeredVessel
     nomoto: NomotoModel
@@ -45,14 +45,15 @@ class ControlTask(NamedTuple):
 
 
 class SearchRange(NamedTuple):
-    """A range of a parameter that tuning searches, by its logarithm.
+    """Logarithmic search range of a tuned parameter.
 
     Attributes:
-        low, high: its ends.
-        disabled_value: value at which the law does without the parameter, None for none. The law is searched
-            without it too, so that none does worse than the simpler one within it.
-        time_power: of T that all three are multiples of; those of a distance go with the speed too.
-        is_distance: whether it is a distance.
+        low, high: limits of the range, non-dimensional.
+        disabled_value: value that switches the parameter's term off; None if it cannot be switched
+            off. Tuning also tries this value, so that the result is never worse than the simpler
+            law.
+        time_power: power of T that the values are multiplied by to obtain SI units.
+        is_distance: whether the values are also multiplied by the speed.
     """
 
     lower: float
@@ -62,7 +63,7 @@ class SearchRange(NamedTuple):
     is_distance: bool = False
 
     def to_si(self, nomoto: NomotoModel) -> SearchRange:
-        """Return the range of a vessel in SI units."""
+        """Convert the range to SI units for a vessel."""
         scale = nomoto.time**self.time_power * (nomoto.speed if self.is_distance else 1.0)
         disabled_value = None if self.disabled_value is None else self.disabled_value * scale
         return SearchRange(self.lower * scale, self.upper * scale, disabled_value)
@@ -70,15 +71,16 @@ class SearchRange(NamedTuple):
 
 @final
 class LinearLaw(AnglePolicy):
-    """The law kp e - kd r + ki I on filtered measurements, with gains of its own for every row.
+    """The law kp e - kd r + ki I on filtered measurements, with separate gains for every row.
 
-    Heading and yaw rate pass a low pass of first order each, as autopilots have one against noise
-    and waves; the integral stops while the rudder is saturated by it.
+    First-order low-pass filters of heading and yaw rate attenuate noise and wave motion. The
+    integration stops while the rudder is saturated (anti-windup).
 
-    Memory [B, 3]: I [rad s], and the filtered heading [rad] and yaw rate [rad/s].
+    Memory [B, 3]: I [rad s], filtered heading [rad] and filtered yaw rate [rad/s].
 
     Args:
-        gains: kp, kd [s], ki [1/s] and the filter's time constant [s]; [B] or one number each.
+        task: vessel, rudder limit and time step.
+        gains: kp, kd [s], ki [1/s] and time constant of the filter [s]; [B] or scalar each.
     """
 
     PARAMETERS: ClassVar[tuple[str, ...]] = ("kp", "kd", "ki", "lag")
@@ -97,7 +99,7 @@ class LinearLaw(AnglePolicy):
         self.n_state = 3
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Return the memory at the start: the filters stand at what is measured."""
+        """Return the initial memory: filters at the measured values, integral zero."""
         measured = x[:, [self.psi, self.r]]
         return torch.cat((torch.zeros_like(measured[:, :1]), measured), dim=1)
 
@@ -123,41 +125,41 @@ class ControllerConfig(Config, ABC):
         """Build the controller for a vessel.
 
         Raises:
-            ConfigError: where a gain is missing that tuning should have filled in.
+            ConfigError: if a gain is missing; it must be given or tuned.
         """
 
 
 class TunableConfig(ControllerConfig, ABC):
-    """The config of a controller whose missing parameters are tuned, within `ranges`."""
+    """Configuration of a controller whose missing parameters are tuned within `ranges`."""
 
     ranges: ClassVar[Mapping[str, SearchRange]]
 
     @property
     @abstractmethod
     def batched_parameters(self) -> tuple[str, ...]:
-        """The names of the numbers of what `build_batched` returns that every row has for itself."""
+        """Names of the attributes of the batched controller that differ between rows."""
 
     def parameter_values(self) -> dict[str, float | None]:
-        """Return the parameters by name; None where they are to be tuned."""
+        """Return the parameters by name; None for parameters to be tuned."""
         return {name: getattr(self, name) for name in self.ranges}
 
     def search_ranges(self, nomoto: NomotoModel) -> dict[str, SearchRange]:
-        """Return the ranges that tuning searches, by parameter."""
+        """Return the search ranges by parameter, in SI units."""
         return {name: search_range.to_si(nomoto) for name, search_range in self.ranges.items()}
 
     @abstractmethod
     def build_batched(self, parameters: Mapping[str, Tensor], task: ControlTask) -> Policy:
-        """Return a controller whose parameters [B] differ from row to row."""
+        """Build a controller with separate parameters [B] for every row."""
 
     def with_parameters(self, parameters: Mapping[str, float]) -> Self:
-        """Return the config with parameters given."""
+        """Return a copy with parameter values."""
         return type(self).model_validate(self.model_dump() | dict(parameters))
 
     def complete_parameters(self) -> dict[str, float]:
         """Return the parameters by name.
 
         Raises:
-            ConfigError: where one is still to be tuned.
+            ConfigError: if a parameter is missing.
         """
         parameters = self.parameter_values()
         if missing := [name for name, value in parameters.items() if value is None]:
@@ -175,8 +177,8 @@ class LinearLawConfig(TunableConfig, ABC):
     """A linear law kp e - kd r + ki I whose missing parameters are tuned.
 
     Attributes:
-        filter_time: time constant of the low pass of heading and yaw rate; null to tune it with the
-            others, and none where these are all given.
+        filter_time: time constant of the low-pass filters of heading and yaw rate in s; null to
+            tune it with the other parameters, or for no filter if all others are given.
     """
 
     filter_time: Seconds | None = Field(default=None, ge=0)
@@ -189,7 +191,7 @@ class LinearLawConfig(TunableConfig, ABC):
     def gains(
         self, parameters: Mapping[str, Tensor], nomoto: NomotoModel
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return kp, kd, ki of parameters, any shape."""
+        """Convert parameters of any shape to kp, kd and ki."""
 
     @final
     def parameter_values(self) -> dict[str, float | None]:
@@ -201,7 +203,7 @@ class LinearLawConfig(TunableConfig, ABC):
         return {**parameters, "filter_time": 0.0 if lag is None and not has_open_gain else lag}
 
     def build(self, task: ControlTask) -> LinearLaw:
-        """Return the law with these parameters."""
+        """Build the law with these parameters."""
         parameters = {
             name: torch.tensor([value]).double()
             for name, value in self.complete_parameters().items()
@@ -209,7 +211,7 @@ class LinearLawConfig(TunableConfig, ABC):
         return self.build_batched(parameters, task)
 
     def build_batched(self, parameters: Mapping[str, Tensor], task: ControlTask) -> LinearLaw:
-        """Return the law with gains of its own for every row."""
+        """Build the law with separate gains for every row."""
         gains = self.gains(parameters, task.nomoto)
         return LinearLaw(task, [*gains, parameters["filter_time"]])
 
@@ -218,8 +220,8 @@ class PdConfig(LinearLawConfig):
     """Proportional and derivative action on the heading error.
 
     Attributes:
-        kp: rad of rudder per rad of error.
-        damping_time: kd/kp.
+        kp: proportional gain in rad of rudder per rad of heading error.
+        damping_time: kd / kp in s.
     """
 
     ranges: ClassVar[Mapping[str, SearchRange]] = {
@@ -242,10 +244,10 @@ class PdConfig(LinearLawConfig):
 
 
 class PidConfig(PdConfig):
-    """A PD law with integral action that stops while the rudder is saturated.
+    """A PID law with anti-windup: the integration stops while the rudder is saturated.
 
     Attributes:
-        integral_time: kp/ki.
+        integral_time: kp / ki in s.
     """
 
     ranges: ClassVar[Mapping[str, SearchRange]] = {
@@ -268,10 +270,9 @@ class PidConfig(PdConfig):
 class LqrConfig(LinearLawConfig):
     """A linear-quadratic regulator of T r_dot + r = K delta.
 
-    The integral of heading_weight e^2 + rate_weight (T r)^2 + delta^2 is least.
-
-    The Riccati equation of this model has the solution kp = sqrt(heading_weight), (1 + K kd)^2 = 1
-    + K^2 T^2 rate_weight + 2 K T kp.
+    It minimises the integral of heading_weight e^2 + rate_weight (T r)^2 + delta^2. The Riccati
+    equation of this model has the solution kp = sqrt(heading_weight),
+    (1 + K kd)^2 = 1 + K^2 T^2 rate_weight + 2 K T kp.
 
     Attributes:
         heading_weight: weight of the squared heading error, dimensionless; None to tune it.
@@ -299,9 +300,9 @@ class LqrConfig(LinearLawConfig):
 
 
 class BangBangConfig(ControllerConfig):
-    """Time-optimal control of T r_dot + r = K delta, which knows vessel and rudder rate exactly.
+    """Time-optimal control of T r_dot + r = K delta with exact knowledge of vessel and rudder rate.
 
-    No controller of the nominal vessel can be faster.
+    It is the lower bound of the settling time of the nominal vessel.
     """
 
     kind: Literal["bang_bang"] = "bang_bang"
@@ -338,16 +339,15 @@ _OBSERVER_RANGES = {
 
 
 class ObservedConfig(TunableConfig, ABC):
-    """A law on the estimates of a disturbance observer, with a predictor of pending commands.
+    """A control law on the estimates of a disturbance observer with a dead-time predictor.
 
     Attributes:
-        lag: time in s between a command and its rudder that the predictor bridges; 0 for no
-            predictor.
-        heading_rate: how fast the estimated heading follows the measured one, in 1/s; null to tune
-            it, as with all that follow.
-        yaw_rate_rate: how fast the estimated yaw rate follows the measured one, in 1/s.
-        push_rate: how fast the estimated push follows the yaw rate's surprises, in 1/s.
-        cross_rate: how fast the estimated yaw rate follows the heading's surprises, in 1/s^2.
+        lag: dead time in s between a command and the rudder; 0 for no predictor.
+        heading_rate: observer gain from heading innovation to heading in 1/s; null to tune it, also
+            for the following gains.
+        yaw_rate_rate: observer gain from yaw-rate innovation to yaw rate in 1/s.
+        push_rate: observer gain from yaw-rate innovation to disturbance in 1/s.
+        cross_rate: observer gain from heading innovation to yaw rate in 1/s^2.
     """
 
     lag: Seconds = Field(default=0.0, ge=0, le=60.0)
@@ -362,7 +362,7 @@ class ObservedConfig(TunableConfig, ABC):
 
     @abstractmethod
     def build_law(self, limit: float, rate: float | None) -> HeadingLaw:
-        """Return the law for a rudder with a limit in rad and a rate in rad/s, None for none."""
+        """Build the law for a rudder limit in rad and a rudder rate in rad/s (None: no limit)."""
 
     def build(self, task: ControlTask) -> ObservedPolicy:
         return self.build_batched(self.complete_parameters(), task)
@@ -370,7 +370,7 @@ class ObservedConfig(TunableConfig, ABC):
     def build_batched(
         self, parameters: Mapping[str, float | Tensor], task: ControlTask
     ) -> ObservedPolicy:
-        """Return the law without a network; each constant is one number or [B]."""
+        """Build the policy without a network; each constant is a scalar or [B]."""
         vessel = task.vessel
         return ObservedPolicy(
             vessel.state,
@@ -402,7 +402,7 @@ class ObservedLqrConfig(ObservedConfig):
     rate_weight: Positive | None = None
 
     def build_law(self, limit: float, rate: float | None) -> HeadingLaw:
-        """Return the linear regulator with this rudder limit in rad."""
+        """Build the linear regulator for a rudder limit in rad."""
         return RegulatorLaw(limit)
 
 
@@ -410,9 +410,9 @@ class PtosConfig(ObservedConfig):
     """The proximate time-optimal law with a disturbance observer.
 
     Attributes:
-        steepness: errors per rad that full rudder answers.
-        share: of the rudder's braking that is counted on.
-        damping: relative damping near the reference.
+        steepness: gain from heading error in rad to the fraction of the rudder limit.
+        share: fraction of the available braking acceleration that the law relies on.
+        damping: damping ratio near the reference.
     """
 
     ranges: ClassVar[Mapping[str, SearchRange]] = {
@@ -438,15 +438,14 @@ AnyPitchLaw = Annotated[
 
 
 class DepthConfig(TunableConfig):
-    """A line of sight down to a depth, and a law on the dive angle; all constants are tuned as one.
+    """Line-of-sight depth guidance with an inner law on the dive angle; tuned jointly.
 
     Attributes:
-        pitch: the law on the dive angle, any that steers a heading.
-        steepest: largest dive angle wanted in rad.
-        lookahead: distance in m from which the line of sight points down; null to tune it, as with
-            the next two.
-        depth_rate: how fast the estimated depth follows the measured one, in 1/s.
-        drift_rate: how fast the drift of the depth is learned, in 1/s.
+        pitch: inner law on the dive angle; any law for the heading.
+        steepest: largest desired dive angle in rad.
+        lookahead: look-ahead distance in m; null to tune it, also for the following gains.
+        depth_rate: observer gain of the depth in 1/s.
+        drift_rate: observer gain of the vertical drift in 1/s.
     """
 
     # a vessel goes speed times T while its dive angle changes
@@ -467,14 +466,14 @@ class DepthConfig(TunableConfig):
         return ("constants", *(f"law.{name}" for name in self.pitch.batched_parameters))
 
     def parameter_values(self) -> dict[str, float | None]:
-        """Return the constants of the line of sight, then those of the law."""
+        """Return the parameters of the line of sight and of the inner law."""
         return super().parameter_values() | self.pitch.parameter_values()
 
     def search_ranges(self, nomoto: NomotoModel) -> dict[str, SearchRange]:
         return super().search_ranges(nomoto) | self.pitch.search_ranges(nomoto)
 
     def with_parameters(self, parameters: Mapping[str, float]) -> Self:
-        """Return the config with parameters given, those of the law in it."""
+        """Return a copy with parameter values, including the inner law."""
         sight_parameters = {
             name: parameters[name] for name in SIGHT_CONSTANTS if name in parameters
         }
@@ -486,7 +485,7 @@ class DepthConfig(TunableConfig):
         )
 
     def build_batched(self, parameters: Mapping[str, Tensor], task: ControlTask) -> DepthPolicy:
-        """Return the policy with constants of its own for every row."""
+        """Build the policy with separate constants for every row."""
         return self.build_policy(self.pitch.build_batched(parameters, task), parameters, task)
 
     def build(self, task: ControlTask) -> DepthPolicy:
@@ -495,7 +494,7 @@ class DepthConfig(TunableConfig):
     def build_policy(
         self, law: AnglePolicy, constants: Mapping[str, float | Tensor], task: ControlTask
     ) -> DepthPolicy:
-        """Return the policy over a law; each constant is one number or [B]."""
+        """Build the policy around an inner law; each constant is a scalar or [B]."""
         return DepthPolicy(
             task.vessel.state,
             nomoto=task.nomoto,
@@ -509,7 +508,7 @@ class DepthConfig(TunableConfig):
 
 
 def angle_law_of(controller: object) -> object:
-    """Return the law that a peer steers by: that on the dive angle of a depth controller."""
+    """Return the inner law of a depth controller, or the controller itself otherwise."""
     return controller.pitch if isinstance(controller, DepthConfig) else controller
 
 
@@ -526,18 +525,18 @@ ClassicalController = Annotated[
 
 
 class _PolicySpec(Stored):
-    """What descriptions of learned heading policies share.
+    """Common fields of the stored specifications of learned heading policies.
 
     Attributes:
-        state: names of the state of the vessel that it was trained on.
-        gain: K of that vessel about straight ahead in 1/s.
-        time: T of that vessel in s.
-        speed: at which K and T hold, in m/s.
-        righting: c of its dive angle; zero of a heading.
-        limit: of the rudder in rad.
-        rate: of the rudder in rad/s; None where it stands at its command at once.
-        dt: step in s that it runs with.
-        trained_at: step of its training in s.
+        state: names of the state of the vessel used in training.
+        gain: Nomoto gain K of that vessel on a straight course in 1/s.
+        time: Nomoto time constant T of that vessel in s.
+        speed: speed in m/s that K and T refer to.
+        righting: restoring coefficient c of the dive angle; zero for a heading.
+        limit: rudder limit in rad.
+        rate: rudder rate in rad/s; None for a rudder without a rate limit.
+        dt: time step in s.
+        trained_at: time step of training in s.
     """
 
     state: tuple[str, ...]
@@ -552,17 +551,17 @@ class _PolicySpec(Stored):
 
     @property
     def nomoto(self) -> NomotoModel:
-        """K, T, speed and c of that vessel."""
+        """Nomoto model of that vessel."""
         return NomotoModel(self.gain, self.time, self.speed, self.righting)
 
 
 class ObservedPolicySpec(_PolicySpec):
-    """A description of a heading policy with observer, predictor and recurrent network.
+    """Stored specification of a heading policy with observer, predictor and recurrent network.
 
     Attributes:
-        schema_name: kind and version of the format.
-        law: with the constants that its training began with.
-        units: of the network; 0 for none.
+        schema_name: name and version of the format.
+        law: control law with the initial constants of the training.
+        units: units of the network; 0 for no network.
     """
 
     schema_name: Literal["residnet.observed_policy/1"] = Field(
@@ -572,7 +571,7 @@ class ObservedPolicySpec(_PolicySpec):
     units: int = Field(ge=0, le=10_000)
 
     def build(self) -> ObservedPolicy:
-        """Return the policy with its network not yet trained."""
+        """Build the policy with an untrained network."""
         return ObservedPolicy(
             self.state,
             nomoto=self.nomoto,
@@ -588,11 +587,11 @@ class ObservedPolicySpec(_PolicySpec):
 
 
 class NetworkPolicySpec(_PolicySpec):
-    """A description of a heading policy that is a recurrent network alone.
+    """Stored specification of a heading policy that is a recurrent network alone.
 
     Attributes:
-        schema_name: kind and version of the format.
-        units: of the network.
+        schema_name: name and version of the format.
+        units: units of the network.
     """
 
     schema_name: Literal["residnet.network_policy/1"] = Field(
@@ -601,7 +600,7 @@ class NetworkPolicySpec(_PolicySpec):
     units: int = Field(ge=1, le=10_000)
 
     def build(self) -> NetworkPolicy:
-        """Return the policy with its network not yet trained."""
+        """Build the policy with an untrained network."""
         return NetworkPolicy(
             self.state,
             nomoto=self.nomoto,
@@ -614,13 +613,13 @@ class NetworkPolicySpec(_PolicySpec):
 
 
 class DepthPolicySpec(Stored):
-    """A description of a depth policy over an observed law with a recurrent network.
+    """Stored specification of a depth policy with an observed inner law and a recurrent network.
 
     Attributes:
-        schema_name: kind and version of the format.
-        law: on the dive angle.
-        steepest: largest dive angle wanted in rad.
-        sight: the constants `SIGHT` that training began with.
+        schema_name: name and version of the format.
+        law: inner law on the dive angle.
+        steepest: largest desired dive angle in rad.
+        sight: initial values of `SIGHT_CONSTANTS` in the training.
     """
 
     schema_name: Literal["residnet.depth_policy/1"] = Field(
@@ -631,7 +630,7 @@ class DepthPolicySpec(Stored):
     sight: dict[str, Positive]
 
     def build(self) -> DepthPolicy:
-        """Return the policy with its network not yet trained."""
+        """Build the policy with an untrained network."""
         law = self.law
         return DepthPolicy(
             law.state,
@@ -650,10 +649,10 @@ RecurrentPolicy = ObservedPolicy | NetworkPolicy | DepthPolicy
 
 
 def load_recurrent(folder: Path, spec_type: type[RecurrentSpec]) -> RecurrentPolicy:
-    """Read a trained recurrent policy, frozen and in float64.
+    """Load a trained recurrent policy in float64, with fixed parameters.
 
     Raises:
-        UsageError: where the folder holds none, or one that is not as it was written.
+        UsageError: if the folder holds no policy, or a file was changed after it was written.
     """
     policy = read_spec(folder, spec_type).build()
     read_weights(folder, policy)

@@ -1,6 +1,6 @@
-"""Learned policies: an observer and a law with a recurrent network, or a network alone.
+"""Learned steering policies: observer and control law with a recurrent network, or network alone.
 
-They steer the heading, or the dive angle under a depth policy.
+A policy controls the heading. As the inner loop of a depth policy it controls the dive angle.
 """
 
 from __future__ import annotations
@@ -22,37 +22,37 @@ from residnet.core.frames import wrap_angle
 
 
 class AnglePolicy(Policy, ABC):
-    """A policy that turns a heading, or the dive angle of a depth policy.
+    """A policy that controls an angle: the heading, or the dive angle in a depth policy.
 
     Attributes:
-        dt: step in s.
+        dt: time step in s.
     """
 
     dt: float
 
     def set_state_columns(self, state: Sequence[str]) -> None:
-        """Take heading and yaw rate, and the speed, from a state with these names."""
+        """Set the columns of heading, yaw rate and speed for a state with these names."""
         self.psi = state.index("psi")
         self.u = state.index("u")
         self.r = state.index("r")
 
     def set_step(self, dt: float) -> None:
-        """Take steps of dt seconds from now on."""
+        """Set the time step to dt seconds."""
         self.dt = dt
 
 
 class HeadingPolicy(AnglePolicy, ABC):
-    """A heading policy with K, T and speed of its vessel, a rudder, and a memory with ranges.
+    """A steering policy that can be exported: it knows its measurements, rudder and memory ranges.
 
     Attributes:
-        axis: that it steers.
-        measured: what it is given, with units; what it steers by stands first.
-        gain: K of its vessel in 1/s.
-        time: T of its vessel in s.
-        speed: at which K and T hold, in m/s.
-        limit: of the rudder in rad.
-        rate: of the rudder in rad/s; infinite where it stands at its command at once.
-        max_rudder_step: most that the rudder moves in a step, in rad.
+        axis: controlled axis.
+        measured: names of the measurements with their units; the controlled state comes first.
+        gain: Nomoto gain K of the vessel in 1/s.
+        time: Nomoto time constant T of the vessel in s.
+        speed: speed in m/s that K and T refer to.
+        limit: rudder limit in rad.
+        rate: rudder rate in rad/s; infinite for a rudder without a rate limit.
+        max_rudder_step: largest movement of the rudder in a time step, in rad.
     """
 
     axis: ClassVar[Axis] = HEADING
@@ -71,36 +71,39 @@ class HeadingPolicy(AnglePolicy, ABC):
 
     def set_step(self, dt: float) -> None:
         super().set_step(dt)
-        # a large number where the rudder has no rate: infinity would spoil gradients
+        # finite without a rate limit, because infinity gives gradients that are not a number
         self.max_rudder_step = min(self.rate * dt, 2.0 * self.limit)
 
     @abstractmethod
     def memory_ranges(
         self, max_yaw_rate: float, max_rudder: float
     ) -> dict[str, tuple[float, float]]:
-        """Return what the entries of the memory can be, [low, high] by name, with some room.
+        """Return the ranges (low, high) of the entries of the memory by name, with a margin.
 
         Args:
-            max_yaw_rate: fastest yaw rate in rad/s that is measured.
-            max_rudder: largest rudder angle in rad, relative to that of a course where one is followed.
+            max_yaw_rate: largest measured yaw rate in rad/s.
+            max_rudder: largest rudder angle in rad; relative to the rudder angle of the course in
+                path following.
         """
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:
-        """Return what the card of an exported policy says of its structure."""
+        """Return the structure of the policy for the card of its export."""
 
 
 @final
 class OddGRUCell(nn.Module):
-    """A gated recurrent unit whose memory changes sign with its features.
+    """A gated recurrent unit that is an odd function of its features and memory.
 
-    Gates see the sizes of features and memory, so that they are even; the candidate has no bias, so
-    that it is odd (K. Cho and others, 2014, for the gates). A step of another length than that of
-    training moves the memory by as much per second.
+    The gates depend on absolute values and are even; the candidate has no bias and is odd (gates:
+    K. Cho and others, 2014). For a time step other than in training the update gate is rescaled so
+    that the memory changes at the same rate per second.
 
     Args:
-        dt: step of training in s.
-        hidden: units of an odd layer between memory and output; 0 for none.
+        features: number of features.
+        units: number of units.
+        dt: time step of training in s.
+        hidden: units of an odd layer before the output; 0 for none.
     """
 
     def __init__(self, features: int, units: int, dt: float, hidden: int = 0) -> None:
@@ -136,21 +139,22 @@ class OddGRUCell(nn.Module):
 
 
 OBSERVER_CONSTANTS = ("heading_rate", "yaw_rate_rate", "push_rate", "cross_rate")
-"""Of the observer: how fast heading, yaw rate and push follow what is measured in 1/s, and how
-fast the yaw rate follows the heading's innovation in 1/s^2."""
+"""Gains of the observer: from innovations to heading, yaw rate and disturbance in 1/s, and from the
+heading innovation to the yaw rate in 1/s^2.
+"""
 
 _MAX_INNOVATION = 0.35
-"""Difference in rad between measured and expected heading beyond which the estimate is lost."""
+"""Heading innovation in rad above which the observer is reset to the measurement."""
 
 
 class ObserverEstimate(NamedTuple):
-    """What is known of the vessel at a step, each [B, 1], SI.
+    """Estimate of the observer at a time step, each [B, 1], SI.
 
     Attributes:
-        heading, r: now.
-        disturbance_rudder: rudder angle that what pushes the bow stands for.
-        heading_ahead, r_ahead: once the pending commands have arrived.
-        surprise_heading, surprise_r: measured less expected.
+        heading, r: estimated heading and yaw rate.
+        disturbance_rudder: estimated yaw disturbance as a rudder angle.
+        predicted_heading, predicted_r: prediction for the time when all pending commands act.
+        heading_innovation, r_innovation: measurement minus one-step prediction.
     """
 
     heading: Tensor
@@ -164,18 +168,19 @@ class ObserverEstimate(NamedTuple):
 
 @final
 class HeadingObserver(nn.Module):
-    """A Luenberger observer of T r_dot + r = K (delta + push - c psi), with a predictor.
+    """Luenberger observer of T r_dot + r = K (delta + d - c psi) with a dead-time predictor.
 
-    The rudder is taken to act `lag` seconds after its command; the predictor adds what the commands
-    of these seconds will do, in closed form. K grows and T falls with the speed; c, which is zero
-    but for a dive angle, falls with its square. Where heading or yaw rate are far from what was
-    expected, the estimate begins anew at what is measured.
+    d is a constant disturbance as a rudder angle. A command acts after `lag` seconds; the predictor
+    adds the effect of the pending commands in closed form (Smith predictor). K is proportional to
+    the speed, T inversely proportional; the restoring coefficient c, which is zero except for a
+    dive angle, decreases with the square of the speed. After a large innovation the observer is
+    reset to the measurement.
 
     Args:
-        nomoto: K, T and speed of the vessel about straight ahead.
-        limit: largest push in rad.
-        lag: time in s between a command and its rudder; 0 for no predictor.
-        dt: step in s.
+        nomoto: K, T, c and speed of the vessel on a straight course.
+        limit: largest disturbance in rad.
+        lag: dead time in s between a command and the rudder; 0 for no predictor.
+        dt: time step in s.
     """
 
     def __init__(self, nomoto: NomotoModel, limit: float, lag: float, dt: float) -> None:
@@ -193,10 +198,10 @@ class HeadingObserver(nn.Module):
         self.set_step(dt)
 
     def set_step(self, dt: float) -> None:
-        """Take steps of dt seconds from now on."""
+        """Set the time step to dt seconds."""
         self.dt = dt
         self.n_pending = round(self.lag / dt)
-        # time in s that is left of the lag when each pending command has acted, the oldest first
+        # remaining dead time in s after each pending command has acted, the oldest first
         remaining = dt * torch.arange(self.n_pending - 1, -1, -1, dtype=torch.float64)
         self.remaining_lag = remaining.to(self.remaining_lag.dtype)
 
@@ -211,19 +216,19 @@ class HeadingObserver(nn.Module):
         ratio: Tensor,
         constants: list[Tensor],
     ) -> ObserverEstimate:
-        """Return the estimate with a measurement taken in.
+        """Update the estimate with a measurement.
 
         Args:
             psi, r: measured heading and yaw rate [B, 1].
-            heading, yaw_rate, push: expected before the measurement, [B, 1].
-            pending: rudder angles [B, pending] that have still to act, the oldest first.
-            ratio: speed [B, 1] over that of K and T.
+            heading, yaw_rate, disturbance: one-step predictions [B, 1].
+            pending: pending rudder angles [B, n_pending], the oldest first.
+            ratio: speed [B, 1] divided by the speed that K and T refer to.
             constants: `OBSERVER_CONSTANTS`, [1] or [B, 1] each.
         """
         heading_innovation = wrap_angle(psi - heading)
         r_innovation = r - yaw_rate
-        # no vessel does this within a step: measurements were missing, and the estimate is taken
-        # up anew where they come back, with the push as it was
+        # no vessel moves this far in one step: measurements were missing. Heading and yaw rate are
+        # reset to the measurement, and the disturbance is not changed.
         max_yaw_rate = 3.0 * self.gain * ratio * self.limit
         is_lost = (heading_innovation.abs() > self.max_innovation) | (
             r_innovation.abs() > max_yaw_rate
@@ -261,7 +266,7 @@ class HeadingObserver(nn.Module):
         )
 
     def with_restoring(self, disturbance: Tensor, heading: Tensor, ratio: Tensor) -> Tensor:
-        """Return the push [B, 1] in rad of rudder with what rights the vessel at an angle."""
+        """Return the disturbance [B, 1] plus the restoring moment, as a rudder angle in rad."""
         return (
             disturbance
             if self.restoring == 0.0
@@ -271,7 +276,7 @@ class HeadingObserver(nn.Module):
     def _predict_pending(
         self, heading: Tensor, r: Tensor, disturbance: Tensor, pending: Tensor, ratio: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return heading and yaw rate [B, 1] when the pending rudder angles have acted."""
+        """Predict heading and yaw rate [B, 1] for the time when all pending commands have acted."""
         time_constant = self.time / ratio
         step_response = 1.0 - torch.exp(-self.dt / time_constant)
         remaining_decay = torch.exp(-self.remaining_lag / time_constant)
@@ -289,7 +294,7 @@ class HeadingObserver(nn.Module):
     def predict_step(
         self, heading: Tensor, r: Tensor, disturbance: Tensor, rudder: Tensor, ratio: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return heading [-pi, pi) and yaw rate [B, 1] a step later under a rudder angle."""
+        """Predict heading in [-pi, pi) and yaw rate [B, 1] after one step at a rudder angle."""
         time_constant = self.time / ratio
         steady_rate = self.gain * ratio * (rudder + disturbance)
         rate_change = (1.0 - torch.exp(-self.dt / time_constant)) * (steady_rate - r)
@@ -299,34 +304,36 @@ class HeadingObserver(nn.Module):
 
 
 OBSERVER_MEMORY = ("heading", "yaw_rate", "push", "rudder", "last_command")
-"""Memory of every observed policy; pending rudder angles and the network's units stand behind."""
+"""First entries of the memory of an observed policy, before pending commands and network units."""
 _N_FEATURES = 11
-"""Columns that the network sees; `ObservedPolicy.forward` lists them."""
+"""Number of features of the network, see `ObservedPolicy.forward`."""
 _DEGREE = math.pi / 180.0
 
 
 @final
 class ObservedPolicy(HeadingPolicy):
-    """The command clamp(limit (law + network) - push), with the law on estimates.
+    """Heading policy with a disturbance observer, a control law and a recurrent residual network.
 
-    An observer estimates heading, yaw rate and push, a predictor where they will be once the
-    pending commands have arrived; the law sees these, and the push is taken away, with what rights
-    a dive angle. The network is a
-    recurrent residual, odd, so that port and starboard are alike; its output starts at zero. With
-    no units there is no network.
+    The command is clamp(limit (law + network) - d). An observer estimates heading, yaw rate and
+    disturbance d, and predicts them over the dead time. The law acts on the prediction. The
+    disturbance and the restoring moment of a dive angle are compensated by feed-forward. The
+    network is odd, so that port and starboard are treated symmetrically, and its initial output is
+    zero.
 
-    Memory s [B, 5 + pending + units]: `OBSERVER_MEMORY` in rad and rad/s, rudder angles that have still to
-    act, the oldest first, and the network's units.
+    Memory s [B, 5 + n_pending + units]: `OBSERVER_MEMORY` in rad and rad/s, pending rudder angles
+    with the oldest first, and the units of the network.
 
     Args:
-        nomoto: K, T and speed of the vessel about straight ahead.
-        constants: of the law, then `observer.CONSTANTS`, all positive.
-        limit: of the rudder in rad.
-        dt: step of the controller in s; `set_step` changes it.
-        rate: of the rudder in rad/s; None where it stands at its command at once.
-        lag: time in s between a command and its rudder; 0 for no predictor.
-        units: of the network; 0 for none.
-        trained_at: step in s that the network is trained at.
+        state: names of the state.
+        nomoto: K, T and speed of the vessel on a straight course.
+        law: control law.
+        constants: constants of the law and `OBSERVER_CONSTANTS`, all positive.
+        limit: rudder limit in rad.
+        dt: time step in s; `set_step` changes it.
+        rate: rudder rate in rad/s; None for a rudder without a rate limit.
+        lag: dead time in s between a command and the rudder; 0 for no predictor.
+        units: units of the network; 0 for no network.
+        trained_at: time step of training in s.
     """
 
     def __init__(
@@ -364,7 +371,7 @@ class ObservedPolicy(HeadingPolicy):
         self.n_state = len(OBSERVER_MEMORY) + self.observer.n_pending + self.units
 
     def without_network(self) -> ObservedPolicy:
-        """Return a copy whose network gives nothing: the law with its constants as they are."""
+        """Return a copy with zero network output: the law with its trained constants."""
         policy = copy.deepcopy(self)
         torch.nn.init.zeros_(policy.network.out.weight)
         return policy
@@ -399,7 +406,7 @@ class ObservedPolicy(HeadingPolicy):
         return {name: (-upper, upper) for name, upper in upper_limits.items()}
 
     def describe(self) -> dict[str, Any]:
-        """Return the constants of law and observer, the predictor's lag and the network's units."""
+        """Return constants of law and observer, dead time of the predictor and network units."""
         return {
             "kind": "observed",
             "constants": self.constant_values(),
@@ -409,7 +416,7 @@ class ObservedPolicy(HeadingPolicy):
         }
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Return the memory at the start: heading and yaw rate as seen, rudder amidships."""
+        """Return the initial memory: measured heading and yaw rate, rudder amidships."""
         heading = wrap_angle(x[:, self.psi : self.psi + 1])
         zero_memory = torch.zeros(x.shape[0], self.n_state - 2, dtype=x.dtype)
         return torch.cat((heading, x[:, self.r : self.r + 1], zero_memory), dim=-1)
@@ -498,22 +505,22 @@ class ObservedPolicy(HeadingPolicy):
 
 @final
 class NetworkPolicy(HeadingPolicy):
-    """The command clamp(limit network): what it knows of its vessel it has learned in flight.
+    """Heading policy that is a recurrent network alone: the command is clamp(limit network).
 
-    The network is a gated recurrent unit with an odd layer behind it, so that port and starboard
-    are alike. It sees heading error, yaw rate, the rudder's angle and the last command. Its output
-    starts at zero: untrained, it holds the rudder amidships. K and speed of the vessel are scales
-    of what it sees.
+    The network is a gated recurrent unit followed by an odd layer, so that port and starboard are
+    treated symmetrically. Its features are heading error, yaw rate, rudder angle and last command,
+    scaled by K and speed of the vessel. Its initial output is zero (rudder amidships).
 
-    Memory s [B, 2 + units]: rudder and last command in rad, then the network's units.
+    Memory s [B, 2 + units]: rudder and last command in rad, then the units of the network.
 
     Args:
-        nomoto: K, T and speed of the vessel about straight ahead.
-        limit: of the rudder in rad.
-        dt: step of the controller in s; `set_step` changes it.
-        rate: of the rudder in rad/s; None where it stands at its command at once.
-        units: of the network, at least one.
-        trained_at: step in s that the network is trained at.
+        state: names of the state.
+        nomoto: K, T and speed of the vessel on a straight course.
+        limit: rudder limit in rad.
+        dt: time step in s; `set_step` changes it.
+        rate: rudder rate in rad/s; None for a rudder without a rate limit.
+        units: units of the network, at least one.
+        trained_at: time step of training in s.
     """
 
     def __init__(
@@ -536,7 +543,7 @@ class NetworkPolicy(HeadingPolicy):
         self.set_step(dt)
 
     def constant_values(self) -> dict[str, float]:
-        """Return no constants: there is no law that has any."""
+        """Return an empty mapping, because the policy has no control law."""
         return {}
 
     def with_applied_rudder(self, s: Tensor, rudder: Tensor) -> Tensor:
@@ -550,7 +557,7 @@ class NetworkPolicy(HeadingPolicy):
         return {name: (-upper, upper) for name, upper in upper_limits.items()}
 
     def describe(self) -> dict[str, Any]:
-        """Return the network's units and the step of its training."""
+        """Return the units of the network and the time step of its training."""
         return {"kind": "network", "units": self.units, "trained_at": self.trained_at}
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -580,30 +587,36 @@ class NetworkPolicy(HeadingPolicy):
 
 
 SIGHT_CONSTANTS = ("lookahead", "depth_rate", "drift_rate")
-"""Of a depth policy: look-ahead distance in m, and how fast depth and drift follow what is
-measured, in 1/s."""
+"""Constants of a depth policy: look-ahead distance in m, and observer gains of depth and drift in
+1/s.
+"""
 MAX_DEPTH = 1.2e4
-"""Largest depth in m, beyond the deepest sea."""
+"""Largest accepted depth in m; no sea is deeper."""
 _MAX_DRIFT_SHARE = 0.5
-"""Largest drift of the depth as a share of the speed."""
+"""Largest vertical drift as a fraction of the speed."""
 
 
 @final
 class DepthPolicy(HeadingPolicy):
-    """Depth by the stern planes: a line of sight down to it, and a law on the dive angle.
+    """Depth policy with stern planes: line-of-sight guidance and an inner loop on the dive angle.
 
-    The dive angle wanted is atan((z_d - z) / lookahead) - d / u, within `steepest`, with depth z
-    and drift d of z_dot = u sin(dive) + d estimated: what buoyancy and the angle of attack do to
-    the depth stands in d (T. I. Fossen, Handbook of Marine Craft, 2nd ed. 2021, section 12.4, for
-    the line of sight). The law sees the dive angle -theta as heading and -q as yaw rate.
+    The desired dive angle is atan((z_d - z) / lookahead) - d / u, limited to `steepest` (line of
+    sight: T. I. Fossen, Handbook of Marine Craft, 2nd ed. 2021, section 12.4). An observer of
+    z_dot = u sin(dive angle) + d estimates depth z and drift d, which contains the effects of
+    buoyancy and angle of attack. The inner law receives the dive angle -theta as heading and -q as
+    yaw rate.
 
-    Memory s [B, 2 + k]: z expected [m], d [m/s], then that of the law.
+    Memory s [B, 2 + k]: predicted depth in m, d in m/s, then the k entries of the inner law.
 
     Args:
+        state: names of the state.
         nomoto: K, T, c and speed of the dive angle.
+        law: policy of the dive angle.
         constants: `SIGHT_CONSTANTS`, all positive.
-        steepest: largest dive angle wanted in rad.
-        limit, rate, dt: as of a heading policy, of the planes.
+        steepest: largest desired dive angle in rad.
+        limit: limit of the stern planes in rad.
+        dt: time step in s.
+        rate: rate of the stern planes in rad/s; None for no rate limit.
     """
 
     axis = DEPTH
@@ -631,7 +644,7 @@ class DepthPolicy(HeadingPolicy):
         self.set_step(dt)
 
     def set_state_columns(self, state: Sequence[str]) -> None:
-        """Take depth, speed, pitch and pitch rate from a state with these names."""
+        """Set the columns of depth, speed, pitch and pitch rate for a state with these names."""
         self.state_columns = [state.index(name) for name in self.measured]
 
     def set_step(self, dt: float) -> None:
@@ -648,7 +661,7 @@ class DepthPolicy(HeadingPolicy):
         return policy
 
     def constant_values(self) -> dict[str, float]:
-        """Return the constants by name, those of an observed law too."""
+        """Return the constants by name, including the constants of an observed inner law."""
         constants = dict(
             zip(SIGHT_CONSTANTS, torch.exp(self.constants.detach()).tolist(), strict=True)
         )
@@ -668,7 +681,7 @@ class DepthPolicy(HeadingPolicy):
         return depth_ranges | self.law.memory_ranges(max_yaw_rate, max_rudder)
 
     def describe(self) -> dict[str, Any]:
-        """Return the constants, the steepest dive, and what the law says of itself."""
+        """Return constants, largest dive angle and the description of the inner law."""
         assert isinstance(self.law, HeadingPolicy)
         return {
             "kind": "depth",
@@ -683,12 +696,12 @@ class DepthPolicy(HeadingPolicy):
         return torch.cat((s[:, :2], self.law.with_applied_rudder(s[:, 2:], rudder)), dim=1)
 
     def _to_angle_state(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the depth [B, 1], and dive angle, speed and rate [B, 3] as the law sees them."""
+        """Return depth [B, 1], and dive angle, speed and dive rate [B, 3] for the inner law."""
         z, u, theta, q = x[:, self.state_columns].split(1, dim=1)
         return z, torch.cat((-theta, u, -q), dim=1)
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Return the memory at the start: the depth as seen, no drift."""
+        """Return the initial memory: measured depth, no drift."""
         z, angle_state = self._to_angle_state(x)
         return torch.cat((z, torch.zeros_like(z), self.law.initial_state(angle_state)), dim=-1)
 
@@ -697,7 +710,7 @@ class DepthPolicy(HeadingPolicy):
         lookahead, depth_rate, drift_rate = torch.exp(self.constants).split(1, dim=-1)
         u = angle_state[:, 1:2].clamp(0.3 * self.speed, 3.0 * self.speed)
         innovation = z - s[:, 0:1]
-        # no vessel does this within a step: the estimate begins anew, with the drift as it was
+        # no vessel moves this far in one step: the depth is reset, the drift is not changed
         innovation = torch.where(innovation.abs() > u, torch.zeros_like(z), innovation)
         predicted_depth = z - innovation
         depth = predicted_depth + (1.0 - torch.exp(-self.dt * depth_rate)) * innovation
