@@ -1,4 +1,4 @@
-"""The interface of controllers and guidance, and the source that puts them into a rollout."""
+"""Interfaces of controllers and guidance, and the closed loop as the source of a rollout."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from residnet.engine.rollout import Source
 
 
 class StatefulModule(nn.Module, ABC):
-    """What has a memory [B, n_state] that goes from step to step."""
+    """A module with a memory [B, n_state] that is passed from step to step."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -24,9 +24,9 @@ class StatefulModule(nn.Module, ABC):
 
 
 class Policy(StatefulModule):
-    """A controller: commands from the state and a reference, once per step.
+    """A controller that computes commands from state and reference once per time step.
 
-    The same tensor code trains, flies and is exported.
+    The same tensor code is used in training, simulation and export.
     """
 
     @abstractmethod
@@ -40,15 +40,15 @@ class Policy(StatefulModule):
         """
 
     def with_applied_rudder(self, s: Tensor, rudder: Tensor) -> Tensor:
-        """Return the memory once the rudder angle [B, 1] is known that is really taken.
+        """Return the memory corrected for the rudder angle [B, 1] that is applied.
 
-        A controller without an estimate of the vessel does not care.
+        A controller without an observer returns the memory unchanged.
         """
         return s
 
 
 class Reference(StatefulModule):
-    """Guidance: what the controller shall follow."""
+    """Guidance: computes the reference of the controller."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -60,17 +60,18 @@ class Reference(StatefulModule):
 
         Args:
             x: state [B, nx].
+            k: number of the time step.
             s: memory [B, n_state].
         """
 
     def is_finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
-        """Return [B] bool: rows that have arrived; asked only where `may_finish`."""
+        """Return which rows [B] have arrived; called only if `may_finish` is set."""
         return torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
 
 
 @final
 class RecordedReference(Reference):
-    """A reference known in advance, [B, T, r]; its last value holds beyond T."""
+    """A reference known in advance, [B, T, r]; its last value is used beyond T."""
 
     def __init__(self, values: Tensor) -> None:
         super().__init__()
@@ -82,9 +83,9 @@ class RecordedReference(Reference):
 
 @final
 class ClosedLoop(Source):
-    """A controller under guidance as the source of a rollout's inputs.
+    """Guidance and controller as the source of the inputs of a rollout.
 
-    Its commands take the first columns of w.
+    The commands replace the first columns of w.
     """
 
     def __init__(self, policy: Policy, reference: Reference) -> None:
@@ -94,11 +95,11 @@ class ClosedLoop(Source):
         self.can_stop = reference.may_finish
 
     def initial(self, x: Tensor) -> Tensor:
-        """Return the memories of guidance and controller side by side."""
+        """Return the initial memories of guidance and controller, concatenated."""
         return torch.cat((self.reference.initial_state(x), self.policy.initial_state(x)), dim=-1)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m]: the command, then what else was given."""
+        """Return the inputs [B, m]: the command, then the other inputs unchanged."""
         n = self.reference.n_state
         target, reference_state = self.reference(x, k, memory[:, :n])
         command, s = self.policy(x, target, memory[:, n:])
@@ -107,18 +108,20 @@ class ClosedLoop(Source):
         )
 
     def is_finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Return the rows whose guidance has arrived."""
+        """Return which rows have arrived at the end of the guidance."""
         return self.reference.is_finished(x, k, memory[:, : self.reference.n_state])
 
 
 @final
 class ReferenceInInputs(Source):
-    """A controller whose reference stands behind the inputs of a rollout, w [B, m + r].
+    """A controller whose reference is passed in the last columns of the inputs, w [B, m + r].
 
-    What does not count steps can be compiled. Its commands take the first columns of the m.
+    Because it does not depend on the number of the time step, it can be compiled. The commands
+    replace the first of the m columns.
 
     Args:
-        inputs: number m of the vessel's inputs.
+        policy: controller.
+        inputs: number m of inputs of the vessel.
     """
 
     def __init__(self, policy: Policy, inputs: int) -> None:
@@ -128,10 +131,10 @@ class ReferenceInInputs(Source):
         self.depends_on_step = False
 
     def initial(self, x: Tensor) -> Tensor:
-        """Return the controller's memory."""
+        """Return the initial memory of the controller."""
         return self.policy.initial_state(x)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m]: the command, then what else was given."""
+        """Return the inputs [B, m]: the command, then the other inputs unchanged."""
         command, memory = self.policy(x, w[:, self.inputs :], memory)
         return torch.cat((command, w[:, command.shape[-1] : self.inputs]), dim=-1), memory

@@ -1,6 +1,6 @@
-"""Guidance laws: from way-points or a planned course to a desired heading.
+"""Guidance laws that compute a desired heading from way-points or a planned course.
 
-The crossing of a ferry feeds a reference filter: document 002 section 2.2.2.
+The guidance of a ferry crossing feeds a reference filter (document 002 section 2.2.2).
 """
 
 from __future__ import annotations
@@ -33,29 +33,29 @@ from residnet.core.frames import wrap_angle
 from residnet.physics.force_model import ForceModel
 
 _ANGLES = 181
-"""Changes of course in the table, one for each degree."""
+"""Number of course changes in the table, one per degree."""
 _SAMPLES = 100
-"""Points of the track of a turn."""
+"""Number of points of the track of a turn."""
 _DISTANCES = 400
-"""Distances that are tried for each turn."""
+"""Number of candidate distances for each turn."""
 
 
 @final
 class WheelOver(nn.Module):
-    """Distance before a way-point at which the leg changes, by the change of course there.
+    """Wheel-over distance before a way-point as a function of the course change.
 
-    A vessel T r_dot + r = K delta that puts its rudder over to the limit, and then back until the
-    yaw stops on the next leg, has turned about the corner of both legs from the distance where its
-    track begins to where it ends. In sharp corners that track would stay out of the way-point's
-    circle of acceptance; there the distance is the largest from which it still reaches into the
-    circle.
+    The turn of a vessel T r_dot + r = K delta is full rudder followed by full counter-rudder until
+    the yaw rate is zero on the next leg. The wheel-over distance is the distance from the start of
+    this turn to the corner of both legs. For sharp corners the track would not enter the circle of
+    acceptance; the distance is then the largest one whose track enters it.
 
     Args:
-        limit: of the rudder in rad.
-        acceptance: radius of the circle in m.
-        share: of that radius that the track keeps within.
-        rate: of the rudder in rad/s; None where it stands at its command at once. While it moves,
-            half of the way is lost.
+        nomoto: K, T and speed of the vessel.
+        limit: rudder limit in rad.
+        acceptance: radius of the circle of acceptance in m.
+        share: fraction of that radius that the track must enter.
+        rate: rudder rate in rad/s; None for a rudder without a rate limit. The distance includes
+            half of the way travelled while the rudder moves.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class WheelOver(nn.Module):
         self.table: Tensor
 
     def forward(self, change: Tensor) -> Tensor:
-        """Return the distance [B] in m for changes of course [B] in rad, within +-pi."""
+        """Return wheel-over distances [B] in m for course changes [B] in rad, within +-pi."""
         table = self.table.to(change.dtype)
         table_position = change.abs() * (float(table.shape[0] - 1) / math.pi)
         lower_index = table_position.floor().clamp(max=float(table.shape[0] - 2))
@@ -102,10 +102,11 @@ class WheelOver(nn.Module):
 def _switching_turns(
     nomoto: NomotoModel, limit: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return heading changes [N], distances to the corner [N] and tracks [N, M, 2] of turns.
+    """Simulate turns of Nomoto's model with full rudder and counter-rudder.
 
-    The heading changes go from 0 to past pi in rad; a distance is from a turn's beginning to where
-    the lines before and after it meet, in m; tracks are ahead and aside, in m.
+    Returns:
+        Heading changes [N] from 0 to more than pi in rad, distances [N] in m from the start to the
+        intersection of initial and final track, and tracks [N, M, 2] (ahead and abeam) in m.
     """
     max_yaw_rate = nomoto.gain * limit
     time_constant = nomoto.time
@@ -152,28 +153,30 @@ def _switching_turns(
 
 
 _MAX_LEG_OFFSET = 0.4
-"""Share of the circle of acceptance that a vessel may be set off its leg by, at the wheel-over and
-on from there, for the turn to count on.
+"""Largest cross-track error at and after the wheel-over, as a fraction of the radius of
+acceptance; with a larger error the leg changes in the circle.
 """
 
 
 @final
 class WaypointGuidance(Reference):
-    """Reference heading [B, 1] along straight legs between way-points.
+    """Desired heading [B, 1] on straight legs between way-points by line-of-sight guidance.
 
-    It is the leg's direction and the angle by which a law of the line of sight steers back to it.
+    The desired heading is the direction of the leg plus the line-of-sight angle. The leg changes
+    when the vessel enters the circle of acceptance of the way-point or has passed it. With a
+    wheel-over distance the leg changes earlier, provided that the present and the predicted
+    cross-track error are small compared with the radius of acceptance. The vessel has arrived when
+    it has passed the last way-point.
 
-    The leg changes when the vessel enters the circle of acceptance of its way-point, or has passed
-    it; with a wheel-over, before that, where the vessel runs along its leg: its cross-track error,
-    and what its heading aside of the leg would add on the way, are small against the circle. A crab
-    angle is such a heading, by as much as the current will set the vessel. Behind the last
-    way-point it has arrived. Memory [B, 3 + that of the law]: number of the way-point that is
-    steered for, and where the vessel began, which is the beginning of the first leg.
+    Memory [B, 3 + n]: number of the active way-point, start position of the first leg, and the n
+    entries of the line-of-sight law.
 
     Args:
-        points: way-points (north, east) in m, in their order.
-        acceptance: radius of the circle in m.
-        wheel_over: how far before a way-point the leg changes; None for in its circle.
+        points: way-points (north, east) in m, in order.
+        acceptance: radius of the circle of acceptance in m.
+        line_of_sight: line-of-sight law.
+        state: names of the state.
+        wheel_over: wheel-over distance; None to change legs in the circle of acceptance.
     """
 
     def __init__(
@@ -203,7 +206,7 @@ class WaypointGuidance(Reference):
         self.may_finish = True
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Return the memory at the start of the first leg, which begins where the vessel is."""
+        """Return the initial memory; the first leg starts at the position of the vessel."""
         law_memory = torch.zeros(x.shape[0], self.n_state - 3, dtype=x.dtype, device=x.device)
         return torch.cat(
             (
@@ -218,9 +221,11 @@ class WaypointGuidance(Reference):
     def leg_geometry(
         self, x: Tensor, leg_number: Tensor, s: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return a leg's direction [B] in rad, distance left [B] and cross-track error [B] in m.
+        """Compute direction, remaining distance and cross-track error with respect to a leg.
 
-        The distance is along the leg; the cross-track error is positive to starboard of it.
+        Returns:
+            Direction [B] in rad, remaining along-track distance [B] in m, and cross-track error [B]
+            in m, positive to starboard of the leg.
         """
         points = self.points.to(x.dtype)
         target = points[leg_number.clamp(max=len(points) - 1)]
@@ -263,7 +268,7 @@ class WaypointGuidance(Reference):
         return heading, torch.cat((leg_number.to(x.dtype).unsqueeze(-1), s[:, 1:3], memory), dim=-1)
 
     def is_finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
-        """Return the rows behind their last way-point."""
+        """Return which rows have passed their last way-point."""
         return s[:, 0] >= self.points.shape[0]
 
 
@@ -273,31 +278,31 @@ _MAX_DRIFT_TANGENT = 1.0
 
 @final
 class DriftEstimate(nn.Module):
-    """An estimate of how a steady current sets the vessel across its way.
+    """Integral action of line-of-sight guidance: an estimate of the drift in a steady current.
 
-    It is the integral of E. Borhaug, A. Pavlov and K. Y. Pettersen (Integral LOS control for path
-    following of underactuated marine surface vessels in the presence of constant ocean currents,
-    CDC 2008; T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, section
-    12.3).
+    heading_d = direction - atan(e / distance + D), with
+    dD/dt = gain e / (distance^2 + (e + distance D)^2). D is sigma e_int / distance in the notation
+    of the source. In the steady state e = 0, and D is the tangent of the crab angle asin(V_c / U)
+    for a cross-current V_c and a speed U.
 
-    heading_d = direction - atan(e / distance + D), dD/dt = gain e / (distance^2 + (e + distance
-    D)^2), their D being sigma e_int / distance. At rest e = 0 and D is the tangent of the crab
-    angle asin(V_c / U) for a current V_c across the way of a vessel at speed U.
+    The direction of a current is constant over ground while the path turns. D is therefore stored
+    as a north-east vector. Only its component across the path enters the heading and is updated, so
+    that the estimate carries over from one leg to the next.
 
-    A current keeps its direction over ground while the way bends. So D is kept as a vector, north
-    and east, that only its part across the way steers by and that grows only there: what one leg
-    has taught is known on the next.
+    Source: E. Borhaug, A. Pavlov and K. Y. Pettersen, Integral LOS control for path following of
+    underactuated marine surface vessels in the presence of constant ocean currents, CDC 2008;
+    T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, section 12.3.
 
-    Memory s [B, 2]: the vector, at most one long.
+    Memory s [B, 2]: the vector D, with a norm of at most one.
 
     Args:
-        distance: look-ahead in m.
-        gain: sigma in m/s. With a quarter of the speed both poles of the error lie at U / (2
-            distance).
-        dt: step in s.
+        distance: look-ahead distance in m.
+        gain: sigma in m/s. For a quarter of the speed both poles of the error are at
+            U / (2 distance).
+        dt: time step in s.
 
     Raises:
-        ConfigError: where one of them is not above zero.
+        ConfigError: if an argument is not positive.
     """
 
     def __init__(self, distance: float, gain: float, dt: float) -> None:
@@ -313,20 +318,20 @@ class DriftEstimate(nn.Module):
         self.max_drift = _MAX_DRIFT_TANGENT
 
     def cross_component(self, direction: Tensor, s: Tensor) -> Tensor:
-        """Return the part [B] to starboard of a direction [B] in rad."""
+        """Return the component [B] of D to starboard of a direction [B] in rad."""
         return torch.cos(direction) * s[:, 1] - torch.sin(direction) * s[:, 0]
 
     def along_component(self, direction: Tensor, s: Tensor) -> Tensor:
-        """Return the part [B] along a direction [B] in rad."""
+        """Return the component [B] of D along a direction [B] in rad."""
         return torch.cos(direction) * s[:, 0] + torch.sin(direction) * s[:, 1]
 
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> Tensor:
-        """Return the memory after a step.
+        """Update the drift estimate by one time step.
 
         Args:
-            s: memory [B, 2].
             error: cross-track error [B] in m.
-            direction: of the way [B] in rad.
+            direction: direction of the path [B] in rad.
+            s: memory [B, 2].
         """
         steering_error = error + self.distance * self.cross_component(direction, s)
         drift_increment = self.dt * self.gain * error / (self.distance**2 + steering_error.square())
@@ -337,7 +342,7 @@ class DriftEstimate(nn.Module):
 
 
 class LineOfSight(nn.Module, ABC):
-    """The angle between a leg and the course that is steered."""
+    """A line-of-sight law: the angle between the leg and the desired course."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -349,22 +354,22 @@ class LineOfSight(nn.Module, ABC):
 
         Args:
             error: cross-track error [B] in m, positive to starboard of the leg.
-            direction: of the leg [B] in rad.
+            direction: direction of the leg [B] in rad.
             s: memory [B, n_state], zeros at the start.
         """
 
 
 @final
 class LookAheadLineOfSight(LineOfSight):
-    """Steering for the point of the leg a distance ahead: -atan(error / distance).
+    """Look-ahead line of sight with the angle -atan(error / distance).
 
-    With an estimate of the drift D across the leg, -atan(error / distance + D), the crab angle that
-    a steady current needs. Source: T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion
-    Control, section 12.3. Memory: of `DriftEstimate`, where there is one.
+    With a drift estimate D across the leg the angle is -atan(error / distance + D), which contains
+    the crab angle for a steady current. Source: T. I. Fossen, Handbook of Marine Craft
+    Hydrodynamics and Motion Control, section 12.3. The memory is the memory of the drift estimate.
 
     Args:
-        distance: along the leg in m.
-        drift: None for none.
+        distance: look-ahead distance along the leg in m.
+        drift: drift estimate; None for no integral action.
     """
 
     def __init__(self, distance: float, drift: DriftEstimate | None = None) -> None:
@@ -383,14 +388,14 @@ class LookAheadLineOfSight(LineOfSight):
 
 @final
 class EnclosureLineOfSight(LineOfSight):
-    """Steering for the forward point where a circle about the vessel meets the leg.
+    """Enclosure-based line of sight with the angle -asin(error / radius).
 
-    The angle is -asin(error / radius) (Fossen, section 12.3).
-
-    Further from the leg than the radius there is none; the vessel then steers straight for the leg.
+    The target is the forward intersection of the leg with a circle about the vessel (Fossen,
+    section 12.3). If the circle does not intersect the leg, the vessel steers at a right angle
+    towards the leg.
 
     Args:
-        radius: of the circle in m.
+        radius: radius of the circle in m.
     """
 
     def __init__(self, radius: float) -> None:
@@ -405,14 +410,14 @@ class LookAheadConfig(Config):
     """Look-ahead-based line of sight.
 
     Attributes:
-        distance: along the leg.
+        distance: look-ahead distance along the leg in m.
     """
 
     kind: Literal["lookahead"] = "lookahead"
     distance: Metres = Field(gt=0)
 
     def build(self, dt: float) -> LineOfSight:
-        """Return the law, for steps of dt seconds."""
+        """Build the law for a time step of dt seconds."""
         return LookAheadLineOfSight(self.distance)
 
 
@@ -420,14 +425,14 @@ class EnclosureConfig(Config):
     """Enclosure-based line of sight.
 
     Attributes:
-        radius: of the circle about the vessel.
+        radius: radius in m of the circle about the vessel.
     """
 
     kind: Literal["enclosure"] = "enclosure"
     radius: Metres = Field(gt=0)
 
     def build(self, dt: float) -> LineOfSight:
-        """Return the law, for steps of dt seconds."""
+        """Build the law for a time step of dt seconds."""
         return EnclosureLineOfSight(self.radius)
 
 
@@ -435,9 +440,9 @@ class IntegralLookAheadConfig(Config):
     """Look-ahead-based line of sight with integral action against a steady current.
 
     Attributes:
-        distance: along the leg.
-        gain: sigma of the integral action, below speed less current; a quarter of the speed returns
-            to a leg without overshoot.
+        distance: look-ahead distance along the leg in m.
+        gain: integral gain sigma in m/s, smaller than speed minus current; a quarter of the speed
+            gives a response without overshoot.
     """
 
     kind: Literal["integral"] = "integral"
@@ -445,7 +450,7 @@ class IntegralLookAheadConfig(Config):
     gain: MetresPerSecond = Field(gt=0)
 
     def build(self, dt: float) -> LineOfSight:
-        """Return the law, for steps of dt seconds."""
+        """Build the law for a time step of dt seconds."""
         return LookAheadLineOfSight(self.distance, DriftEstimate(self.distance, self.gain, dt))
 
 
@@ -455,28 +460,31 @@ AnyLineOfSight = Annotated[
 
 
 _MIN_CURVATURE_FACTOR = 0.3
-"""Of 1 - curvature x cross-track error: beyond, the centre of the turn is near and the nearest
-point no longer known.
+"""Lower limit of 1 - curvature x cross-track error; the nearest point on the path is not well
+defined near the centre of curvature.
 """
 
 
 @final
 class CourseGuidance(Reference):
-    """Reference [B, 3] for a planned course: heading, yaw rate and rudder in rad, rad/s, rad.
+    """Path-following reference [B, 3] on a planned course: heading, yaw rate and rudder angle.
 
-    Line of sight on a curved path: heading_d = heading of the course - atan(e / look-ahead), e the
-    cross-track error, positive to starboard, where the vessel makes way along the course's own
-    tangent. Yaw rate and rudder are those of the course at the present speed, so that turns begin
-    before the arc does. The place along the course moves by one Newton step of the nearest point
-    each time, never back.
+    Line of sight on a curved path: heading_d = heading of the course - atan(e / lookahead), with
+    the cross-track error e, positive to starboard. Yaw rate and rudder angle of the planned course
+    at the present speed are feed-forward terms. The path variable is advanced by one Newton
+    iteration of the nearest point per step and never decreases.
 
-    With an estimate of the drift D, heading_d = heading of the course - atan(e / look-ahead + D
-    across), and the yaw rate takes the speed over ground from D; D turns with respect to
-    the course in its bends. Memory [B, 1 or 3]: place along the course in m, and D.
+    With a drift estimate D, heading_d = heading of the course - atan(e / lookahead + D across), and
+    the feed-forward yaw rate uses the speed over ground from D.
+
+    Memory [B, 1 or 3]: path variable in m, and D.
 
     Args:
-        lookahead: distance in m.
-        drift: integral action against a steady current, at the same look-ahead; None for none.
+        course: planned course.
+        lookahead: look-ahead distance in m.
+        state: names of the state.
+        drift: integral action against a steady current, with the same look-ahead distance; None for
+            none.
     """
 
     def __init__(
@@ -512,10 +520,10 @@ class CourseGuidance(Reference):
         self.may_finish = True
 
     def plan_at(self, arc_length: Tensor) -> Tensor:
-        """Return the plan [B, 7] at places [B] in m along the course.
+        """Interpolate the plan [B, 7] at path variables [B] in m.
 
-        The columns are north, east, direction, heading, rudder, and the curvatures of direction and
-        heading.
+        The columns are north, east, direction, heading, rudder angle, and the derivatives of
+        direction and heading by the path variable.
         """
         table_position = (arc_length / self.table_step).clamp(
             0.0, float(self.table.shape[0]) - 1.001
@@ -528,7 +536,7 @@ class CourseGuidance(Reference):
         ].to(arc_length.dtype)
 
     def track_error(self, x: Tensor, arc_length: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the distance ahead [B] of a place on the course and its cross-track error in m."""
+        """Return along-track and cross-track error [B] in m from a point of the course."""
         planned = self.plan_at(arc_length)
         north, east = x[:, self.x] - planned[:, 0], x[:, self.y] - planned[:, 1]
         c, s = torch.cos(planned[:, 2]), torch.sin(planned[:, 2])
@@ -573,27 +581,27 @@ class CourseGuidance(Reference):
         return reference, torch.cat((arc_length.unsqueeze(-1), memory), dim=-1)
 
     def is_finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
-        """Return the rows behind the end of the course."""
+        """Return which rows have passed the end of the course."""
         return s[:, 0] >= self.length
 
 
 @final
 class TrackKeeping(Policy):
-    """The law delta = delta_d + law(psi - psi_d, r - r_d), saturated.
+    """Trajectory tracking with a heading controller: delta = delta_d + law(psi - psi_d, r - r_d).
 
-    Any heading controller follows turns with it as it holds a course.
+    Nomoto's model T r_dot + r = K delta is linear: deviations from a feasible trajectory obey the
+    same equation. A heading controller applied to the deviations therefore tracks turns without
+    lag. A law with an observer receives the rudder angle minus delta_d.
 
-    T r_dot + r = K delta has the same form for the differences from a motion that fulfils it, so
-    that a law for steps of the heading corrects them and lags behind nothing. A law with an
-    observer gets the rudder angle less delta_d.
-
-    Reference [B, 3] as of `CourseGuidance`. Memory [B, 1 + n_state of the law]: the rudder angle
-    [rad] as the steering gear follows, then the law's.
+    The reference [B, 3] is defined by `CourseGuidance`. Memory [B, 1 + n_state of the law]: rudder
+    angle in rad, then the memory of the law.
 
     Args:
-        limit: of the rudder in rad.
-        dt: step in s.
-        rate: of the rudder in rad/s; None where it stands at its command at once.
+        law: heading controller.
+        state: names of the state.
+        limit: rudder limit in rad.
+        dt: time step in s.
+        rate: rudder rate in rad/s; None for a rudder without a rate limit.
     """
 
     def __init__(
@@ -614,7 +622,7 @@ class TrackKeeping(Policy):
         self.r = state.index("r")
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Return the rudder amidships, then the law's memory."""
+        """Return the initial memory: rudder amidships, then the memory of the law."""
         return torch.cat((torch.zeros_like(x[:, :1]), self.law.initial_state(x)), dim=-1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -622,7 +630,7 @@ class TrackKeeping(Policy):
 
         Args:
             x: state [B, nx].
-            reference: reference [B, 3] as of `CourseGuidance`.
+            reference: reference [B, 3], see `CourseGuidance`.
             s: memory [B, 1 + n_state of the law].
         """
         planned_rudder = reference[:, 2:3]
@@ -639,15 +647,14 @@ class TrackKeeping(Policy):
 
 
 class CrossingConfig(Config):
-    """Legs from the first point to the last, where the ferry stops.
+    """A ferry crossing on straight legs that ends with a stop at the last point.
 
     Attributes:
-        points: (north, east) in m, where the ferry starts and then where each leg ends.
-        circle: radius around the ferry; it meets the leg at the point that is steered for
-            (2.16)-(2.18).
-        frequency: Omega of the filter, all axes.
-        damping: Delta of the filter.
-        duration: of the whole crossing with its stop.
+        points: start and end of each leg, (north, east) in m.
+        circle: radius of the line-of-sight circle about the ferry in m (eq. (2.16) to (2.18)).
+        frequency: natural frequency Omega of the reference filter, all axes.
+        damping: damping ratio Delta of the reference filter.
+        duration: duration of the crossing and the stop in s.
     """
 
     kind: Literal["crossing"] = "crossing"
@@ -664,7 +671,7 @@ class CrossingConfig(Config):
         return self
 
     def filter_config(self) -> ReferenceFilterConfig:
-        """Return the filter behind the guidance."""
+        """Return the settings of the reference filter."""
         final_waypoint = (*self.points[-1], 0.0)
         frequencies = (self.frequency,) * 3
         return ReferenceFilterConfig(
@@ -674,10 +681,9 @@ class CrossingConfig(Config):
 
 @final
 class Crossing(Reference):
-    """Reference [B, 18] for `Assisted`: the filtered line-of-sight point and each model's force.
+    """Reference [B, 18] for `LagCompensatedPID`: filtered line-of-sight target and model forces.
 
-    Memory [B, 13]: the filter's nine, the number of the leg, the point and heading that were
-    steered for last.
+    Memory [B, 13]: nine entries of the filter, number of the leg, last target point and heading.
     """
 
     def __init__(
@@ -696,7 +702,7 @@ class Crossing(Reference):
         self.points = torch.tensor(config.points, dtype=torch.float64)
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Return the memory at rest where the ferry is, on the first leg; NaN for no point yet."""
+        """Return the initial memory: zero velocity, first leg, NaN for the target point."""
         zero_column = torch.zeros_like(x[:, :1])
         return torch.cat(
             (pose(x), zero_column.expand(-1, 7), torch.full_like(pose(x), torch.nan)), dim=-1
@@ -705,9 +711,12 @@ class Crossing(Reference):
     def steering_target(
         self, x: Tensor, desired_heading: Tensor, leg: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the point and heading [B, 3] to steer for, and the leg [B] after a change.
+        """Return target point and heading [B, 3], and the active leg [B].
 
-        `desired_heading` [B] is the desired heading in rad, x [B, nx] the state.
+        Args:
+            x: state [B, nx].
+            desired_heading: last desired heading [B] in rad.
+            leg: number of the active leg [B].
         """
         last_leg = len(self.points) - 2
         current_position = position(x)

@@ -1,4 +1,4 @@
-"""Vessels as heading controllers see them: simulated, or a learned model of one."""
+"""Vessels for the design and simulation of heading controllers: a plant or a learned model."""
 
 from __future__ import annotations
 
@@ -28,36 +28,36 @@ from residnet.physics.plant import HullPlant, Plant
 from residnet.physics.symmetry import get_dof
 
 _MAX_RESPONSE_STEP = 0.4
-"""Longest step in s by which a vessel's answer to its rudder is measured."""
+"""Largest time step in s of simulated rudder responses."""
 _STEPS_PER_LENGTH = 400
-"""Steps of one length before the next are twice as long."""
+"""Number of steps after which the time step doubles."""
 _STEADY_TOLERANCE = 0.1
-"""Share of the yaw rate by which it may still change over the last half of the time."""
+"""Largest relative change of a steady yaw rate over the second half of the simulation."""
 _MAX_OVERSHOOT = 0.02
-"""Share of the steady yaw rate that a vessel of the first order may overshoot by."""
+"""Largest relative overshoot of the yaw rate of a first-order response."""
 _MAX_DURATION_FACTOR = 8
-"""Times the duration given that a turn is waited for."""
+"""Largest multiple of the requested duration that a turn is simulated."""
 _N_ZIGZAG_SWITCHES = 6
-"""Changes of rudder that a zigzag ends after."""
+"""Number of rudder reversals of a zigzag."""
 _STEPS_TO_FIRST_SWITCH = 25
-"""Steps until a zigzag's first change of rudder."""
+"""Number of steps until the first rudder reversal of a zigzag."""
 _MAX_ZIGZAG_STEPS = 12000
-"""Steps after which a zigzag is given up."""
+"""Largest number of steps of a zigzag."""
 _ZERO_STATES = ("x", "y", "z", "theta", "psi", "v", "w", "p", "q", "r")
-"""States that a straight course begins with at zero."""
+"""States that are zero on a straight course."""
 _RUN_UP_STEPS = (0.1, 6000)
-"""Step in s and steps of the run from rest to the speed of a straight course."""
+"""Time step in s and number of steps of the acceleration to the speed of a straight course."""
 
 
 class SteeredVessel(ABC):
-    """A vessel whose first command is the angle that steers: the rudder's, or another axis' own.
+    """A vessel whose first command is the steering angle: the rudder, or the stern planes.
 
     Attributes:
-        axis: that is steered.
+        axis: controlled axis.
         state: names of the columns of x.
         inputs: names of the columns of w.
-        rate: of the rudder in rad/s; None where it stands at its command at once.
-        has_free_step: whether `model` can be built with steps of any length.
+        rate: rudder rate in rad/s; None for a rudder without a rate limit.
+        has_free_step: whether `model` can be built for any time step.
     """
 
     axis: Axis = HEADING
@@ -68,21 +68,21 @@ class SteeredVessel(ABC):
 
     @abstractmethod
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
-        """Return the steps of dt seconds.
+        """Build the dynamics for a time step of dt seconds.
 
-        The first columns of its memory are the variation of each row
-        (`dynamics.steering_variation.VARIATION`).
+        The memory starts with the variation of each row (`steering_variation.VARIATION`).
         """
 
     def memory(self, variation: Tensor) -> Tensor:
-        """Return the memory of `model` for variations [B, 3]."""
+        """Return the initial memory of `model` for variations [B, 3]."""
         return variation
 
     @abstractmethod
     def straight_course(self, speed: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the states [B, nx] and inputs [B, m] of straight courses.
+        """Return states [B, nx] and inputs [B, m] on straight courses.
 
-        `speed` [B] are multiples of the service speed.
+        Args:
+            speed: multiples [B] of the service speed.
         """
 
     @final
@@ -92,21 +92,21 @@ class SteeredVessel(ABC):
 
     @final
     def estimate_nomoto(self, angle: float, duration: float, dt: float = 0.02) -> NomotoModel:
-        """Return K and T at the service speed, from answers to a rudder angle.
+        """Estimate Nomoto's K and T (and c) at the service speed from simulated responses.
 
-        The angle is held first: T is the area above the yaw rate's answer over its end, less that
-        above the rudder's own way to the angle. The yaw rate of a vessel that hardly holds its
-        course overshoots in hard turns, or is not steady for long. Then K and T are those that
-        simulate its yaw rate best in a zigzag, with a delay beside them. An angle that comes to
-        rest under the held rudder tells c, and the zigzag K and T.
+        First the response to a rudder step is evaluated: K is the steady yaw rate per angle, and T
+        is the area between the step response and its final value, minus the contribution of the
+        rudder movement. If the yaw rate overshoots or does not become steady, K, T and a delay are
+        fitted to a zigzag instead. If the heading angle becomes steady, c follows from the final
+        angle, and K and T from a zigzag.
 
         Args:
-            angle: of the rudder in rad.
-            duration: until the turn is steady, in s.
-            dt: step in s; later steps are longer.
+            angle: rudder angle in rad.
+            duration: time in s until the turn is steady.
+            dt: initial time step in s; later steps are longer.
 
         Raises:
-            FitError: where the vessel does not answer its rudder so that it can be steered.
+            FitError: if the vessel does not respond to its rudder like a first-order system.
         """
         speed = float(self._straight_state()[0][0, self.state_column("u")])
         times, rates, headings = self._simulate_step_response(angle, duration, dt)
@@ -149,9 +149,13 @@ class SteeredVessel(ABC):
     def _estimate_restoring(
         self, angle: float, final_angle: float, speed: float, dt: float
     ) -> NomotoModel:
-        """Return K, T and c of a vessel that has come to rest at an angle `final_angle` under a held one.
+        """Estimate K, T and c of a vessel with a restoring moment.
 
-        `speed` is that of K and T in m/s.
+        Args:
+            angle: constant rudder angle in rad.
+            final_angle: steady heading angle at this rudder angle in rad.
+            speed: speed in m/s.
+            dt: initial time step in s.
         """
         if not (math.isfinite(final_angle) and final_angle * angle > 0):
             raise FitError(
@@ -168,18 +172,18 @@ class SteeredVessel(ABC):
         return NomotoModel(float(response.gain), response.time, speed, restoring)
 
     def _longest_step(self, dt: float) -> float:
-        """Return the longest step in s of answers that begin with steps of dt seconds."""
+        """Return the largest time step in s of a response with the initial step dt."""
         return max(dt, _MAX_RESPONSE_STEP) if self.has_free_step else dt
 
     def _straight_state(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return state, inputs and memory of a straight course at the service speed, [1, ...]."""
+        """Return state, inputs and memory [1, ...] on a straight course at the service speed."""
         x, w = self.straight_course(torch.ones(1, dtype=torch.float64))
         return x, w, self.memory(torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64))
 
     def _simulate_step_response(
         self, angle: float, duration: float, dt: float
     ) -> tuple[Array, Array, Array]:
-        """Return times, yaw rates and headings [N] under a held rudder, in steps that grow."""
+        """Simulate a rudder step; returns times, yaw rates and headings [N], not equidistant."""
         r = self.state_column(self.axis.rate)
         psi = self.state_column(self.axis.angle)
         rate_sign = self.axis.side
@@ -204,9 +208,13 @@ class SteeredVessel(ABC):
     def _simulate_zigzag(
         self, angle: float, switch_angle: float, first_switch_time: float, dt: float
     ) -> tuple[ManoeuvreRecord, Array]:
-        """Return a zigzag with its headings, which go to an angle `turned` on each side.
+        """Simulate a zigzag manoeuvre and return its record and its headings.
 
-        `first_switch_time` is the time in s until its first change of rudder.
+        Args:
+            angle: rudder angle in rad.
+            switch_angle: heading change in rad at which the rudder is reversed.
+            first_switch_time: time in s of the first reversal.
+            dt: time step in s.
         """
         r = self.state_column(self.axis.rate)
         psi = self.state_column(self.axis.angle)
@@ -247,7 +255,7 @@ class SteeredVessel(ABC):
 
 
 def _is_steady(times: Array, rates: Array) -> bool:
-    """Return whether a yaw rate is steady over the last half of the time."""
+    """Return whether a yaw rate is steady over the second half of the simulation."""
     last_half = rates[np.searchsorted(times, 0.5 * times[-1]) :]
     steady = rates[-1]
     overshoots = np.abs(rates).max() > (1.0 + _STEADY_TOLERANCE) * abs(steady)
@@ -256,10 +264,10 @@ def _is_steady(times: Array, rates: Array) -> bool:
 
 @final
 class SteeredPlant(SteeredVessel):
-    """A simulated vessel; in calm water, or in the weather [inputs by name] given.
+    """A simulated vessel, in calm water or with environmental inputs.
 
     Raises:
-        ConfigError: where nothing steers it on the axis, or it makes no way ahead.
+        ConfigError: if the vessel has no command for the axis, or does not move ahead.
     """
 
     def __init__(self, plant: Plant, *, in_calm_water: bool = True, axis: Axis = HEADING) -> None:
@@ -283,7 +291,7 @@ class SteeredPlant(SteeredVessel):
         return VariedPlant(self.plant, dt, integrator, self.axis)
 
     def straight_course(self, speed: Tensor) -> tuple[Tensor, Tensor]:
-        """Return states and inputs of straight courses; thrust grows with the speed squared."""
+        """Return states and inputs on straight courses, with thrust proportional to speed^2."""
         x = self._straight_course_state.to(speed.dtype).repeat(len(speed), 1)
         x[:, self.state_column("u")] *= speed
         command = self.plant.commands_for_demand(speed.square(), torch.zeros_like(speed))
@@ -292,7 +300,7 @@ class SteeredPlant(SteeredVessel):
         return x, torch.stack([command_inputs.get(name, zero_input) for name in self.inputs], dim=1)
 
     def _simulate_run_up(self) -> Tensor:
-        """Return the state [1, nx] of a straight course at the speed of full drive, from rest."""
+        """Simulate the acceleration at full drive and return the final state [1, nx]."""
         unit_speed = torch.ones(1, dtype=torch.float64)
         column = self.state_column("u")
         (x, w) = self.straight_course(unit_speed)
@@ -320,10 +328,10 @@ class SteeredPlant(SteeredVessel):
 
 
 def _identify_rudder_gear(plant: Plant, axis: Axis) -> tuple[float | None, float | None]:
-    """Return the rate of the steering gear in rad/s and its time constant in s; None without one.
+    """Identify rate limit [rad/s] and time constant [s] of the steering gear; None if absent.
 
-    They are seen from what two angles lead to: where large ones move the rudder alike, its rate
-    holds, and where small ones move it in their proportion, it follows with a time constant.
+    The gear is tested with steps of two sizes. A response independent of the step size shows a rate
+    limit, a proportional response shows a time constant.
     """
     if axis.gear not in plant.state_names:
         return None, None
@@ -355,13 +363,14 @@ class SteeredModel(SteeredVessel):
     """A learned model with the steering gear and straight courses of the vessel that it models.
 
     Args:
-        input_names: names of its inputs; of what steers the angle or its command, the others are
-            commands of the vessel.
-        input_hold: whether its inputs are those at a step's start or means over the step.
-        vessel: in calm water.
+        model: learned model.
+        input_names: names of its inputs: the steering angle or its command, and further commands of
+            the vessel.
+        input_hold: `start` if an input is sampled at the start of a step, `mean` for step means.
+        vessel: modelled vessel in calm water.
 
     Raises:
-        ConfigError: where nothing steers the model, or an input that the vessel does not command.
+        ConfigError: if no input steers the model, or an input is no command of the vessel.
     """
 
     def __init__(
@@ -398,10 +407,7 @@ class SteeredModel(SteeredVessel):
             self.input_indices.append(vessel.inputs.index(command))
 
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
-        """Return the model, varied, with its own integrator.
-
-        One without memory takes steps of any length.
-        """
+        """Build the varied model with its own integrator; without memory, for any time step."""
         return VariedModel(
             self.hull,
             dt,
@@ -413,7 +419,7 @@ class SteeredModel(SteeredVessel):
         )
 
     def memory(self, variation: Tensor) -> Tensor:
-        """Return the variation, then the head's memory without a past."""
+        """Return the variation followed by the initial memory of the head."""
         return torch.cat((variation, variation.new_zeros(len(variation), self.hull.n_state)), dim=1)
 
     def straight_course(self, speed: Tensor) -> tuple[Tensor, Tensor]:
