@@ -79,9 +79,9 @@ def test_epochs_far_from_the_start_ease_the_charge() -> None:
         {"epoch": float(k), "validation": cost, "diverged": float(refused)}
         for k, (cost, refused) in enumerate(costs)
     ]
-    assert fit._spoilt(fit.history) == 1
-    assert fit._strict() == pytest.approx(1.5 * 0.2)
-    assert fit._spoilt([{"epoch": 9.0}, {"epoch": 9.0, "validation": math.nan}]) == 1
+    assert fit._count_diverged_epochs(fit.history) == 1
+    assert fit._penalty_weight() == pytest.approx(1.5 * 0.2)
+    assert fit._count_diverged_epochs([{"epoch": 9.0}, {"epoch": 9.0, "validation": math.nan}]) == 1
 
 
 def test_epochs_that_swing_come_after_those_that_do_not() -> None:
@@ -111,7 +111,7 @@ def test_swing_and_nominal_overshoot_cost_beyond_what_is_free() -> None:
         about = (changes.dt, ("psi",), HEADING, changes.step_index, changes.n_counted)
         states = torch.zeros(16, len(time) + 1, 1)
         flown = ClosedLoopTrajectories(states, command, changes.target, *about)
-        return float(fit._unsteady(flown, over, 8))
+        return float(fit._limit_cycle_penalty(flown, over, 8))
 
     # 0.2 s are the overshoot; half of what an epoch may swing is free; of eight quiet flights the
     # two that swing most count

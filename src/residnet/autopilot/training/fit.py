@@ -1,4 +1,4 @@
-"""Training of a recurrent policy under stated conditions, through the whole closed loop."""
+"""Train a recurrent policy under operating conditions, by gradients through the closed loop."""
 
 from __future__ import annotations
 
@@ -30,32 +30,33 @@ from residnet.engine.rollout import FreeRun
 from residnet.preprocessing.data_module import EpochDataModule
 from residnet.training.trainer import EpochTraining, run_epochs
 
-_LATE = 1.0 / 3.0
-"""Share of a flight at whose end a quiet one should have come to rest."""
-_ALL = 1_000_000
-"""Refused flights of an epoch that costs more than the start: more than there are."""
-_LITTLE = 0.6
-"""Share of the range of changes of heading that flights without noise are drawn from."""
-_FAR = 1.15
-"""Multiple of the start's cost from which an epoch has left the good policies."""
-_SLOWER = 0.5
-_LESS = 0.2
-"""Factors on the learning rate and on the charge for swinging after every such epoch."""
-_FREE = 0.5
-"""Share of what the rudder may swing that costs nothing in training."""
+_LATE_FRACTION = 1.0 / 3.0
+"""Final fraction of a simulation in which the rudder of a stable loop should be constant."""
+_ALL_REJECTED = 1_000_000
+"""Number of rejected simulations of an epoch that costs more than the start; more than exist."""
+_SMALL_STEP_FRACTION = 0.6
+"""Fraction of the range of reference changes used for simulations without noise."""
+_DIVERGED_COST_RATIO = 1.15
+"""Ratio to the initial cost above which an epoch counts as diverged."""
+_LEARNING_RATE_FACTOR = 0.5
+"""Factor on the learning rate after each diverged epoch."""
+_PENALTY_FACTOR = 0.2
+"""Factor on the penalty of limit cycles after each diverged epoch."""
+_FREE_SWING_FRACTION = 0.5
+"""Fraction of the allowed rudder swing that has no penalty in training."""
 
 
 @final
 class PolicyFit(EpochTraining):
-    """Trains a policy on heading changes that are drawn anew for every batch.
+    """Training of a policy on random heading changes, with a new sample in every batch.
 
     Args:
-        policy: what is trained, float32.
-        vessel: what it steers.
-        settings: of the training.
-        conditions: of flights and their cost.
-        seed: of batches and validation flights.
-        compiler: of the flights; None to fly them as they are.
+        policy: trained policy, float32.
+        vessel: steered vessel.
+        settings: settings of the training.
+        conditions: operating conditions and cost.
+        seed: seed of batches and validation.
+        compiler: compiles simulations and their gradients; None for none.
     """
 
     def __init__(
@@ -72,17 +73,19 @@ class PolicyFit(EpochTraining):
         self.conditions = conditions
         duration = conditions.duration if settings.duration is None else settings.duration
         lengths = {"hold": min(settings.hold, conditions.hold), "duration": duration}
-        self.drawn = conditions.model_copy(update=lengths)
+        self.training_conditions = conditions.model_copy(update=lengths)
         self.vessel = vessel
         self.compiler = compiler
         self._loops: dict[float, tuple[ClosedLoopSimulation, FreeRun]] = {}
-        self._at(settings.dt)
-        random = torch.Generator().manual_seed(seed + 1_000_003)
-        self.unseen = conditions.sample_steps(settings.validation, conditions.dt, random)
-        self.steady = None
+        self._use_time_step(settings.dt)
+        generator = torch.Generator().manual_seed(seed + 1_000_003)
+        self.validation_steps = conditions.sample_steps(
+            settings.validation, conditions.dt, generator
+        )
+        self.limit_cycle_test = None
         if settings.steady is not None:
-            self.steady = LimitCycleTest(settings.steady, conditions, seed + 1_500_007)
-        self.test = ClosedLoopSimulation(
+            self.limit_cycle_test = LimitCycleTest(settings.steady, conditions, seed + 1_500_007)
+        self.validation_loop = ClosedLoopSimulation(
             vessel,
             policy,
             conditions.dt,
@@ -91,14 +94,14 @@ class PolicyFit(EpochTraining):
             max_delay=max(math.ceil(conditions.delay[1] / conditions.dt), 1),
         )
 
-    def _step(self) -> float:
-        """Return the step in s of the present epoch."""
-        coarse = self.epoch < round(self.settings.epochs * (1.0 - self.settings.fine))
-        return self.settings.dt if coarse else self.conditions.dt
+    def _epoch_time_step(self) -> float:
+        """Return the time step of the current epoch in s: a fine one at the end of the training."""
+        is_coarse = self.epoch < round(self.settings.epochs * (1.0 - self.settings.fine))
+        return self.settings.dt if is_coarse else self.conditions.dt
 
-    def _at(self, dt: float) -> None:
-        """Fly at a step of dt seconds from now on."""
-        self.step_size = dt
+    def _use_time_step(self, dt: float) -> None:
+        """Set the time step, and build the closed loop for a new time step."""
+        self.time_step = dt
         self.policy.set_step(dt)
         if dt in self._loops:
             return
@@ -107,182 +110,217 @@ class PolicyFit(EpochTraining):
             self.vessel, self.policy, dt, settings.integrator, torch.float32
         )
         rollout = loop.rollout(max(math.ceil(self.conditions.delay[1] / dt), 1))
-        fly = compile_or_fallback(
-            rollout, self.compiler, loop.rollout_arguments(self._batch(0.0, 2)), _slow
+        simulate = compile_or_fallback(
+            rollout,
+            self.compiler,
+            loop.rollout_arguments(self._sample_batch(0.0, 2)),
+            _warn_not_compiled,
         )
-        self._loops[dt] = loop, fly
+        self._loops[dt] = loop, simulate
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Return Adam over the policy's parameters."""
-        wanted = [p for p in self.policy.parameters() if p.requires_grad]
-        return torch.optim.Adam(wanted, lr=self.settings.learning_rate)
+        trainable = [p for p in self.policy.parameters() if p.requires_grad]
+        return torch.optim.Adam(trainable, lr=self.settings.learning_rate)
 
     def on_fit_start(self) -> None:
-        """Validate the start too: training is kept where it brings something."""
+        """Validate the initial policy, so that training never returns a worse one."""
         super().on_fit_start()
         if not self.history:
             self.validate_start()
             self.best_diverged = self.diverged
 
     def on_train_epoch_start(self) -> None:
-        """Draw the epoch's flights anew, from a seed of its own, at the epoch's step."""
-        self._at(self._step())
-        if self._spoilt(self.history[-1:]):
-            # far from any good policy the gradient leads nowhere; Adam's memory is of that place
+        """Set time step and seed of the epoch; restart from the best policy after divergence."""
+        self._use_time_step(self._epoch_time_step())
+        if self._count_diverged_epochs(self.history[-1:]):
+            # gradients far from a good policy are useless, and so are the moments of Adam
             self.policy.load_state_dict(self.best_state)
             self.trainer.optimizers[0].state.clear()
         self.seed_epoch()
 
-    def _spoilt(self, epochs: list[dict[str, float]]) -> int:
-        """Return how many of some epochs cost far more than the start in full conditions."""
+    def _count_diverged_epochs(self, epochs: list[dict[str, float]]) -> int:
+        """Count epochs whose cost in full conditions is far above the initial cost."""
         settings = self.settings
-        start = self.start_score
-        if start is None or not self.best_state:
+        initial_cost = self.start_score
+        if initial_cost is None or not self.best_state:
             return 0
-        first = math.ceil(settings.spread * settings.epochs)
+        first_full_epoch = math.ceil(settings.spread * settings.epochs)
         costs = [
             entry["validation"]
             for entry in epochs
-            if "validation" in entry and entry["epoch"] >= first
+            if "validation" in entry and entry["epoch"] >= first_full_epoch
         ]
-        return sum(not cost <= _FAR * start for cost in costs)
+        return sum(not cost <= _DIVERGED_COST_RATIO * initial_cost for cost in costs)
 
     def batch(self, number: int) -> HeadingStepBatch:
-        """Return the heading changes of a batch of the present epoch, drawn anew."""
+        """Sample the heading changes of a batch in the current epoch."""
         settings = self.settings
-        share = settings.share(self._progress(number))
-        return self._batch(share, settings.batch, round(settings.quiet * settings.batch))
+        share = settings.share(self._training_progress(number))
+        return self._sample_batch(share, settings.batch, round(settings.quiet * settings.batch))
 
-    def _progress(self, number: int) -> float:
-        """Return the share of the training that is done at a batch."""
+    def _training_progress(self, number: int) -> float:
+        """Return the completed fraction of the training at a batch."""
         return float((self.epoch + number / self.settings.steps) / self.settings.epochs)
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, number: int) -> Any:
-        """Return the batch as it is: policies are trained on the CPU."""
+        """Return the batch unchanged, because policies are trained on the CPU."""
         return batch
 
     def training_step(self, changes: HeadingStepBatch, number: int) -> Tensor:
         """Return the loss of one batch of heading changes."""
         settings = self.settings
-        progress = self._progress(number)
+        progress = self._training_progress(number)
         cosine = 0.5 * (1.0 + math.cos(math.pi * progress))
-        rate = settings.learning_rate * _SLOWER ** self._spoilt(self.history)
+        rate = settings.learning_rate * _LEARNING_RATE_FACTOR ** self._count_diverged_epochs(
+            self.history
+        )
         for group in self.trainer.optimizers[0].param_groups:
             group["lr"] = rate * (settings.final + (1.0 - settings.final) * cosine)
-        quiet = round(settings.quiet * settings.batch)
-        loop, fly = self._loops[self.step_size]
-        flown = loop.to_trajectories(changes, *fly(*loop.rollout_arguments(changes))[:2])
-        found = flown.step_metrics(self.conditions)
+        n_quiet = round(settings.quiet * settings.batch)
+        loop, simulate = self._loops[self.time_step]
+        rollout_results = simulate(*loop.rollout_arguments(changes))
+        trajectories = loop.to_trajectories(changes, *rollout_results[:2])
+        metrics = trajectories.step_metrics(self.conditions)
         loss: Tensor = (
-            found["cost"].mean()
-            + settings.guiding(progress) / self.conditions.overshoot_unit * found["iae"].mean()
+            metrics["cost"].mean()
+            + settings.guiding(progress) / self.conditions.overshoot_unit * metrics["iae"].mean()
         )
-        if quiet > 0:
-            loss = loss + self._strict() * self._unsteady(flown, found["overshoot"], quiet)
-        loss = loss + self._beyond(found["overshoot"])
-        self._losses.append(float(found["cost"].detach().mean()))
+        if n_quiet > 0:
+            loss = loss + self._penalty_weight() * self._limit_cycle_penalty(
+                trajectories, metrics["overshoot"], n_quiet
+            )
+        loss = loss + self._overshoot_penalty(metrics["overshoot"])
+        self._losses.append(float(metrics["cost"].detach().mean()))
         return loss
 
-    def _unsteady(self, flown: ClosedLoopTrajectories, overshoot: Tensor, quiet: int) -> Tensor:
-        """Return what the quiet flights of a batch cost in s for swing and overshoot."""
+    def _limit_cycle_penalty(
+        self, trajectories: ClosedLoopTrajectories, overshoot: Tensor, n_quiet: int
+    ) -> Tensor:
+        """Return the penalty in s for rudder swing and overshoot without noise.
+
+        Args:
+            trajectories: simulations of a batch.
+            overshoot: their overshoot [B] in rad or m.
+            n_quiet: number of simulations without noise, which come first.
+        """
         settings = self.settings
         steady = self.settings.steady
-        # the standard deviation of a sine is its movement peak to peak over two roots of two
-        free = 0.0 if steady is None else (_FREE * steady.rudder_swing) ** 2 / 8.0
-        swing = (flown.late_command_variance(_LATE)[:quiet] - free).clamp(min=0.0)
-        first = quiet // 2
-        last = quiet // 2 + quiet // 4
-        # large changes of the nominal vessel may still be under way
-        swing = torch.cat((swing[:first], swing[last:]))
-        worst = swing.topk(math.ceil(quiet / 4)).values.mean()
-        cost: Tensor = math.degrees(math.degrees(settings.calm)) * worst
-        if last > first:
+        # the standard deviation of a sine is its peak-to-peak range divided by 2 sqrt(2)
+        free_variance = (
+            0.0 if steady is None else (_FREE_SWING_FRACTION * steady.rudder_swing) ** 2 / 8.0
+        )
+        late_variance = trajectories.late_command_variance(_LATE_FRACTION)[:n_quiet]
+        excess = (late_variance - free_variance).clamp(min=0.0)
+        # the nominal vessel is left out: its large changes may not be complete
+        nominal_rows = slice(n_quiet // 2, n_quiet // 2 + n_quiet // 4)
+        excess = torch.cat((excess[: nominal_rows.start], excess[nominal_rows.stop :]))
+        largest_excess = excess.topk(math.ceil(n_quiet / 4)).values.mean()
+        cost: Tensor = math.degrees(math.degrees(settings.calm)) * largest_excess
+        if nominal_rows.stop > nominal_rows.start:
             cost = (
                 cost
-                + settings.exact / self.conditions.overshoot_unit * overshoot[first:last].mean()
+                + settings.exact / self.conditions.overshoot_unit * overshoot[nominal_rows].mean()
             )
         return cost
 
-    def _beyond(self, overshoot: Tensor) -> Tensor:
-        """Return what overshoots beyond the limit of one flight in twenty cost in s."""
+    def _overshoot_penalty(self, overshoot: Tensor) -> Tensor:
+        """Return the penalty in s for overshoot above the limit of its 95th percentile."""
         steady = self.settings.steady
-        limit = math.inf if steady is None else steady.of(self.conditions.axis)[2]
-        beyond: Tensor = (overshoot - limit).clamp(min=0.0).mean()
-        cost: Tensor = self.settings.excess / self.conditions.overshoot_unit * beyond
+        limit = math.inf if steady is None else steady.limits_for(self.conditions.axis)[2]
+        mean_excess: Tensor = (overshoot - limit).clamp(min=0.0).mean()
+        cost: Tensor = self.settings.excess / self.conditions.overshoot_unit * mean_excess
         return cost
 
-    def _strict(self) -> float:
-        """Return the factor on what swing and nominal overshoot cost in this epoch.
+    def _penalty_weight(self) -> float:
+        """Return the factor on the penalty of limit cycles and overshoot in this epoch.
 
-        Epochs that cost more than the start do not count: a heavier charge would not cure them.
+        It grows with the number of rejected epochs. Epochs that cost more than the initial policy
+        are not counted, because a larger penalty would not improve them.
         """
-        refused = sum(0 < entry.get("diverged", 0.0) < _ALL for entry in self.history)
-        return float(self.settings.stricter**refused * _LESS ** self._spoilt(self.history))
+        n_rejected = sum(0 < entry.get("diverged", 0.0) < _ALL_REJECTED for entry in self.history)
+        return float(
+            self.settings.stricter**n_rejected
+            * _PENALTY_FACTOR ** self._count_diverged_epochs(self.history)
+        )
 
-    def _batch(self, share: float, rows: int, quiet: int = 0) -> HeadingStepBatch:
-        """Return heading changes drawn anew, under a share of the conditions.
+    def _sample_batch(self, share: float, rows: int, n_quiet: int = 0) -> HeadingStepBatch:
+        """Sample heading changes, the first `n_quiet` of them without noise and slow disturbance.
 
-        The first `quiet` of them are without noise and slow push: first half of these at a corner
-        of the spread, where a loop swings first, then a quarter that flies the nominal vessel. All
-        but the latter leave out the largest changes of heading, so that the change is over when
-        they are looked at for swinging. A policy's memory may keep a loop swinging behind large
-        changes that does not swing behind small ones.
+        Half of the quiet simulations have vessels at corners of the ranges, where limit cycles
+        occur first, and a quarter has the nominal vessel. Except for the nominal vessel, quiet
+        simulations have only small reference changes, so that the change is complete when limit
+        cycles are evaluated. The memory of a policy can sustain a limit cycle after large changes
+        that does not occur after small ones, which is why the nominal vessel keeps them.
+
+        Args:
+            share: fraction of the deviations from the nominal conditions, 0 to 1.
+            rows: number of simulations.
+            n_quiet: number of simulations without noise.
         """
-        random = torch.Generator().manual_seed(int(torch.randint(2**62, (1,))))
-        changes = self.drawn.sample_steps(rows, self.step_size, random, share)
-        changes.noise[:quiet] = 0.0
-        changes.push[:quiet] = 0.0
-        first = quiet // 2
-        number = quiet // 4
-        least = self.drawn.step_range[0] * changes.target.sign()
-        small = least + _LITTLE * (changes.target - least)
-        for some in (slice(0, first), slice(first + number, quiet)):
-            changes.target[some] = small[some]
-        changes = with_nominal_rows(changes, first, number)
-        return self.drawn.with_corner_rows(changes, first, random, share)
+        generator = torch.Generator().manual_seed(int(torch.randint(2**62, (1,))))
+        conditions = self.training_conditions
+        changes = conditions.sample_steps(rows, self.time_step, generator, share)
+        changes.noise[:n_quiet] = 0.0
+        changes.push[:n_quiet] = 0.0
+        n_corner = n_quiet // 2
+        n_nominal = n_quiet // 4
+        smallest = conditions.step_range[0] * changes.target.sign()
+        small_target = smallest + _SMALL_STEP_FRACTION * (changes.target - smallest)
+        for quiet_rows in (slice(0, n_corner), slice(n_corner + n_nominal, n_quiet)):
+            changes.target[quiet_rows] = small_target[quiet_rows]
+        changes = with_nominal_rows(changes, n_corner, n_nominal)
+        return conditions.with_corner_rows(changes, n_corner, generator, share)
 
     def on_after_backward(self) -> None:
-        """Reset the gradient of a batch where it is no number."""
-        given = [p.grad for p in self.policy.parameters() if p.grad is not None]
-        if not all(bool(torch.isfinite(grad).all()) for grad in given):
+        """Discard the gradient of a batch if it is not finite."""
+        gradients = [p.grad for p in self.policy.parameters() if p.grad is not None]
+        if not all(bool(torch.isfinite(grad).all()) for grad in gradients):
             self.trainer.optimizers[0].zero_grad()
 
     def _gains(self, score: float) -> bool:
         if not self.best_state or not math.isfinite(score):
             return math.isfinite(score)
-        return self._rank(self.diverged, score) < self._rank(self.best_diverged, self.best_score)
+        return self._rank_key(self.diverged, score) < self._rank_key(
+            self.best_diverged, self.best_score
+        )
 
-    def _rank(self, refused: int, cost: float) -> tuple[bool, float]:
-        """Return the order of epochs: those without refused flights, then by what flights cost.
+    def _rank_key(self, n_rejected: int, cost: float) -> tuple[bool, float]:
+        """Return the sort key of an epoch: epochs without rejected simulations first, then by cost.
 
-        A refused flight counts twice.
+        The cost is increased by the fraction of rejected simulations.
         """
-        flights = 0 if self.steady is None else self.steady.n_simulations + self.settings.validation
-        share = refused / max(flights, 1)
-        return refused > 0, cost * (1.0 + share)
+        n_simulations = (
+            0
+            if self.limit_cycle_test is None
+            else self.limit_cycle_test.n_simulations + self.settings.validation
+        )
+        rejected_fraction = n_rejected / max(n_simulations, 1)
+        return n_rejected > 0, cost * (1.0 + rejected_fraction)
 
     def validated(self) -> tuple[nn.Module, float]:
-        """Return the policy and its mean cost over the flights that epochs are chosen on.
+        """Return the policy and its mean cost over the validation simulations.
 
-        Flights that swing are counted, and those beyond one in twenty that overshoot too far. An
-        epoch that costs more than the start counts as if more of them swung than there are, so
-        that it never takes the start's place.
+        Simulations with limit cycles, and overshoots above the limit in excess of 5 %, are counted
+        as rejected. An epoch that costs more than the initial policy is rejected as a whole.
         """
-        self.policy.set_step(self.unseen.dt)
-        found = self.test.simulate(self.unseen).step_metrics(self.conditions)
-        score = float(found["cost"].mean())
-        if self.steady is not None:
-            worse = self.start_score is not None and score > self.start_score
-            limit = self.steady.limits.limits_for(self.conditions.axis)[2]
-            often = count_excess_overshoots(found["overshoot"], limit)
-            self.diverged = _ALL if worse else self.steady.count_failures(self.test) + often
-        self.policy.set_step(self.step_size)
+        self.policy.set_step(self.validation_steps.dt)
+        trajectories = self.validation_loop.simulate(self.validation_steps)
+        metrics = trajectories.step_metrics(self.conditions)
+        score = float(metrics["cost"].mean())
+        if self.limit_cycle_test is not None:
+            is_worse = self.start_score is not None and score > self.start_score
+            limit = self.limit_cycle_test.limits.limits_for(self.conditions.axis)[2]
+            n_overshoots = count_excess_overshoots(metrics["overshoot"], limit)
+            n_limit_cycles = self.limit_cycle_test.count_failures(self.validation_loop)
+            self.diverged = _ALL_REJECTED if is_worse else n_limit_cycles + n_overshoots
+        self.policy.set_step(self.time_step)
         return self.policy, score
 
 
 @final
 class HeadingChangesData(EpochDataModule):
-    """Heading changes that a policy meets, new ones in every batch."""
+    """Random heading changes of the training, a new sample in every batch."""
 
     def __init__(self, fit: PolicyFit) -> None:
         super().__init__(fit.seed, lambda: fit.epoch)
@@ -296,7 +334,7 @@ class HeadingChangesData(EpochDataModule):
         return (self.fit.batch(number) for number in range(self.n_batches))
 
 
-def _slow(error: ExportError) -> None:
+def _warn_not_compiled(error: ExportError) -> None:
     log_message(f"  the flights are not compiled, training is much slower: {error}")
 
 
@@ -310,17 +348,26 @@ def train_policy(
     folder: Path | None,
     compiler: Compiler | None = None,
 ) -> dict[str, Any]:
-    """Train a policy and leave the weights of the epoch with the least cost in it.
+    """Train a policy in place and load the weights of the best epoch.
 
-    `compiler` makes the flights of the training quick. `checkpoints/<name>/last.ckpt` in the folder
-    is resumed where it exists.
+    A checkpoint `checkpoints/<name>/last.ckpt` in the folder is resumed.
+
+    Args:
+        name: name of the policy.
+        policy: trained policy.
+        vessel: steered vessel.
+        settings: settings of the training.
+        conditions: operating conditions and cost.
+        seed: seed of the training.
+        folder: run folder; None for no checkpoints.
+        compiler: compiles simulations and their gradients; None for none.
 
     Returns:
-        What there is to say: the curve by epoch, the cost at the start and the best one, and how
-        many flights are beyond `settings.steady`.
+        The curve by epoch, the initial and the best cost, and the number of rejected simulations
+        (`unsteady`).
 
     Raises:
-        FitError: where no epoch gave a finite cost.
+        FitError: if no epoch has a finite cost.
     """
     fit = PolicyFit(policy.float(), vessel, settings, conditions, seed, compiler)
     notes = run_epochs(name, fit, HeadingChangesData(fit), policy, policy, folder)
