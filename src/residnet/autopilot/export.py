@@ -1,7 +1,7 @@
-"""Heading policies as they are exported, alone and with the guidance of a planned course.
+"""Export of steering policies, alone or together with the guidance of a planned course.
 
-Measurements go in, the rudder command comes out. Input checks and rate limits are inside, and no
-command is ever NaN or infinite.
+An exported policy maps measurements to the rudder command. It contains checks of its inputs and
+rate limits; its command is always finite.
 """
 
 from __future__ import annotations
@@ -27,37 +27,39 @@ from residnet.export.base import Exportable, LoadedExport, RoundingError
 from residnet.export.torchscript import get_size, require_shape, trace_function
 
 FallbackCommand = Literal["hold", "amidships"]
-"""Command while inputs are wrong: the last one, or rudder amidships."""
+"""Fallback command for invalid inputs: hold the last command, or rudder amidships."""
 COURSE_MEASUREMENTS = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
-"""What a policy along a course sees: north and east, heading, surge and sway velocity, yaw rate."""
+"""Measurements of a course policy: north, east, heading, surge and sway velocity, yaw rate."""
 PARITY_STEPS = 1000
 PARITY_TOLERANCE = 1e-4
-"""Steps over which exported commands must agree, and to which share of the rudder's limit.
+"""Largest difference between exported and original commands as a fraction of the rudder limit.
 
-Of a limit of 35 deg it is 0.0035 deg, which no actuator follows, and float32 rounds less.
+For a limit of 35 deg it is 0.0035 deg, below the resolution of actuators and above the rounding of
+float32. It is checked over `PARITY_STEPS` steps.
 """
 _FRAME_OF_AXIS = {
     HEADING: "NED; psi clockwise from north; delta > 0 turns to starboard",
     DEPTH: "NED; z down, theta and q bow up; delta_s > 0 dives",
 }
 _MAX_HEADING = 2000.0 * math.pi
-"""Largest heading in rad."""
+"""Largest accepted heading in rad (1000 turns)."""
 _POSITION_MARGIN = 1e3
-"""How many look-ahead distances outside the course's own extent a position is accepted."""
+"""Accepted distance outside the extent of the course in look-ahead distances."""
 
 
 class _GuardedController(nn.Module):
-    """The checks that all exported policies share.
+    """Input checks and fallback that all exported policies have in common.
 
-    The memory s [B, n] ends with the last command. Where a measurement or the memory is no number
-    or out of range, the command is the safe one, reached at the rudder's rate, and the memory stays
-    as it was; where it was wrong itself, or would become so, it is forgotten and begins anew.
+    The memory s [B, n] ends with the last command. If a measurement or the memory is NaN or out of
+    range, the command moves to the fallback at the rudder rate and the memory is not updated. A
+    memory that is invalid, or would become invalid, is initialised again.
 
     Args:
-        limits: [low, high] in which each measurement is accepted.
-        memory_limits: [low, high] of the memory without the last command.
-        fallback: command while inputs are wrong.
-        dtype: of all numbers.
+        limits: accepted range (low, high) of each measurement.
+        memory_limits: accepted range (low, high) of each memory entry but the last command.
+        policy: steering policy.
+        fallback: command for invalid inputs.
+        dtype: precision.
     """
 
     def __init__(
@@ -77,7 +79,7 @@ class _GuardedController(nn.Module):
             for bound in torch.tensor(ranges, dtype=dtype).T
         )
         self.hold_factor = 1.0 if fallback == "hold" else 0.0
-        # a large number where the rudder has no rate: infinity times zero would be no number
+        # finite without a rate limit, because infinity times zero is not a number
         self.max_step = min(policy.rate * policy.dt, 2.0 * policy.limit)
         self.limit = policy.limit
         self.dt = policy.dt
@@ -89,11 +91,11 @@ class _GuardedController(nn.Module):
         return self.start_memory(torch.where(self.is_in_range(y), y, torch.zeros_like(y)))
 
     def start_memory(self, y: Tensor) -> Tensor:
-        """Return the memory [B, n] at an accepted measurement [B, k]."""
+        """Return the initial memory [B, n] for a valid measurement [B, k]."""
         raise NotImplementedError
 
     def is_in_range(self, measured: Tensor) -> Tensor:
-        """Return which measurements are in range, [B, 1]; what is no number is not."""
+        """Return which measurements are in range, [B, 1]; NaN is not."""
         return ((measured >= self.low) & (measured <= self.high)).all(dim=-1, keepdim=True)
 
     def last_command(self, s: Tensor) -> Tensor:
@@ -113,9 +115,8 @@ class _GuardedController(nn.Module):
         last_command: Tensor,
         is_valid: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return command [B, 1], memory [B, n] and fault [B] from what the policy wishes."""
-        # a memory within its range can still lead out of it, where its entries do not belong
-        # together
+        """Return command [B, 1], memory [B, n] and fault [B] with limits and fallback applied."""
+        # an inconsistent memory within its ranges can still lead to a memory outside of them
         is_inside = (next_memory >= self.memory_low[:-1]) & (next_memory <= self.memory_high[:-1])
         is_sound = is_inside.all(dim=-1, keepdim=True)
         s = torch.where(is_sound, s, fresh_memory)
@@ -129,9 +130,9 @@ class _GuardedController(nn.Module):
 
 
 class GuardedPolicy(_GuardedController):
-    """A heading policy that a controller calls once per step; SI and radians.
+    """A steering policy with input checks, called once per time step; SI and radians.
 
-    Other precisions are converted.
+    Inputs in another precision are converted.
     """
 
     def __init__(
@@ -152,8 +153,8 @@ class GuardedPolicy(_GuardedController):
         """Return the rudder command [B, 1] in rad, memory [B, n] and fault [B].
 
         Args:
-            measured: y [B, 3] = (psi, u, r), or [B, 4] = (z, u, theta, q) of a depth policy.
-            reference: heading [B, 1] in rad, or depth in m.
+            y: measurement [B, 3] = (psi, u, r), or [B, 4] = (z, u, theta, q) of a depth policy.
+            reference: desired heading [B, 1] in rad, or desired depth in m.
             s: memory [B, n].
         """
         dtype = self.low.dtype
@@ -181,15 +182,14 @@ class GuardedPolicy(_GuardedController):
 
 
 class GuardedCoursePolicy(_GuardedController):
-    """A heading policy with the guidance of a course, in float64; SI and radians.
+    """A heading policy with the guidance of a course and input checks, in float64; SI and radians.
 
-    Single precision does not tell places along a course of some hundred metres well enough: two
-    programs that round differently would steer 1 mm apart.
+    Single precision resolves positions on a course of some hundred metres too coarsely: programs
+    with different rounding would deviate by 1 mm.
 
-    The memory s is that of the guidance (place along the course, and the drift where it is
-    estimated), of the policy, and the last command; where it is wrong the course begins anew.
-    `arrived` tells that the course has ended; commands go on along its last leg. Other precisions
-    are converted.
+    The memory s contains the guidance (path variable and, if estimated, the drift), the policy and
+    the last command. After an invalid memory the course starts again. `arrived` is set at the end
+    of the course; the commands then follow its last leg. Inputs in another precision are converted.
     """
 
     def __init__(
@@ -218,7 +218,7 @@ class GuardedCoursePolicy(_GuardedController):
             (0.0, 1.001 * guidance.max_arc_length),
             *[(-1.01, 1.01)] * (guidance.n_state - 1),
             (-rudder_limit, rudder_limit),
-            # relative to the course's motion: rudder and yaw rate may differ by twice their ranges
+            # relative to the motion of the course, rudder and yaw rate have twice their ranges
             *policy.memory_ranges(2.0 * max_yaw_rate, 2.0 * policy.limit).values(),
         ]
         super().__init__(limits, memory_limits, policy, fallback, torch.float64)
@@ -237,7 +237,7 @@ class GuardedCoursePolicy(_GuardedController):
         """Return the rudder command [B, 1] in rad, memory [B, n], fault [B] and arrived [B].
 
         Args:
-            measured: y [B, 6], the names of `COURSE_MEASUREMENTS`.
+            y: measurement [B, 6], see `COURSE_MEASUREMENTS`.
             s: memory [B, n].
         """
         return self.step_unchecked(y.to(torch.float64), s.to(torch.float64))
@@ -266,17 +266,17 @@ class GuardedCoursePolicy(_GuardedController):
 
 
 class _TracedController(nn.Module):
-    """The part that the TorchScript files of all policies share.
+    """Base class of the TorchScript modules of policies.
 
-    Tensors of a wrong shape are refused, never broadcast. TorchScript compiles this class and its
-    subclasses. The policy's own code is only traced, so that it may be written in any Python.
+    Tensors of a wrong shape are rejected, not broadcast. TorchScript compiles this class and its
+    subclasses. The policy is only traced and need not be scriptable.
     """
 
     def __init__(self, inner: GuardedPolicy | GuardedCoursePolicy, sizes: Sequence[int]) -> None:
         super().__init__()
         self.measured = inner.low.numel()
         self.memory = inner.memory_low.numel()
-        # its type is that of all numbers
+        # its dtype defines the precision of the module
         self.low = nn.Buffer(inner.low)
         # two rows: a batch of one would hide where the rows of a batch are confused
         examples = tuple(torch.zeros(2, size, dtype=inner.low.dtype) for size in sizes)
@@ -293,7 +293,7 @@ class _TracedController(nn.Module):
 
 @final
 class TracedPolicy(_TracedController):
-    """The TorchScript file of a heading policy; see `GuardedPolicy`."""
+    """TorchScript module of a steering policy, see `GuardedPolicy`."""
 
     @torch.jit.export
     def step(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -316,7 +316,7 @@ class TracedPolicy(_TracedController):
 
 @final
 class TracedCourse(_TracedController):
-    """The TorchScript file of a policy along a course; see `GuardedCoursePolicy`."""
+    """TorchScript module of a course policy, see `GuardedCoursePolicy`."""
 
     @torch.jit.export
     def step(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -335,7 +335,7 @@ class TracedCourse(_TracedController):
 
 
 class _UncheckedStep(nn.Module):
-    """The step of a controller without checks of shapes, for formats that hold one function."""
+    """Step of a controller without shape checks, for formats that export a single function."""
 
     def __init__(self, controller: GuardedPolicy | GuardedCoursePolicy) -> None:
         super().__init__()
@@ -347,7 +347,7 @@ class _UncheckedStep(nn.Module):
 
 
 class _InitialState(nn.Module):
-    """The memory of a controller at its first measurement, for formats that hold functions."""
+    """Initial memory of a controller, for formats that export functions."""
 
     def __init__(self, controller: GuardedPolicy | GuardedCoursePolicy) -> None:
         super().__init__()
@@ -360,10 +360,11 @@ class _InitialState(nn.Module):
 def guard_policy(
     policy: HeadingPolicy, fallback: FallbackCommand, dtype: torch.dtype = torch.float32
 ) -> GuardedPolicy:
-    """Return the policy with its checks.
+    """Add input checks to a policy.
 
-    It takes headings up to 1000 turns, three times its speed, five times the steady turn at full
-    rudder; a depth policy depths of all seas, and pitches up to a right angle.
+    Accepted are headings up to 1000 turns, three times the speed of the policy and five times the
+    steady yaw rate at full rudder; for a depth policy also all ocean depths and pitch angles up to
+    90 deg.
     """
     policy = copy.deepcopy(policy).to(dtype).eval().requires_grad_(False)
     policy.set_state_columns(tuple(policy.measured))
@@ -383,13 +384,14 @@ def guard_policy(
 
 
 class ExportedController(Exportable):
-    """A policy that is exported: what heading policies and policies along a course share.
+    """Common parts of the export of steering policies and course policies.
 
     Args:
-        policy: at the step that it shall run with.
-        fallback: command while inputs are wrong.
-        description: of the vessel, the training or the course, for the card.
-        metrics: rows of metrics.json of this policy, for the card.
+        name: name of the policy.
+        policy: policy with its final time step.
+        fallback: command for invalid inputs.
+        description: description of vessel, training or course for the card.
+        metrics: rows of metrics.json of this policy for the card.
     """
 
     schema: str
@@ -425,20 +427,20 @@ class ExportedController(Exportable):
 
     @property
     def measured_units(self) -> Mapping[str, str]:
-        """What is measured, with units."""
+        """Names of the measurements with their units."""
         return self.policy.measured
 
     @abstractmethod
     def build_controller(self, dtype: torch.dtype) -> GuardedPolicy | GuardedCoursePolicy:
-        """Return the policy with its checks, in a precision."""
+        """Build the policy with input checks in a precision."""
 
     @abstractmethod
     def parity_arguments(self, module: Any) -> Sequence[Tensor]:
-        """Return the arguments [steps, n] of the parity check, without the memory."""
+        """Return the arguments [PARITY_STEPS, n] of the parity check, without the memory."""
 
     @abstractmethod
     def describe_for_card(self, module: Any) -> dict[str, Any]:
-        """Return what the card says of this kind of policy."""
+        """Return the fields of the card that depend on the type of policy."""
 
     def build_module(self, dtype: torch.dtype) -> nn.Module:
         inner = self.build_controller(dtype)
@@ -493,18 +495,19 @@ class ExportedController(Exportable):
     def check_parity(
         self, loaded: LoadedExport, subject: str, dtype: torch.dtype, tolerance: float | None = None
     ) -> dict[str, Any]:
-        """Return the largest difference of the command from the eager policy over 1,000 steps.
+        """Compare an exported policy with the original over 1,000 steps, some with invalid inputs.
 
-        It is a share of the rudder's limit; wrong inputs are among the steps.
+        Returns:
+            Number of steps and largest difference of the command as a fraction of the rudder limit.
 
         Raises:
-            RoundingError: where it exceeds 1e-4.
-            ExportError: where a command is no number, or a wrong input raises no flag.
+            RoundingError: if the difference exceeds `PARITY_TOLERANCE`.
+            ExportError: if a command is not finite, or the fault flag is wrong.
         """
         module: Any = self.build_controller(dtype)
         parity_inputs = [array.to(dtype) for array in self.parity_arguments(module)]
         is_bad_input = torch.arange(PARITY_STEPS) % 97 == 50
-        # the yaw rate of a heading policy, the place of a course, the speed of a depth policy
+        # the yaw rate of a heading policy, east of a course policy, the speed of a depth policy
         parity_inputs[0][is_bad_input, 2 if len(self.measured_units) == 3 else 1] = torch.nan
         input_arrays = [array.numpy() for array in parity_inputs]
         eager_memory = module.initial_state(parity_inputs[0][:1])
@@ -539,7 +542,7 @@ class ExportedController(Exportable):
 
 @final
 class ExportedHeading(ExportedController):
-    """A heading policy; some laws with a rudder rate ask for double precision in C."""
+    """Export of a heading or depth policy; some laws with a rudder rate need double precision."""
 
     schema = "residnet.policy_card/1"
     kind = "policy"
@@ -553,9 +556,9 @@ class ExportedHeading(ExportedController):
         return guard_policy(self.policy, self.fallback, dtype)
 
     def parity_arguments(self, module: Any) -> Sequence[Tensor]:
-        """Return measurements and references of a swinging vessel.
+        """Return sinusoidal measurements, and references that change in steps.
 
-        The depths of one that dives go by what a heading goes in rad, in m.
+        Depths in m have the same values as headings in rad.
         """
         step_index = torch.arange(PARITY_STEPS, dtype=module.low.dtype)
         max_rate = float(module.high[-1]) / 5.0
@@ -581,7 +584,7 @@ class ExportedHeading(ExportedController):
 
 @final
 class ExportedCoursePolicy(ExportedController):
-    """A heading policy with the guidance of a planned course."""
+    """Export of a heading policy with the guidance of a planned course."""
 
     schema = "residnet.course_card/1"
     kind = "course of"
@@ -612,7 +615,7 @@ class ExportedCoursePolicy(ExportedController):
         return GuardedCoursePolicy(self.policy, self.guidance, self.fallback).eval()
 
     def parity_arguments(self, module: Any) -> Sequence[Tensor]:
-        """Return measurements of a vessel beside the course, off its heading, at varying speed."""
+        """Return measurements with cross-track errors, heading errors and a varying speed."""
         step_index = torch.arange(PARITY_STEPS, dtype=torch.float64)
         course = self.course
         track_index = (step_index * module.dt * module.speed / course.step).long()

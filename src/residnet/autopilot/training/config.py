@@ -1,4 +1,4 @@
-"""How a policy is trained under stated conditions. No Lightning here: `check` must stay quick."""
+"""Settings of policy training; this module does not import Lightning, to keep `check` fast."""
 
 from __future__ import annotations
 
@@ -12,54 +12,56 @@ from residnet.training.config import OneStage
 
 
 class PolicyTraining(OneStage):
-    """Settings of a training through the whole closed loop, under the conditions of the run.
+    """Settings of the training by gradients through the closed loop under operating conditions.
 
-    The loss of a batch is the mean cost of its flights, with a share of the integral of the
-    absolute error that fades out, and with the late rudder swing and the nominal overshoot of
-    flights without noise. Every batch is drawn anew, under the conditions in full. A policy without
-    a law inside may begin with the nominal vessel in calm water instead (`nominal`, `spread`).
+    The loss of a batch is the mean cost of its simulations, plus the weighted integral of the
+    absolute error, whose weight decreases to zero, plus penalties of limit cycles and overshoot in
+    simulations without noise. Every batch is a new random sample. The training of a policy without
+    a control law can start with the nominal vessel in calm water (`nominal`, `spread`).
 
     Attributes:
-        epochs: at most; each ends with a validation.
-        learning_rate: of Adam at the start; it falls along a cosine with every batch. An epoch that
-            costs 15 % more than the start once the conditions are full is undone: the next one
-            begins with the best policy, half of the rate and a fifth of `calm` and `exact`.
-        final: share of it at the end.
-        steps: batches of an epoch.
-        batch: flights of a batch.
-        dt: step in s of vessel and controller in training, but for its end.
-        fine: share of the training, at its end, that takes the step of the conditions: a loop that
-            hardly swings at long steps may swing at short ones.
-        integrator: of the vessel in training.
+        epochs: largest number of epochs; each ends with a validation.
+        learning_rate: initial learning rate of Adam, with cosine annealing. An epoch in full
+            conditions that costs 15 % more than the initial policy is discarded: the next epoch
+            starts from the best policy with half of the learning rate and a fifth of `calm` and
+            `exact`.
+        final: final learning rate as a fraction of the initial one.
+        steps: number of batches per epoch.
+        batch: number of simulations per batch.
+        dt: time step in s of vessel and controller in training, except at its end.
+        fine: fraction of the training, at its end, with the time step of the conditions; a limit
+            cycle can be damped by a large step and appear at a small one.
+        integrator: integration method of the vessel in training.
         hold: longest time in s before the change of heading in training.
-        duration: time in s from the change to the end of a training flight; null for that of the
-            conditions. It should be longer where large changes do not end within that: a policy
-            creeps through what lies behind the end of its training.
-        nominal: share of the training, at its beginning, that flies the nominal vessel in calm
-            water. A policy that starts from a tuned law would leave what the law does well.
-        spread: share of the training after which the conditions are drawn in full, at least
+        duration: time in s from the change to the end of a simulation in training; null for the
+            duration of the conditions. It should be longer than the largest changes take, because
+            the policy is not trained beyond it.
+        nominal: fraction of the training, at its start, with the nominal vessel in calm water. It
+            should be zero for a policy that starts from a tuned law.
+        spread: fraction of the training after which the full conditions are used, at least
             `nominal`.
-        guide: weight of the integral of the absolute error in deg s at the start.
-        faded: share of the training after which that weight is zero.
-        outlying: how much of the loss reaches the gradient of one flight, as a multiple of what the
-            median flight of a batch has: a loop at the edge of swinging has flights whose gradients
-            are millions of times as large as those of others. Only compiled flights are held so.
-        quiet: share of the flights of a batch without noise and slow push, in which a loop that
-            swings by itself is seen; half of them are at corners of the spread, a quarter flies the
+        guide: initial weight of the integral of the absolute error in deg s.
+        faded: fraction of the training after which that weight is zero.
+        outlying: largest gradient of one simulation as a multiple of the median of its batch; near
+            instability a single gradient can be millions of times larger than the others. Only
+            compiled simulations are limited.
+        quiet: fraction of the simulations of a batch without noise and slow disturbance, which show
+            limit cycles; half of them have vessels at corners of the ranges, a quarter has the
             nominal vessel without delay.
-        calm: cost in s of a variance of one degree squared of the rudder command in the last third
-            of those flights, mean over the quarter of them that swings most; a movement of half of
-            what `steady` allows is free.
-        exact: cost in s of one degree of overshoot of the flights of the nominal vessel.
-        excess: cost in s of one degree of overshoot beyond `steady.overshoot_p95`, in all flights,
-            besides what the conditions count for it.
-        stricter: factor on `calm` and `exact` after every epoch that `steady` refuses though it
-            costs less than the start.
-        steady: what a policy must keep to without noise. Epochs that do come first; of those that
-            do not, a flight beyond counts twice. Null to choose by the cost alone.
-        validation: number of flights that epochs are chosen on.
-        compiled: whether flights and their gradient are compiled as C, which takes a C compiler;
-            without one the training says so and is some thirty times slower.
+        calm: penalty in s of a variance of 1 deg^2 of the rudder command in the last third of those
+            simulations, averaged over the worst quarter; half of the swing that `steady` allows has
+            no penalty.
+        exact: penalty in s of one degree of overshoot of the nominal vessel.
+        excess: additional penalty in s of one degree of overshoot above `steady.overshoot_p95`, in
+            all simulations.
+        stricter: factor on `calm` and `exact` after every epoch that violates `steady` although it
+            costs less than the initial policy.
+        steady: limits that a policy must meet without noise. Epochs that meet them are preferred;
+            otherwise the cost is increased by the fraction of rejected simulations. Null to select
+            epochs by the cost alone.
+        validation: number of simulations for the selection of the epoch.
+        compiled: whether simulations and gradients are compiled as C, which needs a C compiler;
+            without one the training is about 30 times slower and prints a message.
     """
 
     epochs: int = Field(default=18, ge=1, le=100_000)
@@ -96,11 +98,11 @@ class PolicyTraining(OneStage):
         return self
 
     def share(self, progress: float) -> float:
-        """Return the share of the conditions that is drawn, at a progress of 0 to 1."""
+        """Return the fraction of the deviations from nominal conditions at a progress 0 to 1."""
         if progress >= self.spread:
             return 1.0
         return max(progress - self.nominal, 0.0) / max(self.spread - self.nominal, 1e-9)
 
     def guiding(self, progress: float) -> float:
-        """Return the weight of the absolute error at a progress of 0 to 1."""
+        """Return the weight of the integral of the absolute error at a progress 0 to 1."""
         return self.guide * max(1.0 - progress / self.faded, 0.0)
