@@ -23,21 +23,21 @@ def design_autopilot(
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
 ) -> RunResult:
-    """Train a heading autopilot for one's own vessel, as `residnet autopilot` does.
+    """Train a heading autopilot for a vessel from its logs, like `residnet autopilot`.
 
     Args:
         source: logs, the folder of a finished fit, or `K,T` in 1/s and s.
-        config: file to write; the vessel's file lies beside it.
-        rudder: largest angle that controllers may use, with its unit; None for that of the logs.
-        rate: of the steering gear, with its unit; None for what the logs show.
-        speed: at which K and T hold, with its unit; None for the mean of the logs.
-        folder: where the run is kept; without one it vanishes with the result.
+        config: config file to write; the vessel file is written to the same folder.
+        rudder: rudder limit of the controllers with its unit; None for the largest angle in the logs.
+        rate: rate of the steering gear with its unit; None to identify it from the logs.
+        speed: speed that K and T refer to, with its unit; None for the mean of the logs.
+        folder: run folder; None for a temporary one that is removed with the result.
         overwrite: replace earlier files and an earlier run.
-        progress: is told how far the training is.
+        progress: callback that receives the progress of the training.
 
     Raises:
-        DataError: where logs lack rudder or yaw rate.
-        FitError: where the logs show no answer to the rudder.
+        DataError: if the logs have no rudder or yaw rate.
+        FitError: if the logs show no response to the rudder.
 
     Example:
         residnet.design_autopilot("0.31,7.4", rate="6 deg/s", folder="runs/own")
@@ -66,20 +66,20 @@ def train_autopilot(
 ) -> RunResult:
     """Train heading autopilots through a vessel and compare them with tuned classical controllers.
 
-    The arguments are the keys of a config of the task `autopilot`, and give the same numbers.
+    The arguments are the keys of a config of the task `autopilot` and give the same results.
 
     Args:
         vessel: name of a vessel, or path of its file.
-        rudder: largest rudder angle that controllers may use, in rad or with a unit.
+        rudder: rudder limit of the controllers, in rad or with a unit.
         peers: classical controllers by name: a kind such as `pd`, or settings.
-        folder: where the run is kept; without one it vanishes with the result.
-        name: of the run.
-        progress: is told how far the training is.
+        folder: run folder; None for a temporary one that is removed with the result.
+        name: name of the run.
+        progress: callback that receives the progress of the training.
         settings: further keys: test, the step of heading that all are compared in; policies,
             learned controllers by name; conditions, predictive, floor, seed and so on.
 
     Raises:
-        ConfigError: where a setting is wrong.
+        ConfigError: if a setting is invalid.
 
     Example:
         residnet.train_autopilot("nomoto_oceanos", "5 deg", test={"duration": 12}, conditions={},

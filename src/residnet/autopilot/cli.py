@@ -1,4 +1,4 @@
-"""The command `residnet autopilot`; its imports stay inside it: `--help` must not wait for PyTorch."""
+"""The command `residnet autopilot`; heavy imports are inside it, so that `--help` is fast."""
 
 from __future__ import annotations
 

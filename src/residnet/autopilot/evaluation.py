@@ -1,6 +1,6 @@
-"""Measures of heading controllers: steps over many vessels, flights under conditions, courses.
+"""Metrics of heading controllers: step responses, random conditions, motion control and courses.
 
-Times of courses are compared with a reference of arcs and straight lines.
+The duration of a course is compared with a reference course of arcs and straight lines.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ of the rudder command, integral of its square.
 def compute_run_metrics(
     trajectories: ClosedLoopTrajectories, tolerance: float
 ) -> dict[str, Tensor]:
-    """Return each of `METRIC_UNITS` by flight, [B]."""
+    """Return each metric of `METRIC_UNITS` [B] by name."""
     values = (
         trajectories.settling_time(tolerance),
         trajectories.overshoot(),
@@ -62,7 +62,7 @@ def compute_run_metrics(
 
 
 def summarize_distribution(values: Tensor) -> dict[str, float]:
-    """Return mean, median, 95th percentile and largest of values [B]."""
+    """Return mean, median, 95th percentile and maximum of values [B]."""
     array = values.double().numpy()
     return {
         "mean": float(array.mean()),
@@ -73,12 +73,12 @@ def summarize_distribution(values: Tensor) -> dict[str, float]:
 
 
 def list_policy_objections(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return what rows of metrics.json say against using a policy rather than a tuned law."""
+    """List reasons against a policy compared with tuned laws, from rows of metrics.json."""
     return _describe_cheaper_law(model, rows, "conditions", "under its conditions")
 
 
 def list_unsuitable_conditions(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return under which conditions beyond its own a tuned law costs less than a policy."""
+    """List further conditions under which a tuned law has a lower cost than a policy."""
     protocols = dict.fromkeys(
         row["protocol"] for row in rows if row["protocol"].startswith("beyond_")
     )
@@ -90,7 +90,7 @@ def list_unsuitable_conditions(model: str, rows: Sequence[Mapping[str, Any]]) ->
 
 
 def describe_limit_cycles(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return in a sentence in how many flights without noise a policy keeps swinging, if any."""
+    """Describe in how many noise-free simulations a policy has a limit cycle; empty if none."""
     rows_by_model = {row["model"]: row for row in rows if row["protocol"] == "quiet"}
     if not (policy_row := rows_by_model.get(model)) or not policy_row.get("cycling"):
         return []
@@ -109,7 +109,7 @@ def describe_limit_cycles(model: str, rows: Sequence[Mapping[str, Any]]) -> list
 def _describe_cheaper_law(
     model: str, rows: Sequence[Mapping[str, Any]], protocol: str, condition_text: str
 ) -> list[str]:
-    """Return in a sentence what the cheapest tuned law costs, where a policy costs more."""
+    """Describe the cheapest tuned law if its cost is below the cost of a policy."""
     costs = {
         row["model"]: (row["kind"], row["cost"]["mean"])
         for row in rows
@@ -131,7 +131,7 @@ def _describe_cheaper_law(
 def _build_row(
     controller: str, model_kind: str, protocol: str, metrics: Mapping[str, Tensor]
 ) -> dict[str, Any]:
-    """Return a row of metrics.json with the distributions of what was found, [B] by name."""
+    """Build a row of metrics.json with the distributions of metrics [B] by name."""
     row = {"model": controller, "kind": model_kind, "split": "simulated", "protocol": protocol}
     return row | {name: summarize_distribution(values) for name, values in metrics.items()}
 
@@ -143,7 +143,7 @@ def build_step_row(
     trajectories: ClosedLoopTrajectories,
     tolerance: float,
 ) -> dict[str, Any]:
-    """Return a row of metrics.json: distributions, flights not settled at the end, flights."""
+    """Build a row of metrics.json with distributions and the number of unsettled simulations."""
     is_finite = torch.isfinite(trajectories.states).all(dim=2).all(dim=1)
     is_unsettled = (trajectories.error[:, -1].abs() > tolerance) | ~is_finite
     return _build_row(
@@ -158,7 +158,7 @@ def build_step_row(
 def build_variation_grid(
     effect_range: tuple[float, float], time_range: tuple[float, float]
 ) -> Tensor:
-    """Return effect, time and zero bias [9, 3]: nominal first, then ends and middles."""
+    """Return a grid of effect and time without bias, [9, 3], with the nominal vessel first."""
     return torch.tensor(
         [
             (effect_factor, time_factor, 0.0)
@@ -171,7 +171,7 @@ def build_variation_grid(
 def draw_variations(
     effect_range: tuple[float, float], time_range: tuple[float, float], n_variations: int, seed: int
 ) -> Tensor:
-    """Return effect and time drawn evenly from their ranges, no bias: [count, 3]."""
+    """Sample effect and time uniformly from their ranges, without bias: [n_variations, 3]."""
     uniform = torch.rand(
         n_variations, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
     )
@@ -189,7 +189,7 @@ def simulate_steps(
     duration: float,
     variations: Tensor,
 ) -> ClosedLoopTrajectories:
-    """Run steps of the reference, to starboard and to port in turn."""
+    """Simulate steps of the reference, alternately to starboard and to port."""
     turn_sign = torch.where(torch.arange(len(variations)) % 2 == 0, 1.0, -1.0)
     return simulate_heading_steps(
         vessel, policy, heading_step * turn_sign, variations, dt=dt, duration=duration
@@ -199,7 +199,7 @@ def simulate_steps(
 def simulate_steps_in_wind(
     plant: Plant, policy: Policy, speed: float, heading_step: float, dt: float, duration: float
 ) -> ClosedLoopTrajectories:
-    """Run steps of the reference with the nominal vessel in wind from eight directions."""
+    """Simulate reference steps of the nominal vessel in wind from eight directions."""
     wind_channels: dict[str, float | Tensor] = {
         "wind_speed": speed,
         "wind_dir": torch.arange(8) * (torch.pi / 4.0),
@@ -226,7 +226,7 @@ def simulate_steps_in_waves(
     duration: float,
     seed: int,
 ) -> ClosedLoopTrajectories:
-    """Run steps of the reference with the nominal vessel in eight seaways."""
+    """Simulate reference steps of the nominal vessel in eight seaways."""
     disturbance = DisturbanceConfig(waves=waves)
     n_seaways = 8
     return simulate_heading_steps(
@@ -243,9 +243,9 @@ def simulate_steps_in_waves(
 def build_sea_row(
     controller: str, model_kind: str, trajectories: ClosedLoopTrajectories, start_time: float
 ) -> dict[str, Any]:
-    """Return a row of metrics.json: roots of mean squares from a time [s] on.
+    """Build a row of metrics.json with RMS values from `start_time` s on.
 
-    They are of heading error, rudder and, where the vessel rolls, heel.
+    The values are heading error, rudder and, for a vessel with roll, heel.
     """
     signals = {"heading": trajectories.error, "rudder": trajectories.command}
     if "phi" in trajectories.names:
@@ -265,7 +265,7 @@ def _nominal_variations(count: int) -> Tensor:
 def build_time_series(
     name: str, trajectories: ClosedLoopTrajectories, variations: Tensor
 ) -> pd.DataFrame:
-    """Return heading, or depth, its rate and rudder every 0.05 s, all turned to starboard."""
+    """Return heading or depth, its rate and rudder every 0.05 s, mirrored to starboard."""
     stride = max(round(0.05 / trajectories.dt), 1)
     tables = []
     for i, variation in enumerate(variations):
@@ -290,13 +290,13 @@ def build_time_series(
 
 
 _SWING_TOLERANCE = 1.25
-"""Of the limits that choose an epoch of training, which are a fifth below what a policy may do."""
+"""Factor on the limits of the training, which are 20 % below the accepted limits."""
 N_QUIET_RUNS = 100
-"""Flights without noise, waves and push; chosen by hand: fewer tell, and each takes longer."""
+"""Number of simulations without noise, waves and disturbance."""
 
 
 def draw_heading_changes(conditions: ConditionsConfig, n_runs: int, seed: int) -> HeadingStepBatch:
-    """Return flights that no tuning or training has seen, the same for all controllers."""
+    """Sample heading changes that are not used in tuning or training."""
     generator = torch.Generator().manual_seed(seed + 2_000_003)
     return conditions.sample_steps(n_runs, conditions.dt, generator)
 
@@ -309,10 +309,10 @@ def evaluate_under_conditions(
     conditions: ConditionsConfig,
     changes: HeadingStepBatch,
 ) -> tuple[dict[str, Any], pd.DataFrame]:
-    """Return a row of metrics.json, and a table with a line for each flight, in SI units.
+    """Build a row of metrics.json, and a table with a line for each simulation, in SI units.
 
-    A flight whose heading is no number counts as diverged, and with a heading error of 180 deg all
-    the time in the means.
+    A simulation with a NaN heading counts as diverged, with a heading error of 180 deg at all
+    times in the means.
     """
     trajectories = run.simulate(changes)
     controlled_angle = trajectories.state(trajectories.axis.value)[:, :-1]
@@ -347,9 +347,9 @@ def evaluate_limit_cycles(
     changes: HeadingStepBatch,
     settling_time: float,
 ) -> dict[str, Any]:
-    """Return the row of metrics.json of flights without noise: what still swings at their end.
+    """Build the row of metrics.json of noise-free simulations: limit cycles at their end.
 
-    `settling_time` is the time in s from the change on from which they are looked at.
+    Limit cycles are evaluated from `settling_time` s after the change of reference.
     """
     trajectories = run.simulate(changes)
     heading_swing, rudder_swing = trajectories.peak_to_peak(settling_time)
@@ -367,7 +367,7 @@ def evaluate_limit_cycles(
 
 @dataclass(frozen=True)
 class TrackingMetrics:
-    """The metrics of one run in closed loop; SI, angles in rad.
+    """Metrics of a closed-loop simulation of motion control; SI, angles in rad.
 
     Attributes:
         position_mae, position_mse: of the distance to the desired position in m, m^2 (4.6).
@@ -394,7 +394,7 @@ class TrackingMetrics:
     iaew: tuple[float, float]
 
     def to_json(self) -> dict[str, float | list[float]]:
-        """Return the metrics for JSON."""
+        """Return the metrics as a JSON object."""
         return {
             key: list(value) if isinstance(value, tuple) else value
             for key, value in asdict(self).items()
@@ -409,15 +409,15 @@ def compute_tracking_metrics(
     feedback: Tensor,
     dt: float,
 ) -> TrackingMetrics:
-    """Return the metrics of a run in closed loop.
+    """Compute the metrics of a closed-loop simulation.
 
     Args:
         pose: x, y, psi [T, 3].
         motion: nu, nu_dot [T, 6].
         desired_motion: eta_d, nu_d, nu_dot_d [T, 9].
         command: tau_c [T, 3].
-        feedback: its part tau_FB [T, 3].
-        dt: step in s.
+        feedback: feedback part tau_FB of the command [T, 3].
+        dt: time step in s.
     """
     position_error = (desired_motion[:, POSITION] - pose[:, POSITION]).norm(dim=-1)
     heading_error = wrap_angle(desired_motion[:, HEADING] - pose[:, HEADING]).abs()
@@ -444,7 +444,7 @@ def compute_tracking_metrics(
 
 
 def mean_squares_by_axis(residuals: Tensor) -> list[float]:
-    """Return the mean square of a residual [N, 3] by axis."""
+    """Return the mean square of residuals [N, 3] for each axis."""
     return [float(value) for value in torch.mean(residuals.square(), dim=0)]
 
 
@@ -453,7 +453,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CourseRun:
-    """A flight of one vessel along one course, until it ended.
+    """Simulation of one vessel on one course.
 
     Attributes:
         track: north, east [N, 2] in m.
@@ -461,8 +461,8 @@ class CourseRun:
         rudder: command [N] in rad.
         speed: [N] in m/s.
         cross_track: [N] in m, positive to starboard of the plan.
-        dt: step in s.
-        finished: whether the end was reached in the time given.
+        dt: time step in s.
+        finished: whether the end of the course was reached within the duration.
     """
 
     track: Array
@@ -538,10 +538,10 @@ def build_course_row(
 
 
 def build_ensemble_row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return a row of metrics.json for many flights of one controller, from their own rows.
+    """Build a row of metrics.json for an ensemble of simulations from their rows.
 
-    `passed` and `finished` are shares of the flights; flights that were given up count with the
-    time until then.
+    `passed` and `finished` are fractions of the simulations. An unfinished simulation counts with
+    its duration.
     """
     ratios, margins = (np.array([row[name] for row in rows]) for name in ("ratio", "margin"))
     summary = {

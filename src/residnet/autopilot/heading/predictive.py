@@ -1,7 +1,7 @@
 """The predictive heading autopilot of document 004 (Gouletas 2020): law, predictors, configs.
 
 Source: sections 6.1.1 to 6.1.3 and 6.2, eqs. (6.3), (6.4), corrections of document 004. There is no
-Lightning here: `residnet check` must stay quick.
+Lightning here, to keep `residnet check` fast.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class SimulatedPredictor(Predictor):
         model: with the columns of the controlled vessel's state; its commands begin with the rudder
             angle.
         steps: of the model, which make the horizon.
-        other_inputs: its inputs beside the rudder command [m - 1], held over the horizon.
+        other_inputs: the other inputs [m - 1], constant over the horizon.
     """
 
     def __init__(
@@ -217,7 +217,7 @@ class NominalSteering(Dynamics):
     """The vessel without variation, and without memory, as predictors expect it.
 
     Attributes:
-        other_inputs: inputs beside the rudder command at service speed [m - 1].
+        other_inputs: the other inputs at service speed [m - 1].
     """
 
     def __init__(self, vessel: SteeredVessel, dt: float) -> None:
@@ -304,7 +304,7 @@ class PredictorTraining(OneStage):
     Document 004, 6.1.1 and 6.2.1.
 
     Attributes:
-        states: to train on; a fifth as many are kept back to validate on.
+        states: number of states for training; a fifth of this number is used for validation.
         wander: longest time under random rudder angles before a state is taken, from straight ahead
             at service speed.
         hold: mean time between these angles.

@@ -1,4 +1,4 @@
-"""A vessel's answer to its rudder: Nomoto's K, T and delay, from a model or from records."""
+"""Identification of Nomoto's K, T and a delay from records of rudder and yaw rate."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ Array = NDArray[np.float64]
 _N_TIMES = 20
 _N_DELAYS = 8
 _N_RATES = 10
-"""Values of T, the delay and the rate of the gear that the coarse search tries."""
+"""Numbers of values of T, delay and rudder rate in the coarse grid search."""
 _MAX_COARSE_SAMPLES = 4000
-"""Samples of a manoeuvre that the first, coarse search looks at."""
+"""Largest number of samples of a manoeuvre in the coarse search."""
 _RUDDER_RATE_RANGE = (math.radians(1.0), math.radians(40.0))
 """Rates of steering gears in rad/s that are searched: SOLAS II-1/29 asks ships for 2.3 deg/s, and
 beyond the fastest a rudder of 20 deg is there within half a second.
 """
 _MIN_EXPLAINED = 0.5
-"""Least share of the yaw rate's variance that a response must explain."""
+"""Smallest fraction of the yaw-rate variance that a response must explain."""
 _CHI2_95 = 3.84
-"""Point of chi squared with one degree of freedom that one value in twenty exceeds."""
+"""95th percentile of the chi-squared distribution with one degree of freedom."""
 
 
 @dataclass(frozen=True)
 class SteeringResponse:
-    """T r_dot + r = K (delta(t - delay) + bias), with a rudder that follows its command at a rate.
+    """Identified model T r_dot + r = K (delta(t - delay) + bias) with a rudder rate.
 
     Attributes:
         gain: K in 1/s.
         time: T in s.
-        delay: in s.
-        bias: rudder angle in rad that is felt with the rudder amidships.
-        rms: error of the simulated yaw rate in rad/s.
-        explained_variance: share of the yaw rate's variance that the response explains.
-        rate: of the rudder in rad/s; None where the records show none, or are of the rudder angle.
-        standard_errors: standard deviations of `gain`, `time` and `delay`, SI, from the fit's covariance
-            with the residual's correlation over time counted in.
+        delay: dead time in s.
+        bias: effective rudder angle in rad with the rudder amidships.
+        rms: RMS error of the simulated yaw rate in rad/s.
+        explained_variance: fraction of the yaw-rate variance that the model explains.
+        rate: rudder rate in rad/s; None if not identifiable, or if the records hold rudder angles.
+        standard_errors: standard errors of `gain`, `time` and `delay`, SI, from the covariance
+            of the fit with autocorrelated residuals.
     """
 
     gain: float
@@ -57,13 +57,13 @@ class SteeringResponse:
 
 @dataclass(frozen=True)
 class ManoeuvreRecord:
-    """A manoeuvre on a uniform grid.
+    """Record of a manoeuvre on a uniform time grid.
 
     Attributes:
-        dt: step in s.
-        rudder: angle or command [N] in rad.
+        dt: time step in s.
+        rudder: rudder angle or command [N] in rad.
         yaw_rate: yaw rate [N] in rad/s.
-        usable: samples [N] that count.
+        usable: mask [N] of the samples used in the fit.
     """
 
     dt: float
@@ -72,16 +72,16 @@ class ManoeuvreRecord:
     usable: NDArray[np.bool_]
 
     def subsample(self) -> ManoeuvreRecord:
-        """Return every so many of the samples."""
+        """Return every n-th sample so that at most `_MAX_COARSE_SAMPLES` are left."""
         stride = slice(None, None, -(-len(self.rudder) // _MAX_COARSE_SAMPLES))
         dt = self.dt * (stride.step or 1)
         return ManoeuvreRecord(dt, self.rudder[stride], self.yaw_rate[stride], self.usable[stride])
 
 
 def limit_rudder_rate(command: Array, rate: float, dt: float) -> Array:
-    """Return the angles [N] of a rudder that follows commands [N] in rad at a rate in rad/s.
+    """Return rudder angles [N] for commands [N] in rad under a rate limit in rad/s.
 
-    It begins at the first command.
+    The first angle is the first command.
     """
     max_change = rate * dt
     if not math.isfinite(max_change):
@@ -97,19 +97,19 @@ def limit_rudder_rate(command: Array, rate: float, dt: float) -> Array:
 def fit_response(
     records: Sequence[ManoeuvreRecord], max_delay: float, *, commands: bool = False
 ) -> SteeringResponse:
-    """Return K, T and delay that simulate the yaw rates of manoeuvres best, each in one run.
+    """Fit K, T and delay to the yaw rates of manoeuvres by simulation error.
 
-    K, the bias and the yaw rate that each manoeuvre begins with enter linearly and are solved for;
-    T, the delay and the rate of the rudder are searched for on a grid, then refined. A rate is kept
-    where the errors without one are larger than chance explains.
+    K, the bias and the initial yaw rate of each manoeuvre enter linearly and are solved for;
+    T, the delay and the rudder rate are searched on a grid, then refined. A rate is included only
+    if it reduces the error significantly (chi-squared test).
 
     Args:
-        records: manoeuvres; turns to both sides tell most.
-        max_delay: that is searched for, in s.
-        commands: whether the records are of rudder commands, which a rudder follows at a rate.
+        records: manoeuvres; turns to both sides are most informative.
+        max_delay: largest delay of the search in s.
+        commands: whether the records hold rudder commands instead of angles.
 
     Raises:
-        FitError: where no response to the rudder is found.
+        FitError: if no response to the rudder is found.
     """
     longest_duration = max(record.dt * len(record.rudder) for record in records)
     min_dt = min(record.dt for record in records)
