@@ -28,7 +28,7 @@ def design_autopilot(
     Args:
         source: logs, the folder of a finished fit, or `K,T` in 1/s and s.
         config: config file to write; the vessel file is written to the same folder.
-        rudder: rudder limit of the controllers with its unit; None for the largest angle in the logs.
+        rudder: rudder limit of the controllers with its unit; None for the largest angle in logs.
         rate: rate of the steering gear with its unit; None to identify it from the logs.
         speed: speed that K and T refer to, with its unit; None for the mean of the logs.
         folder: run folder; None for a temporary one that is removed with the result.

@@ -100,7 +100,8 @@ def describe_limit_cycles(model: str, rows: Sequence[Mapping[str, Any]]) -> list
         if row["kind"] == "classical" and not row["cycling"]
     ]
     return [
-        f"'{model}' keeps swinging in {policy_row['cycling']} of {policy_row['n']} flights without noise, its"
+        f"'{model}' keeps swinging in {policy_row['cycling']} of {policy_row['n']} flights without"
+        " noise, its"
         f" command by up to {math.degrees(policy_row['rudder_swing']['max']):.3g} deg; "
         + (f"not so {', '.join(steady_laws)}." if steady_laws else "each tuned law does so too.")
     ]
@@ -124,7 +125,8 @@ def _describe_cheaper_law(
     if policy_cost <= laws[cheapest_law] or math.isclose(policy_cost, laws[cheapest_law]):
         return []
     return [
-        f"{condition_text} a flight costs {policy_cost:.4g} s, with {cheapest_law} {laws[cheapest_law]:.4g} s"
+        f"{condition_text} a flight costs {policy_cost:.4g} s, with {cheapest_law}"
+        f" {laws[cheapest_law]:.4g} s"
     ]
 
 

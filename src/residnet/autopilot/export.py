@@ -471,7 +471,8 @@ class ExportedController(Exportable):
             ],
             **self.describe_for_card(module),
             "fault": (
-                f"measurement{reference_text} or memory no number or out of range: command {fallback_text}, flag"
+                f"measurement{reference_text} or memory no number or out of range: command"
+                f" {fallback_text}, flag"
                 " set"
             ),
             "command": [
@@ -534,7 +535,8 @@ class ExportedController(Exportable):
             max_difference = max(max_difference, difference)
         if max_difference > PARITY_TOLERANCE:
             raise RoundingError(
-                f"{self.label}: the exported commands differ by {max_difference:.2g} of the rudder's limit;"
+                f"{self.label}: the exported commands differ by {max_difference:.2g} of the"
+                " rudder's limit;"
                 f" allowed {PARITY_TOLERANCE:g}"
             )
         return {"steps": PARITY_STEPS, "share_of_limit": max_difference}

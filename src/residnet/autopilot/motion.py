@@ -31,13 +31,13 @@ Damping = Annotated[float, Field(gt=0)]
 
 
 class ReferenceFilterConfig(Config):
-    """A trajectory through way-points that are given one after the other, smoothed by a filter.
+    """A sequence of way-points at equal time intervals, smoothed by a reference filter.
 
     Attributes:
-        waypoints: (north, east, heading), the first from the start on.
-        interval: between waypoints; the last one stays.
-        frequency: Omega of x, y and psi.
-        damping: Delta of x, y and psi.
+        waypoints: (north, east, heading); the first one is set at the start.
+        interval: time in s between way-points; the last one is held.
+        frequency: natural frequency Omega of x, y and psi.
+        damping: damping ratio Delta of x, y and psi.
     """
 
     kind: Literal["reference_filter"] = "reference_filter"
@@ -48,14 +48,14 @@ class ReferenceFilterConfig(Config):
 
     @property
     def duration(self) -> float:
-        """Until the last waypoint's interval is over, in s."""
+        """Time in s until the end of the last interval."""
         return self.interval * len(self.waypoints)
 
     def build(self, dt: float) -> ReferenceFilter:
-        """Return the guidance for a loop with steps of dt seconds.
+        """Build the reference filter for a time step of dt seconds.
 
         Raises:
-            ConfigError: where the interval is no whole number of steps.
+            ConfigError: if the interval is not a multiple of the time step.
         """
         return ReferenceFilter([self], dt)
 
@@ -64,12 +64,12 @@ class ReferenceFilterConfig(Config):
 class ReferenceFilter(Reference):
     """The filter (s + W)(s^2 + 2 D W s + W^2) on each of north, east and heading.
 
-    It is stepped by RK4 with the way-point held over a step.
+    It is integrated by RK4 with a constant way-point within a step.
 
-    The reference [B, 9] of a step is where the filter stands at its start: eta_d (north, east [m],
+    The reference [B, 9] is the filter state at the start of a step: eta_d (north, east [m],
     heading [rad], not wrapped), then nu_d and nu_d_dot in body axes along the desired heading. The
-    memory [B, 9] holds eta_d and its first and second derivative. The filter starts at rest where
-    the vessel is. It has one config for all rows, or one for each row of the batch, with the same
+    memory [B, 9] holds eta_d and its first and second derivative. The filter starts with zero
+    velocity at the vessel's pose. It has one config for all rows or one per row, with the same
     interval.
     """
 
@@ -81,7 +81,8 @@ class ReferenceFilter(Reference):
         if len(intervals) > 1 or abs(steps - round(steps)) > 1e-6 * steps or round(steps) < 1:
             interval_text = ", ".join(f"{interval:g} s" for interval in sorted(intervals))
             raise ConfigError(
-                f"reference filter: interval ({interval_text}) must be the same for all and a whole number"
+                f"reference filter: interval ({interval_text}) must be the same for all and a"
+                " whole number"
                 f" of steps of {dt:g} s"
             )
         self.steps_per_waypoint = round(steps)
@@ -124,7 +125,7 @@ class ReferenceFilter(Reference):
         return torch.stack(matrices)
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Return the memory [B, 9]: at rest at the vessel's pose."""
+        """Return the initial memory [B, 9]: the vessel's pose with zero derivatives."""
         return torch.cat((pose(x), torch.zeros_like(x[:, :1]).expand(-1, 6)), dim=-1)
 
     def waypoint_at(self, k: int) -> Tensor:
@@ -267,7 +268,7 @@ class AllocatedPolicy(Policy):
     Its forces, for example, are allocated to revolutions and angles of azimuth thrusters.
 
     Args:
-        allocate: returns commands [B, c] for what the controller demands, [B, d].
+        allocate: maps the demand of the controller [B, d] to commands [B, c].
     """
 
     def __init__(self, policy: Policy, allocate: Callable[[Tensor], Tensor]) -> None:
@@ -356,7 +357,7 @@ def required_force(
 ) -> Tensor:
     """Return the force that a model needs when a command given now takes effect, [..., 9].
 
-    Its first and second derivative stand behind it.
+    Its first and second derivatives follow.
 
     Args:
         lag: of the actuators; None commands the force itself, now and without derivatives.
@@ -392,7 +393,7 @@ class LagCompensatedPID(Policy):
 
     Reference [B, 18]: eta_d, nu_d, nu_dot_d, then `required_force`. Memory [B, 15]: the integral of
     the PID, then of each axis the predicted force of the actuators, its rate, and the integral and
-    double integral of what it misses of the needed force.
+    double integral of the difference from the required force.
 
     The command is tau_p + 2 zeta / omega tau_p' + (tau'' + k1 e' + k2 e + k3 I + k4 II) / omega^2,
     e the miss: where the desired jerk jumps, the needed force has a corner that no command follows,
@@ -464,18 +465,18 @@ class LagCompensatedPID(Policy):
 
 
 def stack_reference(motion: PoseDerivatives, force: Tensor) -> Tensor:
-    """Return [..., 18] for `LagCompensatedPID` from the desired motion and `required_force` [..., 9]."""
+    """Stack desired motion and `required_force` [..., 9] to the reference [..., 18]."""
     _, nu, nu_dot = motion.extrapolate(0.0)
     return torch.cat((motion.pose, nu, nu_dot, force), dim=-1)
 
 
 def sample_filtered_course(config: ReferenceFilterConfig, dt: float) -> PoseDerivatives:
-    """Return the desired motion [T, 3] of a whole course from rest at the origin.
+    """Compute the filtered reference [T, 3] of a complete course from zero velocity at the origin.
 
-    It is what the filter of `config` gives step by step.
+    The result equals the filter of `config`, stepped in time.
 
-    The filter is linear and its target constant over an interval, so that powers of its step matrix
-    give each interval at once.
+    The filter is linear and its target is constant in an interval, so that powers of its step
+    matrix give all samples of an interval directly.
     """
     reference_filter = config.build(dt)
     matrix = reference_filter.advance[0]

@@ -49,13 +49,13 @@ class Actuators(nn.Module, ABC):
 
         Args:
             rows: number of trials.
-            hull: names of the hull's h states; what the actuators do not know of it is zero.
+            hull: names of the h states of the hull; states unknown to the actuators are zero.
         """
 
 
 @final
 class PlantActuators(Actuators):
-    """A plant's actuators, whatever their kind.
+    """Interface of the actuators of a plant.
 
     The plant itself moves them, and what its hull would do is thrown away.
     """
@@ -178,7 +178,7 @@ class GivenActuators(Actuators):
         return a + torch.minimum(torch.maximum(w[:, self.limited] - a, -step), step)
 
     def approach(self, rows: int, hull: Sequence[str]) -> Tensor:
-        """Return the state at rest, the inputs without demand."""
+        """Return the state with zero velocity, and the inputs without demand."""
         still = torch.zeros(rows, len(hull), dtype=torch.float64)
         return torch.cat((still, self.centre[self.limited].expand(rows, -1)), dim=-1)
 
@@ -192,7 +192,7 @@ def commanded(name: str) -> str:
 class ActuatedDynamics(Dynamics):
     """A learned model behind actuators, with states x [B, 3 + n + k] and their inputs w [B, m].
 
-    The state is that of the model, then the states of the actuators.
+    The state contains the state of the model, then the states of the actuators.
 
     Each input of the model is a state of the actuators where they have one of that name, else one
     of their inputs, else the command of that name (`cmd_delta` for `delta`: a rudder that stands at

@@ -168,7 +168,7 @@ class ClosedLoopSource(Source):
         return self.manoeuvre_type.initial_memory(*self._observe(x))
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m]; what the motion says is tested at the start of the step."""
+        """Return the inputs [B, m]; conditions on the motion are tested at the start of the step."""
         motion, parameters = self._observe(x)
         *demands, memory = self.manoeuvre_type.step_law(motion, parameters, self.times[k], memory)
         return replace_commands(self.demand_commands(*demands), w), memory
@@ -266,7 +266,7 @@ class Manoeuvre(Config, ABC):
     Attributes:
         name: of its log; the kind with a number where None.
         duration: its length, or for a manoeuvre with a stop condition the time after which it has
-            failed; that of the programme where None.
+            failed; None for the duration of the programme.
         kind: kind of the manoeuvre.
     """
 
@@ -286,7 +286,7 @@ class Manoeuvre(Config, ABC):
 
     @property
     def end_condition(self) -> str | None:
-        """What the manoeuvre ends at, in words; None where it lasts as long as it is given time."""
+        """Description of the end condition; None if the manoeuvre lasts for its full duration."""
         return None
 
     @property
@@ -312,7 +312,7 @@ class Manoeuvre(Config, ABC):
         Those that the log is too short for are left out.
 
         Args:
-            log: what was flown: t, x, y, psi, u, v, r.
+            log: simulated or measured motion: t, x, y, psi, u, v, r.
             length: of the hull in m, for distances in lengths; None where unknown.
         """
         return {}
@@ -348,7 +348,7 @@ class ClosedLoopManoeuvre(Manoeuvre):
     """A manoeuvre that demands drive and steer by the motion that it sees.
 
     Its class methods work on all rows of a batch at once. `motion` holds the states that the kind
-    `observed_states`, [B] each; `numbers` what the rows' manoeuvres say, and the step `dt` in s.
+    `observed_states`, [B] each; `numbers` are the parameters of the rows and the step `dt` in s.
     """
 
     observed_states: ClassVar[tuple[str, ...]]
@@ -356,7 +356,7 @@ class ClosedLoopManoeuvre(Manoeuvre):
     """Settings that the law needs to know as they are."""
 
     def law_parameters(self, helm: Helm) -> dict[str, Any]:
-        """Return what the law needs to know of this manoeuvre, numbers or lists of them."""
+        """Return the parameters of the control law, numbers or lists of numbers."""
         return {name: getattr(self, name) for name in self.parameter_names}
 
     @classmethod
@@ -371,7 +371,7 @@ class ClosedLoopManoeuvre(Manoeuvre):
     ) -> tuple[Tensor, ...]:
         """Return drive [B], steer [B] and the memory [B, k] for the step that begins at `time`.
 
-        Before the memory stands dive [B] where it dives.
+        For a diving vessel, dive [B] precedes the memory.
         """
 
     @classmethod

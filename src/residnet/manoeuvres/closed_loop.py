@@ -46,7 +46,7 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
         heading: change of heading at which the steering is reversed.
         first: side of a positive steer or rudder.
         reversals: ends when the heading is back on its initial course after so many reversals;
-            None: lasts as long as it is given time.
+            None: the manoeuvre lasts for its full duration.
     """
 
     observed_states: ClassVar[tuple[str, ...]] = ("psi",)
@@ -73,7 +73,7 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
     def imo_limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
         """Return IMO's limits of the 10/10 and 20/20 zigzag.
 
-        Where there is no rudder the heading alone tells which of them it is.
+        Without a rudder the heading alone determines the phase.
         """
         angle = (
             self.heading
@@ -164,7 +164,7 @@ class ZigzagFamily(SteeringFamily):
 
 
 class SteadyConfig(Config):
-    """The condition that a turn is steady: for `window` seconds r stays near its running mean.
+    """Condition for a steady turn: for `window` seconds r is close to its running mean.
 
     Attributes:
         window: how long it must stay, and time constant of the running mean; a few times what the
@@ -209,7 +209,7 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
     """Straight ahead until `start`, then the helm held until the heading has changed by `until`.
 
     IMO asks for 540 deg and full rudder. The memory is the heading at the helm order; 0 before the
-    heading change is reached, then 1, then 2; and that of a steady turn.
+    heading change is reached, then 1, then 2; and the state of the steady-turn test.
 
     Attributes:
         until: change of heading.
@@ -361,7 +361,7 @@ class Spiral(ClosedLoopManoeuvre):
     """Dieudonne's spiral: helm angles from one side to the other and back, each until r is steady.
 
     An unstable vessel shows a loop of yaw rate over angle. The memory is the number of the present
-    angle, and that of a steady turn.
+    angle, and the state of the steady-turn test.
 
     Attributes:
         drive: held throughout.
@@ -612,7 +612,7 @@ class DepthStep(ClosedLoopManoeuvre):
     def step_law(
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, ...]:
-        """Dive by what lacks of the depth, less its rate."""
+        """Return the dive demand: proportional to the depth error, damped by the depth rate."""
         ordered_change = torch.where(time >= parameters["start"], parameters["depth"], 0.0)
         depth_error = memory[:, 0] + ordered_change - motion["z"]
         descent = to_level_axes(*(motion[name] for name in ("u", "v", "w", "phi", "theta")))[2]

@@ -58,7 +58,8 @@ class SmoothTrack:
         is_complete = np.isfinite(motion).all(axis=1)
         if is_complete.sum() < 4:
             raise DataError(
-                f"log {log.name}: {int(is_complete.sum())} samples hold x, y, psi, u, v and r together;"
+                f"log {log.name}: {int(is_complete.sum())} samples hold x, y, psi, u, v and r"
+                " together;"
                 " indices need at least 4"
             )
         self.t: np.ndarray = log.t[is_complete] - log.t[0]

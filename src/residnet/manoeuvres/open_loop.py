@@ -33,7 +33,7 @@ from residnet.manoeuvres.base import (
 
 
 class ConstantInput(ScheduledManoeuvre):
-    """Drive and steer held from the start: from rest to the steady state of a speed or a turn.
+    """Constant drive and steer from the start, until speed or turn are steady.
 
     Attributes:
         drive: share of full drive, -1 to 1.
@@ -229,7 +229,7 @@ class Excitation(ScheduledManoeuvre, ABC):
 
     @classmethod
     def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Return the playback of the demands, with the sway forces where there are any.
+        """Return the playback of the demands, including sway forces if present.
 
         Raises:
             UsageError: where a sway force is asked of a vessel whose commands are no forces.
@@ -414,7 +414,7 @@ class Replay(Manoeuvre):
         return self._recorded
 
     def recorded_values(self, name: str) -> np.ndarray | None:
-        """Return what the log has for an input or state of the vessel, [T].
+        """Return the channel [T] of a log for an input or state of the vessel.
 
         None where it has nothing.
 
@@ -439,7 +439,7 @@ class Replay(Manoeuvre):
     def initial_state(self, x: Tensor, state: tuple[str, ...]) -> Tensor:
         """Return the state [nx] at the log's first sample.
 
-        What the log does not have stays as it is in x [nx].
+        States that the log does not have are taken from x [nx].
 
         Raises:
             UsageError: where the log lacks position, heading or a velocity.
@@ -524,7 +524,7 @@ class Replay(Manoeuvre):
 
 @final
 class RecordedSource(Source):
-    """A source of given inputs [B, T, m]; where they are NaN, what the surroundings give."""
+    """A source of prescribed inputs [B, T, m]; NaN entries are taken from the environment."""
 
     def __init__(self, values: Tensor) -> None:
         super().__init__()

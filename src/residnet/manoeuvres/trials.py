@@ -134,7 +134,7 @@ class DisturbanceConfig(Config):
 
     @property
     def logged_inputs(self) -> tuple[str, ...]:
-        """Inputs of the plant that a vessel measures: the true wind, where there is any."""
+        """Inputs of the plant that a vessel measures: the true wind, if present."""
         return WIND_INPUTS if self.wind is not None else ()
 
     def required_plant_inputs(self) -> dict[str, str]:
@@ -176,8 +176,8 @@ class DisturbanceConfig(Config):
 
         The commands are zero.
 
-        The random forces are drawn from `generator` (three values per step whatever their sizes, so
-        that data of one seed stay the same), the gusts from generators of their own under `seed`.
+        The random forces are drawn from `generator` (three values per step for any magnitude, so
+        that data of one seed are reproducible), the gusts from separate generators with `seed`.
         """
         forces = sample_ornstein_uhlenbeck(generator, (n_trials, n_steps, 3), dt, self.correlation)
         currents = self.draw_currents(n_trials, seed)
@@ -268,7 +268,7 @@ def simulate_wind(
 ) -> dict[str, np.ndarray]:
     """Return the speed in m/s and direction in rad [B, T] of the wind with gusts, by input.
 
-    The direction is where it comes from; nothing where there is no wind.
+    The direction is the direction that the wind comes from; empty without wind.
     """
     if wind is None:
         return {}
@@ -288,11 +288,11 @@ class SensorConfig(Config):
 
     Attributes:
         noise: standard deviation of white noise, in the channel's unit (`0.5 deg`); not for u, v,
-            r, which have theirs beside `sensors`.
+            r, which have separate settings in `sensors`.
         bias: constant error, in the channel's unit.
         interval: time between its samples, a multiple of the log's step; the channel is empty in
             between. None: every sample of the log.
-        latency: age of what it reports: the log shows at t what was at t - latency.
+        latency: delay of the measurement: the log shows at t the value of t - latency.
     """
 
     noise: float | str = 0.0
@@ -342,7 +342,7 @@ class SensorsConfig(Config):
         return self
 
     def check_sensors(self, channels: tuple[str, ...], dt: float, vessel: str) -> None:
-        """Stop where a sensor measures what the log has not, or samples more often than it."""
+        """Reject sensors of unknown channels, and sampling rates above the rate of the log."""
         for name, sensor in self.sensors.items():
             if name not in channels:
                 raise ConfigError(
@@ -367,7 +367,7 @@ class SensorsConfig(Config):
         white_noise: np.ndarray,
         seed: tuple[int, ...],
     ) -> dict[str, np.ndarray]:
-        """Return what the log holds.
+        """Build the log.
 
         Args:
             true_channels: channels [T] as they were.
@@ -439,7 +439,7 @@ class ManoeuvreRun:
     """One manoeuvre as it was flown.
 
     Attributes:
-        manoeuvre: what was to be flown.
+        manoeuvre: simulated manoeuvre.
         true_log: the motion itself.
         measured_log: what sensors measured of it. Its meta says `timed_out` where the stop condition was not
             reached, `diverged` where the motion ceased to be finite; both logs end there.
@@ -498,7 +498,7 @@ def simulate_manoeuvres(
         manoeuvres: in the order of the result; rows that reach their stop condition end there.
         duration: of manoeuvres that give none, in s.
         dt: of the logs in s.
-        metadata: what the meta of the logs shall say.
+        metadata: metadata of the logs.
 
     Raises:
         UsageError: where the vessel lacks what a manoeuvre needs.
@@ -584,7 +584,7 @@ def simulate_manoeuvres(
 
 
 def list_logged_channels(vessel: SimulatedVessel, environment: TrialEnvironment) -> tuple[str, ...]:
-    """Return the names of the channels of a flight's log: states, commands, what is measured."""
+    """Return the channel names of a simulated log: states, commands, measured inputs."""
     channel_names = [
         *(name for name in vessel.helm.state if not name.startswith("_")),
         *vessel.helm.inputs[: vessel.n_commands],
@@ -604,20 +604,20 @@ def make_log_names(manoeuvres: Sequence[Manoeuvre]) -> list[str]:
 
 
 class SimulatedTrials(Config):
-    """A programme of sea trials on a simulated vessel, from rest.
+    """A programme of sea trials on a simulated vessel, from zero speed.
 
     A model that only holds near its service speed starts there.
 
     Attributes:
         vessel: name of a vessel of residnet, or path of a vessel file.
-        trials: families of manoeuvres; what is random in them is drawn by `seed`.
+        trials: families of manoeuvres; random quantities are drawn with `seed`.
         duration: of each manoeuvre.
         step: sampling interval of the logs.
         substeps: steps of the plant within one sampling interval.
         identification: number of manoeuvres of each kind that models may be fitted on, drawn by
-            `seed`; kinds that are not named are for identification altogether. The rest is the test
+            `seed`; all manoeuvres of unlisted kinds are for identification. The others are the test
             set.
-        validation: how many of those are kept back to choose between models.
+        validation: number of identification manoeuvres reserved for model selection.
         seed: of everything random in the data (the run's own seed moves only the training).
         noise: of the sensors.
         disturbance: of the sea.
@@ -684,7 +684,8 @@ class SimulatedTrials(Config):
                 or not 0 <= n_validation < n_identification
             ):
                 raise ValueError(
-                    f"{n_identification} of {len(members_of_kind)} '{manoeuvre_kind}' manoeuvres for identification, {n_validation}"
+                    f"{n_identification} of {len(members_of_kind)} '{manoeuvre_kind}' manoeuvres"
+                    f" for identification, {n_validation}"
                     " of them for validation: leaves a split empty"
                 )
             shuffled_indices = generator.permutation(members_of_kind)
@@ -699,7 +700,7 @@ def simulate_trials(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) ->
     """Fly the manoeuvres in one batch and return the motion and the logs of sensors on it.
 
     Channels: the plant's state (for the WAM-V x, y, psi, u, v, r, n_port, n_stbd), the commands,
-    and the true wind where there is any. Float64.
+    and the true wind, if present. Float64.
     """
     plant = build_plant(config.vessel, config.disturbance)
     traced_dynamics = RecordedPlantDynamics(plant, config.step, config.substeps)
@@ -711,9 +712,9 @@ def simulate_trials(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) ->
 
 
 def make_dummy_logs(config: SimulatedTrials) -> list[Log]:
-    """Return logs with the names, channels, lengths and kinds of those of `simulate_trial_logs`, unflown.
+    """Return placeholder logs with names, channels and lengths as from `simulate_trial_logs`.
 
-    Their channels are slow sines: they tell what a run can be made of, before anything is flown.
+    Their channels are slow sines, for checks of a config without a simulation.
 
     Raises:
         UsageError: where the vessel lacks what a manoeuvre needs.

@@ -154,7 +154,8 @@ def find_first_violation(
                 )
         elif passage.min_distance < buoy.radius - tolerance:
             return number - 1, (
-                f"buoy {number}: its circle of {buoy.radius:.4g} m is cut, {passage.min_distance:.4g} m"
+                f"buoy {number}: its circle of {buoy.radius:.4g} m is cut,"
+                f" {passage.min_distance:.4g} m"
             )
         elif {passage.passing_side, passage.side_at_min_distance} != {buoy.leave_to}:
             return (

@@ -373,7 +373,8 @@ def _no_course_message(
     if buoy_numbers:
         *leading_numbers, last_number = (str(number) for number in buoy_numbers)
         return (
-            f"no course found: buoys {', '.join(leading_numbers)} and {last_number} exclude each other for this"
+            f"no course found: buoys {', '.join(leading_numbers)} and {last_number} exclude each"
+            " other for this"
             " vessel's turns, even alone and begun at the one before them; move one, give them"
             " smaller circles, or allow more rudder"
         )

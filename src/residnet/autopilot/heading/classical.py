@@ -427,7 +427,8 @@ def regulator_gains(
 class ProximateTimeOptimalLaw(HeadingLaw):
     """Proximate time-optimal law for heading changes.
 
-    Source: M. L. Workman, Adaptive proximate time-optimal servomechanisms, 1987. The output is steepness (e - g(r)), where g is the heading change during braking with
+    Source: M. L. Workman, Adaptive proximate time-optimal servomechanisms, 1987. The
+    output is steepness (e - g(r)), where g is the heading change during braking with
     counter-rudder, linear in r near the reference. The constants are `steepness`, `share` (the
     fraction of the braking acceleration that the law relies on) and `damping` (damping ratio near
     the reference).

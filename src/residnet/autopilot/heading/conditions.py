@@ -138,7 +138,8 @@ class ConditionsConfig(Config):
         for name, (lower, upper, lower_limit, upper_limit) in ranges.items():
             if not lower_limit <= lower <= upper <= upper_limit:
                 raise ValueError(
-                    f"{name}: low and high must be in order and within {lower_limit:g} and {upper_limit:g},"
+                    f"{name}: low and high must be in order and within {lower_limit:g} and"
+                    f" {upper_limit:g},"
                     f" given {lower:g}, {upper:g}"
                 )
         return self
@@ -928,7 +929,8 @@ def tune_parameters(
     )
     if not result_de.fun < _DIVERGED_COST:
         raise FitError(
-            f"no {config.model_dump()['kind']} controller of {result_de.nfev} tried holds the vessel"
+            f"no {config.model_dump()['kind']} controller of {result_de.nfev} tried holds the"
+            " vessel"
             " under these conditions; widen the rudder's limit or narrow the conditions"
         )
     best_parameters = dict(zip(names, (math.exp(value) for value in result_de.x), strict=True))

@@ -143,7 +143,8 @@ def fit_response(
     if candidate.gain <= 0 or candidate.explained_variance < _MIN_EXPLAINED:
         raise FitError(
             f"steering: the best response found has K {candidate.gain:.3g} 1/s and explains"
-            f" {100 * candidate.explained_variance:.0f} % of the yaw rate; check the rudder's sign and"
+            f" {100 * candidate.explained_variance:.0f} % of the yaw rate; check the rudder's sign"
+            " and"
             " unit, and that the vessel answers its rudder"
         )
     # the rate must explain more than chance does

@@ -159,7 +159,8 @@ class SteeredVessel(ABC):
         """
         if not (math.isfinite(final_angle) and final_angle * angle > 0):
             raise FitError(
-                f"at {angle:.3g} rad of rudder the vessel comes to rest at an angle of {final_angle:.3g}"
+                f"at {angle:.3g} rad of rudder the vessel comes to rest at an angle of"
+                f" {final_angle:.3g}"
                 " rad; it cannot be steered (check the sign of the command that steers)"
             )
         restoring = angle / final_angle
@@ -237,7 +238,8 @@ class SteeredVessel(ABC):
                 if len(rates) > _MAX_ZIGZAG_STEPS:
                     raise FitError(
                         f"a zigzag with {abs(angle):.3g} rad of rudder does not turn the vessel"
-                        f" back within {dt * _MAX_ZIGZAG_STEPS:.3g} s; it cannot be steered with so little"
+                        f" back within {dt * _MAX_ZIGZAG_STEPS:.3g} s; it cannot be steered with"
+                        " so little"
                         " rudder"
                     )
                 headings.append(self.axis.side * (float(x[0, psi]) - initial_heading))

@@ -59,7 +59,8 @@ def _iterate_course_figures(run: RunFiles) -> Iterator[Figure]:
     yield Figure(
         "courses",
         "Flights past the buoys",
-        f"{' '.join(PROTOCOL_RULES[name] for name in run.resolved_config['protocols'])} North is up, and scales of"
+        f"{' '.join(PROTOCOL_RULES[name] for name in run.resolved_config['protocols'])} North is"
+        " up, and scales of"
         " the track are equal. S and P name the side on which a buoy is left, dotted circles are"
         " those of the buoys, and the triangle is the start; dotted lines are the limits of the"
         " rudder. A track that leaves the picture has lost the course. A controller that leaves the"
@@ -166,7 +167,7 @@ def _protocol_case(
 
 
 def _spread_figure(spread_runs: Any) -> Figure:
-    """Draw the course time of every flight of the spread over that of the reference."""
+    """Draw the course times of the random vessels relative to the reference course."""
     styles = _run_styles(spread_runs, "model")
     cases = []
     for protocol, runs in spread_runs.groupby("protocol", sort=False):
@@ -231,7 +232,7 @@ def _spread_figure(spread_runs: Any) -> Figure:
 
 
 def sections(run: RunFiles) -> list[Section]:
-    """Return times and margins by protocol, what the numbers mean, and the figures.
+    """Return the sections: times and margins by protocol, explanations, and figures.
 
     Raises:
         UsageError: where the folder holds no metrics.json.
@@ -374,8 +375,10 @@ def _spread_text(run: RunFiles) -> str:
         else ""
     )
     return (
-        f"Spread: {spread_config['flights']} vessels with {lower_effect:g} to {upper_effect:g} times the rudder's effect,"
+        f"Spread: {spread_config['flights']} vessels with {lower_effect:g} to {upper_effect:g}"
+        " times the rudder's effect,"
         f" {lower_time:g} to {upper_time:g} times the time constants{bias}, in currents of"
-        f" {spread_config['current']:g} m/s from all directions. Ratios of course times do not allow for"
+        f" {spread_config['current']:g} m/s from all directions. Ratios of course times do not"
+        " allow for"
         " the current. Passed: share of the flights that passed all buoys as demanded."
     )

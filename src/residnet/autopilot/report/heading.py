@@ -38,7 +38,7 @@ CONDITIONS_FILE = "conditions.parquet"
 
 
 class AxisWords(NamedTuple):
-    """How a page calls what is steered, its unit and scale from SI, its rate, and what steers."""
+    """Words for the controlled axis: its name, unit, scale from SI, rate, and actuator."""
 
     value: str
     unit: str
@@ -53,7 +53,7 @@ _DEPTH_WORDS = AxisWords("depth", "m", 1.0, "pitch rate", "stern planes", ("z", 
 
 
 def _config_as_run(run: RunFiles) -> Mapping[str, Any]:
-    """Return the config with the times that were flown, those of its pace."""
+    """Return the config with the simulated times, scaled by its pace."""
     return {**run.resolved_config, **run.metrics.get("flown", {})}
 
 
@@ -150,9 +150,11 @@ def _response_figure(
     return Figure(
         "responses",
         f"Step responses of {name}",
-        f"Step of {axis_labels.scale * change:.3g} {axis_labels.unit}. Lines show the nominal vessel, shades"
+        f"Step of {axis_labels.scale * change:.3g} {axis_labels.unit}. Lines show the nominal"
+        " vessel, shades"
         " the corners of the spread under the learned policies. The dotted band of"
-        f" {axis_labels.scale * settling_band:.1f} {axis_labels.unit}, enlarged in the second panel, is the one in"
+        f" {axis_labels.scale * settling_band:.1f} {axis_labels.unit}, enlarged in the second"
+        " panel, is the one in"
         " which a change has settled.",
         styles,
         [
@@ -174,7 +176,7 @@ def _cumulative_shares(
     styles: Mapping[str, GlyphStyle],
     quantities: Sequence[tuple[str, float, str]],
 ) -> list[dict[str, Curve]]:
-    """Return the shares of rows that stay below a value, a panel for each quantity."""
+    """Return the cumulative distributions of the rows, one panel per quantity."""
     panels = []
     for quantity, scale, _ in quantities:
         panel = {}
@@ -246,7 +248,7 @@ def _distribution_figure(
 def _cost_figure(
     runs: pd.DataFrame, kinds: Mapping[str, str], name: str, axis_labels: AxisWords
 ) -> Figure:
-    """Draw the shares of flights under the stated conditions that stay below a value."""
+    """Draw the cumulative distributions of the metrics under the conditions."""
     conditioned_runs = runs[runs["protocol"] == "conditions"]
     quantities = (
         ("cost", 1.0, "cost [s]"),
@@ -263,7 +265,8 @@ def _cost_figure(
     return Figure(
         "conditions",
         f"Flights of {name} under the stated conditions",
-        f"Share of {conditioned_runs['flight'].nunique()} flights under the stated conditions that stay below"
+        f"Share of {conditioned_runs['flight'].nunique()} flights under the stated conditions that"
+        " stay below"
         " a value. The two per cent of all flights with the largest values may lie beyond an axis.",
         styles,
         _share_panels(quantities, limits, "flights"),
@@ -441,13 +444,16 @@ def _autopilot_definitions(config: Mapping[str, Any]) -> list[str]:
     axis_labels = axis_words(config["test"])
     change, band = (axis_labels.scale * value for value in _step_and_band(test))
     return [
-        f"One definition holds for all controllers: a step of {change:.3g} {axis_labels.unit} without"
-        f" prefilter, with the {axis_labels.rudder} within {math.degrees(config['rudder']):.3g} deg. A"
+        f"One definition holds for all controllers: a step of {change:.3g} {axis_labels.unit}"
+        " without"
+        f" prefilter, with the {axis_labels.rudder} within {math.degrees(config['rudder']):.3g}"
+        " deg. A"
         f" change has settled at its last entry into {band:.3g} {axis_labels.unit}.",
         "Worst: over the corners of the spread. Random: over"
         f" {test['plants']} vessels drawn from it. Overshoot: the largest over both. Bias: largest"
         f" error after {test['bias_time']:g} s under {math.degrees(test['bias']):.3g} deg of"
-        f" constant bias of the {axis_labels.rudder}. Not settled: number of changes outside the band at"
+        f" constant bias of the {axis_labels.rudder}. Not settled: number of changes outside the"
+        " band at"
         " their end.",
         "Peers are tuned by the cost under the stated conditions."
         if config.get("conditions")
@@ -458,7 +464,8 @@ def _autopilot_definitions(config: Mapping[str, Any]) -> list[str]:
 def _effort_text(test: JsonObject) -> list[str]:
     texts = [
         f"Mean and 95th percentile over the {test['plants']} random vessels: integral of the"
-        f" absolute {axis_words(test).value} error, travel of the {axis_words(test).rudder} command,"
+        f" absolute {axis_words(test).value} error, travel of the {axis_words(test).rudder}"
+        " command,"
         " and its energy (the integral of its square)."
     ]
     if test.get("wind"):
@@ -491,7 +498,7 @@ def _mean_cost(row: JsonObject) -> float:
 def cost_sentences(rows: Sequence[JsonObject]) -> list[str]:
     """Return a sentence for each learned policy, the cheapest first: its cost and the best law's.
 
-    Without stated conditions there is none.
+    It is empty without operating conditions.
     """
     rows_by_model = {row["model"]: row for row in rows if row["protocol"] == "conditions"}
     if not rows_by_model:
@@ -591,19 +598,25 @@ def _conditions_text(evaluation: Mapping[str, Any]) -> list[str]:
     if depth:
         noise = f"{depth['noise']:.3g} m on the depth, {noise}"
     texts = [
-        f"{evaluation['flights']} changes of {axis_labels.value} of {lower:.3g} to {upper:.3g} {axis_labels.unit},"
+        f"{evaluation['flights']} changes of {axis_labels.value} of {lower:.3g} to {upper:.3g}"
+        f" {axis_labels.unit},"
         " which no tuning or training has seen, the same for all controllers. The vessel's K lies"
         f" within {conditions['effect'][0]:g} to {conditions['effect'][1]:g} and its T within"
-        f" {conditions['time'][0]:g} to {conditions['time'][1]:g} of the nominal one; commands arrive"
-        f" {conditions['delay'][0]:g} to {conditions['delay'][1]:g} s late; the {axis_labels.rudder} has a bias of"
+        f" {conditions['time'][0]:g} to {conditions['time'][1]:g} of the nominal one; commands"
+        " arrive"
+        f" {conditions['delay'][0]:g} to {conditions['delay'][1]:g} s late; the"
+        f" {axis_labels.rudder} has a bias of"
         f" up to {math.degrees(conditions['bias']):.3g} deg and a slow push of"
         f" {math.degrees(conditions['push']):.3g} deg; the noise is {noise} and"
         f" {math.degrees(conditions['noise_r']):.3g} deg/s on the {axis_labels.rate}.",
         f"Cost: the integral of |e| / (|e| + {band:.3g} {axis_labels.unit}) over"
-        f" {conditions['duration']:g} s from the change on, plus {conditions['overshoot_weight']:g} s per"
-        f" {'decimetre' if depth else 'deg'} of overshoot and {conditions['travel_weight']:g} s per deg"
+        f" {conditions['duration']:g} s from the change on, plus"
+        f" {conditions['overshoot_weight']:g} s per"
+        f" {'decimetre' if depth else 'deg'} of overshoot and {conditions['travel_weight']:g} s"
+        " per deg"
         f" of {axis_labels.rudder} travel. Swing: largest movement, peak to"
-        f" peak, from {settled_time(conditions['duration']):.3g} s after a change on in flights without"
+        f" peak, from {settled_time(conditions['duration']):.3g} s after a change on in flights"
+        " without"
         " noise and slow push. Classical controllers are tuned by the same cost, by differential"
         " evolution.",
     ]

@@ -1,4 +1,4 @@
-"""Task `autopilot`: train policies of heading or depth, tune peers, and compare all of them."""
+"""Task `autopilot`: train heading or depth policies, tune classical laws and compare them."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ class PolicyConfig(Config):
     """A recurrent policy of heading or depth, trained under the run's conditions.
 
     Attributes:
-        start: name of a peer with an observer, of kind `ptos` or `lqr_observer`, or of kind `depth`
-            over such a one: the network stands beside its law, whose constants as tuned are where
-            training begins, and they are trained too. Null for a network alone, without law,
+        start: name of a classical law with an observer (kind `ptos` or `lqr_observer`, or `depth`
+            with such an inner law). The network is added to this law; its tuned constants are the
+            initial values of the training. Null for a network alone, without law,
             observer or predictor.
         units: of the recurrent network; 0 trains the constants of a law alone.
-        learned: a learned model to train on instead of the vessel itself; the policy is then
+        learned: learned model to train on instead of the vessel; the policy is
             compared on the vessel.
-        training: how it is trained.
+        training: settings of the training.
     """
 
     start: PartName | None
@@ -74,7 +74,7 @@ class PolicyConfig(Config):
 
     @property
     def role(self) -> str:
-        """What the rows of metrics.json call it: policy, network, or constants."""
+        """Role in the rows of metrics.json: policy, network, or constants."""
         if self.start is None:
             return "network"
         return "policy" if self.units else "constants"
@@ -87,14 +87,14 @@ class PolicyConfig(Config):
 
 
 class EvaluationConditions(Config):
-    """The conditions that all controllers of a run are tuned, trained and judged under.
+    """Operating conditions under which all controllers of a run are tuned, trained and evaluated.
 
     Attributes:
-        stated: the conditions themselves, with the cost of a flight.
-        flights: number of judged flights, which no tuning or training sees.
-        beyond: further conditions by name, outside of those of tuning and training, that
-            controllers are judged under only.
-        evolution: the search for the constants of peers.
+        stated: operating conditions and cost of a simulation.
+        flights: number of simulations for the evaluation, not used in tuning or training.
+        beyond: further conditions by name, outside the range of tuning and training, that
+            are used for evaluation only.
+        evolution: settings of the search for constants of classical laws.
     """
 
     stated: ConditionsConfig = ConditionsConfig()
@@ -121,7 +121,7 @@ class DepthStepTestConfig(Config):
 
 
 class StepTestConfig(Config):
-    """The one test of all controllers: a step of the heading reference, from straight ahead.
+    """Test of all controllers: a step of the heading reference on a straight course.
 
     Attributes:
         depth: a step of the depth instead, which makes depth controllers of all of them, with the
@@ -130,7 +130,7 @@ class StepTestConfig(Config):
         band: heading error in rad; the change has settled at the last entry into this band.
         dt: step of simulation and controllers in s.
         duration: of a flight in s.
-        plants: number of random vessels of the spread, beside its corners.
+        plants: number of random vessels, in addition to the corners of the ranges.
         bias: constant rudder angle of the steady-error test in rad.
         bias_time: duration of the steady-error test in s.
         wind: mean wind speed in m/s of the same test in wind, from eight directions and without
@@ -167,7 +167,7 @@ class StepTestConfig(Config):
 
 @final
 class AutopilotConfig(ComputingTask):
-    """Policies of heading or depth trained through the vessel, beside tuned controllers.
+    """Policies of heading or depth trained through the vessel, compared with tuned controllers.
 
     Attributes:
         seed: of weights, batches and random vessels.
@@ -175,7 +175,7 @@ class AutopilotConfig(ComputingTask):
         rudder: largest rudder angle in rad that controllers may use.
         turning_time: time in s until the turn at that angle is steady.
         pace: multiple of all times in `test`, `conditions` and the trainings of `policies`, delays
-            aside; `vessel` for how many times as long as that of document 004 the vessel takes for
+            excepted; `vessel` for the ratio of the vessel's turning time to the vessel of document 004 for
             a heading change.
         test: the step of the heading reference that all controllers fly, over the vessels of
             `conditions.stated`.
@@ -258,7 +258,8 @@ class AutopilotConfig(ComputingTask):
             if isinstance(peer, DepthConfig) != is_depth:
                 expected_kind = "depth, with its law under 'pitch'" if is_depth else "any but depth"
                 raise ValueError(
-                    f"peers.{name}: test.depth is {'given' if is_depth else 'not given'}, so its kind"
+                    f"peers.{name}: test.depth is {'given' if is_depth else 'not given'}, so its"
+                    " kind"
                     f" must be {expected_kind}"
                 )
         for name, policy in self.policies.items():
@@ -302,7 +303,7 @@ class AutopilotConfig(ComputingTask):
 
     @property
     def axis(self) -> Axis:
-        """What is steered: the heading, or the depth."""
+        """The controlled axis: heading or depth."""
         return HEADING if self.test.depth is None else DEPTH
 
     @property
@@ -321,11 +322,11 @@ class AutopilotConfig(ComputingTask):
         return self.seed
 
     def check(self) -> None:
-        """Check that the vessel turns steadily and can do what is asked, and so for learned models.
+        """Check that the vessel and learned models turn steadily and can perform the tests.
 
         Raises:
             UsageError: where a run or a model is missing.
-            FitError: where a learned model does not turn towards the rudder and stay there.
+            FitError: if a learned model does not turn steadily towards the rudder.
             ConfigError: where the vessel does not, has no time for its changes of heading or no
                 rudder left to hold its course, or where the inputs of a learned model are not its
                 own.
@@ -365,7 +366,8 @@ class AutopilotConfig(ComputingTask):
             if minimum_time > duration:
                 raise ConfigError(
                     f"{key}.duration: a change of heading of {math.degrees(change):.3g} deg takes"
-                    f" this vessel {minimum_time:.3g} s at least, given {duration:.3g} s; give more time,"
+                    f" this vessel {minimum_time:.3g} s at least, given {duration:.3g} s; give"
+                    " more time,"
                     " or more rudder"
                 )
         for model, dt in learned_models:
@@ -376,7 +378,7 @@ class AutopilotConfig(ComputingTask):
 
         Raises:
             UsageError: where the run or the model is missing.
-            ConfigError: where its inputs are not those of the vessel, or the conditions have
+            ConfigError: if its inputs differ from the vessel's inputs, or the conditions have
                 weather, which a learned model does not feel.
         """
         assert self.conditions is not None
@@ -400,8 +402,8 @@ class AutopilotConfig(ComputingTask):
     def with_scaled_times(self) -> AutopilotConfig:
         """Return the config with its times multiplied by its pace, the pace itself being one.
 
-        Delays, which are those of the electronics, stay as they are. What a degree costs grows as
-        the time does.
+        Delays of the electronics are not scaled. The cost of a degree is scaled like
+        the times.
 
         Raises:
             FitError: where the vessel does not turn steadily.
@@ -485,7 +487,7 @@ def minimum_turn_time(
     """Return the least time in s of a change of heading [rad] by T r_dot + r = K delta.
 
     Full rudder is held until full counter-rudder stops the yaw rate on the new heading; each way of
-    the rudder to one side takes its time beside that.
+    the rudder to one side takes additional time.
     """
     steady_yaw_rate = abs(nomoto.gain) * rudder_limit
     time_constant = nomoto.time

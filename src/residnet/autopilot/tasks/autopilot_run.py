@@ -1,4 +1,4 @@
-"""Carrying out an autopilot run, into a run folder."""
+"""Execution of the task `autopilot` in a run folder."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ if TYPE_CHECKING:
     )
 
 Controllers = dict[str, tuple[str, Policy]]
-"""Kind (policy, classical, floor and others) and controller by name."""
+"""Role (policy, classical, floor and others) and controller by name."""
 
 
 def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> TaskOutcome:
@@ -165,7 +165,7 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> TaskOutcome:
 def _tune_peer(
     name: str, peer: AnyController, steering: ControlTask, config: AutopilotConfig
 ) -> tuple[AnyController, dict[str, Any]]:
-    """Return a peer ready to fly, tuned by the cost where it lacks constants, and notes on it."""
+    """Tune the missing constants of a classical law; return it and notes."""
     evaluation_conditions = config.conditions
     if not isinstance(peer, TunableConfig) or None not in peer.parameter_values().values():
         return peer, {"config": peer.model_dump(mode="json")}
@@ -194,7 +194,7 @@ def _tune_peer(
 def _build_vessel_for_conditions(
     config: AutopilotConfig, evaluation_conditions: EvaluationConditions
 ) -> SteeredPlant:
-    """Return the vessel as the conditions need it: in calm water, or in wind and current."""
+    """Return the vessel in calm water, or with wind and current if the conditions have them."""
     is_calm = not any(
         conditions.has_weather for conditions in evaluation_conditions.all_conditions.values()
     )
@@ -208,9 +208,9 @@ def _train_policy_or_resume(
     config: AutopilotConfig,
     folder: RunFolder,
 ) -> tuple[RecurrentPolicy, dict[str, Any], RecurrentPolicy]:
-    """Return a policy trained under the conditions, notes, and the policy as it began.
+    """Train a policy or load it from an interrupted run; return it, notes, and its initial state.
 
-    `base_law` is the law that its network stands beside; None for none.
+    `base_law` is the control law that the network is added to; None for none.
     """
     policy_config = config.policies[name]
     evaluation_conditions = config.conditions
@@ -299,7 +299,7 @@ def load_trained_policy(
 def _run_step_tests(
     controllers: Controllers, vessel: SteeredPlant, config: AutopilotConfig
 ) -> tuple[list[dict[str, Any]], pd.DataFrame, pd.DataFrame]:
-    """Return the rows of metrics.json, and two tables: flights of the corners, random vessels."""
+    """Return rows of metrics.json, time series of the corners, and metrics of random vessels."""
     test = config.test
     main_conditions = _main_conditions(config)
     reference_change, settling_band = test.step_and_tolerance
@@ -374,7 +374,7 @@ def _main_conditions(config: AutopilotConfig) -> ConditionsConfig:
 def _evaluate_under_conditions(
     controllers: Controllers, config: AutopilotConfig, evaluation_conditions: EvaluationConditions
 ) -> tuple[list[dict[str, Any]], pd.DataFrame]:
-    """Return the rows of metrics.json and the table of flights under the conditions."""
+    """Return rows of metrics.json and a table of the simulations under the conditions."""
     vessel = _build_vessel_for_conditions(config, evaluation_conditions)
     conditions_by_protocol = {
         "conditions" if name == "stated" else f"beyond_{name}": conditions
@@ -441,8 +441,10 @@ def _summarize(
         summary_metrics[f"{name}_settling_nominal"] = SummaryMetric(nominal, "s")
         summary_metrics[f"{name}_settling_worst"] = SummaryMetric(slowest, "s")
         sentences.append(
-            f"'{name}' settles on a new {axis_labels.value} {axis_labels.scale * reference_change:.3g} {axis_labels.unit} away"
-            f" in {nominal:.2f} s on the nominal vessel, and in {slowest:.2f} s on the slowest vessel"
+            f"'{name}' settles on a new {axis_labels.value}"
+            f" {axis_labels.scale * reference_change:.3g} {axis_labels.unit} away"
+            f" in {nominal:.2f} s on the nominal vessel, and in {slowest:.2f} s on the slowest"
+            " vessel"
             " at the corners of the spread."
         )
     if config.floor is not None:
@@ -460,7 +462,7 @@ def export_policy(config: AutopilotConfig, request: ExportRequest) -> Path:
     """Write a policy of a run, with its rows of metrics.json in the card; returns the file.
 
     Raises:
-        UsageError: where there is no such policy.
+        UsageError: if the run has no policy of this name.
         WithheldError: where a classical controller costs less, but for `asked.anyway`.
         ExportError: where the file does not reproduce the policy.
     """

@@ -1,4 +1,4 @@
-"""Task `course`: fly a trained heading policy and its peers along a course past buoys."""
+"""Task `course`: simulate a trained heading policy and classical laws on a course past buoys."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from residnet.runs.task import ComputingTask, ExportRequest, PartName, TaskOutco
 
 
 class CourseSpreadConfig(Config):
-    """Random vessels, each in a steady current from a random direction.
+    """Random vessels, each in a steady current of random direction.
 
-    Every controller and guidance flies the same ones.
+    All controllers and guidance laws are simulated with the same vessels.
 
     Attributes:
         flights: number of vessels.
@@ -58,7 +58,8 @@ class CourseSpreadConfig(Config):
         for name, (lower, upper) in {"effect": self.effect, "time": self.time}.items():
             if not 0 < lower <= upper:
                 raise ValueError(
-                    f"{name}: low and high must be positive and in order, given {lower:g}, {upper:g}"
+                    f"{name}: low and high must be positive and in order, given {lower:g},"
+                    f" {upper:g}"
                 )
         return self
 
@@ -79,7 +80,7 @@ class CourseSpreadConfig(Config):
 
 @final
 class CourseTaskConfig(ComputingTask):
-    """A course past buoys, the controllers that fly it, and the guidance laws beside the plan.
+    """A course past buoys, the compared controllers, and line-of-sight laws without a plan.
 
     Attributes:
         autopilot: folder of a finished autopilot run, or the config of one, which is then carried
@@ -97,11 +98,11 @@ class CourseTaskConfig(ComputingTask):
             way-point, as the source did it; for the protocol `enter`.
         legs_change: where they do: in the circle of acceptance, as in the source, or at the
             wheel-over before it.
-        spread: of vessels and currents that all fly the course too, beside the nominal vessel in
-            water at rest; null for none.
+        spread: random vessels and currents, in addition to the nominal vessel
+            without current; null for none.
         dt: step of simulation and controllers in s.
         duration: time in s after which a flight that has not ended is given up.
-        safe: what the exported policy commands while its inputs are wrong: the last good command,
+        safe: command of the exported policy for invalid inputs: the last valid command,
             or rudder amidships.
     """
 
@@ -138,7 +139,7 @@ class CourseTaskConfig(ComputingTask):
         """Return the config of the autopilot, from its run folder or its file.
 
         Raises:
-            UsageError: where the folder is not that of a finished autopilot run.
+            UsageError: if the folder is not a finished autopilot run.
             ConfigError: where the file is no config of an autopilot, or has no such policy or peer.
         """
         autopilot_path = self.autopilot
@@ -150,11 +151,13 @@ class CourseTaskConfig(ComputingTask):
         autopilot_config = load_config(file, [], AutopilotConfig)
         if autopilot_config.test.depth is not None:
             raise ConfigError(
-                f"autopilot: {autopilot_path} steers the depth; a course takes policies of the heading"
+                f"autopilot: {autopilot_path} steers the depth; a course takes policies of the"
+                " heading"
             )
         if self.policy not in autopilot_config.policies:
             raise ConfigError(
-                f"policy: '{self.policy}' is none of {autopilot_path}{suggest_name(self.policy, autopilot_config.policies)}"
+                f"policy: '{self.policy}' is none of"
+                f" {autopilot_path}{suggest_name(self.policy, autopilot_config.policies)}"
             )
         for name in self.peers:
             if name not in (
@@ -188,7 +191,7 @@ class CourseTaskConfig(ComputingTask):
                 raise ConfigError(f"course.buoys, protocol {protocol}: {error}") from error
 
     def execute(self, folder: RunFolder) -> TaskOutcome:
-        """Train where there is no trained policy yet, plan, fly and compare.
+        """Train the policy if necessary, plan the courses, simulate and compare.
 
         Raises:
             ConfigError: where no course fits the vessel's turns.

@@ -66,7 +66,7 @@ _COLUMN_UNITS = {
 
 
 def run_course(config: CourseTaskConfig, folder: RunFolder) -> TaskOutcome:
-    """Train where there is no trained policy yet, plan, fly and compare."""
+    """Train the policy if necessary, plan the courses, simulate and compare."""
     if not config.autopilot.is_dir() and not RunFolder(folder.path / "autopilot").is_finished:
         config.load_autopilot_config().run(
             source=config.autopilot, output_folder=folder.path / "autopilot", resume=True
@@ -109,7 +109,8 @@ def run_course(config: CourseTaskConfig, folder: RunFolder) -> TaskOutcome:
     for protocol in config.protocols:
         planned_course, guidance = plan_with_guidance(config, autopilot_run, protocol)
         log_message(
-            f"{protocol}: planned {planned_course.course.length:.1f} m; the reference of arcs and lines"
+            f"{protocol}: planned {planned_course.course.length:.1f} m; the reference of arcs and"
+            " lines"
             f" has {planned_course.reference_length:.1f} m"
         )
         plans.append(tabulate_plan(planned_course))
@@ -269,7 +270,7 @@ def _run_controller(
     line_of_sight: AnyLineOfSight | None,
     results: _CourseResults,
 ) -> None:
-    """Fly the nominal vessel, then those of the spread, with one controller and guidance."""
+    """Simulate the nominal vessel and the random ones with one controller and guidance."""
     role = "policy" if name == config.policy else "classical"
     guidance = "course" if line_of_sight is None else line_of_sight.kind
     loop_parts = _build_loop_parts(config, planned_course, steering, policy, line_of_sight)
@@ -484,10 +485,10 @@ def export_course(
 ) -> Path:
     """Write a policy with the guidance of a course; returns the file.
 
-    A course that is not at hand is planned again.
+    If no planned course is passed, it is planned again.
 
     Raises:
-        UsageError: where there is no such course.
+        UsageError: if the run has no course of this name.
         ExportError: where another course is planned now than the one that was flown.
     """
     protocols = {f"{config.policy}_{protocol}": protocol for protocol in config.protocols}

@@ -69,7 +69,7 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
     """Return K, T and delay of the vessel that logs are of.
 
     Args:
-        logs: with yaw rate `r` or heading `psi`, and the rudder; turns to both sides tell most. The
+        logs: with yaw rate `r` or heading `psi`, and the rudder; turns to both sides are best. The
             rudder is the command where a log has it, since the delay of the steering gear counts,
             otherwise the measured angle.
         longest_delay: that is searched for, in s.
@@ -86,7 +86,8 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
     max_rudder_std = max(float(np.std(record.rudder)) for record in records)
     if max_rudder_std < _MIN_RUDDER_STD:
         raise DataError(
-            f"steering: the rudder of the logs moves by {max_rudder_std:.2g} rad (rms); K and T need turns,"
+            f"steering: the rudder of the logs moves by {max_rudder_std:.2g} rad (rms); K and T"
+            " need turns,"
             " such as a zigzag"
         )
     logs_with_motion = [
@@ -116,7 +117,8 @@ def _to_uniform_record(log: Log) -> tuple[ManoeuvreRecord, str]:
     source = next((name for name in ("r", "psi") if name in log.channels), None)
     if name is None or source is None:
         raise DataError(
-            f"log {log.name}: K and T need the rudder ({' or '.join(_RUDDER_CHANNELS)}) and the yaw rate r"
+            f"log {log.name}: K and T need the rudder ({' or '.join(_RUDDER_CHANNELS)}) and the"
+            " yaw rate r"
             f" or the heading psi; it has {', '.join(log.channels)}"
         )
     usable = log.usable & np.isfinite(log[source]) & np.isfinite(log[name])
@@ -161,11 +163,11 @@ _REFERENCE_TIME_STEP = 0.02
 
 
 class SteeringDescription(NamedTuple):
-    """What is known of a vessel's steering, and how well.
+    """Identified steering of a vessel with its uncertainty.
 
     Attributes:
         gain, time: K in 1/s and T in s.
-        rate: of the rudder in rad/s; None where it stands at its command at once.
+        rate: rudder rate in rad/s; None for a rudder without a rate limit.
         speed: at which they hold, in m/s.
         rudder: largest angle in rad that controllers may use.
         effect, slow: ranges of K and T as multiples.
@@ -190,7 +192,7 @@ class SteeringDescription(NamedTuple):
 
 
 class _UserSettings(Config):
-    """What a user says of the vessel beside logs or K and T."""
+    """Optional settings of the vessel in addition to logs or K and T."""
 
     rudder: Radians | None = Field(default=None, gt=0, lt=1.5)
     rate: RadiansPerSecond | None = Field(default=None, gt=0)
@@ -210,14 +212,14 @@ def draft_autopilot_config(
 
     Args:
         source: `K,T` in 1/s and s; logs; or the folder of a finished fit, whose logs are taken.
-        output_file: the config; the vessel's file lies beside it.
-        rudder: largest angle that controllers may use, with its unit; by default what the logs
+        output_file: config to write; the vessel file is written to the same folder.
+        rudder: rudder limit of the controllers with its unit; by default the angle that the logs
             hold, and 20 deg without logs.
-        rate: of the steering gear, with its unit; by default what the logs show.
+        rate: rate of the steering gear with its unit; by default identified from the logs.
         speed: at which K and T hold, with its unit; by default the mean of the logs.
 
     Raises:
-        UsageError: where the source is neither, or a file stands there already.
+        UsageError: if the source is neither, or an output file exists already.
         DataError: where logs lack the channels.
         FitError: where the logs show no answer to the rudder.
     """
@@ -240,14 +242,16 @@ def draft_autopilot_config(
     steering = steering._replace(**user_settings)
     with write_owned(vessel_file) as file:
         file.write_text(
-            f"# The steering of your vessel, from {steering.source}; written by `residnet autopilot`."
+            f"# The steering of your vessel, from {steering.source}; written by `residnet"
+            " autopilot`."
             "\n" + yaml.safe_dump(_build_vessel_file(steering, vessel_file.stem), sort_keys=False)
         )
     with write_owned(output_file) as file:
         # each of its own, so that no part is shared under a made-up name
         config = json.loads(json.dumps(_build_autopilot_config(steering, output_file, vessel_file)))
         file.write_text(
-            f"# An autopilot for your vessel, drafted from {steering.source} by `residnet autopilot`."
+            f"# An autopilot for your vessel, drafted from {steering.source} by `residnet"
+            " autopilot`."
             "\n" + yaml.safe_dump(config, sort_keys=False)
         )
     return output_file

@@ -91,7 +91,7 @@ class PredictorFit(EpochTraining):
     """A training by least squares on the changes of heading and yaw rate, each over its spread.
 
     Args:
-        predictor: what is trained, float64.
+        predictor: trained network, float64.
     """
 
     def __init__(
