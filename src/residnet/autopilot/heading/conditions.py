@@ -570,7 +570,9 @@ def simulate_heading_steps(
     rollout_inputs = torch.cat((w, target[:, None]), dim=1).unsqueeze(1).expand(-1, steps, -1)
     with torch.no_grad():
         rollout = Rollout(vessel.model(dt), loop if wrap_source is None else wrap_source(loop))
-        states, inputs, _ = compile_rollout(rollout, steps)(x, rollout_inputs, vessel.memory(variation))
+        states, inputs, _ = compile_rollout(rollout, steps)(
+            x, rollout_inputs, vessel.memory(variation)
+        )
     step_index = torch.zeros(len(target), dtype=torch.int64)
     return ClosedLoopTrajectories(
         states, inputs[:, :, 0], target, dt, vessel.state, vessel.axis, step_index, steps + 1
@@ -1038,4 +1040,6 @@ class CandidateEvaluation:
             # what cannot be compiled is flown as it is
             self.compiler = None
             return simulation.simulate(steps)
-        return simulation.to_trajectories(steps, *self.compiled_rollout.with_rollout(rollout)(*arguments)[:2])
+        return simulation.to_trajectories(
+            steps, *self.compiled_rollout.with_rollout(rollout)(*arguments)[:2]
+        )
