@@ -431,8 +431,8 @@ def test_a_model_that_rolls_flies_behind_the_gear_of_its_vessel() -> None:
     model, columns = make_example_model(spec).double(), spec.signals.input_columns
     gear = PlantActuators(plant, spec.dt)
     flown = ActuatedDynamics(model, columns, "start", gear)
-    helm = Helm(gear.demand, flown.state, gear.inputs)
-    craft = SimulatedVessel("own", flown, helm, gear.commands, flown.approach(1))
+    helm = Helm(gear.commands_for_demand, flown.state_names, gear.input_names)
+    craft = SimulatedVessel("own", flown, helm, gear.n_commands, flown.make_initial_state(1))
     turn = ConstantInput(drive=0.8, steer=0.5, duration=12.0)
     log = simulate_manoeuvres(
         craft,
@@ -442,7 +442,7 @@ def test_a_model_that_rolls_flies_behind_the_gear_of_its_vessel() -> None:
         spec.dt,
     )[0].true_log
     x, w = (
-        flown.approach(1)[:, : len(ROLL_LAYOUT.state_names)],
+        flown.make_initial_state(1)[:, : len(ROLL_LAYOUT.state_names)],
         torch.from_numpy(log.stack(columns))[None],
     )
     with torch.no_grad():

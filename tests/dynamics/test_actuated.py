@@ -43,17 +43,17 @@ def test_the_gear_is_the_plants_whatever_its_kind(vessel: str) -> None:
     gear = PlantActuators(plant, step, substeps)
     random = np.random.default_rng(0)
     demands = torch.from_numpy(random.uniform(-1, 1, (2, 2, 12))).repeat_interleave(5, dim=-1)
-    commands = gear.demand(demands[0], demands[1])
+    commands = gear.commands_for_demand(demands[0], demands[1])
     w = torch.zeros(2, 60, len(plant.input_names), dtype=torch.float64)
     w[:, :, : plant.n_commands] = commands
     start = plant.make_initial_state(2)
     with torch.no_grad():
         truth, _, _ = Rollout(PlantDynamics(plant, step, substeps))(start, w, start[:, :0])
-        model = ActuatedDynamics(still(gear.inputs[:1], step), gear.inputs[:1], "start", gear)
-        mine, _, _ = Rollout(model)(model.approach(2), w, start[:, :0])
+        model = ActuatedDynamics(still(gear.input_names[:1], step), gear.input_names[:1], "start", gear)
+        mine, _, _ = Rollout(model)(model.make_initial_state(2), w, start[:, :0])
     hull = ("x", "y", "phi", "psi", "u", "v", "p", "r")
-    assert len(gear.state) == len([name for name in plant.state_names if name not in hull])
-    for name in gear.state:
+    assert len(gear.state_names) == len([name for name in plant.state_names if name not in hull])
+    for name in gear.state_names:
         if name != "_yaw_lag":
             found, wanted = (
                 mine[..., model.state.index(name)],
@@ -70,16 +70,16 @@ def test_given_gear_by_hand() -> None:
         "delta": InputShare(steer="35 deg", rate="5 deg/s"),
     }
     gear = GivenActuators(shares, ("wind_speed", "wind_dir"), 0.5)
-    assert gear.inputs == ("cmd_n", "cmd_delta", "wind_speed", "wind_dir")
-    assert gear.state == ("delta",)
-    command = gear.demand(torch.tensor([1.0, 0.5]), torch.tensor([-1.0, 2.0]))
+    assert gear.input_names == ("cmd_n", "cmd_delta", "wind_speed", "wind_dir")
+    assert gear.state_names == ("delta",)
+    command = gear.commands_for_demand(torch.tensor([1.0, 0.5]), torch.tensor([-1.0, 2.0]))
     torch.testing.assert_close(command, torch.tensor([[8.0, -35 * DEG], [5.0, 35 * DEG]]))
-    a = gear.approach(1, ())
+    a = gear.make_initial_state(1, ())
     w = torch.tensor([[8.0, 4 * DEG, 0.0, 0.0]], dtype=torch.float64)
-    path = [a := gear.move(a, w) for _ in range(3)]
+    path = [a := gear.step_states(a, w) for _ in range(3)]
     assert [float(p) / DEG for p in path] == pytest.approx([2.5, 4.0, 4.0])
     model = ActuatedDynamics(still(("n", "delta"), 0.5), ("n", "delta"), "start", gear)
-    seen = [*model.actuators.state, *model.actuators.inputs]
+    seen = [*model.actuators.state_names, *model.actuators.input_names]
     assert [seen[i] for i in model.take] == ["cmd_n", "delta"]
     with pytest.raises(ConfigError, match="driven by 'tau'"):
         ActuatedDynamics(still(("tau",)), ("tau",), "start", gear)
@@ -118,5 +118,5 @@ def test_inputs_are_held_as_in_the_fit(hold: Any, expected: list[float]) -> None
     )
     w = torch.full((1, 3, 1), 9.0, dtype=torch.float64)
     with torch.no_grad():
-        states, _, _ = Rollout(model)(model.approach(1), w, torch.zeros(1, 0))
+        states, _, _ = Rollout(model)(model.make_initial_state(1), w, torch.zeros(1, 0))
     assert states[0, :, 3].diff().tolist() == pytest.approx(expected)

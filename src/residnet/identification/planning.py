@@ -25,7 +25,12 @@ from residnet.core.layout import (
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.fitter import FittedModel
-from residnet.manoeuvres.actuated import ActuatedDynamics, GivenActuators, InputShare, commanded
+from residnet.manoeuvres.actuated import (
+    ActuatedDynamics,
+    GivenActuators,
+    InputShare,
+    command_name_for,
+)
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import TurningCircle, Zigzag
 from residnet.manoeuvres.open_loop import AccelerationDeceleration, MultiSine, ThreeTwoOneOne
@@ -411,16 +416,16 @@ def _simulate_manoeuvres(
     spec, model = fitted_model.spec, fitted_model.model.double()
     actuators = GivenActuators(input_shares, spec.signals.exogenous, spec.dt)
     actuated = ActuatedDynamics(model, spec.signals.input_columns, spec.hold, actuators)
-    initial_state = actuated.approach(1)
+    initial_state = actuated.make_initial_state(1)
     # trials begin at a speed in the middle of what the model knows
     initial_state[:, SURGE] = 0.5 * (max(spec.low[0], 0.0) + spec.high[0])
     for name, value in goal_manoeuvres.initial.items():
-        initial_state[:, actuated.state.index(name)] = float(value)
+        initial_state[:, actuated.state_names.index(name)] = float(value)
     vessel = SimulatedVessel(
         fitted_model.name,
         actuated,
-        Helm(actuators.demand, actuated.state, actuators.inputs),
-        actuators.commands,
+        Helm(actuators.commands_for_demand, actuated.state_names, actuators.input_names),
+        actuators.n_commands,
         initial_state,
     )
     environment = TrialEnvironment(None, DisturbanceConfig(), SensorsConfig(), 0)
@@ -436,7 +441,7 @@ def _to_trajectory(simulated_run: ManoeuvreRun, signals: SignalsConfig) -> tuple
     zeros = np.zeros(len(motion))
     # what nobody commands, such as the wind, is left at rest
     inputs = [
-        channel_values.get(name, channel_values.get(commanded(name), zeros))
+        channel_values.get(name, channel_values.get(command_name_for(name), zeros))
         for name in signals.input_columns
     ]
     states = torch.from_numpy(motion.stack(signals.dof.state_names))

@@ -46,7 +46,7 @@ class Helm:
             vessel that cannot make all three.
         side_force: largest commanded sway force in N; None for a vessel whose commands are no
             forces.
-        dive_commands: commands [c] that make the vessel dive with all its force; None where it cannot.
+        dive_commands: commands [c] for a full dive; None for a vessel that cannot dive.
     """
 
     demand: DemandFunction
@@ -168,7 +168,7 @@ class ClosedLoopSource(Source):
         return self.manoeuvre_type.initial_memory(*self._observe(x))
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m]; conditions on the motion are tested at the start of the step."""
+        """Return the inputs [B, m]; conditions are evaluated at the start of the step."""
         motion, parameters = self._observe(x)
         *demands, memory = self.manoeuvre_type.step_law(motion, parameters, self.times[k], memory)
         return replace_commands(self.demand_commands(*demands), w), memory

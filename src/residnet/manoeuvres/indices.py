@@ -1,7 +1,7 @@
 """Manoeuvring indices from logged motion: turning circle, zigzag, stopping; and IMO's limits.
 
 Crossings and peaks are found between samples. Definitions as in IMO resolution MSC.137(76) and
-ITTC procedure 7.5-02-06-01. All SI and rad; lengths also in hull lengths. The limits are those of
+ITTC procedure 7.5-02-06-01. All SI and rad; lengths also in hull lengths. The limits are from
 the resolution, Standards for Ship Manoeuvrability, for ships of 100 m and more.
 """
 
@@ -232,7 +232,7 @@ def zigzag_indices(
     An overshoot is how far the heading goes beyond its bound after a reversal. The time to check
     yaw is from the first reversal to the peak of the heading; the overshoot width is how far the
     track moves on across the initial course after that reversal; the reach is the time from the
-    first execute until the heading is back on the initial course; the period is that of a whole
+    first execute until the heading is back on the initial course; the period is the duration of a whole
     cycle, from reversal to reversal of the same side, mean over the log. The initial course is the
     heading that the log begins with.
 

@@ -266,21 +266,25 @@ class Programme(Config):
             model.double(), spec.signals.input_columns, spec.hold, actuators
         )
         logged_channels = (
-            *actuated.state,
-            *actuators.inputs[: actuators.commands],
+            *actuated.state_names,
+            *actuators.input_names[: actuators.n_commands],
             *self.disturbance.logged_inputs,
         )
         self.noise.check_sensors(logged_channels, step, name)
         if missing_inputs := [
-            channel for channel in self.disturbance.logged_inputs if channel not in actuators.inputs
+            channel
+            for channel in self.disturbance.logged_inputs
+            if channel not in actuators.input_names
         ]:
             raise ConfigError(
                 f"disturbance.wind: model '{name}' and its actuators have no input '{missing_inputs[0]}'"
             )
-        helm = Helm(actuators.demand, actuated.state, actuators.inputs, forces)
-        start = self._set_initial_state(actuated.approach(1), actuated.state, name)
+        helm = Helm(
+            actuators.commands_for_demand, actuated.state_names, actuators.input_names, forces
+        )
+        start = self._set_initial_state(actuated.make_initial_state(1), actuated.state_names, name)
         sea = TrialEnvironment(plant, wind_only, self.noise, self.seed)
-        return SimulatedVessel(name, actuated, helm, actuators.commands, start), sea
+        return SimulatedVessel(name, actuated, helm, actuators.n_commands, start), sea
 
     def _set_initial_state(self, states: Tensor, state: tuple[str, ...], craft_name: str) -> Tensor:
         for name, value in self.initial.items():

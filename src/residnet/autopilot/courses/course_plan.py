@@ -227,7 +227,7 @@ def _find_course(
     turn_maker: TurnMaker | None,
     reasons: list[tuple[float, int, str]],
 ) -> Course | None:
-    """Search the quickest valid course; returns None and appends to `reasons` if there is none.
+    """Search the quickest valid course; returns None and appends to `reasons` if none is found.
 
     If the courses of an outline violate a circle, the next outline has more clearance from it.
     """

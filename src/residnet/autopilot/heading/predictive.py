@@ -335,7 +335,7 @@ class PredictiveConfig(_PredictiveLawConfig):
             document's 0.01 s (corrections, "The controller of document 004").
         candidates: number of rudder angles that are compared, evenly spaced between the limits.
         weight: weight in (6.4) of the angle that is best for the heading error, from 0 to 1; the
-            angle that is best for the yaw rate has the rest.
+            angle that is best for the yaw rate has the complement.
         hidden: widths of the hidden layers; the document has 20 units for Nomoto's model and 30 for
             the 4-DOF vessel.
         linear: leave the activations out, as the document's listing does (correction G21).

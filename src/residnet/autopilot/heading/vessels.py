@@ -23,7 +23,7 @@ from residnet.core.errors import ConfigError, FitError
 from residnet.core.names import suggest_name
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.manoeuvres.actuated import commanded
+from residnet.manoeuvres.actuated import command_name_for
 from residnet.physics.plant import HullPlant, Plant
 from residnet.physics.symmetry import get_dof
 
@@ -400,7 +400,7 @@ class SteeredModel(SteeredVessel):
         self.has_free_step = model.n_state == 0
         self.input_indices: list[int] = []
         for name in input_names:
-            command = commanded(name)
+            command = command_name_for(name)
             if command not in vessel.inputs:
                 raise ConfigError(
                     f"the model is driven by '{name}', which the vessel does not"

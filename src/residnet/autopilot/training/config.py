@@ -48,7 +48,7 @@ class PolicyTraining(OneStage):
         quiet: fraction of the simulations of a batch without noise and slow disturbance, which show
             limit cycles; half of them have vessels at corners of the ranges, a quarter has the
             nominal vessel without delay.
-        calm: penalty in s of a variance of 1 deg^2 of the rudder command in the last third of those
+        calm: penalty in s of a variance of 1 deg^2 of the rudder command in the last third of these
             simulations, averaged over the worst quarter; half of the swing that `steady` allows has
             no penalty.
         exact: penalty in s of one degree of overshoot of the nominal vessel.

@@ -134,16 +134,16 @@ def _build_craft(
     spec, model = fitted_model.spec, fitted_model.model.double()
     gear = GivenActuators(inputs, spec.signals.exogenous, spec.dt)
     actuated = ActuatedDynamics(model, spec.signals.input_columns, spec.hold, gear)
-    start = actuated.approach(1)
+    start = actuated.make_initial_state(1)
     for name, value in config.initial.items():
-        if name not in actuated.state:
+        if name not in actuated.state_names:
             raise ConfigError(
                 f"booklet.initial: '{config.model}' has no state"
-                f" '{name}'{suggest_name(name, actuated.state)}"
+                f" '{name}'{suggest_name(name, actuated.state_names)}"
             )
-        start[:, actuated.state.index(name)] = float(value)
-    helm = Helm(gear.demand, actuated.state, gear.inputs)
-    return SimulatedVessel(config.model, actuated, helm, gear.commands, start)
+        start[:, actuated.state_names.index(name)] = float(value)
+    helm = Helm(gear.commands_for_demand, actuated.state_names, gear.input_names)
+    return SimulatedVessel(config.model, actuated, helm, gear.n_commands, start)
 
 
 def _simulate_draws(
