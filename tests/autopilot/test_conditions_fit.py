@@ -137,6 +137,6 @@ def test_the_conditions_and_the_guide_follow_the_progress() -> None:
     settings = PolicyTraining(nominal=0.05, spread=0.15)
     assert [settings.share(p) for p in (0.0, 0.05, 0.15, 1.0)] == [0.0, 0.0, 1.0, 1.0]
     assert settings.share(0.1) == pytest.approx(0.5)
-    assert settings.guiding(0.0) == settings.guide
-    assert settings.guiding(0.3) == pytest.approx(0.5 * settings.guide)
-    assert settings.guiding(0.6) == 0.0
+    assert settings.error_weight(0.0) == settings.guide
+    assert settings.error_weight(0.3) == pytest.approx(0.5 * settings.guide)
+    assert settings.error_weight(0.6) == 0.0

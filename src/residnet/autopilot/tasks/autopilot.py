@@ -174,9 +174,9 @@ class AutopilotConfig(ComputingTask):
         vessel: name or file of the vessel.
         rudder: largest rudder angle in rad that controllers may use.
         turning_time: time in s until the turn at that angle is steady.
-        pace: multiple of all times in `test`, `conditions` and the trainings of `policies`, delays
-            excepted; `vessel` for the ratio of the vessel's turning time to the vessel of document 004 for
-            a heading change.
+        pace: factor on all times in `test`, `conditions` and the trainings of `policies`, except
+            delays; `vessel` for the turning time of the vessel divided by the turning time of the
+            vessel of document 004.
         test: the step of the heading reference that all controllers fly, over the vessels of
             `conditions.stated`.
         conditions: that all controllers are tuned, trained and judged under; null to compare peers

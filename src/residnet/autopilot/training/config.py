@@ -103,6 +103,6 @@ class PolicyTraining(OneStage):
             return 1.0
         return max(progress - self.nominal, 0.0) / max(self.spread - self.nominal, 1e-9)
 
-    def guiding(self, progress: float) -> float:
+    def error_weight(self, progress: float) -> float:
         """Return the weight of the integral of the absolute error at a progress 0 to 1."""
         return self.guide * max(1.0 - progress / self.faded, 0.0)

@@ -184,7 +184,7 @@ class PolicyFit(EpochTraining):
         metrics = trajectories.step_metrics(self.conditions)
         loss: Tensor = (
             metrics["cost"].mean()
-            + settings.guiding(progress) / self.conditions.overshoot_unit * metrics["iae"].mean()
+            + settings.error_weight(progress) / self.conditions.overshoot_unit * metrics["iae"].mean()
         )
         if n_quiet > 0:
             loss = loss + self._penalty_weight() * self._limit_cycle_penalty(
