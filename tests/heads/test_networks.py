@@ -349,7 +349,7 @@ def test_scales_are_those_of_both_sides() -> None:
 @pytest.mark.parametrize("kind", ["mlp", "lstm"])
 @pytest.mark.parametrize("name", ["trim", "n_port"])
 def test_a_mirror_of_unknown_channels_is_a_configuration_error(kind: str, name: str) -> None:
-    with pytest.raises(ConfigError, match=f"mirror.*{name}.*leave `mirror` out"):
+    with pytest.raises(ConfigError, match=f"mirror.*{name}.*remove `mirror`"):
         MIRRORED[kind].build(("u", "v", "r", name))
 
 

@@ -103,9 +103,9 @@ def test_a_chain_adds_up_and_leaves_what_its_corrections_do_not_explain() -> Non
     [
         ("u_dot", -2400.0, FitError, "cannot be solved"),
         ("u_dot", -2389.65, FitError, "condition"),
-        ("u_dot u", 0.0, ConfigError, "only by themselves"),
-        ("u_dot^2", 0.0, ConfigError, "only by themselves"),
-        ("|v_dot|", 0.0, ConfigError, "only by themselves"),
+        ("u_dot u", 0.0, ConfigError, "only be a term by itself"),
+        ("u_dot^2", 0.0, ConfigError, "only be a term by itself"),
+        ("|v_dot|", 0.0, ConfigError, "only be a term by itself"),
     ],
 )
 def test_what_cannot_run_forward_is_refused(

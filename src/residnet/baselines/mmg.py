@@ -231,7 +231,7 @@ class MMGForces(nn.Module):
         speed = torch.sqrt(u * u + v * v + self.min_speed_squared)
         v_nondim = v / speed
         r_nondim = r * self.length / speed
-        # hull
+        # hull forces are polynomials of the non-dimensional velocities (eqs. (7) to (9))
         pressure = self.pressure_factor * speed * speed
         x_hull = (
             -R_0 * (u / speed) ** 2
@@ -258,7 +258,7 @@ class MMGForces(nn.Module):
             + N_vrr * v_nondim * r_nondim * r_nondim
             + N_rrr * r_nondim**3
         )
-        # propeller: the inflow changes with its drift angle, to both sides differently
+        # propeller: the wake fraction depends on the drift angle, asymmetrically
         propeller_drift = -v_nondim - self.x_P * r_nondim
         wake_ratio = torch.where(propeller_drift > 0, C_2p, C_2n)
         inflow = (
@@ -273,7 +273,7 @@ class MMGForces(nn.Module):
             + self.k2 * inflow * inflow
         )
         thrust = (1 - t_P) * self.density * self.diameter**2 * thrust_loading
-        # rudder, partly in the propeller's race
+        # rudder: part of the span is in the slipstream of the propeller
         race_velocity = torch.sqrt(
             torch.clamp(
                 inflow * inflow + 8.0 / math.pi * thrust_loading, min=self.min_speed_squared
@@ -294,7 +294,7 @@ class MMGForces(nn.Module):
         )
         x_rudder = -(1 - t_R) * normal_force * torch.sin(delta)
         side_force = -normal_force * torch.cos(delta)
-        # rigid body and added mass
+        # equations of motion about midship, solved for the accelerations
         mass_scale = self.pressure_factor * self.length
         mass_x = self.mass + m_x * mass_scale
         mass_y = self.mass + m_y * mass_scale

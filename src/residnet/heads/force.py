@@ -137,8 +137,8 @@ class ForceHead(RenamedStateModule, ClosedFormHead):
         }
         notes = solution.notes | {"space": "force", "augmented_mass": augmented_mass.tolist()}
         if self.constant_forces:
-            # its equation of motion then holds up to a factor, and only the penalty and free runs
-            # keep that near one
+            # the equation of motion is then identifiable up to a factor only; the penalty and free
+            # runs keep the factor near one
             notes["forces_that_never_vary"] = self.constant_forces
         return Solution(solution.hyperparameters, state, notes=notes)
 

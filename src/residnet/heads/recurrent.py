@@ -113,6 +113,7 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
         Innovations are zero if they are not appended to the channels.
         """
         if z.shape[-1] > self.n_channels:
+            # large innovations are outliers or faults: limit their effect smoothly
             z, innovation = z.split([self.n_channels, self.n_dof], dim=-1)
             innovation = self.innovation_clip * torch.tanh(
                 innovation / (self.innovation_clip * self.scale.std.to(z.dtype))
@@ -137,12 +138,13 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
         """Return the next memories [K, B, H], given the input part of the gates [K, B, 3 H]."""
         hidden_size = self.n_state
         hidden = s.reshape(self.batch_ensemble_size, -1, hidden_size)
-        # splits in place of slices: their gradients are joined and not added up
+        # split instead of slices, because gradients of slices are summed over full-size tensors
         gates, candidate = input_gates.split([2 * hidden_size, hidden_size], dim=-1)
         hidden_gates, hidden_candidate = torch.bmm(hidden, self.hidden_weight).split(
             [2 * hidden_size, hidden_size], dim=-1
         )
         update_gate, reset_gate = torch.sigmoid(gates + hidden_gates).chunk(2, dim=-1)
+        # the gate is the share retained over the training step; take its root for shorter steps
         if self.step_ratio != 1.0:
             update_gate = torch.exp(
                 self.step_ratio * torch.log(update_gate.clamp(min=self.min_gate))

@@ -208,14 +208,14 @@ def find_best_delay(
         for library, target in zip(libraries, delayed.target.T, strict=True):
             columns = library(z).numpy()
             columns = columns / np.maximum(np.linalg.norm(columns, axis=0), _MIN_NORM)
-            # candidates may be collinear: what rounding cannot tell apart shares its part
+            # candidates may be collinear, so use the pseudoinverse
             gram_inverse = np.linalg.pinv(
                 columns.T @ columns, rcond=_RANK_TOLERANCE, hermitian=True
             )
             target_energy = float(target @ target)
             projection = columns.T @ target
             rss = max(target_energy - float(projection @ gram_inverse @ projection), 0.0)
-            # what rounding leaves of a perfect fit is no evidence
+            # differences at the level of rounding errors must not decide between delays
             profile[delay_steps] += np.log(rss + _ROUNDING_SHARE * target_energy + _MIN_NORM) / len(
                 terms
             )
@@ -404,6 +404,7 @@ class SymbolicHead(EquationHead):
         terms: list[list[str]] = [linear_terms] * self.n_dof
         tried_delays: list[int] = []
         profile = np.zeros(0)
+        # alternate between the delay and the terms until the delay does not change
         while len(tried_delays) < 2 or (
             tried_delays[-1] != tried_delays[-2] and len(tried_delays) < _MAX_DELAY_ROUNDS
         ):

@@ -290,6 +290,7 @@ class HullPlant(Plant):
             else self.actuators.derivative(actuator_states, command)
         )
         pose_derivative = self._pose_derivative(pose, nu)
+        # without environment the velocities over ground are those through the water
         if not self.has_environment:
             tau = (
                 w.narrow(-1, c, n)
@@ -307,6 +308,7 @@ class HullPlant(Plant):
         current, current_derivative = self._current_in_body_axes(
             w[:, c + n], w[:, c + n + 1], pose, nu
         )
+        # hydrodynamic and actuator forces depend on the velocity through the water
         relative_velocity = nu - current
         tau = w[:, c : c + n]
         if not is_force_included:
@@ -338,6 +340,7 @@ class HullPlant(Plant):
             )
         if not self.has_roll:
             return torch.stack((*to_earth(u, v, pose[..., 2]), nu[..., 2]), dim=-1)
+        # without pitch and heave, roll only tilts the sway velocity and the yaw axis
         cos_phi = torch.cos(pose[..., 2])
         north, east = to_earth(u, v * cos_phi, pose[..., 3])
         return torch.stack((north, east, nu[..., 2], nu[..., 3] * cos_phi), dim=-1)

@@ -258,6 +258,7 @@ class FitnessEvaluator:
         missing = sorted(products - self._cache_rows.keys())
         if not missing:
             return
+        # non-finite and zero columns are marked as unusable instead of raising an error
         values = self._evaluator.evaluate(missing)
         with np.errstate(over="ignore", invalid="ignore"):
             rms = np.sqrt(np.square(values[:, : self.n_train]).mean(axis=1))
@@ -275,6 +276,7 @@ class FitnessEvaluator:
         ]
         x = columns[..., : self.n_train]
         x_validation = columns[..., self.n_train :]
+        # a singular Gram matrix is replaced by the identity, and its result is discarded below
         gram = x @ x.transpose(1, 2) / self.n_train
         cholesky_factor, info = torch.linalg.cholesky_ex(gram)
         right_hand_side = (x @ self.y / self.n_train)[..., None]
@@ -388,6 +390,7 @@ def evolve(
             f" {int(is_training.sum())} of {len(is_training)} samples are for training; give more"
             " manoeuvres"
         )
+    # thin the training samples evenly; all validation samples are used
     training_rows = np.flatnonzero(is_training)
     thinned_index = (
         np.linspace(0, len(training_rows) - 1, min(config.rows, len(training_rows)))
@@ -741,6 +744,7 @@ def evolve_equation(
         if config.final is None
         else find_equation(all_candidates, 0, config.final)
     )
+    # the reduced problem sorts and removes candidates, so map its terms back to products
     products = tuple(candidate_terms[names.index(name)] for name in equation_fit.terms)
     coefficient_values = tuple(equation_fit.values.tolist())
     standard_errors = tuple(equation_fit.standard_errors.tolist())

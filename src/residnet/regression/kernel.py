@@ -122,6 +122,7 @@ def fit_primal_path(
         for f in range(n_folds)
     ]
     errors = torch.zeros(len(penalties), y.shape[1], dtype=y.dtype)
+    # fit on the R factors of the other folds, and evaluate on that of the fold
     for f, fold_factor in enumerate(fold_factors):
         weights, _ = _ridge_weights(
             _qr_factor(
@@ -273,6 +274,7 @@ class RbfKernel(Kernel):
             eigenvalues, eigenvectors = torch.linalg.eigh(
                 torch.exp(-squared_distances(points, points) / (2 * sigma))
             )
+            # whitening with the significant eigenvectors of the kernel of the landmarks
             is_significant = eigenvalues > _RANK_TOLERANCE * eigenvalues[-1]
             whitening = eigenvectors[:, is_significant] / eigenvalues[is_significant].sqrt()
 

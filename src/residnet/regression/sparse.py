@@ -153,6 +153,7 @@ def reduce_problem(
             f"sparse regression: {x.shape[0]} samples do not determine {excited.size} candidates;"
             " give longer logs or fewer candidates"
         )
+    # unit columns make the diagonal of the R factor comparable between candidates
     scale = np.linalg.norm(x[:, excited], axis=0)
     r_factor = _r_factor(np.concatenate((x[:, excited] / scale, y), axis=1))
     all_candidates = ReducedProblem(
@@ -315,6 +316,7 @@ class ForwardSearch:
         subsets = np.zeros((1, 0), dtype=int)
         sizes_without_gain = 0
         while subsets.shape[1] < self.max_terms and sizes_without_gain < _MAX_SIZES_WITHOUT_GAIN:
+            # the best extensions of all subsets, without duplicates
             rss_table = rss_with_one_added(self.r, self.y, subsets)
             order = np.argsort(rss_table, axis=None)[: 4 * _BEAM_WIDTH]
             order = order[np.isfinite(rss_table.ravel()[order])]
@@ -523,6 +525,7 @@ def _equivalent_terms(
     """Return, per term, the candidates that could replace it without strong evidence against."""
     if not subset:
         return {}
+    # replace each term by every other candidate, and keep those with a similar criterion
     criterion_limit = search.criterion_of(subset) + _STRONG_EVIDENCE
     reduced_subsets = [[column for column in subset if column != removed] for removed in subset]
     subsets = np.array(reduced_subsets, dtype=int).reshape(len(subset), -1)

@@ -224,6 +224,7 @@ class Servo(nn.Module):
         Raises:
             ConfigError: if dt is not the step of the delay line.
         """
+        # without lag the position moves to its target at the limited rate
         lag_states = states[..., : self.n_lag_states]
         if self.n_lag_states > 0 and not self.has_lag:
             max_change = self.rate_limit * dt
@@ -238,6 +239,7 @@ class Servo(nn.Module):
                 f" steps by {dt:g} s; set delay_step to the time step of the plant (data.step"
                 " divided by data.substeps)"
             )
+        # shift the delay line by one step
         newest_command = command.clamp(-self.limit, self.limit)
         return torch.cat(
             (lag_states, newest_command, states[..., self.n_lag_states : -self.n_actuators]), dim=-1

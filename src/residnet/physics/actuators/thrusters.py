@@ -306,7 +306,7 @@ class AzimuthThrusters(ForceActuators):
 
         The result has no gradient.
         """
-        # Newton's method from a table of the curve, which rises, within the table's interval
+        # Newton's method from linear interpolation in a table, bounded by the table interval
         thrust_table = self.thrust_table.to(force.dtype)
         upper_index = torch.searchsorted(thrust_table[1].contiguous(), force.contiguous())
         upper_index = upper_index.clamp(1, thrust_table.shape[1] - 1)
