@@ -23,8 +23,8 @@ from residnet.identification.monitoring import (
     OnlineChangeDetector,
     ScoreDistribution,
     compute_robust_score_sums,
+    estimate_score_inflation,
     fit_score_distribution,
-    wider,
 )
 from residnet.identification.recursive_refit import refit_recursively
 from residnet.testing.checks import EXAMPLE_TIME_STEP, make_example_model, make_example_spec
@@ -268,9 +268,9 @@ def test_what_lasts_for_a_stretch_makes_its_scores_lie_wider() -> None:
     scatter = fit_score_distribution(held)
     spread = scores(scatter, 300, lambda: sailed(1, 1))
     assert spread > 1.3
-    assert 0.75 < spread / wider(held, fold, 5) < 1.25
+    assert 0.75 < spread / estimate_score_inflation(held, fold, 5) < 1.25
     free = joined(*(groups(random, 8, 1, UNCHANGED, 0.5) for _ in range(5)))
-    assert wider(free, np.arange(5).repeat(8), 5) < 1.2
+    assert estimate_score_inflation(free, np.arange(5).repeat(8), 5) < 1.2
 
 
 def test_one_log_at_odds_with_the_others_does_not_speak_for_all() -> None:
