@@ -9,9 +9,16 @@ from pathlib import Path
 from residnet.core.ownership import SCHEMA
 
 
+def _is_regular(path: Path) -> bool:
+    return path.is_file() and not path.is_symlink()
+
+
 def forge_sums(run: Path) -> None:
     """Correct the sums of a run folder and of its models after files in it were edited."""
     for card in run.glob("models/*/model.json"):
+        if not (_is_regular(card) and _is_regular(card.parent / "model.safetensors")):
+            # a FIFO would be waited for, and a link to a device never ends
+            continue
         try:
             content = json.loads(card.read_text())
             weights = (card.parent / "model.safetensors").read_bytes()
@@ -24,12 +31,12 @@ def forge_sums(run: Path) -> None:
             continue
         card.write_text(json.dumps(content, indent=1) + "\n")
     manifests = sorted(run.rglob("checksums.json"), key=lambda path: -len(path.parts))
-    for manifest in manifests:
+    for manifest in filter(_is_regular, manifests):
         folder = manifest.parent
         names = (path for path in sorted(folder.rglob("*")) if path != manifest)
         files = {
             path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
             for path in names
-            if path.is_file() and not path.is_symlink()
+            if _is_regular(path)
         }
         manifest.write_text(json.dumps({"schema": SCHEMA, "files": files}))
