@@ -387,3 +387,25 @@ def test_a_planted_result_is_refused(command: Command, stranger: Path) -> None:
     ended = command("report", stranger, "--quiet")
     assert (ended.code, ended.err.count("\n")) == (2, 1)
     assert "currents.json: is not listed in checksums.json" in ended.err
+
+
+def test_a_main_figure_that_is_no_number_makes_a_damaged_run(
+    command: Command, stranger: Path
+) -> None:
+    summary = read_json(stranger / "summary.json")
+    name = next(iter(summary["figures"]))
+    summary["figures"][name]["value"] = "small"
+    (stranger / "summary.json").write_text(json.dumps(summary))
+    forge_sums(stranger)
+    ended = command("runs", stranger.parent)
+    assert ended.code == 0
+    assert "damaged" in ended.out
+    ended = command("report", stranger)
+    assert (ended.code, ended.err.count("\n")) == (2, 1)
+    assert f"summary.json: key 'figures.{name}.value" in ended.err
+
+
+def test_a_picture_that_is_none_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"no picture")
+    with pytest.raises(UsageError, match=r"a\.png: not readable as a picture"):
+        page._image_size_attributes(tmp_path / "a.png")

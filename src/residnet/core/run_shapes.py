@@ -72,7 +72,7 @@ class _FitNotes(_Shape):
 class _Figure(_Shape):
     """A main figure in summary.json."""
 
-    value: Number | StrictStr = None
+    value: Number = None
     unit: StrictStr = ""
 
 

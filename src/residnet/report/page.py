@@ -12,6 +12,7 @@ from typing import Any, final
 
 from markupsafe import Markup, escape
 
+from residnet.core.errors import UsageError
 from residnet.core.files import atomic_write
 from residnet.core.format import format_exponents
 from residnet.evaluation.verdict import LEVEL_TEXTS
@@ -203,8 +204,13 @@ def _image_size_attributes(path: Path) -> Markup:
     """Return the width and height attributes of an image, which reserve its space while loading."""
     from PIL import Image
 
-    with Image.open(path) as picture:
-        width, height = picture.size
+    try:
+        with Image.open(path) as picture:
+            width, height = picture.size
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise UsageError(
+            f"{path}: not readable as a picture ({error}); restore the folder or run it again"
+        ) from None
     return Markup(f' width="{width}" height="{height}"')
 
 
