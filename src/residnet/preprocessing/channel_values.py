@@ -48,7 +48,7 @@ def estimate_noise_std(values: np.ndarray) -> float:
 
 
 def nan_quantiles(values: np.ndarray, *levels: float) -> list[float]:
-    """Return quantiles of the values [T] that are not NaN; NaN if there are none.
+    """Return quantiles of the values [T] that are not NaN; NaN for an empty selection.
 
     The result equals numpy.nanquantile, which takes ten times as long for a short log.
     """
@@ -76,12 +76,12 @@ def nan_quantiles(values: np.ndarray, *levels: float) -> list[float]:
 
 
 def nan_median(values: np.ndarray) -> float:
-    """Return the median of the values [T] that are not NaN; NaN if there are none."""
+    """Return the median of the values [T] that are not NaN; NaN for an empty selection."""
     return nan_quantiles(values, 0.5)[0]
 
 
 def nan_std(values: np.ndarray) -> float:
-    """Return the standard deviation of the finite values; NaN if there are none."""
+    """Return the standard deviation of the finite values; NaN for an empty selection."""
     finite_values = values[np.isfinite(values)]
     if not finite_values.size:
         return np.nan

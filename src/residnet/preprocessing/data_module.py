@@ -74,8 +74,8 @@ class EpochBatches:
 class WindowBatch(NamedTuple):
     """Batch of B windows of L samples.
 
-    The other attributes are those of `PreparedLog` [B, L, ...], with positions relative to the
-    start of the log.
+    The other attributes are described in `PreparedLog` [B, L, ...], with positions relative
+    to the start of the log.
 
     Attributes:
         past_y: measured states before the window [B, H, 3 + n].

@@ -62,7 +62,7 @@ class MotionConfig(Config):
     median intervals remain gaps.
 
     Attributes:
-        antenna: lever arm of the antenna; null if x and y are those of the vessel's centre.
+        antenna: lever arm of the antenna; null if x and y refer to the vessel's centre.
         delay: delay of the positions in s: x and y at t are the position at t - delay.
     """
 
@@ -469,7 +469,7 @@ def fill_sparse(log: Log, channel_names: tuple[str, ...], held_channels: tuple[s
 
 
 def _is_dense(values: np.ndarray) -> bool:
-    """Return whether a channel has values at nearly all samples, apart from gaps."""
+    """Return whether a channel has values at nearly all samples outside of gaps."""
     intervals = np.diff(np.flatnonzero(np.isfinite(values)))
     return bool(
         intervals.size

@@ -288,7 +288,7 @@ def make_samples(logs: Sequence[PreparedLog], signals: Signals) -> Samples:
     The samples contain smoothed channels and measured accelerations.
 
     Raises:
-        DataError: if there are none.
+        DataError: if no log has trainable samples.
     """
     if not any(log.trainable.any() for log in logs):
         raise DataError(

@@ -20,8 +20,8 @@ from residnet.preprocessing.prepare import PreparedLog
 class WindowStore:
     """Concatenated samples of all logs, N in total.
 
-    The other attributes are those of `PreparedLog`, with positions relative to the start of the
-    log.
+    The other attributes are described in `PreparedLog`, with positions relative to the start
+    of the log.
 
     Attributes:
         n_remaining: samples up to the end of the segment, including this one [N]; 0 outside of
