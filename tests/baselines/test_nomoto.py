@@ -148,7 +148,7 @@ def test_what_does_not_settle_or_is_not_there_is_an_error() -> None:
     samples = made()
     unstable = samples.target.clone()
     unstable[:, 2] += samples.channel("r")
-    with pytest.raises(FitError, match="needs a stable r, .* use a baseline"):
+    with pytest.raises(FitError, match=r"needs a stable r, .* use a baseline"):
         parameters(NomotoBaselineConfig(), samples.with_target(unstable))
     with pytest.raises(FitError, match="turning"):
         parameters(NomotoBaselineConfig(manoeuvres=("turning",)), samples)
