@@ -213,7 +213,7 @@ def test_a_header_that_is_wrong_is_asked_about(logs: list[Log], tmp_path: Path) 
     assert [question.options for question in asked] == [("deg/min", "deg/s")]
     marks = DraftNotes()
     draft_tables(files, marks)
-    assert any("the header says deg/s" in text for _, text in marks.guessed_values)
+    assert any("the header has deg/s" in text for _, text in marks.guessed_values)
 
 
 def _told(work: Callable[..., object], files: Sequence[Path]) -> dict[str, Any]:

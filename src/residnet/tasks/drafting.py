@@ -31,7 +31,14 @@ from residnet.core.names import (
 from residnet.core.ownership import require_replaceable
 from residnet.core.progress import log_message
 from residnet.io.drafting.channels import CHANNELS_KEY
-from residnet.io.drafting.questions import AnswerCallback, DraftNotes, dump_commented_yaml
+from residnet.io.drafting.questions import (
+    TEXT_COLUMNS,
+    UNMAPPED_COLUMNS,
+    UNMAPPED_FIELDS,
+    AnswerCallback,
+    DraftNotes,
+    dump_commented_yaml,
+)
 from residnet.io.drafting.reading import INPUTS_KEY, find_log_files, read_drafted
 from residnet.io.header_vocabulary import (
     PLANE_PATTERN,
@@ -50,11 +57,7 @@ from residnet.io.split import (
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.quality import inspect_log
 
-_UNMATCHED_COLUMN_NOTES = (
-    "columns that no channel takes",
-    "columns of text",
-    "fields that no channel takes",
-)
+_UNMATCHED_COLUMN_NOTES = (UNMAPPED_COLUMNS, TEXT_COLUMNS, UNMAPPED_FIELDS)
 _MAX_INSPECTED_LOGS = 12
 """Maximum number of logs that are inspected."""
 _MAX_SHOWN_GUESSES = 12

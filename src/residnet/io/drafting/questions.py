@@ -32,6 +32,10 @@ class Question:
     options: tuple[str, ...] = ()
 
 
+UNMAPPED_COLUMNS = "columns without a channel"
+UNMAPPED_FIELDS = "fields without a channel"
+TEXT_COLUMNS = "columns of text"
+"""Starts of the notes that list columns and fields which the draft does not use."""
 _LINE_WIDTH = 96
 """Largest width of lines in a drafted config, in characters."""
 CommentLookup = Callable[[tuple[str, ...]], list[str]]

@@ -38,7 +38,7 @@ from residnet.io.drafting.channels import (
     fit_to_motion,
     forward_alignment,
 )
-from residnet.io.drafting.questions import DraftNotes, Key
+from residnet.io.drafting.questions import UNMAPPED_FIELDS, DraftNotes, Key
 from residnet.io.drafting.tables import (
     draft_manoeuvre_setting,
     draft_tables,
@@ -277,9 +277,7 @@ def _find_named_table(
     entries = draft_channel_map(names, logs, draft_notes)
     unused_fields = [name for name in fields if name not in names.values()]
     if unused_fields:
-        draft_notes.add_note(
-            CHANNELS_KEY, f"fields without a channel: {', '.join(unused_fields[:20])}"
-        )
+        draft_notes.add_note(CHANNELS_KEY, f"{UNMAPPED_FIELDS}: {', '.join(unused_fields[:20])}")
     settings: dict[str, Any] = {"standard_messages": False}
     for position_kind, channel_pair, keys in (
         ("local", ("x", "y"), ("north", "east")),

@@ -26,7 +26,7 @@ from residnet.io.drafting.channels import (
     find_quaternions,
     find_sin_cos_pairs,
 )
-from residnet.io.drafting.questions import DraftNotes
+from residnet.io.drafting.questions import TEXT_COLUMNS, UNMAPPED_COLUMNS, DraftNotes
 from residnet.io.header_vocabulary import (
     DATE_PART_NAMES,
     GERMANIC_PATTERN,
@@ -647,16 +647,14 @@ def _note_unused_columns(
     used_columns = {*names.values(), *clock.columns}
     unused_columns = [name for name in preview.numeric_columns if name not in used_columns]
     if unused_columns:
-        draft_notes.add_note(
-            CHANNELS_KEY, f"columns without a channel: {', '.join(unused_columns[:20])}"
-        )
+        draft_notes.add_note(CHANNELS_KEY, f"{UNMAPPED_COLUMNS}: {', '.join(unused_columns[:20])}")
     texts = [
         f"{name} ('{truncate(str(cells.dropna().iloc[0]), 20)}')"
         for name, cells in preview.text_columns.items()
         if name not in used_columns
     ]
     if texts:
-        draft_notes.add_note(CHANNELS_KEY, f"columns of text: {', '.join(texts[:12])}")
+        draft_notes.add_note(CHANNELS_KEY, f"{TEXT_COLUMNS}: {', '.join(texts[:12])}")
     if preview.empty_columns:
         draft_notes.add_note(
             CHANNELS_KEY, f"empty columns: {', '.join(preview.empty_columns[:12])}"

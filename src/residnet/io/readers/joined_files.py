@@ -225,7 +225,12 @@ class JoinedConfig(ConfiguredReader):
                 f" assumed to start at the same time: {advice}"
             )
             return float(log.t[0] - other_log.t[0]), make_remark("will mislead", "joined", text)
-        offset_figures = estimate._asdict()
+        # keys of the log's meta, which stay as they were in earlier versions
+        offset_figures = {
+            "seconds": estimate.seconds,
+            "explained": estimate.explained_share,
+            "other": estimate.runner_up_share,
+        }
         is_unambiguous = 1.0 - estimate.runner_up_share >= _MIN_VARIANCE_RATIO * (
             1.0 - estimate.explained_share
         )
