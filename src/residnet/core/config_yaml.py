@@ -19,8 +19,10 @@ from residnet.core.errors import ConfigError
 KeyPath = tuple[str | int, ...]
 """Path to a value of a config: keys of mappings and indices of lists."""
 
-_MAX_VALUES, _MAX_DEPTH, _MAX_DIGITS = 200_000, 60, 400
-"""Limits on values, nesting levels and digits, chosen by hand: far more take minutes to parse."""
+# limits on values, nesting levels and digits, chosen by hand: far more take minutes to parse
+_MAX_VALUES = 200_000
+_MAX_DEPTH = 60
+_MAX_DIGITS = 400
 _TAG_PREFIX = "tag:yaml.org,2002:"
 # the first match counts: a whole number is also a valid float
 _SCALAR_TAGS: tuple[tuple[str, str, str], ...] = (

@@ -18,8 +18,9 @@ from typing import Any
 from residnet.core.errors import FitError
 from residnet.core.trust import is_trusted, set_trusted
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
-"""Parameter numbers of `mallopt` in malloc.h of the GNU C library."""
+# parameter numbers of `mallopt` in malloc.h of the GNU C library
+_TRIM_THRESHOLD = -1
+_MMAP_THRESHOLD = -3
 _MAX_KEPT_BYTES = 128 << 20
 _MAX_REUSED_BYTES = 64 << 20
 

@@ -22,7 +22,9 @@ NEGLIGIBLE_MOTION_SHARE = 1e-3
 SPIKE_REASON = "spike"
 # distance of a spike from the median of its neighbours, in 99 % quantiles of the change between
 # samples or of the distance from that median, and largest length of a spike in samples
-_MIN_SPIKE_CHANGES, _MIN_SPIKE_DISTANCES, _MAX_SPIKE_SAMPLES = 12.0, 30.0, 2
+_MIN_SPIKE_CHANGES = 12.0
+_MIN_SPIKE_DISTANCES = 30.0
+_MAX_SPIKE_SAMPLES = 2
 # lower bound of both limits, in 99 % quantiles of the change between samples
 _MIN_CHANGES_FOR_SCAN = 3.0
 # alternative limit: distance outside the range of the log, in ranges
@@ -31,8 +33,10 @@ _MIN_SAMPLES = 20
 """Smallest number of samples for the detection of spikes; chosen by hand."""
 CACHED_SAMPLES = 8_192
 """Samples per chunk, so that the neighbours fit into the cache of a core."""
-_MAX_SUBSAMPLE, _N_SUBSAMPLE_SEGMENTS = 40_000, 40
-"""Number of samples for quantiles of a long channel, and number of stretches that form them."""
+_MAX_SUBSAMPLE = 40_000
+"""Number of samples for quantiles of a long channel."""
+_N_SUBSAMPLE_SEGMENTS = 40
+"""Number of stretches that form these samples."""
 
 
 def estimate_noise_std(values: np.ndarray) -> float:
@@ -545,8 +549,10 @@ _SENSOR_GROUPS = (("x", "y"), ("u", "v"), ("psi",), ("r",))
 """Channels of one sensor: one may be equal in two measurements, all of them rarely are."""
 _MIN_INTERVALS = 20
 """Smallest number of update intervals for an estimate of their median."""
-INTERVAL_TOLERANCE, MIN_REGULAR_SHARE = 0.25, 0.9
-"""Relative tolerance of a regular interval, and smallest share of regular intervals."""
+INTERVAL_TOLERANCE = 0.25
+"""Relative tolerance of a regular interval."""
+MIN_REGULAR_SHARE = 0.9
+"""Smallest share of regular intervals."""
 
 
 def median_update_interval(values: np.ndarray) -> float:

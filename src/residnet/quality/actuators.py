@@ -45,7 +45,8 @@ def find_propellers(log: LogStatistics) -> list[str]:
 
 
 # limits of the yaw angle per revolution at full rudder in rad; vessels have .003 to .03
-_MIN_TURN_RATIO, _MAX_TURN_RATIO = 8e-4, 0.3
+_MIN_TURN_RATIO = 8e-4
+_MAX_TURN_RATIO = 0.3
 # largest plausible propeller revolutions in 1/s
 _MAX_REVOLUTIONS = 250.0
 _FULL_RUDDER = 0.35
@@ -303,7 +304,9 @@ _WIDER_RANGE_FIX = "log with a wider range, or exclude these parts"
 
 
 # smallest share of time at the limit, ratio of the yaw moments, and t statistic of the difference
-_MIN_SHARE_AT_LIMIT, _MIN_EFFECT_RATIO, _MIN_T_STATISTIC_AT_LIMIT = 0.03, 1.3, 4.5
+_MIN_SHARE_AT_LIMIT = 0.03
+_MIN_EFFECT_RATIO = 1.3
+_MIN_T_STATISTIC_AT_LIMIT = 4.5
 
 
 @check(
@@ -390,7 +393,8 @@ def _excess_turning_at_limit(log: LogStatistics, is_at_limit: np.ndarray) -> flo
 
 # smallest ratios of residual sums of squares: unshifted over shifted inputs, and without over with
 # steering
-_MIN_SHIFT_IMPROVEMENT, _MIN_STEERING_IMPROVEMENT = 1.3, 1.2
+_MIN_SHIFT_IMPROVEMENT = 1.3
+_MIN_STEERING_IMPROVEMENT = 1.2
 
 
 @check("inputs", "rudder_sign", required_channels=("r",), is_record_fault=True, on_subsample=True)
@@ -578,8 +582,10 @@ def _fit_steering_responses(
 
 # a response earlier than this in s is not an inaccuracy
 MIN_LEAD_TIME = 0.45
-# number of minima that are refined, and ratio to the smallest sum of squares of an equivalent fit
-_N_MINIMA, _MAX_EQUIVALENT_RATIO = 4, 1.15
+# number of minima that are refined
+_N_MINIMA = 4
+# ratio to the smallest sum of squares up to which fits are equivalent
+_MAX_EQUIVALENT_RATIO = 1.15
 _N_SHIFTS_PER_SIDE = 12
 """Coarse shifts to either side; chosen by hand, because each costs a fit."""
 

@@ -47,8 +47,10 @@ RIDGE = 1e-6
 """Ridge penalty over the mean of the Gram matrix's diagonal: collinear features are solvable."""
 OVERLAP = 4.0
 """Number of blocks that overlap each sample; their residuals count as one independent one."""
-MIN_BLOCKS, MAX_BLOCKS = 12, 1500
-"""Smallest number of blocks for a decision, and largest number, above which they only overlap."""
+MIN_BLOCKS = 12
+"""Smallest number of blocks of a log for a decision."""
+MAX_BLOCKS = 1500
+"""Largest number of blocks of a log; further ones only overlap."""
 CHUNK_SAMPLES = 20_000
 """Samples per chunk, so that some thirty features fit into the cache of a core."""
 POLYNOMIAL_PREFERENCE = 0.95
@@ -56,15 +58,19 @@ POLYNOMIAL_PREFERENCE = 0.95
 
 # Outlier decision, calibrated on 80 random fleets so that 3 clean ones are flagged
 # (scripts/bench/fleets.py --seed 1, 2)
-MAX_SCORE_TEST, MAX_RMSE_RATIO, MAX_RMSE_Z = 4.8, 1.8, 5.5
+MAX_SCORE_TEST = 4.8
+MAX_RMSE_RATIO = 1.8
+MAX_RMSE_Z = 5.5
 USUAL_SCORE_TEST = 1.3
 """Expected score test of a correct model: mean of the largest of three chi over their size."""
 MIN_LOG_RMSE_STD = 0.1
 """Lower bound on the standard deviation of log(RMSE) among logs of one vessel."""
 MIN_MATERIAL_ERROR = 0.15
 """Smallest mispredicted share of the response that misleads a fit."""
-MAX_SUSPECTS, MIN_SUSPICION = 8, 0.5
-"""Largest number of logs that are left out in turn, and the severity from which a log is."""
+MAX_SUSPECTS = 8
+"""Largest number of logs that are left out in turn."""
+MIN_SUSPICION = 0.5
+"""Severity from which a log is left out in turn."""
 MAX_REFERENCES = 40
 """Largest number of inliers, evenly spread, that serve as the reference of a large fleet."""
 CV_FOLDS = 4
@@ -77,14 +83,17 @@ MIN_CONTAMINATION = 1.6
 1.5 at most without one (`quickstart`; 1 in 48 random fleets); more in 33 of 36 random fleets in
 which two logs share a fault.
 """
-RANGE_MARGIN, SIZE_MARGIN = 0.1, 0.02
-"""Share of the inliers' range, or of their size, within which extrapolation is still trusted."""
+RANGE_MARGIN = 0.1
+"""Share of the inliers' range by which an input may exceed it without extrapolation."""
+SIZE_MARGIN = 0.02
+"""Share of the inliers' largest value by which an input may exceed their range."""
 
 # Motion that no input explains. Of 92 idle stretches of KVLCC2's logs none reaches 3.2; of 311 of
 # the tanker's six do, among them all three in which she accelerates with all inputs at exactly 0.
-MIN_UNEXPLAINED_Z, MAX_UNEXPLAINED_SHARE = 5.5, 0.2
-"""RMS standardized residual of an unexplained idle stretch, and the share of a log up to which
-such stretches are a manual override rather than a wrong log."""
+MIN_UNEXPLAINED_Z = 5.5
+"""Smallest RMS standardized residual of an unexplained idle stretch."""
+MAX_UNEXPLAINED_SHARE = 0.2
+"""Share of a log up to which such stretches are manual control instead of a wrong log."""
 
 Samples = Mapping[str, np.ndarray]
 """Channels at the samples of blocks, [K, samples of a block] each."""
@@ -1036,7 +1045,8 @@ def find_unexplained_idle(
 MIN_UNSTEERED_SHARE = 0.3
 # A heading that swings this far to both sides was steered: gusts cause it in at most one of ten
 # straight runs; in steered fleets at least three of ten logs do it.
-MIN_SWING, MIN_WEAVING_SHARE = math.radians(20.0), 0.2
+MIN_SWING = math.radians(20.0)
+MIN_WEAVING_SHARE = 0.2
 
 
 def find_dead_steering(consensus: Consensus) -> tuple[list[str], float]:

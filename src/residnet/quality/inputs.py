@@ -213,11 +213,10 @@ def check_rudder_unit(log: LogStatistics, make_finding: Check) -> Iterator[Findi
 _DEMAND_PATTERN = re.compile(
     r"^(cmd|ref|command|commanded|set|desired)_|_(cmd|ref|command|commanded|set|desired)(?=_|$)"
 )
-_MIN_STUCK_DURATION, _MIN_STUCK_ERROR = 5.0, 0.2
-"""Duration in s, and distance from the command as a share of its range, of a stuck actuator.
-
-Chosen by hand, above the delay and the inaccuracy of actuators.
-"""
+_MIN_STUCK_DURATION = 5.0
+"""Shortest time in s of a stuck actuator; chosen by hand, above the delay of actuators."""
+_MIN_STUCK_ERROR = 0.2
+"""Smallest distance of a stuck actuator from its command, as a share of the command's range."""
 
 
 @check("inputs", "stuck", fix="exclude this part", is_record_fault=True)

@@ -35,8 +35,10 @@ MIN_LAG = 0.2
 """Smallest lag in s that affects a rollout of a vessel."""
 _MAX_CAUSES = 4
 """Largest number of causes; chosen by hand, because further ones are collinear."""
-# smallest reduction of the sum of squares by a cause in noise variances, and smallest t statistic
-_MIN_IMPROVEMENT, _MIN_T_STATISTIC = 60.0, 3.5
+# smallest reduction of the sum of squares by a cause in noise variances
+_MIN_IMPROVEMENT = 60.0
+# smallest t statistic of a cause
+_MIN_T_STATISTIC = 3.5
 _HALF_WINDOW = SMOOTHING_SAMPLES // 2
 _IS_DISTANT = np.abs(np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)) > 1
 _LEAVE_OUT_WEIGHTS = np.zeros(SMOOTHING_SAMPLES)

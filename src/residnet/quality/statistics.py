@@ -37,8 +37,10 @@ N_SECTIONS = 20
 SMOOTHING_SAMPLES = 15
 """Window length of the parabolic smoother in samples."""
 
-_MAX_SUBSAMPLE, _N_SUBSAMPLE_SEGMENTS = 40_000, 5
-"""Size of a subsample in samples, and the number of stretches that form it.
+_N_SUBSAMPLE_SEGMENTS = 5
+"""Number of stretches that form a subsample."""
+_MAX_SUBSAMPLE = 40_000
+"""Largest number of samples of a subsample.
 
 Chosen by hand; `tests/io/test_relations.py` compares findings on the subsample and on all samples.
 """
@@ -376,7 +378,8 @@ def _section_bounds(n_rows: int) -> np.ndarray:
 
 
 # shortest block in samples and in s
-_MIN_BLOCK_SAMPLES, _MIN_BLOCK_DURATION = 16, 3.0
+_MIN_BLOCK_SAMPLES = 16
+_MIN_BLOCK_DURATION = 3.0
 # number of blocks that overlap each sample
 _BLOCK_OVERLAP = 4
 # largest number of blocks, evenly spread over a long log

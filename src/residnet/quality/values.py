@@ -395,7 +395,8 @@ def _moves_after_run(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
 
 
 # smallest share of repeated rows that is reported, and the longest run of repeats in rows
-_MIN_REPEATED_SHARE, _MAX_REPEAT = 0.1, 5
+_MIN_REPEATED_SHARE = 0.1
+_MAX_REPEAT = 5
 
 
 @check(
@@ -445,7 +446,8 @@ def check_repeated_positions(log: LogStatistics, make_finding: Check) -> Iterato
 
 
 # shortest straight stretch, in samples and in s
-_MIN_STRAIGHT_SAMPLES, _MIN_STRAIGHT_DURATION = 8, 1.0
+_MIN_STRAIGHT_SAMPLES = 8
+_MIN_STRAIGHT_DURATION = 1.0
 # largest straight share; above it, straight lines are the normal behaviour of the channel
 _MAX_STRAIGHT_SHARE = 0.4
 

@@ -99,7 +99,8 @@ def _count_file_pages(statm: Path) -> int:
     return int(statm.read_text().split()[2])
 
 
-_arena, _page_releaser = _FileArena(), _PageReleaser()
+_arena = _FileArena()
+_page_releaser = _PageReleaser()
 
 
 def allocate_on_disk(shape: tuple[int, ...], dtype: Any = np.float64) -> np.ndarray:
