@@ -47,7 +47,7 @@ def test_a_folder_is_taken_up_only_by_its_own_configuration(tmp_path: Path) -> N
         assert (folder.path, folder.resolved_config.read_text()) == (path, "a: 1\n")
     (path / "kept.txt").write_text("mine")
     folder.write_summary("fit", [], {}, is_finished=True)
-    refused("exists already; give another --out", path)
+    refused("exists already; choose another --out", path)
     refused("has another configuration", path, "a: 2\n", resume=True)
     assert RunFolder(path).is_finished
     assert RunFolder.create(path, "a: 1\n", resume=True).path == path
@@ -78,7 +78,7 @@ def test_what_is_no_run_is_left_alone(tmp_path: Path) -> None:
     for path in (file, other):
         for resume in (False, True):
             refused("exists already", path, resume=resume)
-    with pytest.raises(UsageError, match="not the folder of a run"):
+    with pytest.raises(UsageError, match="not a run folder"):
         RunFolder.create(other, "a: 2\n", overwrite=True)
     assert file.read_text() == (other / "notes.txt").read_text() == "precious"
     assert [path.name for path in other.iterdir()] == ["notes.txt"]

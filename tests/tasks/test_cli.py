@@ -190,7 +190,7 @@ def test_the_log_of_a_run_that_ends_badly_goes_on(
     write_yaml(tmp_path / "fly.yaml", FLY)
     again: list[Any] = ["run", "fly.yaml", "--out", "run", "-v", "--quiet"]
     with monkeypatch.context() as patch:
-        patch.setattr(SimulateConfig, "carry_out", broken)
+        patch.setattr(SimulateConfig, "execute", broken)
         assert command(*again).code != 0
     text = (tmp_path / "run/log.txt").read_text()
     for words in ("the wind rises\n", "in broken", type(error).__name__):

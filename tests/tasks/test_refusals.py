@@ -109,8 +109,8 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("'space={heads.ridge.penalty: {low: 0.0, high: 1.0, log: true}}'", "above zero"),
         ("'space={heads.ridge.degree: {choices: [1, 1]}}'", "each only once"),
         ("objective.model=rigde", "did you mean 'ridge'"),
-        ("'objective={kind: figure, name: nrmse}'", "must not choose anything"),
-        ("objective.model=selected pruning={}", "name the network whose training is watched"),
+        ("'objective={kind: figure, name: nrmse}'", "must not be used for selection"),
+        ("objective.model=selected pruning={}", "name the network whose training is monitored"),
     ],
     "study": [
         ("reference=recpie", "did you mean 'recipe'"),
