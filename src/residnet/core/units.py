@@ -70,7 +70,8 @@ _SPELLINGS_OF_UNIT: dict[str, str] = {
     "day": "days tag tage jour jours dag dagen",
     "Hz": "hertz",
     "kn": (
-        "kt kts knot knots knoten nd nds noeud noeuds nœud nœuds nudo nudos knoop knopen knop ノット"
+        "kt kts knot knots knoten nd nds noeud noeuds nœud nœuds nudo nudos knoop knopen knop"
+        " ノット"
     ),
     "rpm": "r.p.m. upm",
     "rps": "r.p.s.",
