@@ -56,7 +56,7 @@ def test_the_gear_is_the_plants_whatever_its_kind(vessel: str) -> None:
     for name in gear.state_names:
         if name != "_yaw_lag":
             found, wanted = (
-                mine[..., model.state.index(name)],
+                mine[..., model.state_names.index(name)],
                 truth[..., plant.state_names.index(name)],
             )
             torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9)
@@ -80,7 +80,7 @@ def test_given_gear_by_hand() -> None:
     assert [float(p) / DEG for p in path] == pytest.approx([2.5, 4.0, 4.0])
     model = ActuatedDynamics(still(("n", "delta"), 0.5), ("n", "delta"), "start", gear)
     seen = [*model.actuators.state_names, *model.actuators.input_names]
-    assert [seen[i] for i in model.take] == ["cmd_n", "delta"]
+    assert [seen[i] for i in model.input_columns] == ["cmd_n", "delta"]
     with pytest.raises(ConfigError, match="driven by 'tau'"):
         ActuatedDynamics(still(("tau",)), ("tau",), "start", gear)
 
