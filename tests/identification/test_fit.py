@@ -85,7 +85,7 @@ def test_a_band_says_why_its_model_could_not_be_fitted_without_some_logs(
     def refuse(*_: FittedModel) -> list[HybridDynamics]:
         raise FitError("the data do not excite it")
 
-    monkeypatch.setattr(LeaveFoldOutModels, "_baseline", refuse)
+    monkeypatch.setattr(LeaveFoldOutModels, "_fit_baseline_without_folds", refuse)
     bands = fit_models(logs, settings_of(bands={"folds": 2}))["baseline"].bands
     assert bands
     for band in bands.values():
@@ -113,7 +113,7 @@ def beside(**training: Any) -> FitSettings:
 def test_side_by_side_gives_the_same_models(
     logs: PreparedSplits, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(parts, "_LONG_TRAINING", 1)
+    monkeypatch.setattr(parts, "_MIN_PARALLEL_STEPS", 1)
     settings = beside()
     alone = fit_models(logs, settings)
     heard: list[Progress] = []
@@ -142,7 +142,7 @@ def test_what_ends_soon_stays_in_this_process(
     fitter = Fitter(logs, settings, FitStore())
     with worker_limit(8):
         assert parts.count_parallel_heads(fitter) == 1
-        monkeypatch.setattr(parts, "_LONG_TRAINING", 1)
+        monkeypatch.setattr(parts, "_MIN_PARALLEL_STEPS", 1)
         assert parts.count_parallel_heads(fitter) == 2
     # a program of the user's own need not be made for processes
     assert available_cores() == 1

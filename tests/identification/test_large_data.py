@@ -31,8 +31,8 @@ from residnet.regression.shrinkage import PLSR, Ridge
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take hundreds of samples for many."""
-    monkeypatch.setattr(paged, "LARGE", 500)
-    monkeypatch.setattr(paged, "PIECE", 130)
+    monkeypatch.setattr(paged, "MAX_SAMPLES_IN_MEMORY", 500)
+    monkeypatch.setattr(paged, "CHUNK_ROWS", 130)
 
 
 @pytest.mark.long
@@ -114,7 +114,7 @@ def pages() -> int:
 
 @LINUX
 def test_pages_are_given_back_while_others_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(paged, "_RESIDENT", 1 << 24)
+    monkeypatch.setattr(paged, "_MAX_RESIDENT_BYTES", 1 << 24)
     before = pages()
     values = paged.allocate_on_disk((1 << 23,))
     values[...] = np.arange(values.size)
@@ -127,7 +127,7 @@ def test_pages_are_given_back_while_others_work(monkeypatch: pytest.MonkeyPatch)
 
 def test_chosen_rows_of_many_lie_in_a_file(few: None, monkeypatch: pytest.MonkeyPatch) -> None:
     placed = Mock(wraps=paged.allocate_on_disk)
-    monkeypatch.setattr(paged, "empty", placed)
+    monkeypatch.setattr(paged, "allocate_on_disk", placed)
     values = torch.arange(3000.0, dtype=torch.float64).reshape(1000, 3)
     many, some = torch.arange(1000) % 4 > 0, torch.arange(1000) < 100
     assert torch.equal(paged.take_rows(values, many), values[many])
@@ -147,7 +147,7 @@ def test_a_look_at_each_item_holds_the_pages_of_one(monkeypatch: pytest.MonkeyPa
         return max(found)
 
     # nobody else gives them back here
-    monkeypatch.setattr(paged, "_RESIDENT", 1 << 40)
+    monkeypatch.setattr(paged, "_MAX_RESIDENT_BYTES", 1 << 40)
     size = 1 << 23
     items = [paged.allocate_on_disk((size // 8,)) for _ in range(8)]
     for item in items:

@@ -76,7 +76,7 @@ def test_an_ensemble_averages_accelerations(tiny_run: Path) -> None:
         model = load_model(tiny_run / "models" / name)[1].double()
         p = model.signals.prepare(w[:, -1])
         rho, _ = model.head(model.signals(y[:, -1], p), model.warmup(y[:, :-1], w[:, :-1]))
-        rates[name] = model.rate(y[:, -1], p, rho)[:, 3:]
+        rates[name] = model.state_derivative(y[:, -1], p, rho)[:, 3:]
     torch.testing.assert_close(rates["ensemble"], (rates["ridge"] + rates["lstm"]) / 2)
 
 
