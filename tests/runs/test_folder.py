@@ -77,7 +77,7 @@ def test_what_is_no_run_is_left_alone(tmp_path: Path) -> None:
         precious.write_text("precious")
     for path in (file, other):
         for resume in (False, True):
-            refused("exists already", path, resume=resume)
+            refused("exists", path, resume=resume)
     with pytest.raises(UsageError, match="not a run folder"):
         RunFolder.create(other, "a: 2\n", overwrite=True)
     assert file.read_text() == (other / "notes.txt").read_text() == "precious"
