@@ -27,8 +27,6 @@ EXCEPTIONS = {
     ("core/processes.py", "from joblib"): "`cpu_count` alone, which counts cores",
     ("tasks/sweep/config.py", "from joblib"): "`cpu_count` alone, which counts cores",
     ("export/torchscript.py", "torch.jit.load"): "the file that the same call has just written",
-    ("autopilot/__init__.py", "importlib.import_module"): "names of residnet's own modules",
-    ("cli.py", "importlib.import_module"): "commands of installed packages, in their entry points",
     ("__init__.py", "importlib.import_module"): "names of residnet's own modules",
     ("core/registry.py", "importlib.import_module"): "paths in residnet's own tables of parts",
     ("autopilot/__init__.py", "importlib.import_module"): "names of residnet's own modules",
