@@ -28,9 +28,9 @@ from residnet.identification.planning import (
     PredictionGoal,
     TrialLimits,
     compute_expected_uncertainty,
-    sensitivity_information,
     plan_trials,
     propose_manoeuvres,
+    sensitivity_information,
 )
 from residnet.identification.prepared import compute_velocity_limits, prepare_splits
 from residnet.identification.settings import FitSettings
@@ -39,7 +39,7 @@ from residnet.manoeuvres.trials import simulate_trial_logs
 from residnet.physics.vessel import load_vessel
 from residnet.preprocessing.prepare import PreparedLog, make_samples
 from residnet.preprocessing.windows import WindowStore
-from residnet.training.left_out import LeftOpen, left_open
+from residnet.training.left_out import RefitUncertainty, estimate_refit_covariance
 
 _HULL = ("u", "v", "r", "u|u|", "r|r|", "u v", "u r", "v r")
 TERMS = {
@@ -74,9 +74,11 @@ def shares_of(vessel: str, flown: str) -> dict[str, InputShare]:
     return out
 
 
-def left(fitted: FittedModel, settings: FitSettings, logs: Sequence[PreparedLog]) -> LeftOpen:
+def left(
+    fitted: FittedModel, settings: FitSettings, logs: Sequence[PreparedLog]
+) -> RefitUncertainty:
     """Return what a refit of this model with such logs leaves open."""
-    return left_open(
+    return estimate_refit_covariance(
         fitted.model.double(),
         make_samples(logs, settings.signals.build()),
         WindowStore.from_logs(logs, torch.float64),

@@ -51,7 +51,7 @@ from residnet.heads.lstm import LstmConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.preprocessing.prepare import PrepareConfig, make_samples, prepare_log
 from residnet.preprocessing.windows import WindowSampler, WindowStore
-from residnet.training.refit import RefitConfig, problem_of, refit, simulate
+from residnet.training.refit import RefitConfig, build_problem, refit, simulate
 
 NAMES = ("u", "v", "r", "tau_x", "tau_n")
 _BATCH, _STEPS, _SLOPE = 1_024, 200, 40
@@ -244,7 +244,7 @@ def refits(repeats: int) -> None:
     store = WindowStore.from_logs(logs, torch.float64)
     plan = RefitConfig(horizon=20.0, every=10.0)
     start = baseline.get_free()
-    problem = problem_of(model, known, store, plan, _SCALES)
+    problem = build_problem(model, known, store, plan, _SCALES)
     windows, steps = problem.inputs.shape[:2]
     found = []
     for _ in range(1 + repeats):

@@ -92,10 +92,10 @@ def test_epochs_that_swing_come_after_those_that_do_not() -> None:
     for refused, cost, better in ((0, 9.0, True), (5, 5.9, True), (0, math.nan, False),
                                   (10, 5.2, False), (10, 4.9, True), (1, 6.9, True)):  # fmt: skip
         fit.diverged = refused
-        assert fit._gains(cost) is better
+        assert fit._is_improvement(cost) is better
     fit.best_diverged = 0
     fit.diverged = 1
-    assert not fit._gains(0.1)
+    assert not fit._is_improvement(0.1)
 
 
 def test_swing_and_nominal_overshoot_cost_beyond_what_is_free() -> None:

@@ -30,7 +30,7 @@ from residnet.preprocessing.prepare import PreparedLog, make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.training.config import MachineConfig, TrainingConfig
 from residnet.training.heads import HeadTraining, Validate, one_step_loss, rollout_loss, train
-from residnet.training.score import Score, Shown
+from residnet.training.score import ExampleRun, Score
 
 
 @pytest.mark.parametrize(
@@ -448,7 +448,7 @@ def test_tensorboard_shows_axes_rate_settings_and_a_free_run(
     t = torch.arange(4.0)
 
     def validate(model: HybridDynamics) -> Score:
-        return Score(0, 1.5, {"u": 1.0, "v": 2.0}, Shown(t, {"u": (t, t + 1)}))
+        return Score(0, 1.5, {"u": 1.0, "v": 2.0}, ExampleRun(t, {"u": (t, t + 1)}))
 
     # beginnings shorter than a step take one sample
     beginnings = {"initial": STEP / 10}

@@ -49,7 +49,7 @@ from residnet.preprocessing.prepare import PreparedLog, make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.regression.estimator import Solution
 from residnet.training.left_out import estimate_leave_one_out
-from residnet.training.refit import parametric
+from residnet.training.refit import require_parametric_baseline
 
 
 def assign_logs_to_folds(manoeuvre_kinds: Sequence[str], max_folds: int, seed: int) -> np.ndarray:
@@ -146,7 +146,7 @@ class LeaveFoldOutModels:
             fitted_model.notes["refit"]["at_rest"],
         )
         for model, theta in zip(fold_models, parameters_by_fold, strict=True):
-            parametric(model).theta.data.copy_(theta)
+            require_parametric_baseline(model).theta.data.copy_(theta)
         return fold_models
 
     def _fit_head_without_fold(

@@ -25,7 +25,7 @@ from residnet.core.progress import (
     report_progress,
 )
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.store import ModelSpec, restored
+from residnet.dynamics.store import ModelSpec, restore_module
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.genetic import GeneticConfig
 from residnet.identification.bands import calibrate_bands
@@ -243,7 +243,7 @@ def _serialize_model(fitted_model: FittedModel) -> _SerializedModel:
 
 def _deserialize_model(serialized: _SerializedModel) -> FittedModel:
     spec, notes, covariance, state_dict = serialized
-    model = restored(spec, state_dict)
+    model = restore_module(spec, state_dict)
     assert isinstance(model, HybridDynamics)
     return FittedModel(spec, model, notes, covariance)
 

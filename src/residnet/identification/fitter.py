@@ -27,7 +27,7 @@ from residnet.core.progress import log_message
 from residnet.core.samples import Samples
 from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.store import ModelSpec, rebuilt
+from residnet.dynamics.store import ModelSpec, rebuild_module
 from residnet.evaluation.band import Band
 from residnet.evaluation.freerun import Candidate, FreeRunErrors, run_free_runs
 from residnet.evaluation.protocol import EvaluationConfig, make_windows
@@ -40,8 +40,8 @@ from residnet.preprocessing.windows import WindowStore
 from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.sparse import coefficient_to_dict
 from residnet.training.config import TrainingConfig
-from residnet.training.refit import free_run_starts, parametric, refit
-from residnet.training.score import Score, Shown
+from residnet.training.refit import find_free_run_starts, refit, require_parametric_baseline
+from residnet.training.score import ExampleRun, Score
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ class ValidationScorer:
             zip(dof.dynamic_states, zip(*measured_and_predicted, strict=True), strict=True)
         )
         columns = {name: columns[name] for name in dof.active_states}
-        example = Shown(self.dt * torch.arange(len(predicted_states)), columns)
+        example = ExampleRun(self.dt * torch.arange(len(predicted_states)), columns)
         nrmse_by_channel = dict(zip(dof.active_states, normalized_rmse.tolist(), strict=True))
         return Score(n_diverged, float(normalized_rmse.mean()), nrmse_by_channel, example)
 
@@ -405,7 +405,7 @@ class Fitter:
         refitted = refit(
             model, self.training_samples, window_store, refit_config, self.state_scales
         )
-        baseline = parametric(model)
+        baseline = require_parametric_baseline(model)
         notes["prior"] = refit_config.prior
         parameter_names = baseline.free_parameter_names()
         notes["open"] = [
@@ -436,7 +436,7 @@ class Fitter:
         # seeded by the head's name, so that adding a head changes no other
         seed = self.settings.seed * 1_000 + sum(map(ord, name))
         torch.manual_seed(seed)
-        model = spec.single()
+        model = spec.build_single_model()
         model.baseline.load_state_dict(copy.deepcopy(baseline.model.baseline.state_dict()))
         residuals = compute_residual_samples(model, self.training_samples)
         start_time = time.perf_counter()
@@ -462,7 +462,7 @@ class Fitter:
             )
 
             def validate(trained_model: HybridDynamics) -> Score:
-                return self.score_on_validation(spec.as_one(trained_model))
+                return self.score_on_validation(spec.average_networks(trained_model))
 
             notes = train(
                 name,
@@ -478,9 +478,9 @@ class Fitter:
         notes |= {
             "baseline": self.settings.get_baseline_name(name),
             "seconds": round(time.perf_counter() - start_time, 1),
-            **self._validation_notes(spec.as_one(model)),
+            **self._validation_notes(spec.average_networks(model)),
         }
-        return self._save_and_reload(FittedModel(spec, spec.as_one(model), notes))
+        return self._save_and_reload(FittedModel(spec, spec.average_networks(model), notes))
 
     def build_acceleration_ensemble(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
         """Return the mean acceleration of fitted models as one model."""
@@ -547,7 +547,7 @@ class Fitter:
             for member_model in member_models
         ]
         model = (
-            spec.mean(trajectory_models)
+            spec.average_trajectories(trajectory_models)
             if averaged_quantity == "trajectories"
             else mean_of(member_models)
         )
@@ -565,7 +565,9 @@ class Fitter:
         The evaluated model is then bit for bit the stored one, and a resumed fit gives the same
         results.
         """
-        reloaded = replace(fitted_model, model=rebuilt(fitted_model.spec, fitted_model.model))
+        reloaded = replace(
+            fitted_model, model=rebuild_module(fitted_model.spec, fitted_model.model)
+        )
         self.store.save(reloaded)
         return reloaded
 
@@ -590,7 +592,7 @@ def check_fit(logs: PreparedSplits, settings: FitSettings) -> Fitter:
     for baseline in settings.all_baselines.values():
         baseline.validate_samples(fitter.training_samples)
     for refit_config in settings.refit.values():
-        free_run_starts(window_store, refit_config, dt)
+        find_free_run_starts(window_store, refit_config, dt)
     for name, config in settings.heads.items():
         head = config.build(fitter.signals.names)
         if isinstance(head, ClosedFormHead):

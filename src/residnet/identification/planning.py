@@ -43,8 +43,8 @@ from residnet.manoeuvres.trials import (
     simulate_manoeuvres,
 )
 from residnet.physics.signals import SignalsConfig
-from residnet.training.left_out import LeftOpen
-from residnet.training.refit import RefitConfig, parametric, sensitivities
+from residnet.training.left_out import RefitUncertainty
+from residnet.training.refit import RefitConfig, require_parametric_baseline, sensitivities
 
 
 @torch.no_grad()
@@ -67,7 +67,7 @@ def sensitivity_information(
         for run, (_, inputs) in enumerate(runs)
         for window_index in range(len(inputs) // horizon)
     ]
-    n_parameters = len(parametric(model).free_indices())
+    n_parameters = len(require_parametric_baseline(model).free_indices())
     gram_by_run = torch.zeros(len(runs), n_parameters, n_parameters, dtype=scales.dtype)
     if not window_starts:
         return gram_by_run
@@ -280,7 +280,7 @@ class TrialPlan:
 
 def plan_trials(
     fitted_model: FittedModel,
-    unidentified: LeftOpen,
+    unidentified: RefitUncertainty,
     refit_config: RefitConfig,
     state_scales_array: np.ndarray,
     input_shares: Mapping[str, InputShare],
@@ -325,7 +325,8 @@ def plan_trials(
     ]
     if not allowed_trajectories:
         raise DataError(
-            f"none of {len(simulated_trajectories)} candidates stays within the limits; allow more area, speed or"
+            f"none of {len(simulated_trajectories)} candidates stays within the limits; allow"
+            f" more area, speed or"
             " rudder, or less time"
         )
     grams = sensitivity_information(
@@ -345,8 +346,10 @@ def plan_trials(
     initial_uncertainty = compute_expected_uncertainty(unidentified.covariance, goal_weights)
     if not (np.isfinite(initial_uncertainty) and initial_uncertainty > 0.0):
         raise DataError(
-            f"model {fitted_model.name}: its refit leaves nothing open of the manoeuvres to predict, or"
-            f" it cannot fly them for {refit_config.horizon:g} s; add logs that cover their speeds and"
+            f"model {fitted_model.name}: its refit leaves nothing open of the manoeuvres to"
+            f" predict, or"
+            f" it cannot fly them for {refit_config.horizon:g} s; add logs that cover their"
+            f" speeds and"
             " rudder angles, or shorten refit.horizon"
         )
     trials = []

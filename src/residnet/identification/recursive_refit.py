@@ -36,7 +36,7 @@ from residnet.identification.monitoring import (
     marginalise,
     split_window,
 )
-from residnet.training.refit import parametric
+from residnet.training.refit import require_parametric_baseline
 
 _MAX_CHANGES = 3
 """Changes that a refit puts into a model at most."""
@@ -119,7 +119,10 @@ def refit_recursively(
         if not stopping_reason:
             _, expressed_share = _parameter_direction(detector.model, first_change, indexed_groups)
             if expressed_share < _MIN_EXPRESSED_SHARE:
-                stopping_reason = f"the baseline's terms can follow only {expressed_share:.0%} of what '{first_change.name}' does"
+                stopping_reason = (
+                    f"the baseline's terms can follow only {expressed_share:.0%} of"
+                    f" what '{first_change.name}' does"
+                )
         if stopping_reason:
             return RecursiveRefit(
                 model, identified_changes, verdict_before, verdict, stopping_reason
@@ -139,7 +142,7 @@ def make_refitted_model(fitted_model: FittedModel, refit: RecursiveRefit) -> Fit
 
     The prediction intervals of the old model are dropped.
     """
-    baseline = parametric(refit.model)
+    baseline = require_parametric_baseline(refit.model)
     values_by_parameter = dict(
         zip(baseline.free_parameter_names(), baseline.get_free().tolist(), strict=True)
     )
@@ -182,11 +185,15 @@ def _stopping_reason(verdict: MonitorVerdict, changes_in_model: Sequence[SystemC
         )
     if first_hypothesis.change.sensor:
         return (
-            f"'{first_hypothesis.change.name}' is named first, which is an error of the data; mend the sensor,"
+            f"'{first_hypothesis.change.name}' is named first, which is an error of the data;"
+            f" mend the sensor,"
             " since a refit would put its error into the vessel"
         )
     if first_hypothesis.change in changes_in_model:
-        return f"'{first_hypothesis.change.name}' is named again, so that its size does not explain the logs"
+        return (
+            f"'{first_hypothesis.change.name}' is named again, so that its size does not"
+            f" explain the logs"
+        )
     if len(changes_in_model) >= _MAX_CHANGES:
         return f"{_MAX_CHANGES} changes are in the model; fit it anew from the new logs"
     return ""
@@ -222,7 +229,7 @@ def _parameter_direction(
             short_step_model.dt * change.size
         )
         sensitivities = (
-            parametric(model)
+            require_parametric_baseline(model)
             .parameter_jacobian(model.compute_channels(states, inputs))
             .flatten(0, 1)
         )
@@ -252,7 +259,7 @@ class _InformationFilter:
     def __init__(self, detector: ChangeDetector, changes: Sequence[SystemChange]) -> None:
         self.detector, self.changes = detector, changes
         self.model = copy.deepcopy(detector.model)
-        self.baseline = parametric(self.model)
+        self.baseline = require_parametric_baseline(self.model)
         self.initial_parameters = self.baseline.get_free()
         self.small_sizes = np.array([change.size for change in changes])
         cause_names = [change.name for change in detector.hypotheses]

@@ -1,4 +1,4 @@
-"""How networks are trained, and on what machine. Neither Lightning nor torch is imported here."""
+"""Settings of the training of networks; neither Lightning nor torch is imported here."""
 
 from __future__ import annotations
 
@@ -14,22 +14,29 @@ if TYPE_CHECKING:
     from residnet.preprocessing.windows import WindowStage
 
 
-def falling(rate: float, final: float, epoch: int, epochs: int) -> float:
-    """Return a learning rate that falls along a cosine to a share `final` in the last epoch."""
+def cosine_learning_rate(rate: float, final: float, epoch: int, epochs: int) -> float:
+    """Return the cosine-annealed learning rate of an epoch.
+
+    Args:
+        rate: learning rate of the first epoch.
+        final: learning rate of the last epoch as a share of `rate`.
+        epoch: index of the epoch, from 0 on.
+        epochs: number of epochs.
+    """
     progress = 0.5 * (1 - math.cos(math.pi * epoch / max(epochs - 1, 1)))
     return rate * (1 - progress * (1 - final))
 
 
 class OneStage(Config):
-    """Settings of a training in one stage, with a learning rate that falls along a cosine.
+    """Settings of a training in one stage with cosine annealing of the learning rate.
 
     Attributes:
-        epochs: at most.
-        learning_rate: of Adam in the first epoch.
-        final: share of it in the last.
+        epochs: maximum number of epochs.
+        learning_rate: learning rate of Adam in the first epoch.
+        final: learning rate of the last epoch as a share of `learning_rate`.
         gradient_clip: largest norm of the gradient.
-        patience: stop when this many validations in a row bring nothing better.
-        validate_every: epochs between validations.
+        patience: number of successive validations without improvement after which training stops.
+        validate_every: number of epochs between validations.
     """
 
     epochs: int = Field(default=20, ge=1, le=100_000)
@@ -41,28 +48,29 @@ class OneStage(Config):
 
     @property
     def last_stage(self) -> int:
-        """Number of the only stage, 0."""
+        """Index of the only stage, 0."""
         return 0
 
     def stage(self, epoch: int) -> tuple[int, int]:
-        """Return stage 0, the only one, and the epoch."""
+        """Return the index of the stage, 0, and the epoch within it."""
         return 0, epoch
 
     def rate(self, epoch: int) -> float:
         """Return the learning rate of an epoch."""
-        return falling(self.learning_rate, self.final, epoch, self.epochs)
+        return cosine_learning_rate(self.learning_rate, self.final, epoch, self.epochs)
 
 
 class MachineConfig(Config):
-    """What a training runs on.
+    """Settings of the hardware and the precision of a training.
 
     Attributes:
-        device: `cpu`, `cuda`, `cuda:1` for the second GPU, or `auto` for a GPU where there is one.
-            Free runs that validate are run on the CPU whatever it is.
-        precision: of numbers, by Lightning's names: `32-true` or `64-true`. Half precision is not
-            offered: the baseline's accelerations, which a rollout adds up, would be off by a
-            hundredth.
-        processes: that share each batch, each on a device of its own (ddp).
+        device: `cpu`, `cuda`, `cuda:1` for the second GPU, or `auto` for a GPU if PyTorch finds
+            one. Free runs for validation always use the CPU.
+        precision: floating-point precision by its name in Lightning: `32-true` or `64-true`. Half
+            precision is not supported: it would give the accelerations of the baseline, which a
+            rollout integrates, a relative error of .01.
+        processes: number of processes that share each batch, each on its own device
+            (distributed data parallel).
     """
 
     device: str = Field(default="cpu", pattern=r"^(auto|cpu|cuda(:\d{1,3})?)$")
@@ -70,52 +78,52 @@ class MachineConfig(Config):
     processes: int = Field(default=1, ge=1, le=1_024)
 
     @property
-    def double(self) -> bool:
-        """Return whether weights and windows are float64."""
+    def is_double_precision(self) -> bool:
+        """Whether weights and windows are float64."""
         return self.precision == "64-true"
 
     def for_lightning(self) -> dict[str, Any]:
-        """Return the arguments of Lightning's trainer.
+        """Return the keyword arguments of `lightning.Trainer` for this hardware.
 
         Raises:
-            UsageError: where the machine has no such device.
+            UsageError: if the machine lacks the device or has too few GPUs.
         """
         import torch
 
-        found = torch.cuda.device_count()
-        kind, _, number = self.device.partition(":")
-        if kind == "auto":
-            kind = "cuda" if found else "cpu"
+        n_gpus = torch.cuda.device_count()
+        device_type, _, number = self.device.partition(":")
+        if device_type == "auto":
+            device_type = "cuda" if n_gpus else "cpu"
         first = int(number or 0)
-        if kind == "cuda" and first + self.processes > found:
+        if device_type == "cuda" and first + self.processes > n_gpus:
             raise UsageError(
                 f"device: {self.device} with {self.processes} processes needs"
-                f" {first + self.processes} GPUs, and PyTorch finds {found}; give device: cpu, or"
+                f" {first + self.processes} GPUs, and PyTorch finds {n_gpus}; give device: cpu, or"
                 " auto"
             )
         devices: int | list[int] = self.processes
-        if kind == "cuda":
+        if device_type == "cuda":
             devices = list(range(first, first + self.processes))
         return {
-            "accelerator": "gpu" if kind == "cuda" else "cpu",
+            "accelerator": "gpu" if device_type == "cuda" else "cpu",
             "devices": devices,
             "precision": self.precision,
-            # stages train different parameters
+            # each stage trains other parameters, so that some have no gradient
             "strategy": "auto" if self.processes == 1 else "ddp_spawn_find_unused_parameters_true",
         }
 
 
 class OneStep(Config):
-    """Settings of the teacher-forced start on residual accelerations (document 003 eq. (20)).
+    """Settings of the teacher-forced stage on residual accelerations (document 003 eq. (20)).
 
     Attributes:
-        epochs: of `steps` batches each.
-        window: length of a window; the loss counts its part after `washout`, which fills a memory
-            first.
-        washout: see above.
-        batch: windows per batch.
-        learning_rate: of Adam; it falls to `final` of it over the stage, along a cosine.
-        final: share of the learning rate at the stage's end.
+        epochs: number of epochs of `steps` batches each.
+        window: length of a window.
+        washout: initial part of each window that fills the memory of the network and is excluded
+            from the loss.
+        batch: number of windows per batch.
+        learning_rate: initial learning rate of AdamW; it decreases along a cosine.
+        final: learning rate at the end of the stage as a share of `learning_rate`.
     """
 
     epochs: int = Field(default=10, ge=0, le=100_000)
@@ -135,15 +143,14 @@ class OneStep(Config):
 
 
 class MultiStep(Config):
-    """A stage of free-run training, which compares velocities over a horizon.
+    """Settings of a free-run stage, whose loss compares velocities over a horizon.
 
     Attributes:
         horizon: length of the rollouts.
-        epochs: of `steps` batches each.
-        batch: rollouts per batch.
-        learning_rate: at the start of the stage; it falls to `final` of it over the stage, along a
-            cosine.
-        final: share of the learning rate at the stage's end.
+        epochs: number of epochs of `steps` batches each.
+        batch: number of rollouts per batch.
+        learning_rate: initial learning rate of AdamW; it decreases along a cosine.
+        final: learning rate at the end of the stage as a share of `learning_rate`.
     """
 
     horizon: Seconds = Field(gt=0)
@@ -154,16 +161,15 @@ class MultiStep(Config):
 
 
 class Beginnings(Config):
-    """Settings of windows at the beginning of a stretch, where there is hardly a past.
+    """Settings of windows at the start of a segment, as free runs of a complete manoeuvre have.
 
-    Whole manoeuvres are run from there.
-
-    One-step windows start with the stretch and are scored from their first sample on; rollouts
-    start after `initial`, from the mean velocities of that time, which alone warms up the memory.
+    One-step windows begin with the segment, and the loss includes their first sample. Rollouts
+    begin after `initial`: the mean velocities of this period are the initial state, and only this
+    period warms up the memory.
 
     Attributes:
-        share: of each batch.
-        initial: see above.
+        share: share of such windows in each batch.
+        initial: length of the period before a rollout.
     """
 
     share: float = Field(default=0.25, gt=0, lt=1)
@@ -171,25 +177,25 @@ class Beginnings(Config):
 
 
 class TrainingConfig(MachineConfig):
-    """Settings of a training: one-step, then each of `multi_step` (a curriculum of horizons).
+    """Settings of a training: a teacher-forced stage, then free-run stages of growing horizon.
 
     Attributes:
-        one_step: the teacher-forced start.
-        multi_step: free-run stages.
-        steps: batches per epoch.
-        history: measured past that warms up the memory before a rollout.
-        beginnings: windows at the beginning of stretches in every batch; null for no more than
-            chance brings.
+        one_step: settings of the teacher-forced stage.
+        multi_step: settings of the free-run stages (a curriculum of horizons).
+        steps: number of batches per epoch.
+        history: length of the measured past that warms up the memory before a rollout.
+        beginnings: share of windows at the start of a segment in every batch; null for random
+            windows only.
         start_noise: standard deviation of the noise on the initial velocities of rollouts, in units
             of the metrics' scales.
-        robust: 0 for the mean square of free-run errors; else windows whose error (in units of the
-            scales) is far above this count by their error and not by its square.
+        robust: error, in units of the scales, above which the loss of a window is linear instead
+            of quadratic; 0 for the mean square error.
         gradient_clip: largest norm of the gradient.
-        weight_decay: of AdamW, on matrices only.
-        mirror: every other window is seen in the mirror, port for starboard.
-        patience: stop when this many validations in a row bring no better free run, once the last
-            stage has begun.
-        validate_every: epochs between validations.
+        weight_decay: weight decay of AdamW, applied to matrices only.
+        mirror: whether every second window is mirrored, with port and starboard exchanged.
+        patience: number of successive validations without a better free run, in the last stage,
+            after which training stops.
+        validate_every: number of epochs between validations.
     """
 
     one_step: OneStep = OneStep()
@@ -214,26 +220,30 @@ class TrainingConfig(MachineConfig):
             *(stage.batch for stage in self.multi_step),
         ):
             raise ValueError(
-                "beginnings need batches of at least 2 windows: some lie at the beginning of a"
-                " stretch, the others anywhere"
+                "beginnings need batches of at least 2 windows: some begin at the"
+                " start of a segment, the others at random samples"
             )
-        least = min(self.one_step.batch, *(stage.batch for stage in self.multi_step), 1_024)
-        if self.processes > least:
-            raise ValueError(f"processes: {self.processes} cannot share batches of {least} windows")
+        smallest_batch = min(
+            self.one_step.batch, *(stage.batch for stage in self.multi_step), 1_024
+        )
+        if self.processes > smallest_batch:
+            raise ValueError(
+                f"processes: {self.processes} cannot share batches of {smallest_batch} windows"
+            )
         return self
 
     @property
     def epochs(self) -> int:
-        """Epochs of all stages together."""
+        """Number of epochs of all stages."""
         return self.one_step.epochs + sum(stage.epochs for stage in self.multi_step)
 
     @property
     def last_stage(self) -> int:
-        """Number of the last free-run stage."""
+        """Index of the last stage."""
         return len(self.multi_step)
 
     def stage(self, epoch: int) -> tuple[int, int]:
-        """Return (stage, epoch within it); stage 0 is one-step, stage i the i-th free-run stage."""
+        """Return the index of an epoch's stage (0: one-step) and the epoch within this stage."""
         begin = 0
         for number, length in enumerate(
             (self.one_step.epochs, *(stage.epochs for stage in self.multi_step))
@@ -245,32 +255,37 @@ class TrainingConfig(MachineConfig):
 
     def rate(self, epoch: int) -> float:
         """Return the learning rate of an epoch."""
-        number, within = self.stage(epoch)
+        number, epoch_in_stage = self.stage(epoch)
         stage = self.one_step if number == 0 else self.multi_step[number - 1]
-        return falling(stage.learning_rate, stage.final, within, stage.epochs)
+        return cosine_learning_rate(stage.learning_rate, stage.final, epoch_in_stage, stage.epochs)
 
     def windows(self, dt: float) -> list[WindowStage | None]:
-        """Return the windows of each stage at a step of dt seconds; None for one without epochs."""
+        """Return the windows of each stage for a step of dt seconds; None without epochs."""
         from residnet.preprocessing.windows import WindowStage
 
-        def begun(batch: int) -> int:
-            """Windows of a batch that begin with a stretch."""
+        def count_segment_starts(batch: int) -> int:
+            """Return the number of windows of a batch that begin with a segment."""
             if self.beginnings is None:
                 return 0
             return min(max(round(self.beginnings.share * batch), 1), batch - 1)
 
-        one, lead = self.one_step, 0
+        one_step = self.one_step
+        lead = 0
         if self.beginnings is not None:
             lead = max(round(self.beginnings.initial / dt), 1)
         first = WindowStage(
-            round(one.window / dt), one.batch, 0, begun(one.batch), columns=("precomputed", "trainable")
+            round(one_step.window / dt),
+            one_step.batch,
+            0,
+            count_segment_starts(one_step.batch),
+            columns=("precomputed", "trainable"),
         )
-        return [first if one.epochs else None] + [
+        return [first if one_step.epochs else None] + [
             WindowStage(
                 round(stage.horizon / dt) + 1,
                 stage.batch,
                 round(self.history / dt),
-                begun(stage.batch),
+                count_segment_starts(stage.batch),
                 lead,
                 ("y", "smoothed", "w", "usable"),
             )

@@ -62,15 +62,15 @@ def estimate_currents(
 
     The baseline gives the regressors and keeps its own coefficients. Standard errors from least
     squares hold where the regressors are the true ones and the errors of neighbouring samples
-    independent, which they never are. So the two halves of each log are estimated apart, and the
-    errors of all are widened by as much as the halves differ more than they say (Birge 1932, Phys.
-    Rev. 40, 207-227).
+    independent, which they never are. So the two halves of each log are estimated separately, and
+    the errors of all are widened by as much as the halves differ more than they say (Birge 1932,
+    Phys. Rev. 40, 207-227).
 
     Args:
         baseline: whose regressors explain the accelerations.
         signals: of the logs.
         logs: L logs that are fitted.
-        config: what is expected of currents.
+        config: settings of the prior of currents.
         others: K logs that the coefficients are not fitted on.
 
     Raises:
@@ -186,7 +186,7 @@ def through_water(log: PreparedLog, current: np.ndarray, signals: Signals) -> Pr
 
 
 def _transform_wind(w: np.ndarray, current: np.ndarray, signals: Signals) -> np.ndarray:
-    """Return inputs [T, m] whose true wind is that of the frame that drifts with the current."""
+    """Return inputs [T, m] with the true wind relative to the frame of the current."""
     if not signals.has_wind:
         return w
     speed = w[:, signals.speed_column]
@@ -367,7 +367,7 @@ class _CurrentProblem:
 def _regularised_gram(phi: Tensor) -> Tensor:
     """Return phi' phi [J, J] with a slightly larger diagonal.
 
-    Collinear regressors then share what they explain.
+    Collinear regressors then share the explained variance.
     """
     gram = phi.T @ phi
     return gram + 1e-12 * torch.diag(gram.diagonal().clamp(min=1e-300))

@@ -1,4 +1,4 @@
-"""Training of heads: windows of logs, one-step and free-run losses, validation in free run."""
+"""Training of residual networks (heads): one-step and free-run losses, free-run validation."""
 
 from __future__ import annotations
 
@@ -27,41 +27,43 @@ from residnet.training.config import TrainingConfig
 from residnet.training.score import Score
 from residnet.training.trainer import EpochTraining, run_epochs
 
-Shared = Callable[[Tensor], Tensor]
-"""A sum over this process's windows to the mean of the sums of all processes."""
+ProcessMean = Callable[[Tensor], Tensor]
+"""Function from a sum over the windows of this process to the mean over all processes."""
 
 
-def alone(value: Tensor) -> Tensor:
-    """Return the mean over one process: the value itself."""
+def single_process_mean(value: Tensor) -> Tensor:
+    """Return the mean over a single process, which is the value itself."""
     return value
 
 
 def one_step_loss(
     model: HybridDynamics,
     z: Tensor,
-    known: Tensor,
+    baseline: Tensor,
     nu_dot: Tensor,
-    good: Tensor,
-    spread: Tensor,
-    shared: Shared = alone,
+    is_counted: Tensor,
+    scale: Tensor,
+    process_mean: ProcessMean = single_process_mean,
 ) -> Tensor:
     """Return the mean squared error of accelerations along windows (document 003 eq. (20)).
 
-    In units of the residual's spread.
+    The error is in units of the standard deviation of the residual.
 
     Args:
         model: the hybrid model.
-        z: channels of smoothed states and the inputs at the same samples [B, T, nz].
-        known: what its baseline says there [B, T, n].
-        nu_dot: accelerations [B, T, n].
-        good: samples that count: acceleration known, memory filled [B, T].
-        spread: of the residual, [n].
-        shared: over the processes of a training, whose mean loss is that of all windows.
+        z: channels of the smoothed states and the inputs at the same samples [B, T, nz].
+        baseline: accelerations of the baseline at these samples, SI [B, T, n].
+        nu_dot: measured accelerations, SI [B, T, n].
+        is_counted: whether the loss includes the sample (valid acceleration, after the washout)
+            [B, T].
+        scale: standard deviation of the residual accelerations, SI [n].
+        process_mean: mean over the processes of a training; it makes the mean of their losses equal
+            to the loss of all windows.
     """
-    error = (nu_dot - model.teacher_forced_accelerations(z, known)) / spread
-    weight = good.to(error.dtype).unsqueeze(-1)
+    error = (nu_dot - model.teacher_forced_accelerations(z, baseline)) / scale
+    weight = is_counted.to(error.dtype).unsqueeze(-1)
     count = float(error.shape[-1])
-    return (error.square() * weight).sum() / shared(count * weight.sum()).clamp(min=1.0)
+    return (error.square() * weight).sum() / process_mean(count * weight.sum()).clamp(min=1.0)
 
 
 def rollout_loss(
@@ -73,23 +75,24 @@ def rollout_loss(
     usable: Tensor,
     scales: Tensor,
     robust: float,
-    shared: Shared = alone,
+    process_mean: ProcessMean = single_process_mean,
 ) -> Tensor:
     """Return the error of free-run velocities, in units of the metrics' scales.
 
-    The mean square, or the mean over windows of their root mean square.
+    The error is the mean square, or with `robust` the mean over windows of the root mean square.
 
     Args:
-        rollout: the free run of the model, as `Rollout` gives it.
+        rollout: free run of the model, for example a `Rollout`.
         x0: initial states [B, 3 + n].
         w: inputs [B, T, m].
         s: initial memory [B, n_state].
         y: measured states after each step [B, T, 3 + n].
-        usable: measured samples that may be scored [B, T].
-        scales: [n].
-        robust: 0 for the mean square; else windows count by sqrt(mean square + robust^2), as the
-            metrics do, so that few bad ones do not rule.
-        shared: over the processes of a training, whose mean loss is that of all windows.
+        usable: whether the measured sample is valid [B, T].
+        scales: scales of the velocities, SI [n].
+        robust: 0 for the mean square; otherwise the loss of a window is
+            sqrt(mean square + robust^2), as in the metrics, so that few outliers do not dominate.
+        process_mean: mean over the processes of a training; it makes the mean of their losses equal
+            to the loss of all windows.
     """
     states, _, _ = rollout(x0, w, s)
     n = scales.numel()
@@ -97,25 +100,26 @@ def rollout_loss(
     weight, count = usable.to(error.dtype).unsqueeze(-1), float(n)
     if robust > 0:
         square = (error.square() * weight).sum((1, 2)) / (count * weight.sum((1, 2))).clamp(min=1.0)
-        return torch.sqrt(square + robust**2).sum() / shared(torch.ones_like(square).sum())
-    # a rollout that runs away must pull back, not drown the batch
+        return torch.sqrt(square + robust**2).sum() / process_mean(torch.ones_like(square).sum())
+    # the Huber loss bounds the gradient of a rollout that diverges
     square = 2.0 * torch.nn.functional.huber_loss(
         error, torch.zeros_like(error), reduction="none", delta=5.0
     )
-    return (square * weight).sum() / shared(count * weight.sum()).clamp(min=1.0)
+    return (square * weight).sum() / process_mean(count * weight.sum()).clamp(min=1.0)
 
 
 Validate = Callable[[HybridDynamics], Score]
+"""Function that returns the free-run score of a model on the validation logs."""
 
 
 @dataclass(frozen=True)
 class Mirror:
-    """How states [..., 3 + n] and inputs [..., m] look in the mirror.
+    """Reflection of states [..., 3 + n] and inputs [..., m] in the centre plane of the vessel.
 
     Attributes:
-        state: signs of the states [3 + n].
-        index: column that each input is taken from [m].
-        sign: and its sign [m].
+        state: sign of each state [3 + n].
+        index: input column that replaces each input [m].
+        sign: sign of this column [m].
     """
 
     state: Tensor
@@ -123,16 +127,16 @@ class Mirror:
     sign: Tensor
 
     @classmethod
-    def of(cls, signals: Signals) -> Mirror | None:
-        """Return that of the channels of a model; None where it is not known for one of them."""
-        found = mirror_channels(signals.names)
-        if found is None:
+    def from_signals(cls, signals: Signals) -> Mirror | None:
+        """Return the reflection for the channels of a model; None if a channel has no known one."""
+        reflection = mirror_channels(signals.names)
+        if reflection is None:
             return None
         n = signals.n_dof
-        index, sign = (part[n : n + signals.n_inputs] for part in found)
+        index, sign = (part[n : n + signals.n_inputs] for part in reflection)
         index = [place - n for place in index]
         if signals.has_wind:
-            # where an earth-fixed wind comes from is mirrored as headings are
+            # the direction of an earth-fixed wind changes its sign as a heading does
             index = [*index, signals.speed_column, signals.direction_column]
             sign = [*sign, 1.0, -1.0]
             order = [*range(signals.n_inputs), signals.speed_column, signals.direction_column]
@@ -144,22 +148,23 @@ class Mirror:
             torch.tensor(sign),
         )
 
-    def every_other(self, windows: WindowBatch) -> WindowBatch:
-        """Return windows of which every other one is seen in the mirror."""
+    def mirror_alternate(self, windows: WindowBatch) -> WindowBatch:
+        """Return the windows with every second one mirrored."""
         rows = torch.arange(len(windows.y)) % 2 == 1
 
-        def seen(values: Tensor, other: Tensor) -> Tensor:
-            return torch.where(rows[:, None, None], other, values)
+        def mirror_rows(values: Tensor, mirrored: Tensor) -> Tensor:
+            return torch.where(rows[:, None, None], mirrored, values)
 
-        state, sign = self.state.to(windows.y), self.sign.to(windows.w)
+        state = self.state.to(windows.y)
+        sign = self.sign.to(windows.w)
         return windows._replace(
             **{
-                name: seen(values, values * state)
+                name: mirror_rows(values, values * state)
                 for name in ("y", "smoothed", "past_y")
                 if (values := getattr(windows, name)) is not None
             },
             **{
-                name: seen(values, values[..., self.index] * sign)
+                name: mirror_rows(values, values[..., self.index] * sign)
                 for name in ("w", "past_w")
                 if (values := getattr(windows, name)) is not None
             },
@@ -168,7 +173,7 @@ class Mirror:
 
 @final
 class HeadTraining(EpochTraining):
-    """A training of `model.head` that keeps the weights which validate best in free run."""
+    """Lightning module that trains `model.head` and validates it by free runs."""
 
     def __init__(
         self,
@@ -186,17 +191,17 @@ class HeadTraining(EpochTraining):
         self.validate = validate
         self.stages = config.windows(model.dt)
         self.rank, self.world = 0, 1
-        self.mirror = Mirror.of(model.signals) if config.mirror else None
+        self.mirror = Mirror.from_signals(model.signals) if config.mirror else None
 
     def data(self, store: WindowStore) -> WindowsDataModule:
-        """Return the windows of each epoch's stage.
+        """Return the data module with the windows of each stage.
 
         Raises:
-            DataError: where no log is long enough for a stage.
+            DataError: if no log is long enough for a stage.
         """
         if self.stages[0] is not None:
             store = replace(store, precomputed=self._precompute(store))
-        # methods, which other processes can be given
+        # methods instead of lambdas: spawned processes receive them pickled
         return WindowsDataModule(
             store, self.stages, self.settings.steps, self.seed, self.stage_of, self.present_epoch
         )
@@ -204,7 +209,7 @@ class HeadTraining(EpochTraining):
     def _precompute(self, store: WindowStore) -> Tensor:
         """Return channels, baseline and measured accelerations of all samples [N, nz + 2 n].
 
-        They do not change during the training, whose epochs use each sample many times.
+        They are constant during the training, and each epoch uses a sample many times.
         """
         n_columns = len(self.model.signals.names) + 2 * self.model.dof
         precomputed = paged.allocate_rows(len(store.y), n_columns, dtype=store.y.dtype)
@@ -217,11 +222,11 @@ class HeadTraining(EpochTraining):
         return precomputed
 
     def stage_of(self, epoch: int) -> int:
-        """Return the number of the stage that an epoch belongs to."""
+        """Return the index of the stage of an epoch."""
         return int(self.settings.stage(epoch)[0])
 
     def present_epoch(self) -> int:
-        """Return the epoch by now, for which the loaders ask."""
+        """Return the index of the current epoch (for the data loaders)."""
         return self.epoch
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -240,21 +245,21 @@ class HeadTraining(EpochTraining):
         self.scales = self.scales.to(self.device)
 
     def on_train_epoch_start(self) -> None:
-        """Seed the epoch and set the stage's learning rate."""
+        """Seed the epoch and set its learning rate."""
         self.seed_epoch()
         self.model.baseline.requires_grad_(False)
         for group in self.trainer.optimizers[0].param_groups:
             group["lr"] = self.settings.rate(self.epoch)
 
     def training_step(self, windows: tuple[WindowBatch, ...], batch_index: int) -> Tensor:
-        """Return the loss of one batch of windows, some of which may begin a stretch."""
+        """Return the loss of a batch: random windows, then windows at the start of a segment."""
         stage, _ = self.settings.stage(self.epoch)
         loss = self._one_step(windows) if stage == 0 else self._multi_step(windows, stage)
-        self._losses.append(float(self.shared(loss.detach())))
+        self._losses.append(float(self.process_mean(loss.detach())))
         return loss
 
-    def shared(self, value: Tensor) -> Tensor:
-        """Return the mean of a value over the processes of the training."""
+    def process_mean(self, value: Tensor) -> Tensor:
+        """Return the mean of a value over all processes of the training."""
         if self.world == 1:
             return value
         total = value.detach().clone()
@@ -276,24 +281,23 @@ class HeadTraining(EpochTraining):
         index = torch.arange(z.shape[1], device=z.device)
         is_counted = trainable & (index >= washout[:, None])
         scale = self.model.head.residual_scale().to(z.dtype)
-        return one_step_loss(self.model, z, baseline, nu_dot, is_counted, scale, self.shared)
+        return one_step_loss(self.model, z, baseline, nu_dot, is_counted, scale, self.process_mean)
 
     def _multi_step(self, windows: Sequence[WindowBatch], stage: int) -> Tensor:
-        begins, memories = [], []
+        initial_states, memories = [], []
         if self.mirror is not None:
-            windows = [self.mirror.every_other(part) for part in windows]
+            windows = [self.mirror.mirror_alternate(part) for part in windows]
         for number, part in enumerate(windows):
             memories.append(self.model.warmup(part.past_y, part.past_w))
             x0 = part.smoothed[:, 0]
             if number == 1:
-                # at the beginning of a stretch the mean of what is known is all that is known
+                # as a free run from a segment start, which has no smoothed state, only this mean
                 mean = all_but_pose(part.past_y).mean(1)
                 x0 = torch.cat((pose(x0), mean), dim=1)
-            begins.append(x0)
-        x0 = torch.cat(begins)
+            initial_states.append(x0)
+        x0 = torch.cat(initial_states)
         if self.settings.start_noise > 0:
-            drawn = self._drawn(stage).to(x0)
-            noise = self.settings.start_noise * self.scales * drawn
+            noise = self.settings.start_noise * self.scales * self._draw_noise(stage).to(x0)
             x0 = torch.cat((pose(x0), all_but_pose(x0) + noise), dim=1)
         w, y, usable = (
             torch.cat([getattr(part, name) for part in windows]) for name in ("w", "y", "usable")
@@ -307,35 +311,36 @@ class HeadTraining(EpochTraining):
             usable[:, 1:],
             self.scales,
             self.settings.robust,
-            self.shared,
+            self.process_mean,
         )
 
-    def _drawn(self, stage: int) -> Tensor:
-        """Return standard normal numbers [B, n] for the windows of this process.
+    def _draw_noise(self, stage: int) -> Tensor:
+        """Draw standard normal numbers [B, n] for the windows of this process.
 
-        They are drawn for the whole batch on the CPU: the same on every device, by any processes.
+        The CPU draws the numbers of the complete batch, so that they do not depend on the device
+        and the number of processes.
         """
         windows = self.stages[stage]
-        assert windows is not None, "an epoch of a stage without windows"
-        drawn = torch.randn(
+        assert windows is not None, "a stage with epochs has windows"
+        noise = torch.randn(
             windows.batch_size, self.scales.numel(), dtype=self.scales.dtype, device="cpu"
         )
         sizes = [
             windows.batch_size - windows.n_segment_start_windows,
             windows.n_segment_start_windows,
         ]
-        return torch.cat([part[self.rank :: self.world] for part in drawn.split(sizes)])
+        return torch.cat([part[self.rank :: self.world] for part in noise.split(sizes)])
 
     def _free_run(self) -> FreeRun:
-        """Return the free run of the model as the training has it now."""
+        """Return the compiled free run of the model."""
         if self._compiled is None:
-            # not before: by now the model is on its device and in training
+            # compiled at the first batch, when the model is on its device and in training mode
             self._compiled = compile_rollout(self.rollout, TRAINING_STEPS)
         return self._compiled
 
-    def validated(self) -> tuple[nn.Module, float]:
+    def compute_validation_score(self) -> tuple[nn.Module, float]:
         score = self.validate(self.model)
-        self.diverged, self.axes, self.shown = score.diverged, score.axes, score.shown
+        self.diverged, self.axes, self.example = score.diverged, score.axes, score.example
         return self.model, score.error
 
 
@@ -350,31 +355,32 @@ def train(
     seed: int,
     folder: Path | None,
 ) -> dict[str, Any]:
-    """Train the head of a model and leave the weights that validated best in it (float32).
+    """Train the head of a model and load the weights of the best validation into it (float32).
 
     Args:
-        name: of the head.
-        model: with its baseline filled in.
-        samples: training samples whose target is the residual; give the scales.
-        store: training windows, float64 where the training's precision is.
-        config: stages.
-        scales: of what moves, [n].
-        validate: divergences and free-run error of a model on the validation data.
-        seed: of weights and batches.
-        folder: for checkpoints (`checkpoints/<name>/last.ckpt` is resumed from where it exists) and
-            the TensorBoard log; None for neither.
+        name: name of the head.
+        model: model with a fitted baseline.
+        samples: training samples whose target is the residual; they determine the scales of the
+            head.
+        store: training windows, in the precision of the training.
+        config: settings of the training.
+        scales: scales of the velocities, SI [n].
+        validate: returns the validation score of a model.
+        seed: seed of noise and batches.
+        folder: folder of checkpoints and TensorBoard log; None to write neither. The checkpoint
+            `checkpoints/<name>/last.ckpt` of an interrupted training is resumed.
 
     Returns:
-        Notes about the training: the curve by epoch, the best score, the number of parameters.
+        Notes about the training: learning curve, best score, number of parameters.
 
     Raises:
-        FitError: where training never gave a finite free run.
+        FitError: if no validation gave a finite free run.
     """
     model.head.calibrate(samples)
     if isinstance(model.head, GRUEnsembleHead):
         return _train_coarse(name, model, store, config, scales, validate, seed, folder)
-    dtype = torch.float64 if config.double else torch.float32
-    # losses and scores are those of velocities
+    dtype = torch.float64 if config.is_double_precision else torch.float32
+    # losses and scores use velocities only
     model.has_position = False
     try:
         module = HeadTraining(model.to(dtype), config, scales.to(dtype), validate, seed)
@@ -394,38 +400,40 @@ def _train_coarse(
     seed: int,
     folder: Path | None,
 ) -> dict[str, Any]:
-    """Train networks in the coarse steps that their gates belong to; see `train`.
+    """Train an ensemble of recurrent networks at the coarse step of their gates; see `train`.
 
-    Every batch holds as many windows for each network, and no network sees those of another.
+    Each network has its own windows, and a batch holds the same number of windows for each.
     """
     head = model.head
     assert isinstance(head, GRUEnsembleHead)
     steps = max(round(head.training_step / model.dt), 1)
     signals = model.signals
-    turning = [signals.direction_column] if signals.has_wind else []
-    # a baseline in steps so long asks for a scheme of second order; a residual alone is held
-    alone = isinstance(model.baseline, FixedBaseline) and not model.baseline.library.n_terms
-    # an oscillation of the roll grows under Euler's scheme
+    angle_columns = [signals.direction_column] if signals.has_wind else []
+    # a baseline at a step of this length needs a second-order scheme; a residual is constant
+    has_no_baseline = (
+        isinstance(model.baseline, FixedBaseline) and not model.baseline.library.n_terms
+    )
+    # an explicit Euler scheme amplifies the roll oscillation
     first: Integrator = "semi_implicit_euler" if model.has_roll else "euler"
-    scheme: Integrator = first if alone else "heun"
+    scheme: Integrator = first if has_no_baseline else "heun"
     coarse = HybridDynamics(signals, model.baseline, head, steps * model.dt, scheme)
     coarse.has_position = False
 
-    def fine(trained: HybridDynamics) -> HybridDynamics:
+    def with_fine_step(trained: HybridDynamics) -> HybridDynamics:
         return HybridDynamics(
             trained.signals, trained.baseline, trained.head, model.dt, model.integrator
         )
 
-    def validated(trained: HybridDynamics) -> Score:
+    def validate_fine(trained: HybridDynamics) -> Score:
         try:
-            return validate(fine(trained))
+            return validate(with_fine_step(trained))
         finally:
             trained.head.set_step(coarse.dt)
 
-    dtype = torch.float64 if config.double else torch.float32
+    dtype = torch.float64 if config.is_double_precision else torch.float32
     try:
-        module = HeadTraining(coarse.to(dtype), config, scales.to(dtype), validated, seed)
-        data = module.data(store.coarsen(steps, turning))
+        module = HeadTraining(coarse.to(dtype), config, scales.to(dtype), validate_fine, seed)
+        data = module.data(store.coarsen(steps, angle_columns))
         return run_epochs(name, module, data, coarse, head, folder, config)
     finally:
         head.set_step(model.dt)

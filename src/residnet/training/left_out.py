@@ -1,9 +1,8 @@
-"""Parameters of a refitted baseline without some of its logs, by one step of Gauss-Newton each.
+"""Leave-one-out parameters of a refitted baseline by one Gauss-Newton step for each fold of logs.
 
-A refit for every group of logs that is left out would take as long as so many refits. At the
-minimum over all logs, the normal equations of a group say what it alone pulls the parameters to;
-taken away, the rest of the logs moves them by one step. All groups together cost as much as one
-iteration of the refit.
+At the minimum over all logs, the normal equations of a fold give its contribution to Hessian and
+gradient. One Gauss-Newton step without this contribution approximates the refit without the fold
+(infinitesimal jackknife). All folds cost as much as one iteration of the refit.
 """
 
 from __future__ import annotations
@@ -21,20 +20,20 @@ from residnet.preprocessing.windows import WindowStore
 from residnet.training.refit import (
     Problem,
     RefitConfig,
+    build_problem,
     estimate_initial_states,
     normal_equations,
-    parametric,
-    problem_of,
+    require_parametric_baseline,
     simulate,
 )
 
 
-class LeftOpen(NamedTuple):
-    """What a refit has left open.
+class RefitUncertainty(NamedTuple):
+    """Uncertainty of the parameters of a refit.
 
     Attributes:
-        covariance: of the free parameters [P, P].
-        square: mean square error of a channel of the free runs, in scales.
+        covariance: covariance of the free parameters [P, P].
+        square: mean square error of a channel of the free runs, in units of the scales.
     """
 
     covariance: Tensor
@@ -48,27 +47,27 @@ def estimate_refit_covariance(
     config: RefitConfig,
     scales: Tensor,
     fixed: Sequence[int],
-) -> LeftOpen:
+) -> RefitUncertainty:
     """Estimate the covariance of a refit's parameters from one pass over its free runs.
 
     Args:
         model: a baseline without a head, after its refit.
-        samples: of the refit.
+        samples: samples of the refit.
         store: training windows of the refit, float64.
-        config: of the refit.
-        scales: of what moves, [n].
+        config: settings of the refit.
+        scales: scales of the velocities in SI units [n].
         fixed: indices of the free parameters that the refit has fixed at zero.
     """
-    problem = problem_of(model, samples, store, config, scales).fixing(fixed)
+    problem = build_problem(model, samples, store, config, scales).with_fixed(fixed)
     problem = estimate_initial_states(model, problem)
     cost, states = simulate(model, problem)
     hessian, _ = normal_equations(model, problem, cost, states)
     covariance = problem.cost_per_nat(cost) * problem.inverse(hessian)
-    return LeftOpen(covariance, float(cost.square() - config.robust**2))
+    return RefitUncertainty(covariance, float(cost.square() - config.robust**2))
 
 
 _MAX_HALVINGS = 4
-"""Largest number of times that a step without a gain is halved."""
+"""Maximum number of trials per step; each halves the step."""
 
 
 def estimate_leave_one_out(
@@ -80,25 +79,25 @@ def estimate_leave_one_out(
     fold: Tensor,
     fixed: Sequence[int] = (),
 ) -> list[Tensor]:
-    """Estimate the parameters of refits that leave out one fold of logs each.
+    """Estimate the parameters of refits that each leave out one fold of logs.
 
     Each is one Gauss-Newton step from the refitted parameters (infinitesimal jackknife).
 
     Args:
         model: a baseline without a head, after its refit; it is not changed.
-        samples: of the refit.
+        samples: samples of the refit.
         store: training windows of the refit, float64.
-        config: of the refit.
-        scales: of what moves, [n].
-        fold: number of the fold of each log [L], from 0 on.
+        config: settings of the refit.
+        scales: scales of the velocities in SI units [n].
+        fold: index of the fold of each log [L], from 0 on.
         fixed: indices of the free parameters that the refit has fixed at zero.
 
     Returns:
-        One theta for each fold; the refitted one where a fold holds no window, or where no part of
-        the step keeps the free runs of the other logs finite and no worse.
+        theta of each fold. It equals the refitted theta if the fold has no window, or if no
+        fraction of the step lowers the cost of the other logs.
     """
-    baseline = parametric(model)
-    problem = problem_of(model, samples, store, config, scales).fixing(fixed)
+    baseline = require_parametric_baseline(model)
+    problem = build_problem(model, samples, store, config, scales).with_fixed(fixed)
     problem = estimate_initial_states(model, problem)
     cost, states = simulate(model, problem)
     refitted_theta, parameters = baseline.theta.detach().clone(), baseline.get_free()
@@ -111,7 +110,7 @@ def estimate_leave_one_out(
         )
         for k in range(n_folds)
     ]
-    # at the minimum the gradient of all logs and that of the prior cancel
+    # at the minimum the gradients of all logs and of the prior cancel
     total_gradient = sum(
         (
             share * equations
@@ -151,7 +150,7 @@ def _largest_improving_step(
     model: HybridDynamics, remaining: Problem, parameters: Tensor, step: Tensor
 ) -> Tensor:
     """Return the parameters after the largest fraction of the step that lowers the cost."""
-    baseline, (initial_cost, _) = parametric(model), simulate(model, remaining)
+    baseline, (initial_cost, _) = require_parametric_baseline(model), simulate(model, remaining)
     for halving in range(_MAX_HALVINGS):
         trial = parameters + 0.5**halving * step
         baseline.set_free(trial)
@@ -163,7 +162,7 @@ def _largest_improving_step(
 
 
 def _select_windows(problem: Problem, is_selected: Tensor) -> Problem:
-    """Return the problem of some of its windows, with their present initial states."""
+    """Return the problem of some of its windows, with their current initial states."""
     return replace(
         problem,
         x0=problem.x0[is_selected],
@@ -178,7 +177,7 @@ def _select_windows(problem: Problem, is_selected: Tensor) -> Problem:
 def _normal_equations_of_windows(
     model: HybridDynamics, problem: Problem, states: Tensor, cost: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return Hessian [P, P] and half the gradient [P] of the mean cost of some windows alone."""
+    """Return Hessian [P, P] and half the gradient [P] of the mean cost of some windows."""
     n_parameters = int(problem.free.numel())
     if len(problem.x0) == 0:
         return torch.zeros(n_parameters, n_parameters, dtype=states.dtype), torch.zeros(
@@ -189,6 +188,6 @@ def _normal_equations_of_windows(
         precision=torch.zeros_like(problem.precision),
         symmetry=torch.zeros_like(problem.symmetry),
         belief_precision=torch.zeros_like(problem.belief_precision),
-        prior_mean=parametric(model).get_free(),
+        prior_mean=require_parametric_baseline(model).get_free(),
     )
     return normal_equations(model, without_prior, cost, states)

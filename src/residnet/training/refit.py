@@ -1,9 +1,9 @@
 """Output-error identification of a baseline: Gauss-Newton on free-run errors.
 
-Least squares on accelerations weighs every sample alike and ignores how errors accumulate; this
-minimises the error that a free run is judged by. The least-squares solution with its information
-matrix is the prior, so that directions which the free runs do not excite stay where accelerations
-put them. A baseline with prior beliefs about its parameters adds these.
+Least squares on accelerations ignores how errors accumulate in a free run. The refit minimises the
+free-run error of the metrics. Its prior is the least-squares solution with its information matrix,
+which determines the parameters that the free runs do not excite. The prior of the baseline about
+its parameters (`belief`), if any, is added.
 
 Source: R. V. Jategaonkar, Flight Vehicle System Identification, 2015, chapter 4, for output-error.
 """
@@ -45,20 +45,20 @@ class RefitConfig(Config):
 
     Attributes:
         horizon: length of the free runs in s.
-        every: time between their starts in s.
+        every: time between the starts of successive free runs in s.
         prior: weight of the least-squares solution, as a share of its own information.
-        asymmetric: shrinks terms that a mirror-symmetric vessel cannot have towards zero; 0 for no
-            such knowledge.
-        robust: windows whose error (in units of the scales) is far above this count by their error
-            and not by its square.
-        correlation: time over which errors of a free run are correlated; the logs hold so many
-            independent errors, which says how much beliefs weigh beside them, and how large the
-            standard errors are.
-        iterations: at most, for each estimate of the initial states.
-        starts: initial states of free runs. `measured`: as measured, and as free runs are judged
-            from. In a lightly damped vessel their noise persists and biases damping upwards.
-            `estimated`: jointly with the parameters, each within its measurement noise, for
-            coefficients that are to be those of the vessel.
+        asymmetric: weight of the prior that shrinks terms towards zero if port-starboard symmetry
+            excludes them; 0 for no such prior.
+        robust: error, in units of the scales, above which the loss of a window is linear instead
+            of quadratic.
+        correlation: correlation time of free-run errors in s. The duration of the logs divided by
+            this time is the number of independent errors, which determines the standard errors
+            and the weight of the data relative to the prior of the baseline.
+        iterations: maximum number of iterations for each estimate of the initial states.
+        starts: initial states of free runs. `measured`: the measured states, as in the metrics.
+            In a lightly damped vessel their noise persists and biases damping upwards.
+            `estimated`: estimated jointly with the parameters, with the measurement noise as
+            prior; gives less biased coefficients.
     """
 
     horizon: Seconds = Field(default=20.0, gt=0)
@@ -79,11 +79,11 @@ class RefitResult:
     """Result of a refit.
 
     Attributes:
-        covariance: of the free parameters, [P, P].
-        notes: cost before and after, iterations, windows, horizon and what the search started with
-            where free runs diverged over all of it, independent errors, parameters fixed at zero.
-        unidentifiable: free parameters that neither accelerations nor free runs determine [P];
-            they stay where least squares put them.
+        covariance: covariance of the free parameters [P, P].
+        notes: cost before and after, number of iterations and windows, horizon, first horizon of
+            the continuation, number of independent errors, parameters fixed at zero.
+        unidentifiable: whether neither accelerations nor free runs determine a free parameter [P];
+            such a parameter keeps its least-squares value.
     """
 
     covariance: Tensor
@@ -96,7 +96,7 @@ class RefitResult:
 
 
 class InitialStates(NamedTuple):
-    """Measured velocities at the starts of free runs [B, n], and their noise [n], SI."""
+    """Measured initial velocities of free runs [B, n], and their noise [n], SI."""
 
     measured: Tensor
     noise: Tensor
@@ -104,23 +104,23 @@ class InitialStates(NamedTuple):
 
 @dataclass(frozen=True)
 class Problem:
-    """The robust cost over B windows of T steps, and the prior on P free parameters.
+    """Robust cost over B windows of T steps, and prior of P free parameters.
 
     Attributes:
         x0: initial states [B, 3 + n].
-        inputs: held over each step [B, T, m].
-        measured: velocities after each step [B, T, n].
-        weight: [B, T, n], 1/scale or 0 for samples that do not count.
-        free: places of the free parameters in theta [P].
-        precision, prior_mean: of the least-squares prior [P, P], [P].
+        inputs: inputs, constant over each step [B, T, m].
+        measured: measured velocities after each step [B, T, n].
+        weight: 1/scale, or 0 for invalid samples [B, T, n].
+        free: indices of the free parameters in theta [P].
+        precision, prior_mean: precision [P, P] and mean [P] of the least-squares prior.
         regularisation: part of `precision` that does not depend on the data [P, P].
-        symmetry: precision of the pull towards port-starboard symmetry [P, P].
-        belief_mean, belief_precision: of the baseline's own prior [P].
-        fixed: parameters fixed at zero [P].
+        symmetry: precision of the prior of port-starboard symmetry [P, P].
+        belief_mean, belief_precision: mean and precision of the prior of the baseline [P].
+        fixed: whether a parameter is fixed at zero [P].
         independent_errors: effective sample size per channel.
-        robust: error above which a window counts linearly, in scales.
+        robust: error above which the loss of a window is linear, in scales.
         log: index of each window's log [B].
-        initial: prior on the initial states; None where they are taken as measured.
+        initial: prior of the initial states; None if they are the measured states.
     """
 
     x0: Tensor
@@ -140,13 +140,13 @@ class Problem:
     log: Tensor
     initial: InitialStates | None = None
 
-    def fixing(self, parameters: Sequence[int]) -> Problem:
+    def with_fixed(self, parameters: Sequence[int]) -> Problem:
         """Return the problem with further parameters fixed at zero."""
         fixed = self.fixed.clone()
         fixed[list(parameters)] = True
         return replace(self, fixed=fixed)
 
-    def truncated(self, steps: int) -> Problem:
+    def truncate(self, steps: int) -> Problem:
         """Return the problem over a shorter horizon."""
         cut = {name: getattr(self, name)[:, :steps] for name in ("inputs", "measured", "weight")}
         return replace(self, **cut)
@@ -157,11 +157,11 @@ class Problem:
         return error.square().mean((1, 2))
 
     def cost_per_nat(self, cost: Tensor) -> Tensor:
-        """Return half of what one unit of negative log-likelihood adds to the cost.
+        """Return half the change of the cost per unit of negative log-likelihood (nat).
 
-        With c the mean square error of n channels of N independent errors each, the log-likelihood
-        falls by n N / 2c per unit of c, and the cost sqrt(c + robust^2) by 1 / (2 cost). It turns
-        beliefs, which are likelihoods, into costs.
+        Let c be the mean square error of n channels of N independent errors each. Per unit of c,
+        the negative log-likelihood increases by n N / 2c and the cost sqrt(c + robust^2) by
+        1 / (2 cost). The ratio converts the prior of the baseline to the unit of the cost.
         """
         mean_square = (cost.square() - self.robust**2).clamp(min=1e-12)
         return mean_square / (2.0 * self.measured.shape[-1] * self.independent_errors * cost)
@@ -179,11 +179,11 @@ class Problem:
         return quadratic + per_nat * (self.belief_precision * from_belief.square()).sum()
 
 
-def parametric(model: HybridDynamics) -> ParametricBaseline:
-    """Return the baseline of a model, which must have free parameters.
+def require_parametric_baseline(model: HybridDynamics) -> ParametricBaseline:
+    """Return the baseline of a model if it has free parameters.
 
     Raises:
-        FitError: where it has none.
+        FitError: if the baseline has no free parameters.
     """
     if not isinstance(model.baseline, ParametricBaseline):
         raise FitError(
@@ -193,15 +193,16 @@ def parametric(model: HybridDynamics) -> ParametricBaseline:
     return model.baseline
 
 
-def free_run_starts(store: WindowStore, config: RefitConfig, dt: float) -> Tensor:
+def find_free_run_starts(store: WindowStore, config: RefitConfig, dt: float) -> Tensor:
     """Return the rows of the store at which free runs start.
 
     Raises:
-        FitError: where no log is long enough.
+        FitError: if no log is long enough.
     """
-    steps, every = round(config.horizon / dt), max(round(config.every / dt), 1)
+    steps = round(config.horizon / dt)
+    steps_between_starts = max(round(config.every / dt), 1)
     starts = store.find_starts(steps + 1)
-    starts = starts[store.n_elapsed[starts] % every == 0]
+    starts = starts[store.n_elapsed[starts] % steps_between_starts == 0]
     if starts.numel() == 0:
         raise FitError(
             f"no training log holds a free run of {config.horizon:g} s for the refit; shorten"
@@ -210,18 +211,18 @@ def free_run_starts(store: WindowStore, config: RefitConfig, dt: float) -> Tenso
     return starts
 
 
-def problem_of(
+def build_problem(
     model: HybridDynamics,
     samples: Samples,
     store: WindowStore,
     config: RefitConfig,
     scales: Tensor,
 ) -> Problem:
-    """Return the problem that follows a least-squares fit to `samples`; nothing is fixed yet."""
-    baseline, steps = parametric(model), round(config.horizon / model.dt)
-    starts = free_run_starts(store, config, model.dt)
+    """Return the refit problem after a least-squares fit to `samples`; no parameter is fixed."""
+    baseline, steps = require_parametric_baseline(model), round(config.horizon / model.dt)
+    starts = find_free_run_starts(store, config, model.dt)
     usable = store.take_windows(store.usable, starts + 1, steps).to(scales.dtype).unsqueeze(-1)
-    # u and v come from positions, which can freeze; all else from an IMU, which then still measures
+    # u and v come from positions, which can freeze; an IMU measures the other velocities
     from_imu = torch.ones_like(usable).expand(-1, -1, model.dof - 2)
     information = baseline.mean_information(samples)
     regularisation = torch.diag(_REGULARISATION * information.diagonal())
@@ -269,35 +270,41 @@ def simulate(model: HybridDynamics, problem: Problem) -> tuple[Tensor, Tensor]:
 def sensitivities(
     model: HybridDynamics, x: Tensor, w: Tensor, *, to_start: bool = False
 ) -> Iterator[tuple[slice, Tensor]]:
-    """Yield sensitivities of free runs, a stretch of steps at a time: steps and [K, B, 1 + n, P].
+    """Yield exact sensitivities of free runs for consecutive blocks of K steps.
 
-    Rows are heading and velocities; columns the free parameters, or heading and velocities at the
-    start with `to_start`, [K, B, 1 + n, 1 + n]. The recursion s' = A s + B is exact.
+    The recursion is s[k + 1] = A[k] s[k] + B[k].
 
     Args:
+        model: a baseline without a head.
         x: states at the start of each step [B, T, 3 + n].
         w: inputs of the steps [B, T, m].
+        to_start: whether to differentiate with respect to the initial heading and velocities
+            instead of the free parameters.
+
+    Yields:
+        Slice of the steps, and sensitivities of heading and velocities [K, B, 1 + n, P], or
+        [K, B, 1 + n, 1 + n] with `to_start`.
     """
     batch, total = w.shape[:2]
-    # CasADi, which it needs, is not imported where nothing is refitted
+    # imported here because it imports CasADi, which only a refit needs
     from residnet.engine.jacobian import StepJacobian
 
     jacobian = StepJacobian.of_model(model)
     s = torch.zeros(batch, 1 + model.dof, len(jacobian.free_indices), dtype=x.dtype)
     if to_start:
         s = torch.eye(1 + model.dof, dtype=x.dtype).expand(batch, -1, -1)
-    stretch = max(_ROWS_PER_BATCH // max(batch, 1), 1)
-    for begin in range(0, total, stretch):
-        steps = slice(begin, min(begin + stretch, total))
+    block_length = max(_ROWS_PER_BATCH // max(batch, 1), 1)
+    for begin in range(0, total, block_length):
+        steps = slice(begin, min(begin + block_length, total))
         by_state, by_parameter = (
             part.unflatten(0, (-1, batch))
             for part in jacobian(*(a[:, steps].transpose(0, 1).flatten(0, 1) for a in (x, w)))
         )
-        out = []
+        block = []
         for a, b in zip(by_state, by_parameter, strict=True):
             s = a @ s if to_start else torch.baddbmm(b, a, s)
-            out.append(s)
-        yield steps, torch.stack(out)
+            block.append(s)
+        yield steps, torch.stack(block)
 
 
 @torch.no_grad()
@@ -307,14 +314,16 @@ def normal_equations(
     """Return the Gauss-Newton Hessian [P, P] and half the gradient [P] of the cost with its prior.
 
     Args:
-        cost: of the free runs.
-        states: of the free runs [B, T + 1, 3 + n].
+        model: a baseline without a head.
+        problem: windows and prior.
+        cost: robust cost of the free runs.
+        states: states of the free runs [B, T + 1, 3 + n].
     """
     batch, steps = problem.inputs.shape[:2]
     count = len(problem.free)
     hessian = torch.zeros(count, count, dtype=states.dtype)
     gradient = torch.zeros(count, dtype=states.dtype)
-    # d sqrt(m + c^2) = dm / (2 sqrt(m + c^2)): each window has a weight of its own
+    # d sqrt(m + c^2) = dm / (2 sqrt(m + c^2)): this is the weight of each window
     rms = torch.sqrt(problem.mean_square(states) + problem.robust**2)
     window = (0.5 / rms / (model.dof * steps * batch)).sqrt()[:, None, None]
     root_weight = (window * problem.weight).transpose(0, 1)
@@ -323,12 +332,12 @@ def normal_equations(
         rows = (s[:, :, 1:] * root_weight[part].unsqueeze(-1)).flatten(0, 2)
         hessian.addmm_(rows.T, rows)
         gradient.addmv_(rows.T, error[part].flatten())
-    theta = parametric(model).get_free()
+    theta = require_parametric_baseline(model).get_free()
     belief = problem.cost_per_nat(cost) * problem.belief_precision
     hessian = hessian + problem.precision + problem.symmetry + torch.diag(belief)
     gradient = gradient + problem.precision @ (theta - problem.prior_mean)
     gradient = gradient + problem.symmetry @ theta + belief * (theta - problem.belief_mean)
-    # a fixed parameter keeps its diagonal, so that the matrix stays invertible, and takes no step
+    # a fixed parameter keeps its diagonal entry, so that the Hessian is invertible; its step is 0
     free = ~problem.fixed
     return hessian * (free[:, None] & free | torch.eye(count).bool()), gradient * free
 
@@ -343,9 +352,9 @@ def _gauss_newton(
     model: HybridDynamics, problem: Problem, iterations: int
 ) -> DescentResult[_Iterate]:
     """Minimise over the parameters, with Levenberg-Marquardt damping."""
-    baseline = parametric(model)
+    baseline = require_parametric_baseline(model)
 
-    def at(theta: Tensor) -> _Iterate:
+    def evaluate(theta: Tensor) -> _Iterate:
         baseline.set_free(theta)
         return _Iterate(theta, *simulate(model, problem))
 
@@ -356,24 +365,25 @@ def _gauss_newton(
 
         def trial(damping: float) -> tuple[float, _Iterate]:
             damped = hessian + damping * torch.diag(hessian.diagonal())
-            new = at(point.theta - torch.linalg.solve(damped, gradient))
+            new = evaluate(point.theta - torch.linalg.solve(damped, gradient))
             return float(new.cost + problem.prior_cost(new.theta, per_nat)), new
 
         return float(point.cost + problem.prior_cost(point.theta, per_nat)), trial
 
-    found = minimize_levenberg_marquardt(
-        at(baseline.get_free()), linearise, iterations, min_relative_decrease=_MIN_GAIN
+    result = minimize_levenberg_marquardt(
+        evaluate(baseline.get_free()), linearise, iterations, min_relative_decrease=_MIN_GAIN
     )
-    baseline.set_free(found.minimizer.theta)
-    return found
+    baseline.set_free(result.minimizer.theta)
+    return result
 
 
 @torch.no_grad()
 def estimate_initial_states(model: HybridDynamics, problem: Problem) -> Problem:
-    """Return the problem after one Gauss-Newton step of the initial states, where they are free.
+    """Return the problem after one Gauss-Newton step of the initial states.
 
-    Sensor noise is new at every sample. The rest of the error may last from start to end, so that
-    all samples together tell no more of it than one does: its variance counts T times.
+    Without a prior of the initial states the problem is returned unchanged. Sensor noise is
+    independent from sample to sample. The model error may be constant over the window, so that
+    T samples contain no more information about it than one: its variance is multiplied by T.
     """
     if problem.initial is None:
         return problem
@@ -401,36 +411,39 @@ def estimate_initial_states(model: HybridDynamics, problem: Problem) -> Problem:
 def _fit_growing_horizon(
     model: HybridDynamics, problem: Problem, iterations: int
 ) -> tuple[int, int]:
-    """Move parameters whose free runs diverge to where they are finite over the whole horizon.
+    """Fit over growing horizons until the free runs over the complete horizon are finite.
 
-    Continuation: the minimum over a horizon that is finite is the start of a longer one.
+    This is a continuation method: the minimum over a short horizon is the initial value of the
+    search over a longer one.
 
     Returns:
-        Steps of the first horizon, and iterations.
+        Number of steps of the first horizon, and number of iterations.
 
     Raises:
-        FitError: where free runs diverge from the first step on.
+        FitError: if the free runs diverge at the first step or after each further step.
     """
 
     def diverges(steps: int) -> bool:
-        cost = float(simulate(model, problem.truncated(steps))[0])
-        # a single step is nearly linear, and gives a direction from anywhere
+        cost = float(simulate(model, problem.truncate(steps))[0])
+        # a single step is nearly linear in the parameters: any finite cost gives a direction
         return not (cost < _DIVERGED or (steps == 1 and cost < torch.inf))
 
-    whole = problem.inputs.shape[1]
+    total = problem.inputs.shape[1]
     horizon, first, iterated = 0, 0, 0
-    while horizon < whole:
-        longer = min(2 * horizon, whole) if horizon else whole
-        while longer > horizon and diverges(longer):
-            longer = horizon + (longer - horizon) // 2
-        if longer == horizon:
+    while horizon < total:
+        # double the horizon, then halve the increase until the free runs are finite
+        next_horizon = min(2 * horizon, total) if horizon else total
+        while next_horizon > horizon and diverges(next_horizon):
+            next_horizon = horizon + (next_horizon - horizon) // 2
+        if next_horizon == horizon:
             raise FitError(
                 "the least-squares baseline diverges within the refit's horizon; shorten `horizon`"
                 " or raise the baseline's ridge"
             )
-        horizon, first = longer, first or longer
-        if horizon < whole:
-            iterated += _gauss_newton(model, problem.truncated(horizon), iterations).n_steps
+        first = first or next_horizon
+        horizon = next_horizon
+        if horizon < total:
+            iterated += _gauss_newton(model, problem.truncate(horizon), iterations).n_steps
     return first, iterated
 
 
@@ -442,23 +455,23 @@ def refit(
     scales: Tensor,
     begin: Tensor | None = None,
 ) -> RefitResult:
-    """Move the parameters of `model.baseline` to the minimum; float64.
+    """Fit the parameters of `model.baseline` to free runs by output error (float64).
 
     Args:
-        model: a baseline without a head, fitted by least squares.
-        samples: the samples of that fit.
+        model: a baseline without a head, fitted by least squares; its parameters are changed.
+        samples: samples of the least-squares fit.
         store: training windows, float64.
-        config: settings.
-        scales: of what moves, [n].
-        begin: theta that the search begins at, where another refit has been near the minimum;
-            None for the least-squares solution, which stays the prior in any case.
+        config: settings of the refit.
+        scales: scales of the velocities, SI [n].
+        begin: initial theta of the search, for example from a similar refit; None for the
+            least-squares solution, which is always the prior.
 
     Raises:
-        FitError: where free runs diverge from the first step on, or from a later one whatever the
-            minimum of those before it is.
+        FitError: if the free runs diverge at the first step, or the continuation over growing
+            horizons cannot extend the horizon.
     """
-    baseline = parametric(model)
-    problem = problem_of(model, samples, store, config, scales)
+    baseline = require_parametric_baseline(model)
+    problem = build_problem(model, samples, store, config, scales)
     if begin is not None:
         with torch.no_grad():
             baseline.theta.copy_(begin)
@@ -470,22 +483,23 @@ def refit(
     cost_before = cost
     undamped: list[int] = []
     for _ in range(_SIGN_ROUNDS):
-        found = _gauss_newton(model, problem, config.iterations)
-        iterated += found.n_steps
-        # alternate with the initial states until these gain no more
+        result = _gauss_newton(model, problem, config.iterations)
+        iterated += result.n_steps
+        # alternate with steps of the initial states while these lower the cost
         for _ in range(config.iterations if problem.initial else 0):
-            moved = estimate_initial_states(model, problem)
-            if not simulate(model, moved)[0] < (1.0 - _MIN_GAIN) * found.minimizer.cost:
+            candidate = estimate_initial_states(model, problem)
+            if not simulate(model, candidate)[0] < (1.0 - _MIN_GAIN) * result.minimizer.cost:
                 break
-            problem, found = moved, _gauss_newton(model, moved, config.iterations)
-            iterated += found.n_steps
-        cost = found.minimizer.cost
-        if feeding := baseline.destabilising_terms():
-            problem = problem.fixing(feeding)
-        elif more := baseline.undamped_terms(samples):
-            # terms that fed energy beside these may not without them: give them another chance
-            undamped += more
-            problem = replace(problem, fixed=torch.zeros_like(problem.fixed)).fixing(undamped)
+            problem = candidate
+            result = _gauss_newton(model, problem, config.iterations)
+            iterated += result.n_steps
+        cost = result.minimizer.cost
+        if destabilising := baseline.destabilising_terms():
+            problem = problem.with_fixed(destabilising)
+        elif new_undamped := baseline.undamped_terms(samples):
+            # without these terms the destabilising ones may have the correct sign: free them again
+            undamped += new_undamped
+            problem = replace(problem, fixed=torch.zeros_like(problem.fixed)).with_fixed(undamped)
         else:
             break
         baseline.set_free(baseline.get_free().masked_fill(problem.fixed, 0.0))

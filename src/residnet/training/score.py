@@ -1,4 +1,4 @@
-"""How a training tells how good a model is: its free runs over the validation logs."""
+"""Validation score of a model: errors of its free runs over the validation logs."""
 
 from __future__ import annotations
 
@@ -8,8 +8,13 @@ from typing import NamedTuple
 from torch import Tensor
 
 
-class Shown(NamedTuple):
-    """A free run for TensorBoard: times [T], and columns by name, measured and predicted [T]."""
+class ExampleRun(NamedTuple):
+    """Example free run for TensorBoard.
+
+    Attributes:
+        t: times in s [T].
+        columns: measured and predicted values [T] of each column by name.
+    """
 
     t: Tensor
     columns: dict[str, tuple[Tensor, Tensor]]
@@ -17,18 +22,20 @@ class Shown(NamedTuple):
 
 @dataclass(frozen=True, order=True)
 class Score:
-    """How a model does in free runs over the validation logs; the lesser score is the better one.
+    """Error of a model's free runs over the validation logs; the lower score is better.
 
-    The error of windows that diverged says little, so that fewer of them count first.
+    Scores are compared by the number of diverged windows first, because the error of a diverged
+    window is arbitrary.
 
     Attributes:
         diverged: number of windows that diverged.
-        error: mean nrmse over u, v, r; a diverged window counts with the error of `constant_velocity`.
-        axes: nrmse of each axis by name.
-        shown: one of the free runs.
+        error: mean normalised RMSE over u, v, r; a diverged window has the error of
+            `constant_velocity`.
+        axes: normalised RMSE of each axis by name.
+        example: one of the free runs.
     """
 
     diverged: int
     error: float
     axes: dict[str, float] = field(default_factory=dict, compare=False)
-    shown: Shown | None = field(default=None, compare=False)
+    example: ExampleRun | None = field(default=None, compare=False)

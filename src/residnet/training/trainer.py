@@ -1,8 +1,7 @@
-"""The one trainer: Lightning runs the epochs of a module on the batches of a data module.
+"""Training loop with validation, early stopping, checkpoints and TensorBoard log, by Lightning.
 
-Epochs can be resumed, the best state is kept, and the last stage stops early. TensorBoard shows
-loss, validation (by axis where there are axes), learning rate, settings with the final score, and
-a free run.
+TensorBoard shows the loss, the validation score (of each axis too), the learning rate, the
+settings with the final score, and an example free run.
 """
 
 from __future__ import annotations
@@ -27,28 +26,28 @@ from residnet.core.ownership import find_run_manifest, require_inside
 from residnet.core.progress import report_progress
 from residnet.preprocessing.data_module import EpochDataModule, compute_epoch_seed
 from residnet.training.config import MachineConfig, OneStage, TrainingConfig
-from residnet.training.score import Shown
+from residnet.training.score import ExampleRun
 
 Epochs = OneStage | TrainingConfig
 """Settings of a training."""
-_KEPT = (
+_CHECKPOINT_FIELDS = (
     "best_score", "best_diverged", "best_state", "start_score", "without_gain", "history",
     "stopped",
 )  # fmt: skip
-"""What a checkpoint keeps of a training, beside Lightning's part and random numbers."""
+"""Attributes of `EpochTraining` in a checkpoint, in addition to the state of Lightning."""
 
 
 class EpochTraining(L.LightningModule, ABC):
-    """A Lightning module that `run_epochs` trains.
+    """Base class of the Lightning modules that `run_epochs` trains.
 
-    Every epoch is seeded by (seed, epoch) alone, so that a run resumed at an epoch's end repeats
-    the undisturbed one.
+    The seed of an epoch depends on (seed, epoch) only, so that a run resumed after an epoch gives
+    the same result as an uninterrupted run.
 
     Attributes:
-        diverged: number of runs of the last validation that are unusable, free runs that diverge
-            or flights that swing; weights with fewer of them are better, whatever the scores.
-        axes: of the last validation, the score of each axis by name, where there are axes.
-        shown: a free run of the best validation, where there is one.
+        diverged: number of rejected runs of the last validation: free runs that diverge or
+            simulations with limit cycles. Fewer rejected runs take precedence over a lower score.
+        axes: score of each axis by name in the last validation; empty if the score has no axes.
+        example: an example free run of the last validation; None without free runs.
     """
 
     def __init__(self, settings: Epochs, seed: int) -> None:
@@ -64,43 +63,43 @@ class EpochTraining(L.LightningModule, ABC):
         self.stopped = False
         self.history: list[dict[str, float]] = []
         self.axes: dict[str, float] = {}
-        self.shown: Shown | None = None
+        self.example: ExampleRun | None = None
 
     @abstractmethod
-    def validated(self) -> tuple[nn.Module, float]:
-        """Return the module that is kept if it is the best so far, and its score, which falls."""
+    def compute_validation_score(self) -> tuple[nn.Module, float]:
+        """Validate, and return the module to save and its score (lower is better)."""
 
     @property
     def epoch(self) -> int:
-        """Epochs finished; Lightning's own count is one behind while it restores a checkpoint."""
+        """Number of finished epochs; Lightning's count is one lower during a restart."""
         return len(self.history)
 
     @property
-    def made_of(self) -> str:
-        """A SHA-256 of settings, seed and tensor shapes, which a checkpoint must share."""
+    def settings_digest(self) -> str:
+        """SHA-256 of settings, seed and tensor shapes; a checkpoint must have the same digest."""
         shapes = {name: str(list(value.shape)) for name, value in self.state_dict().items()}
         return hashlib.sha256(f"{self.settings!r} {self.seed} {shapes}".encode()).hexdigest()
 
     @property
-    def finished(self) -> bool:
-        """Whether all epochs are done or training has stopped early."""
+    def is_finished(self) -> bool:
+        """Whether all epochs are finished or training has stopped early."""
         return self.stopped or self.epoch >= self.settings.epochs
 
     def validate_start(self) -> None:
-        """Validate before the first epoch, so that training is kept only where it helps."""
-        model, score = self.validated()
+        """Validate before the first epoch; later weights must have a better score."""
+        model, score = self.compute_validation_score()
         self.start_score = score
         if math.isfinite(score):
-            self.best_score, self.best_state = score, _copied(model)
+            self.best_score, self.best_state = score, _copy_state(model)
 
     def seed_epoch(self) -> None:
-        """Seed the random numbers of the present epoch."""
+        """Seed the random numbers of the current epoch."""
         torch.manual_seed(compute_epoch_seed(self.seed, self.epoch))
 
     def finish_epoch(self) -> None:
-        """Validate, keep the best weights, and stop early in the last stage.
+        """Validate, save the best weights, and stop early in the last stage.
 
-        The first callback of an epoch's end calls it.
+        `EpochEnd` calls this before it writes the checkpoint.
         """
         stage, _ = self.settings.stage(self.epoch)
         last = self.epoch + 1 == self.settings.epochs
@@ -109,16 +108,16 @@ class EpochTraining(L.LightningModule, ABC):
             "stage": float(stage),
         }
         loss = sum(self._losses) / max(len(self._losses), 1)
-        # a loss beyond all numbers has none; JSON knows no other way to say so
+        # JSON has no number for an infinite or undefined loss
         entry |= {"loss": loss} if math.isfinite(loss) else {}
         self._losses.clear()
         if last or (self.epoch + 1) % self.settings.validate_every == 0:
-            model, score = self.validated()
+            model, score = self.compute_validation_score()
             entry["validation"] = score
             entry["diverged"] = float(self.diverged)
-            if self._gains(score):
+            if self._is_improvement(score):
                 self.best_score, self.best_diverged, self.without_gain = score, self.diverged, 0
-                self.best_state = _copied(model)
+                self.best_state = _copy_state(model)
             else:
                 self.without_gain += 1
         self.history.append(entry)
@@ -126,71 +125,71 @@ class EpochTraining(L.LightningModule, ABC):
         if logger is not None:
             rate = self.trainer.optimizers[0].param_groups[0]["lr"]
             axes = {f"validation_{name}": error for name, error in self.axes.items()}
-            shown = {name: value for name, value in entry.items() if name != "epoch"}
-            logger.log_metrics(shown | axes | {"learning_rate": rate}, step=self.epoch)
+            scalars = {name: value for name, value in entry.items() if name != "epoch"}
+            logger.log_metrics(scalars | axes | {"learning_rate": rate}, step=self.epoch)
         self.stopped = (
             stage == self.settings.last_stage and self.without_gain >= self.settings.patience
         )
         self.trainer.should_stop = self.stopped
 
-    def _gains(self, score: float) -> bool:
+    def _is_improvement(self, score: float) -> bool:
         if not self.best_state:
             return math.isfinite(score)
         return (self.diverged, score) < (self.best_diverged, self.best_score)
 
     def on_fit_start(self) -> None:
-        """Reset the losses of the running epoch."""
+        """Clear the losses of the current epoch."""
         self._losses: list[float] = []
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the best weights, the curve, random state and thread count in the checkpoint."""
-        checkpoint["residnet"] = {name: getattr(self, name) for name in _KEPT} | {
+        """Add best weights, learning curve, random state and number of threads to a checkpoint."""
+        checkpoint["residnet"] = {name: getattr(self, name) for name in _CHECKPOINT_FIELDS} | {
             "stage": self.settings.stage(self.epoch)[0],
             "random": torch.get_rng_state(),
             "threads": torch.get_num_threads(),
-            "made_of": self.made_of,
+            "made_of": self.settings_digest,
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Put back what `on_save_checkpoint` kept."""
+        """Restore the state that `on_save_checkpoint` saved."""
         self.restore(checkpoint["residnet"])
 
-    def restore(self, kept: dict[str, Any]) -> None:
-        """Put back what a checkpoint kept of this module."""
-        for name in _KEPT:
-            setattr(self, name, kept.get(name, getattr(self, name)))
-        torch.set_rng_state(kept["random"])
-        torch.set_num_threads(kept["threads"])
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Restore the attributes of this module from a checkpoint."""
+        for name in _CHECKPOINT_FIELDS:
+            setattr(self, name, saved.get(name, getattr(self, name)))
+        torch.set_rng_state(saved["random"])
+        torch.set_num_threads(saved["threads"])
 
 
-def _copied(model: nn.Module) -> dict[str, Tensor]:
+def _copy_state(model: nn.Module) -> dict[str, Tensor]:
     return {name: value.detach().to("cpu", copy=True) for name, value in model.state_dict().items()}
 
 
 class EpochEnd(L.Callback):
-    """What happens at the end of an epoch: validation, then `last.ckpt`, then a report.
+    """Validate, write `last.ckpt` and report progress at the end of each epoch.
 
-    Lightning runs callbacks before the module's own hook, and the checkpoint must hold what the
-    module finished.
+    A callback does this because Lightning calls callbacks before the hooks of the module, and the
+    checkpoint must contain the result of the validation.
 
     Args:
-        name: of what is trained, for the report; every tenth of the epochs has a line.
-        epochs: in all.
-        checkpoint: file, written whole or not at all; None for none.
+        name: name of the trained module in progress messages.
+        epochs: number of epochs.
+        checkpoint: file of the checkpoint, written atomically; None for no checkpoint.
     """
 
     def __init__(self, name: str, epochs: int, checkpoint: Path | None) -> None:
         self.name, self.epochs, self.checkpoint = name, epochs, checkpoint
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Finish the epoch, keep it, and report loss and the best validation."""
+        """Finish the epoch, write the checkpoint, and report the loss and the best score."""
         assert isinstance(pl_module, EpochTraining)
         pl_module.finish_epoch()
         if self.checkpoint is not None and trainer.is_global_zero:
             with atomic_write(self.checkpoint) as file:
                 trainer.save_checkpoint(file)
         elif self.checkpoint is not None:
-            # the processes wait for each other there; the first alone writes
+            # all processes must call this to synchronise; only the first one writes
             trainer.save_checkpoint(self.checkpoint)
         done, last = trainer.current_epoch + 1, pl_module.history[-1]
         score = pl_module.best_score if math.isfinite(pl_module.best_score) else None
@@ -199,8 +198,9 @@ class EpochEnd(L.Callback):
             f" {last.get('loss', math.nan):.4g}"
             + ("" if score is None else f", best validation {score:.4g}")
         )
-        shown = done % max(self.epochs // 10, 1) == 0 or done == self.epochs
-        report_progress(f"training {self.name}", done, self.epochs, line if shown else "", score)
+        # about ten lines per training
+        has_line = done % max(self.epochs // 10, 1) == 0 or done == self.epochs
+        report_progress(f"training {self.name}", done, self.epochs, line if has_line else "", score)
 
 
 def run_epochs(
@@ -212,28 +212,28 @@ def run_epochs(
     folder: Path | None,
     machine: MachineConfig | None = None,
 ) -> dict[str, Any]:
-    """Train to the last epoch and leave the best state in the model.
+    """Train to the last epoch and load the best weights into the model.
 
-    Where a folder holds a checkpoint of an interrupted training, that training goes on.
+    A checkpoint of an interrupted training in the folder is resumed.
 
     Args:
-        name: of what is trained; `checkpoints/<name>/last.ckpt` in the folder is resumed where it
-            exists.
-        module: that trains it.
-        data: its batches.
-        model: that is validated; it ends frozen, with the weights that scored best.
-        trained: its part whose parameters are counted.
-        folder: for checkpoints and the TensorBoard log; None for neither.
-        machine: that trains; None for one process on the CPU.
+        name: name of the trained module; its checkpoint is `checkpoints/<name>/last.ckpt`.
+        module: Lightning module of the training.
+        data: batches of each epoch.
+        model: the validated module. On return it has the weights of the best validation and no
+            trainable parameters.
+        trained: submodule of `model` whose parameters are counted.
+        folder: folder of checkpoints and TensorBoard log; None to write neither.
+        machine: hardware and precision; None for one process on the CPU.
 
     Returns:
-        Notes about the training: the curve by epoch, the best score, that of the start where it was
-        validated, the number of parameters.
+        Notes about the training: learning curve, best score, score before the first epoch (if
+        validated), number of parameters.
 
     Raises:
-        FitError: where no epoch gave a finite validation.
-        UsageError: where the checkpoint is damaged or belongs to another training, or the machine
-            lacks a device.
+        FitError: if no validation gave a finite score.
+        UsageError: if the checkpoint is damaged or belongs to another training, or the machine
+            lacks the device.
     """
     machine = machine or MachineConfig()
     if machine.processes > 1 and folder is None:
@@ -250,10 +250,9 @@ def run_epochs(
         last.parent.mkdir(parents=True, exist_ok=True)
         logger = TensorBoardLogger(folder / "tensorboard", name=name, version="")
         if machine.processes == 1:
-            # the first use of it makes the file of events, which a killed training leaves
+            # create the event file now, so that the manifest lists it even after a crash
             logger.experiment  # noqa: B018
             _record_events(logger)
-    # a checkpoint that is there is taken up
     checkpoint = last if last is not None and last.is_file() else None
     trainer = L.Trainer(
         **machine.for_lightning(),
@@ -261,7 +260,7 @@ def run_epochs(
         gradient_clip_val=settings.gradient_clip,
         logger=logger if logger is not None else False,
         callbacks=[EpochEnd(name, settings.epochs, last)],
-        # what it would print and keep is printed and kept here
+        # `EpochEnd` reports progress and writes checkpoints
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
@@ -269,13 +268,13 @@ def run_epochs(
         log_every_n_steps=10**9,
     )
     if checkpoint is not None:
-        module.restore(_kept(checkpoint, module.made_of))
-    # killed between the last epoch and the model's file: there is nothing left to train
-    if not module.finished:
-        _fit(trainer, module, data, checkpoint)
+        module.restore(_read_checkpoint(checkpoint, module.settings_digest))
+    # a run that was interrupted after its last epoch needs no further training
+    if not module.is_finished:
+        _run_trainer(trainer, module, data, checkpoint)
         if machine.processes > 1 and last is not None:
-            # other processes have trained: what they found stands in the checkpoint
-            module.restore(_kept(last, module.made_of))
+            # the spawned processes return their result in the checkpoint
+            module.restore(_read_checkpoint(last, module.settings_digest))
     module.cpu()
     if not module.best_state:
         raise FitError(
@@ -283,7 +282,7 @@ def run_epochs(
             " rate or the horizon"
         )
     if logger is not None:
-        _conclude(logger, module)
+        _log_result(logger, module)
         _record_events(logger)
     model.load_state_dict(module.best_state)
     model.eval().requires_grad_(False)
@@ -296,37 +295,36 @@ def run_epochs(
     }
 
 
-def _kept(checkpoint: Path, made_of: str) -> dict[str, Any]:
-    """Return what a checkpoint keeps of a training.
+def _read_checkpoint(checkpoint: Path, settings_digest: str) -> dict[str, Any]:
+    """Read the state of an `EpochTraining` from a checkpoint.
 
     Raises:
-        UsageError: where it is cut off, edited or of another training.
+        UsageError: if the file is damaged or belongs to another training.
     """
-    what_to_do = "delete it to train from the beginning"
+    remedy = "delete it to train from the beginning"
     try:
-        kept: dict[str, Any] = torch.load(checkpoint, weights_only=True)["residnet"]
-        belongs = kept["made_of"] == made_of
-    except Exception as error:  # PyTorch raises whatever it likes
+        saved: dict[str, Any] = torch.load(checkpoint, weights_only=True)["residnet"]
+        is_same_training = saved["made_of"] == settings_digest
+    except Exception as error:  # torch.load documents no exceptions
         first = next(iter(str(error).splitlines()), "")[:200]
         raise UsageError(
-            f"{checkpoint}: is no checkpoint of this training ({type(error).__name__}: {first});"
-            f" {what_to_do}"
+            f"{checkpoint}: not a checkpoint of this training ({type(error).__name__}: {first});"
+            f" {remedy}"
         ) from error
-    if not belongs:
+    if not is_same_training:
         raise UsageError(
-            f"{checkpoint}: belongs to a training with other settings or another network;"
-            f" {what_to_do}"
+            f"{checkpoint}: belongs to a training with other settings or another network; {remedy}"
         )
-    return kept
+    return saved
 
 
-def _fit(
+def _run_trainer(
     trainer: L.Trainer, module: EpochTraining, data: EpochDataModule, checkpoint: Path | None
 ) -> None:
-    """Train; an interruption is passed on, where Lightning would end the process with exit code 1.
+    """Run the trainer and raise KeyboardInterrupt, instead of exit code 1 as Lightning does.
 
     Raises:
-        KeyboardInterrupt: from the keyboard.
+        KeyboardInterrupt: if the user interrupts the training.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -352,19 +350,21 @@ def _record_events(logger: TensorBoardLogger) -> None:
             manifest.record(file, None)
 
 
-def _conclude(logger: TensorBoardLogger, module: EpochTraining) -> None:
-    """Log the settings with the best score, and a picture of a free run."""
+def _log_result(logger: TensorBoardLogger, module: EpochTraining) -> None:
+    """Log the settings with the best score, and a figure of the example free run."""
     flat = {
         f"{key}.{inner}" if isinstance(value, dict) else key: text
         for key, value in module.settings.model_dump(mode="json").items()
         for inner, text in (value.items() if isinstance(value, dict) else [("", value)])
     }
-    given = {key: v if isinstance(v, int | float | str) else str(v) for key, v in flat.items()}
-    logger.log_hyperparams(given, {"best_validation": module.best_score})
-    if module.shown is not None:
+    hyperparameters = {
+        key: v if isinstance(v, int | float | str) else str(v) for key, v in flat.items()
+    }
+    logger.log_hyperparams(hyperparameters, {"best_validation": module.best_score})
+    if module.example is not None:
         from matplotlib.figure import Figure
 
-        t, columns = module.shown
+        t, columns = module.example
         figure = Figure(figsize=(6.0, 1.8 * len(columns)), layout="constrained")
         panels = figure.subplots(len(columns), sharex=True, squeeze=False)[:, 0]
         for axes, (name, (measured, predicted)) in zip(panels, columns.items(), strict=True):

@@ -26,7 +26,7 @@ from residnet.manoeuvres.open_loop import ConstantInput
 from residnet.physics.signals import SignalsConfig
 from residnet.preprocessing.prepare import compute_training_ranges, make_samples
 from residnet.preprocessing.windows import WindowStore
-from residnet.training.left_out import LeftOpen, estimate_refit_covariance
+from residnet.training.left_out import RefitUncertainty, estimate_refit_covariance
 from residnet.training.refit import RefitConfig, refit
 
 CONFIG = RefitConfig(horizon=4.0, every=4.0, iterations=3)
@@ -34,7 +34,7 @@ SHARES = {"tau_x": InputShare(drive=1.0), "tau_n": InputShare(steer=0.3)}
 
 
 @pytest.fixture(scope="module")
-def known() -> tuple[FittedModel, LeftOpen, torch.Tensor]:
+def known() -> tuple[FittedModel, RefitUncertainty, torch.Tensor]:
     logs = trials()[:3]
     model = model_of(LINEAR)
     given, store = make_samples(logs, model.signals), WindowStore.from_logs(logs, torch.float64)
@@ -56,7 +56,7 @@ def known() -> tuple[FittedModel, LeftOpen, torch.Tensor]:
 
 
 def planned(
-    known: tuple[FittedModel, LeftOpen, torch.Tensor],
+    known: tuple[FittedModel, RefitUncertainty, torch.Tensor],
     limits: TrialLimits,
     aim: PredictionGoal | None = None,
 ) -> TrialPlan:
@@ -67,7 +67,7 @@ def planned(
 
 
 def test_a_look_back_finds_the_covariance_of_the_refit(
-    known: tuple[FittedModel, LeftOpen, torch.Tensor],
+    known: tuple[FittedModel, RefitUncertainty, torch.Tensor],
 ) -> None:
     _, open_, covariance = known
     # the prior, which knows how far least squares were off, is not quite what it was
@@ -90,7 +90,7 @@ def test_information_adds_to_what_is_known() -> None:
 
 
 def test_trials_are_chosen_for_what_is_to_be_predicted(
-    known: tuple[FittedModel, LeftOpen, torch.Tensor],
+    known: tuple[FittedModel, RefitUncertainty, torch.Tensor],
 ) -> None:
     straight = ConstantInput(name="straight", drive=1.0, steer=0.0, duration=8.0)
     turning = ConstantInput(name="turning", drive=0.4, steer=1.0, duration=8.0)
@@ -107,7 +107,7 @@ def test_trials_are_chosen_for_what_is_to_be_predicted(
 
 
 def test_trials_are_chosen_within_the_limits_and_narrow_the_intervals(
-    known: tuple[FittedModel, LeftOpen, torch.Tensor],
+    known: tuple[FittedModel, RefitUncertainty, torch.Tensor],
 ) -> None:
     found = planned(known, TrialLimits(time=8.0, count=2))
     assert len(found.selected_trials) == 2
@@ -126,7 +126,7 @@ def test_trials_are_chosen_within_the_limits_and_narrow_the_intervals(
 
 
 def test_inputs_that_steer_are_known_by_unit_or_side(
-    known: tuple[FittedModel, LeftOpen, torch.Tensor],
+    known: tuple[FittedModel, RefitUncertainty, torch.Tensor],
 ) -> None:
     spec = known[0].spec
     assert infer_input_shares(spec)["tau_n"].steer == max(map(abs, spec.ranges["tau_n"]))
@@ -140,7 +140,7 @@ def test_inputs_that_steer_are_known_by_unit_or_side(
 
 
 def test_manoeuvres_too_short_to_tell_anything_are_refused(
-    known: tuple[FittedModel, LeftOpen, torch.Tensor],
+    known: tuple[FittedModel, RefitUncertainty, torch.Tensor],
 ) -> None:
     short = ConstantInput(name="short", drive=1.0, steer=0.0, duration=1.0)
     with pytest.raises(DataError, match="cannot fly them"):

@@ -31,7 +31,7 @@ from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Secon
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.progress import log_message
 from residnet.dynamics.simulated import check_steps
-from residnet.dynamics.store import chosen_model, load_model
+from residnet.dynamics.store import load_model, resolve_model_name
 from residnet.manoeuvres.trials import DisturbanceConfig, WindConfig
 from residnet.physics.environment import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
@@ -395,7 +395,9 @@ class AutopilotConfig(ComputingTask):
                 " of conditions"
             )
         spec, model = load_model(
-            learned_config.run / "models" / chosen_model(learned_config.run, learned_config.model)
+            learned_config.run
+            / "models"
+            / resolve_model_name(learned_config.run, learned_config.model)
         )
         return SteeredModel(model, spec.signals.input_columns, spec.hold, self.steered_vessel)
 

@@ -63,7 +63,7 @@ from residnet.autopilot.report.heading import (
 from residnet.autopilot.training.fit import train_policy
 from residnet.autopilot.training.predictor import train_or_resume_controller
 from residnet.core.progress import begin_stage, log_message, report_progress
-from residnet.dynamics.store import rebuilt
+from residnet.dynamics.store import rebuild_module
 from residnet.engine.compiled import CompiledRollout
 from residnet.evaluation.metrics import SCHEMA
 from residnet.physics.vessel import load_vessel
@@ -270,7 +270,7 @@ def _train_policy_or_resume(
         notes |= {"constants": policy.constant_values()}
         store.save_module(name, spec, policy, notes)
         # as a resumed run reads it
-        policy = rebuilt(spec, policy)
+        policy = rebuild_module(spec, policy)
     untrained_policy = spec.build().eval().requires_grad_(False).double()
     policy.set_step(steering.dt)
     for built_policy in (policy, untrained_policy):

@@ -184,7 +184,9 @@ class PolicyFit(EpochTraining):
         metrics = trajectories.step_metrics(self.conditions)
         loss: Tensor = (
             metrics["cost"].mean()
-            + settings.error_weight(progress) / self.conditions.overshoot_unit * metrics["iae"].mean()
+            + settings.error_weight(progress)
+            / self.conditions.overshoot_unit
+            * metrics["iae"].mean()
         )
         if n_quiet > 0:
             loss = loss + self._penalty_weight() * self._limit_cycle_penalty(
@@ -278,7 +280,7 @@ class PolicyFit(EpochTraining):
         if not all(bool(torch.isfinite(grad).all()) for grad in gradients):
             self.trainer.optimizers[0].zero_grad()
 
-    def _gains(self, score: float) -> bool:
+    def _is_improvement(self, score: float) -> bool:
         if not self.best_state or not math.isfinite(score):
             return math.isfinite(score)
         return self._rank_key(self.diverged, score) < self._rank_key(
@@ -298,7 +300,7 @@ class PolicyFit(EpochTraining):
         rejected_fraction = n_rejected / max(n_simulations, 1)
         return n_rejected > 0, cost * (1.0 + rejected_fraction)
 
-    def validated(self) -> tuple[nn.Module, float]:
+    def compute_validation_score(self) -> tuple[nn.Module, float]:
         """Return the policy and its mean cost over the validation simulations.
 
         Simulations with limit cycles, and overshoots above the limit in excess of 5 %, are counted

@@ -123,7 +123,7 @@ class PredictorFit(EpochTraining):
     def _scaled_errors(self, answers: RudderResponses) -> Tensor:
         return (self.predictor.predict_changes(answers.x) - answers.change) / self.predictor.scale
 
-    def validated(self) -> tuple[nn.Module, float]:
+    def compute_validation_score(self) -> tuple[nn.Module, float]:
         """Return the predictor and its error on fresh states, as a share of the spread.
 
         The error is the root of the mean square.
