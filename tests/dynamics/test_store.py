@@ -13,7 +13,7 @@ import torch
 from residnet.baselines.given import ZeroBaselineConfig
 from residnet.baselines.regressors import RegressorsConfig
 from residnet.core.errors import ConfigError, UsageError
-from residnet.dynamics.store import ModelSpec, load_model, model_names, rebuilt, save_model
+from residnet.dynamics.store import ModelSpec, load_model, model_names, rebuild_module, save_model
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
@@ -81,7 +81,7 @@ def test_a_rebuilt_model_is_the_loaded_one_bit_for_bit(tmp_path: Path) -> None:
     model = kept.build().to(torch.float32)
     save_model(tmp_path / "m", kept, model)
     _, loaded = load_model(tmp_path / "m")
-    again = rebuilt(kept, model)
+    again = rebuild_module(kept, model)
     theirs, rounded = dict(loaded.named_buffers()), dict(model.named_buffers())
     assert any(not torch.equal(theirs[name], rounded[name].double()) for name in theirs)
     for name, value in [*again.named_buffers(), *again.named_parameters()]:
@@ -143,7 +143,7 @@ WEIGHTS, JSON = r"model\.safetensors: .*run the fit again", r"model\.json: .* JS
         (swap, WEIGHTS),
         (lambda f: (f / "model.safetensors").unlink(), WEIGHTS),
         # though their hash is right
-        (lambda f: edited(f, baseline=OTHER), "does not belong to what model.json describes"),
+        (lambda f: edited(f, baseline=OTHER), "does not belong to the module of model.json"),
         (tamper, r"model\.json: was edited: .*run the fit again"),
         (lambda f: card(f, "{"), JSON),
         (lambda f: card(f, "[1, 2]"), JSON),

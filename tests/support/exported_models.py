@@ -105,11 +105,11 @@ def built(variant: str) -> tuple[ModelSpec, HybridDynamics]:
         spec = spec_of(None, role="ensemble", baseline={"kind": "still"})
         spec = spec.model_copy(update={"members": members, "of": "trajectories"})
         single = [m.members[0] if isinstance(m, MeanOfTrajectories) else m for _, m in parts]
-        return spec, spec.mean(single)
+        return spec, spec.average_trajectories(single)
     spec = spec_of(VARIANTS[variant])
-    model = spec.single()
+    model = spec.build_single_model()
     fill(model)
-    return spec, spec.as_one(model)
+    return spec, spec.average_networks(model)
 
 
 class AsTensors:

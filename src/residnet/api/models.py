@@ -20,7 +20,7 @@ from residnet.core.ownership import Manifest, record_folder
 from residnet.core.run_loader import accept_run, name_damaged_key
 from residnet.core.trust import trusting
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.store import ModelSpec, chosen_model, load_model, save_model
+from residnet.dynamics.store import ModelSpec, load_model, resolve_model_name, save_model
 from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import Rollout
 from residnet.evaluation.band import read_bands
@@ -135,9 +135,9 @@ class Model:
         states, inputs = self._parse_arrays(("x0", x0, 1), ("w", w, 2))
         memory = self._parse_memory(s, len(states))
         with torch.no_grad():
-            trajectory, _, _ = compile_rollout(Rollout(self._double_precision_module()), inputs.shape[1])(
-                states, inputs, memory
-            )
+            trajectory, _, _ = compile_rollout(
+                Rollout(self._double_precision_module()), inputs.shape[1]
+            )(states, inputs, memory)
         return _to_numpy(trajectory, np.ndim(x0) == 1)
 
     def warmup(self, y_history: Any, w_history: Any) -> np.ndarray:
@@ -176,7 +176,7 @@ class Model:
         return copy.deepcopy(self.module).to(torch.float64).eval()
 
     def _parse_arrays(self, *named_arrays: tuple[str, Any, int]) -> tuple[Tensor, Tensor]:
-        """Check states and inputs, given as (name, value, axes); returns float64 [B, (T,) width]."""
+        """Check states and inputs (name, value, axes), and return float64 [B, (T,) width]."""
         tensors = []
         for (name, value, axes), array_kind in zip(named_arrays, ("states", "inputs"), strict=True):
             columns = self.states if array_kind == "states" else self.inputs
@@ -191,7 +191,8 @@ class Model:
                 expected_shape = f"T, {width}" if axes == 2 else f"{width}"
                 raise UsageError(
                     f"model {self.name}: {name} has the shape {list(values.shape)}, expected"
-                    f" [B, {expected_shape}] or [{expected_shape}] ({array_kind} {', '.join(columns)})"
+                    f" [B, {expected_shape}] or [{expected_shape}] ({array_kind}"
+                    f" {', '.join(columns)})"
                 )
             if not np.isfinite(values).all():
                 raise UsageError(f"model {self.name}: {name} contains a value that is not finite")
@@ -272,7 +273,9 @@ def load(folder: PathLikeArg, name: str | None = None, *, trust: bool = False) -
         model_folder = parse_path(folder, "load")
         is_model = (model_folder / "model.json").is_file()
         if name is not None or (not is_model and (model_folder / "models").is_dir()):
-            model_folder = model_folder / "models" / chosen_model(model_folder, name or "predictor")
+            model_folder = (
+                model_folder / "models" / resolve_model_name(model_folder, name or "predictor")
+            )
         verify_checksums(model_folder)
         spec, module = load_model(model_folder)
         # a model saved outside of a run has neither notes nor bands

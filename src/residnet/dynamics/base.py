@@ -145,8 +145,8 @@ class Dynamics(nn.Module, ABC):
         angular_velocity = derivative.index_select(-1, self.attitude)
         commutator = cross_product(vector, angular_velocity)
         vector_rate = angular_velocity + 0.5 * commutator + cross_product(vector, commutator) / 12.0
-        joined = torch.cat((derivative, vector_rate), dim=-1)
-        return joined.index_select(-1, self.columns_with_attitude)
+        both_derivatives = torch.cat((derivative, vector_rate), dim=-1)
+        return both_derivatives.index_select(-1, self.columns_with_attitude)
 
     def integrate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return the state one step later [B, nx]; arguments as of `state_derivative`."""

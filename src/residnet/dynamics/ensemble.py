@@ -185,7 +185,7 @@ class MeanOfTrajectories(HybridDynamics):
     def _average(
         self, x: Tensor, states: list[Tensor], memories: list[Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """Return the state and memory of the mean from those of the members.
+        """Return the state and memory of the mean from the states and memories of the members.
 
         Args:
             x: state of the mean before the step [B, 3 + n].
@@ -207,8 +207,8 @@ class MeanOfTrajectories(HybridDynamics):
         for i, velocities in enumerate(member_velocities):
             size = self.memory_sizes[i]
             memory = memories[i].reshape(self.copies[i], n_rows, size - self.dof)
-            joined = torch.cat((velocities - mean, memory), dim=-1)
-            parts.append(joined.transpose(0, 1).reshape(n_rows, self.copies[i] * size))
+            member_memory = torch.cat((velocities - mean, memory), dim=-1)
+            parts.append(member_memory.transpose(0, 1).reshape(n_rows, self.copies[i] * size))
 
         # midpoint rule: the pose moves with the mean of old and new velocities at half the turn
         mid_velocities = 0.5 * (nu + mean)

@@ -129,7 +129,7 @@ class HybridDynamics(Dynamics):
 
         Args:
             x: states [B, 3 + n].
-            p: what `signals.prepare` returned for the inputs of the step.
+            p: result of `signals.prepare` for the inputs of the step.
             rho: residual of the step [B, n].
         """
         baseline_acceleration = self.baseline(self.signals(x, p))
@@ -139,7 +139,8 @@ class HybridDynamics(Dynamics):
     def total_acceleration(self, baseline: Tensor, rho: Tensor, nu: Tensor) -> Tensor:
         """Return the derivatives of the dynamic states [..., n].
 
-        The derivative of an inactive velocity is zero; those of angles follow from the velocities.
+        The derivative of an inactive velocity is zero; the velocities determine the derivatives of
+        angles.
 
         Args:
             baseline: accelerations of the baseline [..., n].
@@ -208,7 +209,7 @@ class HybridDynamics(Dynamics):
         Args:
             x: states [B, 3 + n].
             z: their channels [B, nz], which the first stage reuses.
-            p: what `signals.prepare` returned for the inputs of the step.
+            p: result of `signals.prepare` for the inputs of the step.
             rho: residual of the step [B, n].
         """
         nu_dot = self.total_acceleration(self.baseline(z), rho, dynamic_states(x, self.dof))
@@ -277,8 +278,8 @@ class HybridDynamics(Dynamics):
             filter_memory = innovation_filter.next_memory(next_state, innovation)
             s = torch.cat((head_memory, filter_memory), dim=-1) * is_inside[:, k, None]
             accelerations.append(nu_dot)
-        settled = torch.stack(accelerations[length:], dim=1).reshape(n_copies, n_rows, -1, n)
-        return settled.mean(0)[:, :n_steps]
+        recorded = torch.stack(accelerations[length:], dim=1).reshape(n_copies, n_rows, -1, n)
+        return recorded.mean(0)[:, :n_steps]
 
     def acceleration(self, x: Tensor, w: Tensor, s: Tensor) -> Tensor:
         """Return nu_dot [B, n] at states x [B, 3 + n], inputs w [B, m] and memory s."""

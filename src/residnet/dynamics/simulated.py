@@ -16,7 +16,7 @@ MAX_STEPS = 2_000_000
 
 
 def check_steps(duration: float, step: float, what: str = "duration") -> None:
-    """Refuse a simulation with more steps than anybody can intend.
+    """Refuse a simulation of more than `MAX_STEPS` steps.
 
     Args:
         duration: duration of the simulation in s.
@@ -24,7 +24,7 @@ def check_steps(duration: float, step: float, what: str = "duration") -> None:
         what: name of the duration in the message.
 
     Raises:
-        ValueError: where there are more steps than `MAX_STEPS`.
+        ValueError: if the number of steps exceeds `MAX_STEPS`.
     """
     n_steps = duration / step
     if n_steps > MAX_STEPS:
@@ -38,7 +38,8 @@ def check_steps(duration: float, step: float, what: str = "duration") -> None:
 class PlantDynamics(Dynamics):
     """A plant integrated with RK4 under held actuators, which move after the step.
 
-    The golden runs have the same order. Inputs are held over all sub-steps of a step.
+    The reference data of the tests use the same order. Inputs are constant over all sub-steps of a
+    step.
     """
 
     def __init__(self, plant: Plant, dt: float, substeps: int = 1) -> None:
@@ -61,9 +62,10 @@ class PlantDynamics(Dynamics):
 class InAmbientCurrent(Dynamics):
     """A model in a steady uniform current, which may differ from row to row.
 
-    u and v are velocities through the water, x and y the position over ground. In such a current a
-    vessel moves through the water as in water at rest; only its position drifts. The memory s
-    [B, 2 + k] is the current to the north and to the east in m/s, followed by that of the model.
+    u and v are velocities through the water, x and y the position over ground. The
+    current does not change the motion relative to the water; it only adds a drift to the position.
+    The memory s [B, 2 + k] is the current to the north and to the east in m/s, followed by the
+    memory of the model.
 
     Source: T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, section 8.3,
     irrotational ocean currents.

@@ -1,7 +1,7 @@
-"""Modules on disk: `model.json` says how to build one, `model.safetensors` holds its numbers.
+"""Storage of modules: description in `model.json`, parameters and buffers in `model.safetensors`.
 
-The description holds the SHA-256 of the numbers; nothing in the folder runs when it is loaded.
-Vessel models are described here, policies by the packages that build them.
+The description contains the SHA-256 of the tensors. Loading a model executes no code from its
+folder. This module describes vessel models; other packages describe their policies.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ from residnet.physics.signals import SignalsConfig
 
 
 class BandTable(Config):
-    """Half widths of a model's free runs against the horizon, whatever the run is like.
+    """Half widths of the prediction intervals of free runs as functions of the horizon.
 
     Attributes:
-        level: share of the samples that they are to hold.
-        steps: horizons, numbers of steps from 1 on, ascending.
+        level: nominal coverage of the intervals.
+        steps: horizons as numbers of steps, from 1 on, ascending.
         u: half widths in m/s.
         v: half widths in m/s.
         r: half widths in rad/s.
         heading: half widths in rad.
-        position: radius about the predicted position in m.
-        p: half widths in rad/s, where the model rolls.
-        phi: half widths in rad, where it does.
-        w: half widths in m/s, of all six degrees of freedom.
-        q: half widths in rad/s, of these.
-        z: half widths in m, of these.
-        theta: half widths in rad, of these.
-        logs: number of logs that calibrated them.
-        cautions: whole sentences about what they do not promise.
+        position: radii about the predicted position in m.
+        p: half widths in rad/s; None without roll.
+        phi: half widths in rad; None without roll.
+        w: half widths in m/s; None without six degrees of freedom.
+        q: half widths in rad/s; None without six degrees of freedom.
+        z: half widths in m; None without six degrees of freedom.
+        theta: half widths in rad; None without six degrees of freedom.
+        logs: number of logs of the calibration.
+        cautions: sentences about the limits of the calibration.
     """
 
     level: float = Field(gt=0, lt=1)
@@ -78,7 +78,7 @@ class BandTable(Config):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """What has half widths."""
+        """Names of the channels with half widths."""
         if self.z is not None:
             return SIX_DOF_LAYOUT.band_channels
         return (
@@ -89,51 +89,51 @@ class BandTable(Config):
 
     @property
     def columns(self) -> tuple[tuple[float, ...], ...]:
-        """The half widths of each of `channels`."""
+        """Half widths of each channel, in the order of `channels`."""
         return tuple(getattr(self, name) or () for name in self.channels)
 
 
 _DESCRIPTION, _WEIGHTS = "model.json", "model.safetensors"
 
-_OWN_SUM = "description_sha256"
+_CHECKSUM_KEY = "description_sha256"
 
 SpecT = TypeVar("SpecT", bound="Stored")
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
 
 class Stored(Config, ABC):
-    """A description that a stored module is built from; the kind's own package has it.
+    """Base class of the descriptions from which stored modules are built.
 
-    A subclass adds a `schema_name` of type `Literal["residnet.kind/1"]` with that default and the
-    alias `schema`, which tells the kinds apart on disk.
+    A subclass adds a field `schema_name` of type `Literal["residnet.kind/1"]` with this value as
+    default and the alias `schema`, which identifies the kind of module in the file.
     """
 
     @abstractmethod
     def build(self) -> nn.Module:
-        """Return the module with its numbers not yet filled in."""
+        """Return the module with initial parameters and buffers."""
 
 
 class ModelSpec(Stored):
-    """A description of a vessel model: everything that determines it but its numbers.
+    """Description of a vessel model: everything except its parameters and buffers.
 
     Attributes:
-        schema_name: kind and version of the format.
-        version: of residnet that wrote it.
-        name: of the model in its run.
+        schema_name: kind and version of the file format.
+        version: version of residnet that wrote the file.
+        name: name of the model in its run.
         role: constant_velocity, baseline, head or ensemble.
-        signals: what drives it.
-        baseline: the known part.
-        head: the learned part; None for none.
+        signals: velocities and inputs of the model.
+        baseline: settings of the physical baseline.
+        head: settings of the residual model; None without one.
         dt: step in s.
-        integrator: explicit scheme.
-        hold: whether an input is the sample at a step's start or the mean of the samples at its
-            ends.
-        low: smallest of what moves and of the inputs in the training data, SI, [n + m].
-        high: their largest.
-        band: how far free runs may be off; None where none was calibrated.
-        members: of an ensemble; its own baseline and head are then empty.
-        of: what an ensemble averages: accelerations within one free run, or the trajectories of
-            members that run by themselves.
+        integrator: explicit integration scheme.
+        hold: whether the input of a step is the sample at the start of the step (`start`) or the
+            mean of the samples at its start and end (`mean`).
+        low: minima of velocities and inputs in the training data, SI [n + m].
+        high: maxima of velocities and inputs in the training data, SI [n + m].
+        band: half widths of the prediction intervals; None if not calibrated.
+        members: members of an ensemble, whose baseline and head are then empty.
+        of: quantity that an ensemble averages: accelerations within one free run, or trajectories
+            of independent free runs of the members.
     """
 
     schema_name: Literal["residnet.model/1"] = Field(default="residnet.model/1", alias="schema")
@@ -154,38 +154,44 @@ class ModelSpec(Stored):
 
     def build(self) -> HybridDynamics:
         if self.of == "trajectories":
-            return self.mean([member.single() for member in self.members])
-        return self.as_one(self.single())
+            return self.average_trajectories(
+                [member.build_single_model() for member in self.members]
+            )
+        return self.average_networks(self.build_single_model())
 
-    def as_one(self, model: HybridDynamics) -> HybridDynamics:
-        """Return the model of `single`, with the mean of its networks' trajectories."""
-        return self.mean([model]) if model.head.batch_ensemble_size > 1 else model
+    def average_networks(self, model: HybridDynamics) -> HybridDynamics:
+        """Return the mean-trajectory model if the head has several networks, else the model."""
+        return self.average_trajectories([model]) if model.head.batch_ensemble_size > 1 else model
 
-    def mean(self, members: Sequence[HybridDynamics]) -> MeanOfTrajectories:
-        """Return the mean of the trajectories of single models as this one."""
+    def average_trajectories(self, members: Sequence[HybridDynamics]) -> MeanOfTrajectories:
+        """Return the model of the mean trajectory of several models with this description."""
         n = self.signals.dof.n_dynamic
         return MeanOfTrajectories(members, self.low[:n], self.high[:n])
 
-    def single(self) -> HybridDynamics:
-        """Return the model in whose rows all networks of its head stand one after the other."""
+    def build_single_model(self) -> HybridDynamics:
+        """Build the model without averaging.
+
+        If its head has several networks, the batch rows contain one block for each network.
+        """
         if self.members:
             return mean_of([member.build() for member in self.members])
         signals = self.signals.build()
-        live = self.signals.dof
+        dof = self.signals.dof
         head = ZeroHead(signals.names) if self.head is None else self.head.build(signals.names)
-        if head.n_dof != live.n_dynamic:
+        if head.n_dof != dof.n_dynamic:
             raise ConfigError(
-                f"model {self.name}: its head tells {head.n_dof} accelerations, and the model moves"
-                f" {', '.join(live.dynamic_states)}; a head gives these to ResidualHead as its channels"
+                f"model {self.name}: its head has {head.n_dof} accelerations, expected one for"
+                f" each of"
+                f" {', '.join(dof.dynamic_states)}; pass these names to ResidualHead as channels"
             )
-        known = self.baseline.build(signals.names)
-        head.set_inertia(known.inertia_matrix())
-        model = HybridDynamics(signals, known, head, self.dt, self.integrator)
+        baseline = self.baseline.build(signals.names)
+        head.set_inertia(baseline.inertia_matrix())
+        model = HybridDynamics(signals, baseline, head, self.dt, self.integrator)
         if self.role == "constant_velocity":
-            # all is held, angles too
+            # constant velocity: the angles are constant too
             model.angle_rate_matrix.zero_()
-            if live.is_six_dof:
-                # it goes on over the ground, level
+            if dof.is_six_dof:
+                # the vessel moves horizontally, at constant depth
                 model.has_roll = False
                 model.set_attitude_columns((), 0)
         return model
@@ -199,8 +205,8 @@ class ModelSpec(Stored):
     def ranges(self) -> dict[str, tuple[float, float]]:
         """The training range of each velocity and input."""
         return {
-            name: (low, high)
-            for name, low, high in zip(
+            name: (lower_bound, upper_bound)
+            for name, lower_bound, upper_bound in zip(
                 self.signals.dof.dynamic_states + self.signals.input_columns,
                 self.low,
                 self.high,
@@ -210,20 +216,20 @@ class ModelSpec(Stored):
 
 
 def save_model(folder: Path, spec: Stored, module: nn.Module) -> None:
-    """Write a module of any kind; the folder is complete once `model.json` stands in it.
+    """Write a module; `model.json` is written last and marks the folder as complete.
 
     Args:
-        folder: of this one module; made where it is not there.
-        spec: what the module is built from.
-        module: whose numbers are kept.
+        folder: folder of the module, created if missing.
+        spec: description of the module.
+        module: module whose parameters and buffers are saved.
     """
     from safetensors.torch import save
 
     weights = save({name: value.contiguous() for name, value in module.state_dict().items()})
     content = spec.model_dump(mode="json", by_alias=True)
     content["sha256"] = hashlib.sha256(weights).hexdigest()
-    content[_OWN_SUM] = _description_sum(content)
-    # an earlier description would promise other numbers between the two writes
+    content[_CHECKSUM_KEY] = _description_checksum(content)
+    # delete an existing description first: its checksum would not match the new tensors
     description = folder / _DESCRIPTION
     if (manifest := find_run_manifest(description)) is not None:
         manifest.require_replaceable(description)
@@ -234,39 +240,42 @@ def save_model(folder: Path, spec: Stored, module: nn.Module) -> None:
         file.write_text(json.dumps(content, indent=1) + "\n")
 
 
-def rebuilt(spec: Stored, module: ModuleT) -> ModuleT:
-    """Return a module as `save_model` and a load would give it back, without the files.
+def rebuild_module(spec: Stored, module: ModuleT) -> ModuleT:
+    """Return a module as if saved and loaded, without files.
 
-    Numbers that are kept stay as they are; what a build computes is computed anew, in its own
-    precision. A module that was trained in float32 has rounded these.
+    Persistent parameters and buffers are copied. Constants that `build` computes are computed
+    again in their original precision, because a module trained in float32 has rounded them.
 
     Args:
-        spec: what the module was built from.
-        module: whose numbers are taken over.
+        spec: description of the module.
+        module: module whose parameters and buffers are copied.
     """
-    again = restored(spec, module.state_dict())
-    assert isinstance(again, type(module))
-    return again
+    copy = restore_module(spec, module.state_dict())
+    assert isinstance(copy, type(module))
+    return copy
 
 
-def restored(spec: Stored, state: dict[str, Tensor]) -> nn.Module:
-    """Return the module of a description with its numbers filled in; in evaluation mode.
+def restore_module(spec: Stored, state: dict[str, Tensor]) -> nn.Module:
+    """Build a module from description and state, in evaluation mode.
 
     Args:
-        spec: what the module is built from.
-        state: its `state_dict()`.
+        spec: description of the module.
+        state: `state_dict()` of the module.
     """
     module = spec.build()
-    _fill(module, state)
+    _load_state(module, state)
     return module.eval().requires_grad_(False)
 
 
 def load_model(folder: Path) -> tuple[ModelSpec, HybridDynamics]:
-    """Read a vessel model that `save_model` wrote; in evaluation mode.
+    """Load a vessel model that `save_model` wrote, in evaluation mode.
+
+    Args:
+        folder: folder of the model.
 
     Raises:
-        UsageError: where the folder holds no vessel model, or one that is not as it was written;
-            the message names the models beside it.
+        UsageError: if the folder contains no vessel model, or its files were changed; the message
+            suggests the other models of the run.
     """
     spec = read_spec(folder, ModelSpec)
     model = spec.build()
@@ -278,126 +287,132 @@ def read_spec(folder: Path, kind: type[SpecT]) -> SpecT:
     """Read the description of a stored module.
 
     Args:
-        folder: of the module.
-        kind: what is expected there.
+        folder: folder of the module.
+        kind: expected class of the description.
 
     Raises:
-        UsageError: where there is none, or one of another kind.
-        ConfigError: where a key is wrong.
+        UsageError: if the folder has no description, or one of another kind.
+        ConfigError: if a key is invalid.
     """
-    content = _description(folder)
+    content = _read_description(folder)
     content.pop("sha256", None)
-    content.pop(_OWN_SUM, None)
-    wanted = kind.model_fields["schema_name"].default
-    if content.get("schema") != wanted:
+    content.pop(_CHECKSUM_KEY, None)
+    expected_schema = kind.model_fields["schema_name"].default
+    if content.get("schema") != expected_schema:
         raise UsageError(
-            f"{folder / _DESCRIPTION}: holds '{content.get('schema')}', expected '{wanted}'; name a"
-            " folder of that kind"
+            f"{folder / _DESCRIPTION}: holds '{content.get('schema')}', expected"
+            f" '{expected_schema}'; give a folder of this kind"
         )
     return validate_config(content, kind, str(folder / _DESCRIPTION))
 
 
 def read_weights(folder: Path, module: nn.Module) -> None:
-    """Fill a module with the numbers that stand in a folder, in the module's own precision.
+    """Load parameters and buffers from a folder into a module, in the precision of the module.
+
+    Args:
+        folder: folder of the stored module.
+        module: module built from the description in the folder.
 
     Raises:
-        UsageError: where the numbers are missing, are not those that were written, or belong to
-            another module.
+        UsageError: if the file is missing, was changed, or belongs to another module.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load
 
     file = folder / _WEIGHTS
-    again = "restore the folder or run the fit again"
+    remedy = "restore the folder or run the fit again"
     try:
         weights = read_regular_file(file, SIZE_LIMITS[".safetensors"])
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise UsageError(f"{file}: cannot be read ({reason}); {again}") from None
-    if hashlib.sha256(weights).hexdigest() != _description(folder).get("sha256"):
+        raise UsageError(f"{file}: cannot be read ({reason}); {remedy}") from None
+    if hashlib.sha256(weights).hexdigest() != _read_description(folder).get("sha256"):
         raise UsageError(
-            f"{file}: its SHA-256 is not the one in {_DESCRIPTION}, so it is cut off, edited or"
-            f" from elsewhere; {again}"
+            f"{file}: its SHA-256 is not the one in {_DESCRIPTION}, so the file is truncated,"
+            f" edited"
+            f" or from another folder; {remedy}"
         )
     try:
-        numbers = load(weights)
+        tensors = load(weights)
     except SafetensorError as error:
-        raise UsageError(f"{file}: no safetensors file ({error}); {again}") from None
+        raise UsageError(f"{file}: not a safetensors file ({error}); {remedy}") from None
     try:
-        _fill(module, numbers)
+        _load_state(module, tensors)
     except RuntimeError as error:
         first = str(error).splitlines()[-1].strip()
         raise UsageError(
-            f"{file}: does not belong to what {_DESCRIPTION} describes ({first}); {again}"
+            f"{file}: does not belong to the module of {_DESCRIPTION} ({first}); {remedy}"
         ) from None
 
 
-def _fill(module: nn.Module, numbers: Mapping[str, Tensor]) -> None:
-    """Fill a module with numbers, in its own precision.
+def _load_state(module: nn.Module, state: Mapping[str, Tensor]) -> None:
+    """Load a state into a module, in the precision of the module.
 
-    A module may take tensors of other sizes than it was built with, such as support vectors.
+    Some modules accept tensors of other sizes than they were built with, such as support vectors.
     """
     tensors = module.state_dict()
     module.load_state_dict(
         {
             name: value.to(tensors[name].dtype) if name in tensors else value
-            for name, value in numbers.items()
+            for name, value in state.items()
         }
     )
 
 
-def _description(folder: Path) -> dict[str, Any]:
-    card = folder / _DESCRIPTION
-    if not card.is_file():
+def _read_description(folder: Path) -> dict[str, Any]:
+    """Read `model.json` and verify its checksum."""
+    path = folder / _DESCRIPTION
+    if not path.is_file():
         raise UsageError(
-            f"{folder}: no model here{suggest_name(folder.name, model_names(folder.parent))}"
+            f"{folder}: no model found{suggest_name(folder.name, model_names(folder.parent))}"
         )
-    content = read_json(card)
-    # descriptions of earlier versions have no sum of their own
-    if content.get(_OWN_SUM, _description_sum(content)) != _description_sum(content):
+    content = read_json(path)
+    # descriptions of earlier versions have no checksum
+    if content.get(_CHECKSUM_KEY, _description_checksum(content)) != _description_checksum(content):
         raise UsageError(
-            f"{card}: was edited: its contents do not give the {_OWN_SUM} that it holds; restore"
+            f"{path}: was edited: its contents do not match its {_CHECKSUM_KEY}; restore"
             " the folder or run the fit again"
         )
     return content
 
 
-def _description_sum(content: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a description, whose form on disk does not matter."""
-    known = {key: value for key, value in content.items() if key != _OWN_SUM}
-    return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
+def _description_checksum(content: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a description, independent of the layout of the file."""
+    checked = {key: value for key, value in content.items() if key != _CHECKSUM_KEY}
+    return hashlib.sha256(json.dumps(checked, sort_keys=True).encode()).hexdigest()
 
 
 def model_names(folder: Path) -> Sequence[str]:
-    """Return the names of the models in a run's `models` folder, whatever their kind."""
+    """Return the names of the models of all kinds in the `models` folder of a run."""
     return sorted(path.parent.name for path in folder.glob(f"*/{_DESCRIPTION}"))
 
 
-def chosen_model(run: Path, name: str) -> str:
-    """Return the name of a model in its run.
+def resolve_model_name(run: Path, name: str) -> str:
+    """Return the name of a model in a run, with the aliases of the run resolved.
 
-    `selected` is the single model that validation chose, `predictor` the one reported first.
+    Args:
+        run: folder of the run.
+        name: name of a model, `selected` (the single model chosen by validation) or `predictor`
+            (the model that the report names first).
 
     Raises:
-        UsageError: where there is no such folder or no such model in it.
+        UsageError: if the folder or the model does not exist.
     """
     if not run.is_dir():
         raise UsageError(
-            f"{run}: no such folder; run the fit first that identifies the model (residnet run"
+            f"{run}: no such folder; first run the fit that identifies the model (residnet run"
             f" CONFIG --out {run})"
         )
     require_trustworthy(run)
     names = model_names(run / "models")
-    meant = name in ("selected", "predictor")
-    if not meant and name in names:
+    is_alias = name in ("selected", "predictor")
+    if not is_alias and name in names:
         return name
     metrics = run / "metrics.json"
-    written = read_json(metrics) if meant and metrics.is_file() else {}
-    # runs of earlier versions name no predictor
-    selected = str(written.get(name, written.get("selected", "")))
+    content = read_json(metrics) if is_alias and metrics.is_file() else {}
+    # runs of earlier versions have no predictor
+    selected = str(content.get(name, content.get("selected", "")))
     if selected not in names:
-        raise UsageError(
-            f"{run}: no model"
-            f" '{name}'{suggest_name(name, names) if names else '; not the folder of a finished fit'}"
-        )
+        hint = suggest_name(name, names) if names else "; not the folder of a finished fit"
+        raise UsageError(f"{run}: no model '{name}'{hint}")
     return selected

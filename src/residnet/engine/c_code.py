@@ -101,13 +101,13 @@ class FunctionWriter:
     """Writes a function as C statements: single numbers where few act, loops where many do.
 
     Args:
-        function: of dense columns.
-        tables: of the file.
-        what: is written, for messages.
+        function: CasADi function of dense columns.
+        tables: constant tables of the file.
+        what: name of the function, for messages.
 
     Attributes:
         lines: name and text of each statement.
-        results: what is known of each result once all is written.
+        results: C expressions of each result, complete after all statements are written.
     """
 
     REAL: str = "REAL"
@@ -116,13 +116,13 @@ class FunctionWriter:
     logical: Mapping[int, str] = _LOGICAL
 
     @property
-    def zero(self) -> str:
-        """Zero, as constants are written."""
+    def zero_literal(self) -> str:
+        """Zero as a C literal."""
         return self.write_literal(0.0)
 
     @property
-    def one(self) -> str:
-        """One, as constants are written."""
+    def one_literal(self) -> str:
+        """One as a C literal."""
         return self.write_literal(1.0)
 
     def write_literal(self, value: float) -> str:
@@ -224,7 +224,7 @@ class FunctionWriter:
         return name
 
     def write_instruction(self, k: int, op: int, operands: Sequence[_CColumn]) -> list[_CColumn]:
-        """Return what an instruction makes."""
+        """Write an instruction and return its results."""
         if op in (ca.OP_VERTCAT, ca.OP_HORZCAT):
             if any(column.is_boolean for column in operands):
                 operands = [self.to_real_column(column) for column in operands]
@@ -234,9 +234,9 @@ class FunctionWriter:
         if op in (ca.OP_VERTSPLIT, ca.OP_HORZSPLIT, ca.OP_GETNONZEROS, ca.OP_TRANSPOSE):
             return [operands[0].select(places) for places in self.selected_indices(k, op)]
         if op == ca.OP_MTIMES:
-            start, left, right = operands
+            start, left_factor, right_factor = operands
             rows, columns = self.function.instruction_MX(k).shape
-            return [self.write_product(start, left, right, rows, columns)]
+            return [self.write_product(start, left_factor, right_factor, rows, columns)]
         if op == ca.OP_GETNONZEROS_PARAM:
             table = self.as_array(self.to_real_column(operands[0]))
             return [
@@ -245,7 +245,7 @@ class FunctionWriter:
         return [self.write_elementwise(op, operands)]
 
     def selected_indices(self, k: int, op: int) -> list[list[int]]:
-        """Return the places of the numbers that each output of an instruction takes."""
+        """Return the indices of the operand entries in each output of an instruction."""
         matrix = self.function.instruction_MX(k)
         if op == ca.OP_TRANSPOSE:
             rows, columns = matrix.shape
@@ -312,10 +312,15 @@ class FunctionWriter:
     ) -> str:
         """Write an operation on single numbers; what does nothing is left out."""
         is_constant = [cell in self.constants for cell in expressions]
-        if op == ca.OP_ADD and self.zero in expressions and not any(flags):
-            return expressions[expressions[0] == self.zero]
-        if op == ca.OP_MUL and self.one in expressions and not any(flags) and not all(is_constant):
-            return expressions[expressions[0] == self.one]
+        if op == ca.OP_ADD and self.zero_literal in expressions and not any(flags):
+            return expressions[expressions[0] == self.zero_literal]
+        if (
+            op == ca.OP_MUL
+            and self.one_literal in expressions
+            and not any(flags)
+            and not all(is_constant)
+        ):
+            return expressions[expressions[0] == self.one_literal]
         name = self.write_scalar(self.operation_expression(op, expressions, flags), is_boolean)
         self.note_conditional(op, name, expressions, flags)
         return name
@@ -353,7 +358,7 @@ class FunctionWriter:
             return self.conditional_expression(
                 self.to_truth(expressions[0], flags[0]),
                 self.to_real(expressions[1], flags[1]),
-                self.zero,
+                self.zero_literal,
             )
         if op in _LOGICAL:
             return self.logical[op].format(*map(self.to_truth, expressions, flags))
@@ -400,12 +405,14 @@ class FunctionWriter:
                         (left.cells[i * rows + j], right.cells[h * inner + i]) for i in range(inner)
                     ]
                     terms = [
-                        " * ".join(cell for cell in pair if cell != self.one) or "ONE"
+                        " * ".join(cell for cell in pair if cell != self.one_literal) or "ONE"
                         for pair in pairs
-                        if self.zero not in pair
+                        if self.zero_literal not in pair
                     ]
                     start_cell = start.cells[h * rows + j]
-                    terms = terms if terms and start_cell == self.zero else [start_cell, *terms]
+                    terms = (
+                        terms if terms and start_cell == self.zero_literal else [start_cell, *terms]
+                    )
                     cells.append(self.write_scalar(_write_sum(terms)))
             return _CColumn(cells)
         a, b = self.as_array(left), self.as_array(right)
@@ -458,27 +465,27 @@ def _slice_indices(slice_: Any) -> list[int]:
 
 
 class CompilerError(ExportError):
-    """There is no C compiler, or it fails."""
+    """No C compiler is installed, or the compiler fails."""
 
 
 def find_compiler() -> str:
-    """Return the C compiler: what CC names, or cc, gcc or clang.
+    """Return the path of the C compiler: `CC` of the environment, or cc, gcc or clang.
 
     Raises:
-        ExportError: where there is none.
+        ExportError: if no compiler is installed.
     """
     for name in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
-        if name and (found := shutil.which(name)):
-            return found
+        if name and (path := shutil.which(name)):
+            return path
     raise CompilerError(
         "no C compiler was found; install gcc or clang, or name one in the environment variable CC"
     )
 
 
-# -O1 is twice as quick as -O2 over all, and what it makes is as quick, but that the latter joins
-# products and sums: one of the "expensive" ones, which cost nothing here. Of -ffast-math only what
-# leaves infinities and NaN as they are: a whole one also makes the processor flush subnormal
-# numbers, in all that the process computes from then on
+# -O1 compiles in half the time of -O2. With -fexpensive-optimizations, which fuses products and
+# sums at no cost here, its code is as fast. Of -ffast-math only the flags that preserve infinities
+# and NaN: the complete option also makes the processor flush subnormal numbers in the entire
+# process from then on
 _FLAGS = (
     *("-O1", "-fexpensive-optimizations", "-ftree-vectorize", "-march=native"),
     *("-fPIC", "-shared", "-w"),
@@ -488,22 +495,22 @@ _FLAGS = (
 _MAX_JOURNAL_SIZE = 1_000_000
 """Bytes of the cache's journal above which it is merged into the manifest."""
 _MAX_CACHED_LIBRARIES = 64
-"""Libraries that are kept, those used last."""
+"""Number of most recently used libraries in the cache."""
 
 
 def load_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
-    """Return a C source as a library compiled for this machine, from the cache where it is there.
+    """Return a library compiled for this machine from a C source, or from the cache.
 
     The cache is `residnet/compiled` in `XDG_CACHE_HOME`, or in `~/.cache`; `RESIDNET_CACHE` names
-    a folder in which the cache is the folder `residnet-cache`. Without a folder to write to, or if
-    a file there is not as residnet wrote it, the library is compiled every time.
+    a folder in which the cache is the folder `residnet-cache`. If the
+    folder is not writable or a file in it was changed, the library is compiled at every call.
 
     Args:
-        source: in C.
-        quick: whether it is compiled in little time and runs slowly, rather than the reverse.
+        source: C source.
+        quick: whether to compile without optimisation: compilation is fast, the library slow.
 
     Raises:
-        ExportError: where there is no compiler, or it fails.
+        ExportError: if no compiler is installed or the compiler fails.
     """
     compiler_path = find_compiler()
     flags = ("-O0", *_FLAGS[1:]) if quick else _FLAGS
@@ -527,7 +534,7 @@ def load_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
 
 
 def _cache_path(compiler_path: str, source: str, flags: Sequence[str]) -> Path:
-    """Return the file of the cache that is the library of a source."""
+    """Return the path of the library of a source in the cache."""
     key = hashlib.sha256(
         "\n".join((source, *flags, *_machine_key(compiler_path))).encode()
     ).hexdigest()
@@ -544,7 +551,7 @@ def _cache_folder() -> Path:
 
 @cache
 def _machine_key(compiler_path: str) -> tuple[str, ...]:
-    """Return what a compiled library depends on beside its source: compiler and processor."""
+    """Return compiler and processor, which a compiled library depends on besides its source."""
     version = subprocess.run([compiler_path, "--version"], capture_output=True, text=True).stdout
     return compiler_path, version, platform.node(), platform.machine(), platform.processor()
 
@@ -555,7 +562,7 @@ def _run_compiler(
     """Compile a C source to a library.
 
     Raises:
-        ExportError: with the compiler's first complaint.
+        ExportError: with the first message of the compiler.
     """
     with tempfile.TemporaryDirectory() as folder:
         source_path = Path(folder) / "compiled.c"
@@ -576,11 +583,11 @@ def _run_compiler(
 
 
 def _evict_old_libraries(manifest: Manifest) -> None:
-    """Delete all but the libraries that were used last; files that residnet did not write stay."""
+    """Delete the least recently used libraries, but only files that residnet wrote."""
     paths = [path for name in manifest.read() if (path := manifest.folder / name).is_file()]
     paths.sort(key=lambda path: path.stat().st_mtime, reverse=True)
     for path in paths[_MAX_CACHED_LIBRARIES:]:
         manifest.remove_if_owned(path)
-    # another process may append meanwhile, and its entry would be lost: not after each library
+    # rarely: an entry that another process appends at the same time would be lost
     if manifest.journal.stat().st_size > _MAX_JOURNAL_SIZE:
         manifest.compact()

@@ -192,12 +192,12 @@ _MATRIX_PRODUCT_LOOPS = "".join(
 def _write_prelude(dtype: torch.dtype) -> str:
     """Return the definitions at the beginning of a C file in this precision."""
     single = dtype == torch.float32
-    words = {
+    macros = {
         "REAL": "float" if single else "double",
         "INT": "int" if single else "long long",
         "R(name)": "name##f" if single else "name",
     }
-    defined = [f"#define {name} {text}\n" for name, text in words.items()]
+    defined = [f"#define {name} {text}\n" for name, text in macros.items()]
     functions = _SCALAR_FUNCTIONS | _VECTOR_FUNCTIONS[dtype]
     return "".join(
         (*defined, _PRELUDE, *functions.values(), _MATRIX_PRODUCT_LOOPS, _ACTIVATION_LOOPS)
@@ -216,8 +216,8 @@ class _LaneWriter(FunctionWriter):
     Args:
         function: the function.
         strides: strides of arguments and results by name; the default is `LANES`.
-        calls: for each result, the arguments that are computed from it as soon as it is complete,
-            and the statements that compute them.
+        calls: for each result, the arguments that are computed from it once it is complete, and
+            the statements that compute them.
     """
 
     REAL, FLAG = "V", "I"
@@ -293,7 +293,7 @@ def _write_function(
             stores += [
                 f"*{body.matrix_index(result, i)} {sign} {cell};"
                 for i, cell in enumerate(expressions)
-                if result not in accumulated or cell != body.zero
+                if result not in accumulated or cell != body.zero_literal
             ]
     parameters = [f"const REAL *restrict {name}" for name in body.names if name not in declarations]
     result_parameters = [
@@ -346,14 +346,14 @@ def _write_source(
         ("x", "w", "s", "q", "own", "x_after", "s_after", "q_after", "a"), "stride"
     )
 
-    def lay_out(array: str, names: Sequence[str]) -> tuple[dict[str, slice], dict[str, str]]:
+    def build_layout(array: str, names: Sequence[str]) -> tuple[dict[str, slice], dict[str, str]]:
         """Return the layout of quantities in an array, and declarations of pointers to them."""
-        ends = [0, *accumulate(sizes_by_name[name] for name in names)]
+        offsets = [0, *accumulate(sizes_by_name[name] for name in names)]
         return (
-            {name: slice(*pair) for name, pair in zip(names, pairwise(ends), strict=True)},
+            {name: slice(*pair) for name, pair in zip(names, pairwise(offsets), strict=True)},
             {
                 name: f"REAL *{name} = {array} + {begin} * LANES;"
-                for name, begin in zip(names, ends, strict=False)
+                for name, begin in zip(names, offsets, strict=False)
             },
         )
 
@@ -402,12 +402,12 @@ def _write_source(
             for name, product in zip(slope_function.name_in(), symbols, strict=True)
             if name in is_needed
         }
-        forward_storage, stored_pointers = lay_out(
+        forward_storage, stored_pointers = build_layout(
             "held",
             [name for name, needed in is_needed.items() if needed]
             + [f"factor_{k}" for k in sorted(matrices, key=slope_of)],
         )
-        backward_storage, declarations = lay_out(
+        backward_storage, declarations = build_layout(
             "pulled", [*dict.fromkeys(map(slope_of, matrices))]
         )
         backward_storage |= {f"product_{k}_slope": backward_storage[slope_of(k)] for k in matrices}
@@ -597,7 +597,7 @@ class CompiledRollout:
             no gradient.
         max_gradient_ratio: largest ratio of a row's gradient to its cotangent, as a multiple of the
             median over rows; larger gradients are scaled down. Rows of a marginally stable loop
-            can have gradients that are millions of times as large as those of others.
+            can have gradients 10^6 times larger than the other rows.
 
     Raises:
         ExportError: where a step cannot be traced or written in C, or compilation fails.

@@ -145,7 +145,8 @@ def trace_rollout(rollout: Rollout, steps: int) -> FreeRun:
     """Return the rollout with its model's step traced by TorchScript.
 
     A traced step takes half the time of the step in Python. It shares parameters and buffers with
-    the model as it is now: trace again after the model is moved to another device or type, or
+    the current state of the model: trace again after the model is moved to another device or type,
+        or
     changes between training and evaluation.
 
     Args:

@@ -122,7 +122,7 @@ def _require_deterministic(graph: Graph, what: str) -> None:
     """Refuse a step that draws random numbers, such as dropout in training.
 
     Raises:
-        ExportError: where there is such an operation.
+        ExportError: if the graph has such an operation.
     """
     for node in graph.nodes:
         if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
@@ -143,7 +143,7 @@ def _lower_graph(
 
     Args:
         graph: the recorded graph.
-        values: values of some nodes; those of all other nodes are added.
+        values: values of some nodes; the values of all other nodes are added.
         what: name of the model, for messages.
         replacement: returns the value of a node from its arguments, or None for the usual value.
     """
@@ -200,7 +200,7 @@ class StepParts:
     """A step split into computations that rows share, matrix products, and the remainder.
 
     Attributes:
-        function: the remainder. Its arguments are those of a row, `theta`, the results
+        function: the remainder. Its arguments are the arguments of a row, `theta`, the results
             `product_<k>` of the products, and the values `detached_<k>` that the step detaches. It
             returns the factors `factor_<k>` of the products, then the results of the step, then
             `detached_<k>_value`. A factor depends on previous products alone.
@@ -682,11 +682,11 @@ def _lower_data_movement(
         for i, arg in enumerate(args)
     ]
     indices = target(*arguments, **keyword_arguments)
-    joined = columns[0] if len(columns) == 1 else ca.vertcat(*columns)
+    all_columns = columns[0] if len(columns) == 1 else ca.vertcat(*columns)
     if isinstance(example, Tensor):
-        return _TracedValue(example, _select(joined, indices))
+        return _TracedValue(example, _select(all_columns, indices))
     return [
-        _TracedValue(element, _select(joined, element_indices))
+        _TracedValue(element, _select(all_columns, element_indices))
         for element, element_indices in zip(example, indices, strict=True)
     ]
 
@@ -802,11 +802,11 @@ def _lower_product(
 ) -> _TracedValue:
     (m, k), n = a.example.shape, b.example.shape[1]
     # columns are in row order, and CasADi reshapes by columns: matrices are transposed
-    right = (
+    transposed_b = (
         ca.MX(ca.DM(b.example.double().T.tolist())) if b.is_constant else ca.reshape(b.column, n, k)
     )
     product = _TracedValue(
-        example, ca.vec(ca.mtimes(right, ca.reshape(_scale(a, alpha).column, k, m)))
+        example, ca.vec(ca.mtimes(transposed_b, ca.reshape(_scale(a, alpha).column, k, m)))
     )
     return (
         product

@@ -12,7 +12,7 @@ from residnet.core.errors import UsageError
 from residnet.core.layout import SURGE
 from residnet.core.names import STATE_NAMES
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.store import chosen_model, load_model
+from residnet.dynamics.store import load_model, resolve_model_name
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import Rollout
 from residnet.export.guard import GuardedDynamics
@@ -85,7 +85,7 @@ def load_learned_vehicle(run: Path, name: str = "selected") -> Vehicle:
     Raises:
         UsageError: where the run has no such model.
     """
-    spec, model = load_model(run / "models" / chosen_model(run, name))
+    spec, model = load_model(run / "models" / resolve_model_name(run, name))
     dof = spec.signals.dof
     dof.require_on_surface("a simulator")
     guarded_step = _UnflaggedStep(

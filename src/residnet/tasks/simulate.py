@@ -18,7 +18,7 @@ from residnet.core.files import make_file_stem
 from residnet.core.names import CHANNEL_UNITS, suggest_name
 from residnet.core.progress import log_message
 from residnet.dynamics.simulated import check_steps
-from residnet.dynamics.store import chosen_model, load_model
+from residnet.dynamics.store import load_model, resolve_model_name
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.evaluation.booklet import build_index_rows, build_index_table
 from residnet.io.readers import ReaderConfig
@@ -89,7 +89,7 @@ class ModelChoice(Config):
         Raises:
             UsageError: if the run has no such model.
         """
-        return self.run / "models" / chosen_model(self.run, self.name)
+        return self.run / "models" / resolve_model_name(self.run, self.name)
 
 
 class Programme(Config):
@@ -277,7 +277,8 @@ class Programme(Config):
             if channel not in actuators.input_names
         ]:
             raise ConfigError(
-                f"disturbance.wind: model '{name}' and its actuators have no input '{missing_inputs[0]}'"
+                f"disturbance.wind: model '{name}' and its actuators have no input"
+                f" '{missing_inputs[0]}'"
             )
         helm = Helm(
             actuators.commands_for_demand, actuated.state_names, actuators.input_names, forces
@@ -400,7 +401,8 @@ class SimulateConfig(ComputingTask):
             else f"All {n_flights} manoeuvres ended as they should"
         )
         verdict = [
-            f"{completion_text}; they were flown by {' and '.join(craft.name for craft, _ in flights_by_craft)}, and"
+            f"{completion_text}; they were flown by"
+            f" {' and '.join(craft.name for craft, _ in flights_by_craft)}, and"
             " their logs are in the folder logs."
         ]
         verdict += [f"{row['craft']}, {row['log']}: {row['fault']}." for row in faulty_rows[:5]]
@@ -414,7 +416,8 @@ class SimulateConfig(ComputingTask):
             log_message(line)
         failures = [line for line, is_listed in fault_messages if is_listed]
         failure_message = failures and (
-            f"{failures[-1]} ({len(failures)} of {n_flights} flights did not end as they should; give"
+            f"{failures[-1]} ({len(failures)} of {n_flights} flights did not end as they should;"
+            f" give"
             " more duration, drive or steer)"
         )
         return TaskOutcome(
