@@ -15,7 +15,7 @@ from safetensors.numpy import load, save
 from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.trust import trusting
-from residnet.dynamics.store import load_model, restored, save_model
+from residnet.dynamics.store import load_model, restore_module, save_model
 from residnet.heads import scikit, scikit_state
 from residnet.heads.scikit import SklearnConfig, SklearnHead
 from residnet.testing.checks import make_example_model, make_example_spec
@@ -129,7 +129,7 @@ def test_a_forged_state_is_refused(name: str, key: str, value: Any, message: str
     arrays = {k: np.ascontiguousarray(v) for k, v in arrays.items()}
     forged = np.concatenate((stored[:5], np.frombuffer(save(arrays), dtype=np.uint8)))
     with pytest.raises(UsageError, match=message):
-        restored(spec, state | {"head._extra_state": torch.from_numpy(forged)})
+        restore_module(spec, state | {"head._extra_state": torch.from_numpy(forged)})
 
 
 @pytest.mark.parametrize("length", [0, 3, 5, 40, 400])
@@ -139,10 +139,10 @@ def test_a_cut_state_is_refused(length: int) -> None:
     state["head._extra_state"] = state["head._extra_state"][:length]
     if length == 0:
         # the state of a head that is not fitted yet
-        assert restored(spec, state).head.axis_pipelines == []
+        assert restore_module(spec, state).head.axis_pipelines == []
         return
     with pytest.raises(UsageError, match="a head of kind sklearn: its state"):
-        restored(spec, state)
+        restore_module(spec, state)
 
 
 def test_samples_to_fit_on_again_are_refused() -> None:
@@ -152,9 +152,9 @@ def test_samples_to_fit_on_again_are_refused() -> None:
     forged = state["head._extra_state"].clone()
     forged[0] = 2
     with pytest.raises(UsageError, match="give --trust"):
-        restored(spec, state | {"head._extra_state": forged})
+        restore_module(spec, state | {"head._extra_state": forged})
     with pytest.raises(UsageError, match="earlier version"):
-        restored(spec, state | {"head._extra_state": torch.zeros(4, 9)})
+        restore_module(spec, state | {"head._extra_state": torch.zeros(4, 9)})
 
 
 MEMORY = [

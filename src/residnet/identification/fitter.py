@@ -455,7 +455,7 @@ class Fitter:
             from residnet.training.heads import train
 
             training_config = self.settings.training.get(name, TrainingConfig())
-            dtype = torch.float64 if training_config.double else torch.float32
+            dtype = torch.float64 if training_config.is_double_precision else torch.float32
             windows, folder = (
                 WindowStore.from_logs(self.training_logs, dtype),
                 self.store.training_folder,
