@@ -275,7 +275,7 @@ def test_files_of_an_interrupted_training_are_recorded(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(trainer, "_conclude", interrupt)
+    monkeypatch.setattr(trainer, "_log_result", interrupt)
     out = tmp_path / "run"
     assert command("run", tiny_config, "--out", out, "--quiet").code != 0
     assert list(out.rglob("last.ckpt"))
