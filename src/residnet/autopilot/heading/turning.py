@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -283,3 +283,8 @@ class NomotoModel:
             "speed": self.speed,
             "righting": self.restoring,
         }
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, float]) -> NomotoModel:
+        """Read the numbers that `to_json` wrote."""
+        return cls(content["gain"], content["time"], content["speed"], content["righting"])

@@ -197,7 +197,10 @@ def open_autopilot_run(config: CourseTaskConfig, folder: RunFolder) -> Autopilot
     )
     notes = read_json(run_folder.path / "controllers.json")
     steering = ControlTask(
-        autopilot.steered_vessel, NomotoModel(**notes["turning"]), autopilot.rudder, config.dt
+        autopilot.steered_vessel,
+        NomotoModel.from_json(notes["turning"]),
+        autopilot.rudder,
+        config.dt,
     )
     return AutopilotRun(
         autopilot,
