@@ -306,7 +306,7 @@ WRONG = [
     ("free_run(models, data).plot_track('zigzag')", "no log 'zigzag'; "),
     ("export_model(ridge, 'x', 'torchscrip')", "did you mean 'torchscript'"),
     ("save(data, 'x')", "expected a model, given a Dataset"),
-    ("load(folder)", "no model found"),
+    ("load(folder)", "checksums.json"),
     ("vessel('wam_v_call')", "did you mean 'wam_v_cal'"),
     ("simulate('wam_v_cal', 'zigzagg')", "unknown value 'zigzagg'; did you mean 'zigzag'"),
     ("simulate('wam_v_cal')", "no manoeuvre"),

@@ -335,7 +335,8 @@ def summary(records: list[dict[str, Any]]) -> str:
         spread = np.nanstd(ratio) / np.sqrt(len(ratio))
         better = int((mean <= errors).sum())
         out.append(
-            f"  {name:40} {np.exp(np.nanmean(ratio)):.3f} +- {spread:.3f}; the ensemble is no worse in"
+            f"  {name:40} {np.exp(np.nanmean(ratio)):.3f} +- {spread:.3f}; the ensemble is no"
+            f" worse in"
             f" {better}"
         )
     return "\n".join(out)

@@ -23,7 +23,13 @@ SYMBOL_LENGTH = 3
 
 def target_name(node: ast.expr) -> str:
     """Return the name that an assignment binds, without leading underscores."""
-    name = node.id if isinstance(node, ast.Name) else node.attr if isinstance(node, ast.Attribute) else ""
+    name = (
+        node.id
+        if isinstance(node, ast.Name)
+        else node.attr
+        if isinstance(node, ast.Attribute)
+        else ""
+    )
     return name.lstrip("_")
 
 
@@ -80,7 +86,8 @@ def split_assignments(text: str) -> str:
         if first_line[: node.col_offset].strip() or trailing.startswith(";") or "#" in statement:
             continue
         assignments = [
-            f"{indent}{ast.get_source_segment(text, target)} = ({ast.get_source_segment(text, value)})\n"
+            f"{indent}{ast.get_source_segment(text, target)} ="
+            f" ({ast.get_source_segment(text, value)})\n"
             for target, value in zip(node.targets[0].elts, node.value.elts, strict=True)
         ]
         lines[node.lineno - 1 : node.end_lineno] = assignments
@@ -91,7 +98,9 @@ def main(arguments: list[str]) -> int:
     """Check or rewrite the Python files below the given paths; return the exit status."""
     is_fixing = "--fix" in arguments
     paths = [Path(name) for name in arguments if name != "--fix"]
-    files = [file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])]
+    files = [
+        file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])
+    ]
     n_matches = 0
     for file in files:
         text = file.read_text()

@@ -729,7 +729,8 @@ def ardupilot(
     print(f"{vehicle_model.name} listens on UDP port {back_end.port}; Ctrl-C stops it", flush=True)
     for name, servo_output in zip(vehicle_model.inputs, back_end.servos, strict=False):
         print(
-            f"  {name}: servo output {servo_output.channel}, {servo_output.lower_command:g} to {servo_output.upper_command:g}",
+            f"  {name}: servo output {servo_output.channel}, {servo_output.lower_command:g} to"
+            f" {servo_output.upper_command:g}",
             flush=True,
         )
     back_end.serve()

@@ -126,7 +126,9 @@ def test_overshoot_beyond_the_limit_of_one_in_twenty_costs() -> None:
     limits = SteadinessLimits(flights=4, overshoot_p95=math.radians(0.5))
     settings = PolicyTraining(dt=0.1, hold=0.0, validation=4, excess=2.0, steady=limits)
     overshoot = torch.deg2rad(torch.tensor([0.0, 0.4, 0.7, 1.5]))
-    assert float(fitted(settings)._overshoot_penalty(overshoot)) == pytest.approx(2.0 * (0.2 + 1.0) / 4.0)
+    assert float(fitted(settings)._overshoot_penalty(overshoot)) == pytest.approx(
+        2.0 * (0.2 + 1.0) / 4.0
+    )
     assert fitted(settings.model_copy(update={"steady": None}))._overshoot_penalty(overshoot) == 0.0
 
 

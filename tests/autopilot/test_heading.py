@@ -361,7 +361,10 @@ def test_planes_of_a_learned_torpedo_pitch_it_as_the_vessel_does() -> None:
     with torch.no_grad():
         for axis, row in known.items():
             for term, value in row.items():
-                place = baseline.output_names.index(f"{axis}_dot"), baseline.library.terms.index(term)
+                place = (
+                    baseline.output_names.index(f"{axis}_dot"),
+                    baseline.library.terms.index(term),
+                )
                 baseline.theta[place] = value
     learned = SteeredModel(model, SUBMERGED_SIGNALS.input_columns, "start", vessel)
     found, wanted = (one.estimate_nomoto(5 * DEG, 20.0, 0.1) for one in (learned, vessel))

@@ -230,7 +230,10 @@ def test_baseline(kind: str) -> None:
 
 @pytest.mark.parametrize(
     ("signals", "refusal"),
-    [(ROLLING_SIGNALS, "does not support roll"), (SUBMERGED_SIGNALS, "does not support depth and pitch")],
+    [
+        (ROLLING_SIGNALS, "does not support roll"),
+        (SUBMERGED_SIGNALS, "does not support depth and pitch"),
+    ],
     ids=["roll", "six"],
 )
 @pytest.mark.parametrize("kind", load_kinds(BaselineConfig))

@@ -49,7 +49,9 @@ def test_the_gear_is_the_plants_whatever_its_kind(vessel: str) -> None:
     start = plant.make_initial_state(2)
     with torch.no_grad():
         truth, _, _ = Rollout(PlantDynamics(plant, step, substeps))(start, w, start[:, :0])
-        model = ActuatedDynamics(still(gear.input_names[:1], step), gear.input_names[:1], "start", gear)
+        model = ActuatedDynamics(
+            still(gear.input_names[:1], step), gear.input_names[:1], "start", gear
+        )
         mine, _, _ = Rollout(model)(model.make_initial_state(2), w, start[:, :0])
     hull = ("x", "y", "phi", "psi", "u", "v", "p", "r")
     assert len(gear.state_names) == len([name for name in plant.state_names if name not in hull])

@@ -93,7 +93,9 @@ def test_what_is_no_number_stays_so_and_subnormal_numbers_stay_numbers() -> None
     lost = x.clone()
     lost[3, 0], lost[5, 1] = torch.nan, torch.inf
     with torch.no_grad():
-        fast = CompiledRollout(rollout, x, w, s, max_gradient_ratio=1e9)  # what flies alone has no gradient
+        fast = CompiledRollout(
+            rollout, x, w, s, max_gradient_ratio=1e9
+        )  # what flies alone has no gradient
         (found, *_), (wanted, *_) = fast(lost, w, s), rollout(lost, w, s)
     assert torch.equal(found.isfinite(), wanted.isfinite())
     assert not found[3].isfinite().all()

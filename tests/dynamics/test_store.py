@@ -166,20 +166,3 @@ def test_what_is_not_as_written_is_refused_in_one_line(
     with pytest.raises((UsageError, ConfigError), match=said) as caught:
         load_model(tmp_path / "m")
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("key", "idle", "busy"),
-    [("disturbance", None, {"settle": 20.0}), ("encoder", False, True)],
-)
-def test_keys_of_before_that_did_nothing_are_dropped(
-    tmp_path: Path, key: str, idle: object, busy: object
-) -> None:
-    folder = tmp_path / "baseline"
-    kept = saved(folder)
-    edited(folder, **{key: idle})
-    assert load_model(folder)[0] == kept
-    saved(folder)
-    edited(folder, **{key: busy})
-    with pytest.raises(ConfigError, match=key):
-        load_model(folder)

@@ -222,8 +222,8 @@ def test_a_mean_is_that_of_the_trajectories_of_its_members() -> None:
 
 
 def test_a_window_beyond_short_training_logs_is_no_divergence() -> None:
-    """A vessel that does more than it did in training exceeds the limit itself, and so does `constant_velocity`
-    that holds its velocities.
+    """A vessel that does more than it did in training exceeds the limit itself, and so does
+    `constant_velocity` that holds its velocities.
     """
     log = made(random_states(80, np.random.default_rng(3)), STEP)
     fast = float(np.abs(log.y[:, 3]).max())

@@ -245,7 +245,8 @@ def test_data_outside_the_training_range_and_the_doctor_are_told() -> None:
 def test_an_old_run_without_these_files_still_has_a_verdict() -> None:
     said = write_verdict(evidence(selection={}, limits_by_protocol={}))
     assert said == [
-        "On test data model mlp is 60 % better than constant velocity and 20 % better than the baseline; its"
+        "On test data model mlp is 60 % better than constant velocity and 20 % better than the"
+        " baseline; its"
         " NRMSE is 0.200."
     ]
 

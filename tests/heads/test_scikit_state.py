@@ -80,9 +80,9 @@ def test_a_stored_pipeline_predicts_the_same_without_a_fit(
     no_fit()
     stored = load_model(tmp_path / "model")[1]
     x = np.random.default_rng(0).normal(size=(50, model.head.features.n_features))
-    before = model.head.asked(torch.from_numpy(x))
+    before = model.head.predict(torch.from_numpy(x))
     assert before.std() > 0
-    assert torch.equal(stored.head.asked(torch.from_numpy(x)), before)
+    assert torch.equal(stored.head.predict(torch.from_numpy(x)), before)
     assert stored.head.parameter_counts() == model.head.parameter_counts()
     assert b"pickle" not in (tmp_path / "model" / "model.safetensors").read_bytes()
 
@@ -179,6 +179,6 @@ def test_other_classes_need_trust_at_the_fit_and_at_the_load(tmp_path: Path) -> 
         save_model(tmp_path / "model", spec, model)
         stored = load_model(tmp_path / "model")[1]
     x = torch.randn(9, model.head.features.n_features)
-    assert torch.equal(stored.head.asked(x), model.head.asked(x))
+    assert torch.equal(stored.head.predict(x), model.head.predict(x))
     with pytest.raises(ConfigError, match=r"BaggingRegressor' is not among.*--trust"):
         load_model(tmp_path / "model")

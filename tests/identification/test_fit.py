@@ -299,7 +299,9 @@ def test_accelerations_are_those_of_the_models_rate_at_the_sample(
     )
     z = compute_channels(log, model.signals)[at : at + 1]
     torch.testing.assert_close(z, model.compute_channels(x, w), rtol=1e-12, atol=1e-12)
-    rate = model.state_derivative(x, model.signals.prepare(w), model.head(z, model.initial_state(1))[0])
+    rate = model.state_derivative(
+        x, model.signals.prepare(w), model.head(z, model.initial_state(1))[0]
+    )
     predicted = run_teacher_forced(model, log).predicted_accelerations[at]
     np.testing.assert_allclose(predicted, rate[0, 3:].detach().numpy(), rtol=1e-9)
 

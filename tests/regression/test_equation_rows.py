@@ -76,7 +76,7 @@ def test_stretches_end_at_gaps_and_manoeuvres() -> None:
 
 def test_what_cannot_be_done_is_one_line() -> None:
     sampled = record()
-    with pytest.raises(FitError, match="weak form: .* 19 s"):
+    with pytest.raises(FitError, match=r"weak form: .* 19 s"):
         WeakRows(window=19.0).build_rows(sampled, 0.1)
     with pytest.raises(ConfigError, match=r"a window of 0\.2 s has 2 samples"):
         WeakRows(window=0.2).build_rows(sampled, 0.1)

@@ -83,7 +83,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
     ],
     "ferry": [
         ("'baseline={kind: regressors, terms: [u, tau_x]}'", "space: force needs a baseline"),
-        ("'heads.mlp={kind: mlp, features: [u_dot]}'", "only a residual in force space knows it"),
+        ("'heads.mlp={kind: mlp, features: [u_dot]}'", "only heads in force space support"),
     ],
     "ship": [
         ("~programme.vessel", "no vessel"),

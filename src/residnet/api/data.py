@@ -432,7 +432,8 @@ def _prepare_splits(
             )
             if not prepared[split][-1].trainable.any():
                 raise DataError(
-                    f"log {log.name}: no stretch is as long as the window of the derivative; leave the"
+                    f"log {log.name}: no stretch is as long as the window of the derivative;"
+                    f" leave the"
                     " log out or use a shorter window"
                 )
             n_done += 1

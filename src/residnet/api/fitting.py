@@ -92,7 +92,8 @@ class FreeRuns:
     def table(self) -> pd.DataFrame:
         """One row for each log, protocol, model, window and time step.
 
-        Columns: log, protocol, model, window, t (s, clock of the log), usable, diverged; measured u,
+        Columns: log, protocol, model, window, t (s, clock of the log), usable, diverged; measured
+            u,
         v (m/s), r (rad/s), psi (rad), x, y (m); predicted states with the suffix `_hat`.
         """
         import pandas as pd
@@ -155,7 +156,8 @@ class FreeRuns:
             raise UsageError(f"log {log_name} has no window of the protocol {protocol_name}")
         if window is not None and not 0 <= window < len(windows_of_log):
             raise UsageError(
-                f"log {log_name} has {len(windows_of_log)} windows of {protocol_name}, no number {window}"
+                f"log {log_name} has {len(windows_of_log)} windows of {protocol_name}, no number"
+                f" {window}"
             )
         stored_window = (
             max(windows_of_log, key=lambda one: len(one.t))
@@ -224,7 +226,8 @@ def free_run(
         if model.inputs != data.signals.input_columns:
             raise UsageError(
                 f"free_run: model {model.name} has the inputs {', '.join(model.inputs)}, the data"
-                f" have {', '.join(data.signals.input_columns)}; prepare them with the model's inputs"
+                f" have {', '.join(data.signals.input_columns)}; prepare them with the model's"
+                f" inputs"
             )
         if abs(model.dt - step) > 1e-9:
             raise UsageError(

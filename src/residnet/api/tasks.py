@@ -66,7 +66,8 @@ def list_available(part_kind: PartKind) -> pd.DataFrame:
 
     if part_kind not in get_args(PartKind):
         raise UsageError(
-            f"list_available: there are no '{part_kind}'{suggest_name(str(part_kind), get_args(PartKind))}"
+            f"list_available: there are no"
+            f" '{part_kind}'{suggest_name(str(part_kind), get_args(PartKind))}"
         )
     return pd.DataFrame(list_catalogue(part_kind), columns=["name", "about"])
 

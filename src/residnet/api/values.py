@@ -50,7 +50,8 @@ def parse_part(value: PartLike, description: str, **settings: Any) -> dict[str, 
     if isinstance(value, Mapping | BaseModel):
         return {**to_builtin(value), **to_builtin(settings)}
     raise UsageError(
-        f"{description}: expected its kind, a mapping or a config object, given {describe_type(value)}"
+        f"{description}: expected its kind, a mapping or a config object, given"
+        f" {describe_type(value)}"
     )
 
 
@@ -69,7 +70,8 @@ def parse_named_parts(value: Any, description: str) -> dict[str, Any]:
     if isinstance(value, list | tuple) and all(isinstance(part_kind, str) for part_kind in value):
         return {part_kind: parse_part(part_kind, description) for part_kind in value}
     raise UsageError(
-        f"{description}s: expected kinds such as ['plsr', 'lstm'], or a mapping from names to settings,"
+        f"{description}s: expected kinds such as ['plsr', 'lstm'], or a mapping from names to"
+        f" settings,"
         f" given {describe_type(value)}"
     )
 

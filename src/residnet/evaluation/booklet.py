@@ -78,7 +78,8 @@ class BookletConfig(Config):
         ]
         if len(steering_inputs) != 1:
             raise ConfigError(
-                f"booklet.inputs: one input must have a share in steer, given {steering_inputs or 'none'}"
+                f"booklet.inputs: one input must have a share in steer, given"
+                f" {steering_inputs or 'none'}"
             )
         return steering_inputs[0]
 

@@ -419,7 +419,9 @@ def _to_prediction(
     dt: float,
     velocity_limits: np.ndarray,
 ) -> Prediction:
-    """Return states [L, 3 + n] or what moves [L, n] with its pose; of `constant_velocity` if it ran away."""
+    """Return states [L, 3 + n] or what moves [L, n] with its pose; of `constant_velocity` if it ran
+    away.
+    """
     log, window_slice = logs[window.log_index], slice(window.start, window.stop)
     velocities = simulated[:, -log.dof.n_dynamic :]
     measured_speeds = np.abs(log.y[window_slice, log.dof.dynamic_columns][log.usable[window_slice]])

@@ -558,7 +558,9 @@ class ProtocolEvaluation:
         ]
 
     def compare_with_references(self) -> dict[str, dict[str, Any]]:
-        """Return paired differences of each model to constant velocity and to the first baseline."""
+        """Return paired differences of each model to constant velocity and to the first
+        baseline.
+        """
         all_windows = np.ones(len(self.log_indices), dtype=bool)
         reference_names = [CONSTANT_VELOCITY] if CONSTANT_VELOCITY in self.errors else []
         reference_names += [

@@ -192,9 +192,12 @@ def make_windows(
         longest_log = max(logs, key=len)
         longest_segment = max(map(longest_segment_length, logs))
         raise DataError(
-            f"protocol {protocol_name}: none of {len(logs)} '{logs[0].split}' logs holds a window; the"
-            f" longest, {longest_log.log.name}, lasts {len(longest_log) * dt:.1f} s, and the longest"
-            f" stretch without a gap {longest_segment * dt:.1f} s; give longer logs, fill gaps that may be"
+            f"protocol {protocol_name}: none of {len(logs)} '{logs[0].split}' logs holds a"
+            f" window; the"
+            f" longest, {longest_log.log.name}, lasts {len(longest_log) * dt:.1f} s, and the"
+            f" longest"
+            f" stretch without a gap {longest_segment * dt:.1f} s; give longer logs, fill gaps"
+            f" that may be"
             " interpolated, or shorten the protocol"
         )
     return windows

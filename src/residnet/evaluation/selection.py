@@ -237,12 +237,17 @@ def _simplest_equivalent(
     elif candidate is most_accurate:
         reason = f"{candidate.name} errs least ({error_text})"
         if any(model.complexity_rank < most_accurate.complexity_rank for model in bounded_models):
-            reason += f", and no {'simpler' if most_accurate.is_sound else 'sound'} one comes within {tolerance_text}"
+            reason += (
+                f", and no {'simpler' if most_accurate.is_sound else 'sound'} one comes"
+                f" within {tolerance_text}"
+            )
     else:
         superlative = "simplest sound" if candidate.is_sound else "simplest"
         reason = (
-            f"{candidate.name} is the {superlative} model within {tolerance_text} ({format_number(100.0 * tolerance, 2)} %) of"
-            f" the best one, {most_accurate.name} ({error_text} and {format_number(most_accurate.mean_nrmse)})"
+            f"{candidate.name} is the {superlative} model within {tolerance_text}"
+            f" ({format_number(100.0 * tolerance, 2)} %) of"
+            f" the best one, {most_accurate.name} ({error_text} and"
+            f" {format_number(most_accurate.mean_nrmse)})"
         )
     diverged_models = [
         model

@@ -322,7 +322,8 @@ def settled_acceleration(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
 def check_damping(
     spec: ModelSpec, model: HybridDynamics, training_points: TrainingPoints
 ) -> SanityFinding:
-    """Check that each velocity decays by itself: d u_dot/du < 0 and so on, by automatic differentiation.
+    """Check that each velocity decays by itself: d u_dot/du < 0 and so on, by automatic
+    differentiation.
 
     No derivative may be positive at more than half of the recorded points, unless it is negligible
     against its values at the other points.
@@ -342,7 +343,8 @@ def check_damping(
         np.quantile(np.abs(damping_slopes), 0.9, axis=0),
     )
     wrong_signs = [
-        f"d{name}′/d{name} {median_slopes[i]:+.2g} 1/s, positive at {(damping_slopes[:, i] > 0).mean():.0%} of it"
+        f"d{name}′/d{name} {median_slopes[i]:+.2g} 1/s, positive at"
+        f" {(damping_slopes[:, i] > 0).mean():.0%} of it"
         for i, name in enumerate(dof.velocities)
         if median_slopes[i] > _NEGLIGIBLE_SLOPE_SHARE * typical_sizes[i]
     ]
@@ -457,7 +459,8 @@ def check_stability(
             [rates_and_points[0][1].speed, rates_and_points[-1][1].speed], digits=2
         )
         text = (
-            f"{motion_text} {verb} stable in straight running at {speeds} m/s (no mode doubles within"
+            f"{motion_text} {verb} stable in straight running at {speeds} m/s (no mode doubles"
+            f" within"
             f" {_MAX_DOUBLING_TIME:.0f} s). {summary}"
         )
         return _to_sanity_finding(spec, STABILITY, True, text, fault)
@@ -469,8 +472,10 @@ def check_stability(
     mode_rate, worst_point = max(unstable_inside or unstable_points, key=lambda one: one[0])
     range_text = "inside the training data" if unstable_inside else "only outside the training data"
     text = (
-        f"{motion_text} unstable in straight running, {range_text}: worst at {worst_point}, a disturbance"
-        f" doubles in {format_number(math.log(2) / mode_rate, 2)} s. Some full hulls are so in truth; otherwise"
+        f"{motion_text} unstable in straight running, {range_text}: worst at {worst_point}, a"
+        f" disturbance"
+        f" doubles in {format_number(math.log(2) / mode_rate, 2)} s. Some full hulls are so in"
+        f" truth; otherwise"
         f" do not trust long free runs there. {summary}"
     )
     return _to_sanity_finding(spec, STABILITY, False, text, fault)
@@ -525,7 +530,8 @@ def find_contradicting_steady_run(model: HybridDynamics, steady_runs: Sequence[S
         ):
             return (
                 "it is unstable where the logs are not (a disturbance would double in"
-                f" {format_number(math.log(2.0) / model_rate, 2)} s; log {run.log} runs steadily for"
+                f" {format_number(math.log(2.0) / model_rate, 2)} s; log {run.log} runs steadily"
+                f" for"
                 f" {run.duration:.0f} s)"
             )
     return ""
@@ -626,7 +632,8 @@ def check_symmetry(
         "A single screw, an offset of the steering or too few turns one way may be the reason. "
     )
     text = (
-        f"port and starboard {'alike' if is_symmetric else 'differ'}: the uneven part of the acceleration is"
+        f"port and starboard {'alike' if is_symmetric else 'differ'}: the uneven part of the"
+        f" acceleration is"
         f" up to {max_percentage:.0f} % of its spread. {'' if is_symmetric else reason}RMS over"
         f" {int(is_inside.sum())} points of the training data: {details}"
     )
@@ -702,17 +709,22 @@ def check_boundedness(
     limit_text = f"(more than {divergence_factor:g} times the largest training velocity)"
     if not bool((divergence_time > 0.0).any()):
         text = (
-            f"{n_recorded} runs of {_LONG_RUN_DURATION:.0f} s or longer from recorded states, and {len(corners)}"
+            f"{n_recorded} runs of {_LONG_RUN_DURATION:.0f} s or longer from recorded states, and"
+            f" {len(corners)}"
             " from rest with inputs held at their extremes, stay bounded"
         )
         return _to_sanity_finding(spec, BOUNDEDNESS, True, text, "")
     if first_diverged < n_recorded:
         fault = (
-            f"it runs away within {float(divergence_time[first_diverged]):.0f} s from a recorded state with recorded"
+            f"it runs away within {float(divergence_time[first_diverged]):.0f} s from a recorded"
+            f" state with recorded"
             f" inputs ({inputs})"
         )
         return _to_sanity_finding(spec, BOUNDEDNESS, False, limit_text.strip("()"), fault)
-    text = f"runs away within {float(divergence_time[first_diverged]):.0f} s with {inputs} held from rest {limit_text}"
+    text = (
+        f"runs away within {float(divergence_time[first_diverged]):.0f} s with {inputs} held"
+        f" from rest {limit_text}"
+    )
     return _to_sanity_finding(spec, BOUNDEDNESS, False, text, "")
 
 

@@ -245,14 +245,18 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
     horizon_text, criterion_sentences = f"{format_number(main_entry['seconds'], 2)} s ahead", []
     if not sufficient_entries:
         lead_sentence = (
-            f"{format_count(main_entry['windows'], 'window')} of {format_count(main_entry['logs'], 'log')} on"
+            f"{format_count(main_entry['windows'], 'window')} of"
+            f" {format_count(main_entry['logs'], 'log')} on"
             f" {evidence.split} data cannot say how good {evidence.selected} is ({_MIN_WINDOWS} of"
             f" {MIN_LOGS_FOR_INTERVAL} logs are needed); {horizon_text} it is off by {error_text}."
         )
     elif longest_horizon:
         lead_sentence = f"Up to {horizon_text}, where {evidence.selected} is off by {error_text}."
     else:
-        lead_sentence = f"{horizon_text[0].upper()}{horizon_text[1:]} {evidence.selected} is off by {error_text}."
+        lead_sentence = (
+            f"{horizon_text[0].upper()}{horizon_text[1:]} {evidence.selected} is off"
+            f" by {error_text}."
+        )
         limits_by_unit = {
             "m": f"{100.0 * _MAX_DISTANCE_SHARE:.0f} % of the way",
             "rad": f"{math.degrees(_MAX_ANGLE_ERROR):.0f} deg",
@@ -265,7 +269,8 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
             )
         )
         criterion_sentences = [
-            f"Good would be within {good_limits_text} up to the upper end of the interval, or twice the noise"
+            f"Good would be within {good_limits_text} up to the upper end of the interval, or"
+            f" twice the noise"
             " floor, without a diverged window and near the best model of the run."
         ]
     reference_labels = {CONSTANT_VELOCITY: "constant velocity", evidence.baseline: "baseline"}
@@ -280,20 +285,23 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
         f"noise floor (measured velocities, integrated) {_format_pose_errors(main_entry['floor'])}"
     )
     other_horizons = [
-        f"{_format_pose_errors(horizon_entry['models'][evidence.selected])} after {horizon_entry['seconds']:.4g} s"
+        f"{_format_pose_errors(horizon_entry['models'][evidence.selected])} after"
+        f" {horizon_entry['seconds']:.4g} s"
         for horizon_entry in horizon_entries
         if horizon_entry is not main_entry
     ]
     has_position = "position" in error_names
     scope_sentence = (
-        f"It holds for {format_count(main_entry['windows'], 'free run')} ({main_entry['protocol']}) of"
+        f"It holds for {format_count(main_entry['windows'], 'free run')}"
+        f" ({main_entry['protocol']}) of"
         f" {format_count(main_entry['logs'], 'log')}"
         + f" at mean speeds of {format_number(main_entry['slowest'], 2)} to"
         f" {format_number(main_entry['fastest'], 2)} m/s" * has_position + "."
     )
     return [
         lead_sentence,
-        f"Reference models: {'; '.join([*reference_texts, *([noise_floor_text] if has_noise_floor else [])])}.",
+        f"Reference models:"
+        f" {'; '.join([*reference_texts, *([noise_floor_text] if has_noise_floor else [])])}.",
         *criterion_sentences,
         *(
             [f"At other times of these free runs: {'; '.join(other_horizons)}."]
@@ -340,7 +348,8 @@ def _format_errors_with_intervals(
         )
         if error_name == "position" and distance_travelled > 0.0:
             details.append(
-                f"{format_number(100.0 * model_errors[error_name] / distance_travelled, 2)} % of the {format_number(distance_travelled, 2)} m sailed"
+                f"{format_number(100.0 * model_errors[error_name] / distance_travelled, 2)} % of"
+                f" the {format_number(distance_travelled, 2)} m sailed"
             )
         texts.append(error_text + (f" ({', '.join(details)})" if details else ""))
     has_intervals = all(model_errors["intervals"].values()) or distance_travelled == 0.0
@@ -356,7 +365,8 @@ def list_model_objections(evidence: VerdictEvidence) -> list[str]:
     if selected_row is None:
         return []
     return [
-        f"on {evidence.split} data its NRMSE is {format_number(_mean_nrmse(selected_row))}, that of {reference_name}"
+        f"on {evidence.split} data its NRMSE is {format_number(_mean_nrmse(selected_row))}, that"
+        f" of {reference_name}"
         f" {format_number(_mean_nrmse(reference_row))}"
         for reference_name in dict.fromkeys((CONSTANT_VELOCITY, evidence.baseline))
         if (reference_row := evidence.rows_by_model.get(reference_name)) is not None
@@ -383,11 +393,14 @@ def is_useless(evidence: VerdictEvidence) -> bool:
 
 
 def compare_velocity_errors(evidence: VerdictEvidence) -> str:
-    """Return a sentence that compares the velocity errors with constant velocity and the baseline."""
+    """Return a sentence that compares the velocity errors with constant velocity and the
+    baseline.
+    """
     model_name, split = evidence.selected, evidence.split
     if model_name == CONSTANT_VELOCITY:
         return (
-            "NOTHING BEATS CONSTANT VELOCITY, which holds the initial velocities of each free run: no"
+            "NOTHING BEATS CONSTANT VELOCITY, which holds the initial velocities of each free"
+            " run: no"
             " model of this run is of use for prediction."
         )
     selected_row, constant_velocity_row = (
@@ -404,9 +417,12 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
             else "WORSE"
         )
         return (
-            f"{comparison_text} THAN CONSTANT VELOCITY: on {split} data the selected model {model_name} has an NRMSE of"
-            f" {format_number(selected_nrmse)}{_diverged_suffix(selected_row)}, and the constant-velocity"
-            f" model {format_number(_mean_nrmse(constant_velocity_row))}{_format_paired_interval(evidence, CONSTANT_VELOCITY)}. DO NOT USE it for"
+            f"{comparison_text} THAN CONSTANT VELOCITY: on {split} data the selected model"
+            f" {model_name} has an NRMSE of"
+            f" {format_number(selected_nrmse)}{_diverged_suffix(selected_row)}, and the"
+            f" constant-velocity"
+            f" model"
+            f" {format_number(_mean_nrmse(constant_velocity_row))}{_format_paired_interval(evidence, CONSTANT_VELOCITY)}. DO NOT USE it for"  # noqa: E501
             " prediction."
         )
     comparisons = []
@@ -426,10 +442,14 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
             reference_name, reference_name
         )
         comparisons.append(
-            f"{abs(percent_change):.0f} % {comparison} than {reference_label}{_format_paired_interval(evidence, reference_name)}"
+            f"{abs(percent_change):.0f} % {comparison} than"
+            f" {reference_label}{_format_paired_interval(evidence, reference_name)}"
         )
     comparison_clause = f" is {' and '.join(comparisons)};" if comparisons else ""
-    return f"On {split} data model {model_name}{comparison_clause} its NRMSE is {format_number(selected_nrmse)}{_diverged_suffix(selected_row)}."
+    return (
+        f"On {split} data model {model_name}{comparison_clause} its NRMSE is"
+        f" {format_number(selected_nrmse)}{_diverged_suffix(selected_row)}."
+    )
 
 
 def describe_soundness(evidence: VerdictEvidence) -> str:
@@ -465,13 +485,16 @@ def describe_extrapolation(evidence: VerdictEvidence) -> str:
         f"{name} {_format_percent(channel_share)}" for name, channel_share in channels
     )
     return (
-        f"Of the {evidence.split} data, {_format_percent(outside_share)} lies outside the range of the training"
+        f"Of the {evidence.split} data, {_format_percent(outside_share)} lies outside the range"
+        f" of the training"
         f" data ({channel_texts}); nothing is known of the model there but these runs."
     )
 
 
 def describe_divergence(metrics_row: JsonObject) -> str:
-    """Return the count of diverged windows of a row, for display next to its error; may be empty."""
+    """Return the count of diverged windows of a row, for display next to its error; may be
+    empty.
+    """
     return (
         f"{metrics_row['diverged']}/{metrics_row['windows']} diverged"
         if metrics_row.get("diverged")

@@ -118,7 +118,9 @@ class CFunction:
 
     def render_definition(self, prefix: str, tables: Tables) -> str:
         """Return the function in C."""
-        statement_writer = FunctionWriter(expand_if_small(self.function), tables, f"{prefix}_{self.name}")
+        statement_writer = FunctionWriter(
+            expand_if_small(self.function), tables, f"{prefix}_{self.name}"
+        )
         names = self.function.name_out()
         store_statements = [
             f"{name}[{i}] = {value};"

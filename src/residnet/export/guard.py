@@ -101,7 +101,9 @@ class GuardedDynamics(Dynamics):
         self.float_max = _FLOAT32_MAX
         self.n_state = model.n_state
         self.dof, self.has_roll = model.dof, model.has_roll
-        self.set_attitude_columns(ATTITUDE if model.spatial else (), len(spec.signals.dof.state_names) + 1)
+        self.set_attitude_columns(
+            ATTITUDE if model.spatial else (), len(spec.signals.dof.state_names) + 1
+        )
         lower, upper, margin = (
             torch.tensor(values, dtype=torch.float64)
             for values in (spec.low, spec.high, _accepted_margins(spec))

@@ -328,7 +328,8 @@ class IdentifiedModels(Mapping[str, FittedModel]):
             divergences = [
                 (
                     n_diverged,
-                    f"{n_diverged} of its {len(free_run_.windows)} {split} windows diverged ({free_run_.protocol})",
+                    f"{n_diverged} of its {len(free_run_.windows)} {split} windows diverged"
+                    f" ({free_run_.protocol})",
                 )
                 for split, validation_runs in checked_runs.items()
                 for free_run_ in validation_runs

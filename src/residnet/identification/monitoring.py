@@ -558,7 +558,8 @@ def fit_score_distribution(groups: GroupScores) -> ScoreDistribution:
 def estimate_score_inflation(
     groups: GroupScores, fold_of_group: np.ndarray, groups_per_stretch: int
 ) -> float:
-    """Return the ratio of the scatter of clean segments to the scatter expected from other clean logs.
+    """Return the ratio of the scatter of clean segments to the scatter expected from other clean
+    logs.
 
     Wind, waves and model errors differ between logs and persist for minutes. The expected scatter
     of a whole segment is therefore tested by cross-validation over logs.
@@ -719,7 +720,8 @@ class ChangeDetector:
         ]
         if len(indexed_groups) < _MIN_GROUPS:
             raise DataError(
-                f"the clean logs hold {len(indexed_groups)} stretches of {config.group:g} s; a monitor"
+                f"the clean logs hold {len(indexed_groups)} stretches of {config.group:g} s; a"
+                f" monitor"
                 f" needs at least {_MIN_GROUPS} to know how innovations scatter"
             )
         log_of_group = np.array([k for k, _ in indexed_groups])
@@ -747,8 +749,10 @@ class ChangeDetector:
         )
         if has_diverged.mean() > _MAX_DIVERGED_SHARE:
             raise DataError(
-                f"model {spec.name}: free runs of {config.window:g} s run away in {has_diverged.sum()} of"
-                f" {len(has_diverged)} clean windows; watch with another model, or with a shorter window"
+                f"model {spec.name}: free runs of {config.window:g} s run away in"
+                f" {has_diverged.sum()} of"
+                f" {len(has_diverged)} clean windows; watch with another model, or with a shorter"
+                f" window"
             )
         model_bias = self._estimate_bias(innovations_by_group)
         self.whitening_matrices = [

@@ -142,7 +142,7 @@ def propose_manoeuvres(
         if dof.has_heading:
             manoeuvres += [
                 Zigzag(
-                    name=f"zigzag_{angle:.0f}_steer_{round(100 * steer_share * max_steer)}_{drive_label}",
+                    name=f"zigzag_{angle:.0f}_steer_{round(100 * steer_share * max_steer)}_{drive_label}",  # noqa: E501
                     drive=drive,
                     steer=steer_share * max_steer,
                     heading=math.radians(angle),

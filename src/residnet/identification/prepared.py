@@ -189,7 +189,8 @@ def convert_to_motion_through_water(
     )
     current_speeds = np.hypot(north, east)
     log_message(
-        f"  currents of {len(current_rows)} logs: {current_speeds.mean():.3f} m/s on average, at most"
+        f"  currents of {len(current_rows)} logs: {current_speeds.mean():.3f} m/s on average, at"
+        f" most"
         f" {current_speeds.max():.3f} m/s"
     )
     converted_logs = iter(

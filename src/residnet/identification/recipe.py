@@ -115,7 +115,7 @@ class TrainingDataSummary:
             angle_std, rate_std = (float(std[channel_names.index(name)]) for name in ("phi", "p"))
             roll_time_per_radian = angle_std / max(rate_std, 1e-9)
         return cls(
-            channel_names, tuple(varying_channels), tuple(reversing_inputs), dt, free_run_length, history, median_segment_duration, len(samples),
+            channel_names, tuple(varying_channels), tuple(reversing_inputs), dt, free_run_length, history, median_segment_duration, len(samples),  # noqa: E501
             roll_time_per_radian,
         )  # fmt: skip
 
@@ -560,7 +560,8 @@ class PreparationPlan:
     def reason(self) -> str:
         """The reason of the time constants, for the drafted config."""
         return (
-            f"logs have a sample each {self.sample_interval:.3g} s, and a {self.correlated_quantity} that stays alike"
+            f"logs have a sample each {self.sample_interval:.3g} s, and a"
+            f" {self.correlated_quantity} that stays alike"
             f" for {self.correlation_time:.3g} s"
         )
 

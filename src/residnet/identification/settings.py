@@ -98,7 +98,8 @@ class FitSettings(ModelPartsConfig):
             return self
         if specified_parts:
             raise ValueError(
-                f"recipe: standard stands in place of {', '.join(PART_KEYS)}; leave '{specified_parts[0]}' out"
+                f"recipe: standard stands in place of {', '.join(PART_KEYS)}; leave"
+                f" '{specified_parts[0]}' out"
             )
         return self.with_parts(TrainingDataSummary.from_channel_names(self.signals.build().names))
 
@@ -133,7 +134,8 @@ class FitSettings(ModelPartsConfig):
         if scale_names != required_names:
             raise ValueError(
                 f"evaluation.scales: the velocities of the model are {', '.join(required_names)}"
-                f" (signals.velocities), and scales are given of {', '.join(scale_names) or 'none'}; give"
+                f" (signals.velocities), and scales are given of"
+                f" {', '.join(scale_names) or 'none'}; give"
                 " one of each"
             )
         baseline_configs = self.all_baselines

@@ -167,8 +167,8 @@ class SteadyConfig(Config):
     """Condition for a steady turn: for `window` seconds r is close to its running mean.
 
     Attributes:
-        window: duration of the condition and time constant of the running mean in s; a few times the
-            time for one ship length.
+        window: duration of the condition and time constant of the running mean in s; a few times
+            the time for one ship length.
         tolerance: how far it may be off, as a share of the largest yaw rate of the manoeuvre so
             far.
     """

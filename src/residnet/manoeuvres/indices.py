@@ -232,9 +232,9 @@ def zigzag_indices(
     An overshoot is how far the heading goes beyond its bound after a reversal. The time to check
     yaw is from the first reversal to the peak of the heading; the overshoot width is how far the
     track moves on across the initial course after that reversal; the reach is the time from the
-    first execute until the heading is back on the initial course; the period is the duration of a whole
-    cycle, from reversal to reversal of the same side, mean over the log. The initial course is the
-    heading that the log begins with.
+    first execute until the heading is back on the initial course; the period is the duration of a
+    whole cycle, from reversal to reversal of the same side, mean over the log. The initial course
+    is the heading that the log begins with.
 
     Args:
         log: t, x, y, psi, u, v, r.
@@ -359,8 +359,8 @@ class SteeredZigzag(NamedTuple):
         angle: rudder angle held, mean over both sides, rad.
         heading: change of heading at which the rudder was ordered back, mean over the reversals,
             rad.
-        departure_heading: change of heading at which the rudder left its side, rad; beyond `heading` by what
-            the vessel turned while the order took effect.
+        departure_heading: change of heading at which the rudder left its side, rad; beyond
+            `heading` by what the vessel turned while the order took effect.
         departure_rate: rate of turn when it left, mean over the reversals, rad/s.
     """
 

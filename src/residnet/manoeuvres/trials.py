@@ -441,8 +441,9 @@ class ManoeuvreRun:
     Attributes:
         manoeuvre: simulated manoeuvre.
         true_log: the motion itself.
-        measured_log: what sensors measured of it. Its meta says `timed_out` where the stop condition was not
-            reached, `diverged` where the motion ceased to be finite; both logs end there.
+        measured_log: what sensors measured of it. Its meta says `timed_out` where the stop
+            condition was not reached, `diverged` where the motion ceased to be finite; both logs
+            end there.
     """
 
     manoeuvre: Manoeuvre

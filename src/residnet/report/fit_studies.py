@@ -1,7 +1,7 @@
 """Registry of published experiments whose figures the report of a fit can show.
 
-A study is registered by the entry point group `residnet.fit_studies` of a wing or of another package.
-It is imported on first use.
+A study is registered by the entry point group `residnet.fit_studies` of a wing or of another
+package. It is imported on first use.
 """
 
 from __future__ import annotations

@@ -221,7 +221,8 @@ class RunFiles:
 
     @cached_property
     def model_kinds(self) -> dict[str, str]:
-        """The kind (constant_velocity, baseline, head, plant, ...) of each model, in the order of metrics.json.
+        """The kind (constant_velocity, baseline, head, plant, ...) of each model, in the order of
+        metrics.json.
 
         Reductions refer to the first baseline; the others are `further` models, judged like heads.
         """
@@ -255,7 +256,9 @@ class RunFiles:
 
     @cached_property
     def heads(self) -> list[str]:
-        """The models that are neither constant_velocity, baseline nor plant, the predictor first."""
+        """The models that are neither constant_velocity, baseline nor plant, the predictor
+        first.
+        """
         heads = [
             model
             for model, kind in self.model_kinds.items()

@@ -293,7 +293,8 @@ class RunFolder:
             )
         if not overwrite:
             raise UsageError(
-                f"{self.path}: exists already; choose another --out (in Python `folder`), continue it"
+                f"{self.path}: exists already; choose another --out (in Python `folder`),"
+                f" continue it"
                 " with --resume (`resume=True`), or replace it with --overwrite (`overwrite=True`)"
             )
         self.manifest.require_all_owned()
@@ -330,7 +331,8 @@ def require_apart(folder: Path, inputs: Iterable[Path]) -> None:
     for file in inputs:
         if file.resolve().is_relative_to(place):
             raise UsageError(
-                f"{file}: lies in {folder}, which --overwrite would empty; move it, or choose another"
+                f"{file}: lies in {folder}, which --overwrite would empty; move it, or choose"
+                f" another"
                 " --out"
             )
 

@@ -293,7 +293,8 @@ def _error_figure(
     channels: Sequence[str],
     models: Sequence[str],
 ) -> Figure:
-    """Return a figure of RMSE by model, and of the errors of test runs relative to the linear model.
+    """Return a figure of RMSE by model, and of the errors of test runs relative to the linear
+    model.
 
     A line shows the error of the plant, which is due to sensor noise.
     """

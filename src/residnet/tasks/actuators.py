@@ -144,7 +144,8 @@ class StepTest(ActuatorTest):
         for path, (t, *_) in zip(self.files, responses, strict=True):
             if (backward_steps := np.flatnonzero(np.diff(t) <= 0)).size:
                 raise DataError(
-                    f"{path}: time repeats or runs backwards in row {int(backward_steps[0]) + 2} of the data"
+                    f"{path}: time repeats or runs backwards in row {int(backward_steps[0]) + 2}"
+                    f" of the data"
                 )
         return responses
 
@@ -262,7 +263,8 @@ class ActuatorsTaskConfig(Task):
             folder.figures, [plot_actuator_tests(self.name, throttle_data, step_data, bollard_data)]
         )
         sentence = (
-            f"The tests gave {' and '.join(test_names)}; actuators.yaml holds the lines for a vessel"
+            f"The tests gave {' and '.join(test_names)}; actuators.yaml holds the lines for a"
+            f" vessel"
             " file."
         )
         summary_metrics = {
@@ -386,7 +388,8 @@ def plot_actuator_tests(
     Args:
         throttle_data: throttle [N], revolutions [N] in 1/s, and the fitted map.
         step_data: measured step responses, and the fitted one.
-        bollard_data: revolutions [N] in 1/s, thrust [N] of one thruster in N, and the fitted curves.
+        bollard_data: revolutions [N] in 1/s, thrust [N] of one thruster in N, and the fitted
+            curves.
     """
     panels_and_curves: list[tuple[Panel, dict[str, Curve]]] = []
     if throttle_data is not None:

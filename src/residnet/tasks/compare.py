@@ -276,7 +276,8 @@ def _write_conclusion(
     entry = entries[best_run.name]
     certainty = " (significant)." if entry["excludes_zero"] else " (not significant)."
     return (
-        f"Over {entry['windows']} common windows of {protocol}, {best_run.name} ({best_run.model}) has"
+        f"Over {entry['windows']} common windows of {protocol}, {best_run.name}"
+        f" ({best_run.model}) has"
         f" the lowest error: {entry['nrmse_mean']:+.3f} against {runs[0].name}{certainty}"
     )
 

@@ -160,7 +160,8 @@ def draft_fit_config(
         draft_notes.add_guess(
             INPUTS_KEY,
             "no channel of the logs is a rudder, a propeller or another command (channels:"
-            f" {channel_names}): a model without inputs can only predict how the vessel coasts; name"
+            f" {channel_names}): a model without inputs can only predict how the vessel coasts;"
+            f" name"
             " the columns of the commands",
         )
     elif missing := missing_control(inputs, draft_logs.dof):
@@ -199,7 +200,10 @@ def draft_fit_config(
         if name in measured_channels and name not in ROLL_LAYOUT.dynamic_states
     ]
     if depth_channels and not dof.is_six_dof:
-        text = f"{', '.join(depth_channels)}: not used: six degrees of freedom need depth, pitch and roll"
+        text = (
+            f"{', '.join(depth_channels)}: not used: six degrees of freedom need depth, pitch"
+            f" and roll"
+        )
         draft_notes.add_note(
             CHANNELS_KEY, f"{text} angles, and u and v or a position, that move in all logs"
         )
@@ -233,7 +237,8 @@ def draft_fit_config(
     draft_notes.add_note(("prepare", "grid"), preparation_recipe.reason)
     draft_notes.add_note(
         ("evaluation", "protocols"),
-        f"free runs of a length that most logs contain; {evaluation_settings['selection']} is used for"
+        f"free runs of a length that most logs contain; {evaluation_settings['selection']} is"
+        f" used for"
         " model selection on validation logs",
     )
     draft_notes.add_note(
@@ -340,7 +345,9 @@ class _DraftLogs:
             raise DataError(f"{reason} ({unmatched_notes})" if unmatched_notes else reason)
 
     def keep_inputs(self, inputs: Sequence[str], draft_notes: DraftNotes) -> tuple[str, ...]:
-        """Rename selected forces to tau_x, tau_y, tau_n, and drop unused channels; returns inputs."""
+        """Rename selected forces to tau_x, tau_y, tau_n, and drop unused channels; returns
+        inputs.
+        """
         renamed_inputs = {
             name: next((f for f in ("tau_x", "tau_y", "tau_n") if name.startswith(f"{f}_")), name)
             for name in inputs
@@ -417,13 +424,15 @@ class _DraftLogs:
         ]
         if derived_channels := next(iter(self.complete_logs.values())).meta.get("smoothed"):
             lines.append(
-                f"{', '.join(derived_channels)} are not measured at every sample: a smoother makes them from"
+                f"{', '.join(derived_channels)} are not measured at every sample: a smoother"
+                f" makes them from"
                 " position and heading. Where the antenna stands off the vessel's centre, or its"
                 " positions come late, add prepare.motion: {antenna: {x: ..., y: ...}, delay: ...}."
             )
         if derived_channels := next(iter(self.complete_logs.values())).meta.get("integrated"):
             lines.append(
-                f"{', '.join(derived_channels)} are not measured: they are integrated from the velocities, and"
+                f"{', '.join(derived_channels)} are not measured: they are integrated from the"
+                f" velocities, and"
                 " errors of position and heading are those of integrated velocities."
             )
         log_message(f"{len(self.logs)} logs were read, {len(self.exclusion_reasons)} left out")
@@ -461,7 +470,8 @@ def _split_logs(
     for split, logs in split_logs(list(usable_logs.values())).items():
         for log in logs:
             segment_limits = log.meta.get("stretch")
-            # the name of a stretch starts with the name of its log; a shorter log name may match, too
+            # the name of a stretch starts with the name of its log; a shorter log name may match,
+            # too
             matching_names = [
                 n for n in paths if n == log.name or (segment_limits and log.name.startswith(n))
             ]
@@ -507,7 +517,9 @@ def _split_logs(
 def _move_short_logs_to_training(
     split_entries: dict[str, list[_SplitEntry]], memory_time: float, draft_notes: DraftNotes
 ) -> None:
-    """Move logs that are too short for evaluation to the training split, unless it is the last one."""
+    """Move logs that are too short for evaluation to the training split, unless it is the last
+    one.
+    """
     from residnet.identification.recipe import choose_window_length, make_protocols
 
     for name in SPLITS[1:]:
@@ -573,7 +585,8 @@ def choose_inputs(logs: Sequence[Log], draft_notes: DraftNotes) -> tuple[str, ..
     if control_loops:
         draft_notes.add_guess(
             INPUTS_KEY,
-            f"u_{min(control_loops)} is taken as what a controller asks for, by the names beside it",
+            f"u_{min(control_loops)} is taken as what a controller asks for, by the names beside"
+            f" it",
         )
     names = [name for name in actuator_names if _is_excited(name, values[name], draft_notes)]
     names = _prefer_measured_inputs(_choose_force_set(logs, names, draft_notes), draft_notes)
@@ -732,8 +745,8 @@ def _are_duplicates(first: np.ndarray, second: np.ndarray) -> bool:
 def missing_control(names: Sequence[str], dof: DegreesOfFreedom = SURGE_SWAY_YAW) -> str:
     """Return the missing effect of the inputs, `drives` or `steers`; empty if none is missing.
 
-    A vessel without yaw needs no input that steers, a vessel without surge none that drives. Forces,
-    azimuth thrusters and several thrusters have both effects.
+    A vessel without yaw needs no input that steers, a vessel without surge none that drives.
+    Forces, azimuth thrusters and several thrusters have both effects.
     """
     base_names = [name.removeprefix("cmd_") for name in names if not PLANE_PATTERN.match(name)]
     is_steering = [name.startswith("delta") for name in base_names]

@@ -99,7 +99,8 @@ class ImportConfig(Task):
         n_with_warnings = sum(row["loud"] > 0 for row in rows)
         sentence = (
             f"{len(paths)} recording{'s were' if len(paths) > 1 else ' was'} read;"
-            f" {n_with_warnings or 'none'} of them {'have findings' if n_with_warnings != 1 else 'has findings'} that"
+            f" {n_with_warnings or 'none'} of them"
+            f" {'have findings' if n_with_warnings != 1 else 'has findings'} that"
             " need a look."
         )
         summary_metrics = {

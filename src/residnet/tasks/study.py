@@ -201,7 +201,8 @@ def _summarize_variants(rows: Sequence[dict[str, Any]], reference: str) -> list[
         if best_row["diverged"]:
             sentence = (
                 f"{protocol}: EVERY VARIANT DIVERGED in some windows; of the errors, which count"
-                f" those windows as constant velocity does, that of '{best_row['variant']}' is the least,"
+                f" those windows as constant velocity does, that of '{best_row['variant']}' is"
+                f" the least,"
                 f" {best_row['nrmse_mean']:.4f}"
             )
         interval = best_row["difference_ci95"]

@@ -51,7 +51,9 @@ def known() -> tuple[FittedModel, RefitUncertainty, torch.Tensor]:
         low=tuple(low.tolist()),
         high=tuple(high.tolist()),
     )
-    open_ = estimate_refit_covariance(model, given, store, CONFIG, SCALES, refitted.notes["at_rest"])
+    open_ = estimate_refit_covariance(
+        model, given, store, CONFIG, SCALES, refitted.notes["at_rest"]
+    )
     return FittedModel(spec, model, {}), open_, refitted.covariance
 
 

@@ -386,7 +386,10 @@ def _no_course_message(
         )
     miss_distance, _, problem_text = min(reasons)
     if miss_distance > 0:
-        problem_text += f": the best course found with this vessel's turns misses its circle by {miss_distance:.3g} m"
+        problem_text += (
+            f": the best course found with this vessel's turns misses its circle by"
+            f" {miss_distance:.3g} m"
+        )
     return f"no course found: {problem_text}; {advice}"
 
 

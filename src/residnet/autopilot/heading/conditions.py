@@ -1035,7 +1035,9 @@ class CandidateEvaluation:
         try:
             if self.compiled_rollout is None:
                 per_row_names = [f"source.policy.{name}" for name in self.config.batched_parameters]
-                self.compiled_rollout = self.compiler(rollout, *arguments, row_tensors=per_row_names)
+                self.compiled_rollout = self.compiler(
+                    rollout, *arguments, row_tensors=per_row_names
+                )
         except ExportError:
             # what cannot be compiled is flown as it is
             self.compiler = None

@@ -208,7 +208,8 @@ class VariedModel(Dynamics):
         self.slowed = nn.Buffer(slowed, persistent=False)
         if model.n_state > 0 and not math.isclose(model.dt, dt, rel_tol=1e-9):
             raise ConfigError(
-                f"the learned model has a memory and steps of {model.dt:g} s; set dt of the policy's"
+                f"the learned model has a memory and steps of {model.dt:g} s; set dt of the"
+                f" policy's"
                 f" training to this value instead of {dt:g} s"
             )
         # one for each precision: policies are trained in single and simulated in double precision

@@ -270,7 +270,7 @@ def _describe_steering(source: Sequence[str | Path]) -> SteeringDescription:
         relative_range = (1.0 - _DEFAULT_UNCERTAINTY, 1.0 + _DEFAULT_UNCERTAINTY)
         bias = math.radians(_DEFAULT_BIAS_DEG)
         return SteeringDescription(
-            gain, time_constant, None, math.nan, math.radians(20.0), relative_range, relative_range, _DEFAULT_DELAY, bias, None,
+            gain, time_constant, None, math.nan, math.radians(20.0), relative_range, relative_range, _DEFAULT_DELAY, bias, None,  # noqa: E501
             f"K = {gain:g} 1/s and T = {time_constant:g} s as given",
         )  # fmt: skip
     logs, name = _read_source_logs([Path(item) for item in source])
@@ -358,7 +358,7 @@ def _build_autopilot_config(
     """Return the content of the config."""
     nomoto = NomotoModel(steering.gain, steering.time_constant, steering.speed)
     pace = float(
-        f"{minimum_turn_time(nomoto, steering.rudder, steering.rate) / minimum_turn_time(*REFERENCE_STEERING, None):.2g}"
+        f"{minimum_turn_time(nomoto, steering.rudder, steering.rate) / minimum_turn_time(*REFERENCE_STEERING, None):.2g}"  # noqa: E501
     )
     noise = (_DEFAULT_NOISE_DEG, _DEFAULT_NOISE_DEG)
     if steering.noise is not None:

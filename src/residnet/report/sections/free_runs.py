@@ -443,7 +443,8 @@ def bands_section(run: RunFiles) -> Section | None:
         f" runs that"
         f" a band holds from beginning to end, each channel for itself, where it is widened to hold"
         f" {level} of them. Score: mean width, and {2 / (1 - band['level']):.0f} times what lies"
-        " outside, in units of the error of the constant-velocity model; less is better. Beside it stands a band of one"
+        " outside, in units of the error of the constant-velocity model; less is better. Beside"
+        " it stands a band of one"
         " width at all horizons.",
     ]
     blocks: list[Block] = [Text(introduction)]

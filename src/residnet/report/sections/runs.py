@@ -88,8 +88,8 @@ _RANK_NAMES = ("median error", "largest error", "least error")
 def model_styles(run: RunFiles) -> dict[str, GlyphStyle]:
     """Return how each model looks.
 
-    Constant velocity, baseline and plant have their own looks; the selected head is always the solid blue one.
-    Leading head, baseline and plant alone are switched on at first.
+    Constant velocity, baseline and plant have their own looks; the selected head is always the
+    solid blue one. Leading head, baseline and plant alone are switched on at first.
     """
     visible_models = {run.main_model, run.baseline, run.plant, *run.heads[:1]}
     styles = {}
@@ -152,7 +152,10 @@ def free_run_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | 
             f"{window.log}: {format_fixed(float(time[-1]), 1)} s under protocol {window.protocol}."
         )
         if diverged := [model for model, state in window.diverged.items() if state]:
-            note += f" Diverged: {', '.join(diverged)}; constant-velocity curves are drawn in their place."
+            note += (
+                f" Diverged: {', '.join(diverged)}; constant-velocity curves are drawn in"
+                f" their place."
+            )
         kind_prefix = "" if manoeuvre_kind == "unknown" else f"{manoeuvre_kind}, "
         title = f"{kind_prefix}{window.protocol}: {rank} ({window.log}{window_text})"
         cases.append(

@@ -178,7 +178,8 @@ class BreedingTaskConfig(StudyTask, SearchConfig):
             table = getattr(self, name)
             if table is not None and [len(row) for row in table] != [n_columns] * n_rows:
                 raise ValueError(
-                    f"{name}: expected {n_rows} rows of {n_columns} numbers, as rows and columns have"
+                    f"{name}: expected {n_rows} rows of {n_columns} numbers, as rows and columns"
+                    f" have"
                     " values"
                 )
         for row, column in self.combinations():
@@ -274,7 +275,8 @@ class BreedingTaskConfig(StudyTask, SearchConfig):
                 sum(row[key] for row in published_rows) for key in ("found", "published_found")
             )
             sentences.append(
-                f"Document 000 finds it in {n_published:g} of the {_PUBLISHED_RUNS * len(published_rows)} runs"
+                f"Document 000 finds it in {n_published:g} of the"
+                f" {_PUBLISHED_RUNS * len(published_rows)} runs"
                 f" of the same table; here it is {n_found} of {self.repeats * len(published_rows)}."
             )
         best_columns = [

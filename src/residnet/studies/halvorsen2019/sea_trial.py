@@ -305,7 +305,8 @@ class SeaTrialTaskConfig(StudyTask, ComputingTask):
             ):
                 if given_name not in allowed_names:
                     raise ValueError(
-                        f"published: no {name_role} '{given_name}'{suggest_name(given_name, allowed_names)}"
+                        f"published: no {name_role}"
+                        f" '{given_name}'{suggest_name(given_name, allowed_names)}"
                     )
         return self
 
@@ -328,7 +329,8 @@ class SeaTrialTaskConfig(StudyTask, ComputingTask):
                 for axis, row in _best_rows(trial["rows"][set_name]).items()
             ]
             sentences.append(
-                f"Trial {name}: on the validation stretches of the {SET_NAMES[set_name]}, the models"
+                f"Trial {name}: on the validation stretches of the {SET_NAMES[set_name]}, the"
+                f" models"
                 f" with the least root mean square error are {join_list(best_texts)}."
             )
             undetermined = trial["standard"][set_name]["undetermined"]
@@ -843,7 +845,8 @@ def _trial_text(trial: StudyResults) -> str:
     return (
         f"The trial lasts {trial['seconds'] / 60:.0f} minutes in {trial['logs']} logs, sampled at"
         f" {1 / trial['step']:.0f} Hz: {join_list(phase_texts)}. The standard deviations of the"
-        f" accelerations are {join_list(spread_texts)}. {100 * trial['validation_share']:.0f} % of the"
+        f" accelerations are {join_list(spread_texts)}. {100 * trial['validation_share']:.0f} %"
+        f" of the"
         " stretches validate."
     )
 
@@ -937,7 +940,8 @@ def _identifiability_notes(trial: StudyResults) -> list[str]:
         )
         notes.append(
             f"In the {SET_NAMES[set_name]}, {determined_text}; the condition number of the rest is"
-            f" {format_number(standard_fit['condition'], 2)}. {n_same_cost} of {len(costs)} starting points end at the"
+            f" {format_number(standard_fit['condition'], 2)}. {n_same_cost} of {len(costs)}"
+            f" starting points end at the"
             " least error."
         )
     return [

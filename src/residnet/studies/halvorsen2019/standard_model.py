@@ -172,7 +172,8 @@ def fit_standard_model(
     nu, tau, nu_dot = nu[:: config.thin], tau[:: config.thin], nu_dot[:: config.thin]
     if 3 * len(nu) <= len(STANDARD_PARAMETER_NAMES):
         raise FitError(
-            f"the standard model's {len(STANDARD_PARAMETER_NAMES)} parameters need more than {len(nu)} samples; give a"
+            f"the standard model's {len(STANDARD_PARAMETER_NAMES)} parameters need more than"
+            f" {len(nu)} samples; give a"
             " longer trial"
         )
     root_weights = np.sqrt(config.weights)

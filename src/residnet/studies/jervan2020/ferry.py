@@ -316,8 +316,10 @@ class FerryStudyConfig(StudyTask, ComputingTask):
         models, best_name = results["models"], find_best_model(results)
         remaining_text = join_numbers([100 * share for share in models[best_name]["share_left"]])
         sentences = [
-            f"Of {len(models)} residual models, {best_name} leaves the least of the residual force on"
-            f" the unseen half of the course: {remaining_text} % of its mean square in surge, sway and yaw."
+            f"Of {len(models)} residual models, {best_name} leaves the least of the residual"
+            f" force on"
+            f" the unseen half of the course: {remaining_text} % of its mean square in surge,"
+            f" sway and yaw."
         ]
         for run_kind in ("course", "crossing"):
             position_errors = {name: run["position_mae"] for name, run in results[run_kind].items()}
@@ -330,8 +332,10 @@ class FerryStudyConfig(StudyTask, ComputingTask):
                     else "does NOT fall: it goes"
                 )
                 sentences.append(
-                    f"With {closest_model} as feed-forward, the mean position error in the {run_kind} {change_text}"
-                    f" from {format_number(believed_error)} m to {format_number(position_errors[closest_model])} m."
+                    f"With {closest_model} as feed-forward, the mean position error in the"
+                    f" {run_kind} {change_text}"
+                    f" from {format_number(believed_error)} m to"
+                    f" {format_number(position_errors[closest_model])} m."
                 )
         return sentences + [
             f"On the vessel as it is later, {name} {update['text']}."
@@ -735,7 +739,8 @@ def list_feed_forward_objections(name: str, results: StudyResults) -> list[str]:
     if sum(shares) > len(shares):
         remaining_text = join_numbers([100 * share for share in shares])
         reasons.append(
-            f"on the unseen half it leaves {remaining_text} % of the residual force in surge, sway and yaw"
+            f"on the unseen half it leaves {remaining_text} % of the residual force in surge,"
+            f" sway and yaw"
         )
     for run_kind in ("course", "crossing", "feed_forward_alone"):
         if name in (runs := results[run_kind]):
@@ -744,7 +749,8 @@ def list_feed_forward_objections(name: str, results: StudyResults) -> list[str]:
             )
             if model_error > believed_error:
                 reasons.append(
-                    f"its mean position error in the {run_kind.replace('_', ' ')} is {format_number(model_error)} m,"
+                    f"its mean position error in the {run_kind.replace('_', ' ')} is"
+                    f" {format_number(model_error)} m,"
                     f" the believed model's {format_number(believed_error)} m"
                 )
     return reasons

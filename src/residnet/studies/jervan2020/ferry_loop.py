@@ -234,7 +234,8 @@ class FerrySimulation:
         self.believed_hull = load_force_vessel(believed_name)[0].hull
         if not self.thrusters.state_names:
             raise ConfigError(
-                f"vessel '{plant_name}': its forces follow at once; the study is about thrusters that"
+                f"vessel '{plant_name}': its forces follow at once; the study is about thrusters"
+                f" that"
                 " lag, give actuators.response"
             )
         if disturbance == Disturbance():
@@ -292,7 +293,9 @@ class FerrySimulation:
                         f"source.loop.policy.policy.{name}" for name in ("lag", "step")
                     ]
                     model = compile_or_fallback(
-                        model, partial(CompiledRollout, row_tensors=per_row_names), rollout_arguments
+                        model,
+                        partial(CompiledRollout, row_tensors=per_row_names),
+                        rollout_arguments,
                     )
             states, applied_inputs, _ = model(*rollout_arguments)
             states = states[:, :-1]

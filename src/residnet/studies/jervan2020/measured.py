@@ -229,13 +229,15 @@ class ForceResidualConfig(StudyTask, ComputingTask):
         thrusters = results["forces"]["lag"]
         lags = {name: model["all"].get("lag") for name, model in results["models"].items()}
         lag_texts = [
-            f"{format_number(lag['frequency'])} rad/s and {format_number(lag['delay'], 2)} s for {name}"
+            f"{format_number(lag['frequency'])} rad/s and {format_number(lag['delay'], 2)} s for"
+            f" {name}"
             for name, lag in lags.items()
             if lag
         ]
         if lag_texts and not isinstance(thrusters, str):
             sentences.append(
-                f"The lag fitted together with the residual is {join_list(lag_texts)}; the actual forces"
+                f"The lag fitted together with the residual is {join_list(lag_texts)}; the actual"
+                f" forces"
                 f" follow the commands with {format_number(thrusters['frequency'])} rad/s and"
                 f" {format_number(thrusters['delay'], 2)} s."
             )
@@ -581,14 +583,17 @@ def _gain_sentences(regression_rows: Sequence[StudyResults]) -> list[str]:
     better_models = [row for row in regression_rows if flags_by_model[row["model"]][3]]
     if not better_models:
         sentences = [
-            f"None of the {len(regression_rows)} regressions is better than {reference_text}: every interval of the mean"
+            f"None of the {len(regression_rows)} regressions is better than {reference_text}:"
+            f" every interval of the mean"
             " over the axes reaches zero."
         ]
     else:
         gain = -100 * min(row["minus_reference"]["mean"][3] for row in better_models)
         sentences = [
-            f"Of {len(regression_rows)} regressions, these are better than {reference_text} in the mean over the axes:"
-            f" {join_list([row['model'] for row in better_models])}. The largest gain is {format_fixed(gain, 1)} %"
+            f"Of {len(regression_rows)} regressions, these are better than {reference_text} in"
+            f" the mean over the axes:"
+            f" {join_list([row['model'] for row in better_models])}. The largest gain is"
+            f" {format_fixed(gain, 1)} %"
             " of the force's mean square."
         ]
     single_axis_texts = [
@@ -598,7 +603,8 @@ def _gain_sentences(regression_rows: Sequence[StudyResults]) -> list[str]:
     ]
     if single_axis_texts:
         sentences.append(
-            f"Better on single axes: {join_list(single_axis_texts)}; of {3 * len(regression_rows)} such comparisons, one in"
+            f"Better on single axes: {join_list(single_axis_texts)}; of"
+            f" {3 * len(regression_rows)} such comparisons, one in"
             " forty comes out so by chance."
         )
     worse_models = [
@@ -641,7 +647,8 @@ def _data_section(config: ForceResidualConfig, results: StudyResults) -> Section
         else "each is a stretch of time of every log"
     )
     paragraphs = [
-        f"Logs: {', '.join(log_texts)}. Masked: {', '.join(mask_texts) or 'nothing'}; {results['used']} of"
+        f"Logs: {', '.join(log_texts)}. Masked: {', '.join(mask_texts) or 'nothing'};"
+        f" {results['used']} of"
         f" {results['samples']} samples are used.",
         f"There are {folds['count']} folds; {fold_text}. No model is fitted to data within"
         f" {validation.gap:g} s of what it predicts. Orders and penalties are chosen inside the"
@@ -649,7 +656,8 @@ def _data_section(config: ForceResidualConfig, results: StudyResults) -> Section
         " segments.",
         "There are no intervals, because there are fewer than five segments."
         if blocks is None
-        else f"Intervals (95 %) come from resampling {format_count(blocks['count'], blocks['of'][:-1])}."
+        else f"Intervals (95 %) come from resampling"
+        f" {format_count(blocks['count'], blocks['of'][:-1])}."
         + (
             ""
             if blocks["of"] == "logs"
@@ -666,8 +674,10 @@ def _force_section(results: StudyResults, run: Path) -> Section:
     text = (
         f"The thrusters' lag is not determined: {lag}."
         if isinstance(lag, str)
-        else f"The actual force follows the command with a lag of {format_number(lag['frequency'])} rad/s,"
-        f" a damping ratio of {format_number(lag['damping'])} and a delay of {format_number(lag['delay'])} s."
+        else f"The actual force follows the command with a lag of"
+        f" {format_number(lag['frequency'])} rad/s,"
+        f" a damping ratio of {format_number(lag['damping'])} and a delay of"
+        f" {format_number(lag['delay'])} s."
     )
     table = build_table(
         [{"axis": axis, **results["forces"][axis]} for axis in AXES],

@@ -373,7 +373,9 @@ class ResidualForceModel(NamedTuple):
         """
         force = record.command
         if self.lag is not None:
-            force = simulate_lagged_force(record.averaged_command, self.lag, record.dt, record.run_lengths)
+            force = simulate_lagged_force(
+                record.averaged_command, self.lag, record.dt, record.run_lengths
+            )
         return self.force.force_residual(force, record.nu_dot, record.nu, record.pose[:, HEADING])
 
     def test_mse(self, record: ForceRecord) -> list[float]:

@@ -107,7 +107,8 @@ def write_booklet(
             )
     folder.write_table(folder.booklet.with_suffix(".parquet"), pd.concat(parts))
     return (
-        f"booklet: {len(config.manoeuvres)} manoeuvres, {len(measured_zigzags)} measured zigzags repeated,"
+        f"booklet: {len(config.manoeuvres)} manoeuvres, {len(measured_zigzags)} measured zigzags"
+        f" repeated,"
         f" {config.draws} draws each"
     )
 
@@ -185,7 +186,9 @@ def _initial_state_of_log(craft: SimulatedVessel, log: Log) -> torch.Tensor:
 
 
 def sample_parameters(fitted_model: FittedModel, draws: int, seed: int) -> torch.Tensor:
-    """Return fitted parameters and `draws` samples of their normal distribution, [1 + draws, ...]."""
+    """Return fitted parameters and `draws` samples of their normal distribution, [1 + draws,
+    ...].
+    """
     baseline = fitted_model.model.baseline
     assert isinstance(baseline, ParametricBaseline), "the configuration was validated"
     assert fitted_model.covariance is not None, "the configuration was validated"
@@ -201,7 +204,9 @@ def sample_parameters(fitted_model: FittedModel, draws: int, seed: int) -> torch
 
 
 def _input_shares_from_logs(config: BookletConfig, logs: Sequence[Log]) -> dict[str, InputShare]:
-    """Return the input shares with full drive and steer scaled to the largest inputs of the logs."""
+    """Return the input shares with full drive and steer scaled to the largest inputs of the
+    logs.
+    """
     rudder = config.steering_input()
     max_rudder = max(identify_zigzag(log, rudder).angle for log in logs)
     return {

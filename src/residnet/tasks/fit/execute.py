@@ -218,7 +218,8 @@ def export_model(config: FitConfig, request: ExportRequest) -> Path:
     available_models = model_names(run.models)
     if model_name not in available_models:
         raise UsageError(
-            f"{run.path}: no model '{name}'{suggest_name(name, [*_MODEL_ALIASES, *available_models])}"
+            f"{run.path}: no model"
+            f" '{name}'{suggest_name(name, [*_MODEL_ALIASES, *available_models])}"
         )
     spec, model = load_model(run.models / model_name)
     rows = [

@@ -138,8 +138,10 @@ class MonitoredLog:
             : _MAX_NAMED_CAUSES if self.alarm_time is not None else 1
         ]
         return [f"{self.name}: {alarm_text} ({self.n_windows} windows)"] + [
-            f"  {suspect.change.name}: score {suspect.test_statistic:.1f} of {self.final_verdict.threshold:.1f},"
-            f" size {suspect.estimated_size:+.3g} +- {suspect.standard_error:.2g} {suspect.change.unit}"
+            f"  {suspect.change.name}: score {suspect.test_statistic:.1f} of"
+            f" {self.final_verdict.threshold:.1f},"
+            f" size {suspect.estimated_size:+.3g} +- {suspect.standard_error:.2g}"
+            f" {suspect.change.unit}"
             f" (the logs look as if {suspect.change.description})"
             for suspect in suspects
         ]
@@ -221,12 +223,14 @@ def write_monitoring_page(folder: Path, logs: Sequence[MonitoredLog]) -> Path:
     step = logs[0].window_seconds / 60.0
     logs_with_alarm = [log for log in logs if log.alarm_time is not None]
     summary = [
-        f"No alarm in {format_count(len(logs), 'log')}: the innovations are as those of the reference logs."
+        f"No alarm in {format_count(len(logs), 'log')}: the innovations are as those of the"
+        f" reference logs."
     ]
     if logs_with_alarm:
         likeliest_change = logs_with_alarm[-1].final_verdict.hypotheses[0].change
         summary = [
-            f"ALARM in {len(logs_with_alarm)} of {format_count(len(logs), 'log')}: as if {likeliest_change.description}.",
+            f"ALARM in {len(logs_with_alarm)} of {format_count(len(logs), 'log')}: as if"
+            f" {likeliest_change.description}.",
             "Other causes may have similar effects: see the scores of all causes.",
         ]
     log_end_times = step * np.cumsum([log.n_windows for log in logs])
@@ -288,7 +292,8 @@ def write_monitoring_page(folder: Path, logs: Sequence[MonitoredLog]) -> Path:
     return write_page(
         folder,
         "New logs watched",
-        f"{format_count(len(scores), 'window')} of {logs[0].window_seconds:g} s, threshold {format_number(threshold)}",
+        f"{format_count(len(scores), 'window')} of {logs[0].window_seconds:g} s, threshold"
+        f" {format_number(threshold)}",
         summary,
         [
             Section("", [write_figure(folder / "figures", figure), overview]),
@@ -318,8 +323,10 @@ class RefitResult:
     def to_lines(self) -> list[str]:
         """Return the result as lines for the terminal."""
         lines = [
-            f"refit: {changed_parameter.change.name} {changed_parameter.estimated_size:+.3g} +- {changed_parameter.standard_error:.2g} {changed_parameter.change.unit}, after"
-            f" each log {', '.join(f'{size_after_log:+.3g}' for size_after_log in changed_parameter.size_by_log)}"
+            f"refit: {changed_parameter.change.name} {changed_parameter.estimated_size:+.3g} +-"
+            f" {changed_parameter.standard_error:.2g} {changed_parameter.change.unit}, after"
+            f" each log"
+            f" {', '.join(f'{size_after_log:+.3g}' for size_after_log in changed_parameter.size_by_log)}"  # noqa: E501
             for changed_parameter in self.recursive_refit.identified_changes
         ]
         lines.append(f"refit: ended since {self.recursive_refit.stopping_reason}")
@@ -363,7 +370,8 @@ def require_refit_folder(run: RunFolder, output_folder: Path, config: FitConfig)
     """
     if output_folder.resolve().is_relative_to(run.path.resolve()):
         raise UsageError(
-            f"{output_folder}: lies in the run {run.path}, which a refit does not change; choose another"
+            f"{output_folder}: lies in the run {run.path}, which a refit does not change; choose"
+            f" another"
             " folder for --refit"
         )
     RunFolder(output_folder).require_usable(dump_config(config))
@@ -394,7 +402,8 @@ def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
     n_held_out = max(len(service.logs) // _HOLD_OUT_RATIO, 1)
     training_logs, held_out_logs = service.logs[:-n_held_out], service.logs[-n_held_out:]
     log_message(
-        f"recursive refit of {original_model.name} on {len(training_logs)} logs, {n_held_out} held out"
+        f"recursive refit of {original_model.name} on {len(training_logs)} logs, {n_held_out}"
+        f" held out"
     )
     recursive_result = refit_recursively(
         service.detector, [service.detector.make_windows(log) for log in training_logs]
@@ -463,7 +472,8 @@ def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
             for candidate_model in refitted_model.notes["refit_changes"]
         ]
         sentence = (
-            f"The recursive refit ({', '.join(changes)}) is {'' if is_better else 'not '}worth taking"
+            f"The recursive refit ({', '.join(changes)}) is {'' if is_better else 'not '}worth"
+            f" taking"
             " by the logs that were held out."
         )
         outcome = build_fit_outcome(folder, EXTERNAL_SPLIT)
@@ -516,7 +526,9 @@ class NextTrials:
 
     @property
     def recommendation(self) -> str:
-        """Sentence with the selected trials and the expected reduction of the prediction intervals."""
+        """Sentence with the selected trials and the expected reduction of the prediction
+        intervals.
+        """
         names = ", ".join(trial.simulated_run.true_log.name for trial in self.plan.selected_trials)
         return (
             f"Run {names}: the model expects that together they narrow the prediction intervals by"

@@ -201,7 +201,8 @@ class FreeRunObjective(Config):
         models = ("selected", *task.model_names)  # type: ignore[attr-defined]
         if self.model not in models:
             raise UsageError(
-                f"objective.model: no model is named '{self.model}'{suggest_name(self.model, models)}"
+                f"objective.model: no model is named"
+                f" '{self.model}'{suggest_name(self.model, models)}"
             )
 
     def read_value(self, run: RunFolder) -> float | None:
@@ -265,7 +266,8 @@ class FigureObjective(Config):
         summary_figures = run.read_summary()["figures"]
         if self.name not in summary_figures:
             raise DataError(
-                f"{run.summary}: has no main figure '{self.name}'{suggest_name(self.name, summary_figures)}"
+                f"{run.summary}: has no main figure"
+                f" '{self.name}'{suggest_name(self.name, summary_figures)}"
             )
         figure_value: float | None = summary_figures[self.name]["value"]
         return figure_value

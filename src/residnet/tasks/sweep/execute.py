@@ -327,7 +327,8 @@ def _write_results(config: SweepConfig, study: optuna.Study, folder: RunFolder) 
         f"Trial {best_row['number']} of {len(rows)} is the best:"
         f" {config.objective.description.removesuffix(' [-]')} {best_row['value']:.5g}, with"
         f" {', '.join(f'{key} = {text}' for key, text in texts.items())}.",
-        f"Its run is {_trial_folder_path(Path(), best_row['number'])} in the sweep's folder, and the config"
+        f"Its run is {_trial_folder_path(Path(), best_row['number'])} in the sweep's folder, and"
+        f" the config"
         f" {BEST_CONFIG_FILE} there repeats it.",
     ]
     if by_state["ended early"]:
@@ -336,7 +337,8 @@ def _write_results(config: SweepConfig, study: optuna.Study, folder: RunFolder) 
         verdict.append(f"{len(failed_rows)} trials failed; the first: {failed_rows[0]['fault']}.")
     if len(finished_rows) > 1:
         verdict.append(
-            f"The best of {len(finished_rows)} validation errors is biased by the selection: evaluate it"
+            f"The best of {len(finished_rows)} validation errors is biased by the selection:"
+            f" evaluate it"
             " on other data, such as the test split of its run."
         )
     summary_metrics = {"best": SummaryMetric(best_row["value"]), **summary_metrics}
