@@ -28,6 +28,7 @@ from residnet.core.layout import (
     to_horizontal_plane,
 )
 from residnet.core.log import Log
+from residnet.core.run_loader import accept_run
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import save_model
@@ -209,7 +210,7 @@ def test_sensitivities_are_the_derivatives_of_the_step(scheme: Integrator) -> No
             values, moved = start.clone(), x.clone()
             values[j] += sign * size
             moved[:, 2:] += sign * size * s[:, :, j]
-            baseline.place(values)
+            baseline.set_free(values)
             with torch.no_grad():
                 ends.append(model.step(moved, w, moved[:, :0])[0][:, 2:])
         wanted = (ends[0] - ends[1]) / (2.0 * size)
@@ -291,7 +292,7 @@ def test_what_logs_of_a_torpedo_tell_and_lack() -> None:
     assert not DegreesOfFreedom.from_channels(held).is_six_dof
     with pytest.raises(UsageError, match="z is not measured at every sample"):
         complete_motion(log.replace(channels=held), MotionConfig(), live)
-    with pytest.raises(ResidnetError, match="all six"):
+    with pytest.raises(ResidnetError, match="u, v, r, w, p, q in this order"):
         validate_config({"inputs": ["n"], "velocities": ["u", "v", "w"]}, SignalsConfig, "here")
     assert {"damping heave", "damping pitch", "restoring pitch"} <= {
         c.name for c in make_fault_hypotheses(SUBMERGED_SIGNALS)
@@ -463,6 +464,7 @@ def test_a_model_that_rolls_flies_behind_the_gear_of_its_vessel() -> None:
 def test_a_simulator_shows_the_roll(tmp_path: Path) -> None:
     spec = make_example_spec(RidgeConfig(), ROLLING_SIGNALS)
     save_model(tmp_path / "models" / "example", spec, make_example_model(spec))
+    accept_run(tmp_path)
     known = load_vehicle(tmp_path, model="example")
     assert known.states == ROLL_LAYOUT.state_names
     assert known.lower_commands.tolist() == pytest.approx(spec.low[5:])

@@ -204,7 +204,7 @@ def test_scales_are_of_the_velocities_of_the_model() -> None:
     for part, key, value, told in (
         ("evaluation", "scales", {"u": 0.3, "v": 0.1, "r": 0.1}, "give one of each"),
         ("signals", "velocities", ["r", "u"], "in this order"),
-        ("signals", "exogenous", ["wind_speed", "wind_dir"], "need u, v and r"),
+        ("signals", "exogenous", ["wind_speed", "wind_dir"], "wind needs u, v, r"),
     ):
         wrong = {**content, part: {**content[part], key: value}}  # type: ignore[dict-item]
         with pytest.raises((ValueError, ConfigError), match=told):

@@ -193,10 +193,10 @@ def test_terms_follow_from_what_moves() -> None:
     wanted = {"u|u|", "n|n|", "|n| u", "n|n| delta", "wind_u wind_mag"}
     assert wanted | {"u^2 v", "n r", "wind_mag r", "n|n| delta|delta|"} <= set(hull())
     assert "n^2" not in hull()
-    astern = hull(astern=("n",), moving=("n", "delta"))
+    astern = hull(reversing_inputs=("n",), varying_channels=("n", "delta"))
     assert "n^2 delta" in astern
     assert not [term for term in astern if "wind" in term]
-    assert not [term for term in hull(moving=("delta",)) if "n" in term.split()]
+    assert not [term for term in hull(varying_channels=("delta",)) if "n" in term.split()]
     turned = short(("u", "v", "r", "n_bow", "azimuth_bow"))["baselines"]["hull"]["terms"]["r"]
     assert {"n_bow|n_bow| sin(azimuth_bow)", "u |n_bow| cos(azimuth_bow)"} <= set(turned)
     assert not {"n_bow", "azimuth_bow"} & set(turned)

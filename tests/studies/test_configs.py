@@ -27,7 +27,11 @@ REFUSED: tuple[tuple[str, tuple[str, ...], str], ...] = (
     (SEA, ("validation.gap=0",), "at least one step"),
     (SEA, ("prepare.hold=mean",), "leave it out"),
     (GRID, ("rows.key=head.evolution.populaton",), "did you mean 'population'"),
-    (GRID, (FAST, "~published", "~published_error"), "together at most 1"),
+    (
+        GRID,
+        (FAST, "~published", "~published_error"),
+        "their sum is a share of the offspring and at most 1",
+    ),
     (GRID, ("published=[[1, 2]]",), "expected . rows of . numbers"),
     (TRIAL, ("standard.weights=[1, 1, 0]",), "positive"),
     (TRIAL, ("equations.force.head.features=[u]",), "give `inputs` instead"),

@@ -70,19 +70,19 @@ def make_fault_hypotheses(signals: SignalsConfig) -> list[SystemChange]:
         return SystemChange(name, description, "share", 0.02, **effect)
 
     units, dof = signals.channel_units(), signals.dof
-    changes = [share("mass", "the vessel has become heavier", heavier=1.0)]
+    changes = [share("mass", "the vessel has become heavier", inertia_share=1.0)]
     for velocity in dof.velocities:
         description = f"the damping in {_AXIS_NAMES[velocity]} has grown"
         changes.append(share(f"damping {_AXIS_NAMES[velocity]}", description, damping=velocity))
     if dof.has_roll:
         description = "the vessel has become stiffer in roll"
-        changes.append(share("restoring", description, damping="p", by="phi"))
+        changes.append(share("restoring", description, damping="p", damped_by="phi"))
     if dof.is_six_dof:
         description = "the vessel has become stiffer in pitch"
-        changes.append(share("restoring pitch", description, damping="q", by="theta"))
+        changes.append(share("restoring pitch", description, damping="q", damped_by="theta"))
     for input_index, name in enumerate(signals.inputs):
         changes.append(
-            share(f"gain {name}", f"{name} has grown stronger than it was", gain=input_index)
+            share(f"gain {name}", f"{name} has grown stronger than it was", gain_input=input_index)
         )
         if units.get(name) == "rad":
             description = f"{name} has an offset"

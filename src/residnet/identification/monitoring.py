@@ -440,7 +440,13 @@ class ScoreDistribution:
         """Return the distribution of selected changes, by index."""
         indices = list(cause_indices)
         selected_fields = {
-            name: getattr(self, name)[indices] for name in ("noise", "apart", "shared", "known")
+            name: getattr(self, name)[indices]
+            for name in (
+                "noise_factor",
+                "size_variance",
+                "shared_size_variance",
+                "mean_size_variance",
+            )
         }
         return replace(
             self, correlation=self.correlation[np.ix_(indices, indices)], **selected_fields

@@ -121,7 +121,7 @@ def test_an_alarm_ends_where_scores_have_fallen_clearly_below_the_threshold(
         suspects = [replace(plain.hypotheses[0], test_statistic=score), *plain.hypotheses[1:]]
         return replace(plain, is_alarm=score > watch.threshold, hypotheses=suspects)
 
-    monkeypatch.setattr(watch, "judge", judge)
+    monkeypatch.setattr(watch, "evaluate", judge)
     watcher = OnlineChangeDetector(watch)
     alarms = [watcher.update_with_sums(sums[0]).is_alarm for _ in range(7)]
     assert alarms == [False, True, True, True, False, False, True]
