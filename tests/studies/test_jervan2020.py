@@ -78,7 +78,7 @@ def test_the_lag_and_the_missing_half_are_found_and_flown(short: FerryStudy) -> 
     assert after.position_mae < 0.05 * before.position_mae
     assert after.iaew[0] < 0.05 * before.iaew[0]
     motion = short.believed_run.nu_dot, short.believed_run.nu
-    missed = (model.force(*motion) - hull("milliampere_half").required(*motion)).std(0)
+    missed = (model.force(*motion) - hull("milliampere_half").required_force(*motion)).std(0)
     # over both halves: of a shortened course the second goes beyond what identified
     assert bool((missed < 0.06 * short.believed_run.thruster_force.std(0)).all())
 
@@ -132,7 +132,7 @@ def test_azimuth_thrusters_get_the_controllers_force_and_push_late() -> None:
     expected = needed[:: flown.loop.steps_per_sample, :3] + flight.feedback
     torch.testing.assert_close(flight.command, expected, rtol=1e-9, atol=1e-6)
     # and what they make is what moves the hull
-    moved = hull("milliampere_azimuth_half").required(flight.nu_dot, flight.nu)
+    moved = hull("milliampere_azimuth_half").required_force(flight.nu_dot, flight.nu)
     torch.testing.assert_close(flight.thruster_force, moved, rtol=1e-9, atol=1e-6)
     late = (flight.thruster_force[4:] - flight.command[:-4]).square().mean(0)
     assert bool((late < (flight.thruster_force - flight.command).square().mean(0)).all())

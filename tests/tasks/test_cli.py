@@ -225,7 +225,7 @@ def test_a_quiet_run_for_machines_and_the_list_of_runs(tmp_path: Path, command: 
 @pytest.mark.parametrize(
     ("place", "told"),
     [
-        ("file/run", "cannot be written|is no folder"),
+        ("file/run", "cannot be written|is not a folder"),
         ("x" * 300, "name too long|too long"),
         ("/".join(["deep" * 20] * 60), "too long"),
         ("full/run", "No space left on device"),

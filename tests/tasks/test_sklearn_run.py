@@ -49,7 +49,7 @@ def test_the_plain_head_runs_to_its_end(command: Command, tmp_path: Path) -> Non
     assert read_json(run / "summary.json")["finished"]
     rows = read_json(run / "metrics.json")["rows"]
     assert "boosting" in {row["model"] for row in rows}
-    assert load(run, "boosting").module.head.axes
+    assert load(run, "boosting").module.head.axis_pipelines
     ended = command("export", run, "--model", "boosting", "--anyway")
     assert (ended.code, ended.err.count("\n")) == (1, 1)
     assert "scikit-learn need Python" in ended.err
@@ -65,7 +65,7 @@ def test_other_classes_need_trust(command: Command, tmp_path: Path) -> None:
     assert command("run", config, "--out", run, "--quiet", "--trust").code == 0
     with pytest.raises(UsageError, match="--trust"):
         load(run, "boosting")
-    assert load(run, "boosting", trust=True).module.head.axes
+    assert load(run, "boosting", trust=True).module.head.axis_pipelines
     # the permission ends with the command
     assert command("check", config).code == 2
     assert command("check", config, "--trust").code == 0
