@@ -98,7 +98,7 @@ def test_saved_and_loaded_with_functions_of_sums(tmp_path: Path) -> None:
         assert torch.equal(
             again.head.teacher_forced_residuals(z), model.head.teacher_forced_residuals(z)
         )
-    assert again.head.names() == model.head.names()
+    assert again.head.format_terms() == model.head.format_terms()
 
 
 def expression(algebra: Algebra) -> Sum:
