@@ -23,7 +23,8 @@ VESSEL = of_kind(load_vessel("wam_v_cal"), FossenConfig)
 
 def pushed(thrusters: Any, n: np.ndarray) -> np.ndarray:
     """Thrust of one thruster at revolutions in rpm."""
-    found: np.ndarray = thrusters.thruster_forces.thrust(torch.from_numpy(n / 60)[:, None])[:, 0].numpy()
+    revolutions = torch.from_numpy(n / 60)[:, None]
+    found: np.ndarray = thrusters.thruster_forces.thrust_at(revolutions)[:, 0].numpy()
     return found
 
 
